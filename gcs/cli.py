@@ -1,0 +1,187 @@
+"""The `gcs` command. Slow imports (cvxpy, rerun) are made by the commands that need them, so that --help is quick."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    help="Fly UAV formations over MAVLink and see how much link delay they can take.",
+)
+
+ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file, as scenarios/triangle5.toml")]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
+
+EXIT_FAILED = 1
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+
+class InputError(Exception):
+    """The user's input cannot be used: one line with what was read and what was wanted; exit code 2."""
+
+
+@app.callback(invoke_without_command=True)
+def help_without_command(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command()
+def fly(
+    scenario_file: ScenarioFile,
+    link_delay: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="emulate this constant delay each way, on every link")
+    ] = None,
+    connect: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="listen here, and fly only vehicles that are already there")
+    ] = "",
+    listen: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="listen here for the vehicles that this command starts")
+    ] = "127.0.0.1:14550",
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="run folder; default runs/<scenario>-<time>")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Design the control, start the vehicles, fly, show, record."""
+    from gcs.fly import FlyOptions, new_folder
+    from gcs.fly import fly as fly_now
+    from gcs.plan import flight_plan
+    from gcs.udp import StationSocket
+
+    scenario = _scenario(scenario_file)
+    if link_delay is not None:
+        if not 0 <= link_delay < 60:
+            raise InputError(f"--link-delay: read {link_delay}, wanted seconds from 0 to 60")
+        scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
+    address = _address("--connect", connect) if connect else _address("--listen", listen)
+    try:
+        link = StationSocket(*address)
+    except OSError as error:
+        raise InputError(f"{address[0]}:{address[1]}: {error.strerror}; wanted a free UDP port") from None
+    with link:
+        design, plan = flight_plan(scenario)
+        if not as_json:
+            _print_design(design)
+        folder = _out_folder(out) if out is not None else new_folder(scenario.name)
+        options = FlyOptions(folder=folder, start_vehicles=not connect, show_table=not as_json)
+        summary = fly_now(plan, design, link, options)
+    if as_json:
+        typer.echo(json.dumps(summary, indent=2))
+    else:
+        from gcs.report import print_summary
+
+        print_summary(summary, folder)
+    raise typer.Exit(_exit_code(summary))
+
+
+@app.command()
+def design(scenario_file: ScenarioFile, as_json: AsJson = False) -> None:
+    """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
+    from gcs.plan import flight_plan
+
+    result, _ = flight_plan(_scenario(scenario_file))
+    if as_json:
+        typer.echo(json.dumps(result, indent=2))
+    else:
+        _print_design(result)
+
+
+@app.command()
+def view(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder, or a .rrd file")],
+    picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="write a picture; open no window")] = None,
+    at: Annotated[float, typer.Option(metavar="SECONDS", help="scenario time of the picture")] = 10.0,
+) -> None:
+    """Open a recording in the Rerun viewer."""
+    from gcs.viewer import ViewerError, screenshot
+    from gcs.viewer import view as open_viewer
+
+    try:
+        if picture is not None:
+            screenshot(run, picture, time_s=at)
+        else:
+            open_viewer(run)
+    except ViewerError as error:
+        raise InputError(str(error)) from None
+
+
+@app.command()
+def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run that was killed")]) -> None:
+    """Finish the files of a run whose processes were killed: ticks.parquet, summary.json, flight.rrd."""
+    from gcs.observer import record_run
+    from gcs.report import print_summary
+    from gcs.summary import RunError, finish
+
+    try:
+        summary = finish(run)
+        record_run(run)
+    except RunError as error:
+        raise InputError(str(error)) from None
+    print_summary(summary, run)
+
+
+def main() -> None:
+    """Entry point: bad input is one line and exit code 2."""
+    from gains.errors import GainsError
+    from scenarios.files import ScenarioError
+
+    try:
+        code = app(standalone_mode=False)
+    except (InputError, ScenarioError, GainsError) as error:
+        code = _fail(str(error))
+    except typer.TyperException as error:  # an unknown option, a missing argument
+        code = _fail(error.format_message() if isinstance(error, typer.BadParameter) else str(error))
+    except (KeyboardInterrupt, typer.Abort):
+        print("interrupted", file=sys.stderr)
+        code = EXIT_INTERRUPTED
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(line: str) -> int:
+    print(" ".join(line.split()), file=sys.stderr)
+    return EXIT_BAD_INPUT
+
+
+def _scenario(file: Path) -> Any:
+    from scenarios.files import load
+
+    return load(file)
+
+
+def _address(option: str, text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 <= int(port) < 65536:
+        raise InputError(f"{option}: read {text!r}, wanted HOST:PORT, as 127.0.0.1:14550")
+    return host, int(port)
+
+
+def _out_folder(out: Path) -> Path:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        used = any(out.iterdir())
+    except OSError as error:
+        raise InputError(f"--out: {out}: {error.strerror}, wanted a folder that can be written") from None
+    if used:
+        raise InputError(f"--out: {out} is not empty, wanted a new or empty folder")
+    return out
+
+
+def _print_design(result: dict[str, Any]) -> None:
+    from gcs.report import print_design
+
+    print_design(result)
+
+
+def _exit_code(summary: dict[str, Any]) -> int:
+    if summary["reason"].startswith("interrupted"):
+        return EXIT_INTERRUPTED
+    return 0 if summary["verdict"] == "stable" else EXIT_FAILED
+
+
+if __name__ == "__main__":
+    main()

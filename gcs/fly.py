@@ -1,0 +1,119 @@
+"""One flight from scenario to summary, in real time: design, find or start the vehicles, fly, record, sum up."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time  # noqa: TID251 - names the run's folder; the flight's own clock is in the driver
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gcs import mavlink
+from gcs.record import DESIGN_FILE, READY_FILE, SCENARIO_FILE, RunWriter
+from gcs.sitl import VehicleProcess
+from gcs.station import CONNECT_PATIENCE_S, FlightPlan, Station
+from gcs.summary import finish
+from gcs.udp import StationSocket, clock_ns, drive, prepare_real_time
+from scenarios import files as scenario_files
+
+_NS = 1_000_000_000
+_HEARTBEAT_PERIOD_S = 1.2
+"""Vehicles that already fly have been heard within this time."""
+_OBSERVER_PATIENCE_S = 60.0
+_START_DELAY_NS = _NS // 5
+
+
+@dataclass(frozen=True)
+class FlyOptions:
+    """How one flight is run; the experiment itself is in the scenario."""
+
+    folder: Path
+    start_vehicles: bool
+    """Whether to start simulated vehicles when none are heard."""
+    show_table: bool
+    """Whether the live table (or, without a terminal, its plain lines) is shown."""
+
+
+def fly(plan: FlightPlan, design: dict[str, Any], link: StationSocket, options: FlyOptions) -> dict[str, Any]:
+    """Fly a designed scenario in real time and return the summary of the run left in the folder."""
+    folder = options.folder
+    (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
+    (folder / DESIGN_FILE).write_text(json.dumps(design, indent=2), encoding="utf-8")
+    with contextlib.ExitStack() as stack:
+        stop_reason = stack.enter_context(_stop_signals())
+        heard = _vehicles_heard(link, plan)
+        # Left in the reverse order: the log is closed, the vehicles end, the observer has finished the recording.
+        observer = stack.enter_context(_observer(folder, show_table=options.show_table))
+        if options.start_vehicles and not heard:
+            stack.enter_context(VehicleProcess(folder / SCENARIO_FILE, station=link.address, folder=folder))
+        writer = RunWriter(folder)
+        stack.callback(writer.close)
+        _wait_until_ready(observer, folder)
+        if heard:
+            text = f"vehicles {heard} are flying already: none are started"
+            writer.event(time_s=-CONNECT_PATIENCE_S, kind="vehicle", text=text)
+        prepare_real_time()
+        station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS)
+        drive(station, link, writer, stop_reason)
+        writer.event(time_s=station.scenario_time_s(clock_ns()), kind="end", text=station.end_reason)
+    return finish(folder)
+
+
+def new_folder(scenario_name: str) -> Path:
+    """A fresh folder for a run below runs/, named after the scenario and the local time."""
+    stem = f"{scenario_name}-{time.strftime('%Y%m%d-%H%M%S')}"
+    for count in range(1, 1000):
+        folder = Path("runs") / (stem if count == 1 else f"{stem}-{count}")
+        with contextlib.suppress(FileExistsError):
+            folder.mkdir(parents=True)
+            return folder
+    raise FileExistsError(f"runs/{stem}: 1000 runs in one second")
+
+
+@contextlib.contextmanager
+def _stop_signals() -> Iterator[Callable[[], str]]:
+    """While entered, Ctrl-C and SIGTERM raise nothing: they become a reason to end the flight, vehicles holding."""
+    asked: list[str] = []
+
+    def on_signal(number: int, _frame: object) -> None:
+        asked.append(f"interrupted: {signal.Signals(number).name}")
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked[0] if asked else ""
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _vehicles_heard(link: StationSocket, plan: FlightPlan) -> list[int]:
+    """System ids of the scenario that already send to our port, as after a station was killed in flight."""
+    while (until_ns := link.bound_ns + round(_HEARTBEAT_PERIOD_S * _NS)) > clock_ns():
+        time.sleep((until_ns - clock_ns()) * 1e-9)
+    frames = [frame for datagram in link.receive() for frame in mavlink.decode(datagram.data, Counter())]
+    return sorted({frame.system_id for frame in frames} & set(plan.formation.system_ids))
+
+
+@contextlib.contextmanager
+def _observer(folder: Path, *, show_table: bool) -> Iterator["subprocess.Popen[bytes]"]:
+    """The process that shows and records the flight; left, it has ended by itself or been told to."""
+    command = [sys.executable, "-m", "gcs.observer", str(folder), "--parent", str(os.getpid())]
+    process = subprocess.Popen(command + ([] if show_table else ["--no-table"]), stdin=subprocess.DEVNULL)
+    try:
+        yield process
+        process.wait(_OBSERVER_PATIENCE_S)
+    except BaseException:
+        process.terminate()
+        process.wait(_OBSERVER_PATIENCE_S)
+        raise
+
+
+def _wait_until_ready(observer: "subprocess.Popen[bytes]", folder: Path) -> None:
+    """Wait for the observer's slow imports, so that they do not take the processor from the first ticks."""
+    while observer.poll() is None and not (folder / READY_FILE).exists():
+        time.sleep(0.02)

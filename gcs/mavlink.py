@@ -1,0 +1,154 @@
+"""The station's MAVLink 2 codec: frames in and out of datagrams.
+
+The message definitions (wire layout, CRC_EXTRA) are those of pymavlink's dialect; framing and checksum are our own,
+because they run for each of 25,000 datagrams a second with 250 vehicles. Field order is that of the wire.
+"""
+
+import struct
+from collections import Counter
+from math import isfinite
+from typing import Any, NamedTuple
+
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+STATION_SYSTEM_ID = 255
+STATION_COMPONENT_ID = 190
+
+HEARTBEAT = 0
+LOCAL_POSITION_NED = 32
+GLOBAL_POSITION_INT = 33
+COMMAND_LONG = 76
+COMMAND_ACK = 77
+SET_POSITION_TARGET_LOCAL_NED = 84
+TIMESYNC = 111
+STATUSTEXT = 253
+
+_MAGIC = 0xFD
+_HEADER = struct.Struct("<BBBBBBBHB")
+_SIGNED = 0x01
+_SIGNATURE_LENGTH = 13
+_OVERHEAD = 12
+
+
+class _Layout(NamedTuple):
+    packing: struct.Struct
+    length: int
+    crc_extra: bytes
+
+
+def _layouts() -> dict[int, _Layout]:
+    messages: dict[int, Any] = dialect.mavlink_map
+    return {
+        msg_id: _Layout(message.unpacker, message.unpacker.size, bytes([message.crc_extra]))
+        for msg_id, message in messages.items()
+    }
+
+
+_LAYOUTS = _layouts()
+
+
+class Frame(NamedTuple):
+    """One valid frame. `fields` are in wire order (largest type first), as pymavlink's `ordered_fieldnames` lists."""
+
+    msg_id: int
+    system_id: int
+    component_id: int
+    sequence: int
+    fields: tuple[Any, ...]
+    data: bytes
+
+
+def field_names(msg_id: int) -> list[str]:
+    """Names of a message's fields in wire order; an array counts as one name but as many fields."""
+    messages: dict[int, Any] = dialect.mavlink_map
+    return list(messages[msg_id].ordered_fieldnames)
+
+
+def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
+    """The valid frames of one datagram; what is refused is counted by reason and never raised.
+
+    Each datagram is parsed on its own: a frame cut short cannot swallow the next datagram. A frame with a number that
+    is NaN or infinite in one of the messages used for control is refused, as its checksum says nothing about that.
+    """
+    frames: list[Frame] = []
+    at, end = 0, len(datagram)
+    while at < end:
+        if datagram[at] != _MAGIC:
+            refused["not MAVLink 2"] += 1
+            break
+        if end - at < _OVERHEAD:
+            refused["truncated"] += 1
+            break
+        _, length, incompatible, _, sequence, system_id, component_id, id_low, id_high = _HEADER.unpack_from(
+            datagram, at
+        )
+        stop = at + _OVERHEAD + length + (_SIGNATURE_LENGTH if incompatible & _SIGNED else 0)
+        if stop > end:
+            refused["truncated"] += 1
+            break
+        frame, at = datagram[at:stop] if stop != end or at else datagram, stop
+        layout = _LAYOUTS.get(id_low | id_high << 16)
+        if layout is None:
+            refused["unknown message"] += 1
+        elif incompatible & ~_SIGNED:
+            refused["unknown flags"] += 1
+        elif mcrf4xx(frame[1 : 10 + length] + layout.crc_extra) != frame[10 + length] | frame[11 + length] << 8:
+            refused["bad checksum"] += 1
+        else:
+            payload = frame[10 : 10 + min(length, layout.length)].ljust(layout.length, b"\0")
+            fields = layout.packing.unpack(payload)
+            if id_low == LOCAL_POSITION_NED and not isfinite(sum(fields)):
+                refused["not finite"] += 1
+            else:
+                frames.append(Frame(id_low | id_high << 16, system_id, component_id, sequence, fields, frame))
+    return frames
+
+
+def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int) -> bytes:
+    """One frame from the station; `fields` in wire order."""
+    layout = _LAYOUTS[msg_id]
+    payload = layout.packing.pack(*fields).rstrip(b"\0") or b"\0"
+    header = _HEADER.pack(
+        _MAGIC,
+        len(payload),
+        0,
+        0,
+        sequence & 0xFF,
+        STATION_SYSTEM_ID,
+        STATION_COMPONENT_ID,
+        msg_id & 0xFFFF,
+        msg_id >> 16,
+    )
+    body = header + payload
+    return body + mcrf4xx(body[1:] + layout.crc_extra).to_bytes(2, "little")
+
+
+def heartbeat() -> tuple[Any, ...]:
+    """Fields of the station's HEARTBEAT."""
+    return (0, dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, dialect.MAV_STATE_ACTIVE, 3)
+
+
+def timesync(*, tc1_ns: int, ts1_ns: int) -> tuple[Any, ...]:
+    """Fields of TIMESYNC: a request has tc1 = 0, a reply mirrors ts1."""
+    return (tc1_ns, ts1_ns)
+
+
+def command_long(
+    command: int, *, target_system: int, confirmation: int = 0, parameters: tuple[float, ...] = ()
+) -> tuple[Any, ...]:
+    """Fields of COMMAND_LONG to the autopilot (component 1) of one vehicle; parameters left out are 0."""
+    padded = (*parameters, *(0.0 for _ in range(7 - len(parameters))))
+    return (*padded, command, target_system, 1, confirmation)
+
+
+IGNORE_ALL_BUT_ACCELERATION = 0x0C3F
+"""type_mask of a set-point of which only the acceleration counts: the other bits set are ignore bits."""
+
+
+def acceleration_set_point(*, key_ms: int, target_system: int, north_m_s2: float, east_m_s2: float) -> tuple[Any, ...]:
+    """Fields of SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED with acceleration only, no climb."""
+    return (
+        key_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, north_m_s2, east_m_s2, 0.0, 0.0, 0.0,
+        IGNORE_ALL_BUT_ACCELERATION, target_system, 1, dialect.MAV_FRAME_LOCAL_NED,
+    )  # fmt: skip

@@ -1,0 +1,141 @@
+"""What a run leaves behind while it flies: the tick record, the events, the telemetry log.
+
+All three are append-only files written with one system call a tick, so a killed process loses nothing that it had
+logged, and so that others (the live table, the Rerun recording) follow the flight by reading files: the control loop
+never waits for them.
+"""
+
+import json
+import os
+import struct
+from collections.abc import Iterable
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SCENARIO_FILE = "scenario.toml"
+DESIGN_FILE = "design.json"
+TICKS_FILE = "ticks.part"
+"""The growing tick log; it becomes PARQUET_FILE when the run is finished."""
+PARQUET_FILE = "ticks.parquet"
+EVENTS_FILE = "events.jsonl"
+TLOG_FILE = "flight.tlog"
+RECORDING_FILE = "flight.rrd"
+SUMMARY_FILE = "summary.json"
+READY_FILE = ".observer-ready"
+"""There while an observer follows the run."""
+
+TickArray = NDArray[Any]
+"""A structured array of dtype TICK: one row for each vehicle."""
+
+
+class Mode(IntEnum):
+    """What the station thinks of one vehicle."""
+
+    WAITING = 0  # not heard, or not yet ready to fly
+    NOMINAL = 1  # flying, loop delay well below the margin
+    CAUTION = 2  # flying, little headroom left
+    CRITICAL = 3  # flying, loop delay above the margin
+    FAILSAFE = 4  # heard, but it does not take set-points: it holds its velocity
+    LOST = 5  # not heard
+
+
+TICK = np.dtype(
+    [
+        ("tick", "<i8"),  # counts control ticks, from 0; a number left out is a tick that was skipped
+        ("time_s", "<f8"),  # scenario time; below 0 before the formation is flown
+        ("due_ns", "<i8"),  # when the tick was due, station clock
+        ("sent_ns", "<i8"),  # when its set-points had been handed to the kernel, station clock
+        ("key_ms", "<u4"),  # time_boot_ms of its set-points: joins this log with the vehicles' own
+        ("system_id", "u1"),
+        ("mode", "u1"),  # Mode
+        ("commanded", "?"),  # a set-point was sent to this vehicle
+        ("sample_boot_ms", "<u4"),  # time_boot_ms of the newest state used
+        ("sample_ns", "<i8"),  # the same instant on the station's clock, as estimated
+        ("telemetry_age_s", "<f8"),  # sent_ns - sample_ns; NaN while the vehicle's clock is unknown
+        ("north_m", "<f8"),  # newest state, local NED
+        ("east_m", "<f8"),
+        ("down_m", "<f8"),
+        ("velocity_north_m_s", "<f8"),
+        ("velocity_east_m_s", "<f8"),
+        ("velocity_down_m_s", "<f8"),
+        ("spacing_error_north_m", "<f8"),  # e^p at the instant of the newest state; NaN for the leader
+        ("spacing_error_east_m", "<f8"),
+        ("velocity_error_north_m_s", "<f8"),  # e^v
+        ("velocity_error_east_m_s", "<f8"),
+        ("command_north_m_s2", "<f8"),  # set-point, acceleration; NaN when none was sent
+        ("command_east_m_s2", "<f8"),
+        ("queue_s", "<f8"),  # from the kernel's receive stamp of the newest state to its use by a step
+        ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
+        ("loop_delay_s", "<f8"),  # telemetry_age_s + down_delay_s
+        ("headroom", "<f8"),  # 1 - loop delay / margin
+        ("rtt_s", "<f8"),  # the TIMESYNC round trip that ended since the tick before; NaN if none did
+        ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock
+        ("clock_offset_bound_s", "<f8"),
+        ("received", "<u4"),  # frames from this vehicle so far, and those lost, late, twice
+        ("lost", "<u4"),
+        ("late", "<u4"),
+        ("duplicate", "<u4"),
+    ]
+)
+
+
+class RunWriter:
+    """Appends ticks, events and MAVLink frames to the files of one run folder."""
+
+    def __init__(self, folder: Path) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        self._ticks, self._events, self._tlog = (
+            os.open(folder / name, flags, 0o644) for name in (TICKS_FILE, EVENTS_FILE, TLOG_FILE)
+        )
+
+    def tick(self, rows: TickArray) -> None:
+        os.write(self._ticks, rows.tobytes())
+
+    def event(self, *, time_s: float, kind: str, text: str, system_id: int | None = None) -> None:
+        line = {"time_s": round(time_s, 6), "kind": kind, "system_id": system_id, "text": text}
+        os.write(self._events, (json.dumps(line) + "\n").encode())
+
+    def frames(self, frames: Iterable[tuple[bytes, int]]) -> None:
+        """Log frames, each with its time in ns since 1970, in the .tlog layout: big-endian µs, then the frame."""
+        entries = b"".join(struct.pack(">Q", time_ns // 1000) + frame for frame, time_ns in frames)
+        if entries:
+            os.write(self._tlog, entries)
+
+    def close(self) -> None:
+        for descriptor in (self._ticks, self._events, self._tlog):
+            os.close(descriptor)
+
+
+class RunTail:
+    """Reads what has been added to a run's ticks and events since the last call; the run may still be growing."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._ticks_read = 0
+        self._events_read = 0
+
+    def ticks(self) -> TickArray:
+        """New rows, in the order they were written; a half-written one is left for the next call."""
+        data, count = self._new(TICKS_FILE, self._ticks_read, TICK.itemsize)
+        self._ticks_read += count
+        return np.frombuffer(data[:count], dtype=TICK)
+
+    def events(self) -> list[dict[str, Any]]:
+        """New events: time_s, kind, system_id (or None), text."""
+        data, _ = self._new(EVENTS_FILE, self._events_read, 1)
+        whole = data[: data.rfind(b"\n") + 1]
+        self._events_read += len(whole)
+        return [json.loads(line) for line in whole.splitlines()]
+
+    def _new(self, name: str, start: int, unit: int) -> tuple[bytes, int]:
+        try:
+            with (self._folder / name).open("rb") as file:
+                file.seek(start)
+                data = file.read()
+        except FileNotFoundError:
+            return b"", 0
+        return data, len(data) - len(data) % unit

@@ -1,0 +1,91 @@
+"""What the terminal shows before and after a flight."""
+
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+UNKNOWN = "–"
+
+
+def print_design(design: dict[str, Any], console: Console | None = None) -> None:
+    """Gains, robustness, both margins, and the trade-off between robustness and margin."""
+    console = console or Console(highlight=False, soft_wrap=True)
+    own, front, spacing = (design[name][0][0] for name in ("K1_1_s", "K2_1_s", "K3_1_s2"))
+    behaviour = design["behaviour"]
+    console.print(f"design   {design['method']}, loop {design['loop']}, period {design['period_s'] * 1e3:g} ms")
+    console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
+    console.print("         u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike")
+    console.print(
+        f"margin   {_ms(design['delay_margin_s'])} of loop delay in the sampled loop, "
+        f"{_ms(design['delay_margin_continuous_s'])} in the continuous model"
+    )
+    console.print(
+        f"alpha    {design['alpha']:.4f} (robustness bound); spacing errors grow by {behaviour['string_peak']:.2f} "
+        f"at most from vehicle to vehicle, decay {behaviour['decay_rate_1_s']:.2f} 1/s without delay"
+    )
+    if not design["trade_off"]:
+        return
+    table = Table(box=box.SIMPLE_HEAD, title="the trade-off it sits on", title_justify="left", title_style="")
+    table.add_column("delay margin, ms", justify="right")
+    table.add_column("largest alpha", justify="right")
+    for point in design["trade_off"]:
+        table.add_row(_ms(point["delay_margin_s"], unit=""), f"{point['alpha']:.3f}")
+    console.print(table)
+
+
+def print_summary(summary: dict[str, Any], folder: Path, console: Console | None = None) -> None:
+    """The verdict with its figures, and where the files are."""
+    console = console or Console(highlight=False, soft_wrap=True)
+    style = {"stable": "bold green", "unstable": "bold red"}.get(summary["verdict"], "bold yellow")
+    console.print(f"verdict  [{style}]{summary['verdict']}[/]: {summary['reason']}")
+    delay = summary["loop_delay_s"]
+    console.print(
+        f"delay    loop {_ms(delay['p50'])} p50, {_ms(delay['p99'])} p99, {_ms(delay['max'])} max; "
+        f"margin {_ms(summary['delay_margin_s'])}; least headroom {_percent(summary['headroom_min'])}"
+    )
+    control = summary["control"]
+    console.print(
+        f"control  {control['ticks']} ticks at {control['rate_hz']:g} Hz, "
+        f"{control['deadline_misses']} deadline misses; settled {_after(summary['settling_time_s'])}"
+    )
+    table = Table(box=box.SIMPLE_HEAD)
+    for name in ("vehicle", "final error, m", "largest, m", "RTT p50, ms", "loop p50, ms", "p99, ms", "lost", "late"):
+        table.add_column(name, justify="right")
+    for vehicle in summary["vehicles"]:
+        table.add_row(
+            str(vehicle["system_id"]),
+            _metres(vehicle["spacing_error_final_m"]),
+            _metres(vehicle["spacing_error_max_m"]),
+            _ms(vehicle["rtt_s"]["p50"], unit=""),
+            _ms(vehicle["loop_delay_s"]["p50"], unit=""),
+            _ms(vehicle["loop_delay_s"]["p99"], unit=""),
+            _count(vehicle["lost"]),
+            _count(vehicle["late"]),
+        )
+    console.print(table)
+    console.print(f"files    {folder}: {', '.join(summary['files'])}")
+    if "flight.rrd" in summary["files"]:
+        console.print(f"look     gcs view {folder}")
+
+
+def _ms(seconds: float | None, *, unit: str = " ms") -> str:
+    return UNKNOWN if seconds is None else f"{seconds * 1e3:.1f}{unit}"
+
+
+def _metres(value: float | None) -> str:
+    return UNKNOWN if value is None else f"{value:.2f}"
+
+
+def _percent(value: float | None) -> str:
+    return UNKNOWN if value is None else f"{value:.0%}"
+
+
+def _after(seconds: float | None) -> str:
+    return "not at all" if seconds is None else f"after {seconds:.1f} s"
+
+
+def _count(value: int | None) -> str:
+    return UNKNOWN if value is None else str(value)

@@ -1,0 +1,49 @@
+"""Simulated vehicles for the station, as a process of their own."""
+
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from gcs.vehicle import Address
+
+VEHICLES_LOG = "vehicles.log"
+TRUTH_FILE = "truth.bin"
+_SILENCE_S = 60.0
+_STOP_PATIENCE_S = 5.0
+
+
+class VehicleProcess:
+    """The simulated vehicles of a scenario as a child process that survives this one.
+
+    If the station is killed, the vehicles fly on in their failsafe and can be taken over again; without any station
+    they end after a minute.
+    """
+
+    def __init__(self, scenario_file: Path, *, station: Address, folder: Path) -> None:
+        host, port = station
+        with (folder / VEHICLES_LOG).open("wb") as log:
+            self._process = subprocess.Popen(
+                [
+                    sys.executable, "-m", "sim_vehicles.cli", str(scenario_file), "--station", f"{host}:{port}",
+                    "--truth", str(folder / TRUTH_FILE), "--stop-after-silence", str(_SILENCE_S),
+                ],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C is the station's to answer: it brings them to safety first
+            )  # fmt: skip
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._process.terminate()
+        try:
+            self._process.wait(_STOP_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()

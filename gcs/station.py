@@ -1,0 +1,394 @@
+"""The ground station as a pure machine: datagrams and the time in, datagrams and tick records out.
+
+One loop: receive, decide, command, record. No socket, clock or file is touched here; a driver feeds `step` in real time
+or in virtual time, with the same bytes.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs import mavlink
+from gcs.control import LARGEST_COMMAND_M_S2, Formation, FormationControl, Gains, overlapping_control, without
+from gcs.modes import Phase, next_phase, vehicle_mode
+from gcs.record import TICK, Mode, TickArray
+from gcs.telemetry import StateHistory
+from gcs.vehicle import HOLD, Address, RemoteVehicle
+from scenarios.schema import NS_PER_S, Scenario
+
+CONNECT_PATIENCE_S = 20.0
+SILENCE_S = 1.5
+"""A vehicle whose telemetry has not come for this long is lost: it gets no more set-points and is flown around."""
+_HEARTBEAT_NS = NS_PER_S
+
+
+class Datagram(NamedTuple):
+    """One received datagram; `received_ns` is the kernel's stamp, on the station's clock."""
+
+    data: bytes
+    address: Address
+    received_ns: int
+
+
+class Event(NamedTuple):
+    time_s: float
+    kind: str
+    text: str
+    system_id: int | None = None
+
+
+class Outgoing(NamedTuple):
+    data: bytes
+    address: Address
+
+
+@dataclass(frozen=True)
+class FlightPlan:
+    """What the station flies: the formation, the gains and the margin they have."""
+
+    scenario: Scenario
+    formation: Formation
+    gains: Gains
+    delay_margin_s: float
+
+
+def plan_formation(scenario: Scenario) -> Formation:
+    """The scenario's formation as arrays, vehicles in `leader_first` order."""
+    ordered = scenario.leader_first()
+    row = {vehicle.system_id: k for k, vehicle in enumerate(ordered)}
+    return Formation(
+        system_ids=tuple(row),
+        predecessor=np.array([-1 if v.follows is None else row[v.follows] for v in ordered], dtype=np.int64),
+        offset_ne_m=np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered]),
+    )
+
+
+class Station:
+    """Flies one formation. `start_ns` is the time of the first control tick."""
+
+    def __init__(self, plan: FlightPlan, *, start_ns: int) -> None:
+        rates = plan.scenario.rates
+        self.plan = plan
+        self.phase = Phase.CONNECTING
+        self.end_reason = ""
+        self.events: list[Event] = []
+        self.frames: list[tuple[bytes, int]] = []
+        """Frames received since the driver last took them, with their receive time."""
+        self.counters: Counter[str] = Counter()
+        self.vehicles = [
+            RemoteVehicle(system_id, telemetry_hz=rates.telemetry_hz, report=self._reporter(system_id))
+            for system_id in plan.formation.system_ids
+        ]
+        n = len(self.vehicles)
+        self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
+        self._history = StateHistory(n)
+        self._formation = plan.formation
+        self._period_ns = round(NS_PER_S / rates.control_hz)
+        self._timesync_ns = round(NS_PER_S / rates.timesync_hz)
+        self._start_ns = start_ns
+        self._phase_since_ns = start_ns
+        self._flight_start_ns: int | None = None
+        self._next_tick_ns = start_ns
+        self._next_heartbeat_ns = start_ns
+        # Requests are spread over the interval, half a period off the ticks, so that they do not wait for set-points.
+        self._next_timesync_ns = start_ns + self._period_ns // 2
+        self._timesync_spacing_ns = max(1, self._timesync_ns // n)
+        self._timesync_row = 0
+        self._tick_count = 0
+        self._stop = ""
+        self._now_ns = start_ns
+        self._rows: TickArray = np.zeros(n, TICK)
+        self._rows["system_id"] = plan.formation.system_ids
+        self._rows["headroom"] = np.nan
+        self._boot_ms = [0] * n
+        self._queue_s = [np.nan] * n
+        self._telemetry_ns = [0] * n
+        self._fresh_rtt_s = [np.nan] * n
+        self._lost = np.zeros(n, dtype=bool)
+
+    @property
+    def next_event_ns(self) -> int:
+        """When `step` next has something to do of its own accord."""
+        return min(self._next_tick_ns, self._next_heartbeat_ns, self._next_timesync_ns)
+
+    def request_stop(self, reason: str) -> None:
+        """End the flight at the next tick: the vehicles are told to hold, and seen to."""
+        self._stop = self._stop or reason
+
+    def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], TickArray | None]:
+        """Take datagrams in and do what is due.
+
+        Returns
+        -------
+        datagrams to send, and the rows of the control tick if one was due. The driver passes the rows to
+        `complete` once the datagrams are sent.
+        """
+        self._now_ns = now_ns
+        outgoing: list[Outgoing] = []
+        for datagram in datagrams:
+            self._receive(datagram, outgoing)
+        rows = None
+        if now_ns >= self._next_tick_ns:
+            rows = self._tick(outgoing)
+        if now_ns >= self._next_heartbeat_ns:
+            self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
+            for vehicle in self.vehicles:
+                self._send(vehicle, mavlink.HEARTBEAT, mavlink.heartbeat(), outgoing)
+        while now_ns >= self._next_timesync_ns:
+            self._request_timesync(outgoing)
+        return outgoing, rows
+
+    def complete(self, rows: TickArray, sent_ns: int) -> None:
+        """Close a tick's rows with the time at which its set-points were sent: ages, loop delays, headroom."""
+        rows["sent_ns"] = sent_ns
+        rows["telemetry_age_s"] = np.where(rows["sample_ns"] > 0, (sent_ns - rows["sample_ns"]) * 1e-9, np.nan)
+        rows["loop_delay_s"] = rows["telemetry_age_s"] + rows["down_delay_s"]
+        rows["headroom"] = 1.0 - rows["loop_delay_s"] / self.plan.delay_margin_s
+
+    def scenario_time_s(self, now_ns: int) -> float:
+        """Time since the formation flight began; before that, time since the start minus the patience, below 0."""
+        if self._flight_start_ns is None:
+            return (now_ns - self._start_ns) / NS_PER_S - CONNECT_PATIENCE_S
+        return (now_ns - self._flight_start_ns) / NS_PER_S
+
+    # -- receive ---------------------------------------------------------------------------------------------------
+
+    def _receive(self, datagram: Datagram, outgoing: list[Outgoing]) -> None:
+        for frame in mavlink.decode(datagram.data, self.counters):
+            row = self._row.get(frame.system_id)
+            if row is None:
+                self.counters["unknown system id"] += 1
+                continue
+            vehicle = self.vehicles[row]
+            if not self._is_from(vehicle, datagram, frame.msg_id):
+                self.counters["known system id from another address"] += 1
+                continue
+            vehicle.heard_ns = datagram.received_ns
+            if frame.component_id == 1:
+                vehicle.frames.add(frame.sequence)
+            self.frames.append((frame.data, datagram.received_ns))
+            self._handle(row, vehicle, frame, datagram, outgoing)
+
+    def _is_from(self, vehicle: RemoteVehicle, datagram: Datagram, msg_id: int) -> bool:
+        """Whether the datagram comes from the vehicle's address; its first heartbeat, or one after silence, sets it."""
+        if vehicle.address == datagram.address:
+            return True
+        silent = datagram.received_ns - vehicle.heard_ns > SILENCE_S * NS_PER_S
+        if msg_id != mavlink.HEARTBEAT or (vehicle.address is not None and not silent):
+            return False
+        self.events.append(Event(self.scenario_time_s(self._now_ns), "vehicle", "found", vehicle.system_id))
+        vehicle.address = datagram.address
+        return True
+
+    def _handle(
+        self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]
+    ) -> None:
+        fields = frame.fields
+        match frame.msg_id:
+            case mavlink.LOCAL_POSITION_NED:
+                self._position(row, vehicle, frame, datagram.received_ns)
+            case mavlink.TIMESYNC:
+                tc1_ns, ts1_ns = fields
+                if tc1_ns == 0:
+                    reply = mavlink.timesync(tc1_ns=datagram.received_ns, ts1_ns=ts1_ns)
+                    self._send(vehicle, mavlink.TIMESYNC, reply, outgoing)
+                else:
+                    self._timesync_reply(row, vehicle, tc1_ns, ts1_ns, datagram.received_ns)
+            case mavlink.HEARTBEAT:
+                vehicle.heartbeat(fields, datagram.received_ns)
+            case mavlink.COMMAND_ACK:
+                vehicle.acknowledge(fields, datagram.received_ns)
+            case mavlink.STATUSTEXT:
+                text = fields[1].split(b"\0")[0].decode(errors="replace")
+                self.events.append(Event(self.scenario_time_s(self._now_ns), "statustext", text, vehicle.system_id))
+            case _:
+                pass
+
+    def _position(self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, received_ns: int) -> None:
+        boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
+        self._telemetry_ns[row] = received_ns
+        clock = vehicle.clock.estimate
+        if clock.samples == 0:
+            return
+        sample_ns = clock.to_station_ns(boot_ms * 1_000_000)
+        if not self._history.add(row, sample_ns, (north, east, v_north, v_east)):
+            return
+        self._boot_ms[row] = boot_ms
+        self._queue_s[row] = (self._now_ns - received_ns) * 1e-9
+        self._rows["down_m"][row], self._rows["velocity_down_m_s"][row] = down, v_down
+
+    def _timesync_reply(self, row: int, vehicle: RemoteVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
+        jumps = vehicle.clock.jumps
+        rtt_ns = vehicle.clock.reply(tc1_ns=tc1_ns, ts1_ns=ts1_ns, received_ns=received_ns)
+        if rtt_ns is not None:
+            self._fresh_rtt_s[row] = rtt_ns * 1e-9
+        if vehicle.clock.jumps != jumps:
+            self._history.forget(row)
+            vehicle.forget_rates()
+            self.events.append(
+                Event(self.scenario_time_s(self._now_ns), "vehicle", "its clock jumped", vehicle.system_id)
+            )
+
+    # -- the control tick ------------------------------------------------------------------------------------------
+
+    def _tick(self, outgoing: list[Outgoing]) -> TickArray:
+        due_ns = self._next_tick_ns
+        behind = (self._now_ns - due_ns) // self._period_ns
+        self._next_tick_ns = due_ns + (behind + 1) * self._period_ns  # ticks that were slept through are left out
+        self._decide(due_ns)
+        flying = self.phase is Phase.FLYING
+        time_s = self.scenario_time_s(due_ns)
+        limit = self.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2
+        control = overlapping_control(
+            self._history,
+            self._formation,
+            self.plan.gains,
+            nominal_velocity_m_s=self.plan.scenario.nominal_velocity_at(time_s),
+            limit_m_s2=limit,
+        )
+        if flying:
+            self._watch_spacing(control)
+        key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
+        commanded = flying & ~self._lost & np.isfinite(control.command_m_s2).all(axis=1)
+        for row in np.flatnonzero(commanded).tolist():
+            north, east = control.command_m_s2[row].tolist()
+            fields = mavlink.acceleration_set_point(
+                key_ms=key_ms, target_system=self.vehicles[row].system_id, north_m_s2=north, east_m_s2=east
+            )
+            self._send(self.vehicles[row], mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
+        for vehicle in self.vehicles:
+            frame = vehicle.converse(self._now_ns)
+            if frame is not None and vehicle.address is not None:
+                outgoing.append(Outgoing(frame, vehicle.address))
+        rows = self._record(control, commanded, due_ns=due_ns, time_s=time_s, key_ms=key_ms)
+        self._tick_count += 1 + behind
+        return rows
+
+    def _decide(self, due_ns: int) -> None:
+        """Modes, lost vehicles and the flight's phase."""
+        flying = self.phase is Phase.FLYING
+        silence_ns = SILENCE_S * NS_PER_S
+        silent = [self._now_ns - heard_ns > silence_ns for heard_ns in self._telemetry_ns]
+        lost = np.array(silent) & flying
+        if (lost != self._lost).any():
+            for row in np.flatnonzero(lost != self._lost).tolist():
+                text = "is lost" if lost[row] else "is heard again"
+                self._report("vehicle", text, self.vehicles[row].system_id)
+            self._lost = lost
+            self._formation = without(self.plan.formation, lost)
+        for row, vehicle in enumerate(self.vehicles):
+            before = Mode(int(self._rows["mode"][row]))
+            mode = vehicle_mode(
+                silent=silent[row],
+                guided=vehicle.guided,
+                failsafe=vehicle.critical,
+                flying=flying,
+                headroom=float(self._rows["headroom"][row]),
+            )
+            if mode is not before:
+                self._rows["mode"][row] = mode
+                self._report("mode", f"{before.name} -> {mode.name}", vehicle.system_id)
+        self._next_phase(due_ns)
+
+    def _next_phase(self, due_ns: int) -> None:
+        waited_s = (due_ns - self._phase_since_ns) / NS_PER_S
+        if self.phase is Phase.CONNECTING and waited_s > CONNECT_PATIENCE_S:
+            unready = "; ".join(f"vehicle {v.system_id} {v.missing}" for v in self.vehicles if not v.ready)
+            self.request_stop(f"not ready: {unready}")
+        if self.phase is Phase.FLYING:
+            if waited_s >= self.plan.scenario.duration_s:
+                lost = ", ".join(str(v.system_id) for v, gone in zip(self.vehicles, self._lost, strict=True) if gone)
+                self.request_stop(f"lost: vehicles {lost}" if lost else "completed: duration reached")
+            elif self._lost.all():
+                self.request_stop("lost: all vehicles")
+        phase = next_phase(
+            self.phase,
+            all_ready=all(vehicle.ready for vehicle in self.vehicles)
+            and bool(np.isfinite(self._history.newest()[1]).all()),
+            stop=bool(self._stop),
+            all_holding=all(v.custom_mode == HOLD for v in self.vehicles if v.address is not None),
+            waited_s=waited_s,
+        )
+        if phase is self.phase:
+            return
+        self.phase, self._phase_since_ns = phase, due_ns
+        if phase is Phase.FLYING:
+            self._flight_start_ns = due_ns
+        if phase is Phase.ENDING:
+            self.end_reason = self._stop
+            for vehicle in self.vehicles:
+                # A formation that broke is left to its own failsafe: what broke may be the link.
+                vehicle.wanted_mode = None if self._stop.startswith("broken") else HOLD
+        self._report("phase", str(phase))
+
+    def _watch_spacing(self, control: FormationControl) -> None:
+        """Ask for the end when a spacing error passes the scenario's limit."""
+        limit_m = self.plan.scenario.safety.spacing_error_limit_m
+        error_m = np.hypot(control.spacing_error_m[:, 0], control.spacing_error_m[:, 1])
+        error_m[self._lost | ~np.isfinite(error_m)] = 0.0
+        worst = int(error_m.argmax())
+        if error_m[worst] > limit_m:
+            system_id = self.vehicles[worst].system_id
+            self.request_stop(
+                f"broken: spacing error of vehicle {system_id} is {error_m[worst]:.0f} m, limit {limit_m:g} m"
+            )
+
+    def _record(
+        self,
+        control: FormationControl,
+        commanded: NDArray[np.bool_],
+        *,
+        due_ns: int,
+        time_s: float,
+        key_ms: int,
+    ) -> TickArray:
+        rows = self._rows
+        rows["tick"], rows["time_s"], rows["due_ns"], rows["key_ms"] = self._tick_count, time_s, due_ns, key_ms
+        rows["commanded"] = commanded
+        rows["sample_boot_ms"] = self._boot_ms
+        rows["sample_ns"] = np.maximum(control.sample_ns, 0)
+        rows["north_m"], rows["east_m"] = control.position_m.T
+        rows["velocity_north_m_s"], rows["velocity_east_m_s"] = control.velocity_m_s.T
+        rows["spacing_error_north_m"], rows["spacing_error_east_m"] = control.spacing_error_m.T
+        rows["velocity_error_north_m_s"], rows["velocity_error_east_m_s"] = control.velocity_error_m_s.T
+        command = np.where(commanded[:, None], control.command_m_s2, np.nan)
+        rows["command_north_m_s2"], rows["command_east_m_s2"] = command.T
+        rows["queue_s"] = self._queue_s
+        rows["rtt_s"] = self._fresh_rtt_s
+        self._fresh_rtt_s = [np.nan] * len(self.vehicles)
+        clocks = [vehicle.clock for vehicle in self.vehicles]
+        rows["down_delay_s"] = [np.nan if c.down_ns is None else c.down_ns * 1e-9 for c in clocks]
+        known = [c.estimate if c.estimate.samples else None for c in clocks]
+        rows["clock_offset_s"] = [np.nan if e is None else e.offset_ns * 1e-9 for e in known]
+        rows["clock_offset_bound_s"] = [np.nan if e is None else e.bound_ns * 1e-9 for e in known]
+        frames = [vehicle.frames for vehicle in self.vehicles]
+        for name in ("received", "lost", "late", "duplicate"):
+            rows[name] = [getattr(counter, name) for counter in frames]
+        return rows
+
+    # -- small things ----------------------------------------------------------------------------------------------
+
+    def _request_timesync(self, outgoing: list[Outgoing]) -> None:
+        vehicle = self.vehicles[self._timesync_row]
+        self._timesync_row = (self._timesync_row + 1) % len(self.vehicles)
+        self._next_timesync_ns += self._timesync_spacing_ns
+        if vehicle.address is not None:
+            ts1_ns = vehicle.clock.request(self._now_ns)
+            self._send(vehicle, mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=ts1_ns), outgoing)
+
+    def _send(self, vehicle: RemoteVehicle, msg_id: int, fields: tuple[object, ...], outgoing: list[Outgoing]) -> None:
+        if vehicle.address is not None:
+            outgoing.append(Outgoing(vehicle.encode(msg_id, fields), vehicle.address))
+
+    def _report(self, kind: str, text: str, system_id: int | None = None) -> None:
+        self.events.append(Event(self.scenario_time_s(self._now_ns), kind, text, system_id))
+
+    def _reporter(self, system_id: int) -> Callable[[str, str], None]:
+        def report(kind: str, text: str) -> None:
+            self._report(kind, text, system_id)
+
+        return report

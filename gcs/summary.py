@@ -1,0 +1,209 @@
+"""From a run's logs to its verdict: ticks.parquet and summary.json.
+
+Works from the files alone, so a run whose station was killed is finished by the same code as one that ended well.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs.record import (
+    DESIGN_FILE,
+    PARQUET_FILE,
+    SCENARIO_FILE,
+    SUMMARY_FILE,
+    TICK,
+    TICKS_FILE,
+    Mode,
+    RunTail,
+    TickArray,
+)
+from scenarios import files as scenario_files
+from scenarios.schema import Scenario
+
+SILENT_END = "interrupted: the station ended without a word"
+_DECAY = 0.8
+
+
+class RunError(Exception):
+    """A run folder that cannot be read: one line, what was read and what was wanted."""
+
+
+def finish(folder: Path) -> dict[str, Any]:
+    """Write ticks.parquet and summary.json of a run that has ended, and return the summary.
+
+    Raises
+    ------
+    RunError
+        If the folder is not a run.
+    """
+    if not (folder / SCENARIO_FILE).exists():
+        raise RunError(f"{folder}: read no {SCENARIO_FILE}, wanted the folder of a run")
+    scenario = scenario_files.load(folder / SCENARIO_FILE)
+    design = json.loads((folder / DESIGN_FILE).read_text())
+    tail = RunTail(folder)
+    ticks = read_ticks(folder)
+    summary = summarise(scenario, design, ticks, tail.events())
+    _write_parquet(folder, ticks)
+    summary["files"] = sorted(file.name for file in folder.iterdir() if not file.name.startswith("."))
+    if SUMMARY_FILE not in summary["files"]:
+        summary["files"] = sorted([*summary["files"], SUMMARY_FILE])
+    _write_whole(folder / SUMMARY_FILE, json.dumps(summary, indent=2, allow_nan=False).encode())
+    return summary
+
+
+def read_ticks(folder: Path) -> TickArray:
+    """All tick rows of a run, finished or not."""
+    if (folder / TICKS_FILE).exists():
+        return RunTail(folder).ticks()
+    if not (folder / PARQUET_FILE).exists():
+        raise RunError(f"{folder}: read neither {TICKS_FILE} nor {PARQUET_FILE}, wanted the folder of a run")
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(folder / PARQUET_FILE)
+    ticks = np.empty(table.num_rows, TICK)
+    for name in TICK.names or ():
+        ticks[name] = table[name].to_numpy()
+    return ticks
+
+
+def _write_parquet(folder: Path, ticks: TickArray) -> None:
+    """Turn the growing log into Parquet; the log goes only when the Parquet file is whole."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.table({name: np.ascontiguousarray(ticks[name]) for name in TICK.names or ()})
+    part = folder / (PARQUET_FILE + ".new")
+    pq.write_table(table, part, compression="zstd")
+    part.replace(folder / PARQUET_FILE)
+    (folder / TICKS_FILE).unlink(missing_ok=True)
+
+
+def _write_whole(file: Path, data: bytes) -> None:
+    part = file.with_suffix(".new")
+    part.write_bytes(data)
+    part.replace(file)
+
+
+def summarise(
+    scenario: Scenario, design: dict[str, Any], ticks: TickArray, events: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """The summary of a run, as plain types; an unknown is None."""
+    commanded = ticks["tick"][ticks["commanded"]]
+    flown = ticks[(ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1))]
+    ends = [event["text"] for event in events if event["kind"] == "end"]
+    reason = ends[-1] if ends else SILENT_END
+    followers = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
+    errors = {system_id: _error(flown, system_id) for system_id in followers}
+    settled = _settling_time_s(errors, followers, scenario.safety.settled_fraction)
+    loop_delay = flown["loop_delay_s"][flown["commanded"]]
+    headroom = flown["headroom"][flown["commanded"]]
+    return {
+        "scenario": scenario.name,
+        "verdict": verdict(reason, errors, settled),
+        "reason": reason,
+        "loop": scenario.control.loop,
+        "delay_margin_s": _number(design["delay_margin_s"]),
+        "delay_margin_continuous_s": _number(design["delay_margin_continuous_s"]),
+        "loop_delay_s": _spread(loop_delay),
+        "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
+        "settling_time_s": settled,
+        "duration_s": _number(flown["time_s"].max()) if flown.size else 0.0,
+        "vehicles": [_vehicle(ticks, flown, v.system_id, errors.get(v.system_id)) for v in scenario.vehicles],
+        "control": _control(scenario, flown),
+        "mode_changes": [e for e in events if e["kind"] == "mode" and e["time_s"] >= 0],
+        "files": [],
+    }
+
+
+Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Times (s) and the norm of the spacing error (m) of one follower."""
+
+
+def verdict(reason: str, errors: dict[int, Errors], settling_time_s: float | None) -> str:
+    """ "stable", "unstable" or "aborted".
+
+    A flight that broke a limit is unstable; one that ended early for any other reason is aborted. One that lasted is
+    stable if all spacing errors have settled, or are still shrinking: the largest of the last fifth of the flight is
+    below 0.8 of the largest of the fifth before.
+    """
+    if reason.startswith("broken"):
+        return "unstable"
+    if not reason.startswith("completed"):
+        return "aborted"
+    if settling_time_s is not None:
+        return "stable"
+    for time_s, error_m in errors.values():
+        end = time_s[-1]
+        last = error_m[time_s > 0.8 * end].max()
+        before = error_m[(time_s > 0.6 * end) & (time_s <= 0.8 * end)].max()
+        if not last < _DECAY * before:
+            return "unstable"
+    return "stable"
+
+
+def _error(flown: TickArray, system_id: int) -> Errors:
+    rows = flown[flown["system_id"] == system_id]
+    error = np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
+    known = np.isfinite(error)
+    return rows["time_s"][known], error[known]
+
+
+def _settling_time_s(errors: dict[int, Errors], spacing_m: dict[int, float], fraction: float) -> float | None:
+    """When the last follower came within its band for good; None if one has not."""
+    latest = 0.0
+    for system_id, (time_s, error_m) in errors.items():
+        outside = np.flatnonzero(error_m > fraction * spacing_m[system_id])
+        if not time_s.size or (outside.size and outside[-1] == time_s.size - 1):
+            return None
+        if outside.size:
+            latest = max(latest, float(time_s[outside[-1] + 1]))
+    return round(latest, 6)
+
+
+def _vehicle(ticks: TickArray, flown: TickArray, system_id: int, error: Errors | None) -> dict[str, Any]:
+    rows = ticks[ticks["system_id"] == system_id]
+    rtt = rows["rtt_s"]
+    own = flown[flown["system_id"] == system_id]
+    error_m = error[1] if error is not None and error[1].size else None
+    counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
+    return {
+        "system_id": system_id,
+        "spacing_error_final_m": None if error_m is None else _number(error_m[-1]),
+        "spacing_error_max_m": None if error_m is None else _number(error_m.max()),
+        "rtt_s": _spread(rtt) | {"samples": int(np.isfinite(rtt).sum())},
+        "loop_delay_s": _spread(own["loop_delay_s"][own["commanded"]]),
+        "mode_final": None if not rows.size else Mode(int(rows["mode"][-1])).name,
+        **counted,
+    }
+
+
+def _control(scenario: Scenario, flown: TickArray) -> dict[str, Any]:
+    """Ticks flown, and deadline misses: set-points sent later than half a period after they were due, or not at all."""
+    period_s = 1.0 / scenario.rates.control_hz
+    ticks, first = np.unique(flown["tick"], return_index=True)
+    late_s = (flown["sent_ns"][first] - flown["due_ns"][first]) * 1e-9
+    skipped = int(ticks[-1] - ticks[0] + 1 - ticks.size) if ticks.size else 0
+    return {
+        "rate_hz": scenario.rates.control_hz,
+        "ticks": int(ticks.size),
+        "deadline_misses": skipped + int((late_s > period_s / 2).sum()),
+        "lateness_s": _spread(late_s),
+    }
+
+
+def _spread(values: NDArray[np.float64]) -> dict[str, float | None]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return {"p50": None, "p99": None, "max": None}
+    p50, p99 = np.percentile(known, [50, 99])
+    return {"p50": _number(p50), "p99": _number(p99), "max": _number(known.max())}
+
+
+def _number(value: Any) -> float | None:
+    """A finite float, or None: JSON has no infinity, and an unbounded margin has no number."""
+    number = float(value) if value is not None else np.nan
+    return round(number, 9) if np.isfinite(number) else None

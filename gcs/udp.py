@@ -1,0 +1,134 @@
+"""The station's real-time driver: one UDP socket, the monotonic clock, one select loop.
+
+The only file of the station that reads a clock or touches a socket. Kernel receive stamps (SO_TIMESTAMPNS) say when a
+datagram arrived, so a busy station does not lengthen the delays that it measures.
+"""
+
+import ctypes
+import gc
+import select
+import socket
+import struct
+import time  # noqa: TID251 - this is a driver
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from gcs.modes import Phase
+from gcs.record import RunWriter
+from gcs.station import Datagram, Outgoing, Station
+from gcs.vehicle import Address
+
+_SO_TIMESTAMPNS = 35
+_TIMESPEC = struct.Struct("qq")
+_ANCILLARY_BYTES = 64
+_LARGEST_DATAGRAM = 2048
+_DATAGRAMS_A_STEP = 4096
+_PR_SET_TIMERSLACK = 29
+
+
+def clock_ns() -> int:
+    """The station's clock."""
+    return time.monotonic_ns()
+
+
+def realtime_offset_ns() -> int:
+    """What to add to the station's clock to get ns since 1970."""
+    return time.time_ns() - time.monotonic_ns()
+
+
+class StationSocket:
+    """One bound UDP socket with kernel receive stamps.
+
+    Raises OSError if the address cannot be bound.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+            self._socket.bind((host, port))
+        except OSError:
+            self._socket.close()
+            raise
+        self._socket.setblocking(False)
+        self.bound_ns = clock_ns()
+        self.send_errors = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._socket.close()
+
+    @property
+    def address(self) -> Address:
+        host, port = self._socket.getsockname()
+        return host, port
+
+    def wait(self, until_ns: int) -> None:
+        """Return when a datagram is there or the time has come."""
+        left_s = max(0, until_ns - clock_ns()) * 1e-9
+        select.select([self._socket], [], [], left_s)
+
+    def receive(self) -> list[Datagram]:
+        """All datagrams that wait, oldest first, with their arrival on the station's clock."""
+        datagrams: list[Datagram] = []
+        to_monotonic_ns = -realtime_offset_ns()
+        for _ in range(_DATAGRAMS_A_STEP):
+            try:
+                data, ancillary, _, address = self._socket.recvmsg(_LARGEST_DATAGRAM, _ANCILLARY_BYTES)
+            except BlockingIOError:
+                break
+            except ConnectionError:  # an earlier datagram met a closed port: the vehicle will count as silent
+                self.send_errors += 1
+                continue
+            seconds, nanoseconds = _TIMESPEC.unpack(ancillary[0][2])
+            datagrams.append(Datagram(data, address, seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns))
+        return datagrams
+
+    def send(self, outgoing: list[Outgoing]) -> None:
+        for data, address in outgoing:
+            try:
+                self._socket.sendto(data, address)
+            except OSError:  # a full buffer or a closed port is loss, which the link statistics show
+                self.send_errors += 1
+
+
+def prepare_real_time() -> None:
+    """Make this process wake on time: least timer slack, and no garbage collection of what exists by now."""
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    gc.collect()
+    gc.freeze()
+
+
+def drive(station: Station, link: StationSocket, writer: RunWriter, stop_reason: Callable[[], str]) -> None:
+    """Run the station in real time until its flight has ended.
+
+    `stop_reason` is asked at every tick; a text other than "" ends the flight for that reason.
+    """
+    while station.phase is not Phase.ENDED:
+        link.wait(station.next_event_ns)
+        datagrams = link.receive()
+        now_ns = clock_ns()
+        outgoing, rows = station.step(datagrams, now_ns)
+        link.send(outgoing)
+        if rows is None:
+            continue
+        station.complete(rows, clock_ns())
+        writer.tick(rows)
+        _log(station, writer, [data for data, _ in outgoing], now_ns)
+        if reason := stop_reason():
+            station.request_stop(reason)
+
+
+def _log(station: Station, writer: RunWriter, sent: list[bytes], now_ns: int) -> None:
+    """Write the frames of this tick, in the order of their times, and the events."""
+    offset_ns = realtime_offset_ns()
+    frames = [(frame, received_ns + offset_ns) for frame, received_ns in station.frames]
+    writer.frames(frames + [(frame, now_ns + offset_ns) for frame in sent])
+    station.frames.clear()
+    for event in station.events:
+        writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
+    station.events.clear()

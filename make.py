@@ -1,0 +1,79 @@
+"""Set up the project and run its main jobs; needs nothing but Python >= 3.11.
+
+`python3 make.py fly` flies the main scenario, `python3 make.py test` runs the tests.
+Each makes .venv first, from requirements.lock, and does nothing there if it is already up to date.
+"""
+
+import argparse
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent
+VENV = ROOT / ".venv"
+STAMP = VENV / "installed.sha256"
+LOCK = ROOT / "requirements.lock"
+
+# name: (what it is for, the commands; further arguments go to the last one)
+JOBS: dict[str, tuple[str, list[str]]] = {
+    "setup": ("make .venv with everything in requirements.lock", ["python --version"]),
+    "fly": ("fly scenarios/triangle5.toml", ["gcs fly scenarios/triangle5.toml"]),
+    "test": ("run the tests", ["python -m pytest"]),
+    "lint": (
+        "check format, style, types and import contracts",
+        ["ruff format --check .", "ruff check .", "pyright", "lint-imports"],
+    ),
+    "format": ("format the code", ["ruff check --fix-only .", "ruff format ."]),
+    "lock": (
+        "write requirements.lock anew from pyproject.toml",
+        [
+            "uv pip compile --upgrade --universal --generate-hashes --no-header --no-emit-index-url "
+            "--group dev pyproject.toml -o requirements.lock"
+        ],
+    ),
+}
+
+
+def install() -> None:
+    """Bring .venv to the state that requirements.lock and pyproject.toml describe."""
+    wanted = hashlib.sha256(LOCK.read_bytes() + (ROOT / "pyproject.toml").read_bytes()).hexdigest()
+    if STAMP.exists() and STAMP.read_text() == wanted:
+        return
+    python = VENV / "bin" / "python"
+    if not python.exists():
+        print(f"making {VENV}", flush=True)
+        if subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=False).returncode != 0:
+            sys.exit("python could not make a virtual environment; on Debian and Ubuntu: apt install python3-venv")
+    print("installing the locked packages (some minutes the first time)", flush=True)
+    pip = [str(python), "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
+    subprocess.run([*pip, "--require-hashes", "-r", str(LOCK)], check=True)
+    subprocess.run([*pip, "--no-deps", "--no-build-isolation", "--editable", str(ROOT)], check=True)
+    STAMP.write_text(wanted)
+
+
+def main() -> None:
+    if sys.version_info < (3, 11):
+        sys.exit(f"python {sys.version.split()[0]} is too old: wanted 3.11 or newer")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    jobs = parser.add_subparsers(dest="job", required=True, metavar="JOB")
+    for name, (text, _) in JOBS.items():
+        jobs.add_parser(name, help=text)
+    chosen, further = parser.parse_known_args()
+    try:
+        install()
+    except subprocess.CalledProcessError as error:
+        sys.exit(f"installation failed: {' '.join(error.cmd)}")
+    os.chdir(ROOT)
+    *first, last = [[str(VENV / "bin" / line.split()[0]), *line.split()[1:]] for line in JOBS[chosen.job][1]]
+    for command in first:
+        status = subprocess.run(command, check=False).returncode
+        if status != 0:
+            sys.exit(status)
+    # The last command takes this process over, so that Ctrl-C reaches it alone and its exit code is ours.
+    os.execv(last[0], [*last, *further])
+
+
+if __name__ == "__main__":
+    main()

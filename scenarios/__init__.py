@@ -1,0 +1,1 @@
+"""What an experiment is: the schema of a scenario file, and reading and writing one."""
