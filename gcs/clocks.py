@@ -110,8 +110,8 @@ class VehicleClock:
         y = (self._offset_ns[:n] - base).astype(float)
         t_mean, y_mean = weight @ t, weight @ y
         spread = weight @ (t - t_mean) ** 2
-        # A slope from a short stretch would be noise: below 1 s (rms) of history the clock is taken as drift-free.
-        skew = float(weight @ ((t - t_mean) * (y - y_mean)) / spread) if spread > 1e18 else 0.0
+        # A slope from a short stretch would be noise: below 0.3 s (rms) of history the clock is taken as drift-free.
+        skew = float(weight @ ((t - t_mean) * (y - y_mean)) / spread) if spread > 0.09e18 else 0.0
         offset = base + round(y_mean - skew * t_mean)
         return ClockEstimate(
             samples=n, offset_ns=offset, skew=skew, bound_ns=least // 2 + 1, reference_ns=now_ns

@@ -4,6 +4,7 @@ Deterministic: the same plan gives the same ticks to the last bit. Nothing waits
 """
 
 from collections.abc import Iterator
+from typing import Protocol
 
 from gcs.modes import Phase
 from gcs.record import TickArray
@@ -11,28 +12,42 @@ from gcs.station import Datagram, FlightPlan, Station
 from sim_vehicles.fleet import Fleet
 
 START_NS = 1_000_000_000
-"""Virtual time of the first tick; not zero, so that a forgotten time shows."""
+"""Virtual time at which vehicles and station start; not zero, so that a forgotten time shows."""
 _HOST = "virtual"
 
+Sent = list[tuple[int, bytes, int]]
+"""Datagrams as (system id, bytes, time in ns)."""
 
-def fly_lockstep(plan: FlightPlan, station: Station | None = None) -> Iterator[TickArray]:
+
+class Vehicles(Protocol):
+    """The vehicles behind their links: takes the station's datagrams, gives those that arrive at the station."""
+
+    @property
+    def next_event_ns(self) -> int: ...
+
+    def step(self, received: Sent, now_ns: int) -> Sent: ...
+
+
+def fly_lockstep(
+    plan: FlightPlan, *, station: Station | None = None, vehicles: Vehicles | None = None
+) -> Iterator[TickArray]:
     """Fly a plan in virtual time, giving each control tick's rows (a fresh copy) as it is done.
 
-    The address of a vehicle is (`_HOST`, its system id). A station may be passed in so that its events and end reason
-    can be read afterwards; it must start at START_NS.
+    A station may be passed in, so that its events and end reason can be read afterwards, and vehicles that have
+    already flown. The address of a vehicle is (a fixed name, its system id).
     """
     station = station or Station(plan, start_ns=START_NS)
-    fleet = Fleet(plan.scenario, START_NS)
-    to_vehicles: list[tuple[int, bytes, int]] = []
-    now_ns = START_NS
+    vehicles = vehicles or Fleet(plan.scenario, START_NS)
+    to_vehicles: Sent = []
+    now_ns = station.next_event_ns
     while station.phase is not Phase.ENDED:
-        arrived = fleet.step(to_vehicles, now_ns)
+        arrived = vehicles.step(to_vehicles, now_ns)
         datagrams = [Datagram(data, (_HOST, system_id), time_ns) for system_id, data, time_ns in arrived]
         outgoing, rows = station.step(datagrams, now_ns)
-        to_vehicles = [(port, data, now_ns) for data, (_, port) in outgoing]
+        to_vehicles = [(system_id, data, now_ns) for data, (_, system_id) in outgoing]
         if rows is not None:
             station.complete(rows, now_ns)
             yield rows.copy()
             station.frames.clear()
         if not to_vehicles:
-            now_ns = max(now_ns, min(fleet.next_event_ns, station.next_event_ns))
+            now_ns = max(now_ns, min(vehicles.next_event_ns, station.next_event_ns))

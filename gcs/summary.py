@@ -25,7 +25,6 @@ from scenarios import files as scenario_files
 from scenarios.schema import Scenario
 
 SILENT_END = "interrupted: the station ended without a word"
-_DECAY = 0.8
 
 
 class RunError(Exception):
@@ -103,7 +102,7 @@ def summarise(
     headroom = flown["headroom"][flown["commanded"]]
     return {
         "scenario": scenario.name,
-        "verdict": verdict(reason, errors, settled),
+        "verdict": verdict(reason, settled),
         "reason": reason,
         "loop": scenario.control.loop,
         "delay_margin_s": _number(design["delay_margin_s"]),
@@ -123,26 +122,18 @@ Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Times (s) and the norm of the spacing error (m) of one follower."""
 
 
-def verdict(reason: str, errors: dict[int, Errors], settling_time_s: float | None) -> str:
+def verdict(reason: str, settling_time_s: float | None) -> str:
     """ "stable", "unstable" or "aborted".
 
-    A flight that broke a limit is unstable; one that ended early for any other reason is aborted. One that lasted is
-    stable if all spacing errors have settled, or are still shrinking: the largest of the last fifth of the flight is
-    below 0.8 of the largest of the fifth before.
+    Stable: flown to the end of its duration, and every spacing error had settled by then. Unstable: a limit was broken,
+    or a spacing error had not settled, be it that it grows, circles in a limit cycle or shrinks too slowly for the
+    scenario's duration. Aborted: ended early for any other reason.
     """
     if reason.startswith("broken"):
         return "unstable"
     if not reason.startswith("completed"):
         return "aborted"
-    if settling_time_s is not None:
-        return "stable"
-    for time_s, error_m in errors.values():
-        end = time_s[-1]
-        last = error_m[time_s > 0.8 * end].max()
-        before = error_m[(time_s > 0.6 * end) & (time_s <= 0.8 * end)].max()
-        if not last < _DECAY * before:
-            return "unstable"
-    return "stable"
+    return "unstable" if settling_time_s is None else "stable"
 
 
 def _error(flown: TickArray, system_id: int) -> Errors:
