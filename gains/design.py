@@ -1,0 +1,339 @@
+"""Overlapping gains for a formation, with the delay they take and the disturbance they withstand.
+
+`design` finds gains of largest robustness α with a wanted delay margin, or of largest delay margin with a wanted α;
+`evaluate_gains` says the same of gains that are given. Both check their result with the functions of `gains.delay`,
+`gains.sampled`, `gains.robust` and `gains.inclusion` on the whole formation.
+
+The margin that is asked for is that of the loop really flown: `sampled`, with period and zero-order hold, and `ground`,
+with all feedback late. It is about half a period less than the continuous one. Both are reported.
+
+Source: Sahoo 2012 (see `gains.formation`), sections 3 and 5.
+"""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gains.behaviour import Behaviour, BlockMargin, Gains, behaviour, block_margin, follower_block, leader_block
+from gains.delay import delay_margin
+from gains.errors import BadModelError, DisagreementError, InfeasibleError
+from gains.formation import FormationModel, checked_gain
+from gains.robust import Certificate, SolverFacts, certify, robustness
+from gains.sampled import sampled_delay_margin
+from gains.search import ScalarGains, largest_alpha, largest_margin
+
+FloatArray = NDArray[np.float64]
+
+PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
+DEFAULT_DELAY_MARGIN_S = 0.3
+# The certificate proves this share of α: at α itself the proof is on the edge of existence.
+_CERTIFIED_SHARE = 1 - 1e-4
+# Below this α, which belongs to margins beyond 30 s, the numbers in a proof spread too far for the solver.
+_ALPHA_MIN, _DELAY_MARGIN_MAX_S = 5e-4, 30.0
+# The search aims this much above a margin asked for, so that rounding cannot leave it below.
+_MARGIN_AIM_S = 2e-10
+_TRADE_OFF_MARGINS_S = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """What the design must reach.
+
+    With `delay_margin_s` given, α is made as large as possible; with `alpha` alone, the delay margin; with both, α is
+    made as large as possible and must reach `alpha`. With neither, a margin of 0.3 s is wanted.
+
+    Attributes
+    ----------
+    delay_margin_s
+        Least sampled delay margin, up to 30 s.
+    alpha
+        Least sector bound, from 5e-4.
+    string_peak_max
+        Limit, at least 1, on the growth of spacing errors from vehicle to vehicle, without delay and at half the
+        margin. 1 lets no error grow down the chain and costs little α. Not limited if None.
+    """
+
+    delay_margin_s: float | None = None
+    alpha: float | None = None
+    string_peak_max: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("delay_margin_s", "alpha"):
+            wanted = getattr(self, name)
+            if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
+                raise BadModelError(f"{name} = {wanted}; wanted a positive number")
+        if self.delay_margin_s is not None and self.delay_margin_s > _DELAY_MARGIN_MAX_S:
+            raise BadModelError(f"delay_margin_s = {self.delay_margin_s}; wanted at most {_DELAY_MARGIN_MAX_S} s")
+        if self.alpha is not None and self.alpha < _ALPHA_MIN:
+            raise BadModelError(f"alpha = {self.alpha}; wanted at least {_ALPHA_MIN}")
+        if self.string_peak_max is not None and not 1 <= self.string_peak_max < np.inf:
+            raise BadModelError(f"string_peak_max = {self.string_peak_max}; wanted a number of at least 1")
+        if self.delay_margin_s is None and self.alpha is None:
+            object.__setattr__(self, "delay_margin_s", DEFAULT_DELAY_MARGIN_S)
+
+
+@dataclass(frozen=True)
+class TradeOffPoint:
+    """Largest α (exact, W = I) at a sampled delay margin."""
+
+    delay_margin_s: float
+    alpha: float
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Gains, what they are good for, and how that is known.
+
+    Attributes
+    ----------
+    K1, K2, K3
+        Gains on the own velocity error (1/s), that of the vehicle in front (1/s) and the spacing error (1/s²), each of
+        shape (axes, axes).
+    alpha
+        Exact sector bound for W = I, `gains.robust.robustness`; 0 if the loop is unstable.
+    certificate
+        Lyapunov proof of 0.9999 α; None if the loop is unstable or its α is below 5e-4.
+    delay_margin_s, delay_margin_continuous_s
+        Margin of the sampled loop and of the continuous one, all feedback late.
+    leader, follower
+        The continuous margin block by block.
+    trade_off
+        Points of the curve of best designs with this period and limit on spacing errors.
+    """
+
+    K1: FloatArray
+    K2: FloatArray
+    K3: FloatArray
+    alpha: float
+    delay_margin_s: float
+    delay_margin_continuous_s: float
+    period_s: float
+    vehicles: int
+    leader: BlockMargin
+    follower: BlockMargin
+    behaviour: Behaviour
+    certificate: Certificate | None
+    requirement: Requirement | None = None
+    trade_off: tuple[TradeOffPoint, ...] = field(default=())
+    method: Literal["inclusion", "given"] = "inclusion"
+    loop: Literal["ground"] = "ground"
+    pattern: str = PATTERN
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists, numbers and strings, for JSON; a number that is not finite becomes None."""
+        plain = asdict(self)
+        renamed = {"K1": "K1_1_s", "K2": "K2_1_s", "K3": "K3_1_s2"}
+        return {renamed.get(name, name): _plain(value) for name, value in plain.items()}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Return the design that `to_dict` was called on.
+
+        Raises
+        ------
+        BadModelError
+            If a field is missing or is not of the kind wanted.
+        """
+        try:
+            certificate, requirement = data["certificate"], data["requirement"]
+            return cls(
+                K1=np.array(data["K1_1_s"], dtype=float),
+                K2=np.array(data["K2_1_s"], dtype=float),
+                K3=np.array(data["K3_1_s2"], dtype=float),
+                alpha=_number(data["alpha"]),
+                delay_margin_s=_number(data["delay_margin_s"]),
+                delay_margin_continuous_s=_number(data["delay_margin_continuous_s"]),
+                period_s=_number(data["period_s"]),
+                vehicles=int(data["vehicles"]),
+                leader=BlockMargin(**_numbers(data["leader"])),
+                follower=BlockMargin(**_numbers(data["follower"])),
+                behaviour=Behaviour(**_numbers(data["behaviour"])),
+                certificate=None if certificate is None else _certificate_from(certificate),
+                requirement=None if requirement is None else Requirement(**requirement),
+                trade_off=tuple(TradeOffPoint(**_numbers(point)) for point in data["trade_off"]),
+                method=data["method"],
+                loop=data["loop"],
+                pattern=data["pattern"],
+            )
+        except KeyError as error:
+            raise BadModelError(f"the design has no field {error}; wanted all fields that to_dict writes") from error
+        except (TypeError, AttributeError) as error:
+            raise BadModelError(f"the design is not as to_dict writes it: {error}") from error
+
+
+def design(formation: FormationModel, requirement: Requirement | None = None, *, period_s: float) -> Design:
+    """Return the gains that meet the requirement and are the best in what it leaves open.
+
+    Parameters
+    ----------
+    formation
+        At least a leader and one follower.
+    requirement
+        A sampled delay margin of 0.3 s if not given.
+    period_s
+        Period of the control loop: sample, hold.
+
+    Raises
+    ------
+    InfeasibleError
+        If no gains meet the requirement; the message says what can be reached.
+    """
+    wanted = Requirement() if requirement is None else requirement
+    _check_period(period_s)
+    gains = _best_gains(wanted, period_s)
+    identity = np.eye(formation.axes)
+    result = _assess(
+        formation,
+        (0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity),
+        period_s=period_s,
+        requirement=wanted,
+        method="inclusion",
+    )
+    short_of_margin = wanted.delay_margin_s is not None and result.delay_margin_s < wanted.delay_margin_s
+    if short_of_margin or (wanted.alpha is not None and result.alpha < wanted.alpha):
+        raise DisagreementError(
+            f"the search found gains for {wanted}, but the exact analysis gives them delay_margin_s = "
+            f"{result.delay_margin_s!r} and alpha = {result.alpha!r}"
+        )
+    return result
+
+
+def evaluate_gains(
+    formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, *, period_s: float
+) -> Design:
+    """Return margins, α and behaviour of given gains, each of shape (axes, axes).
+
+    Gains of an unstable loop are reported too: α and the continuous margin are 0 and there is no certificate.
+    """
+    _check_period(period_s)
+    own, front, spacing = (
+        checked_gain(name, gain, formation.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
+    )
+    return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None, method="given")
+
+
+def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains:
+    """Gains that meet the requirement, or InfeasibleError with what can be reached."""
+    limit = wanted.string_peak_max
+    if wanted.delay_margin_s is None:
+        assert wanted.alpha is not None
+        found = largest_margin(wanted.alpha, period_s, limit)
+        if found is None:
+            raise InfeasibleError(f"alpha = {wanted.alpha} cannot be reached: {_alpha_limit(period_s, limit)}")
+        return found[1]
+    gains = largest_alpha(wanted.delay_margin_s + _MARGIN_AIM_S, period_s, limit)
+    if gains is None:
+        raise InfeasibleError(
+            f"no gains have a sampled delay margin of {wanted.delay_margin_s} s with period_s = {period_s} "
+            f"and string_peak_max = {limit}; raise string_peak_max or lower period_s"
+        )
+    if wanted.alpha is not None and gains.alpha < wanted.alpha:
+        found = largest_margin(wanted.alpha, period_s, limit)
+        at_alpha = (
+            f"the largest margin at alpha = {wanted.alpha} is {found[0]:.4f} s"
+            if found
+            else f"alpha = {wanted.alpha} cannot be reached at any margin: {_alpha_limit(period_s, limit)}"
+        )
+        raise InfeasibleError(
+            f"delay_margin_s = {wanted.delay_margin_s} and alpha = {wanted.alpha} exclude each other: the largest "
+            f"alpha at that margin is {gains.alpha:.4f}, and {at_alpha}"
+        )
+    return gains
+
+
+def _alpha_limit(period_s: float, string_peak_max: float | None) -> str:
+    gains = largest_alpha(0.0, period_s, string_peak_max)
+    return (
+        f"with period_s = {period_s} alpha is below {gains.alpha if gains else 0.0:.4f} even with no delay margin left"
+    )
+
+
+def _assess(
+    formation: FormationModel,
+    gains: Gains,
+    *,
+    period_s: float,
+    requirement: Requirement | None,
+    method: Literal["inclusion", "given"],
+) -> Design:
+    """Everything that is reported of the gains, by the exact methods and on the whole formation."""
+    # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
+    from gains.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
+
+    if formation.vehicles < 2:
+        raise BadModelError("the formation has no follower; wanted a leader and at least one follower")
+    A, B, K = formation.A, formation.B, formation.overlapping_gain(*gains)
+    expansion, K_expanded = expand(formation), modified_gain(formation, expanded_gain(formation, *gains))
+    verify_inclusion(expansion, A, B, K=K, K_expanded=K_expanded)
+
+    alpha = robustness(*gains)
+    margin_s = float(sampled_delay_margin(A, B, K, period_s=period_s))
+    continuous_s = delay_margin(A, B @ K)
+    leader, follower = block_margin(*leader_block(gains)), block_margin(*follower_block(gains))
+    if not np.isclose(continuous_s, min(leader.delay_margin_s, follower.delay_margin_s), rtol=1e-9, atol=0):
+        raise DisagreementError(
+            f"the formation's delay margin is {continuous_s!r}, its leader's and follower's are "
+            f"{leader.delay_margin_s!r} and {follower.delay_margin_s!r}; wanted the less of the two"
+        )
+    return Design(
+        K1=gains[0],
+        K2=gains[1],
+        K3=gains[2],
+        alpha=alpha,
+        delay_margin_s=margin_s,
+        delay_margin_continuous_s=continuous_s,
+        period_s=period_s,
+        vehicles=formation.vehicles,
+        leader=leader,
+        follower=follower,
+        behaviour=behaviour(gains, (margin_s + period_s) / 2),
+        certificate=certify(*gains, _CERTIFIED_SHARE * alpha) if alpha >= _ALPHA_MIN else None,
+        requirement=requirement,
+        trade_off=trade_off(period_s=period_s, string_peak_max=requirement.string_peak_max if requirement else None),
+        method=method,
+    )
+
+
+def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple[TradeOffPoint, ...]:
+    """Return the largest α at sampled delay margins from 0.05 to 1 s; margins no gains have are left out."""
+    points = ((margin_s, largest_alpha(margin_s, period_s, string_peak_max)) for margin_s in _TRADE_OFF_MARGINS_S)
+    return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)
+
+
+def _check_period(period_s: float) -> None:
+    if not (np.isfinite(period_s) and period_s > 0):
+        raise BadModelError(f"period_s = {period_s}; wanted a positive number of seconds")
+
+
+def _plain(value: Any) -> Any:
+    """Lists, numbers, strings and None in place of arrays, tuples, numpy numbers and numbers that are not finite."""
+    if isinstance(value, dict):
+        return {str(name): _plain(entry) for name, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+def _number(value: float | None) -> float:
+    """Inverse of `_plain` for a number; which kind of not finite it was is not kept, except that no margin ends: ∞."""
+    return float("inf") if value is None else float(value)
+
+
+def _numbers(data: dict[str, Any]) -> dict[str, float]:
+    return {name: _number(value) for name, value in data.items()}
+
+
+def _certificate_from(data: dict[str, Any]) -> Certificate:
+    return Certificate(
+        P=np.array(data["P"], dtype=float),
+        alpha=float(data["alpha"]),
+        P_eigenvalue_min=float(data["P_eigenvalue_min"]),
+        s_procedure_eigenvalue_max=float(data["s_procedure_eigenvalue_max"]),
+        solver=SolverFacts(**data["solver"]),
+    )

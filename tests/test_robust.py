@@ -1,0 +1,161 @@
+"""Robustness: the LMI against its closed-form supremum, exact bounds against each other and against known systems."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gains.errors import BadModelError, InfeasibleError, SolverError
+from gains.robust import certify, disturbance_bound, robust_lmi, robustness, subsystem_loop
+
+EYE = np.eye(2)
+
+
+@pytest.mark.parametrize(("shear", "supremum"), [(-1.0, 0.7071), (-2.0, 0.8944), (-3.0, 0.9487), (-2.53, 0.9300)])
+def test_lmi_reaches_its_supremum_as_the_bounds_get_loose(shear: float, supremum: float) -> None:
+    """α(c) = |c| / √(1 + c²) for W = I; the source's published 0.93 is c = −2.53."""
+    alphas = [robust_lmi(shear=shear, gain_bound=k, lyapunov_bound=k).alpha for k in (10.0, 30.0, 100.0)]
+    assert alphas == sorted(alphas)
+    assert alphas[-1] < abs(shear) / np.hypot(1, shear)
+    # Figures are printed to four digits; with bounds of 100 the optimum is within 2e-6 of the supremum.
+    assert alphas[-1] == pytest.approx(supremum, abs=6e-5)
+    assert alphas[-1] == pytest.approx(abs(shear) / np.hypot(1, shear), abs=5e-6)
+
+
+def test_lmi_gains_have_the_same_k1_and_block_size_changes_nothing() -> None:
+    """Two axes at once: no coupling of the axes can do better, and the gains are the scalar ones times I."""
+    scalar = robust_lmi(shear=-1.7, gain_bound=10.0, lyapunov_bound=10.0)
+    double = robust_lmi(shear=-1.7, gain_bound=10.0, lyapunov_bound=10.0, axes=2)
+    # Both optima are reached to the solver's 1e-7 in γ; gains near the optimum are flatter, hence the wider band.
+    assert double.alpha == pytest.approx(scalar.alpha, abs=1e-6)
+    np.testing.assert_allclose(double.K1, scalar.K1 * EYE, atol=1e-2 * abs(scalar.K1[0, 0]))
+    np.testing.assert_allclose(double.K3, scalar.K3 * EYE, atol=1e-2 * abs(scalar.K3[0, 0]))
+
+
+def test_lmi_certificate_holds_in_the_original_coordinates() -> None:
+    """Recomputed here from the gains and P alone: V' < 0 for every w with w'w ≤ α² E'E, tried on its worst w."""
+    gains = robust_lmi(shear=-2.0, gain_bound=10.0, lyapunov_bound=10.0)
+    A, P = subsystem_loop(gains.K1, gains.K2, gains.K3), gains.certificate.P
+    assert np.linalg.eigvalsh(P).min() > 0
+    rng = np.random.default_rng(1)
+    for E in rng.normal(size=(200, 3)):
+        gradient = 2 * P @ E
+        worst = gains.alpha * np.linalg.norm(E) * gradient / np.linalg.norm(gradient)
+        assert gradient @ (A @ E + worst) < 0
+
+
+def test_lmi_alpha_is_a_lower_bound_of_the_exact_one() -> None:
+    """The full Lyapunov matrix of `robustness` can prove at least what a block-diagonal one in some coordinates can."""
+    for shear in (-0.3, -1.0, -2.0):
+        gains = robust_lmi(shear=shear, gain_bound=10.0, lyapunov_bound=10.0)
+        assert robustness(gains.K1, gains.K2, gains.K3) > gains.alpha
+
+
+def test_lmi_weight_scales_alpha_inversely() -> None:
+    """w'w ≤ α² E'W'W E with W = 2 I is the problem of W = I with 2 α in place of α."""
+    plain = robust_lmi(shear=-1.0, gain_bound=10.0, lyapunov_bound=10.0)
+    weighted = robust_lmi(shear=-1.0, gain_bound=10.0, lyapunov_bound=10.0, W=2 * np.eye(3))
+    # γ is four times larger, and so is the solver's error.
+    assert weighted.alpha == pytest.approx(plain.alpha / 2, rel=1e-5)
+
+
+def test_bounds_too_tight_end_in_a_solver_error_that_names_them() -> None:
+    with pytest.raises(SolverError, match=r"'infeasible'.*gain_bound = 2.*lyapunov_bound = 2"):
+        robust_lmi(shear=-5.0, gain_bound=2.0, lyapunov_bound=2.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("shear", {"shear": 1.0, "gain_bound": 10.0, "lyapunov_bound": 10.0}),
+        ("gain_bound", {"shear": -1.0, "gain_bound": -1.0, "lyapunov_bound": 10.0}),
+        ("lyapunov_bound", {"shear": -1.0, "gain_bound": 10.0, "lyapunov_bound": np.nan}),
+    ],
+)
+def test_arguments_out_of_range_are_refused_by_name(name: str, arguments: dict[str, float]) -> None:
+    with pytest.raises(BadModelError, match=name):
+        robust_lmi(
+            shear=arguments["shear"],
+            gain_bound=arguments["gain_bound"],
+            lyapunov_bound=arguments["lyapunov_bound"],
+        )
+
+
+def test_bound_of_a_normal_matrix_is_the_distance_of_its_spectrum_from_the_axis() -> None:
+    """For a normal A, σ_min(jωI − A) is the least |jω − λ|, so α is the least |Re λ|: here 0.25 (exact)."""
+    A = np.array([[-0.25, 7.0, 0.0], [-7.0, -0.25, 0.0], [0.0, 0.0, -3.0]])
+    # The level-set search stops at 1e-10 of the bound, on the safe side.
+    assert disturbance_bound(A, np.eye(3)) == pytest.approx(0.25, rel=3e-10)
+    assert disturbance_bound(A, np.eye(3)) <= 0.25
+
+
+def test_bound_of_an_oscillator_is_its_resonance_peak() -> None:
+    """x'' + 2 ζ x' + x = w seen through position: peak gain 1 / (2 ζ √(1 − ζ²)), to which the other entries add.
+
+    With W = [1 0] and A = [[0, 1], [−1, −2ζ]] the response is [s + 2ζ, 1] / (s² + 2ζs + 1); its largest norm is found
+    here on a dense grid of its closed form.
+    """
+    zeta = 0.01
+    x = np.linspace(0.99, 1.01, 2_000_001) ** 2
+    squared = (x + 4 * zeta**2 + 1) / ((1 - x) ** 2 + 4 * zeta**2 * x)
+    A = np.array([[0.0, 1.0], [-1.0, -2 * zeta]])
+    # Spacing of the grid 1e-8 against a peak 0.02 wide: error of the grid about 1e-13.
+    assert disturbance_bound(A, np.array([[1.0, 0.0]])) == pytest.approx(squared.max() ** -0.5, rel=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.2, 30), st.floats(-30, 30), st.floats(0.05, 200))
+def test_exact_bound_is_the_least_singular_value_over_all_frequencies(k1: float, k2: float, k3: float) -> None:
+    """For W = I, α is the complex stability radius: no frequency of a dense grid may lie below, some must come near."""
+    alpha = robustness(-k1, k2, k3)
+    A = subsystem_loop(-k1, k2, k3)
+    omega = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 3000)])
+    sigma = np.linalg.svd(1j * omega[:, None, None] * np.eye(3) - A, compute_uv=False)[:, -1]
+    assert alpha <= sigma.min() * (1 + 1e-9)
+    # Steps of the grid are 0.46 %; σ_min(ω) changes by at most |Δω| because jωI has norm ω.
+    at = omega[np.argmin(sigma)]
+    assert alpha >= sigma.min() - 0.0024 * at - 1e-3
+
+
+@pytest.mark.parametrize("gains", [(-3.5, 3.5, 6.0), (-1.0, 1.0, 1.0), (-20.0, 22.0, 216.0), (-0.7, 0.7, 0.24)])
+def test_lmi_and_frequency_response_agree_on_the_bound(gains: tuple[float, float, float]) -> None:
+    """Two independent ways: just below the exact bound a certificate exists, just above there is none."""
+    alpha = robustness(*gains)
+    certificate = certify(*gains, alpha * (1 - 1e-4))
+    assert certificate.P_eigenvalue_min > 0 > certificate.s_procedure_eigenvalue_max
+    assert certificate.solver.status == "optimal"
+    with pytest.raises(InfeasibleError, match="lower alpha"):
+        certify(*gains, alpha * (1 + 1e-4))
+
+
+def test_agreement_holds_for_coupled_axes_and_a_weight() -> None:
+    K1, K2, K3 = (
+        np.array([[-3.0, 0.5], [-0.4, -2.0]]),
+        np.array([[1.0, 0.2], [0.0, 1.5]]),
+        np.array([[4.0, 1], [0, 3.0]]),
+    )
+    W = np.array([[1.0, 0, 0, 0.5, 0, 0], [0, 2.0, 0, 0, 0, 0.3]])
+    alpha = robustness(K1, K2, K3, W)
+    assert certify(K1, K2, K3, alpha * (1 - 1e-4), W).alpha == alpha * (1 - 1e-4)
+    with pytest.raises(InfeasibleError):
+        certify(K1, K2, K3, alpha * (1 + 1e-4), W)
+
+
+def test_certificate_of_equal_axes_proves_the_scalar_bound() -> None:
+    assert robustness(-3 * EYE, 2 * EYE, 4 * EYE) == pytest.approx(robustness(-3, 2, 4), rel=3e-10)
+
+
+def test_an_unstable_loop_withstands_nothing() -> None:
+    assert robustness(1.0, 0.0, 1.0) == 0
+    assert robustness(-1.0, 0.0, -1.0) == 0
+    with pytest.raises(InfeasibleError):
+        certify(1.0, 0.0, 1.0, 0.1)
+
+
+def test_arguments_of_another_shape_are_refused_by_name() -> None:
+    with pytest.raises(BadModelError, match=r"K2 has shape \(1, 1\)"):
+        robustness(-EYE, 1.0, EYE)
+    with pytest.raises(BadModelError, match=r"W has shape \(2, 2\); wanted \(any, 3\)"):
+        robustness(-1.0, 1.0, 1.0, EYE)
+    with pytest.raises(BadModelError, match="alpha = -1"):
+        certify(-1.0, 1.0, 1.0, -1.0)
