@@ -1,9 +1,11 @@
-"""The decentralised overlapping control law, for the whole formation at once.
+"""The control law u = K e of the whole formation, computed from states reported at different instants.
 
-u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, and u_1 = K1 e_1^v for the leader (thesis eqs. 2.10 and 3.25).
+For the leader-follower pattern u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, and u_1 = K1 e_1^v for the leader (thesis eqs.
+2.10 and 3.25); any other gain matrix K is flown by the same code.
 
-Each e_i is formed at one instant: that of vehicle i's newest state. The state of the vehicle in front is brought to it.
-So the loop around vehicle i is late by vehicle i's own link only, and a slow link ahead of it cannot take its margin.
+All errors that enter u_i are formed at one instant: that of vehicle i's newest state, to which the states of the others
+are brought. So the loop around vehicle i is late by vehicle i's own link only, and a slow link ahead of it cannot take
+its margin.
 """
 
 from dataclasses import dataclass
@@ -11,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.formation import FormationModel
 from gcs.telemetry import FloatArray, IntArray, StateHistory
 
 LARGEST_COMMAND_M_S2 = 1e4
@@ -18,30 +21,107 @@ LARGEST_COMMAND_M_S2 = 1e4
 
 
 @dataclass(frozen=True)
-class Gains:
-    """K1 (own velocity error), K2 (velocity error of the vehicle in front), K3 (spacing error), each (2, 2)."""
-
-    K1: FloatArray
-    K2: FloatArray
-    K3: FloatArray
-
-
-@dataclass(frozen=True)
 class Formation:
     """Who follows whom, in an order in which every vehicle comes after the one it follows.
 
-    `predecessor` (n,) holds rows, -1 for one that follows nobody; `offset_ne_m` (n, 2) is the wanted position relative
-    to the predecessor, zero where there is none.
+    `predecessor` (n,) holds rows, -1 for the leader; `offset_ne_m` (n, 2) is the wanted position relative to the
+    predecessor, zero for the leader.
     """
 
     system_ids: tuple[int, ...]
     predecessor: IntArray
     offset_ne_m: FloatArray
 
+    def place_ne_m(self) -> FloatArray:
+        """Wanted positions relative to the leader, (n, 2)."""
+        place = self.offset_ne_m.copy()
+        for row, ahead in enumerate(self.predecessor.tolist()):
+            if ahead >= 0:
+                place[row] += place[ahead]
+        return place
+
+
+@dataclass(frozen=True)
+class FeedbackLaw:
+    """u = K e as a sum over pairs of vehicles: u_i = sum over k of G_ik (x_k - x*_k).
+
+    x_k = (position, velocity) of vehicle k and x*_k = (place in the formation, v_d). Pairs are sorted by i, and every
+    vehicle that flies has the pair (i, i) and, if somebody is ahead of it, the pair (i, one ahead).
+    """
+
+    to: IntArray
+    """(pairs,) the commanded vehicle i."""
+    source: IntArray
+    """(pairs,) the vehicle k whose state is used."""
+    gain: FloatArray
+    """(pairs, 2, 4) the blocks G_ik."""
+    first: IntArray
+    """(flying,) index of the first pair of each vehicle that flies."""
+    follower: IntArray
+    """(followers,) vehicles with one ahead."""
+    own_pair: IntArray
+    """(followers,) index of their pair (i, i)."""
+    ahead_pair: IntArray
+    """(followers,) index of their pair (i, one ahead)."""
+    place_ne_m: FloatArray
+    """(n, 2) wanted positions relative to the leader."""
+
+
+def feedback_law(formation: Formation, K: FloatArray, lost: NDArray[np.bool_]) -> FeedbackLaw:
+    """The law of a gain matrix K (inputs, states; in `gains.formation.FormationModel`'s order), around lost vehicles.
+
+    The nearest vehicle ahead that is left stands in for a lost one: spacing is kept to it, two spacings away, and its
+    velocity error is used. What nobody ahead can stand in for, and the spacing error of a lost vehicle itself, drops
+    out. A vehicle with nobody left ahead keeps the nominal velocity, as the leader does.
+    """
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    stand_in: list[int] = []
+    for row, ahead in enumerate(formation.predecessor.tolist()):
+        stand_in.append(row if not lost[row] else stand_in[ahead] if ahead >= 0 else -1)
+    in_front = [stand_in[ahead] if ahead >= 0 else -1 for ahead in formation.predecessor.tolist()]
+    blocks: dict[tuple[int, int], FloatArray] = {}
+
+    def block(i: int, k: int) -> FloatArray:
+        return blocks.setdefault((i, k), np.zeros((2, 4)))
+
+    for i in np.flatnonzero(~lost).tolist():
+        block(i, i)
+        if in_front[i] >= 0:
+            block(i, in_front[i])
+        rows = K[model.input_slice(i)]
+        used = {(column + 2) // 4 for column in np.flatnonzero(rows.any(axis=0)).tolist()}
+        for j in sorted(used):
+            on_velocity = rows[:, model.velocity_slice(j)]
+            if on_velocity.any() and stand_in[j] >= 0:
+                block(i, stand_in[j])[:, 2:] += on_velocity
+            on_spacing = rows[:, model.spacing_slice(j)] if j > 0 else on_velocity[:, :0]
+            if on_spacing.any() and not lost[j] and in_front[j] >= 0:
+                # e_j^p = Z_ahead - Z_j - d
+                block(i, in_front[j])[:, :2] += on_spacing
+                block(i, j)[:, :2] -= on_spacing
+    return _law(blocks, [k if not gone else -1 for k, gone in zip(in_front, lost, strict=True)], formation.place_ne_m())
+
+
+def _law(blocks: dict[tuple[int, int], FloatArray], in_front: list[int], place_ne_m: FloatArray) -> FeedbackLaw:
+    pairs = sorted(blocks)
+    index = {pair: k for k, pair in enumerate(pairs)}
+    to = np.array([i for i, _ in pairs], dtype=np.int64)
+    followers = [i for i, ahead in enumerate(in_front) if ahead >= 0]
+    return FeedbackLaw(
+        to=to,
+        source=np.array([k for _, k in pairs], dtype=np.int64),
+        gain=np.array([blocks[pair] for pair in pairs]).reshape(-1, 2, 4),
+        first=np.flatnonzero(np.diff(to, prepend=-1)),
+        follower=np.array(followers, dtype=np.int64),
+        own_pair=np.array([index[i, i] for i in followers], dtype=np.int64),
+        ahead_pair=np.array([index[i, in_front[i]] for i in followers], dtype=np.int64),
+        place_ne_m=place_ne_m,
+    )
+
 
 @dataclass(frozen=True)
 class FormationControl:
-    """What the control law saw and wants: rows of vehicles, columns north and east."""
+    """What the law saw and wants: rows of vehicles, columns north and east; NaN where unknown or lost."""
 
     sample_ns: IntArray
     position_m: FloatArray
@@ -51,47 +131,26 @@ class FormationControl:
     command_m_s2: FloatArray
 
 
-def without(formation: Formation, lost: NDArray[np.bool_]) -> Formation:
-    """The formation flown around lost vehicles: followers take the nearest vehicle ahead that is left.
-
-    Offsets add up, so everybody keeps its place. A follower with nobody left ahead keeps the nominal velocity, as a
-    leader does.
-    """
-    predecessor, offset = formation.predecessor.copy(), formation.offset_ne_m.copy()
-    for row in range(len(predecessor)):  # predecessors first, so theirs are already flown around
-        ahead = predecessor[row]
-        if ahead >= 0 and lost[ahead]:
-            offset[row] += offset[ahead]
-            predecessor[row] = predecessor[ahead]
-            if predecessor[row] < 0:
-                offset[row] = 0.0
-    return Formation(formation.system_ids, predecessor, offset)
-
-
-def overlapping_control(
-    history: StateHistory,
-    formation: Formation,
-    gains: Gains,
-    *,
-    nominal_velocity_m_s: tuple[float, float],
-    limit_m_s2: float,
+def formation_control(
+    history: StateHistory, law: FeedbackLaw, *, nominal_velocity_m_s: tuple[float, float], limit_m_s2: float
 ) -> FormationControl:
     """Errors and commands of every vehicle from the newest reported states.
 
-    A row whose own or predecessor's state is unknown has NaN errors and a NaN command; nothing is to be sent for it.
-    A command longer than `limit_m_s2` is shortened to it.
+    A vehicle whose law uses an unknown state has a NaN command; nothing is to be sent for it. A command longer than
+    `limit_m_s2` is shortened to it.
     """
     sample_ns, position, velocity = history.newest()
-    velocity_error = velocity - nominal_velocity_m_s
-    follower = np.flatnonzero(formation.predecessor >= 0)
-    ahead = formation.predecessor[follower]
-    ahead_position, ahead_velocity = history.at(ahead, sample_ns[follower])
+    # (pairs, 4): what each vehicle sees of the others at its own instant, against where they should be
+    seen = history.at(law.source, sample_ns[law.to])
+    seen[:, :2] -= law.place_ne_m[law.source]
+    seen[:, 2:] -= nominal_velocity_m_s
     spacing_error = np.full_like(position, np.nan)
-    # e^p = Z_(i-1) - Z_i - d with d = -offset
-    spacing_error[follower] = ahead_position - position[follower] + formation.offset_ne_m[follower]
-    command = velocity_error @ gains.K1.T
-    command[follower] += (ahead_velocity - nominal_velocity_m_s) @ gains.K2.T
-    command[follower] += spacing_error[follower] @ gains.K3.T
+    spacing_error[law.follower] = seen[law.ahead_pair, :2] - seen[law.own_pair, :2]
+    command = np.full_like(position, np.nan)
+    if law.to.size:
+        # Positions are taken against the vehicle's own: sums of large numbers would lose digits.
+        seen[:, :2] -= (position - law.place_ne_m)[law.to]
+        command[law.to[law.first]] = np.add.reduceat((law.gain @ seen[:, :, None])[:, :, 0], law.first)
     size = np.hypot(command[:, 0], command[:, 1])
-    command *= np.where(size > limit_m_s2, limit_m_s2 / np.maximum(size, limit_m_s2), 1.0)[:, None]
-    return FormationControl(sample_ns, position, velocity, spacing_error, velocity_error, command)
+    command *= (limit_m_s2 / np.maximum(size, limit_m_s2))[:, None]
+    return FormationControl(sample_ns, position, velocity, spacing_error, velocity - nominal_velocity_m_s, command)

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time  # noqa: TID251 - names the run's folder; the flight's own clock is in the driver
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,7 @@ def new_folder(scenario_name: str) -> Path:
 
 
 @contextlib.contextmanager
-def _stop_signals() -> Iterator[Callable[[], str]]:
+def _stop_signals() -> Generator[Callable[[], str]]:
     """While entered, Ctrl-C and SIGTERM raise nothing: they become a reason to end the flight, vehicles holding."""
     asked: list[str] = []
 
@@ -100,7 +100,7 @@ def _vehicles_heard(link: StationSocket, plan: FlightPlan) -> list[int]:
 
 
 @contextlib.contextmanager
-def _observer(folder: Path, *, show_table: bool) -> Iterator["subprocess.Popen[bytes]"]:
+def _observer(folder: Path, *, show_table: bool) -> Generator["subprocess.Popen[bytes]"]:
     """The process that shows and records the flight; left, it has ended by itself or been told to."""
     command = [sys.executable, "-m", "gcs.observer", str(folder), "--parent", str(os.getpid())]
     process = subprocess.Popen(command + ([] if show_table else ["--no-table"]), stdin=subprocess.DEVNULL)

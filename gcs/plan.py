@@ -6,7 +6,6 @@ import numpy as np
 
 from gains.design import Design, Requirement, design, evaluate_gains
 from gains.formation import FormationModel
-from gcs.control import Gains
 from gcs.station import FlightPlan, plan_formation
 from scenarios.schema import Scenario
 
@@ -20,11 +19,12 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
         If the scenario's requirement cannot be met.
     """
     formation = plan_formation(scenario)
-    found = _design(scenario, FormationModel(formation.predecessor))
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    found = _design(scenario, model)
     plan = FlightPlan(
         scenario=scenario,
         formation=formation,
-        gains=Gains(np.asarray(found.K1), np.asarray(found.K2), np.asarray(found.K3)),
+        gain=model.overlapping_gain(found.K1, found.K2, found.K3),
         delay_margin_s=found.delay_margin_s,
     )
     return found.to_dict(), plan

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs import mavlink
-from gcs.control import LARGEST_COMMAND_M_S2, Formation, FormationControl, Gains, overlapping_control, without
+from gcs.control import LARGEST_COMMAND_M_S2, Formation, FormationControl, feedback_law, formation_control
 from gcs.modes import Phase, next_phase, vehicle_mode
 from gcs.record import TICK, Mode, TickArray
-from gcs.telemetry import StateHistory
+from gcs.telemetry import FloatArray, StateHistory
 from gcs.vehicle import HOLD, Address, RemoteVehicle
 from scenarios.schema import NS_PER_S, Scenario
 
@@ -52,7 +52,8 @@ class FlightPlan:
 
     scenario: Scenario
     formation: Formation
-    gains: Gains
+    gain: FloatArray
+    """K of u = K e, rows and columns in the order of `gains.formation.FormationModel`."""
     delay_margin_s: float
 
 
@@ -86,7 +87,7 @@ class Station:
         n = len(self.vehicles)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
         self._history = StateHistory(n)
-        self._formation = plan.formation
+        self._law = feedback_law(plan.formation, plan.gain, np.zeros(n, dtype=bool))
         self._period_ns = round(NS_PER_S / rates.control_hz)
         self._timesync_ns = round(NS_PER_S / rates.timesync_hz)
         self._start_ns = start_ns
@@ -243,10 +244,9 @@ class Station:
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
         limit = self.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2
-        control = overlapping_control(
+        control = formation_control(
             self._history,
-            self._formation,
-            self.plan.gains,
+            self._law,
             nominal_velocity_m_s=self.plan.scenario.nominal_velocity_at(time_s),
             limit_m_s2=limit,
         )
@@ -279,7 +279,7 @@ class Station:
                 text = "is lost" if lost[row] else "is heard again"
                 self._report("vehicle", text, self.vehicles[row].system_id)
             self._lost = lost
-            self._formation = without(self.plan.formation, lost)
+            self._law = feedback_law(self.plan.formation, self.plan.gain, lost)
         for row, vehicle in enumerate(self.vehicles):
             before = Mode(int(self._rows["mode"][row]))
             mode = vehicle_mode(

@@ -2,62 +2,82 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from gcs.control import Formation, Gains, overlapping_control, without
-from gcs.telemetry import HISTORY, StateHistory
+from gains.formation import FormationModel
+from gcs.control import Formation, FormationControl, feedback_law, formation_control
+from gcs.telemetry import HISTORY, FloatArray, StateHistory
 
 MS = 1_000_000
 RNG = np.random.default_rng(11)
-GAINS = Gains(*(RNG.normal(size=(2, 2)) for _ in range(3)))
+K1, K2, K3 = (RNG.normal(size=(2, 2)) for _ in range(3))
+NOBODY = np.zeros(5, dtype=bool)
 # 0 leads; 1 and 2 follow it; 3 follows 1; 4 follows 3
 TREE = Formation((9, 3, 4, 7, 5), np.array([-1, 0, 0, 1, 3]), np.vstack([np.zeros(2), RNG.normal(size=(4, 2)) * 100]))
+MODEL = FormationModel((-1, 0, 0, 1, 3))
+OVERLAPPING = MODEL.overlapping_gain(K1, K2, K3)
 
 
-def filled(states: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> StateHistory:
+def filled(states: FloatArray) -> StateHistory:
     history = StateHistory(len(states))
-    for row, state in enumerate(states):
-        assert history.add(row, 5 * MS, tuple(state))
+    for row, (north, east, v_north, v_east) in enumerate(states.tolist()):
+        assert history.add(row, 5 * MS, (north, east, v_north, v_east))
     return history
 
 
-def test_commands_are_those_of_the_thesis() -> None:
-    states = RNG.normal(size=(5, 4)) * [1000, 1000, 50, 50]
-    v_d = (40.0, -3.0)
-    result = overlapping_control(filled(states), TREE, GAINS, nominal_velocity_m_s=v_d, limit_m_s2=1e9)
-    for i in range(5):
-        e_v = states[i, 2:] - v_d
-        u = GAINS.K1 @ e_v
+def controlled(
+    history: StateHistory,
+    K: FloatArray = OVERLAPPING,
+    lost: NDArray[np.bool_] = NOBODY,
+    *,
+    v_d: tuple[float, float] = (1.0, 0.0),
+    limit_m_s2: float = 1e9,
+) -> FormationControl:
+    law = feedback_law(TREE, K, lost)
+    return formation_control(history, law, nominal_velocity_m_s=v_d, limit_m_s2=limit_m_s2)
+
+
+def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:
+    """The error vector e of the thesis (2.10), from the definition."""
+    parts = [states[0, 2:] - v_d]
+    for i in range(1, 5):
         ahead = TREE.predecessor[i]
-        if ahead >= 0:
-            d = -TREE.offset_ne_m[i]
-            e_p = states[ahead, :2] - states[i, :2] - d
-            u = u + GAINS.K2 @ (states[ahead, 2:] - v_d) + GAINS.K3 @ e_p
-            assert result.spacing_error_m[i] == pytest.approx(e_p)
-        else:
-            assert np.isnan(result.spacing_error_m[i]).all()
-        assert result.command_m_s2[i] == pytest.approx(u)
+        d = -TREE.offset_ne_m[i]
+        parts += [states[ahead, :2] - states[i, :2] - d, states[i, 2:] - v_d]
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize("gain", [OVERLAPPING, RNG.normal(size=OVERLAPPING.shape)], ids=["overlapping", "full"])
+def test_commands_are_those_of_the_thesis(gain: FloatArray) -> None:
+    states = RNG.normal(size=(5, 4)) * [1000, 1000, 50, 50] + [1e5, -1e5, 0, 0]
+    v_d = (40.0, -3.0)
+    result = controlled(filled(states), gain, v_d=v_d)
+    e = errors(states, v_d)
+    assert result.command_m_s2.ravel() == pytest.approx(gain @ e, rel=1e-9)
+    for i in range(1, 5):
+        assert result.spacing_error_m[i] == pytest.approx(e[MODEL.spacing_slice(i)], rel=1e-9)
+    assert np.isnan(result.spacing_error_m[0]).all()
+    assert result.velocity_error_m_s == pytest.approx(states[:, 2:] - v_d)
 
 
 def test_command_is_shortened_to_the_limit_and_keeps_its_direction() -> None:
     states = RNG.normal(size=(5, 4)) * 1000
-    free = overlapping_control(filled(states), TREE, GAINS, nominal_velocity_m_s=(1.0, 0.0), limit_m_s2=1e9)
-    held = overlapping_control(filled(states), TREE, GAINS, nominal_velocity_m_s=(1.0, 0.0), limit_m_s2=5.0)
-    assert np.hypot(*held.command_m_s2.T) == pytest.approx(np.full(5, 5.0))
+    free = controlled(filled(states))
+    held = controlled(filled(states), limit_m_s2=5.0)
     direction = free.command_m_s2 / np.hypot(*free.command_m_s2.T)[:, None]
     assert held.command_m_s2 == pytest.approx(5.0 * direction)
 
 
 def test_a_formation_in_place_is_left_alone_though_its_states_are_of_different_instants() -> None:
-    v_d = np.array([91.44, 10.0])
-    place = np.zeros((5, 2))
-    for row in range(1, 5):
-        place[row] = place[TREE.predecessor[row]] + TREE.offset_ne_m[row]
+    v_d = (91.44, 10.0)
+    place = TREE.place_ne_m()
     history = StateHistory(5)
     for k in range(10):
         for row in range(5):
             t_ns = 20 * MS * k + 3 * MS * row
-            history.add(row, t_ns, (*(place[row] + v_d * t_ns * 1e-9), *v_d))
-    result = overlapping_control(history, TREE, GAINS, nominal_velocity_m_s=(91.44, 10.0), limit_m_s2=1e9)
+            north, east = place[row] + np.array(v_d) * t_ns * 1e-9
+            history.add(row, t_ns, (north, east, *v_d))
+    result = controlled(history, v_d=v_d)
     assert result.command_m_s2 == pytest.approx(np.zeros((5, 2)), abs=1e-9)
 
 
@@ -65,22 +85,33 @@ def test_unknown_vehicle_gives_no_command_to_itself_and_its_follower_only() -> N
     history = StateHistory(5)
     for row in (0, 2, 3, 4):
         history.add(row, 5 * MS, (0.0, 0.0, 1.0, 1.0))
-    result = overlapping_control(history, TREE, GAINS, nominal_velocity_m_s=(1.0, 0.0), limit_m_s2=1e9)
+    result = controlled(history)
     assert np.isfinite(result.command_m_s2).all(axis=1).tolist() == [True, False, True, False, True]
 
 
 def test_lost_vehicles_are_flown_around_with_everybody_in_place() -> None:
-    lost = np.array([False, True, False, True, False])
-    around = without(TREE, lost)
-    assert around.predecessor[4] == 0
-    assert around.offset_ne_m[4] == pytest.approx(TREE.offset_ne_m[[1, 3, 4]].sum(axis=0))
-    assert around.predecessor[2] == 0
+    place = TREE.place_ne_m()
+    states = np.hstack([place + np.array([500.0, 300.0]), np.tile([40.0, 2.0], (5, 1))])
+    states[[1, 3]] = np.nan
+    result = controlled(filled(states), lost=np.array([False, True, False, True, False]), v_d=(40.0, 2.0))
+    assert result.command_m_s2[[0, 2, 4]] == pytest.approx(np.zeros((3, 2)), abs=1e-9)
+    assert np.isnan(result.command_m_s2[[1, 3]]).all()
+    states[4] += [3.0, -4.0, 0.5, 0.25]  # vehicle 4 now keeps its distance to the leader
+    states[0, 2:] += [0.125, 1.0]
+    result = controlled(filled(states), lost=np.array([False, True, False, True, False]), v_d=(40.0, 2.0))
+    assert result.command_m_s2[4] == pytest.approx(K1 @ [0.5, 0.25] + K2 @ [0.125, 1.0] + K3 @ [-3.0, 4.0])
 
 
 def test_followers_of_a_lost_leader_keep_the_nominal_velocity() -> None:
-    around = without(TREE, np.array([True, False, False, False, False]))
-    assert around.predecessor.tolist() == [-1, -1, -1, 1, 3]
-    assert around.offset_ne_m[1].tolist() == [0.0, 0.0]
+    states = RNG.normal(size=(5, 4)) * 10
+    result = controlled(filled(states), lost=np.array([True, False, False, False, False]), v_d=(4.0, 2.0))
+    assert result.command_m_s2[1] == pytest.approx(K1 @ (states[1, 2:] - [4.0, 2.0]))
+    assert np.isnan(result.spacing_error_m[1]).all()
+
+
+def test_with_everybody_lost_nobody_is_commanded() -> None:
+    result = controlled(filled(RNG.normal(size=(5, 4))), lost=np.ones(5, dtype=bool))
+    assert np.isnan(result.command_m_s2).all()
 
 
 def test_interpolation_is_exact_under_constant_acceleration() -> None:
@@ -95,12 +126,14 @@ def test_interpolation_is_exact_under_constant_acceleration() -> None:
     newest_s = 0.02 * (HISTORY + 49)
     for back_s in (0.0, 0.003, 0.4, 2.5):
         t_s = newest_s - back_s
-        position, velocity = history.at(np.array([0]), np.array([round(t_s * 1e9)]))
-        assert position[0] == pytest.approx(state(t_s)[:2], rel=1e-9)
-        assert velocity[0] == pytest.approx(state(t_s)[2:], rel=1e-9)
+        found = history.at(np.array([0]), np.array([round(t_s * 1e9)]))[0]
+        assert found == pytest.approx(state(t_s), rel=1e-9)
+    oldest_s = newest_s - 0.02 * (HISTORY - 1)
+    found = history.at(np.array([0]), np.array([round((oldest_s - 0.5) * 1e9)]))[0]  # before the oldest report
+    assert found[:2] == pytest.approx(np.array(state(oldest_s)[:2]) - 0.5 * np.array(state(oldest_s)[2:]), rel=1e-9)
     ahead_s = newest_s + 0.01  # straight on: off by a t^2 / 2
-    position, _ = history.at(np.array([0]), np.array([round(ahead_s * 1e9)]))
-    assert position[0] == pytest.approx(np.array(state(ahead_s)[:2]) - a * 0.01**2 / 2, rel=1e-9)
+    found = history.at(np.array([0]), np.array([round(ahead_s * 1e9)]))[0]
+    assert found[:2] == pytest.approx(np.array(state(ahead_s)[:2]) - a * 0.01**2 / 2, rel=1e-9)
 
 
 def test_a_report_older_than_the_newest_changes_nothing() -> None:
@@ -109,3 +142,10 @@ def test_a_report_older_than_the_newest_changes_nothing() -> None:
     assert not history.add(0, 100, (9.0, 9.0, 9.0, 9.0))
     assert not history.add(0, 50, (9.0, 9.0, 9.0, 9.0))
     assert history.newest()[1].tolist() == [[1.0, 2.0]]
+
+
+def test_before_the_first_report_the_first_one_is_used() -> None:
+    history = StateHistory(1)
+    history.add(0, 1000 * MS, (10.0, 0.0, 2.0, 0.0))
+    history.add(0, 1020 * MS, (10.04, 0.0, 2.0, 0.0))
+    assert history.at(np.array([0]), np.array([500 * MS]))[0] == pytest.approx([9.0, 0.0, 2.0, 0.0])

@@ -84,7 +84,7 @@ def test_formation_follows_the_turns() -> None:
 def test_above_the_margin_the_formation_breaks_and_vehicles_are_left_in_failsafe() -> None:
     plan, design = planned("triangle5")
     scenario = plan.scenario.with_link_delay(up_s=0.4, down_s=0.4)
-    plan = FlightPlan(scenario, plan.formation, plan.gains, plan.delay_margin_s)
+    plan = FlightPlan(scenario, plan.formation, plan.gain, plan.delay_margin_s)
     ticks, summary = flown(plan, design)
     assert summary["verdict"] == "unstable"
     assert summary["reason"].startswith("broken: spacing error of vehicle")
@@ -106,11 +106,11 @@ def test_errors_grow_and_decay_as_the_sampled_model_says(link_delay_s: float) ->
     """Two independent ways: the slope of the flown error, and the lifted map at the loop delay that was measured."""
     plan, design = planned("chain3", duration_s=40.0)
     scenario = plan.scenario.with_link_delay(up_s=link_delay_s, down_s=link_delay_s)
-    ticks, _ = flown(FlightPlan(scenario, plan.formation, plan.gains, plan.delay_margin_s), design)
+    ticks, _ = flown(FlightPlan(scenario, plan.formation, plan.gain, plan.delay_margin_s), design)
     own = ticks[(ticks["system_id"] == 2) & ticks["commanded"]]
     delay_s = float(np.median(own["loop_delay_s"]))
-    k1, k3 = -plan.gains.K1[0, 0], plan.gains.K3[0, 0]
-    A, B, K = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[k3, -k1]])
+    A, B = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    K = np.array([[design["K3_1_s2"][0][0], design["K1_1_s"][0][0]]])
     predicted = growth_rate(A, B, K, period_s=0.02, delay_s=delay_s)
     # 1 ms of drift of the sampling instants over the flight moves the rate by 0.01 /s.
     assert dominant_growth_1_s(ticks, 2) == pytest.approx(predicted, abs=0.02)
@@ -136,7 +136,7 @@ def test_asymmetric_links_give_the_same_loop_delay() -> None:
     medians: list[float] = []
     for up_s, down_s in ((0.05, 0.05), (0.09, 0.01)):
         scenario = plan.scenario.with_link_delay(up_s=up_s, down_s=down_s)
-        ticks, _ = flown(FlightPlan(scenario, plan.formation, plan.gains, plan.delay_margin_s), design)
+        ticks, _ = flown(FlightPlan(scenario, plan.formation, plan.gain, plan.delay_margin_s), design)
         medians.append(float(np.median(ticks[ticks["commanded"]]["loop_delay_s"])) - up_s - down_s)
     assert all(0.0 <= waiting <= 0.02 for waiting in medians)
 
