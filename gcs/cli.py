@@ -102,12 +102,14 @@ def view(
     from gcs.viewer import view as open_viewer
 
     try:
-        if picture is not None:
-            screenshot(run, picture, time_s=at)
-        else:
-            open_viewer(run)
+        if picture is None:
+            raise typer.Exit(open_viewer(run))
+        complaints = screenshot(run, picture, time_s=at)
     except ViewerError as error:
         raise InputError(str(error)) from None
+    for complaint in complaints:
+        typer.echo(complaint, err=True)
+    raise typer.Exit(EXIT_FAILED if complaints else 0)
 
 
 @app.command()
@@ -118,8 +120,9 @@ def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a
     from gcs.summary import RunError, finish
 
     try:
-        summary = finish(run)
+        finish(run)
         record_run(run)
+        summary = finish(run)  # again: it lists the files
     except RunError as error:
         raise InputError(str(error)) from None
     print_summary(summary, run)

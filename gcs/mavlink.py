@@ -71,8 +71,12 @@ def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     Each datagram is parsed on its own: a frame cut short cannot swallow the next datagram. A frame with a number that
     is NaN or infinite in one of the messages used for control is refused, as its checksum says nothing about that.
     """
+    end = len(datagram)
+    if end >= _OVERHEAD and datagram[0] == _MAGIC and end == _OVERHEAD + datagram[1] and not datagram[2]:
+        frame = _checked(datagram, datagram[1], refused)  # the usual case: one unsigned frame
+        return [] if frame is None else [frame]
     frames: list[Frame] = []
-    at, end = 0, len(datagram)
+    at = 0
     while at < end:
         if datagram[at] != _MAGIC:
             refused["not MAVLink 2"] += 1
@@ -80,29 +84,42 @@ def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
         if end - at < _OVERHEAD:
             refused["truncated"] += 1
             break
-        _, length, incompatible, _, sequence, system_id, component_id, id_low, id_high = _HEADER.unpack_from(
-            datagram, at
-        )
+        length, incompatible = datagram[at + 1], datagram[at + 2]
         stop = at + _OVERHEAD + length + (_SIGNATURE_LENGTH if incompatible & _SIGNED else 0)
         if stop > end:
             refused["truncated"] += 1
             break
-        frame, at = datagram[at:stop] if stop != end or at else datagram, stop
-        layout = _LAYOUTS.get(id_low | id_high << 16)
-        if layout is None:
-            refused["unknown message"] += 1
-        elif incompatible & ~_SIGNED:
+        if incompatible & ~_SIGNED:
             refused["unknown flags"] += 1
-        elif mcrf4xx(frame[1 : 10 + length] + layout.crc_extra) != frame[10 + length] | frame[11 + length] << 8:
-            refused["bad checksum"] += 1
         else:
-            payload = frame[10 : 10 + min(length, layout.length)].ljust(layout.length, b"\0")
-            fields = layout.packing.unpack(payload)
-            if id_low == LOCAL_POSITION_NED and not isfinite(sum(fields)):
-                refused["not finite"] += 1
-            else:
-                frames.append(Frame(id_low | id_high << 16, system_id, component_id, sequence, fields, frame))
+            frame = _checked(datagram[at:stop], length, refused)
+            if frame is not None:
+                frames.append(frame)
+        at = stop
     return frames
+
+
+def _checked(data: bytes, length: int, refused: Counter[str]) -> Frame | None:
+    """One frame of known extent, or None if it is refused."""
+    _, _, _, _, sequence, system_id, component_id, id_low, id_high = _HEADER.unpack_from(data)
+    msg_id = id_low | id_high << 16
+    layout = _LAYOUTS.get(msg_id)
+    if layout is None:
+        refused["unknown message"] += 1
+        return None
+    packing, full_length, crc_extra = layout
+    body_end = 10 + length
+    if mcrf4xx(data[1:body_end] + crc_extra) != data[body_end] | data[body_end + 1] << 8:
+        refused["bad checksum"] += 1
+        return None
+    if length == full_length:
+        fields = packing.unpack_from(data, 10)
+    else:  # trailing zeros are not sent, and fields added by a newer dialect are not ours
+        fields = packing.unpack(data[10 : 10 + min(length, full_length)].ljust(full_length, b"\0"))
+    if msg_id == LOCAL_POSITION_NED and not isfinite(sum(fields)):
+        refused["not finite"] += 1
+        return None
+    return Frame(msg_id, system_id, component_id, sequence, fields, data)
 
 
 def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int) -> bytes:

@@ -1,0 +1,191 @@
+"""The command `sim-vehicles`: fly a scenario's vehicles on UDP until told to stop."""
+
+import argparse
+import contextlib
+import math
+import signal
+import socket
+import sys
+import time  # noqa: TID251 - the command starts the vehicles' clock
+from collections import Counter
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import TYPE_CHECKING, Never
+
+if TYPE_CHECKING:
+    from scenarios.schema import Scenario
+    from sim_vehicles.truth import TruthLog
+    from sim_vehicles.udp import Ports
+    from sim_vehicles.vehicle import Change
+
+SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
+NS_PER_S = 1_000_000_000
+
+DESCRIPTION = """\
+Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
+They stay on the launcher until a station arms them, commands GUIDED and sends set-points."""
+
+
+def main() -> None:
+    """Entry point."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """The command with its arguments: the exit code."""
+    options = _parser().parse_args(arguments)
+    with _signals() as signals, contextlib.ExitStack() as opened:
+        # After parsing, so that --help and a mistyped option answer at once.
+        from scenarios.files import ScenarioError, load
+        from sim_vehicles.truth import TruthLog
+        from sim_vehicles.udp import Ports
+
+        try:
+            scenario = load(options.scenario)
+        except ScenarioError as error:
+            return _complain(str(error))
+        try:
+            ports = Ports(tuple(sorted(v.system_id for v in scenario.vehicles)), options.station)
+        except OSError as error:
+            return _complain(f"--station {options.station[0]}:{options.station[1]}: {error.strerror or error}")
+        opened.callback(ports.close)
+        log = None
+        if options.truth:
+            try:
+                log = TruthLog(options.truth)
+            except (OSError, ValueError) as error:
+                return _complain(f"--truth: {error}")
+            opened.callback(log.close)
+        _fly(scenario, ports, log, signals, options)
+    return INTERRUPTED if signal.SIGINT in signals else SUCCESS
+
+
+def _fly(
+    scenario: "Scenario", ports: "Ports", log: "TruthLog | None", signals: list[int], options: argparse.Namespace
+) -> None:
+    from sim_vehicles.fleet import Fleet
+    from sim_vehicles.udp import fly
+
+    start_ns = time.monotonic_ns()
+    fleet = Fleet(scenario, start_ns, record=log.record if log else None)
+    say = _Lines(start_ns)
+    say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {options.station[0]}:{options.station[1]}")
+    fly(fleet, ports, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log))
+    say.changes(fleet.take_changes())
+    counters = fleet.counters + ports.counters + Counter(truth_lost=log.lost if log else 0)
+    say.line("received: " + (", ".join(f"{name} {count}" for name, count in sorted(counters.items())) or "nothing"))
+
+
+def _stop_rule(signals: list[int], start_ns: int, options: argparse.Namespace) -> Callable[[int, int], bool]:
+    duration_ns, silence_ns = options.duration * NS_PER_S, options.stop_after_silence * NS_PER_S
+
+    def stop(now_ns: int, last_heard_ns: int) -> bool:
+        return bool(signals) or now_ns - start_ns >= duration_ns or now_ns - last_heard_ns >= silence_ns
+
+    return stop
+
+
+def _teller(say: "_Lines", log: "TruthLog | None") -> Callable[[list["Change"]], None]:
+    def tell(changes: list["Change"]) -> None:
+        say.changes(changes)
+        if log:
+            log.flush()
+
+    return tell
+
+
+class _Lines:
+    """Lines for a person, on the terminal or in the log of whoever started this."""
+
+    def __init__(self, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._read = True
+
+    def line(self, text: str) -> None:
+        if self._read:
+            try:
+                print(text, flush=True)
+            except OSError:  # terminal or pipe was closed; the vehicles fly on
+                self._read = False
+
+    def changes(self, changes: list["Change"]) -> None:
+        for change in changes:
+            self.line(
+                f"{(change.time_ns - self._start_ns) / NS_PER_S:8.3f} s  vehicle {change.system_id}: {change.text}"
+            )
+
+
+@contextlib.contextmanager
+def _signals() -> Generator[list[int]]:
+    """The list that SIGINT and SIGTERM are appended to while the context lasts."""
+    caught: list[int] = []
+    wanted = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda number, _: caught.append(number)) for number in wanted]
+    try:
+        yield caught
+    finally:
+        for number, handler in zip(wanted, before, strict=True):
+            signal.signal(number, handler)
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    """A parser that complains in one line."""
+
+    def error(self, message: str) -> Never:
+        sys.exit(_complain(message))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _OneLineParser(
+        prog="sim-vehicles", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenario", type=Path, metavar="SCENARIO", help="scenario file (TOML)")
+    parser.add_argument(
+        "--station",
+        type=_address,
+        default=("127.0.0.1", 14550),
+        metavar="HOST:PORT",
+        help="where the station listens (127.0.0.1:14550)",
+    )
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="write what really happened when; continues a log")
+    parser.add_argument(
+        "--stop-after-silence",
+        type=_seconds,
+        default=math.inf,
+        metavar="SECONDS",
+        help="end when no station was heard for that long (never)",
+    )
+    parser.add_argument(
+        "--duration", type=_seconds, default=math.inf, metavar="SECONDS", help="end after that time (never)"
+    )
+    return parser
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
+        raise argparse.ArgumentTypeError(f"read {text!r}, wanted HOST:PORT with a port from 1 to 65535")
+    try:
+        found = socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as error:
+        raise argparse.ArgumentTypeError(f"read {text!r}, wanted a host that can be found ({error})") from None
+    return str(found[0][4][0]), int(port)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not seconds > 0:
+        raise argparse.ArgumentTypeError(f"read {text!r}, wanted a number of seconds above 0")
+    return seconds
+
+
+def _complain(text: str) -> int:
+    print(f"sim-vehicles: {text}", file=sys.stderr)
+    return USAGE
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""The clock a vehicle counts from its boot: an offset and a drift against the host's clock, in exact integers."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from scenarios.schema import NS_PER_S, Clocks
+
+NS_PER_MS = 1_000_000
+PARTS = 1_000_000_000
+
+CLOCK_STREAM = 0
+"""Last word of the spawn key of the clock's random stream; other streams of a vehicle take other numbers."""
+
+
+@dataclass(frozen=True)
+class BootClock:
+    """Host time (CLOCK_MONOTONIC, or the virtual clock) to boot time and back, without rounding drift."""
+
+    start_ns: int
+    """Host time at which the clock shows `offset_ns`."""
+    offset_ns: int
+    drift_ppb: int
+
+    @classmethod
+    def draw(cls, clocks: Clocks, seed: int, system_id: int, start_ns: int) -> Self:
+        """A vehicle's clock from the scenario's seed: offset in 0 to the bound, drift in plus or minus the bound."""
+        stream = np.random.SeedSequence(seed, spawn_key=(system_id, CLOCK_STREAM))
+        offset, drift = np.random.default_rng(stream).random(2)
+        offset_ns = int(offset * clocks.offset_max_s * NS_PER_S)
+        return cls(start_ns, offset_ns, round((2.0 * drift - 1.0) * clocks.drift_max_ppm * 1000.0))
+
+    def boot_ns(self, host_ns: int) -> int:
+        """What the clock shows at a host time."""
+        return self.offset_ns + (host_ns - self.start_ns) * (PARTS + self.drift_ppb) // PARTS
+
+    def host_ns(self, boot_ns: int) -> int:
+        """The first host nanosecond at which the clock shows at least `boot_ns`."""
+        return self.start_ns - (self.offset_ns - boot_ns) * PARTS // (PARTS + self.drift_ppb)

@@ -1,0 +1,286 @@
+"""The vehicles' side of MAVLink 2: datagrams to typed messages, and reports to frames. The one user of pymavlink here.
+
+Datagrams are cut into frames here, each on its own: pymavlink's stream parser would let a frame cut short swallow the
+next datagram. Its message tables, and its decoder for all but the one frequent message, do the rest. What is refused
+is counted by reason and never raised.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+MAGIC_1, MAGIC_2 = dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2
+HEADER_BYTES, CHECKSUM_BYTES, SIGNATURE_BYTES = dialect.HEADER_LEN_V2, 2, dialect.MAVLINK_SIGNATURE_BLOCK_LEN
+SIGNED = dialect.MAVLINK_IFLAG_SIGNED
+
+COMPONENT_AUTOPILOT = dialect.MAV_COMP_ID_AUTOPILOT1
+TYPE_GCS = dialect.MAV_TYPE_GCS
+MODE_STABILIZE, MODE_GUIDED, MODE_LOITER = 0, 4, 5
+BASE_MODE_CUSTOM = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+BASE_MODE_ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
+BASE_MODE_GUIDED = dialect.MAV_MODE_FLAG_GUIDED_ENABLED
+STATUS_STANDBY, STATUS_ACTIVE = dialect.MAV_STATE_STANDBY, dialect.MAV_STATE_ACTIVE
+STATUS_CRITICAL = dialect.MAV_STATE_CRITICAL
+SEVERITY_CRITICAL = dialect.MAV_SEVERITY_CRITICAL
+FRAME_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
+MASK_ACCELERATION, MASK_VELOCITY_ACCELERATION = 0x0C3F, 0x0C07
+
+COMMAND_MODE, COMMAND_ARM = dialect.MAV_CMD_DO_SET_MODE, dialect.MAV_CMD_COMPONENT_ARM_DISARM
+COMMAND_INTERVAL, COMMAND_REQUEST = dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialect.MAV_CMD_REQUEST_MESSAGE
+ACCEPTED, DENIED = dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_DENIED
+UNSUPPORTED = dialect.MAV_RESULT_UNSUPPORTED
+
+HEARTBEAT = dialect.MAVLINK_MSG_ID_HEARTBEAT
+LOCAL_POSITION = dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+GLOBAL_POSITION = dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+SETPOINT = dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED
+COMMAND_LONG, COMMAND_INT = dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK_MSG_ID_COMMAND_INT
+TIMESYNC = dialect.MAVLINK_MSG_ID_TIMESYNC
+AUTOPILOT_VERSION = dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+HOME_POSITION = dialect.MAVLINK_MSG_ID_HOME_POSITION
+MESSAGE_INTERVAL = dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL
+
+_CRC_EXTRA: dict[int, bytes] = {number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items()}
+_LOCAL_POSITION = dialect.MAVLink_local_position_ned_message
+_SETPOINT = dialect.MAVLink_set_position_target_local_ned_message
+_DECODER = dialect.MAVLink(None)
+_CAPABILITIES = (
+    dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+)
+
+
+class Setpoint(NamedTuple):
+    """SET_POSITION_TARGET_LOCAL_NED as it came; vectors are north, east, down."""
+
+    time_boot_ms: int
+    velocity_ned_m_s: tuple[float, float, float]
+    acceleration_ned_m_s2: tuple[float, float, float]
+    type_mask: int
+    target_system: int
+    target_component: int
+    frame: int
+
+
+class Command(NamedTuple):
+    """COMMAND_LONG or COMMAND_INT, with the parameters this vehicle looks at."""
+
+    source: tuple[int, int]
+    target_system: int
+    target_component: int
+    command: int
+    param1: float
+    param2: float
+
+
+class Heartbeat(NamedTuple):
+    """HEARTBEAT of another system."""
+
+    vehicle_type: int
+
+
+class Timesync(NamedTuple):
+    """TIMESYNC; target_system is 0 if the sender named none."""
+
+    tc1: int
+    ts1: int
+    target_system: int
+
+
+Message = Setpoint | Command | Heartbeat | Timesync
+
+
+def read_datagram(data: bytes, counters: Counter[str]) -> list[Message]:
+    """The messages of a datagram that a vehicle may act on.
+
+    Everything else is counted: `refused_empty`, `refused_mavlink1`, `refused_garbage` (no frame begins where one
+    should), `refused_truncated`, `refused_incompatible` (unknown flags), `refused_unknown` (message id not in the
+    dialect), `refused_crc`, and `ignored_message` (valid, but nothing for a vehicle).
+    """
+    messages: list[Message] = []
+    begin, end = 0, len(data)
+    if not data:
+        counters["refused_empty"] += 1
+    while begin < end:
+        if data[begin] != MAGIC_2:
+            counters["refused_mavlink1" if data[begin] == MAGIC_1 else "refused_garbage"] += 1
+            break
+        if end - begin < HEADER_BYTES + CHECKSUM_BYTES:
+            counters["refused_truncated"] += 1
+            break
+        flags = data[begin + 2]
+        checked = begin + HEADER_BYTES + data[begin + 1]
+        after = checked + CHECKSUM_BYTES + (SIGNATURE_BYTES if flags & SIGNED else 0)
+        if after > end:
+            counters["refused_truncated"] += 1
+            break
+        reason = _refusal(data, begin, checked)
+        if reason:
+            counters[reason] += 1
+        else:
+            _append(messages, data[begin:after], checked - begin, counters)
+        begin = after
+    return messages
+
+
+def message_id(data: bytes) -> int:
+    """Message id of a datagram's first frame, 0xFFFFFF if it has none."""
+    return int.from_bytes(data[7:10], "little") if len(data) >= HEADER_BYTES and data[0] == MAGIC_2 else 0xFFFFFF
+
+
+def _refusal(data: bytes, begin: int, checked: int) -> str:
+    if data[begin + 2] & ~SIGNED:
+        return "refused_incompatible"
+    extra = _CRC_EXTRA.get(data[begin + 7] | data[begin + 8] << 8 | data[begin + 9] << 16)
+    if extra is None:
+        return "refused_unknown"
+    if mcrf4xx(data[begin + 1 : checked] + extra) != data[checked] | data[checked + 1] << 8:
+        return "refused_crc"
+    return ""
+
+
+def _append(messages: list[Message], frame: bytes, checked: int, counters: Counter[str]) -> None:
+    """Decode one frame whose checksum is right; `checked` is where its payload ends."""
+    number = frame[7] | frame[8] << 8 | frame[9] << 16
+    if number == SETPOINT:
+        # Trailing zeros are trimmed on the wire. This message is most of the traffic: no object of pymavlink's is made.
+        size = _SETPOINT.unpacker.size
+        values = _SETPOINT.unpacker.unpack(frame[HEADER_BYTES:checked].ljust(size, b"\0")[:size])
+        messages.append(Setpoint(values[0], values[4:7], values[7:10], *values[12:]))
+    elif number in (HEARTBEAT, TIMESYNC, COMMAND_LONG, COMMAND_INT):
+        messages.append(_decode(number, frame, checked))
+    else:
+        counters["ignored_message"] += 1
+
+
+def _decode(number: int, frame: bytes, checked: int) -> Message:
+    decoded: Any = _DECODER.decode(bytearray(frame))
+    if number == HEARTBEAT:
+        return Heartbeat(decoded.type)
+    if number == TIMESYNC:
+        # The target is an extension field that this dialect does not know yet.
+        target = frame[HEADER_BYTES + 16] if checked > HEADER_BYTES + 16 else 0
+        return Timesync(decoded.tc1, decoded.ts1, target)
+    return Command(
+        (frame[5], frame[6]),
+        decoded.target_system,
+        decoded.target_component,
+        decoded.command,
+        decoded.param1,
+        decoded.param2,
+    )
+
+
+class Encoder:
+    """One vehicle's frames, numbered in the order they are made."""
+
+    def __init__(self, system_id: int) -> None:
+        self._pymavlink = dialect.MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_AUTOPILOT)
+        self._source = bytes([system_id, COMPONENT_AUTOPILOT, LOCAL_POSITION, 0, 0])
+
+    def local_position(
+        self, time_boot_ms: int, north_m: float, east_m: float, down_m: float, velocity_ne_m_s: tuple[float, float]
+    ) -> bytes:
+        """LOCAL_POSITION_NED; no vertical speed."""
+        payload = _LOCAL_POSITION.unpacker.pack(time_boot_ms, north_m, east_m, down_m, *velocity_ne_m_s, 0.0)
+        payload = payload.rstrip(b"\0") or b"\0"
+        mav = self._pymavlink
+        body = bytes([len(payload), 0, 0, mav.seq]) + self._source + payload
+        mav.seq = (mav.seq + 1) & 0xFF
+        return b"\xfd" + body + mcrf4xx(body + _CRC_EXTRA[LOCAL_POSITION]).to_bytes(2, "little")
+
+    def global_position(
+        self,
+        *,
+        time_boot_ms: int,
+        latitude_deg: float,
+        longitude_deg: float,
+        altitude_m: float,
+        relative_altitude_m: float,
+        velocity_ne_m_s: tuple[float, float],
+        heading_deg: float,
+    ) -> bytes:
+        """GLOBAL_POSITION_INT; what does not fit a field is cut to its largest value."""
+        north, east = velocity_ne_m_s
+        return self._pack(
+            dialect.MAVLink_global_position_int_message(
+                time_boot_ms,
+                _clipped(latitude_deg * 1e7, 2**31 - 1),
+                _clipped(longitude_deg * 1e7, 2**31 - 1),
+                _clipped(altitude_m * 1e3, 2**31 - 1),
+                _clipped(relative_altitude_m * 1e3, 2**31 - 1),
+                _clipped(north * 1e2, 2**15 - 1),
+                _clipped(east * 1e2, 2**15 - 1),
+                0,
+                round(heading_deg * 1e2) % 36000,
+            )
+        )
+
+    def heartbeat(self, base_mode: int, custom_mode: int, system_status: int) -> bytes:
+        """HEARTBEAT of an ArduCopter."""
+        return self._pack(
+            dialect.MAVLink_heartbeat_message(
+                dialect.MAV_TYPE_QUADROTOR,
+                dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+                base_mode,
+                custom_mode,
+                system_status,
+                3,
+            )
+        )
+
+    def timesync(self, tc1: int, ts1: int) -> bytes:
+        """TIMESYNC, a request if tc1 is 0."""
+        return self._pack(dialect.MAVLink_timesync_message(tc1, ts1))
+
+    def command_ack(self, command: int, result: int, requester: tuple[int, int]) -> bytes:
+        """COMMAND_ACK to the (system, component) that asked."""
+        return self._pack(
+            dialect.MAVLink_command_ack_message(
+                command, result, target_system=requester[0], target_component=requester[1]
+            )
+        )
+
+    def statustext(self, severity: int, text: str) -> bytes:
+        """STATUSTEXT in one chunk."""
+        encoded = text.encode("ascii")
+        assert len(encoded) <= 50
+        return self._pack(dialect.MAVLink_statustext_message(severity, encoded))
+
+    def message_interval(self, number: int, interval_us: int) -> bytes:
+        """MESSAGE_INTERVAL."""
+        return self._pack(dialect.MAVLink_message_interval_message(number, interval_us))
+
+    def autopilot_version(self) -> bytes:
+        """AUTOPILOT_VERSION: the capabilities, and zeros for hardware that is not there."""
+        none: Sequence[int] = (0,) * 8
+        uid = self._pymavlink.srcSystem
+        return self._pack(
+            dialect.MAVLink_autopilot_version_message(_CAPABILITIES, 0, 0, 0, 0, none, none, none, 0, 0, uid)
+        )
+
+    def home_position(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> bytes:
+        """HOME_POSITION at the origin of the local frame."""
+        return self._pack(
+            dialect.MAVLink_home_position_message(
+                round(latitude_deg * 1e7),
+                round(longitude_deg * 1e7),
+                round(altitude_m * 1e3),
+                *(0.0, 0.0, 0.0),
+                (1.0, 0.0, 0.0, 0.0),
+                *(0.0, 0.0, 0.0),
+            )
+        )
+
+    def _pack(self, message: dialect.MAVLink_message) -> bytes:
+        frame = message.pack(self._pymavlink)
+        self._pymavlink.seq = (self._pymavlink.seq + 1) & 0xFF
+        return frame
+
+
+def _clipped(value: float, largest: int) -> int:
+    return max(-largest, min(largest, round(value)))

@@ -1,0 +1,98 @@
+"""The truth log: what really happened when, on the host's clock, to grade the station's estimates against.
+
+A magic and then fixed-size records, written straight to the file in batches: a killed process loses its last batch at
+most, and a record cut in two at the end is left out when reading and overwritten when the log is continued.
+"""
+
+import contextlib
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+SAMPLED, ACTED, LINK_UP, LINK_DOWN = 1, 2, 3, 4
+KINDS = {SAMPLED: "SAMPLED", ACTED: "ACTED", LINK_UP: "LINK_UP", LINK_DOWN: "LINK_DOWN"}
+
+DTYPE = np.dtype(
+    [("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_ns", "<i8"), ("entered_ns", "<i8"), ("due_ns", "<i8")]
+)
+"""One record.
+
+SAMPLED: the state in the LOCAL_POSITION_NED with time_boot_ms `key` was sampled at `time_ns`. ACTED: the set-point
+with the sender's time_boot_ms `key` acts from `time_ns` on. For these two the other times equal `time_ns`.
+LINK_UP, LINK_DOWN: a datagram whose first frame has the message id `key` (0xFFFFFF if it has none) entered the link
+at `entered_ns`, was due at `due_ns`, and left at `time_ns`: upwards handed to the socket (in virtual time, to the
+station), downwards taken by the vehicle.
+"""
+
+_MAGIC = b"UAVTRUE1"
+_PACK = struct.Struct("<BBIqqq").pack
+_BATCH = 1024
+
+
+Row = tuple[int, int, int, int, int, int]
+"""One record's values, in the order of DTYPE."""
+Record = Callable[[Row], None]
+"""Takes one record: TruthLog.record, or the append of a list."""
+
+
+class TruthLog:
+    """A truth log being written; its `record` is what a Fleet takes."""
+
+    def __init__(self, path: Path) -> None:
+        self.lost = 0
+        """Records that could not be written; the disk being full stops no vehicle."""
+        self._batch: list[bytes] = []
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        size = os.fstat(self._file).st_size
+        if size == 0:
+            os.pwrite(self._file, _MAGIC, 0)
+            size = len(_MAGIC)
+        elif os.pread(self._file, len(_MAGIC), 0) != _MAGIC:
+            os.close(self._file)
+            raise ValueError(f"{path} exists and is not a truth log")
+        self._end = size - (size - len(_MAGIC)) % DTYPE.itemsize
+        """Where the next batch goes: behind the last whole record, whatever a failed write has left there."""
+
+    def record(self, row: Row) -> None:
+        """Add a record to the batch, and write the batch if it is full."""
+        self._batch.append(_PACK(*row))
+        if len(self._batch) >= _BATCH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand the batch to the operating system."""
+        data = b"".join(self._batch)
+        try:
+            written = os.pwrite(self._file, data, self._end)
+        except OSError:
+            written = 0
+        whole = written // DTYPE.itemsize
+        self._end += whole * DTYPE.itemsize
+        self.lost += len(self._batch) - whole
+        self._batch.clear()
+
+    def close(self) -> None:
+        """Write what is left; a record cut in two is cut off."""
+        self.flush()
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._file, self._end)
+        os.close(self._file)
+
+
+def read_truth(path: Path) -> npt.NDArray[np.void]:
+    """The whole records of a truth log, in the order written, as an array of DTYPE.
+
+    Raises
+    ------
+    ValueError
+        If the file is not a truth log.
+    """
+    data = path.read_bytes()
+    if not data.startswith(_MAGIC):
+        raise ValueError(f"{path} is not a truth log")
+    count = (len(data) - len(_MAGIC)) // DTYPE.itemsize
+    return np.frombuffer(data, DTYPE, count, len(_MAGIC))

@@ -1,0 +1,321 @@
+"""One simulated UAV: a MAVLink system of its own that flies. Bytes and time in, bytes and time out.
+
+It starts on the launcher: held at its initial state, and reporting the initial position and velocity, until it has
+been armed, is in GUIDED and the first set-point is accepted; from that instant on it flies. Everything happens at its
+exact instant, however late `step` is called.
+"""
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from scenarios import schema
+from scenarios.schema import NS_PER_S
+from sim_vehicles import mavlink
+from sim_vehicles.autopilot import MODE_NAMES, Autopilot
+from sim_vehicles.clock import BootClock
+from sim_vehicles.dynamics import COAST, VELOCITY_GAIN_1_S, Command, State, advance, bounds_of, state_from
+from sim_vehicles.schedule import US_PER_MS, Schedule
+from sim_vehicles.truth import ACTED, SAMPLED, Record
+
+ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M = -35.363262, 149.165237, 584.0
+"""Origin of the local frame of all vehicles, on the ground: where ArduPilot's simulator starts."""
+EARTH_RADIUS_M = 6_378_137.0
+
+TIMESYNC_INTERVAL_US = 10_000_000
+HEARTBEAT_INTERVAL_US = 1_000_000
+DEFAULT_INTERVAL_US = {mavlink.LOCAL_POSITION: 250_000, mavlink.GLOBAL_POSITION: 1_000_000}
+"""Sent unasked, slowly, as an autopilot does on a telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes it."""
+SHORTEST_INTERVAL_US = US_PER_MS
+LONGEST_HISTORY = 1000
+"""Changes kept if nobody reads them; a hostile sender can cause them without end."""
+ABSURD = 1e4
+"""A set-point with more m/s² or m/s than this is refused."""
+
+
+class Change(NamedTuple):
+    """Something a person watching would want to know, such as "failsafe: set-points stopped"."""
+
+    time_ns: int
+    system_id: int
+    text: str
+
+
+class Vehicle:
+    """A UAV with its autopilot, boot clock and counters.
+
+    `counters` says what came in: `heartbeats`, `commands`, `timesync_requests`, `timesync_replies`, `setpoints`, and
+    by reason what was not obeyed: `refused_...` for what is wrong with it, `ignored_...` for what is well formed but
+    not for this vehicle or not now.
+    """
+
+    def __init__(
+        self, scenario: schema.Scenario, own: schema.Vehicle, start_ns: int, *, record: Record | None = None
+    ) -> None:
+        self.system_id = own.system_id
+        self.counters: Counter[str] = Counter()
+        self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
+        """Appended to; whoever reads may clear it."""
+        self.last_heard_ns = start_ns
+        """When the last valid frame for this vehicle, or for all, arrived."""
+        self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
+        self.autopilot = Autopilot(scenario.safety)
+        self._record = record
+        self._encoder = mavlink.Encoder(own.system_id)
+        self._altitude_m = scenario.altitude_m
+        self._bounds = bounds_of(scenario.limits)
+        self._state = state_from(own.position_ne_m, own.velocity_ne_m_s)
+        self._state_ns = start_ns
+        self._command = COAST
+        self._timesync_ts1 = -1
+        self._out: list[tuple[bytes, int]] = []
+        self._answers: dict[int, Callable[[mavlink.Command, int], int]] = {
+            mavlink.COMMAND_ARM: self._arm,
+            mavlink.COMMAND_MODE: self._set_mode,
+            mavlink.COMMAND_INTERVAL: self._set_interval,
+            mavlink.COMMAND_REQUEST: self._request,
+        }
+        self._schedule = Schedule(self.clock)
+        self._schedule.add_once(mavlink.HEARTBEAT, start_ns)  # found at once, not after up to a second
+        self._schedule.set_interval(mavlink.HEARTBEAT, HEARTBEAT_INTERVAL_US, start_ns)
+        self._schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, start_ns)
+        for message_id, interval_us in DEFAULT_INTERVAL_US.items():
+            self._schedule.set_interval(message_id, interval_us, start_ns)
+
+    @property
+    def next_event_ns(self) -> int:
+        """When the vehicle next does something if nothing arrives."""
+        scheduled_ns, deadline_ns = self._schedule.next_ns, self.autopilot.deadline_ns
+        return deadline_ns if deadline_ns < scheduled_ns else scheduled_ns
+
+    def state_at(self, time_ns: int) -> State:
+        """The true state at a time not before the last event, if nothing arrives until then."""
+        if not self.autopilot.flying or time_ns <= self._state_ns:
+            return self._state
+        return advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
+
+    def step(self, datagrams: Iterable[tuple[bytes, int]], now_ns: int) -> list[tuple[bytes, int]]:
+        """Live until now: what arrives, as (datagram, instant) in order of time, to what is sent, likewise.
+
+        A datagram with an instant that is already behind acts at once. One that arrives at the very instant of
+        something scheduled comes first: a set-point on the deadline is in time.
+        """
+        self._out = []
+        for data, time_ns in datagrams:
+            self._run(time_ns)
+            self._receive(data, time_ns)
+        self._run(now_ns + 1)
+        return self._out
+
+    def _run(self, end_ns: int) -> None:
+        """Do what is scheduled before the end."""
+        schedule, autopilot = self._schedule, self.autopilot
+        while True:
+            if autopilot.deadline_ns <= schedule.next_ns:
+                if autopilot.deadline_ns >= end_ns:
+                    return
+                self._fail(autopilot.deadline_ns)
+            elif schedule.next_ns >= end_ns:
+                return
+            else:
+                self._report(*schedule.pop())
+
+    # What arrives
+
+    def _receive(self, data: bytes, time_ns: int) -> None:
+        for message in mavlink.read_datagram(data, self.counters):
+            if isinstance(message, mavlink.Setpoint):
+                if self._is_for_us(message.target_system, message.target_component):
+                    self.last_heard_ns = time_ns
+                    self._take_setpoint(message, time_ns)
+            elif isinstance(message, mavlink.Command):
+                if self._is_for_us(message.target_system, message.target_component):
+                    self.last_heard_ns = time_ns
+                    self._take_command(message, time_ns)
+            elif isinstance(message, mavlink.Timesync):
+                self._take_timesync(message, time_ns)
+            elif message.vehicle_type == mavlink.TYPE_GCS:
+                self.counters["heartbeats"] += 1
+                self.last_heard_ns = time_ns
+                self.autopilot.hear_heartbeat(max(time_ns, self._state_ns))
+            else:
+                self.counters["ignored_heartbeat"] += 1
+
+    def _is_for_us(self, target_system: int, target_component: int) -> bool:
+        if target_system == self.system_id and target_component in (0, mavlink.COMPONENT_AUTOPILOT):
+            return True
+        self.counters["ignored_not_addressed"] += 1
+        return False
+
+    def _take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
+        time_ns = max(time_ns, self._state_ns)
+        on_launcher = not self.autopilot.flying
+        reason = _setpoint_fault(setpoint) or self.autopilot.accept_setpoint(time_ns)
+        if reason:
+            self.counters[reason] += 1
+            return
+        self.counters["setpoints"] += 1
+        if on_launcher:
+            self._state_ns = time_ns  # its state is the initial one until now
+            self._tell(time_ns, "flying")
+        self._advance(time_ns)
+        north, east, _ = setpoint.acceleration_ned_m_s2
+        if setpoint.type_mask == mavlink.MASK_ACCELERATION:
+            self._command = Command(north, east)
+        else:
+            self._command = Command(north, east, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
+        if self._record is not None:
+            self._record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
+
+    def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
+        if message.target_system not in (0, self.system_id):
+            self.counters["ignored_not_addressed"] += 1
+        elif message.tc1 == 0:
+            self.counters["timesync_requests"] += 1
+            self.last_heard_ns = time_ns
+            # Not 0 even at the very boot: that would make the reply a request.
+            tc1 = max(1, self.clock.boot_ns(time_ns))
+            self._send(self._encoder.timesync(tc1, message.ts1), time_ns)
+        elif message.ts1 == self._timesync_ts1:
+            self.counters["timesync_replies"] += 1
+            self.last_heard_ns = time_ns
+        else:
+            self.counters["ignored_timesync_reply"] += 1  # to another vehicle, or a duplicate
+
+    # Commands
+
+    def _take_command(self, command: mavlink.Command, time_ns: int) -> None:
+        self.counters["commands"] += 1
+        answer = self._answers.get(command.command)
+        time_ns = max(time_ns, self._state_ns)
+        # The acknowledgement goes before what the command asks for, as request and reply are read.
+        at = len(self._out)
+        result = mavlink.UNSUPPORTED if answer is None else answer(command, time_ns)
+        self._out.insert(at, (self._encoder.command_ack(command.command, result, command.source), time_ns))
+
+    def _arm(self, command: mavlink.Command, time_ns: int) -> int:
+        if command.param1 not in (0.0, 1.0):
+            return mavlink.DENIED
+        was = self.autopilot.armed
+        result = self.autopilot.arm(command.param1 == 1.0)
+        if self.autopilot.armed != was:
+            self._tell(time_ns, "armed" if self.autopilot.armed else "disarmed")
+        return result
+
+    def _set_mode(self, command: mavlink.Command, time_ns: int) -> int:
+        base_mode, mode = _whole(command.param1), _whole(command.param2)
+        if base_mode is None or mode is None or not base_mode & mavlink.BASE_MODE_CUSTOM:
+            return mavlink.DENIED
+        before = (self.autopilot.mode, self.autopilot.failsafe)
+        result = self.autopilot.set_mode(mode, time_ns)
+        if (self.autopilot.mode, self.autopilot.failsafe) != before:
+            self._advance(time_ns)
+            self._command = COAST
+            self._tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
+        return result
+
+    def _set_interval(self, command: mavlink.Command, time_ns: int) -> int:
+        message_id, interval_us = _whole(command.param1), _whole(command.param2)
+        if message_id not in DEFAULT_INTERVAL_US or interval_us is None:
+            return mavlink.DENIED
+        if interval_us == 0:
+            interval_us = DEFAULT_INTERVAL_US[message_id]
+        elif interval_us == -1:
+            interval_us = 0
+        elif not SHORTEST_INTERVAL_US <= interval_us < 2**31:
+            return mavlink.DENIED
+        self._schedule.set_interval(message_id, interval_us, time_ns)
+        return mavlink.ACCEPTED
+
+    def _request(self, command: mavlink.Command, time_ns: int) -> int:
+        message_id = _whole(command.param1)
+        if message_id in DEFAULT_INTERVAL_US or message_id == mavlink.HEARTBEAT:
+            self._schedule.add_once(message_id, time_ns)
+        elif message_id == mavlink.AUTOPILOT_VERSION:
+            self._send(self._encoder.autopilot_version(), time_ns)
+        elif message_id == mavlink.HOME_POSITION:
+            home = (ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M)
+            self._send(self._encoder.home_position(*home), time_ns)
+        elif message_id == mavlink.MESSAGE_INTERVAL:
+            asked = _whole(command.param2)
+            if asked not in (*DEFAULT_INTERVAL_US, mavlink.HEARTBEAT):
+                return mavlink.DENIED
+            interval_us = self._schedule.interval_us(asked) or -1
+            self._send(self._encoder.message_interval(asked, interval_us), time_ns)
+        else:
+            return mavlink.DENIED
+        return mavlink.ACCEPTED
+
+    # What happens by itself
+
+    def _fail(self, time_ns: int) -> None:
+        self._advance(time_ns)
+        self._command = COAST
+        self.autopilot.fail()
+        text = f"failsafe: {self.autopilot.failsafe} stopped"
+        self._tell(time_ns, text)
+        self._send(self._encoder.statustext(mavlink.SEVERITY_CRITICAL, text), time_ns)
+
+    def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
+        boot_ms &= 0xFFFFFFFF
+        if message_id == mavlink.LOCAL_POSITION:
+            self._advance(time_ns)
+            state = self._state
+            velocity = state.velocity_ne_m_s()
+            frame = self._encoder.local_position(boot_ms, state[0], state[1], -self._altitude_m, velocity)
+            if self._record is not None:
+                self._record((SAMPLED, self.system_id, boot_ms, time_ns, time_ns, time_ns))
+        elif message_id == mavlink.GLOBAL_POSITION:
+            self._advance(time_ns)
+            frame = self._global_position(boot_ms)
+        elif message_id == mavlink.TIMESYNC:
+            self._timesync_ts1 = self.clock.boot_ns(time_ns)
+            frame = self._encoder.timesync(0, self._timesync_ts1)
+        else:
+            autopilot = self.autopilot
+            frame = self._encoder.heartbeat(autopilot.base_mode, autopilot.mode, autopilot.system_status)
+        self._send(frame, time_ns)
+
+    def _global_position(self, boot_ms: int) -> bytes:
+        """The local position on a flat earth around the origin."""
+        state = self._state
+        east_per_radian_m = EARTH_RADIUS_M * math.cos(math.radians(ORIGIN_LATITUDE_DEG))
+        return self._encoder.global_position(
+            time_boot_ms=boot_ms,
+            latitude_deg=ORIGIN_LATITUDE_DEG + math.degrees(state.north_m / EARTH_RADIUS_M),
+            longitude_deg=ORIGIN_LONGITUDE_DEG + math.degrees(state.east_m / east_per_radian_m),
+            altitude_m=ORIGIN_ALTITUDE_M + self._altitude_m,
+            relative_altitude_m=self._altitude_m,
+            velocity_ne_m_s=state.velocity_ne_m_s(),
+            heading_deg=math.degrees(state.yaw_rad) % 360.0,
+        )
+
+    def _advance(self, time_ns: int) -> None:
+        if time_ns > self._state_ns:
+            if self.autopilot.flying:
+                self._state = advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
+            self._state_ns = time_ns
+
+    def _send(self, frame: bytes, time_ns: int) -> None:
+        self._out.append((frame, time_ns))
+
+    def _tell(self, time_ns: int, text: str) -> None:
+        self.changes.append(Change(time_ns, self.system_id, text))
+
+
+def _setpoint_fault(setpoint: mavlink.Setpoint) -> str:
+    """What is wrong with a set-point, or an empty string. NaN fails every comparison, so it counts as absurd."""
+    if setpoint.frame != mavlink.FRAME_LOCAL_NED:
+        return "refused_frame"
+    if setpoint.type_mask == mavlink.MASK_VELOCITY_ACCELERATION:
+        if not math.hypot(*setpoint.velocity_ned_m_s) <= ABSURD:
+            return "refused_absurd"
+    elif setpoint.type_mask != mavlink.MASK_ACCELERATION:
+        return "refused_mask"
+    return "" if math.hypot(*setpoint.acceleration_ned_m_s2) <= ABSURD else "refused_absurd"
+
+
+def _whole(parameter: float) -> int | None:
+    """A command's parameter that has to be a whole number, or None."""
+    return int(parameter) if math.isfinite(parameter) and parameter == int(parameter) else None

@@ -1,0 +1,73 @@
+"""The truth log: what is written is read back, whatever happened to the writer."""
+
+import resource
+import signal
+from pathlib import Path
+
+import pytest
+
+from sim_vehicles.truth import ACTED, DTYPE, LINK_UP, SAMPLED, TruthLog, read_truth
+
+ROWS = [(SAMPLED, 1, 2**32 - 1, 10, 10, 10), (ACTED, 250, 0, 2**62, 5, -7), (LINK_UP, 3, 32, 30, 10, 29)]
+
+
+def write(path: Path, rows: list[tuple[int, int, int, int, int, int]]) -> None:
+    log = TruthLog(path)
+    for row in rows:
+        log.record(row)
+    log.close()
+
+
+def test_what_is_recorded_is_read_back(tmp_path: Path) -> None:
+    write(tmp_path / "truth", ROWS * 1000)
+    assert [tuple(row) for row in read_truth(tmp_path / "truth").tolist()] == ROWS * 1000
+
+
+def test_a_flushed_batch_is_in_the_file_though_the_log_is_never_closed(tmp_path: Path) -> None:
+    log = TruthLog(tmp_path / "truth")
+    log.record(ROWS[0])
+    log.flush()
+    log.record(ROWS[1])
+    assert read_truth(tmp_path / "truth").tolist() == ROWS[:1]
+    log.close()
+
+
+@pytest.mark.parametrize("cut", range(1, DTYPE.itemsize))
+def test_a_record_cut_in_two_is_left_out_and_overwritten(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "truth"
+    write(path, ROWS)
+    path.write_bytes(path.read_bytes()[:-cut])
+    assert read_truth(path).tolist() == ROWS[:2]
+    write(path, ROWS[:1])
+    assert read_truth(path).tolist() == ROWS[:2] + ROWS[:1]
+
+
+def test_a_full_disk_loses_records_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "truth"
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        log = TruthLog(path)
+        log.record(ROWS[0])
+        log.flush()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + DTYPE.itemsize + 5, limit[1]))
+        for row in ROWS:  # room for one of them and a piece of the second
+            log.record(row)
+        log.flush()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, before)
+    log.record(ROWS[2])
+    log.close()
+    assert log.lost == 2
+    assert read_truth(path).tolist() == [ROWS[0], ROWS[0], ROWS[2]]
+
+
+def test_another_file_is_neither_read_nor_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_text("something that matters to someone")
+    with pytest.raises(ValueError, match=r"notes\.txt"):
+        read_truth(path)
+    with pytest.raises(ValueError, match=r"notes\.txt"):
+        TruthLog(path)
+    assert path.read_text() == "something that matters to someone"

@@ -1,0 +1,106 @@
+"""The real-time driver on real sockets."""
+
+import select
+import socket
+import statistics
+import time  # noqa: TID251 - what is tested here is the clock
+from collections.abc import Generator
+
+import pytest
+
+from sim_vehicles.udp import Ports
+
+pytestmark = pytest.mark.realtime
+MS = 1_000_000
+
+
+@pytest.fixture
+def station() -> Generator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
+        own.bind(("127.0.0.1", 0))
+        own.settimeout(5.0)
+        yield own
+
+
+@pytest.fixture
+def ports(station: socket.socket) -> Generator[Ports]:
+    opened = Ports((1, 7), station.getsockname())
+    yield opened
+    opened.close()
+
+
+def test_each_vehicle_has_a_port_and_answers_come_back_to_it(station: socket.socket, ports: Ports) -> None:
+    ports.send([(1, b"one", 0), (7, b"seven", 0)])
+    addresses = dict((station.recvfrom(100), station.recvfrom(100)))
+    assert addresses[b"one"] != addresses[b"seven"]
+    station.sendto(b"to seven", addresses[b"seven"])
+    station.sendto(b"to one", addresses[b"one"])
+    received: set[tuple[int, bytes]] = set()
+    while len(received) < 2:
+        ports.wait(time.monotonic_ns() + 5000 * MS)
+        received |= {(system_id, data) for system_id, data, _ in ports.receive()}
+    assert received == {(1, b"to one"), (7, b"to seven")}
+    assert ports.receive() == []
+
+
+def test_datagrams_bear_the_time_of_their_arrival_not_that_of_their_reading(
+    station: socket.socket, ports: Ports
+) -> None:
+    ports.send([(1, b"x", 0)])
+    _, address = station.recvfrom(100)
+    errors_ns: list[int] = []
+    for _ in range(20):
+        before_ns = time.monotonic_ns()
+        station.sendto(b"stamped", address)
+        after_ns = time.monotonic_ns()
+        select.select([], [], [], 0.01)  # the reader is busy with something else for 10 ms
+        ((_, _, time_ns),) = ports.receive()
+        assert time_ns >= before_ns - MS // 10  # the two clocks are compared to some µs
+        errors_ns.append(time_ns - after_ns)
+    assert statistics.median(errors_ns) < MS  # a loaded host may stop us between any two lines, but not mostly
+
+
+def test_only_the_station_is_listened_to(station: socket.socket, ports: Ports) -> None:
+    ports.send([(1, b"x", 0)])
+    _, address = station.recvfrom(100)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(b"obey me", address)
+    station.sendto(b"station", address)
+    ports.wait(time.monotonic_ns() + 5000 * MS)
+    assert [data for _, data, _ in ports.receive()] == [b"station"]
+
+
+def test_it_waits_until_the_instant_and_not_less(ports: Ports) -> None:
+    late_ns: list[int] = []
+    for _ in range(20):
+        until_ns = time.monotonic_ns() + 3 * MS + MS // 10
+        ports.wait(until_ns)
+        late_ns.append(time.monotonic_ns() - until_ns)
+    assert min(late_ns) >= 0
+    # The best, because a loaded host puts off most. A time-out rounded up to whole milliseconds is never below 0.9 ms.
+    assert min(late_ns) < MS // 2
+
+
+def test_a_datagram_ends_the_wait(station: socket.socket, ports: Ports) -> None:
+    ports.send([(1, b"x", 0)])
+    _, address = station.recvfrom(100)
+    station.sendto(b"wake up", address)
+    begin_ns = time.monotonic_ns()
+    ports.wait(begin_ns + 5000 * MS)
+    assert time.monotonic_ns() - begin_ns < 4000 * MS
+    assert [data for _, data, _ in ports.receive()] == [b"wake up"]
+
+
+def test_a_dead_station_is_counted_and_a_new_one_on_its_port_is_found(station: socket.socket, ports: Ports) -> None:
+    address = station.getsockname()
+    station.close()
+    for _ in range(3):
+        ports.send([(1, b"anyone?", 0)])
+        ports.wait(time.monotonic_ns() + 5000 * MS)  # woken by the refusal
+        assert ports.receive() == []
+    assert ports.counters["send_refused"] + ports.counters["receive_refused"] >= 3
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as restarted:
+        restarted.bind(address)
+        restarted.settimeout(5.0)
+        ports.send([(1, b"again", 0)])
+        assert restarted.recvfrom(100)[0] == b"again"
