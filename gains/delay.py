@@ -1,0 +1,222 @@
+"""How much constant delay a linear loop x'(t) = A0 x(t) + A1 x(t - tau) takes: exact, without a grid.
+
+The roots of det(sI - A0 - A1 e^{-s tau}) move continuously with tau and change half plane only through the imaginary
+axis, at delays that come in arithmetic sequences (theta + 2 pi k) / omega. Starting from the unstable eigenvalues of
+A0 + A1 and counting crossings in and out gives every window of stability. Strongly connected blocks are analysed one
+by one, see `gains.structure`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.delay_crossings import AxisCrossing, axis_crossings
+from gains.delay_loci import ComplexArray
+from gains.delay_sweep import frequency_sweep_margin
+from gains.errors import BadModelError, DisagreementError
+from gains.structure import Block, FloatArray, balanced, distinct_blocks, square_matrices
+
+__all__ = ["Crossing", "DelayAnalysis", "analyse_delay", "delay_margin", "frequency_sweep_margin"]
+
+# more critical delays than this are not listed: a near-tangent pair of crossings can have millions
+_MOST_EVENTS = 200_000
+# two critical delays closer than this (relative) are one
+_SAME_DELAY = 1e-12
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Roots +-j `omega_rad_s` on the imaginary axis at the delays `delay_s` + 2 pi k / `omega_rad_s`, k = 0, 1, ...
+
+    `direction` is +1 when they go into the right half plane as the delay grows, -1 when they come out, 0 when they
+    touch the axis and return; it is the same for every k. `roots` counts the roots that cross here together: 2, times
+    the number of equal blocks.
+    """
+
+    omega_rad_s: float
+    delay_s: float
+    direction: int
+    roots: int
+
+
+@dataclass(frozen=True)
+class DelayAnalysis:
+    """Verdict on x'(t) = A0 x(t) + A1 x(t - tau) for every constant delay tau >= 0.
+
+    `stable_intervals_s` are the open windows of asymptotic stability, `inf` for an unbounded one; zero delay itself
+    belongs to a window that begins at 0 unless A0 + A1 has roots on the imaginary axis, which then leave it to the
+    left. `delay_margin_s` is the end of the window that begins at 0, or 0 when none does. `delay_independent` is true
+    when the loop is stable at every delay. `crossings` ascend by delay. `unstable_roots_at_zero_delay` counts
+    eigenvalues of A0 + A1 with positive real part. The windows are complete up to `complete_to_s`, which is `inf`
+    unless the caller gave a horizon or the critical delays were too many to list; the margin is exact all the same.
+    """
+
+    stable_intervals_s: tuple[tuple[float, float], ...]
+    delay_margin_s: float
+    delay_independent: bool
+    crossings: tuple[Crossing, ...]
+    unstable_roots_at_zero_delay: int
+    complete_to_s: float
+
+
+def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = None) -> DelayAnalysis:
+    """Stability windows, critical delays and delay margin of x'(t) = A0 x(t) + A1 x(t - tau).
+
+    A loop with a root that stays on the imaginary axis at every delay is asymptotically stable at none: no window,
+    margin 0. A singular A0 + A1 is such a loop (s = 0); if the root is the common value of a consensus and of no
+    interest, take it out first with `gains.structure.project_out_equilibria`.
+
+    Parameters
+    ----------
+    A0, A1
+        Real matrices (n, n), 1/s.
+    horizon_s
+        List windows that begin before this delay only. By default all are listed: they are finitely many.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size, or the horizon is not a positive number.
+    DisagreementError
+        Crossings and eigenvalues contradict each other (a loop at the limit of double precision).
+    """
+    blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
+    if horizon_s is not None and not horizon_s > 0.0:
+        raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
+    crossings: list[Crossing] = []
+    unstable, fixed_on_axis = 0, False
+    for block in blocks:
+        found, unstable_of_block, fixed_of_block = _analyse_block(block)
+        crossings += found
+        unstable += unstable_of_block
+        fixed_on_axis |= fixed_of_block
+    crossings.sort(key=lambda crossing: (crossing.delay_s, crossing.omega_rad_s))
+    intervals, complete_to_s = ((), inf) if fixed_on_axis else _windows(crossings, unstable, horizon_s)
+    margin_s = next((end_s for start_s, end_s in intervals if start_s == 0.0), 0.0)
+    return DelayAnalysis(
+        stable_intervals_s=intervals,
+        delay_margin_s=margin_s,
+        delay_independent=margin_s == inf,
+        crossings=tuple(crossings),
+        unstable_roots_at_zero_delay=unstable,
+        complete_to_s=complete_to_s,
+    )
+
+
+def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
+    """The least delay (s) at which x'(t) = A0 x(t) + A1 x(t - tau) loses stability.
+
+    `inf` if no delay does, 0 if the loop is unstable without delay. Exceptions as of `analyse_delay`.
+    """
+    # the first critical delay is wanted only: the shortest horizon lists the fewest windows
+    return analyse_delay(A0, A1, horizon_s=1e-300).delay_margin_s
+
+
+def _analyse_block(block: Block) -> tuple[list[Crossing], int, bool]:
+    """Crossings of one block, unstable roots of all its copies without delay, and whether a root stays on the axis."""
+    A0, A1 = balanced(*block.matrices)
+    roots = np.linalg.eigvals(A0 + A1).astype(np.complex128)
+    if _has_fixed_root(A0, A1, roots):
+        return [], block.copies * int(np.count_nonzero(roots.real > _marginal(A0, A1))), True
+    found = axis_crossings(A0, A1)
+    # a pair that crosses at zero delay is on the axis there: rounding must not put it in either half plane
+    for crossing in found:
+        if crossing.theta == 0.0:
+            for sign in (1.0, -1.0):
+                roots = np.delete(roots, np.argmin(np.abs(roots - sign * 1j * crossing.omega)))
+    unstable = int(np.count_nonzero(roots.real > 0.0))
+    return [_to_crossing(crossing, block.copies) for crossing in found], block.copies * unstable, False
+
+
+def _to_crossing(crossing: AxisCrossing, copies: int) -> Crossing:
+    return Crossing(
+        omega_rad_s=crossing.omega,
+        delay_s=crossing.theta / crossing.omega,
+        direction=crossing.direction,
+        roots=2 * copies,
+    )
+
+
+def _marginal(A0: FloatArray, A1: FloatArray) -> float:
+    """Largest distance (1/s) from the imaginary axis that rounding alone can give a simple eigenvalue."""
+    return 1e-13 * float(np.linalg.norm(A0) + np.linalg.norm(A1))
+
+
+def _has_fixed_root(A0: FloatArray, A1: FloatArray, roots: ComplexArray) -> bool:
+    """Whether some j omega is a root at every delay: at omega = 0, or of the pencil for every e^{-j theta}."""
+    n = A0.shape[0]
+    scale = float(np.linalg.norm(A0) + np.linalg.norm(A1))
+    if scale == 0.0:
+        return True
+    # a defective root at zero is known to sqrt(eps) only: the singular value decides, not the eigenvalue
+    for root in roots[np.abs(roots.real) < 1e-6 * scale]:
+        omega = abs(root.imag)
+        if omega < 1e-6 * scale:
+            if np.linalg.svd(A0 + A1, compute_uv=False)[-1] < n * 1e-15 * scale:
+                return True
+        elif all(_least_singular(A0 + z * A1, omega) < 1e-12 * scale for z in (1.0, 1j, -1.0)):
+            return True
+    return False
+
+
+def _least_singular(matrix: FloatArray | ComplexArray, omega: float) -> float:
+    return float(np.linalg.svd(1j * omega * np.eye(matrix.shape[0]) - matrix, compute_uv=False)[-1])
+
+
+def _windows(
+    crossings: Sequence[Crossing], unstable: int, horizon_s: float | None
+) -> tuple[tuple[tuple[float, float], ...], float]:
+    """Windows without unstable roots, and the delay up to which they are complete."""
+    if not crossings:
+        return (((0.0, inf),) if unstable == 0 else ()), inf
+    omega = np.array([crossing.omega_rad_s for crossing in crossings])
+    first = np.array([crossing.delay_s for crossing in crossings])
+    change = np.array([crossing.direction * crossing.roots for crossing in crossings])
+    # roots that leave the axis at zero delay to the right are unstable from there on, to the left they always were
+    at_zero = first == 0.0
+    unstable += int(change[at_zero & (change > 0)].sum())
+    first = np.where(at_zero, 2.0 * pi / omega, first)
+    wanted_s, complete_to_s = _last_delay(omega, first, change, unstable, horizon_s)
+    # a window that begins by then ends within one period of the slowest sequence
+    last_s = wanted_s + 2.0 * pi / float(omega.min())
+    times = np.floor((last_s - first) * omega / (2.0 * pi)).astype(np.int64) + 1
+    # the first delay of every sequence is listed in any case
+    times = np.maximum(times, 1)
+    source = np.repeat(np.arange(first.size), times)
+    k = np.arange(source.size) - np.repeat(np.cumsum(times) - times, times)
+    delays = first[source] + 2.0 * pi * k / omega[source]
+    order = np.lexsort((-change[source], delays))
+    delays = np.concatenate([[0.0], delays[order], [inf]])
+    count = unstable + np.concatenate([[0], np.cumsum(change[source][order])])
+    wide = np.diff(delays) > _SAME_DELAY * delays[:-1]
+    known = delays[:-1] <= wanted_s
+    if bool(np.any(count[wide & known] < 0)):
+        raise DisagreementError(
+            f"more roots leave the right half plane than are in it (crossings {tuple(crossings)}, "
+            f"{unstable} unstable roots without delay): the loop is at the limit of double precision"
+        )
+    stable = wide & known & (count == 0)
+    return tuple(zip(delays[:-1][stable].tolist(), delays[1:][stable].tolist(), strict=True)), complete_to_s
+
+
+def _last_delay(
+    omega: FloatArray, first: FloatArray, change: FloatArray, unstable: int, horizon_s: float | None
+) -> tuple[float, float]:
+    """The last delay (s) at which a window to be listed may begin, and the one up to which all are listed then.
+
+    A sequence has at least (tau - first) omega / 2 pi and at most one more member up to tau, so the count of unstable
+    roots has a lower bound that grows linearly with tau, and no window lies where that exceeds zero.
+    """
+    growth = float((change * omega).sum()) / (2.0 * pi)
+    offset = unstable - float((change * omega * first).sum()) / (2.0 * pi) + float(change[change < 0].sum())
+    end_s = inf if growth <= 0.0 else max(-offset / growth, 0.0)
+    events_per_s = float(omega.sum()) / (2.0 * pi)
+    affordable_s = _MOST_EVENTS / events_per_s
+    wanted_s = end_s if horizon_s is None else min(horizon_s, end_s)
+    complete_to_s = inf if wanted_s >= end_s else wanted_s
+    if wanted_s > affordable_s:
+        wanted_s = complete_to_s = affordable_s
+    return wanted_s, complete_to_s

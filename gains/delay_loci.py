@@ -1,0 +1,178 @@
+"""Eigenvalue loci of a delayed loop, and the frequencies at which one of them crosses the unit circle.
+
+x'(t) = A0 x(t) + A1 x(t - tau) with A1 = B C of rank r has the root s = j omega at the delay tau exactly when
+e^{j omega tau} is an eigenvalue of the r x r loop G(j omega) = C (j omega I - A0)^{-1} B. The moduli of these
+eigenvalues do not depend on tau: crossings of the imaginary axis happen at the frequencies where a modulus is one.
+Sorted moduli are continuous functions of the frequency however the eigenvalues are numbered, which makes
+bracketing safe: between two frequencies at which a different number of moduli exceeds one, there is a crossing.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.structure import FloatArray
+
+ComplexArray = NDArray[np.complex128]
+Loci = Callable[[FloatArray], ComplexArray]
+
+_EPS = float(np.finfo(np.float64).eps)
+# two crossings closer than this (relative) are one place: below the error of a double eigenvalue, sqrt(eps)
+_SAME_PLACE = 1e-10
+# log of the modulus of a locus at such a place
+_ON_CIRCLE = 1e-8
+
+
+@dataclass(frozen=True)
+class UnitCrossing:
+    """An eigenvalue `locus` of the loop (modulus one to rounding) at the frequency `omega`.
+
+    `outward` is the number by which the count of moduli above one drops as the frequency rises through `omega`: +1
+    modulus falling, -1 rising, 0 touching one and returning.
+    """
+
+    omega: float
+    locus: complex
+    outward: int
+
+
+def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """B (n, r) and C (r, n) with B C = `matrix` to rounding, r its numerical rank, and equal norms of both."""
+    U, singular, Vh = np.linalg.svd(matrix)
+    rank = int(np.count_nonzero(singular > matrix.shape[0] * _EPS * singular[0])) if singular[0] > 0.0 else 0
+    root = np.sqrt(singular[:rank])
+    return U[:, :rank] * root, root[:, np.newaxis] * Vh[:rank]
+
+
+def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray) -> Loci:
+    """The function omega (k,) -> eigenvalues (k, r) of C (j omega I - A0)^{-1} B."""
+    identity = np.eye(A0.shape[0])
+
+    def loci(omega: FloatArray) -> ComplexArray:
+        resolvent = 1j * omega[:, np.newaxis, np.newaxis] * identity - A0
+        try:
+            states = np.linalg.solve(resolvent, B.astype(np.complex128))
+        except np.linalg.LinAlgError:
+            # exactly on a pole the modulus is infinite: one step beside it is huge, which says the same
+            states = np.linalg.solve(resolvent + 1e-14j * np.abs(resolvent).max() * identity, B.astype(np.complex128))
+        loop = C @ states
+        return loop[:, :, 0] if B.shape[1] == 1 else np.linalg.eigvals(loop).astype(np.complex128)
+
+    return loci
+
+
+def log_moduli(values: ComplexArray) -> FloatArray:
+    """Natural logarithms of the moduli along the last axis, largest first; zero and infinity become large numbers."""
+    return -np.sort(-_log(values), axis=-1)
+
+
+def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
+    """All crossings of the unit circle that change the number of moduli above one between neighbouring `points`.
+
+    Parameters
+    ----------
+    loci
+        Frequencies (k,) to eigenvalues (k, r).
+    points
+        Ascending frequencies that separate the crossings of opposite direction from each other; crossings of the
+        same direction need not be separated.
+    """
+    logs = log_moduli(loci(points))
+    above = np.count_nonzero(logs > 0.0, axis=1)
+    intervals = np.flatnonzero(above[1:] != above[:-1])
+    if intervals.size == 0:
+        return []
+    lower: list[int] = []
+    rank: list[int] = []
+    for i in intervals.tolist():
+        ranks = range(min(above[i], above[i + 1]), max(above[i], above[i + 1]))
+        lower.extend([i] * len(ranks))
+        rank.extend(ranks)
+    at, nth = np.array(lower), np.array(rank)
+
+    def nth_log(omega: FloatArray) -> FloatArray:
+        return log_moduli(loci(omega))[np.arange(omega.size), nth]
+
+    omega = bracketed_roots(nth_log, points[at], points[at + 1], logs[at, nth], logs[at + 1, nth])
+    outward = np.sign(above[at] - above[at + 1])
+    return _read_loci(loci, omega, outward)
+
+
+def slope_sign(loci: Loci, omega: float, locus: complex) -> int:
+    """+1 when the modulus of this locus falls through one at omega, -1 when it rises, 0 when it does neither."""
+    # far above the accuracy of a locus, far below the distance of frequencies at which anything else happens
+    step = 1e-5 * omega
+    before, after = (_log(row[np.argmin(np.abs(row - locus))]) for row in loci(np.array([omega - step, omega + step])))
+    return 0 if before * after >= 0.0 else int(np.sign(before))
+
+
+def _read_loci(loci: Loci, omega: FloatArray, outward: NDArray[np.int_]) -> list[UnitCrossing]:
+    """Crossings at the frequencies found, loci that cross at one frequency told apart.
+
+    Loci of equal modulus at all frequencies (symmetric formations) change places in the sorted order from one
+    evaluation to the next, so all that cross at one place are read from one evaluation. Where the count goes up and
+    down at one place, by rounding or because loci cross in opposite directions, each locus is followed by itself.
+    """
+    order = np.argsort(omega, kind="stable")
+    omega, outward = omega[order], outward[order]
+    places = np.split(np.arange(omega.size), np.flatnonzero(np.diff(omega) > _SAME_PLACE * omega[1:]) + 1)
+    centres = np.array([omega[place].mean() for place in places])
+    crossings: list[UnitCrossing] = []
+    for place, centre, row in zip(places, centres.tolist(), loci(centres), strict=True):
+        from_one = np.abs(_log(row))
+        if np.unique(outward[place]).size == 1 and place.size <= row.size:
+            nearest = row[np.argsort(from_one)[: place.size]].tolist()
+            crossings += [UnitCrossing(centre, locus, int(outward[place[0]])) for locus in nearest]
+        else:
+            on_circle = row[from_one < _ON_CIRCLE].tolist()
+            crossings += [UnitCrossing(centre, locus, slope_sign(loci, centre, locus)) for locus in on_circle]
+    return crossings
+
+
+def _log(values: ComplexArray) -> FloatArray:
+    """Natural logarithms of the moduli, zero and infinity as large numbers."""
+    return np.log(np.clip(np.abs(values), 1e-300, 1e300))
+
+
+def bracketed_roots(
+    function: Callable[[FloatArray], FloatArray], a: FloatArray, b: FloatArray, fa: FloatArray, fb: FloatArray
+) -> FloatArray:
+    """Roots of many scalar functions at once, each within its bracket [a, b], to rounding.
+
+    Chandrupatla's method: inverse quadratic interpolation where it is safe, bisection elsewhere. `function` takes all
+    abscissae (k,) and returns all values (k,); `fa` and `fb` differ in sign.
+    """
+    a, b, fa, fb = a.copy(), b.copy(), fa.copy(), fb.copy()
+    c, fc = a.copy(), fa.copy()
+    fraction = np.full(a.size, 0.5)
+    # 100 halvings exhaust any bracket of doubles; interpolation needs about 6
+    for _ in range(100):
+        x = a + fraction * (b - a)
+        fx = function(x)
+        same = np.sign(fx) == np.sign(fa)
+        c, fc = np.where(same, a, b), np.where(same, fa, fb)
+        b, fb = np.where(same, b, a), np.where(same, fb, fa)
+        a, fa = x, fx
+        best = np.where(np.abs(fa) < np.abs(fb), a, b)
+        width = np.abs(b - a)
+        tolerance = 2.0 * _EPS * np.abs(best)
+        if bool(np.all((width <= 2.0 * tolerance) | (fa == 0.0))):
+            break
+        fraction = _next_fraction(a, b, c, fa, fb, fc)
+        least = np.minimum(tolerance / np.maximum(width, tolerance), 0.5)
+        fraction = np.clip(fraction, least, 1.0 - least)
+        fraction = np.where(fa == 0.0, 0.0, fraction)
+    return np.where(np.abs(fa) <= np.abs(fb), a, b)
+
+
+def _next_fraction(
+    a: FloatArray, b: FloatArray, c: FloatArray, fa: FloatArray, fb: FloatArray, fc: FloatArray
+) -> FloatArray:
+    """Chandrupatla's choice of the next abscissa, as a fraction of the way from a to b."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+        interpolate = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
+        quadratic = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+        return np.where(interpolate & np.isfinite(quadratic), quadratic, 0.5)

@@ -1,0 +1,82 @@
+"""The thesis's frequency sweep: a second opinion on the delay margin that shares no algebra with the first.
+
+P. R. Sahoo, "Decentralized Control Design Approaches for Formation Control of Unmanned Aerial Vehicles", M.Tech
+thesis, NIT Rourkela, 2012, Theorem 2: with A0 + A1 Hurwitz, the margin is the least theta / omega over all omega > 0
+with a generalised eigenvalue lambda(j omega I - A0, A1) = e^{-j theta}. Here the generalised eigenvalues are computed
+as the reciprocals of the eigenvalues of (j omega I - A0)^{-1} A1.
+"""
+
+from math import inf, pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.delay_loci import Loci, delay_loci, log_moduli, unit_crossings
+from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
+
+# points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
+_POINTS_PER_DECADE = 60
+_DECADES = 9
+# a modulus peak is searched when its sampled height is this close to one (log): sampled peaks are flat by far less
+_NEAR_UNIT = 1.0
+_GOLDEN = (3.0 - 5.0**0.5) / 2.0
+
+
+def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
+    """Delay margin (s) of x'(t) = A0 x(t) + A1 x(t - tau) by a frequency sweep, refined where a modulus is near one.
+
+    0 when A0 + A1 is not Hurwitz, `inf` when no modulus reaches one. The sweep is dense near the natural frequencies
+    of A0 and of A0 + A1, and every local extremum of every sorted modulus near one is located, so that two crossings
+    between neighbouring grid points are seen. It is a search, not a proof.
+    """
+    blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
+    return min(_block_margin(*balanced(*block.matrices)) for block in blocks)
+
+
+def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
+    """Ascending frequencies (rad/s) up to the bound of every crossing frequency, dense around resonances."""
+    highest = 1.1 * float(np.linalg.norm(A0 - A0.T) / 2.0 + np.linalg.norm(A1))
+    grid = [highest * np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE)]
+    roots = np.concatenate([np.linalg.eigvals(A0), np.linalg.eigvals(A0 + A1)])
+    offsets = np.sinh(np.linspace(-5.0, 5.0, 41))
+    for root in roots[roots.imag > 0.0]:
+        width = max(abs(root.real), 1e-6 * abs(root.imag))
+        grid.append(root.imag + width * offsets)
+    # away from the pole itself, where the resolvent does not exist
+    omega = np.unique(np.concatenate(grid)) * (1.0 + 1e-9)
+    return omega[(omega > 0.0) & (omega <= highest)]
+
+
+def _block_margin(A0: FloatArray, A1: FloatArray) -> float:
+    if float(np.max(np.linalg.eigvals(A0 + A1).real)) >= 0.0:
+        return 0.0
+    if not A1.any():
+        return inf
+    loci = delay_loci(A0, A1, np.eye(A0.shape[0]))
+    omega = sweep_frequencies(A0, A1)
+    omega = np.union1d(omega, near_unit_extrema(loci, omega))
+    # e^{j theta} is the locus, so the delay is its angle in [0, 2 pi) over the frequency; an angle a rounding error
+    # below zero would belong to a root on the axis at zero delay, which A0 + A1 Hurwitz excludes
+    crossings = unit_crossings(loci, omega)
+    return min((float(np.angle(c.locus)) % (2.0 * pi) / c.omega for c in crossings), default=inf)
+
+
+def near_unit_extrema(loci: Loci, omega: FloatArray) -> FloatArray:
+    """Frequencies of local extrema of the sorted log moduli that may reach zero between grid points."""
+    logs = log_moduli(loci(omega))
+    inner, left, right = logs[1:-1], logs[:-2], logs[2:]
+    peak = (inner >= left) & (inner >= right) & (inner <= 0.0)
+    valley = (inner <= left) & (inner <= right) & (inner >= 0.0)
+    row, rank = np.nonzero((peak | valley) & (np.abs(inner) < _NEAR_UNIT))
+    if row.size == 0:
+        return np.empty(0)
+    sign = np.where(peak[row, rank], 1.0, -1.0)
+    a, b = omega[row], omega[row + 2]
+    # golden section, all extrema at once; 45 steps shrink a bracket to 1e-9, the accuracy of an extremum
+    for _ in range(45):
+        c, d = a + _GOLDEN * (b - a), b - _GOLDEN * (b - a)
+        at_c = log_moduli(loci(c))[np.arange(c.size), rank]
+        at_d = log_moduli(loci(d))[np.arange(d.size), rank]
+        to_left = sign * at_c > sign * at_d
+        a, b = np.where(to_left, a, c), np.where(to_left, d, b)
+    return (a + b) / 2.0
