@@ -20,7 +20,7 @@ LOCK = ROOT / "requirements.lock"
 JOBS: dict[str, tuple[str, list[str]]] = {
     "setup": ("make .venv with everything in requirements.lock", ["python --version"]),
     "fly": ("fly scenarios/triangle5.toml", ["gcs fly scenarios/triangle5.toml"]),
-    "test": ("run the tests", ["python -m pytest"]),
+    "test": ("run the tests", ["python -m pytest -n auto"]),
     "lint": (
         "check format, style, types and import contracts",
         ["ruff format --check .", "ruff check .", "pyright", "lint-imports"],
