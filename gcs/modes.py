@@ -1,11 +1,6 @@
-"""Who may fly and what state a flight is in: pure functions, tested as tables."""
+"""The phases of a flight, as a pure function. What the station thinks of each vehicle is in `gcs.monitor`."""
 
 from enum import StrEnum
-
-from gcs.record import Mode
-
-CAUTION_HEADROOM = 0.25
-"""Below this headroom a vehicle is in CAUTION."""
 
 
 class Phase(StrEnum):
@@ -15,34 +10,6 @@ class Phase(StrEnum):
     FLYING = "flying"
     ENDING = "ending"  # no more set-points; until every vehicle is seen to hold its velocity
     ENDED = "ended"
-
-
-def vehicle_mode(*, silent: bool, guided: bool, failsafe: bool, flying: bool, headroom: float) -> Mode:
-    """What the station thinks of one vehicle.
-
-    ======  ======  ======  ========  ==============  ========
-    flying  silent  guided  failsafe  headroom        mode
-    ======  ======  ======  ========  ==============  ========
-    no      any     any     no        any             WAITING
-    no      any     any     yes       any             FAILSAFE
-    yes     yes     any     any       any             LOST
-    yes     no      no      any       any             FAILSAFE
-    yes     no      yes     any       < 0             CRITICAL
-    yes     no      yes     any       0 to 0.25       CAUTION
-    yes     no      yes     any       more, unknown   NOMINAL
-    ======  ======  ======  ========  ==============  ========
-    """
-    if not flying:
-        return Mode.FAILSAFE if failsafe else Mode.WAITING
-    if silent:
-        return Mode.LOST
-    if not guided:
-        return Mode.FAILSAFE
-    if headroom < 0:
-        return Mode.CRITICAL
-    if headroom < CAUTION_HEADROOM:
-        return Mode.CAUTION
-    return Mode.NOMINAL
 
 
 def next_phase(phase: Phase, *, all_ready: bool, stop: bool, all_holding: bool, waited_s: float) -> Phase:

@@ -21,13 +21,33 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
     formation = plan_formation(scenario)
     model = FormationModel(tuple(formation.predecessor.tolist()))
     found = _design(scenario, model)
+    schedule = _schedule(scenario, model, found)
     plan = FlightPlan(
         scenario=scenario,
         formation=formation,
         gain=model.overlapping_gain(found.K1, found.K2, found.K3),
         delay_margin_s=found.delay_margin_s,
+        slower=tuple((model.overlapping_gain(s.K1, s.K2, s.K3), s.delay_margin_s) for _, s in schedule),
     )
-    return found.to_dict(), plan
+    return found.to_dict() | {"schedule": [_entry(1.0, found), *(_entry(*slower) for slower in schedule)]}, plan
+
+
+def _schedule(scenario: Scenario, model: FormationModel, found: Design) -> list[tuple[float, Design]]:
+    """The design slowed down by the scenario's factors.
+
+    With K1 / s, K2 / s and K3 / s² the loop does the same things s times slower, so its delay margin is s times larger.
+    """
+    period_s = 1.0 / scenario.rates.control_hz
+    return [
+        (s, evaluate_gains(model, found.K1 / s, found.K2 / s, found.K3 / s**2, period_s=period_s))
+        for s in scenario.monitor.time_scales[1:]
+    ]
+
+
+def _entry(time_scale: float, design: Design) -> dict[str, Any]:
+    names = ("K1_1_s", "K2_1_s", "K3_1_s2", "alpha", "delay_margin_s", "delay_margin_continuous_s")
+    whole = design.to_dict()
+    return {"time_scale": time_scale} | {name: whole[name] for name in names}
 
 
 def _design(scenario: Scenario, model: FormationModel) -> Design:

@@ -41,6 +41,7 @@ class Mode(IntEnum):
     CRITICAL = 3  # flying, loop delay above the margin
     FAILSAFE = 4  # heard, but it does not take set-points: it holds its velocity
     LOST = 5  # not heard
+    RECOVERING = 6  # flying, its gains on the way back to faster ones
 
 
 TICK = np.dtype(
@@ -52,6 +53,7 @@ TICK = np.dtype(
         ("key_ms", "<u4"),  # time_boot_ms of its set-points: joins this log with the vehicles' own
         ("system_id", "u1"),
         ("mode", "u1"),  # Mode
+        ("gain_set", "u1"),  # place in the gain schedule, 0 the fastest
         ("commanded", "?"),  # a set-point was sent to this vehicle
         ("sample_boot_ms", "<u4"),  # time_boot_ms of the newest state used
         ("sample_ns", "<i8"),  # the same instant on the station's clock, as estimated
@@ -68,6 +70,7 @@ TICK = np.dtype(
         ("velocity_error_east_m_s", "<f8"),
         ("command_north_m_s2", "<f8"),  # set-point, acceleration; NaN when none was sent
         ("command_east_m_s2", "<f8"),
+        ("nearest_m", "<f8"),  # distance to the nearest other vehicle, at the tick's instant; NaN while unknown
         ("queue_s", "<f8"),  # from the kernel's receive stamp of the newest state to its use by a step
         ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
         ("loop_delay_s", "<f8"),  # telemetry_age_s + down_delay_s

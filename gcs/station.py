@@ -10,14 +10,23 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs import mavlink
-from gcs.control import LARGEST_COMMAND_M_S2, Formation, FormationControl, feedback_law, formation_control
-from gcs.modes import Phase, next_phase, vehicle_mode
-from gcs.record import TICK, Mode, TickArray
+from gcs.control import (
+    LARGEST_COMMAND_M_S2,
+    Formation,
+    FormationControl,
+    blended_gain,
+    feedback_law,
+    formation_control,
+    nearest_vehicle,
+)
+from gcs.modes import Phase, next_phase
+from gcs.monitor import FleetView, FormationMonitor
+from gcs.record import TICK, TickArray
+from gcs.rows import write_control, write_links
 from gcs.telemetry import FloatArray, StateHistory
-from gcs.vehicle import HOLD, Address, RemoteVehicle
+from gcs.vehicle import GUIDED, HOLD, Address, RemoteVehicle
 from scenarios.schema import NS_PER_S, Scenario
 
 CONNECT_PATIENCE_S = 20.0
@@ -55,6 +64,20 @@ class FlightPlan:
     gain: FloatArray
     """K of u = K e, rows and columns in the order of `gains.formation.FormationModel`."""
     delay_margin_s: float
+    slower: tuple[tuple[FloatArray, float], ...] = ()
+    """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
+    separable: bool = True
+    """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
+
+    @property
+    def gains(self) -> tuple[FloatArray, ...]:
+        """The gain schedule, fastest first."""
+        return (self.gain, *(gain for gain, _ in self.slower))
+
+    @property
+    def margins_s(self) -> tuple[float, ...]:
+        """The delay margins of the gain schedule."""
+        return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
 
 
 def plan_formation(scenario: Scenario) -> Formation:
@@ -87,8 +110,15 @@ class Station:
         n = len(self.vehicles)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
         self._history = StateHistory(n)
-        self._law = feedback_law(plan.formation, plan.gain, np.zeros(n, dtype=bool))
+        self._law = feedback_law(plan.formation, plan.gains, np.zeros(n, dtype=bool))
         self._period_ns = round(NS_PER_S / rates.control_hz)
+        self._monitor = FormationMonitor(
+            n,
+            plan.margins_s,
+            plan.scenario.monitor,
+            separable=plan.separable,
+            period_s=self._period_ns / NS_PER_S,
+        )
         self._timesync_ns = round(NS_PER_S / rates.timesync_hz)
         self._start_ns = start_ns
         self._phase_since_ns = start_ns
@@ -148,7 +178,7 @@ class Station:
         rows["sent_ns"] = sent_ns
         rows["telemetry_age_s"] = np.where(rows["sample_ns"] > 0, (sent_ns - rows["sample_ns"]) * 1e-9, np.nan)
         rows["loop_delay_s"] = rows["telemetry_age_s"] + rows["down_delay_s"]
-        rows["headroom"] = 1.0 - rows["loop_delay_s"] / self.plan.delay_margin_s
+        rows["headroom"] = 1.0 - rows["loop_delay_s"] / np.array(self.plan.margins_s)[rows["gain_set"]]
 
     def scenario_time_s(self, now_ns: int) -> float:
         """Time since the formation flight began; before that, time since the start minus the patience, below 0."""
@@ -243,17 +273,20 @@ class Station:
         self._decide(due_ns)
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
+        flown, former, share = self._monitor.sets_and_blends(time_s)
         limit = self.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2
         control = formation_control(
             self._history,
             self._law,
+            blended_gain(self._law, flown, former, share),
             nominal_velocity_m_s=self.plan.scenario.nominal_velocity_at(time_s),
             limit_m_s2=limit,
+            opening=self._monitor.opening,
         )
-        if flying:
-            self._watch_spacing(control)
+        self._watch(control, due_ns, flying=flying)
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
-        commanded = flying & ~self._lost & np.isfinite(control.command_m_s2).all(axis=1)
+        released = np.array([state.released for state in self._monitor.states])
+        commanded = flying & ~self._lost & ~released & np.isfinite(control.command_m_s2).all(axis=1)
         for row in np.flatnonzero(commanded).tolist():
             north, east = control.command_m_s2[row].tolist()
             fields = mavlink.acceleration_set_point(
@@ -264,7 +297,14 @@ class Station:
             frame = vehicle.converse(self._now_ns)
             if frame is not None and vehicle.address is not None:
                 outgoing.append(Outgoing(frame, vehicle.address))
-        rows = self._record(control, commanded, due_ns=due_ns, time_s=time_s, key_ms=key_ms)
+        rows = self._rows
+        rows["tick"], rows["time_s"], rows["due_ns"], rows["key_ms"] = self._tick_count, time_s, due_ns, key_ms
+        write_control(rows, control, commanded)
+        write_links(rows, self.vehicles)
+        rows["mode"] = [state.mode for state in self._monitor.states]
+        rows["gain_set"] = [state.gain_set for state in self._monitor.states]
+        rows["sample_boot_ms"], rows["queue_s"], rows["rtt_s"] = self._boot_ms, self._queue_s, self._fresh_rtt_s
+        self._fresh_rtt_s = [np.nan] * len(self.vehicles)
         self._tick_count += 1 + behind
         return rows
 
@@ -279,19 +319,24 @@ class Station:
                 text = "is lost" if lost[row] else "is heard again"
                 self._report("vehicle", text, self.vehicles[row].system_id)
             self._lost = lost
-            self._law = feedback_law(self.plan.formation, self.plan.gain, lost)
-        for row, vehicle in enumerate(self.vehicles):
-            before = Mode(int(self._rows["mode"][row]))
-            mode = vehicle_mode(
-                silent=silent[row],
-                guided=vehicle.guided,
-                failsafe=vehicle.critical,
-                flying=flying,
-                headroom=float(self._rows["headroom"][row]),
-            )
-            if mode is not before:
-                self._rows["mode"][row] = mode
-                self._report("mode", f"{before.name} -> {mode.name}", vehicle.system_id)
+            self._law = feedback_law(self.plan.formation, self.plan.gains, lost)
+        view = FleetView(
+            time_s=self.scenario_time_s(due_ns),
+            flying=flying,
+            silent=silent,
+            guided=[vehicle.guided for vehicle in self.vehicles],
+            failsafe=[vehicle.critical for vehicle in self.vehicles],
+            loop_delay_s=self._rows["loop_delay_s"],
+        )
+        for row, before, after in self._monitor.update(view):
+            vehicle = self.vehicles[row]
+            if flying:
+                vehicle.wanted_mode = None if after.released else GUIDED
+            if after.mode is not before.mode:
+                self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
+            if after.gain_set != before.gain_set and flying:
+                margin_s = self.plan.margins_s[after.gain_set]
+                self._report("gains", f"gain set {after.gain_set}, delay margin {margin_s:.3f} s", vehicle.system_id)
         self._next_phase(due_ns)
 
     def _next_phase(self, due_ns: int) -> None:
@@ -325,50 +370,25 @@ class Station:
                 vehicle.wanted_mode = None if self._stop.startswith("broken") else HOLD
         self._report("phase", str(phase))
 
-    def _watch_spacing(self, control: FormationControl) -> None:
-        """Ask for the end when a spacing error passes the scenario's limit."""
-        limit_m = self.plan.scenario.safety.spacing_error_limit_m
+    def _watch(self, control: FormationControl, due_ns: int, *, flying: bool) -> None:
+        """Note who is nearest to whom; in flight, end it on a collision or a spacing error past the limit."""
+        safety = self.plan.scenario.safety
+        nearest_m, other = nearest_vehicle(control, due_ns)
+        self._rows["nearest_m"] = nearest_m
+        if not flying:
+            return
+        closest = int(np.where(np.isfinite(nearest_m), nearest_m, np.inf).argmin())
+        if nearest_m[closest] < safety.collision_distance_m:
+            one, two = (self.vehicles[row].system_id for row in (closest, int(other[closest])))
+            self.request_stop(f"broken: vehicles {one} and {two} have collided, {nearest_m[closest]:.1f} m apart")
         error_m = np.hypot(control.spacing_error_m[:, 0], control.spacing_error_m[:, 1])
         error_m[self._lost | ~np.isfinite(error_m)] = 0.0
         worst = int(error_m.argmax())
-        if error_m[worst] > limit_m:
-            system_id = self.vehicles[worst].system_id
+        if error_m[worst] > safety.spacing_error_limit_m:
+            error, limit = f"{error_m[worst]:.0f} m", f"{safety.spacing_error_limit_m:g} m"
             self.request_stop(
-                f"broken: spacing error of vehicle {system_id} is {error_m[worst]:.0f} m, limit {limit_m:g} m"
+                f"broken: spacing error of vehicle {self.vehicles[worst].system_id} is {error}, limit {limit}"
             )
-
-    def _record(
-        self,
-        control: FormationControl,
-        commanded: NDArray[np.bool_],
-        *,
-        due_ns: int,
-        time_s: float,
-        key_ms: int,
-    ) -> TickArray:
-        rows = self._rows
-        rows["tick"], rows["time_s"], rows["due_ns"], rows["key_ms"] = self._tick_count, time_s, due_ns, key_ms
-        rows["commanded"] = commanded
-        rows["sample_boot_ms"] = self._boot_ms
-        rows["sample_ns"] = np.maximum(control.sample_ns, 0)
-        rows["north_m"], rows["east_m"] = control.position_m.T
-        rows["velocity_north_m_s"], rows["velocity_east_m_s"] = control.velocity_m_s.T
-        rows["spacing_error_north_m"], rows["spacing_error_east_m"] = control.spacing_error_m.T
-        rows["velocity_error_north_m_s"], rows["velocity_error_east_m_s"] = control.velocity_error_m_s.T
-        command = np.where(commanded[:, None], control.command_m_s2, np.nan)
-        rows["command_north_m_s2"], rows["command_east_m_s2"] = command.T
-        rows["queue_s"] = self._queue_s
-        rows["rtt_s"] = self._fresh_rtt_s
-        self._fresh_rtt_s = [np.nan] * len(self.vehicles)
-        clocks = [vehicle.clock for vehicle in self.vehicles]
-        rows["down_delay_s"] = [np.nan if c.down_ns is None else c.down_ns * 1e-9 for c in clocks]
-        known = [c.estimate if c.estimate.samples else None for c in clocks]
-        rows["clock_offset_s"] = [np.nan if e is None else e.offset_ns * 1e-9 for e in known]
-        rows["clock_offset_bound_s"] = [np.nan if e is None else e.bound_ns * 1e-9 for e in known]
-        frames = [vehicle.frames for vehicle in self.vehicles]
-        for name in ("received", "lost", "late", "duplicate"):
-            rows[name] = [getattr(counter, name) for counter in frames]
-        return rows
 
     # -- small things ----------------------------------------------------------------------------------------------
 

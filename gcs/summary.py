@@ -110,6 +110,7 @@ def summarise(
         "loop_delay_s": _spread(loop_delay),
         "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
         "settling_time_s": settled,
+        "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,
         "duration_s": _number(flown["time_s"].max()) if flown.size else 0.0,
         "vehicles": [_vehicle(ticks, flown, v.system_id, errors.get(v.system_id)) for v in scenario.vehicles],
         "control": _control(scenario, flown),

@@ -3,7 +3,9 @@
 ScenarioError(Exception)    the one error: file, key, what was read, what was wanted, in one line
 """
 
+import csv
 import difflib
+import itertools
 import math
 import tomllib
 from collections.abc import Iterator
@@ -13,7 +15,11 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from scenarios.schema import Scenario
+from scenarios.schema import Jitter, Link, Links, Outage, Scenario
+
+TRACE_DELAYS = 100_000
+"""Most delays of a trace."""
+TRACE_COLUMN = "delay_s"
 
 
 class ScenarioError(Exception):
@@ -53,7 +59,7 @@ def parse(text: str, file: Path) -> Scenario:
         raise _first_error(errors, data, file) from None
     for key, read, wanted in _contradictions(scenario):
         raise ScenarioError(file, key, read, wanted)
-    return scenario
+    return _with_traces(scenario, file)
 
 
 def dump(scenario: Scenario) -> str:
@@ -121,19 +127,24 @@ def _contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
     """What no single key can show: (key, what was read, what was wanted)."""
     yield from _formation_contradictions(scenario)
     yield from _velocity_contradictions(scenario)
-    system_ids = [v.system_id for v in scenario.vehicles]
-    own = [link.system_id for link in scenario.links.vehicles]
-    for k, system_id in enumerate(own):
-        if system_id not in system_ids:
-            yield f"links.vehicles[{k}].system_id", system_id, "the system_id of a vehicle of this scenario"
-        if system_id in own[:k]:
-            yield f"links.vehicles[{k}].system_id", system_id, "one entry for each vehicle"
+    yield from _links_contradictions(scenario)
     control = scenario.control
     if control.gains is not None and (control.alpha is not None or control.delay_margin_s is not None):
         yield "control.gains", control.gains.model_dump(), "either gains or a requirement (alpha, delay_margin_s)"
+    yield from _monitor_contradictions(scenario)
     limits = scenario.limits
     if limits.speed_max_m_s is not None and limits.speed_max_m_s <= limits.speed_min_m_s:
         yield "limits.speed_max_m_s", limits.speed_max_m_s, f"more than speed_min_m_s = {limits.speed_min_m_s:g}"
+
+
+def _monitor_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+    monitor = scenario.monitor
+    if monitor.critical_headroom >= monitor.caution_headroom:
+        wanted = f"less than caution_headroom = {monitor.caution_headroom:g}"
+        yield "monitor.critical_headroom", monitor.critical_headroom, wanted
+    scales = monitor.time_scales
+    if scales[0] != 1 or any(slow <= fast for fast, slow in itertools.pairwise(scales)):
+        yield "monitor.time_scales", list(scales), "1 first, then increasing factors"
 
 
 def _formation_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
@@ -171,3 +182,119 @@ def _velocity_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, 
     for k, vehicle in enumerate(scenario.vehicles):
         if not lowest <= math.hypot(*vehicle.velocity_ne_m_s) <= highest:
             yield f"vehicles[{k}].velocity_ne_m_s", vehicle.velocity_ne_m_s, wanted_speed
+
+
+def _links_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+    links = scenario.links
+    system_ids = [v.system_id for v in scenario.vehicles]
+    own = [link.system_id for link in links.vehicles]
+    for k, system_id in enumerate(own):
+        if system_id not in system_ids:
+            yield f"links.vehicles[{k}].system_id", system_id, "the system_id of a vehicle of this scenario"
+        if system_id in own[:k]:
+            yield f"links.vehicles[{k}].system_id", system_id, "one entry for each vehicle"
+    names = [channel.name for channel in links.channels]
+    for k, channel in enumerate(links.channels):
+        if channel.name in names[:k]:
+            yield f"links.channels[{k}].name", channel.name, "another name for each channel"
+        if (channel.queue_bytes is None) == (channel.queue_datagrams is None):
+            read = "neither" if channel.queue_bytes is None else "both"
+            yield f"links.channels[{k}]", read, "either queue_bytes or queue_datagrams"
+    for key, link in _places(links):
+        if link.channel is not None and link.channel not in names:
+            yield f"{key}.channel", link.channel, f"the name of one of links.channels: {', '.join(names) or 'none'}"
+        yield from _link_contradictions(key, link)
+
+
+def _places(links: Links) -> Iterator[tuple[str, Link]]:
+    """Each link of the file with its key."""
+    yield "links.up", links.up
+    yield "links.down", links.down
+    for k, own in enumerate(links.vehicles):
+        if own.up is not None:
+            yield f"links.vehicles[{k}].up", own.up
+        if own.down is not None:
+            yield f"links.vehicles[{k}].down", own.down
+
+
+def _link_contradictions(key: str, link: Link) -> Iterator[tuple[str, object, str]]:
+    times_s = [point.at_s for point in link.delay_points]
+    if times_s and link.delay_s:
+        yield f"{key}.delay_s", link.delay_s, "either delay_s or delay_points"
+    for k, time_s in enumerate(times_s):
+        if k and time_s < times_s[k - 1]:
+            yield f"{key}.delay_points[{k}].at_s", time_s, "times that do not go back"
+        if times_s[max(k - 2, 0) : k] == [time_s, time_s]:
+            yield f"{key}.delay_points[{k}].at_s", time_s, "two points at one time, a step, and no more"
+    if link.loss_bursts is not None and link.loss_probability:
+        yield f"{key}.loss_probability", link.loss_probability, "either loss_probability or loss_bursts"
+    last = Outage(from_s=0.0, until_s=1e-9)
+    for k, outage in enumerate(link.outages):
+        if outage.until_s <= outage.from_s:
+            yield f"{key}.outages[{k}].until_s", outage.until_s, f"more than from_s = {outage.from_s:g}"
+        if k and outage.from_s < last.until_s:
+            yield f"{key}.outages[{k}].from_s", outage.from_s, f"at least until_s = {last.until_s:g} of the one before"
+        last = outage
+    if link.jitter is not None:
+        yield from _jitter_contradictions(f"{key}.jitter", link.jitter)
+
+
+def _jitter_contradictions(key: str, jitter: Jitter) -> Iterator[tuple[str, object, str]]:
+    given = [name for name in ("scale_s", "shape", "trace_file", "trace_s") if getattr(jitter, name) is not None]
+    if jitter.distribution == "trace":
+        if len(given) != 1 or given[0] not in ("trace_file", "trace_s"):
+            yield key, ", ".join(given) or "neither", "either trace_file or trace_s with distribution trace"
+        if jitter.trace_s is not None and not 1 <= len(jitter.trace_s) <= TRACE_DELAYS:
+            yield f"{key}.trace_s", f"{len(jitter.trace_s)} delays", f"1 to {TRACE_DELAYS}"
+    else:
+        wanted = ["scale_s", "shape"] if jitter.distribution == "gamma" else ["scale_s"]
+        if given != wanted:
+            read, text = ", ".join(given) or "nothing", " and ".join(wanted)
+            yield key, read, f"{text} and nothing else with distribution {jitter.distribution}"
+
+
+def _with_traces(scenario: Scenario, file: Path) -> Scenario:
+    """The scenario with the delays themselves in place of the names of trace files: it stays whole when it is moved."""
+
+    def read(key: str, link: Link | None) -> Link | None:
+        if link is None or link.jitter is None or link.jitter.trace_file is None:
+            return link
+        trace_s = _read_trace(file.parent / link.jitter.trace_file, file, f"{key}.jitter.trace_file")
+        jitter = link.jitter.model_copy(update={"trace_file": None, "trace_s": trace_s})
+        return link.model_copy(update={"jitter": jitter})
+
+    links = scenario.links
+    own = tuple(
+        v.model_copy(
+            update={"up": read(f"links.vehicles[{k}].up", v.up), "down": read(f"links.vehicles[{k}].down", v.down)}
+        )
+        for k, v in enumerate(links.vehicles)
+    )
+    whole = {"up": read("links.up", links.up), "down": read("links.down", links.down), "vehicles": own}
+    return scenario.model_copy(update={"links": links.model_copy(update=whole)})
+
+
+def _read_trace(path: Path, file: Path, key: str) -> tuple[float, ...]:
+    """The delays of a trace file, in s."""
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ScenarioError(file, key, str(error), "a readable file with a delay in s on each line, or CSV") from None
+    column, first = 0, 0
+    if rows and TRACE_COLUMN in (cells := [cell.strip() for cell in rows[0]]):
+        column, first = cells.index(TRACE_COLUMN), 1
+    delays: list[float] = []
+    for number, row in enumerate(rows[first:], first + 1):
+        if not row:
+            continue
+        try:
+            delay_s = float(row[column]) if first or len(row) == 1 else math.nan
+        except (ValueError, IndexError):
+            delay_s = math.nan
+        if not 0 <= delay_s < math.inf:
+            wanted = f"a delay of 0 s or more on each line, or CSV with a column {TRACE_COLUMN}"
+            raise ScenarioError(file, key, f"{path.name} line {number}: {','.join(row)}", wanted)
+        delays.append(delay_s)
+    if not 1 <= len(delays) <= TRACE_DELAYS:
+        raise ScenarioError(file, key, f"{path.name}: {len(delays)} delays", f"1 to {TRACE_DELAYS}")
+    return tuple(delays)

@@ -13,6 +13,7 @@ SystemId = Annotated[int, Field(ge=1, le=250)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Rate = Annotated[float, Field(ge=1, le=500)]
+Probability = Annotated[float, Field(ge=0, le=1)]
 NS_PER_S = 1_000_000_000
 
 
@@ -84,10 +85,75 @@ class Control(Part):
     gains: FixedGains | None = None
 
 
+class Jitter(Part):
+    """What is added to the delay of each datagram anew. Delay and jitter together are cut off at 0 from below.
+
+    uniform      from -scale_s to +scale_s: mean 0, standard deviation scale_s / sqrt(3)
+    normal       mean 0, standard deviation scale_s
+    exponential  from 0 on: mean and standard deviation scale_s
+    gamma        from 0 on: mean shape * scale_s, standard deviation sqrt(shape) * scale_s
+    trace        measured delays, one datagram after the other from a place drawn for each link, then from the first
+    """
+
+    distribution: Literal["uniform", "normal", "exponential", "gamma", "trace"]
+    scale_s: Positive | None = None
+    shape: Positive | None = None
+    trace_file: str | None = None
+    """Relative to the scenario file: a delay in s on each line, or CSV with a column delay_s. Read with the scenario,
+    which then holds the delays themselves in trace_s."""
+    trace_s: tuple[NotNegative, ...] | None = None
+
+
+class LossBursts(Part):
+    """Gilbert-Elliott loss: a link is good, as at first, or bad; it may change with every datagram that enters.
+
+    The part of all datagrams that find it bad is p / (p + r); a bad time lasts 1 / r datagrams in the mean.
+    """
+
+    to_bad_probability: Probability
+    """p, of a good link to be bad for the next datagram."""
+    to_good_probability: Annotated[float, Field(gt=0, le=1)]
+    """r, of a bad link to be good for the next datagram."""
+    loss_good_probability: Probability = 0.0
+    loss_bad_probability: Probability = 1.0
+
+
+class DelayPoint(Part):
+    """The constant part of a link's delay at one time. Linear in between; two points at one time are a step."""
+
+    at_s: NotNegative
+    delay_s: NotNegative
+
+
+class Outage(Part):
+    """From `from_s` on, and before `until_s`, whatever enters the link is lost."""
+
+    from_s: NotNegative
+    until_s: Positive
+
+
 class Link(Part):
-    """One direction of a radio link."""
+    """One direction of a radio link. Times are link times, see Links.times_from.
+
+    What happens to a datagram, in this order: an outage or a full queue of the channel drops it, the channel takes its
+    time to send it, it is lost on the way or some of its bits are flipped, and it arrives after delay and jitter.
+    """
 
     delay_s: NotNegative = 0.0
+    delay_points: tuple[DelayPoint, ...] = ()
+    """Instead of delay_s; a datagram's delay is that of the time at which it enters."""
+    jitter: Jitter | None = None
+    reordering: bool = False
+    """Whether a datagram may overtake an earlier one. If not, it waits for it."""
+    loss_probability: Probability = 0.0
+    loss_bursts: LossBursts | None = None
+    duplicate_probability: Probability = 0.0
+    """Of what arrives. The second copy has a jitter of its own."""
+    corrupt_probability: Probability = 0.0
+    """Of a datagram to arrive with one to four of its bits flipped."""
+    outages: tuple[Outage, ...] = ()
+    channel: str | None = None
+    """Name of one of Links.channels; without it the link has no limit of bandwidth."""
 
 
 class VehicleLinks(Part):
@@ -98,12 +164,42 @@ class VehicleLinks(Part):
     down: Link | None = None
 
 
+class Channel(Part):
+    """A limited bandwidth: one datagram is sent at a time, the others wait in order of their coming.
+
+    What finds the queue full is dropped; an idle channel takes a datagram of any size. A datagram takes
+    size * bits_per_byte / bandwidth_bit_s. A serial radio has a start and a stop bit (8N1): 10 bits per byte.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+    bandwidth_bit_s: Annotated[float, Field(ge=1, le=1e12)]
+    bits_per_byte: Annotated[int, Field(ge=8, le=16)] = 8
+    queue_bytes: Annotated[int, Field(ge=0, le=10**9)] | None = None
+    """Most bytes that wait; what is being sent waits no more."""
+    queue_datagrams: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    shared: bool = True
+    """One for all vehicles whose links name it; otherwise each vehicle has one of its own."""
+    half_duplex: bool = False
+    """Up and down share the bandwidth and the queue; otherwise each direction has its own."""
+
+
 class Links(Part):
     """Emulated links: up is vehicle to station, down is station to vehicle."""
 
     up: Link = Link()
     down: Link = Link()
     vehicles: tuple[VehicleLinks, ...] = ()
+    channels: tuple[Channel, ...] = ()
+    times_from: Literal["flight", "start"] = "flight"
+    """When the time of outages and delay points is 0: when the station's first set-point enters a link (before that
+    the delay is the first point's and there is no outage), or when the vehicles start."""
+
+    def of(self, system_id: int) -> tuple[Link, Link]:
+        """The (up, down) links of one vehicle."""
+        for own in self.vehicles:
+            if own.system_id == system_id:
+                return own.up or self.up, own.down or self.down
+        return self.up, self.down
 
 
 class Clocks(Part):
@@ -119,8 +215,38 @@ class Safety(Part):
     setpoint_timeout_s: Positive = 1.0
     heartbeat_timeout_s: Positive = 3.0
     spacing_error_limit_m: Positive = 1000.0
+    collision_distance_m: NotNegative = 5.0
+    """Vehicles nearer than this to each other have collided."""
     settled_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """A follower has settled when its spacing error is below this part of its spacing."""
+
+
+class Monitor(Part):
+    """When the station acts on a shrinking headroom (1 - loop delay / margin), and how."""
+
+    act: bool = True
+    """Off: the modes are shown, and nothing is done."""
+    caution_headroom: Annotated[float, Field(lt=1)] = 0.3
+    critical_headroom: Annotated[float, Field(lt=1)] = 0.15
+    hysteresis: NotNegative = 0.05
+    window_s: Positive = 1.0
+    """The loop delay judged is the one that nine tenths of the ticks of this window stay below."""
+    hold_s: NotNegative = 0.3
+    """How long a condition holds before the slower side is taken,"""
+    ease_s: NotNegative = 3.0
+    """and before the faster one is taken back."""
+    blend_s: Positive = 1.0
+    """How long a change of gains takes."""
+    time_scales: Annotated[tuple[Annotated[float, Field(ge=1)], ...], Field(min_length=1, max_length=8)] = (
+        1.0,
+        2.0,
+        4.0,
+    )
+    """The gain schedule: the design slowed down by these factors, which multiplies its delay margin by them."""
+    open_factor: Annotated[float, Field(ge=1)] = 1.5
+    """The formation's spacing is opened by this factor when the slowest gains have too little headroom,"""
+    open_s: Positive = 10.0
+    """over this time."""
 
 
 class Scenario(Part):
@@ -138,6 +264,7 @@ class Scenario(Part):
     links: Links = Links()
     clocks: Clocks = Clocks()
     safety: Safety = Safety()
+    monitor: Monitor = Monitor()
 
     def leader_first(self) -> tuple[Vehicle, ...]:
         """Vehicles ordered so that each comes after the one it follows, by system id within a rank."""
@@ -151,10 +278,7 @@ class Scenario(Part):
 
     def link_of(self, system_id: int) -> tuple[Link, Link]:
         """The (up, down) links of one vehicle."""
-        for own in self.links.vehicles:
-            if own.system_id == system_id:
-                return own.up or self.links.up, own.down or self.links.down
-        return self.links.up, self.links.down
+        return self.links.of(system_id)
 
     def nominal_velocity_at(self, time_s: float) -> Pair:
         """v_d at a scenario time; before time zero it is the first entry's."""
@@ -165,15 +289,17 @@ class Scenario(Part):
         return current.velocity_ne_m_s
 
     def with_link_delay(self, *, up_s: float | None, down_s: float | None) -> Self:
-        """The same scenario with other constant link delays for every vehicle; None leaves a direction as it is."""
-        up = self.links.up if up_s is None else Link(delay_s=up_s)
-        down = self.links.down if down_s is None else Link(delay_s=down_s)
+        """The same scenario with other constant link delays for every vehicle; None leaves a direction as it is.
+
+        Delay points go; jitter, losses and channels stay.
+        """
+
+        def delayed(link: Link, delay_s: float | None) -> Link:
+            return link if delay_s is None else link.model_copy(update={"delay_s": delay_s, "delay_points": ()})
+
         own = tuple(
-            VehicleLinks(
-                system_id=v.system_id,
-                up=v.up if up_s is None else None,
-                down=v.down if down_s is None else None,
-            )
+            v.model_copy(update={"up": v.up and delayed(v.up, up_s), "down": v.down and delayed(v.down, down_s)})
             for v in self.links.vehicles
         )
-        return self.model_copy(update={"links": Links(up=up, down=down, vehicles=own)})
+        links = {"up": delayed(self.links.up, up_s), "down": delayed(self.links.down, down_s), "vehicles": own}
+        return self.model_copy(update={"links": self.links.model_copy(update=links)})

@@ -33,8 +33,8 @@ def controlled(
     v_d: tuple[float, float] = (1.0, 0.0),
     limit_m_s2: float = 1e9,
 ) -> FormationControl:
-    law = feedback_law(TREE, K, lost)
-    return formation_control(history, law, nominal_velocity_m_s=v_d, limit_m_s2=limit_m_s2)
+    law = feedback_law(TREE, (K,), lost)
+    return formation_control(history, law, law.gain[0], nominal_velocity_m_s=v_d, limit_m_s2=limit_m_s2)
 
 
 def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:

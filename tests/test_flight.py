@@ -1,6 +1,7 @@
 """Whole flights in virtual time: vehicles, links and station with real MAVLink bytes on one clock."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from gcs.record import Mode, TickArray
 from gcs.station import FlightPlan, Station
 from gcs.summary import summarise
 from scenarios.files import load
-from scenarios.schema import FixedGains, Scenario
+from scenarios.schema import FixedGains, Monitor, Scenario
 from sim_vehicles.fleet import Fleet
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
@@ -84,7 +85,7 @@ def test_formation_follows_the_turns() -> None:
 def test_above_the_margin_the_formation_breaks_and_vehicles_are_left_in_failsafe() -> None:
     plan, design = planned("triangle5")
     scenario = plan.scenario.with_link_delay(up_s=0.4, down_s=0.4)
-    plan = FlightPlan(scenario, plan.formation, plan.gain, plan.delay_margin_s)
+    plan = replace(plan, scenario=scenario)
     ticks, summary = flown(plan, design)
     assert summary["verdict"] == "unstable"
     assert summary["reason"].startswith("broken: spacing error of vehicle")
@@ -104,9 +105,9 @@ def dominant_growth_1_s(ticks: TickArray, system_id: int) -> float:
 @pytest.mark.parametrize("link_delay_s", [0.130, 0.140, 0.145])
 def test_errors_grow_and_decay_as_the_sampled_model_says(link_delay_s: float) -> None:
     """Two independent ways: the slope of the flown error, and the lifted map at the loop delay that was measured."""
-    plan, design = planned("chain3", duration_s=40.0)
+    plan, design = planned("chain3", duration_s=40.0, monitor=Monitor(act=False))
     scenario = plan.scenario.with_link_delay(up_s=link_delay_s, down_s=link_delay_s)
-    ticks, _ = flown(FlightPlan(scenario, plan.formation, plan.gain, plan.delay_margin_s), design)
+    ticks, _ = flown(replace(plan, scenario=scenario), design)
     own = ticks[(ticks["system_id"] == 2) & ticks["commanded"]]
     delay_s = float(np.median(own["loop_delay_s"]))
     A, B = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
@@ -136,7 +137,7 @@ def test_asymmetric_links_give_the_same_loop_delay() -> None:
     medians: list[float] = []
     for up_s, down_s in ((0.05, 0.05), (0.09, 0.01)):
         scenario = plan.scenario.with_link_delay(up_s=up_s, down_s=down_s)
-        ticks, _ = flown(FlightPlan(scenario, plan.formation, plan.gain, plan.delay_margin_s), design)
+        ticks, _ = flown(replace(plan, scenario=scenario), design)
         medians.append(float(np.median(ticks[ticks["commanded"]]["loop_delay_s"])) - up_s - down_s)
     assert all(0.0 <= waiting <= 0.02 for waiting in medians)
 
@@ -221,7 +222,7 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
     control = scenario.control.model_copy(
         update={"delay_margin_s": None, "gains": FixedGains(K1=-20.0, K2=0.0, K3=150.0)}
     )
-    plan, design = planned("chain3", control=control)
+    plan, design = planned("chain3", control=control, monitor=Monitor(act=False))
     assert design["delay_margin_s"] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
     _, summary = flown(plan, design)
     assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design["delay_margin_s"]

@@ -1,35 +1,8 @@
-"""Modes and phases as tables."""
+"""The phases of a flight as a table."""
 
 from itertools import product
 
-import pytest
-
-from gcs.modes import END_PATIENCE_S, Phase, next_phase, vehicle_mode
-from gcs.record import Mode
-
-NAN = float("nan")
-
-
-@pytest.mark.parametrize(
-    ("flying", "silent", "guided", "failsafe", "headroom", "mode"),
-    [
-        (False, False, False, False, NAN, Mode.WAITING),
-        (False, True, True, False, -1.0, Mode.WAITING),
-        (False, False, False, True, 0.5, Mode.FAILSAFE),
-        (True, True, True, False, 0.5, Mode.LOST),
-        (True, True, False, True, -0.5, Mode.LOST),
-        (True, False, False, False, 0.5, Mode.FAILSAFE),
-        (True, False, False, True, -0.5, Mode.FAILSAFE),
-        (True, False, True, False, -0.001, Mode.CRITICAL),
-        (True, False, True, False, 0.0, Mode.CAUTION),
-        (True, False, True, False, 0.249, Mode.CAUTION),
-        (True, False, True, False, 0.25, Mode.NOMINAL),
-        (True, False, True, False, NAN, Mode.NOMINAL),
-    ],
-)
-def test_vehicle_mode(flying: bool, silent: bool, guided: bool, failsafe: bool, headroom: float, mode: Mode) -> None:
-    got = vehicle_mode(flying=flying, silent=silent, guided=guided, failsafe=failsafe, headroom=headroom)
-    assert got is mode
+from gcs.modes import END_PATIENCE_S, Phase, next_phase
 
 
 def test_phases_follow_each_other_in_one_order_only() -> None:
