@@ -50,6 +50,7 @@ LEGEND_MAX = 8
 MODE_COLORS: dict[Mode, Color] = {
     Mode.WAITING: (110, 110, 120),
     Mode.NOMINAL: (56, 142, 60),
+    Mode.RECOVERING: (38, 166, 154),
     Mode.CAUTION: (245, 166, 35),
     Mode.CRITICAL: (229, 57, 53),
     Mode.FAILSAFE: (171, 71, 188),

@@ -36,11 +36,20 @@ UNKNOWN = "–"
 
 HEADROOM_GOOD = 0.3
 """Headroom from which it is shown in green."""
-BADNESS = (Mode.NOMINAL, Mode.WAITING, Mode.CAUTION, Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST)
+BADNESS = (
+    Mode.NOMINAL,
+    Mode.WAITING,
+    Mode.RECOVERING,
+    Mode.CAUTION,
+    Mode.CRITICAL,
+    Mode.FAILSAFE,
+    Mode.LOST,
+)
 """Modes, from good to bad."""
 MODE_STYLES: dict[Mode, str] = {
     Mode.WAITING: "dim",
     Mode.NOMINAL: "green",
+    Mode.RECOVERING: "cyan",
     Mode.CAUTION: "yellow",
     Mode.CRITICAL: "bold red",
     Mode.FAILSAFE: "bold magenta",
@@ -53,7 +62,9 @@ class FlightState:
 
     def __init__(self, scenario: Scenario, design: dict[str, Any]) -> None:
         self.scenario = scenario
-        self.margin_s = float(np.nan if design["delay_margin_s"] is None else design["delay_margin_s"])
+        schedule = design.get("schedule") or [design]
+        self.margins_s = [np.nan if s["delay_margin_s"] is None else float(s["delay_margin_s"]) for s in schedule]
+        """Delay margin of each gain set, the fastest first."""
         self.phase = UNKNOWN
         self.time_s = np.nan
         self.skipped = 0
@@ -159,7 +170,7 @@ def _headline(state: FlightState) -> Text:
     time = UNKNOWN if np.isnan(state.time_s) else f"{state.time_s:.1f} s"
     line = Text.assemble((state.scenario.name, "bold"), "  ", (state.phase, "bold cyan"), f"  {time}")
     loop = state.scenario.control.loop
-    line.append(f"   delay margin {_number(1e3 * state.margin_s, '.0f')} ms (sampled, {loop} loop)", style="dim")
+    line.append(f"   delay margin {_number(1e3 * state.margins_s[0], '.0f')} ms (sampled, {loop} loop)", style="dim")
     line.no_wrap = True
     return line
 
@@ -195,7 +206,7 @@ def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int
             _number(1e3 * figures.rtt_s[k], ".1f"),
             _number(1e3 * figures.loop_delay_s_p50[k], ".1f"),
             _number(1e3 * figures.loop_delay_s_p99[k], ".1f"),
-            *[_number(1e3 * state.margin_s, ".0f")] * wide,
+            *[_number(1e3 * state.margins_s[state.newest["gain_set"][k]], ".0f")] * wide,
             Text(_number(100 * headroom, ".0f"), _headroom_style(headroom)),
             *[Text(_bar(headroom), _headroom_style(headroom))] * widest,
             str(figures.lost[k]),
