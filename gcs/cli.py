@@ -1,6 +1,7 @@
 """The `gcs` command. Slow imports (cvxpy, rerun) are made by the commands that need them, so that --help is quick."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -142,6 +143,9 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted", file=sys.stderr)
         code = EXIT_INTERRUPTED
+    except BrokenPipeError:  # whoever read our output, as `head`, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = EXIT_FAILED
     sys.exit(code if isinstance(code, int) else 0)
 
 
