@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from gcs import mavlink
+from gcs.plan import FlightPlan
 from gcs.record import DESIGN_FILE, READY_FILE, SCENARIO_FILE, RunWriter
 from gcs.sitl import VehicleProcess
-from gcs.station import CONNECT_PATIENCE_S, FlightPlan, Station
+from gcs.station import CONNECT_PATIENCE_S, Station
 from gcs.summary import finish
 from gcs.udp import StationSocket, clock_ns, drive, prepare_real_time
 from scenarios import files as scenario_files

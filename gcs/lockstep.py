@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from typing import Protocol
 
 from gcs.modes import Phase
+from gcs.plan import FlightPlan
 from gcs.record import TickArray
-from gcs.station import Datagram, FlightPlan, Station
+from gcs.station import Datagram, Station
 from sim_vehicles.fleet import Fleet
 
 START_NS = 1_000_000_000

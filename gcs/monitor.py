@@ -110,11 +110,10 @@ def _by_headroom(
         faster = own  # what it has to come back to is the slowest set
     last_resort = state.gain_set == slowest and state.mode is Mode.CRITICAL and not state.released
     limit = 0.0 if last_resort else policy.critical_headroom
-    state = replace(
-        state,
-        pressed_s=_since(state.pressed_s, own < limit, now_s),
-        eased_s=_since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s),
-    )
+    pressed_s = _since(state.pressed_s, own < limit, now_s)
+    eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)
+    if (pressed_s, eased_s) != (state.pressed_s, state.eased_s):  # a copy costs more than all the rest
+        state = replace(state, pressed_s=pressed_s, eased_s=eased_s)
     blending = now_s < state.changed_s + policy.blend_s
     if not blending and _lasted(state.pressed_s, policy.hold_s, now_s) and not state.released:
         pressed = replace(state, mode=Mode.CRITICAL, pressed_s=None, eased_s=None)
@@ -128,7 +127,8 @@ def _by_headroom(
             return replace(state, released=False, mode=Mode.FAILSAFE, eased_s=None)
         if state.gain_set > 0:
             return _changed(replace(state, mode=Mode.RECOVERING, eased_s=None), state.gain_set - 1, now_s)
-    return replace(state, mode=_calm_mode(state, own, blending=blending, policy=policy, now_s=now_s))
+    mode = _calm_mode(state, own, blending=blending, policy=policy, now_s=now_s)
+    return state if mode is state.mode else replace(state, mode=mode)
 
 
 def _calm_mode(state: VehicleState, own: float, *, blending: bool, policy: Monitor, now_s: float) -> Mode:

@@ -1,13 +1,51 @@
 """From a scenario to what is flown: formation, gains, margins."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gains.design import Design, Requirement, design, evaluate_gains
 from gains.formation import FormationModel
-from gcs.station import FlightPlan, plan_formation
+from gcs.control import Formation
+from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
+
+
+@dataclass(frozen=True)
+class FlightPlan:
+    """What the station flies: the formation, the gains and the margin they have."""
+
+    scenario: Scenario
+    formation: Formation
+    gain: FloatArray
+    """K of u = K e, rows and columns in the order of `gains.formation.FormationModel`."""
+    delay_margin_s: float
+    slower: tuple[tuple[FloatArray, float], ...] = ()
+    """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
+    separable: bool = True
+    """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
+
+    @property
+    def gains(self) -> tuple[FloatArray, ...]:
+        """The gain schedule, fastest first."""
+        return (self.gain, *(gain for gain, _ in self.slower))
+
+    @property
+    def margins_s(self) -> tuple[float, ...]:
+        """The delay margins of the gain schedule."""
+        return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
+
+
+def plan_formation(scenario: Scenario) -> Formation:
+    """The scenario's formation as arrays, vehicles in `leader_first` order."""
+    ordered = scenario.leader_first()
+    row = {vehicle.system_id: k for k, vehicle in enumerate(ordered)}
+    return Formation(
+        system_ids=tuple(row),
+        predecessor=np.array([-1 if v.follows is None else row[v.follows] for v in ordered], dtype=np.int64),
+        offset_ne_m=np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered]),
+    )
 
 
 def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:

@@ -6,7 +6,6 @@ or in virtual time, with the same bytes.
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,6 @@ import numpy as np
 from gcs import mavlink
 from gcs.control import (
     LARGEST_COMMAND_M_S2,
-    Formation,
     FormationControl,
     blended_gain,
     feedback_law,
@@ -23,11 +21,12 @@ from gcs.control import (
 )
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
+from gcs.plan import FlightPlan
 from gcs.record import TICK, TickArray
 from gcs.rows import write_control, write_links
-from gcs.telemetry import FloatArray, StateHistory
+from gcs.telemetry import StateHistory
 from gcs.vehicle import GUIDED, HOLD, Address, RemoteVehicle
-from scenarios.schema import NS_PER_S, Scenario
+from scenarios.schema import NS_PER_S
 
 CONNECT_PATIENCE_S = 20.0
 SILENCE_S = 1.5
@@ -53,42 +52,6 @@ class Event(NamedTuple):
 class Outgoing(NamedTuple):
     data: bytes
     address: Address
-
-
-@dataclass(frozen=True)
-class FlightPlan:
-    """What the station flies: the formation, the gains and the margin they have."""
-
-    scenario: Scenario
-    formation: Formation
-    gain: FloatArray
-    """K of u = K e, rows and columns in the order of `gains.formation.FormationModel`."""
-    delay_margin_s: float
-    slower: tuple[tuple[FloatArray, float], ...] = ()
-    """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
-    separable: bool = True
-    """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
-
-    @property
-    def gains(self) -> tuple[FloatArray, ...]:
-        """The gain schedule, fastest first."""
-        return (self.gain, *(gain for gain, _ in self.slower))
-
-    @property
-    def margins_s(self) -> tuple[float, ...]:
-        """The delay margins of the gain schedule."""
-        return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
-
-
-def plan_formation(scenario: Scenario) -> Formation:
-    """The scenario's formation as arrays, vehicles in `leader_first` order."""
-    ordered = scenario.leader_first()
-    row = {vehicle.system_id: k for k, vehicle in enumerate(ordered)}
-    return Formation(
-        system_ids=tuple(row),
-        predecessor=np.array([-1 if v.follows is None else row[v.follows] for v in ordered], dtype=np.int64),
-        offset_ne_m=np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered]),
-    )
 
 
 class Station:

@@ -12,9 +12,9 @@ from gains.sampled import growth_rate
 from gcs import mavlink
 from gcs.lockstep import START_NS, Sent, fly_lockstep
 from gcs.modes import Phase
-from gcs.plan import flight_plan
+from gcs.plan import FlightPlan, flight_plan
 from gcs.record import Mode, TickArray
-from gcs.station import FlightPlan, Station
+from gcs.station import Station
 from gcs.summary import summarise
 from scenarios.files import load
 from scenarios.schema import FixedGains, Monitor, Scenario

@@ -8,7 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gains.formation import FormationModel
-from gcs.station import Datagram, FlightPlan, Outgoing, Station, plan_formation
+from gcs.plan import FlightPlan, plan_formation
+from gcs.station import Datagram, Outgoing, Station
 from scenarios.files import load
 
 S, MS = 1_000_000_000, 1_000_000
