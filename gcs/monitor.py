@@ -215,7 +215,7 @@ class FormationMonitor:
             self.states[row] = after
             if (before.mode, before.gain_set) != (after.mode, after.gain_set):
                 changes.append((row, before, after))
-        self._open(flying=view.flying)
+        self._open(view.time_s, flying=view.flying)
         return changes
 
     def sets_and_blends(self, time_s: float) -> tuple[IntArray, IntArray, FloatArray]:
@@ -242,11 +242,13 @@ class FormationMonitor:
                 return row
         return -1
 
-    def _open(self, *, flying: bool) -> None:
+    def _open(self, time_s: float, *, flying: bool) -> None:
         """Open the formation, free of jumps, while somebody is CRITICAL or gone on the slowest gains."""
-        slowest = len(self.margins_s) - 1
-        troubled = (Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST)
-        wide = self._policy.act and any(s.gain_set == slowest and s.mode in troubled for s in self.states)
+        slowest, troubled = len(self.margins_s) - 1, (Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST)
+        settled_s = time_s - self._policy.blend_s  # just changed, the slowest gains have still to show what they can do
+        wide = self._policy.act and any(
+            s.gain_set == slowest and s.mode in troubled and s.changed_s < settled_s for s in self.states
+        )
         goal = self._policy.open_factor if wide and flying else 1.0
         step = (self._policy.open_factor - 1.0) * self._period_s / self._policy.open_s
         self.opening += min(step, max(-step, goal - self.opening))

@@ -203,6 +203,14 @@ def test_release_goes_from_the_end_of_the_tree_forwards() -> None:
     assert order == [3, 2, 1]
 
 
+def test_formation_is_not_opened_when_the_slowest_gains_are_enough() -> None:
+    monitor = formation(1)
+    for k in range(1000):
+        monitor.update(view(k, [0.05 if k < 100 else 0.55]))
+        assert monitor.opening == 1.0
+    assert monitor.states[0].gain_set == 2
+
+
 def test_formation_is_opened_slowly_while_the_slowest_gains_are_critical() -> None:
     monitor, openings = formation(2), list[float]()
     for k in range(1500):
