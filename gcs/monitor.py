@@ -199,7 +199,7 @@ class FormationMonitor:
         self._tick = 0
 
     def update(self, view: FleetView) -> list[tuple[int, VehicleState, VehicleState]]:
-        """Judge a tick; returns the vehicles whose mode or gain set changed, with the state before and after."""
+        """Judge a tick; returns the vehicles whose mode, gain set or release changed, with both states."""
         self._delays_s[self._tick % len(self._delays_s)] = view.loop_delay_s
         self._tick += 1
         delays_s = self._judged_delay_s()
@@ -213,7 +213,7 @@ class FormationMonitor:
             if after.released and not before.released and row != next_to_release:
                 after = replace(after, mode=Mode.CRITICAL, released=False)  # somebody behind goes first
             self.states[row] = after
-            if (before.mode, before.gain_set) != (after.mode, after.gain_set):
+            if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
                 changes.append((row, before, after))
         self._open(view.time_s, flying=view.flying)
         return changes

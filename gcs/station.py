@@ -297,6 +297,9 @@ class Station:
                 vehicle.wanted_mode = None if after.released else GUIDED
             if after.mode is not before.mode:
                 self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
+            if after.released != before.released and flying:
+                text = "is released to its failsafe" if after.released else "is called back"
+                self._report("vehicle", text, vehicle.system_id)
             if after.gain_set != before.gain_set and flying:
                 margin_s = self.plan.margins_s[after.gain_set]
                 self._report("gains", f"gain set {after.gain_set}, delay margin {margin_s:.3f} s", vehicle.system_id)
@@ -345,7 +348,8 @@ class Station:
             one, two = (self.vehicles[row].system_id for row in (closest, int(other[closest])))
             self.request_stop(f"broken: vehicles {one} and {two} have collided, {nearest_m[closest]:.1f} m apart")
         error_m = np.hypot(control.spacing_error_m[:, 0], control.spacing_error_m[:, 1])
-        error_m[self._lost | ~np.isfinite(error_m)] = 0.0
+        released = np.array([state.released for state in self._monitor.states])
+        error_m[self._lost | released | ~np.isfinite(error_m)] = 0.0
         worst = int(error_m.argmax())
         if error_m[worst] > safety.spacing_error_limit_m:
             error, limit = f"{error_m[worst]:.0f} m", f"{safety.spacing_error_limit_m:g} m"
