@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Never
 if TYPE_CHECKING:
     from scenarios.schema import Scenario
     from sim_vehicles.truth import TruthLog
-    from sim_vehicles.udp import Ports
+    from sim_vehicles.udp import Sockets
     from sim_vehicles.vehicle import Change
 
 SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
@@ -23,7 +23,10 @@ NS_PER_S = 1_000_000_000
 
 DESCRIPTION = """\
 Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
-They stay on the launcher until a station arms them, commands GUIDED and sends set-points."""
+They stay on the launcher until a station arms them, commands GUIDED and sends set-points.
+
+With --links-only no vehicle is flown: any MAVLink vehicles that send to a --vehicle-port get the scenario's links, each
+those of its system id, and the station hears each from a port of its own."""
 
 
 def main() -> None:
@@ -33,22 +36,19 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """The command with its arguments: the exit code."""
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.links_only != bool(options.vehicle_port):
+        parser.error("read one of --links-only and --vehicle-port, wanted both or neither")
     with _signals() as signals, contextlib.ExitStack() as opened:
         # After parsing, so that --help and a mistyped option answer at once.
         from scenarios.files import ScenarioError, load
         from sim_vehicles.truth import TruthLog
-        from sim_vehicles.udp import Ports
 
         try:
             scenario = load(options.scenario)
         except ScenarioError as error:
             return _complain(str(error))
-        try:
-            ports = Ports(tuple(sorted(v.system_id for v in scenario.vehicles)), options.station)
-        except OSError as error:
-            return _complain(f"--station {options.station[0]}:{options.station[1]}: {error.strerror or error}")
-        opened.callback(ports.close)
         log = None
         if options.truth:
             try:
@@ -56,24 +56,66 @@ def run(arguments: list[str]) -> int:
             except (OSError, ValueError) as error:
                 return _complain(f"--truth: {error}")
             opened.callback(log.close)
-        _fly(scenario, ports, log, signals, options)
+        try:
+            run_it = _links_only if options.links_only else _fly
+            run_it(scenario, log, signals, options, opened)
+        except _AddressError as error:
+            return _complain(str(error))
     return INTERRUPTED if signal.SIGINT in signals else SUCCESS
 
 
+class _AddressError(Exception):
+    """An address that was given cannot be used."""
+
+
 def _fly(
-    scenario: "Scenario", ports: "Ports", log: "TruthLog | None", signals: list[int], options: argparse.Namespace
+    scenario: "Scenario",
+    log: "TruthLog | None",
+    signals: list[int],
+    options: argparse.Namespace,
+    opened: contextlib.ExitStack,
 ) -> None:
     from sim_vehicles.fleet import Fleet
-    from sim_vehicles.udp import fly
+    from sim_vehicles.udp import Ports, fly
 
+    try:
+        ports = Ports(tuple(sorted(v.system_id for v in scenario.vehicles)), options.station)
+    except OSError as error:
+        raise _AddressError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
+    opened.callback(ports.close)
     start_ns = time.monotonic_ns()
     fleet = Fleet(scenario, start_ns, record=log.record if log else None)
     say = _Lines(start_ns)
-    say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {options.station[0]}:{options.station[1]}")
-    fly(fleet, ports, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log))
+    say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}")
+    fly(fleet, ports, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log, ports.sockets))
     say.changes(fleet.take_changes())
-    counters = fleet.counters + ports.counters + Counter(truth_lost=log.lost if log else 0)
-    say.line("received: " + (", ".join(f"{name} {count}" for name, count in sorted(counters.items())) or "nothing"))
+    say.summary(fleet.counters + ports.counters, log)
+
+
+def _links_only(
+    scenario: "Scenario",
+    log: "TruthLog | None",
+    signals: list[int],
+    options: argparse.Namespace,
+    opened: contextlib.ExitStack,
+) -> None:
+    from sim_vehicles.relay import Relay
+    from sim_vehicles.relay_udp import Peers, relay
+
+    try:
+        peers = Peers(options.vehicle_port, options.station)
+    except OSError as error:
+        ports = ", ".join(map(_shown, options.vehicle_port))
+        text = f"--vehicle-port {ports}, --station {_shown(options.station)}: {error.strerror or error}"
+        raise _AddressError(text) from None
+    opened.callback(peers.sockets.close)
+    start_ns = time.monotonic_ns()
+    links = Relay(scenario, start_ns, record=log.record if log else None)
+    say = _Lines(start_ns)
+    ports = ", ".join(map(_shown, options.vehicle_port))
+    say.line(f"the links of {scenario.name}, from vehicles at {ports}, to {_shown(options.station)}")
+    relay(links, peers, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log, peers.sockets))
+    say.summary(links.counters + peers.sockets.counters, log)
 
 
 def _stop_rule(signals: list[int], start_ns: int, options: argparse.Namespace) -> Callable[[int, int], bool]:
@@ -85,9 +127,10 @@ def _stop_rule(signals: list[int], start_ns: int, options: argparse.Namespace) -
     return stop
 
 
-def _teller(say: "_Lines", log: "TruthLog | None") -> Callable[[list["Change"]], None]:
+def _teller(say: "_Lines", log: "TruthLog | None", sockets: "Sockets") -> Callable[[list["Change"]], None]:
     def tell(changes: list["Change"]) -> None:
         say.changes(changes)
+        say.lateness(sockets)
         if log:
             log.flush()
 
@@ -100,6 +143,8 @@ class _Lines:
     def __init__(self, start_ns: int) -> None:
         self._start_ns = start_ns
         self._read = True
+        self._late = 0
+        self._late_line_ns = start_ns
 
     def line(self, text: str) -> None:
         if self._read:
@@ -113,6 +158,24 @@ class _Lines:
             self.line(
                 f"{(change.time_ns - self._start_ns) / NS_PER_S:8.3f} s  vehicle {change.system_id}: {change.text}"
             )
+
+    def lateness(self, sockets: "Sockets") -> None:
+        """At most once a second: how much left too late for the links to be what the scenario says."""
+        late, now_ns = sockets.counters["left_late"], time.monotonic_ns()
+        if late > self._late and now_ns - self._late_line_ns >= NS_PER_S:
+            since_s = (now_ns - self._late_line_ns) / NS_PER_S
+            self.line(
+                f"{(now_ns - self._start_ns) / NS_PER_S:8.3f} s  this host does not keep up: {late - self._late} "
+                f"datagrams left more than 5 ms late in {since_s:.1f} s, the latest {sockets.latest_ns / 1e6:.1f} ms"
+            )
+            self._late, self._late_line_ns, sockets.latest_ns = late, now_ns, 0
+
+    def summary(self, counters: Counter[str], log: "TruthLog | None") -> None:
+        """The last line: what was counted."""
+        counters += Counter(truth_lost=log.lost if log else 0)
+        self.line(
+            "received: " + (", ".join(f"{name} {count}" for name, count in sorted(counters.items())) or "nothing")
+        )
 
 
 @contextlib.contextmanager
@@ -158,7 +221,26 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--duration", type=_seconds, default=math.inf, metavar="SECONDS", help="end after that time (never)"
     )
+    parser.add_argument(
+        "--links-only", action="store_true", help="fly no vehicles; put the links before other vehicles"
+    )
+    parser.add_argument(
+        "--vehicle-port",
+        type=_port,
+        action="append",
+        default=[],
+        metavar="[HOST:]PORT",
+        help="with --links-only: vehicles send here (127.0.0.1); may be given more than once",
+    )
     return parser
+
+
+def _port(text: str) -> tuple[str, int]:
+    return _address(text if ":" in text else f"127.0.0.1:{text}")
+
+
+def _shown(address: tuple[str, int]) -> str:
+    return f"{address[0]}:{address[1]}"
 
 
 def _address(text: str) -> tuple[str, int]:

@@ -12,9 +12,8 @@ from operator import itemgetter
 
 from scenarios import schema
 from sim_vehicles.dynamics import State
-from sim_vehicles.links import NEVER_NS, Link
-from sim_vehicles.mavlink import message_id
-from sim_vehicles.truth import LINK_DOWN, LINK_UP, Record
+from sim_vehicles.links import NEVER_NS, Link, LinkSet
+from sim_vehicles.truth import Record
 from sim_vehicles.vehicle import Change, Vehicle
 
 Datagram = tuple[int, bytes, int]
@@ -30,6 +29,8 @@ class _Member:
     down: Link
     leaves_ns: int = NEVER_NS
     """The earliest instant at which a datagram of this vehicle can leave its up link."""
+    acts_ns: int = NEVER_NS
+    """With channels only: the next instant at which the vehicle does something or a datagram reaches it."""
 
 
 class Fleet:
@@ -37,6 +38,8 @@ class Fleet:
 
     Vehicles do not meet each other here, so each is brought up to date only when a datagram of its own can leave,
     in order of that time and of system id; nothing is late for it, since everything it does has its exact instant.
+    Only where links have channels does what one vehicle sends delay the others: then all that happens is done in order
+    of time, and at one instant first what the station sends and then the vehicles by system id.
     """
 
     def __init__(self, scenario: schema.Scenario, start_ns: int, *, record: Record | None = None) -> None:
@@ -44,10 +47,16 @@ class Fleet:
         self._members: dict[int, _Member] = {}
         self._heap: list[tuple[int, int]] = []
         """(leaves_ns, system id); entries that no longer agree with the member are stale and skipped."""
+        self._links = LinkSet(scenario, start_ns, record=record)
+        self._acts: list[tuple[int, int]] = []
+        """With channels only: (acts_ns, system id), stale entries likewise."""
+        self._entering: list[tuple[int, int, int, bytes]] = []
+        """With channels only: (time, system id, number, data) of what the station has sent, earliest first."""
+        self._entered = 0
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
-            up, down = scenario.link_of(own.system_id)
-            member = _Member(Vehicle(scenario, own, start_ns, record=record), Link(up), Link(down))
-            self._members[own.system_id] = member
+            vehicle = Vehicle(scenario, own, start_ns, record=record)
+            self._members[own.system_id] = _Member(vehicle, *self._links.of(own.system_id))
+        for member in self._members.values():
             self._plan(member)
 
     @property
@@ -70,12 +79,10 @@ class Fleet:
 
     @property
     def counters(self) -> Counter[str]:
-        """The vehicles' counters added up, with the links' `link_up_dropped` and `link_down_dropped`."""
-        total: Counter[str] = Counter()
+        """The vehicles' counters added up, with the links' (LinkSet.counters)."""
+        total = self._links.counters()
         for member in self._members.values():
             total.update(member.vehicle.counters)
-            total["link_up_dropped"] += member.up.dropped
-            total["link_down_dropped"] += member.down.dropped
         return total
 
     def vehicle(self, system_id: int) -> Vehicle:
@@ -99,11 +106,18 @@ class Fleet:
         received
             Datagrams of the station with the instants at which each enters its vehicle's down link.
         """
-        for system_id, data, time_ns in received:
-            member = self._members[system_id]
-            member.down.send(data, time_ns)
-            if member.down.next_due_ns + member.up.least_delay_ns < member.leaves_ns:
-                self._plan(member)
+        if self._links.zero_ns == NEVER_NS:
+            received = list(received)
+            for _, data, time_ns in received:
+                self._links.hear(data, time_ns)
+        if self._links.have_channels:
+            self._run_in_order(received, now_ns)
+        else:
+            for system_id, data, time_ns in received:
+                member = self._members[system_id]
+                member.down.send(data, time_ns)
+                if member.down.next_due_ns + member.up.least_delay_ns < member.leaves_ns:
+                    self._plan(member)
         out: list[Datagram] = []
         heap = self._heap
         while heap and heap[0][0] <= now_ns:
@@ -112,30 +126,54 @@ class Fleet:
             if leaves_ns != member.leaves_ns:
                 continue
             self._live(member, now_ns)
-            for data, due_ns, entered_ns in member.up.due_entered(now_ns):
-                out.append((system_id, data, due_ns))
+            for entry in member.up.due(now_ns):
+                out.append((system_id, entry[3], entry[0]))
                 if self._record is not None:
-                    self._record((LINK_UP, system_id, message_id(data), now_ns, entered_ns, due_ns))
+                    self._record(member.up.row(entry, now_ns))
             self._plan(member)
         out.sort(key=_DUE_THEN_SYSTEM_ID)
         return out
 
     def state(self, system_id: int, now_ns: int) -> State:
         """The true state of a vehicle now, everything that has reached it by now included."""
+        if self._links.have_channels:
+            self._run_in_order((), now_ns)
         member = self._members[system_id]
         self._live(member, now_ns)
         self._plan(member)
         return member.vehicle.state_at(now_ns)
 
+    def _run_in_order(self, received: Iterable[Datagram], now_ns: int) -> None:
+        """Let everything enter its link in order of time, from the station and from the vehicles, until now."""
+        for system_id, data, time_ns in received:
+            self._entered += 1
+            heapq.heappush(self._entering, (time_ns, system_id, self._entered, data))
+        acts, entering = self._acts, self._entering
+        while True:
+            acts_ns, acting_id = acts[0] if acts else (NEVER_NS, 0)
+            enters_ns = entering[0][0] if entering else NEVER_NS
+            if enters_ns <= acts_ns and enters_ns <= now_ns:
+                time_ns, system_id, _, data = heapq.heappop(entering)
+                member = self._members[system_id]
+                member.down.send(data, time_ns)
+            elif acts_ns <= now_ns:
+                heapq.heappop(acts)
+                member = self._members[acting_id]
+                if acts_ns != member.acts_ns:
+                    continue
+                self._live(member, acts_ns)
+            else:
+                return
+            self._plan(member)
+
     def _live(self, member: _Member, now_ns: int) -> None:
         """Bring a vehicle up to now; what it sends enters its up link."""
         arrived: list[tuple[bytes, int]] = []
         if member.down.next_due_ns <= now_ns:
-            for data, due_ns, entered_ns in member.down.due_entered(now_ns):
-                arrived.append((data, due_ns))
+            for entry in member.down.due(now_ns):
+                arrived.append((entry[3], entry[0]))
                 if self._record is not None:
-                    key = message_id(data)
-                    self._record((LINK_DOWN, member.vehicle.system_id, key, due_ns, entered_ns, due_ns))
+                    self._record(member.down.row(entry, entry[0]))
         for data, time_ns in member.vehicle.step(arrived, now_ns):
             member.up.send(data, time_ns)
 
@@ -147,3 +185,10 @@ class Fleet:
         if leaves_ns != member.leaves_ns:
             member.leaves_ns = leaves_ns
             heapq.heappush(self._heap, (leaves_ns, member.vehicle.system_id))
+        if self._links.have_channels:
+            self._plan_act(member, min(acts_ns, arrives_ns))
+
+    def _plan_act(self, member: _Member, acts_ns: int) -> None:
+        if acts_ns != member.acts_ns:
+            member.acts_ns = acts_ns
+            heapq.heappush(self._acts, (acts_ns, member.vehicle.system_id))

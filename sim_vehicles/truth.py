@@ -17,24 +17,48 @@ SAMPLED, ACTED, LINK_UP, LINK_DOWN = 1, 2, 3, 4
 KINDS = {SAMPLED: "SAMPLED", ACTED: "ACTED", LINK_UP: "LINK_UP", LINK_DOWN: "LINK_DOWN"}
 
 DTYPE = np.dtype(
-    [("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_ns", "<i8"), ("entered_ns", "<i8"), ("due_ns", "<i8")]
+    [
+        ("kind", "u1"),
+        ("system_id", "u1"),
+        ("key", "<u4"),
+        ("time_ns", "<i8"),
+        ("entered_ns", "<i8"),
+        ("due_ns", "<i8"),
+        ("fate", "u1"),
+        ("queued_ns", "<i8"),
+    ]
 )
 """One record.
 
 SAMPLED: the state in the LOCAL_POSITION_NED with time_boot_ms `key` was sampled at `time_ns`. ACTED: the set-point
-with the sender's time_boot_ms `key` acts from `time_ns` on. For these two the other times equal `time_ns`.
-LINK_UP, LINK_DOWN: a datagram whose first frame has the message id `key` (0xFFFFFF if it has none) entered the link
-at `entered_ns`, was due at `due_ns`, and left at `time_ns`: upwards handed to the socket (in virtual time, to the
-station), downwards taken by the vehicle.
+with the sender's time_boot_ms `key` acts from `time_ns` on. For these two the other times equal `time_ns`, and the
+last two fields are 0.
+LINK_UP, LINK_DOWN: a datagram whose first frame has the message id `key` (0xFFFFFF if it has none; as it left, so
+perhaps corrupted) entered the link at `entered_ns`, was due at `due_ns`, and left at `time_ns`: handed to a socket (in
+virtual time, to the station), or downwards taken by the simulated vehicle. For `queued_ns` it waited for the channel.
+`fate` adds up what happened to it, see FATES. If that is one of DROPPED it never left: due_ns and time_ns are
+entered_ns. Of a datagram that was duplicated there are two records, the second copy's with DUPLICATE.
 """
 
-_MAGIC = b"UAVTRUE1"
-_PACK = struct.Struct("<BBIqqq").pack
+PASSED = 0
+DUPLICATE, CORRUPTED, LOST, OUTAGE, QUEUE_FULL, LINK_FULL = 1, 2, 4, 8, 16, 32
+DROPPED = LOST | OUTAGE | QUEUE_FULL | LINK_FULL
+FATES = {
+    DUPLICATE: "duplicated",
+    CORRUPTED: "corrupted",
+    LOST: "lost",
+    OUTAGE: "outage",
+    QUEUE_FULL: "queue_full",
+    LINK_FULL: "link_full",
+}
+
+_MAGIC = b"UAVTRUE2"
+_PACK = struct.Struct("<BBIqqqBq").pack
 _BATCH = 1024
 
 
-Row = tuple[int, int, int, int, int, int]
-"""One record's values, in the order of DTYPE."""
+Row = tuple[int, int, int, int, int, int] | tuple[int, int, int, int, int, int, int, int]
+"""One record's values, in the order of DTYPE; the last two may be left out and are 0."""
 Record = Callable[[Row], None]
 """Takes one record: TruthLog.record, or the append of a list."""
 
@@ -59,7 +83,7 @@ class TruthLog:
 
     def record(self, row: Row) -> None:
         """Add a record to the batch, and write the batch if it is full."""
-        self._batch.append(_PACK(*row))
+        self._batch.append(_PACK(*row) if len(row) == 8 else _PACK(*row, PASSED, 0))
         if len(self._batch) >= _BATCH:
             self.flush()
 

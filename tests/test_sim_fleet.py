@@ -121,8 +121,8 @@ def test_the_truth_says_when_states_were_sampled_and_set_points_acted() -> None:
     assert len(acted) == COUNT * 98  # 100 ticks, the last two still under way
     for kind, delay_ns in ((LINK_UP, 20 * MS), (LINK_DOWN, 30 * MS)):
         links = [row for row in rows if row[0] == kind]
-        assert {due - entered for _, _, _, _, entered, due in links} == {delay_ns}
-        assert all(left >= due for _, _, _, left, _, due in links)
+        assert {row[5] - row[4] for row in links} == {delay_ns}
+        assert all(row[3] >= row[5] for row in links)
 
 
 def test_when_a_station_was_last_heard_and_what_was_counted() -> None:

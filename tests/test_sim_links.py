@@ -1,12 +1,23 @@
-"""An emulated link: exact due times, order, bounds."""
+"""An emulated link: exact due times, order, bounds, and nothing invented or forgotten."""
 
+from collections import Counter
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from scenarios import schema
-from sim_vehicles.links import NEVER_NS, Link
+from scenarios.schema import DelayPoint, Jitter, LossBursts, Outage
+from sim_vehicles.links import NEVER_NS, Entry, Link
+from sim_vehicles.truth import CORRUPTED, DROPPED, DUPLICATE, LINK_FULL, LINK_UP, OUTAGE, Row
 
 MS = 1_000_000
+SECOND = 1_000_000_000
+
+
+def times(out: list[Entry]) -> list[tuple[bytes, int]]:
+    """(data, when it came out)."""
+    return [(entry[3], entry[0]) for entry in out]
 
 
 def test_a_datagram_comes_out_exactly_its_delay_later_and_not_before() -> None:
@@ -15,7 +26,7 @@ def test_a_datagram_comes_out_exactly_its_delay_later_and_not_before() -> None:
     link.send(b"a", 5)
     assert link.next_due_ns == 12_300_005
     assert link.due(12_300_004) == []
-    assert link.due(20_000_000) == [(b"a", 12_300_005)]
+    assert times(link.due(20_000_000)) == [(b"a", 12_300_005)]
     assert link.due(20_000_000) == []
     assert link.next_due_ns == NEVER_NS
 
@@ -25,16 +36,138 @@ def test_all_come_out_once_in_order_of_time_and_of_entry(entered: list[int], loo
     link = Link(schema.Link(delay_s=10e-9))
     for number, time_ns in enumerate(entered):
         link.send(bytes([number]), time_ns)
-    out = [datagram for now_ns in [*sorted(looks), 100] for datagram in link.due(now_ns)]
+    out = [datagram for now_ns in [*sorted(looks), 100] for datagram in times(link.due(now_ns))]
     expected = sorted((time_ns + 10, number) for number, time_ns in enumerate(entered))
     assert out == [(bytes([number]), due_ns) for due_ns, number in expected]
 
 
-def test_a_full_link_drops_what_comes_and_counts_it() -> None:
-    link = Link(schema.Link(delay_s=1.0), capacity=3)
+@pytest.mark.parametrize("jitter", [None, Jitter(distribution="uniform", scale_s=1e-9)])
+def test_a_full_link_drops_what_comes_and_counts_it(jitter: Jitter | None) -> None:
+    rows: list[Row] = []
+    link = Link(schema.Link(delay_s=1.0, jitter=jitter), capacity=3, record=rows.append)
     for number in range(5):
         link.send(bytes([number]), number)
-    assert (link.sent, link.dropped) == (3, 2)
-    assert [data for data, _ in link.due(10**10)] == [b"\0", b"\1", b"\2"]
+    assert (link.entered, link.dropped, link.under_way) == (5, 2, 3)
+    assert [data for data, _ in times(link.due(10**10))] == [b"\0", b"\1", b"\2"]
+    assert rows == [(LINK_UP, 0, 0xFFFFFF, k, k, k, LINK_FULL, 0) for k in (3, 4)]
     link.send(b"again", 0)
     assert link.dropped == 2
+
+
+def test_a_ramp_is_exact_at_given_instants() -> None:
+    points = ((1.0, 0.02), (3.0, 0.42), (3.0, 0.1), (4.0, 0.1), (6.0, 0.0))
+    schedule = tuple(DelayPoint(at_s=at_s, delay_s=delay_s) for at_s, delay_s in points)
+    link = Link(schema.Link(delay_points=schedule, reordering=True))
+    link.zero_ns = 7 * SECOND
+    expected_ms = {
+        0.0: 20,
+        1.0: 20,
+        1.5: 120,
+        2.0: 220,
+        2.75: 370,
+        3.0: 100,
+        3.7: 100,
+        5.0: 50,
+        5.5: 25,
+        6.0: 0,
+        99.0: 0,
+    }
+    for at_s in expected_ms:
+        link.send(str(at_s).encode(), 7 * SECOND + round(at_s * SECOND))
+    found = {float(data): (due_ns, entered_ns) for due_ns, _, entered_ns, data, _, _ in link.due(NEVER_NS)}
+    assert {at_s: due_ns - entered_ns for at_s, (due_ns, entered_ns) in found.items()} == {
+        at_s: delay_ms * MS for at_s, delay_ms in expected_ms.items()
+    }
+
+
+def test_before_its_time_begins_a_link_has_its_first_delay_and_no_outage() -> None:
+    points = (DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=1.0, delay_s=0.5))
+    link = Link(schema.Link(delay_points=points, outages=(Outage(from_s=0.0, until_s=9.0),)))
+    link.send(b"early", 5 * SECOND)
+    assert times(link.due(NEVER_NS)) == [(b"early", 5 * SECOND + 20 * MS)]
+
+
+def test_an_outage_drops_from_its_first_instant_until_before_its_last() -> None:
+    rows: list[Row] = []
+    link = Link(
+        schema.Link(outages=(Outage(from_s=1.0, until_s=2.0), Outage(from_s=3.0, until_s=4.0))), record=rows.append
+    )
+    link.zero_ns = 0
+    for time_ns in (0, SECOND - 1, SECOND, 2 * SECOND - 1, 2 * SECOND, 3 * SECOND, 4 * SECOND):
+        link.send(b"x", time_ns)
+    assert [due_ns for _, due_ns in times(link.due(NEVER_NS))] == [0, SECOND - 1, 2 * SECOND, 4 * SECOND]
+    assert [(row[3], row[6:]) for row in rows] == [(t, (OUTAGE, 0)) for t in (SECOND, 2 * SECOND - 1, 3 * SECOND)]
+
+
+probability = st.sampled_from([0.0, 0.05, 0.5, 1.0])
+jitters = st.one_of(
+    st.none(),
+    st.builds(Jitter, distribution=st.sampled_from(["uniform", "normal", "exponential"]), scale_s=st.just(0.01)),
+    st.builds(Jitter, distribution=st.just("gamma"), scale_s=st.just(0.01), shape=st.floats(0.1, 5)),
+    st.builds(Jitter, distribution=st.just("trace"), trace_s=st.just((0.001, 0.03, 0.0))),
+)
+bursts = st.builds(LossBursts, to_bad_probability=probability, to_good_probability=st.sampled_from([0.1, 1.0]))
+misbehaving = st.builds(
+    schema.Link,
+    delay_s=st.sampled_from([0.0, 0.004]),
+    jitter=jitters,
+    reordering=st.booleans(),
+    loss_bursts=st.one_of(st.none(), bursts),
+    duplicate_probability=probability,
+    corrupt_probability=probability,
+    outages=st.sampled_from([(), (Outage(from_s=0.01, until_s=0.02),)]),
+)
+arrivals = st.lists(st.integers(0, 50 * MS), max_size=60).map(sorted)
+
+
+def passed(behaviour: schema.Link, entered: list[int], seed: int, rows: list[Row]) -> tuple[Link, list[Entry]]:
+    """The link and what came out of it, the last second included, when numbered datagrams entered at these times."""
+    link = Link(behaviour, capacity=20, seed=seed, record=rows.append)
+    link.zero_ns = 0
+    out: list[Entry] = []
+    for number, time_ns in enumerate(entered):
+        out += link.due(time_ns)
+        link.send(b"%03d" % number, time_ns)
+        assert link.under_way <= 20
+        assert link.entered + link.counts["duplicated"] == len(out) + link.dropped + link.under_way
+    out += link.due(NEVER_NS)
+    return link, out
+
+
+@given(misbehaving, arrivals, st.integers(0, 2**32))
+def test_nothing_is_invented_and_nothing_disappears_unrecorded(
+    behaviour: schema.Link, entered: list[int], seed: int
+) -> None:
+    rows: list[Row] = []
+    link, out = passed(behaviour, entered, seed, rows)
+    assert link.under_way == 0
+    assert link.entered + link.counts["duplicated"] == len(out) + len(rows)
+    assert len(rows) == link.dropped
+    assert all(row[6] & DROPPED for row in rows if len(row) == 8)
+    whole = Counter(data for _, _, _, data, fate, _ in out if not fate & CORRUPTED)
+    assert all(0 <= int(data) < len(entered) for data in whole)
+    twice = Counter(data for _, _, _, data, fate, _ in out if fate & DUPLICATE and not fate & CORRUPTED)
+    assert all(count == 1 + twice[data] for data, count in whole.items() if twice[data])
+    assert all(count == 1 for data, count in whole.items() if not twice[data])
+    for due_ns, number, entered_ns, data, fate, _ in out:
+        assert entered_ns == entered[number - 1]
+        assert due_ns >= entered_ns + link.least_delay_ns
+        assert (data != b"%03d" % (number - 1)) == bool(fate & CORRUPTED)
+
+
+@given(misbehaving.filter(lambda link: not link.reordering), arrivals, st.integers(0, 2**32))
+def test_without_reordering_no_datagram_leaves_before_an_earlier_one(
+    behaviour: schema.Link, entered: list[int], seed: int
+) -> None:
+    _, out = passed(behaviour, entered, seed, [])
+    numbers = [number for _, number, *_ in out]
+    assert numbers == sorted(numbers)
+
+
+def test_with_reordering_some_do() -> None:
+    jitter = Jitter(distribution="uniform", scale_s=0.03)
+    link = schema.Link(delay_s=0.03, jitter=jitter, reordering=True)
+    _, out = passed(link, [k * MS for k in range(20)], 1, [])
+    numbers = [number for _, number, *_ in out]
+    assert sorted(numbers) == list(range(1, 21))
+    assert numbers != sorted(numbers)

@@ -6,12 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from sim_vehicles.truth import ACTED, DTYPE, LINK_UP, SAMPLED, TruthLog, read_truth
+from sim_vehicles.truth import ACTED, CORRUPTED, DTYPE, DUPLICATE, LINK_UP, SAMPLED, Row, TruthLog, read_truth
 
-ROWS = [(SAMPLED, 1, 2**32 - 1, 10, 10, 10), (ACTED, 250, 0, 2**62, 5, -7), (LINK_UP, 3, 32, 30, 10, 29)]
+ROWS: list[Row] = [
+    (SAMPLED, 1, 2**32 - 1, 10, 10, 10, 0, 0),
+    (ACTED, 250, 0, 2**62, 5, -7, 0, 0),
+    (LINK_UP, 3, 32, 30, 10, 29, DUPLICATE | CORRUPTED, 7),
+]
 
 
-def write(path: Path, rows: list[tuple[int, int, int, int, int, int]]) -> None:
+def write(path: Path, rows: list[Row]) -> None:
     log = TruthLog(path)
     for row in rows:
         log.record(row)
@@ -21,6 +25,11 @@ def write(path: Path, rows: list[tuple[int, int, int, int, int, int]]) -> None:
 def test_what_is_recorded_is_read_back(tmp_path: Path) -> None:
     write(tmp_path / "truth", ROWS * 1000)
     assert [tuple(row) for row in read_truth(tmp_path / "truth").tolist()] == ROWS * 1000
+
+
+def test_what_is_left_out_of_a_record_is_zero(tmp_path: Path) -> None:
+    write(tmp_path / "truth", [ROWS[0][:6]])
+    assert read_truth(tmp_path / "truth").tolist() == [ROWS[0]]
 
 
 def test_a_flushed_batch_is_in_the_file_though_the_log_is_never_closed(tmp_path: Path) -> None:

@@ -1,0 +1,105 @@
+"""The monitor in flight, in virtual time: it speaks before the formation suffers, and its action saves the flight.
+
+`MONITOR_SEEDS=200 python3 make.py test tests/test_flight_monitor.py` flies as many seeds; a few are flown by default.
+"""
+
+import os
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gcs.lockstep import START_NS, fly_lockstep
+from gcs.plan import FlightPlan, flight_plan
+from gcs.record import Mode, TickArray
+from gcs.station import Station
+from scenarios.files import load
+from scenarios.schema import DelayPoint, Jitter, Link, Links, Monitor, Safety
+
+TRIANGLE = load(Path(__file__).parent.parent / "scenarios" / "triangle5.toml")
+SEEDS = range(int(os.environ.get("MONITOR_SEEDS", "3")))
+QUIET_S = 8.0
+"""The formation has settled by then."""
+
+
+def ramp(highest_s: float) -> Links:
+    """From 20 ms each way at 10 s to a highest delay at 40 s, held for 10 s, and back within 8 s."""
+    points = ((10.0, 0.02), (40.0, highest_s), (50.0, highest_s), (58.0, 0.02))
+    link = Link(delay_points=tuple(DelayPoint(at_s=at_s, delay_s=delay_s) for at_s, delay_s in points))
+    return Links(up=link, down=link)
+
+
+@cache
+def planned() -> FlightPlan:
+    return flight_plan(TRIANGLE)[1]
+
+
+def flown(**changes: Any) -> tuple[TickArray, Station]:
+    plan = replace(planned(), scenario=TRIANGLE.model_copy(update=changes))
+    station = Station(plan, start_ns=START_NS)
+    return np.concatenate(list(fly_lockstep(plan, station=station))), station
+
+
+def error_m(ticks: TickArray) -> Any:
+    error = np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])
+    return np.where((ticks["time_s"] > QUIET_S) & ticks["commanded"], error, np.nan)
+
+
+def first_time_s(station: Station, mode: Mode) -> float:
+    return min(e.time_s for e in station.events if e.kind == "mode" and e.text.endswith(f"-> {mode.name}"))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_with_the_monitor_the_formation_survives_three_times_its_first_margin(seed: int) -> None:
+    ticks, station = flown(seed=seed, duration_s=75.0, links=ramp(0.44))
+    assert station.end_reason == "completed: duration reached"
+    assert np.nanmax(ticks["loop_delay_s"]) > 2.9 * planned().delay_margin_s
+    assert np.nanmax(error_m(ticks)) < 0.01 * 172.4  # of the spacing
+    last = ticks[ticks["time_s"] < 75.0][-5:]
+    assert set(last["mode"]) == {Mode.NOMINAL}  # all the way back
+    assert set(last["gain_set"]) == {0}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_without_its_action_caution_and_critical_come_before_the_error_and_the_formation_breaks(seed: int) -> None:
+    ticks, station = flown(seed=seed, duration_s=75.0, links=ramp(0.44), monitor=Monitor(act=False))
+    assert station.end_reason.startswith("broken")
+    out_s = float(ticks["time_s"][error_m(ticks) > 0.01 * 172.4].min())
+    assert first_time_s(station, Mode.CAUTION) < first_time_s(station, Mode.CRITICAL) < out_s
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_false_alarm_in_a_nominal_flight_with_jitter(seed: int) -> None:
+    """20 ms each way, and 10 ms of exponential jitter on top of each: a loop delay of about 80 ms against 300 ms."""
+    link = Link(delay_s=0.02, jitter=Jitter(distribution="exponential", scale_s=0.01))
+    ticks, station = flown(seed=seed, duration_s=20.0, links=Links(up=link, down=link))
+    assert station.end_reason == "completed: duration reached"
+    assert set(ticks[(ticks["time_s"] > 0.1) & (ticks["time_s"] < 20.0)]["mode"]) == {Mode.NOMINAL}
+
+
+def test_gains_change_without_a_jump_in_command() -> None:
+    ticks, _ = flown(seed=1, duration_s=75.0, links=ramp(0.44))
+    for system_id in (1, 2, 3, 4, 5):
+        own = ticks[(ticks["system_id"] == system_id) & ticks["commanded"] & (ticks["time_s"] > QUIET_S)]
+        changes = np.flatnonzero(np.diff(own["gain_set"].astype(int))) + 1
+        assert changes.size == 4
+        jump = np.abs(np.diff(own["command_north_m_s2"]))
+        around = [float(jump[k - 1]) for k in changes]
+        # No greater than what the command does from tick to tick in the second around it.
+        for k, step in zip(changes.tolist(), around, strict=True):
+            assert step <= 1.5 * float(np.max(np.delete(jump[k - 25 : k + 25], 24))) + 1e-3
+
+
+def test_release_when_even_the_slowest_gains_have_no_headroom_leaves_vehicles_in_failsafe() -> None:
+    # Released while the formation opens, vehicles drift apart; on the way back their spacing errors are large.
+    safety = Safety(spacing_error_limit_m=2000.0)
+    ticks, station = flown(seed=1, duration_s=90.0, links=ramp(0.9), safety=safety)
+    assert station.end_reason == "completed: duration reached"
+    modes = {Mode(int(mode)) for mode in np.unique(ticks["mode"])}
+    assert Mode.FAILSAFE in modes
+    assert float(np.nanmin(ticks["nearest_m"])) > 50.0
+    last = ticks[ticks["time_s"] < 90.0][-5:]
+    assert set(last["mode"]) <= {Mode.NOMINAL, Mode.CAUTION, Mode.RECOVERING}
