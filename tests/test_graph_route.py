@@ -1,0 +1,63 @@
+"""The graph route on the thesis's formation: fixed modes, structured LQR and the D-K type iteration."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from gains.dk_iteration import dk_iteration
+from gains.errors import InfeasibleError
+from gains.fixed_modes import check_stabilisable, fixed_modes
+from gains.formation import FormationModel
+from gains.pattern import Pattern, all_to_all, bidirectional, formation_plant, leader_follower, without_links
+from gains.structured_lqr import Weights, lqr_cost, structured_lqr
+
+CHAIN = FormationModel((-1, 0, 1))
+PLANT = formation_plant(CHAIN)
+WEIGHTS = Weights(np.eye(10), np.eye(6))
+
+
+def abscissa(matrix: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> float:
+    return float(np.linalg.eigvals(matrix).real.max())
+
+
+@pytest.mark.parametrize("pattern", [leader_follower(CHAIN), bidirectional(CHAIN), all_to_all(CHAIN)])
+def test_formations_have_no_fixed_modes(pattern: Pattern) -> None:
+    assert fixed_modes(PLANT, pattern) == ()
+
+
+def test_a_vehicle_that_may_not_use_its_own_output_cannot_be_stabilised_and_the_missing_link_is_named() -> None:
+    pattern = without_links(leader_follower(CHAIN), [(2, 2)])
+    with pytest.raises(InfeasibleError, match=r"\(2, 2\)"):
+        check_stabilisable(PLANT, pattern)
+
+
+def test_with_all_information_the_structured_optimum_is_the_centralised_one() -> None:
+    result = structured_lqr(PLANT, all_to_all(CHAIN), WEIGHTS)
+    assert abs(result.loss) < 1e-6  # the Riccati equation is the independent method
+
+
+@pytest.mark.parametrize("pattern", [leader_follower(CHAIN), bidirectional(CHAIN)], ids=["tree", "bidirectional"])
+def test_structured_optimum_is_stationary_stable_in_the_pattern_and_costs_more(pattern: Pattern) -> None:
+    result = structured_lqr(PLANT, pattern, WEIGHTS)
+    mask = pattern.mask
+    assert not result.K[~mask].any()
+    assert abscissa(PLANT.closed_loop(result.K)) < 0
+    assert result.loss > 0
+    step = np.random.default_rng(1).normal(size=result.K.shape) * mask
+    step *= 1e-4 / np.linalg.norm(step)
+    up, down = (lqr_cost(PLANT, pattern, WEIGHTS, result.K + s * step)[0] for s in (1, -1))
+    assert up > result.cost
+    assert down > result.cost
+    assert abs(up - down) < 1e-3 * (up + down - 2 * result.cost) + 1e-9 * result.cost  # flat to first order
+
+
+def test_dk_iteration_falls_at_each_iterate_and_ends_stable_in_the_pattern() -> None:
+    chain = FormationModel((-1, 0), axes=1)
+    pattern, plant = leader_follower(chain), formation_plant(chain)
+    design = dk_iteration(plant, pattern)
+    alphas = [iterate.alpha for iterate in design.iterates]
+    assert all(later <= earlier + 1e-9 for earlier, later in pairwise(alphas))
+    assert alphas[-1] < 0
+    assert not design.K[~pattern.mask].any()
+    assert abscissa(plant.closed_loop(design.K)) < 0
