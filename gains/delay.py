@@ -19,7 +19,14 @@ from gains.delay_sweep import frequency_sweep_margin
 from gains.errors import BadModelError, DisagreementError
 from gains.structure import Block, FloatArray, balanced, distinct_blocks, square_matrices
 
-__all__ = ["Crossing", "DelayAnalysis", "analyse_delay", "delay_margin", "frequency_sweep_margin"]
+__all__ = [
+    "Crossing",
+    "DelayAnalysis",
+    "analyse_delay",
+    "delay_margin",
+    "frequency_sweep_margin",
+    "stability_windows",
+]
 
 # more critical delays than this are not listed: a near-tangent pair of crossings can have millions
 _MOST_EVENTS = 200_000
@@ -94,7 +101,7 @@ def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = Non
         unstable += unstable_of_block
         fixed_on_axis |= fixed_of_block
     crossings.sort(key=lambda crossing: (crossing.delay_s, crossing.omega_rad_s))
-    intervals, complete_to_s = ((), inf) if fixed_on_axis else _windows(crossings, unstable, horizon_s)
+    intervals, complete_to_s = ((), inf) if fixed_on_axis else stability_windows(crossings, unstable, horizon_s)
     margin_s = next((end_s for start_s, end_s in intervals if start_s == 0.0), 0.0)
     return DelayAnalysis(
         stable_intervals_s=intervals,
@@ -166,7 +173,7 @@ def _least_singular(matrix: FloatArray | ComplexArray, omega: float) -> float:
     return float(np.linalg.svd(1j * omega * np.eye(matrix.shape[0]) - matrix, compute_uv=False)[-1])
 
 
-def _windows(
+def stability_windows(
     crossings: Sequence[Crossing], unstable: int, horizon_s: float | None
 ) -> tuple[tuple[tuple[float, float], ...], float]:
     """Windows without unstable roots, and the delay up to which they are complete."""

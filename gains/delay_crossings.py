@@ -6,6 +6,7 @@ direction, brackets them, and does not rely on the list being accurate; Newton's
 gives the last digits.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,13 +54,16 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
     B, C = factor_rank(A1)
     if B.shape[1] == 0:
         return []
-    loci = delay_loci(A0, B, C)
-    highest = highest_frequency(A0, A1)
-    candidates = _candidates(A0, A1, B, C, highest)
-    crossings = unit_crossings(loci, separating_points(candidates, highest))
-    crossings += _hidden_crossings(loci, candidates, crossings)
-    polished = [_polish(A0, A1, crossing) for crossing in crossings]
+    candidates = _candidates(A0, A1, B, C, highest_frequency(A0, A1))
+    found = crossings_of_loci(delay_loci(A0, B, C), candidates, highest_frequency(A0, A1))
+    polished = [polish((A0, A1), crossing) for crossing in found]
     return sorted(polished, key=lambda crossing: (crossing.omega, crossing.theta))
+
+
+def crossings_of_loci(loci: Loci, candidates: FloatArray, highest: float) -> list[UnitCrossing]:
+    """All crossings of the unit circle, mere touches included, given frequencies that come near each of them."""
+    crossings = unit_crossings(loci, separating_points(candidates, highest))
+    return crossings + _hidden_crossings(loci, candidates, crossings)
 
 
 def highest_frequency(A0: FloatArray, A1: FloatArray) -> float:
@@ -121,27 +125,27 @@ def _hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossi
     return hidden
 
 
-def _polish(A0: FloatArray, A1: FloatArray, crossing: UnitCrossing) -> AxisCrossing:
-    """Newton steps on u*(j w I - A0 - A1 e^{-j theta}) v = 0 with the singular vectors u, v of the least value.
+def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> AxisCrossing:
+    """Newton steps on u*(j w I - sum_k A_k e^{-j k theta}) v = 0, u, v the singular vectors of the least value.
 
     A step is taken only while it lowers the least singular value, and not where two are small at once (several roots
     cross at one place) or the two unknowns act alike (near-tangent): there the bracketed value is the better one.
     """
     omega, theta = crossing.omega, float(np.angle(crossing.locus))
-    identity = np.eye(A0.shape[0])
+    identity = np.eye(matrices[0].shape[0])
     best = np.inf
     result = (omega, theta)
     for _ in range(3):
-        delayed = A1 * np.exp(-1j * theta)
-        U, singular, Vh = np.linalg.svd(1j * omega * identity - A0 - delayed)
+        delayed = [matrix * np.exp(-1j * k * theta) for k, matrix in enumerate(matrices)]
+        U, singular, Vh = np.linalg.svd(1j * omega * identity - sum(delayed))
         if singular[-1] >= best:
             break
         best, result = singular[-1], (omega, theta)
         if singular.size > 1 and singular[-2] < 1e-6 * singular[0]:
             break
         u, v = U[:, -1].conj(), Vh[-1].conj()
-        # the residual is singular[-1]; its derivatives are j u*v and j e^{-j theta} u*A1 v
-        by_omega, by_theta = 1j * (u @ v), 1j * (u @ delayed @ v)
+        # the residual is singular[-1]; its derivatives are j u*v and sum_k j k e^{-j k theta} u*A_k v
+        by_omega, by_theta = 1j * (u @ v), 1j * (u @ sum(k * matrix for k, matrix in enumerate(delayed)) @ v)
         determinant = by_omega.real * by_theta.imag - by_omega.imag * by_theta.real
         if abs(determinant) < 1e-6 * abs(by_omega) * abs(by_theta):
             break

@@ -61,13 +61,16 @@ def _block_margin(A0: FloatArray, A1: FloatArray) -> float:
     return min((float(np.angle(c.locus)) % (2.0 * pi) / c.omega for c in crossings), default=inf)
 
 
-def near_unit_extrema(loci: Loci, omega: FloatArray) -> FloatArray:
-    """Frequencies of local extrema of the sorted log moduli that may reach zero between grid points."""
+def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
+    """Frequencies of local extrema of the sorted log moduli that may reach zero between grid points.
+
+    Extrema whose sampled log modulus is `near` or more away from zero are taken not to reach it.
+    """
     logs = log_moduli(loci(omega))
     inner, left, right = logs[1:-1], logs[:-2], logs[2:]
     peak = (inner >= left) & (inner >= right) & (inner <= 0.0)
     valley = (inner <= left) & (inner <= right) & (inner >= 0.0)
-    row, rank = np.nonzero((peak | valley) & (np.abs(inner) < _NEAR_UNIT))
+    row, rank = np.nonzero((peak | valley) & (np.abs(inner) < near))
     if row.size == 0:
         return np.empty(0)
     sign = np.where(peak[row, rank], 1.0, -1.0)

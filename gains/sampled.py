@@ -39,7 +39,7 @@ def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, del
     BadModelError
         Naming the argument, what was read and what was wanted.
     """
-    plant = HeldPlant(*_checked_loop(A, B, K), _checked_period(period_s))
+    plant = HeldPlant(*checked_loop(A, B, K), _checked_period(period_s))
     return lifted_map(plant, _checked_delay(delay_s))
 
 
@@ -48,7 +48,7 @@ def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float
 
     Strongly connected blocks are taken one by one: identical followers do not spoil each other's eigenvalues.
     """
-    plants = held_blocks(*_checked_loop(A, B, K), period_s=_checked_period(period_s))
+    plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
     return max(block_radius(plant, _checked_delay(delay_s)) for plant in plants)
 
 
@@ -82,7 +82,7 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
     DisagreementError
         The eigenvalues of the one-period map contradict the crossings found.
     """
-    plants = held_blocks(*_checked_loop(A, B, K), period_s=_checked_period(period_s))
+    plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
     return min(block_delay_margin(plant) for plant in plants)
 
 
@@ -98,12 +98,12 @@ def sampling_period_limit(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> float:
     BadModelError
         Naming the argument, what was read and what was wanted.
     """
-    plant, entry, feedback = _checked_loop(A, B, K)
+    plant, entry, feedback = checked_loop(A, B, K)
     blocks = distinct_blocks(plant, entry @ feedback)
     return min(block_period_limit(*balanced(*block.matrices)) for block in blocks)
 
 
-def _checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A (n, n), B (n, p), K (p, n) as finite real matrices; BadModelError names what does not fit."""
     [plant] = square_matrices(A=A)
     entry, feedback = real_matrix("B", B), real_matrix("K", K)

@@ -39,9 +39,9 @@ def block_period_limit(A: FloatArray, BK: FloatArray) -> float:
     start_s = 1e-3 * float((-loop_roots.real).min()) / (float(np.linalg.norm(A) + np.linalg.norm(BK)) ** 2)
     slowest = float(plant_roots.real.max())
     for _ in range(_CHUNKS):
-        periods_s = _next_periods(start_s, fastest)
+        periods_s = next_periods(start_s, fastest)
         logs = log_radius(periods_s)
-        periods_s, logs = _with_peaks(log_radius, periods_s, logs)
+        periods_s, logs = with_peaks(log_radius, periods_s, logs)
         above = np.flatnonzero(logs >= 0.0)
         if above.size > 0 and above[0] > 0:
             i = above[:1]
@@ -57,7 +57,7 @@ def block_period_limit(A: FloatArray, BK: FloatArray) -> float:
     )
 
 
-def _next_periods(start_s: float, fastest: float) -> FloatArray:
+def next_periods(start_s: float, fastest: float) -> FloatArray:
     """Ascending periods from `start_s`, geometric until the steps would skip an oscillation of the plant."""
     largest_step_s = 2.0 * np.pi * _STEP / fastest if fastest > 0.0 else inf
     periods_s = [start_s]
@@ -66,7 +66,7 @@ def _next_periods(start_s: float, fastest: float) -> FloatArray:
     return np.array(periods_s)
 
 
-def _with_peaks(
+def with_peaks(
     log_radius: Callable[[FloatArray], FloatArray], periods_s: FloatArray, logs: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """The samples with the local maxima of the radius below one added, located by golden section."""

@@ -124,29 +124,58 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
     ]
 
 
-def project_out_equilibria(A0: ArrayLike, A1: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """The pair (A0, A1) without the states along which nothing ever acts: consensus without its common value.
+def project_out_equilibria(*matrices: ArrayLike) -> tuple[FloatArray, ...]:
+    """The matrices without the states along which nothing ever acts: consensus without its common value.
 
-    Directions v with A0 v = A1 v = 0 (or, for conserved quantities, w'A0 = w'A1 = 0) carry a root of
-    det(sI - A0 - A1 e^{-s tau}) at s = 0 for every delay. An orthonormal basis whose first columns span them makes
-    both matrices block triangular; the remaining diagonal block is returned, repeatedly until no such direction is
-    left (a formation at constant velocity has two, one after the other). All other roots are kept.
+    Directions v with A_k v = 0 for every k (or, for conserved quantities, w'A_k = 0) carry a root of
+    det(sI - A_0 - A_1 e^{-s tau} - ...) at s = 0 for every delay. An orthonormal basis whose first columns span them
+    makes all matrices block triangular; the remaining diagonal block is returned, repeatedly until no such direction
+    is left (a formation at constant velocity has two, one after the other). All other roots are kept.
 
     Raises
     ------
     BadModelError
         The matrices are not square, finite and of one size, or nothing but equilibria is left.
     """
-    now, late = square_matrices(A0=A0, A1=A1)
+    left = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
     while True:
-        basis = _complement_of_common_kernel(now, late)
-        if basis.shape[1] == now.shape[0]:
-            basis = _complement_of_common_kernel(now.T, late.T)
-        if basis.shape[1] == now.shape[0]:
-            return now, late
+        basis = _complement_of_common_kernel(left)
+        if basis.shape[1] == left[0].shape[0]:
+            basis = _complement_of_common_kernel([matrix.T for matrix in left])
+        if basis.shape[1] == left[0].shape[0]:
+            return tuple(left)
         if basis.shape[1] == 0:
-            raise BadModelError("A0 and A1 have nothing but equilibria; at least one moving state is wanted")
-        now, late = basis.T @ now @ basis, basis.T @ late @ basis
+            raise BadModelError("the matrices have nothing but equilibria; at least one moving state is wanted")
+        left = [basis.T @ matrix @ basis for matrix in left]
+
+
+def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], int]:
+    """The matrices with `project_out_equilibria` done in each strongly connected block, and how many states went.
+
+    The blocks are put side by side, which keeps the spectrum. A block in which nothing moves at all (an integrator
+    that nobody feeds back) stays as it is.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size.
+    """
+    checked = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
+    size = checked[0].shape[0]
+    kept = [np.zeros((size, size)) for _ in checked]
+    filled = 0
+    for indices in strongly_connected_blocks(*checked):
+        block = [matrix[np.ix_(indices, indices)] for matrix in checked]
+        if any(matrix.any() for matrix in block) and _is_singular(sum(block, np.zeros_like(block[0]))):
+            block = _moving_part(block)
+        place = slice(filled, filled + block[0].shape[0])
+        for target, matrix in zip(kept, block, strict=True):
+            target[place, place] = matrix
+        filled = place.stop
+    if filled == size:
+        # with the couplings between blocks, which a reader of the matrices expects
+        return tuple(checked), 0
+    return tuple(matrix[:filled, :filled] for matrix in kept), size - filled
 
 
 def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
@@ -179,12 +208,25 @@ def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
     return tuple(matrix * scale / scale[:, np.newaxis] for matrix in matrices)
 
 
-def _complement_of_common_kernel(A0: FloatArray, A1: FloatArray) -> FloatArray:
-    """Orthonormal basis (n, n - k) of the complement of the k-dimensional common kernel of A0 and A1."""
-    _, singular, rows = np.linalg.svd(np.vstack([A0, A1]))
+def _complement_of_common_kernel(matrices: list[FloatArray]) -> FloatArray:
+    """Orthonormal basis (n, n - k) of the complement of the k-dimensional common kernel of the matrices."""
+    _, singular, rows = np.linalg.svd(np.vstack(matrices))
     # relative to the largest singular value; a kernel known to rounding shows at a few eps
     rank = int(np.count_nonzero(singular > 1e-12 * singular[0]))
     return rows[:rank].T
+
+
+def _is_singular(matrix: FloatArray) -> bool:
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    return bool(singular[-1] <= 1e-12 * singular[0])
+
+
+def _moving_part(block: list[FloatArray]) -> list[FloatArray]:
+    """`project_out_equilibria`, or the block itself if it has none or nothing else."""
+    try:
+        return list(project_out_equilibria(*block))
+    except BadModelError:
+        return block
 
 
 def _labels_by_closure(pattern: NDArray[np.bool_]) -> IntArray:

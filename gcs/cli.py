@@ -93,6 +93,21 @@ def design(scenario_file: ScenarioFile, as_json: AsJson = False) -> None:
 
 
 @app.command()
+def margin(
+    model_file: Annotated[Path, typer.Argument(metavar="MODEL.json", help="matrices and delays of any linear loop")],
+    as_json: AsJson = False,
+) -> None:
+    """How much delay any linear loop takes: stability windows, margin, crossings."""
+    from gcs.margin import margin_of_file, print_margin
+
+    result = margin_of_file(model_file)
+    if as_json:
+        typer.echo(json.dumps(result, indent=2))
+    else:
+        print_margin(result)
+
+
+@app.command()
 def view(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder, or a .rrd file")],
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="write a picture; open no window")] = None,

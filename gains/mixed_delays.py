@@ -1,0 +1,179 @@
+"""Known delays beside one unknown: x'(t) = sum_i A_i x(t - d_i - k_i tau) with d_i in seconds and k_i whole.
+
+As in `gains.commensurate` the loci lambda(j omega) = e^{j omega tau} are eigenvalues of a block companion matrix; the
+known delays merely make its blocks depend on the frequency by e^{-j omega d_i}. A root is on the imaginary axis where
+a modulus is one and goes right where the modulus falls, for every delay. What is lost is the algebra: the frequencies
+come from a sweep, fine enough for the turning of e^{-j omega d_i} and with extrema near one refined. The unstable
+roots without the unknown delay are counted by the argument principle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.commensurate import column_space, companion_loci, highest_frequency
+from gains.delay import Crossing, DelayAnalysis, stability_windows
+from gains.delay_loci import ComplexArray, Loci, unit_crossings
+from gains.delay_sweep import near_unit_extrema
+from gains.errors import BadModelError, DisagreementError
+from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
+
+# rad by which e^{-j omega d} turns between neighbouring frequencies
+_TURN = 0.1
+_POINTS_PER_DECADE, _DECADES = 60, 9
+# more frequencies than this take more than a few seconds
+_MOST_POINTS = 60_000
+# rad by which the determinant may turn between neighbouring frequencies, and how often the grid is halved for it
+_DETERMINANT_TURN, _HALVINGS = 0.5, 40
+
+
+@dataclass(frozen=True)
+class MixedTerm:
+    """A x(t - known_s - multiple * tau): `matrix` A real (n, n) in 1/s, `known_s` >= 0, `multiple` whole and >= 0."""
+
+    matrix: ArrayLike
+    known_s: float
+    multiple: int
+
+
+def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None) -> DelayAnalysis:
+    """Stability windows, critical delays and margin in tau of x'(t) = sum A x(t - known_s - multiple tau).
+
+    `unstable_roots_at_zero_delay` counts the roots at tau = 0, with the known delays. Crossing frequencies come from
+    a sweep: a search, not a proof.
+
+    Raises
+    ------
+    BadModelError
+        No term, matrices that are not square, finite and of one size, a delay that is negative or not finite, or known
+        delays so long that the sweep would be too large.
+    DisagreementError
+        A root too close to the imaginary axis at tau = 0 to count it on either side.
+    """
+    matrices = _checked(terms)
+    known_s, multiples = np.array([t.known_s for t in terms]), [t.multiple for t in terms]
+    crossings: list[Crossing] = []
+    unstable, on_axis = 0, False
+    for block in distinct_blocks(*matrices):
+        parts = _Parts(np.array(balanced(*block.matrices)), known_s, np.array(multiples))
+        if parts.is_singular_at_zero():
+            on_axis = True
+            continue
+        crossings += [
+            Crossing(omega, theta / omega, outward, 2 * block.copies) for omega, theta, outward in _crossings(parts)
+        ]
+        unstable += block.copies * _unstable_roots(parts)
+    crossings.sort(key=lambda crossing: (crossing.delay_s, crossing.omega_rad_s))
+    intervals, complete_to_s = ((), inf) if on_axis else stability_windows(crossings, unstable, horizon_s)
+    margin_s = next((end_s for start_s, end_s in intervals if start_s == 0.0), 0.0)
+    return DelayAnalysis(intervals, margin_s, margin_s == inf, tuple(crossings), unstable, complete_to_s)
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """One block: `matrices` (terms, n, n), `known_s` (terms,), `multiples` (terms,)."""
+
+    matrices: FloatArray
+    known_s: FloatArray
+    multiples: FloatArray
+
+    @property
+    def size(self) -> int:
+        return self.matrices.shape[1]
+
+    @property
+    def degree(self) -> int:
+        late = np.array([bool(matrix.any()) for matrix in self.matrices])
+        return int(self.multiples[late].max(initial=0))
+
+    def at(self, omega: FloatArray) -> ComplexArray:
+        """The sums of A_i e^{-j omega d_i} of each multiple 0, ..., m, shape (frequencies, m + 1, n, n)."""
+        turned = np.exp(-1j * omega[:, np.newaxis] * self.known_s)[:, :, np.newaxis, np.newaxis] * self.matrices
+        return np.stack([turned[:, self.multiples == k].sum(axis=1) for k in range(self.degree + 1)], axis=1)
+
+    def highest(self) -> float:
+        """Bound (rad/s) of every root on the imaginary axis."""
+        at_once = (self.known_s == 0.0) & (self.multiples == 0)
+        return highest_frequency([self.matrices[at_once].sum(axis=0), *self.matrices[~at_once]])
+
+    def is_singular_at_zero(self) -> bool:
+        # s = 0 is then a root whatever the delays
+        singular = np.linalg.svd(self.matrices.sum(axis=0), compute_uv=False)
+        return bool(singular[-1] <= 1e-14 * self.size * np.linalg.norm(self.matrices))
+
+    def frequencies(self, highest: float) -> FloatArray:
+        turning = np.linspace(0.0, highest, int(highest * float(self.known_s.max()) / _TURN) + 200)
+        decades = highest * np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE)
+        # away from poles of the resolvent on the axis at round numbers
+        return np.union1d(turning[1:], decades) * (1.0 + 1e-9)
+
+
+def _crossings(parts: _Parts) -> list[tuple[float, float, int]]:
+    """Frequency, angle theta = omega tau modulo 2 pi and direction of every crossing of the imaginary axis."""
+    if parts.degree == 0:
+        return []
+    loci = _loci(parts)
+    omega = parts.frequencies(1.1 * parts.highest())
+    omega = np.union1d(omega, near_unit_extrema(loci, omega))
+    return [
+        (crossing.omega, float(np.angle(crossing.locus)) % (2.0 * pi), crossing.outward)
+        for crossing in unit_crossings(loci, omega)
+    ]
+
+
+def _loci(parts: _Parts) -> Loci:
+    late = [matrix for matrix, k in zip(parts.matrices, parts.multiples, strict=True) if k > 0]
+    return companion_loci(parts.at, column_space(late))
+
+
+def _unstable_roots(parts: _Parts) -> int:
+    """Roots with positive real part at tau = 0: turns of det(j omega I - A(j omega)) / (j omega + c)^n.
+
+    The quotient is analytic in the right half plane and tends to one, so it winds around zero once for each root
+    there as omega goes from infinity to minus infinity.
+    """
+    identity, scale = np.eye(parts.size), parts.highest() + float(np.linalg.norm(parts.matrices[0]))
+
+    def phase(omega: FloatArray) -> ComplexArray:
+        matrix = 1j * omega[:, np.newaxis, np.newaxis] * identity - parts.at(omega).sum(axis=1)
+        return np.linalg.slogdet(matrix)[0] * np.exp(-1j * parts.size * np.angle(1j * omega + scale))
+
+    far = parts.highest() * np.logspace(0.0, 4.0, 100)
+    omega = np.concatenate([[0.0], parts.frequencies(parts.highest()), far])
+    omega = np.unique(omega)
+    values = phase(omega)
+    for _ in range(_HALVINGS):
+        turns = np.angle(values[1:] / values[:-1])
+        coarse = np.flatnonzero(np.abs(turns) > _DETERMINANT_TURN)
+        if coarse.size == 0:
+            break
+        between = (omega[coarse] + omega[coarse + 1]) / 2.0
+        omega = np.insert(omega, coarse + 1, between)
+        values = np.insert(values, coarse + 1, phase(between))
+    else:
+        raise DisagreementError("a root is too close to the imaginary axis at tau = 0 to count it on either side")
+    # from the far end, where the quotient is one up to a few n / 10^4, to zero, where it is real
+    total = float(np.angle(values[-1])) - float(np.sum(np.angle(values[1:] / values[:-1])))
+    return round(total / pi)
+
+
+def _checked(terms: Sequence[MixedTerm]) -> list[FloatArray]:
+    if len(terms) == 0:
+        raise BadModelError("terms is empty; at least one is wanted")
+    for i, term in enumerate(terms):
+        if not (np.isfinite(term.known_s) and term.known_s >= 0.0):
+            raise BadModelError(f"terms[{i}].known_s is {term.known_s}; a number of seconds >= 0 is wanted")
+        if term.multiple < 0:
+            raise BadModelError(f"terms[{i}].multiple is {term.multiple}; a whole number >= 0 is wanted")
+    matrices = square_matrices(**{f"terms[{i}].matrix": term.matrix for i, term in enumerate(terms)})
+    longest_s = max(term.known_s for term in terms)
+    points = longest_s * sum(float(np.linalg.norm(matrix)) for matrix in matrices) / _TURN
+    if points > _MOST_POINTS:
+        raise BadModelError(
+            f"the longest known delay is {longest_s} s, which takes {points:.3g} frequencies; "
+            f"at most {_MOST_POINTS} are wanted"
+        )
+    return matrices

@@ -1,0 +1,81 @@
+"""`gcs margin` as a user runs it: systems with known margins, and input that cannot be used."""
+
+import json
+import subprocess
+import sys
+from math import pi
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+KNOWN: dict[str, tuple[dict[str, Any], list[list[float | None]]]] = {
+    "x' = -x(t - tau): pi/2": ({"A0": [[0.0]], "A1": [[-1.0]]}, [[0.0, pi / 2]]),
+    "Gu, Kharitonov, Chen 2003, page 192": (
+        {"A0": [[-2.0, 0.0], [0.0, -0.9]], "A1": [[-1.0, 0.0], [-1.0, -1.0]]},
+        [[0.0, 6.172581371221286]],
+    ),
+    "delay-induced stability, the same, page 193": (
+        {"A0": [[0.0, 1.0], [-2.0, 0.1]], "A1": [[0.0, 0.0], [1.0, 0.0]]},
+        [[0.10016826845243451, 1.7178581782970905]],
+    ),
+    "stable for every delay (Hayes)": ({"A0": [[-2.0]], "A1": [[1.0]]}, [[0.0, None]]),
+    "the same delay written as terms": (
+        {"terms": [{"A": [[0.0]], "delay": 0}, {"A": [[-1.0]], "delay": "2*tau"}]},
+        [[0.0, pi / 4]],
+    ),
+    "sampled loop, the period unknown": (
+        {"A": [[0, 1], [0, -0.1]], "B": [[0], [0.1]], "K": [[-3.75, -11.5]], "hold": True},
+        [[0.0, 1.7294142794798775]],
+    ),
+}
+
+
+def run(tmp_path: Path, text: str, *options: str) -> "subprocess.CompletedProcess[str]":
+    file = tmp_path / "model.json"
+    file.write_text(text, encoding="utf-8")
+    command = [sys.executable, "-m", "gcs.cli", "margin", str(file), *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize(("model", "intervals"), KNOWN.values(), ids=KNOWN)
+def test_known_margins(tmp_path: Path, model: dict[str, Any], intervals: list[list[float | None]]) -> None:
+    done = run(tmp_path, json.dumps(model), "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    result = json.loads(done.stdout)
+    assert len(result["stable_intervals_s"]) == len(intervals)
+    for got, wanted in zip(result["stable_intervals_s"], intervals, strict=True):
+        assert got == [None if end is None else pytest.approx(end, rel=1e-8) for end in wanted]
+    first = intervals[0]
+    assert result["delay_margin_s"] == (first[1] if first[0] == 0.0 and first[1] is None else pytest.approx(
+        first[1] if first[0] == 0.0 else 0.0, rel=1e-8
+    ))  # fmt: skip
+
+
+def test_fixed_delays_give_the_rightmost_root(tmp_path: Path) -> None:
+    model = {"terms": [{"A": [[0.0]], "delay": 0}, {"A": [[-1.0]], "delay": pi / 2}]}
+    result = json.loads(run(tmp_path, json.dumps(model), "--json").stdout)
+    assert result["rightmost_root"][0] == pytest.approx(0.0, abs=1e-9)
+    assert abs(result["rightmost_root"][1]) == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("{", "JSON"),
+        ('{"A0": [[1]]}', "A0"),
+        ('{"A0": [[1, 2], [3]], "A1": [[1]]}', "A0"),
+        ('{"A0": [[1]], "A1": [[1, 2], [3, 4]]}', "A1"),
+        ('{"A0": [["x"]], "A1": [[1]]}', "A0"),
+        ('{"A0": [[NaN]], "A1": [[1]]}', "A0"),
+        ('{"A0": [[1]], "A1": [[1]], "A2": [[1]]}', "A2"),
+        ('{"terms": [{"A": [[1]], "delay": -0.1}]}', "delay"),
+    ],
+)
+def test_bad_model_is_one_line_and_exit_code_2(tmp_path: Path, text: str, named: str) -> None:
+    done = run(tmp_path, text)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert named in done.stderr
+    assert "model.json" in done.stderr
