@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from gcs.stress import stress
+
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
@@ -142,6 +144,9 @@ def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a
     except RunError as error:
         raise InputError(str(error)) from None
     print_summary(summary, run)
+
+
+app.command()(stress)
 
 
 def main() -> None:

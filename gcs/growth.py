@@ -1,0 +1,246 @@
+"""How fast the errors of a flight grow or die away, with the uncertainty of the figure.
+
+"Did it diverge within 60 s" is a poor test of a delay margin: near the margin errors change so slowly that either
+answer is luck. Here the modes z_k of the flown loop are fitted to the tick record, y[n] = sum_k a_k z_k^n in every
+channel, and the growth rate is ln|z| / T of the slowest one; its zero is the margin.
+
+Method: ESPRIT (Roy and Kailath, "ESPRIT - estimation of signal parameters via rotational invariance techniques",
+IEEE Trans. ASSP 37(7), 1989) on Hankel matrices of all channels side by side, which share their modes. It is done
+twice: the second time on y[n] e^{-g n T} with g from the first, so that the beginning and the end of a motion that
+grows or shrinks by orders of magnitude count alike.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs.record import TickArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+DECAY_KEPT = 0.02
+"""A motion is followed until it has shrunk to this part of what it was: rounding of the telemetry, which the loop feeds
+back and amplifies, lies well below that, also in real time."""
+FEWEST_SAMPLES = 12
+_MOST_SAMPLES = 300
+"""More are thinned out: the accuracy is in the length of the window, the cost in the number of samples."""
+_ENVELOPE_S = 1.0
+_FEWEST_ENVELOPE = 4
+_LONGEST_HANKEL = 120
+_ORDER = 4
+_RANK_FLOOR = 1e-9
+_LEAST_SHARE = 0.1
+"""A mode counts when it carries this part of the motion: what rounding and noise of the clock add carries less."""
+_CHANNELS = (
+    "spacing_error_north_m",
+    "spacing_error_east_m",
+    "velocity_error_north_m_s",
+    "velocity_error_east_m_s",
+)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Errors at equally spaced instants.
+
+    Attributes
+    ----------
+    time_s
+        (n,) instants on the vehicle's clock, from the first sample used.
+    values
+        (n, channels) spacing errors in m and velocity errors in m/s.
+    period_s
+        Distance of two instants.
+    """
+
+    time_s: FloatArray
+    values: FloatArray
+    period_s: float
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
+
+    `error_1_s` is the standard error: the larger of what the misfit allows and of half the difference between the
+    first and the second half of the window. The window is `start_s` to `end_s` of the motion's time.
+    """
+
+    growth_1_s: float
+    error_1_s: float
+    frequency_rad_s: float
+    start_s: float
+    end_s: float
+    samples: int
+
+
+def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -> Motion:
+    """The errors of some vehicles at the instants of the states that were used to command them.
+
+    A state that two ticks used (telemetry late or slower than control) counts once. `sample_boot_ms` is exact, so
+    the samples are equally spaced to the last digit when telemetry is regular; when it is not, a cubic spline
+    brings them to equally spaced instants.
+    """
+    columns: list[FloatArray] = []
+    for system_id in system_ids:
+        rows = ticks[(ticks["system_id"] == system_id) & ticks["commanded"] & (ticks["time_s"] >= 0.0)]
+        boot_ms, first = np.unique(rows["sample_boot_ms"], return_index=True)
+        rows, time_s = rows[first], (boot_ms - boot_ms[:1]) * 1e-3
+        values = np.stack([rows[name] for name in _CHANNELS], axis=1).astype(np.float64)
+        values = values[:, np.isfinite(values).all(axis=0)]  # the leader has no spacing error
+        columns.append(_equally_spaced(time_s, values, period_s))
+    count = min((len(column) for column in columns), default=0)
+    values = np.hstack([column[:count] for column in columns]) if columns else np.empty((0, 0))
+    return Motion(np.arange(count, dtype=np.float64) * period_s, values, period_s)
+
+
+def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Growth | None:
+    """The growth rate of a motion from `start_s` on, when faster modes have died away.
+
+    The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. None if fewer than `FEWEST_SAMPLES`
+    are left or nothing moves.
+    """
+    inside = (motion.time_s >= start_s) & (motion.time_s < end_s)
+    values, time_s = motion.values[inside], motion.time_s[inside]
+    values = values[: _count_before_rest(values)]
+    time_s = time_s[: len(values)]
+    if len(values) < FEWEST_SAMPLES:
+        return None
+    step = max(1, len(values) // _MOST_SAMPLES)
+    kept = values[::step]
+    scale = np.sqrt((kept**2).mean(axis=0))
+    kept = kept[:, scale > 0.0] / scale[scale > 0.0]
+    period_s = motion.period_s * step
+    fitted = _slowest_mode(kept, period_s)
+    if fitted is None:
+        return None
+    mode, misfit_error = fitted
+    halves = [_slowest_mode(part, period_s) for part in np.array_split(kept, 2)] if len(kept) >= 24 else []
+    rates = [half[0].real for half in halves if half is not None]
+    drift = abs(rates[0] - rates[1]) / 2.0 if len(rates) == 2 else abs(mode.real) / 10.0
+    return Growth(
+        growth_1_s=mode.real,
+        error_1_s=max(misfit_error, drift),
+        frequency_rad_s=abs(mode.imag),
+        start_s=float(time_s[0]),
+        end_s=float(time_s[-1]),
+        samples=len(values),
+    )
+
+
+def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Growth | None:
+    """The growth rate of a whole formation's errors, from their size at every `period_s`: slope of ln(envelope).
+
+    For flights that have no free response to fit modes to: random links push the vehicles all the time, and large
+    errors are of many vehicles at once. The envelope is the largest of a second; it is followed until it has sunk to
+    `DECAY_KEPT`, below which noise may keep it.
+    """
+    reach = max(1, round(_ENVELOPE_S / period_s))
+    if size.size < reach + 1:
+        return None
+    envelope = np.lib.stride_tricks.sliding_window_view(size, reach).max(axis=1)
+    time_s = period_s * np.arange(envelope.size)
+    low = np.flatnonzero(envelope < DECAY_KEPT * envelope.max())
+    inside = (time_s >= start_s) & (envelope > 0.0) & (np.arange(envelope.size) < (low[0] if low.size else size.size))
+    time_s, level = time_s[inside], np.log(envelope[inside])
+    if time_s.size < _FEWEST_ENVELOPE:
+        return None
+    slopes = [float(np.polyfit(t, y, 1)[0]) for t, y in _whole_and_halves(time_s, level)]
+    return Growth(
+        growth_1_s=slopes[0],
+        error_1_s=abs(slopes[1] - slopes[2]) / 2.0,
+        frequency_rad_s=0.0,
+        start_s=float(time_s[0]),
+        end_s=float(time_s[-1]),
+        samples=time_s.size,
+    )
+
+
+def _whole_and_halves(time_s: FloatArray, level: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    half = time_s.size // 2
+    return [(time_s, level), (time_s[:half], level[:half]), (time_s[half:], level[half:])]
+
+
+def _equally_spaced(time_s: FloatArray, values: FloatArray, period_s: float) -> FloatArray:
+    if len(time_s) < 4 or np.allclose(np.diff(time_s), period_s, rtol=0.0, atol=1e-6):
+        return values
+    from scipy.interpolate import CubicSpline  # slow to import, and regular telemetry does not need it
+
+    return CubicSpline(time_s, values)(np.arange(0.0, time_s[-1], period_s))
+
+
+def _count_before_rest(values: FloatArray) -> int:
+    """Number of samples until all that follows is below `DECAY_KEPT` of the largest, in the mean of the channels."""
+    if not values.size:
+        return 0
+    size = (np.abs(values) / np.maximum(np.abs(values).max(axis=0), np.finfo(float).tiny)).mean(axis=1)
+    still_to_come = np.maximum.accumulate(size[::-1])[::-1]
+    return int(np.count_nonzero(still_to_come >= DECAY_KEPT * size.max()))
+
+
+def _slowest_mode(values: FloatArray, period_s: float) -> tuple[complex, float] | None:
+    """s = ln z / T of the slowest mode that carries a share of the motion, and the standard error of its real part."""
+    if len(values) < FEWEST_SAMPLES or not values.any():
+        return None
+    time_s = np.arange(len(values)) * period_s
+    z = _modes(values)
+    if z is None:
+        return None
+    slowest = _slowest(z, values)
+    trend_1_s = float(np.log(abs(slowest)) / period_s)
+    # relative to the middle of the window, so that no weight overflows
+    flattened = values * np.exp(np.clip(-trend_1_s * (time_s - time_s.mean()), -300.0, 300.0))[:, np.newaxis]
+    z = _modes(flattened)
+    if z is None:
+        return None
+    z, error = _with_error(z, flattened, period_s)
+    return complex(trend_1_s, 0.0) + complex(np.log(z)) / period_s, error
+
+
+def _modes(values: FloatArray) -> ComplexArray | None:
+    """Modes z shared by all channels, ESPRIT of order `_ORDER` or less."""
+    count = len(values)
+    rows = min(count // 2, _LONGEST_HANKEL)
+    windows = np.lib.stride_tricks.sliding_window_view(values, count - rows + 1, axis=0)  # (rows, channels, columns)
+    left, singular, _ = np.linalg.svd(windows.reshape(rows, -1), full_matrices=False)
+    order = min(_ORDER, int(np.count_nonzero(singular > _RANK_FLOOR * singular[0])), rows - 1)
+    if order == 0:
+        return None
+    shift = np.linalg.lstsq(left[:-1, :order], left[1:, :order], rcond=None)[0]
+    z = np.linalg.eigvals(shift).astype(np.complex128)
+    z = z[np.abs(z) > 1e-6]
+    return z if z.size else None
+
+
+def _amplitudes(z: ComplexArray, values: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Motions z^n (n, modes), scaled to at most one, and their amplitudes (modes, channels) by least squares."""
+    n = np.arange(len(values))[:, np.newaxis]
+    exponent = n * np.log(z)
+    powers = np.exp(exponent - exponent.real.max(axis=0)).astype(np.complex128)
+    return powers, np.linalg.lstsq(powers, values, rcond=None)[0].astype(np.complex128)
+
+
+def _slowest(z: ComplexArray, values: FloatArray) -> complex:
+    """The mode of largest modulus among those that carry a share of the motion."""
+    powers, amplitudes = _amplitudes(z, values)
+    carried = np.linalg.norm(powers, axis=0) * np.linalg.norm(amplitudes, axis=1) / np.linalg.norm(values)
+    counting = z[carried >= min(_LEAST_SHARE, float(carried.max()))]
+    return complex(counting[np.abs(counting).argmax()])
+
+
+def _with_error(z: ComplexArray, values: FloatArray, period_s: float) -> tuple[complex, float]:
+    """The slowest mode and the standard error of its rate, from the misfit.
+
+    The rate enters as t e^{st}; the part of this motion that no change of the amplitudes can make determines it.
+    """
+    slowest = _slowest(z, values)
+    powers, amplitudes = _amplitudes(z, values)
+    misfit = values - (powers @ amplitudes).real
+    k = int(np.argmin(np.abs(z - slowest)))
+    n = np.arange(len(values))
+    own = np.outer(powers[:, k], amplitudes[k]).real * (1 if abs(slowest.imag) < 1e-9 else 2)
+    slope = own * (n - n.mean())[:, np.newaxis] * period_s
+    return slowest, float(np.sqrt((misfit**2).mean()) / max(np.linalg.norm(slope), np.finfo(float).tiny))

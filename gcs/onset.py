@@ -1,0 +1,163 @@
+"""Where the formation loses stability: predicted loop by loop, and located from measured growth rates.
+
+The states of a formation fall into loops that do not act on those ahead of them: in a leader-follower tree every
+vehicle is a loop of its own. The formation is stable exactly when every loop is, each at its own loop delay, so the
+loop with the least room, margin minus loop delay, is the one that breaks first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.formation import FormationModel
+from gains.rightmost import rightmost_root
+from gains.sampled import growth_rate, sampled_delay_margin
+from gains.structure import strongly_connected_blocks
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Vehicles that act on each other, with their part of e' = A e + B u, u = K e."""
+
+    system_ids: tuple[int, ...]
+    A: FloatArray
+    B: FloatArray
+    K: FloatArray
+    period_s: float
+
+    def margin_s(self) -> float:
+        """The least loop delay at which the sampled and held loop loses stability."""
+        return float(sampled_delay_margin(self.A, self.B, self.K, period_s=self.period_s))
+
+    def growth_1_s(self, delay_s: float) -> float:
+        """Growth rate of the sampled and held loop at a loop delay."""
+        return growth_rate(self.A, self.B, self.K, period_s=self.period_s, delay_s=delay_s)
+
+    def growth_continuous_1_s(self, delay_s: float) -> float:
+        """Real part of the rightmost root of the continuous model; the hold counts as half a period of delay."""
+        late = self.B @ self.K
+        return rightmost_root([(self.A, 0.0), (late, delay_s + self.period_s / 2.0)]).real
+
+    def same_as(self, other: "Loop") -> bool:
+        """Whether the other loop is the same system, of other vehicles."""
+        mine, its = (self.A, self.B, self.K), (other.A, other.B, other.K)
+        return self.period_s == other.period_s and all(
+            a.shape == b.shape and bool((a == b).all()) for a, b in zip(mine, its, strict=True)
+        )
+
+
+@dataclass(frozen=True)
+class GrowthPoint:
+    """One flight near the onset: the loop delay it had, and the growth rate measured."""
+
+    loop_delay_s: float
+    growth_1_s: float
+    error_1_s: float
+
+
+@dataclass(frozen=True)
+class Zero:
+    """Where growth passes from below to above zero; `error_s` is the standard error, `slope_1_s2` dg/dtau there.
+
+    `inside` says that there are flights on both sides: otherwise it is extrapolated.
+    """
+
+    loop_delay_s: float
+    error_s: float
+    slope_1_s2: float
+    inside: bool
+
+
+def loops_of(predecessors: Sequence[int], system_ids: Sequence[int], K: FloatArray, *, period_s: float) -> list[Loop]:
+    """The loops of a formation flown with a gain matrix K, those ahead first.
+
+    `predecessors` and the order of K are those of `gains.formation.FormationModel`.
+    """
+    model = FormationModel(tuple(predecessors))
+    states = [
+        np.r_[model.spacing_slice(i), model.velocity_slice(i)] if i > 0 else np.r_[model.velocity_slice(0)]
+        for i in range(model.vehicles)
+    ]
+    A, B = model.A, model.B
+    pattern = np.abs(A) + np.abs(B @ K)
+    coupled = np.array([[pattern[np.ix_(own, other)].sum() for other in states] for own in states])
+    loops: list[Loop] = []
+    for members in strongly_connected_blocks(coupled):
+        rows = members.tolist()
+        own = np.concatenate([states[i] for i in rows])
+        inputs = np.concatenate([np.r_[model.input_slice(i)] for i in rows])
+        loops.append(
+            Loop(
+                system_ids=tuple(system_ids[i] for i in rows),
+                A=A[np.ix_(own, own)],
+                B=B[np.ix_(own, inputs)],
+                K=K[np.ix_(inputs, own)],
+                period_s=period_s,
+            )
+        )
+    return loops
+
+
+def distinct(loops: Sequence[Loop]) -> list[Loop]:
+    """One loop of each kind."""
+    kinds: list[Loop] = []
+    for loop in loops:
+        if not any(loop.same_as(kind) for kind in kinds):
+            kinds.append(loop)
+    return kinds
+
+
+def critical_loop(loops: Sequence[Loop], loop_delay_s: dict[int, float]) -> Loop:
+    """The loop of largest predicted growth, each at the largest loop delay of its vehicles; the first in a tie."""
+    rates: list[float] = []
+    known: list[tuple[Loop, float, float]] = []
+    for loop in loops:
+        delay_s = max(loop_delay_s[system_id] for system_id in loop.system_ids)
+        rate = next((r for other, d, r in known if abs(d - delay_s) < 1e-9 and other.same_as(loop)), None)
+        if rate is None:
+            rate = loop.growth_1_s(delay_s)
+            known.append((loop, delay_s, rate))
+        rates.append(rate)
+    return loops[int(np.argmax(rates))]
+
+
+def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
+    """The loop delay of zero growth, from at least two flights at different delays.
+
+    A line, or with four and more flights a parabola, by least squares weighted with the flights' errors. None when
+    growth does not rise with delay in them.
+    """
+    if len({round(point.loop_delay_s, 6) for point in points}) < 2:
+        return None
+    delay_s, growth, error = np.array([(p.loop_delay_s, p.growth_1_s, p.error_1_s) for p in points], dtype=float).T
+    # no flight is trusted more than a thousandth of what the rates differ by: the curve is not exactly a parabola
+    error = np.maximum(error, 1e-3 * float(np.ptp(growth)) + 1e-9)
+    middle, half = float(delay_s.mean()), float(np.ptp(delay_s)) / 2.0
+    x = (delay_s - middle) / half
+    for degree in (2, 1) if len(points) >= 4 else (1,):
+        weighted = np.vander(x, degree + 1) / error[:, np.newaxis]
+        coefficients = np.linalg.lstsq(weighted, growth / error, rcond=None)[0]
+        at = _rising_root(coefficients, nearest_to=float(x[np.abs(growth).argmin()]))
+        if at is not None:
+            row = at ** np.arange(degree, -1, -1.0)
+            slope = float(np.polyval(np.polyder(coefficients), at))
+            variance = float(row @ np.linalg.pinv(weighted.T @ weighted) @ row)
+            return Zero(
+                loop_delay_s=middle + half * at,
+                error_s=half * variance**0.5 / slope,
+                slope_1_s2=slope / half,
+                inside=bool((growth < 0.0).any() and (growth > 0.0).any()),
+            )
+    return None
+
+
+def _rising_root(coefficients: FloatArray, *, nearest_to: float) -> float | None:
+    """The root at which a polynomial rises; of two the one nearest to a place."""
+    roots = np.roots(coefficients)
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    rising = real[np.polyval(np.polyder(coefficients), real) > 0.0]
+    return float(rising[np.abs(rising - nearest_to).argmin()]) if rising.size else None

@@ -1,0 +1,104 @@
+"""A flight that measures one loop and nothing else.
+
+The formation starts exactly in place at its nominal velocity but for the vehicles of one loop, which have a small
+error. Nothing acts on the vehicles ahead, so what follows is the free response of that loop alone. In a formation with
+errors of its own, identical loops along the chain drive each other at resonance (t^k e^{st}), and growth can be read
+only after a long time.
+
+What would hide the loop is taken out:
+
+* Drift of the clocks moves the sampling instants, and with them the loop delay while it is being measured.
+* Vehicles on the launcher report a velocity but do not move. The station brings their states to one instant, so it
+  would see errors of up to v T where there are none, and push every vehicle at the start. Vehicles that sample at one
+  instant do not have this error, so all clocks are one. The time that the probed loop waits for the control tick,
+  which its clock decides otherwise, is kept by moving less than one period of delay between its up and down links.
+* Links that differ start the vehicles at different instants, and leave clocks that are wrong by different halves of the
+  links' asymmetry, which the station sees as errors too. So all vehicles have the links of the one that is probed.
+  Its loop is the same for that: what the station uses of the others is brought to the instant of its own state.
+* Changes of the nominal velocity.
+"""
+
+import numpy as np
+
+from gcs.control import LARGEST_COMMAND_M_S2
+from gcs.plan import FlightPlan
+from gcs.record import TickArray
+from scenarios.schema import Link, Scenario, Vehicle
+
+PROBE_S = 20.0
+_LINEAR_SHARE = 0.2
+"""Part of the nominal speed that an error may reach: far from the singularity of the kinematics at speed zero."""
+
+
+def probe_scenario(
+    plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float, links: tuple[Link, Link], waiting_s: float
+) -> Scenario:
+    """The plan's scenario with every vehicle in place, but for an error of the given vehicles.
+
+    The error is in the position of a follower (m) and in the velocity of the leader (m/s), whose position is not
+    controlled; north and east alike, and different for each vehicle. All vehicles get `links` (up, down), changed so
+    that telemetry waits `waiting_s` for the control tick.
+    """
+    scenario, place = plan.scenario, plan.formation.place_ne_m()
+    row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
+    [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
+    up, down = with_waiting(*links, period_s=1.0 / scenario.rates.control_hz, waiting_s=waiting_s)
+    vehicles: list[Vehicle] = []
+    for vehicle in scenario.vehicles:
+        position = np.array(leader.position_ne_m) + place[row[vehicle.system_id]]
+        velocity = np.array(scenario.nominal_velocity[0].velocity_ne_m_s)
+        if vehicle.system_id in system_ids:
+            k = system_ids.index(vehicle.system_id)
+            error = amplitude * (1.0 + 0.3 * k) * (-1.0) ** k * np.array([1.0, -1.0])
+            if vehicle is leader:
+                velocity += error
+            else:
+                position += error
+        update = {"position_ne_m": tuple(position.tolist()), "velocity_ne_m_s": tuple(velocity.tolist())}
+        vehicles.append(vehicle.model_copy(update=update))
+    update = {
+        "vehicles": tuple(vehicles),
+        "nominal_velocity": scenario.nominal_velocity[:1],
+        "duration_s": PROBE_S,
+        "links": scenario.links.model_copy(update={"up": up, "down": down, "vehicles": ()}),
+        "clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0, "offset_max_s": 0.0}),
+    }
+    return scenario.model_copy(update=update)
+
+
+def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> tuple[Link, Link]:
+    """The links with delay moved between them so that telemetry sampled at whole periods waits for so long.
+
+    The up link then takes a whole number of periods less the waiting; up and down together take what they did. Links
+    too short to move delay keep the loop delay instead: the down link takes the time that telemetry does not wait.
+    """
+    if up.delay_points or down.delay_points:
+        return up, down
+    to_down_s = (up.delay_s + waiting_s) % period_s
+    to_down_s -= period_s if to_down_s > up.delay_s else 0.0
+    from_up_s = to_down_s
+    if down.delay_s + to_down_s < 0.0:
+        from_up_s, to_down_s = 0.0, waiting_s - (-up.delay_s) % period_s
+
+    def moved(link: Link, by_s: float) -> Link:
+        return link.model_copy(update={"delay_s": max(0.0, link.delay_s + by_s)})
+
+    return moved(up, -from_up_s), moved(down, to_down_s)
+
+
+def linear_until_s(scenario: Scenario, own: TickArray) -> float:
+    """Time since the first of the rows at which an error leaves the range in which no limit and no singularity is near.
+
+    `own` are rows of the probed vehicles, in order of time; infinity if none leaves it.
+    """
+    limits = scenario.limits
+    speed = float(np.hypot(*scenario.nominal_velocity[0].velocity_ne_m_s))
+    room_m_s = [_LINEAR_SHARE * speed, speed - limits.speed_min_m_s, (limits.speed_max_m_s or np.inf) - speed]
+    command_m_s2 = 0.9 * min(
+        limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2,
+        (limits.turn_rate_max_rad_s or np.inf) * (1.0 - _LINEAR_SHARE) * speed,
+    )
+    error_m_s = np.hypot(own["velocity_error_north_m_s"], own["velocity_error_east_m_s"])
+    size_m_s2 = np.hypot(own["command_north_m_s2"], own["command_east_m_s2"])
+    beyond = np.flatnonzero((error_m_s > min(room_m_s)) | (size_m_s2 > command_m_s2))
+    return float(own["time_s"][beyond[0]] - own["time_s"][0]) if beyond.size else np.inf

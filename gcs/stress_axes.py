@@ -1,0 +1,150 @@
+"""The axes of a campaign: what of a scenario is varied, and over which values.
+
+*Link delay* here is the total of a vehicle's two links, up plus down, so that it compares directly with the delay
+margin: what is missing to the loop delay is only the time that telemetry waits for the next control tick, less than one
+period. It is split into an up link of whole control periods, as near to half as can be, and a down link of the rest.
+With any other split the waiting would jump by a period as the up link grows past one, and the loop delay would grow in
+steps; with this one it grows as the link delay does.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenarios.schema import Jitter, Link, Scenario, VehicleLinks
+
+
+class AxisError(Exception):
+    """Values of an axis that cannot be used: what was read and what was wanted."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One thing that is varied. `name` is "delay", "jitter", "loss", "rate", or "delay_<system id>"."""
+
+    name: str
+    values: tuple[float, ...]
+
+    @property
+    def label(self) -> str:
+        """What stands at the axis of a plot."""
+        if self.name.startswith("delay_"):
+            return f"link delay of vehicle {self.name.removeprefix('delay_')}, up + down [s]"
+        return _LABELS[self.name]
+
+
+_LABELS = {
+    "delay": "link delay, up + down [s]",
+    "jitter": "link jitter, each way [s]",
+    "loss": "loss of datagrams, each way",
+    "rate": "control and telemetry rate [Hz]",
+}
+_RANGES = {"delay": (0.0, 60.0), "jitter": (0.0, 10.0), "loss": (0.0, 1.0), "rate": (1.0, 500.0)}
+
+
+def parse_axis(name: str, text: str) -> Axis:
+    """The axis of an option's text: FROM:TO:COUNT, or values with commas between them.
+
+    Raises
+    ------
+    AxisError
+        If it is neither, or a value is out of range.
+    """
+    low, high = _RANGES[name.split("_", maxsplit=1)[0]]
+    try:
+        if ":" in text:
+            first, last, count = text.split(":")
+            values = np.linspace(float(first), float(last), int(count)).tolist()
+        else:
+            values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    # the same number that a user would write, so that ids do not depend on how a range was cut
+    values = [round(value, 9) for value in values]
+    if not values or not all(low <= value <= high for value in values):
+        raise AxisError(f"read {text!r}, wanted FROM:TO:COUNT or values as 0.1,0.2, from {low:g} to {high:g}")
+    return Axis(name, tuple(dict.fromkeys(values)))
+
+
+def parse_vehicle_axis(text: str, system_ids: tuple[int, ...]) -> Axis:
+    """The axis of one vehicle's link delay from ID=FROM:TO:COUNT.
+
+    Raises
+    ------
+    AxisError
+        If there is no such vehicle, or the values cannot be used.
+    """
+    system_id, equals, values = text.partition("=")
+    if not equals or system_id not in map(str, system_ids):
+        raise AxisError(f"read {text!r}, wanted ID=FROM:TO:COUNT with the system id of a vehicle of this scenario")
+    return parse_axis(f"delay_{system_id}", values)
+
+
+def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenario:
+    """The scenario at one point of a campaign.
+
+    A rate is set for control, and for telemetry if both were the same. Jitter keeps the distribution of a link that
+    has one, and is uniform (mean 0, from minus to plus the value) where there is none.
+    """
+    if "rate" in coordinates:
+        rates, hz = scenario.rates, coordinates["rate"]
+        together = rates.telemetry_hz == rates.control_hz
+        telemetry_hz = hz if together else rates.telemetry_hz
+        update = {"rates": rates.model_copy(update={"control_hz": hz, "telemetry_hz": telemetry_hz})}
+        scenario = scenario.model_copy(update=update)
+    if "delay" in coordinates:
+        up_s, down_s = split_delay(coordinates["delay"], 1.0 / scenario.rates.control_hz)
+        scenario = scenario.with_link_delay(up_s=up_s, down_s=down_s)
+    for name, delay_s in coordinates.items():
+        if name.startswith("delay_"):
+            scenario = _with_vehicle_delay(scenario, int(name.removeprefix("delay_")), delay_s)
+    if "jitter" in coordinates:
+        scenario = _changed_links(scenario, lambda link: _with_jitter(link, coordinates["jitter"]))
+    if "loss" in coordinates:
+        loss = {"loss_probability": coordinates["loss"]}
+        scenario = _changed_links(scenario, lambda link: link.model_copy(update=loss))
+    return scenario
+
+
+def has_regular_links(scenario: Scenario) -> bool:
+    """Whether every link has a constant delay and nothing else, so that the models say exactly what it does."""
+    links = scenario.links
+    every = [links.up, links.down, *(link for v in links.vehicles for link in (v.up, v.down) if link is not None)]
+    return all(link == Link(delay_s=link.delay_s) for link in every)
+
+
+def split_delay(total_s: float, period_s: float) -> tuple[float, float]:
+    """Up and down parts of a total link delay: up a whole number of periods, down the rest, about half each."""
+    up_s = round(round(total_s / 2.0 / period_s) * period_s, 12)
+    return up_s, max(0.0, round(total_s - up_s, 12))
+
+
+def _with_jitter(link: Link, scale_s: float) -> Link:
+    if scale_s == 0.0:
+        return link.model_copy(update={"jitter": None})
+    if link.jitter is not None and link.jitter.scale_s is not None:
+        return link.model_copy(update={"jitter": link.jitter.model_copy(update={"scale_s": scale_s})})
+    return link.model_copy(update={"jitter": Jitter(distribution="uniform", scale_s=scale_s)})
+
+
+def _with_vehicle_delay(scenario: Scenario, system_id: int, delay_s: float) -> Scenario:
+    up_s, down_s = split_delay(delay_s, 1.0 / scenario.rates.control_hz)
+    up, down = scenario.link_of(system_id)
+    own = VehicleLinks(
+        system_id=system_id,
+        up=up.model_copy(update={"delay_s": up_s, "delay_points": ()}),
+        down=down.model_copy(update={"delay_s": down_s, "delay_points": ()}),
+    )
+    others = tuple(links for links in scenario.links.vehicles if links.system_id != system_id)
+    return scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (*others, own)})})
+
+
+def _changed_links(scenario: Scenario, change: Callable[[Link], Link]) -> Scenario:
+    """The scenario with every link changed."""
+    links = scenario.links
+    own = tuple(
+        v.model_copy(update={"up": v.up and change(v.up), "down": v.down and change(v.down)}) for v in links.vehicles
+    )
+    update = {"up": change(links.up), "down": change(links.down), "vehicles": own}
+    return scenario.model_copy(update={"links": links.model_copy(update=update)})

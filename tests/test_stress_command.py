@@ -1,0 +1,61 @@
+"""`gcs stress` as a user runs it: flights break where the margin says, and a wrong claim is caught."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCENARIOS = Path(__file__).parent.parent / "scenarios"
+
+
+def stress(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "gcs.cli", "stress", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+
+
+def test_onset_of_instability_is_measured_at_the_sampled_margin(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = stress(SCENARIOS / "chain3.toml", "--onset", "--out", out, "--json", "--workers", "2")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout) == json.loads((out / "stress.json").read_text())
+    result = json.loads(done.stdout)
+    assert result["passed"]
+    for name in ("report.html", "trials.parquet", "growth.png"):
+        assert (out / name).stat().st_size > 1000
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "http://" not in page
+    assert "https://" not in page
+
+
+def test_a_campaign_is_resumed_without_flying_a_trial_again(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = (SCENARIOS / "chain3.toml", "--delay", "0.1:0.3:3", "--out", out, "--workers", "2", "--json")
+    first = stress(*arguments)
+    assert first.returncode in (0, 1), first.stderr
+    log = out / "trials.jsonl"
+    lines = log.read_text().splitlines()
+    log.write_text("\n".join(lines[:-1]) + "\n" + lines[-1][:20])  # killed while the last trial was written
+    again = stress(*arguments, "--resume")
+    assert again.returncode == first.returncode, again.stderr
+    ids = [
+        json.loads(line)["id"] for line in log.read_text().splitlines() if line.startswith("{") and line.endswith("}")
+    ]
+    assert len(ids) == len(set(ids)) == len(lines)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        ((), "--"),
+        (("--delay", "0:0.6:0"), "--delay"),
+        (("--delay", "nonsense"), "--delay"),
+        (("--onset", "--resume"), "--resume"),
+    ],
+)
+def test_bad_options_are_one_line_and_exit_code_2(arguments: tuple[str, ...], wanted: str) -> None:
+    done = stress(SCENARIOS / "chain3.toml", *arguments)
+    assert done.returncode == 2, done.stdout
+    assert wanted in done.stderr
+    assert done.stderr.count("\n") == 1
