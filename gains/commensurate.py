@@ -22,8 +22,8 @@ from gains.delay_sweep import near_unit_extrema
 from gains.errors import BadModelError
 from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
 
-# the pencil's companion matrix takes 0.3 s at this size; larger ones leave the frequencies to the sweep
-_LARGEST_PENCIL = 600
+# the pencil's companion matrix takes 3 s at this size; larger ones leave the frequencies to the sweep
+_LARGEST_PENCIL = 1200
 # a locus is an eigenvalue of a companion matrix of this size at most
 _LARGEST_COMPANION = 200
 # where the polynomial in cos(theta) is expanded: off [-1, 1], and no special angle
@@ -34,6 +34,10 @@ _CANDIDATE_TOLERANCE = 1e-3
 _ANGLES = 400
 # a local extremum of a real part is refined when its sample is this close to the axis, relative to the norm
 _NEAR_AXIS = 0.1
+# and is on the axis when it is this close to it
+_ON_AXIS = 1e-9
+# below this share of the highest frequency a crossing may be that of a root that passes zero, seen so far beside it
+_SLOW, _BESIDE = 1e-6, 0.05
 
 
 def analyse_commensurate(matrices: Sequence[ArrayLike], *, horizon_s: float | None = None) -> DelayAnalysis:
@@ -303,9 +307,26 @@ def _circle_crossings(terms: Sequence[FloatArray]) -> list[tuple[float, float]]:
         # e^{s / scale}: of modulus one on the axis, and |s| / scale <= 1 leaves the frequency in the angle
         return np.exp(np.linalg.eigvals(_at_angle(terms, theta)) / scale).astype(np.complex128)
 
-    theta = np.linspace(1e-9, pi, _ANGLES)
+    # a little beyond pi, so that a crossing at pi itself is inside
+    theta = np.linspace(1e-9, 1.01 * pi, _ANGLES)
     theta = np.union1d(theta, near_unit_extrema(loci, theta, near=_NEAR_AXIS))
-    return [(crossing.omega, float(np.angle(crossing.locus)) * scale) for crossing in unit_crossings(loci, theta)]
+    angles = np.array([crossing.omega for crossing in unit_crossings(loci, theta)])
+    # several roots may cross at nearly one angle (all of them, if nothing acts at once): take all that are on the axis
+    roots = np.log(loci(angles)) * scale if angles.size > 0 else np.empty((0, 0))
+    return [
+        (angle, float(root.imag))
+        for angle, row in zip(angles.tolist(), roots, strict=True)
+        for root in row[np.abs(row.real) <= max(_ON_AXIS * scale, float(np.abs(row.real).min()))]
+    ]
+
+
+def _passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool:
+    """Whether an eigenvalue of A(theta) is slow at this angle only: it passes s = 0, which no finite delay does.
+
+    The motions of a slow part of the loop are slow at the angles beside it too.
+    """
+    beside = np.abs(np.linalg.eigvals(_at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
+    return bool(beside.min() > 1e3 * omega)
 
 
 def _circle_margin(terms: Sequence[FloatArray]) -> float:
@@ -316,7 +337,7 @@ def _circle_margin(terms: Sequence[FloatArray]) -> float:
     scale = highest_frequency(terms)
     margin_s = inf
     for theta, omega in _circle_crossings(terms):
-        # a root at zero at an angle off zero belongs to no finite delay; -j omega belongs to the angle -theta
-        if abs(omega) > 1e-9 * scale:
+        # -j omega belongs to the angle -theta
+        if abs(omega) > _SLOW * scale or not _passes_zero(terms, theta, abs(omega)):
             margin_s = min(margin_s, (theta if omega > 0.0 else 2.0 * pi - theta) / abs(omega))
     return margin_s

@@ -187,8 +187,9 @@ def stability_windows(
     unstable += int(change[at_zero & (change > 0)].sum())
     first = np.where(at_zero, 2.0 * pi / omega, first)
     wanted_s, complete_to_s = _last_delay(omega, first, change, unstable, horizon_s)
-    # a window that begins by then ends within one period of the slowest sequence
-    last_s = wanted_s + 2.0 * pi / float(omega.min())
+    # a window that begins by then ends at a root that comes in, within one period of the fastest sequence that does
+    entering = change >= 0 if bool(np.any(change >= 0)) else np.full(change.size, True)
+    last_s = float(np.maximum(first, wanted_s + 2.0 * pi / omega)[entering].min())
     times = np.floor((last_s - first) * omega / (2.0 * pi)).astype(np.int64) + 1
     # the first delay of every sequence is listed in any case
     times = np.maximum(times, 1)

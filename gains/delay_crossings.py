@@ -19,6 +19,7 @@ from gains.delay_loci import (
     factor_rank,
     slope_sign,
     unit_crossings,
+    without_limits_at_zero,
 )
 from gains.structure import FloatArray
 
@@ -63,7 +64,7 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
 def crossings_of_loci(loci: Loci, candidates: FloatArray, highest: float) -> list[UnitCrossing]:
     """All crossings of the unit circle, mere touches included, given frequencies that come near each of them."""
     crossings = unit_crossings(loci, separating_points(candidates, highest))
-    return crossings + _hidden_crossings(loci, candidates, crossings)
+    return without_limits_at_zero(loci, crossings + _hidden_crossings(loci, candidates, crossings), highest)
 
 
 def highest_frequency(A0: FloatArray, A1: FloatArray) -> float:

@@ -23,6 +23,8 @@ _EPS = float(np.finfo(np.float64).eps)
 _SAME_PLACE = 1e-10
 # log of the modulus of a locus at such a place
 _ON_CIRCLE = 1e-8
+# below this share of the highest frequency a locus that moves less than this when the frequency doubles is at its limit
+_SLOW, _FLAT = 1e-5, 1e-2
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,25 @@ def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
     omega = bracketed_roots(nth_log, points[at], points[at + 1], logs[at, nth], logs[at + 1, nth])
     outward = np.sign(above[at] - above[at + 1])
     return _read_loci(loci, omega, outward)
+
+
+def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: float) -> list[UnitCrossing]:
+    """The crossings without those that rounding makes of a locus of modulus one at zero frequency.
+
+    Where A0 + z A1 is singular for some |z| = 1 (x' = -x - x(t - tau): z = -1), a locus tends to 1/z as the frequency
+    tends to zero, and its modulus differs from one by less than rounding. No finite delay belongs to it. A slow motion
+    that does cross, of a loop with fast ones beside it, has a locus that changes with the frequency at its own pace.
+    """
+    return [
+        crossing
+        for crossing in crossings
+        if crossing.omega > _SLOW * highest or not _is_flat(loci, crossing.omega, crossing.locus)
+    ]
+
+
+def _is_flat(loci: Loci, omega: float, locus: complex) -> bool:
+    rows = loci(np.array([omega / 2.0, 2.0 * omega]))
+    return bool(np.all(np.min(np.abs(rows - locus), axis=1) < _FLAT))
 
 
 def slope_sign(loci: Loci, omega: float, locus: complex) -> int:

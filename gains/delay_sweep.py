@@ -11,7 +11,7 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.delay_loci import Loci, delay_loci, log_moduli, unit_crossings
+from gains.delay_loci import Loci, delay_loci, log_moduli, unit_crossings, without_limits_at_zero
 from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
 
 # points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
@@ -57,7 +57,7 @@ def _block_margin(A0: FloatArray, A1: FloatArray) -> float:
     omega = np.union1d(omega, near_unit_extrema(loci, omega))
     # e^{j theta} is the locus, so the delay is its angle in [0, 2 pi) over the frequency; an angle a rounding error
     # below zero would belong to a root on the axis at zero delay, which A0 + A1 Hurwitz excludes
-    crossings = unit_crossings(loci, omega)
+    crossings = without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
     return min((float(np.angle(c.locus)) % (2.0 * pi) / c.omega for c in crossings), default=inf)
 
 

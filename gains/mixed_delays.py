@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from gains.commensurate import column_space, companion_loci, highest_frequency
 from gains.delay import Crossing, DelayAnalysis, stability_windows
-from gains.delay_loci import ComplexArray, Loci, unit_crossings
+from gains.delay_loci import ComplexArray, Loci, unit_crossings, without_limits_at_zero
 from gains.delay_sweep import near_unit_extrema
 from gains.errors import BadModelError, DisagreementError
 from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
@@ -120,7 +120,7 @@ def _crossings(parts: _Parts) -> list[tuple[float, float, int]]:
     omega = np.union1d(omega, near_unit_extrema(loci, omega))
     return [
         (crossing.omega, float(np.angle(crossing.locus)) % (2.0 * pi), crossing.outward)
-        for crossing in unit_crossings(loci, omega)
+        for crossing in without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
     ]
 
 
