@@ -6,7 +6,6 @@ loses nothing that was finished, and a later one takes it up: what is stored und
 
 import contextlib
 import ctypes
-import json
 import os
 import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -160,15 +159,14 @@ def _here(trials: Sequence[Trial]) -> Iterator[Outcome]:
 
 def _pool(count: int) -> ProcessPoolExecutor:
     # spawn: a fork would copy the threads' locks of whatever the user's process has loaded
-    return ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_prepare_worker)
+    return ProcessPoolExecutor(
+        count, mp_context=get_context("spawn"), initializer=_prepare_worker, initargs=(os.getpid(),)
+    )
 
 
-def _prepare_worker() -> None:
+def _prepare_worker(parent: int) -> None:
     """Ctrl-C is the parent's to answer; and without a parent there is nobody to fly for."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-
-
-def read_result(file: Path) -> dict[str, Any]:
-    """A JSON file that a campaign wrote, or nothing if there is none."""
-    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    if os.getppid() != parent:  # it died while this process was starting, before it could be told
+        os._exit(1)

@@ -143,8 +143,7 @@ def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Gro
         return None
     envelope = np.lib.stride_tricks.sliding_window_view(size, reach).max(axis=1)
     time_s = period_s * np.arange(envelope.size)
-    low = np.flatnonzero(envelope < DECAY_KEPT * envelope.max())
-    inside = (time_s >= start_s) & (envelope > 0.0) & (np.arange(envelope.size) < (low[0] if low.size else size.size))
+    inside = (time_s >= start_s) & (envelope > 0.0) & (np.arange(envelope.size) < _count_before_rest(envelope[:, None]))
     time_s, level = time_s[inside], np.log(envelope[inside])
     if time_s.size < _FEWEST_ENVELOPE:
         return None

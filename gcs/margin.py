@@ -295,7 +295,7 @@ def _verdict_lines(result: dict[str, Any]) -> list[str]:
     margin_s = result["delay_margin_s"]
     lines.append("no limit: stable at every delay" if margin_s is None else f"margin {margin_s:.6g} s")
     if result["unstable_roots_at_zero_delay"]:
-        lines.append(f"{result['unstable_roots_at_zero_delay']} unstable roots at {name} = 0")
+        lines.append(f"unstable roots at {name} = 0: {result['unstable_roots_at_zero_delay']}")
     if result["checked_by"]:
         lines.append(f"confirmed by {' and '.join(result['checked_by'])}")
     return lines

@@ -146,12 +146,15 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
 
     study, design = _study(options)
     axes = _axes(options, study)
-    folder = out if out is not None else _new_folder(study.plan.scenario.name)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / SCENARIO_FILE).write_text(dump(study.plan.scenario), encoding="utf-8")
     onset: Onset | None = None
     why_not = ""
-    with contextlib.closing(Store(folder)) as store, _workers(options) as fly, _progress(shown) as progress:
+    with contextlib.ExitStack() as stack:
+        fly = stack.enter_context(_workers(options))
+        folder = out if out is not None else _new_folder(study.plan.scenario.name)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / SCENARIO_FILE).write_text(dump(study.plan.scenario), encoding="utf-8")
+        store = stack.enter_context(contextlib.closing(Store(folder)))
+        progress = stack.enter_context(_progress(shown))
         try:
             sweep: list[Outcome] = []
             if axes:

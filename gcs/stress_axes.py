@@ -55,7 +55,8 @@ def parse_axis(name: str, text: str) -> Axis:
     try:
         if ":" in text:
             first, last, count = text.split(":")
-            values = np.linspace(float(first), float(last), int(count)).tolist()
+            ends = float(first), float(last)
+            values = np.linspace(*ends, int(count)).tolist() if np.isfinite(ends).all() else []
         else:
             values = [float(word) for word in text.split(",")]
     except ValueError:

@@ -130,9 +130,10 @@ def print_outcome(outcome: Outcome) -> None:
     console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {outcome.coordinates}")
     console.print(f"verdict  {outcome.verdict}: {outcome.reason}")
     if outcome.growth_1_s is not None:
+        of = f" of vehicle {outcome.probed}" if outcome.probed is not None else ""
         console.print(
-            f"growth   {_number(outcome.growth_1_s)} ± {_number(outcome.growth_error_1_s, '0.1g')} 1/s of vehicle "
-            f"{outcome.probed}, predicted {_number(outcome.predicted_growth_1_s)} at {_ms(outcome.loop_delay_s)}"
+            f"growth   {_number(outcome.growth_1_s)} ± {_number(outcome.growth_error_1_s, '0.1g')} 1/s{of}, "
+            f"predicted {_number(outcome.predicted_growth_1_s)} at {_ms(outcome.loop_delay_s)}"
         )
     if outcome.error is not None:
         console.print(outcome.error)

@@ -1,0 +1,123 @@
+"""Growth rates from motions whose modes are known."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from gcs.growth import Motion, envelope_growth, fit_growth, motion_of
+from gcs.record import TICK, TickArray
+
+PERIOD_S = 0.02
+
+
+def motion(*modes: tuple[complex, float], seconds: float = 20.0, noise: float = 0.0, seed: int = 1) -> Motion:
+    """Two channels, each the sum of modes e^{st} with given amplitudes and different phases."""
+    time_s = np.arange(round(seconds / PERIOD_S), dtype=np.float64) * PERIOD_S
+    values = np.zeros((time_s.size, 2))
+    for s, amplitude in modes:
+        values += amplitude * np.real(np.exp(s * time_s[:, None] + 1j * np.array([0.3, 1.7])))
+    return Motion(time_s, values + noise * np.random.default_rng(seed).standard_normal(values.shape), PERIOD_S)
+
+
+@given(
+    growth=st.floats(-3.0, 3.0),
+    frequency=st.floats(0.5, 12.0),
+    amplitude=st.floats(1e-3, 1e2),
+)
+def test_one_oscillation_is_found_whatever_its_rate_frequency_and_size(
+    growth: float, frequency: float, amplitude: float
+) -> None:
+    found = fit_growth(motion((complex(growth, frequency), amplitude), seconds=8.0), start_s=0.0)
+    assert found is not None
+    assert found.growth_1_s == pytest.approx(growth, abs=1e-5)  # of a window of 1.3 s at least, in double precision
+    assert found.frequency_rad_s == pytest.approx(frequency, abs=1e-4)
+
+
+def test_the_slower_of_two_modes_is_reported_though_the_faster_begins_larger() -> None:
+    found = fit_growth(motion((-0.3 + 4j, 1.0), (-1.5 + 2j, 3.0)), start_s=0.0)
+    assert found is not None
+    assert found.growth_1_s == pytest.approx(-0.3, abs=1e-6)
+
+
+def test_a_real_mode_is_found_beside_an_oscillation() -> None:
+    found = fit_growth(motion((-0.2, 2.0), (-0.9 + 3j, 2.0)), start_s=0.0)
+    assert found is not None
+    assert found.growth_1_s == pytest.approx(-0.2, abs=1e-6)
+    assert found.frequency_rad_s == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_error_says_how_far_noise_has_moved_the_rate() -> None:
+    """Over many seeds: within three standard errors nearly always, and the errors are not just large."""
+    misses = 0
+    errors: list[float] = []
+    for seed in range(60):
+        found = fit_growth(motion((-0.05 + 3.7j, 1.0), noise=0.02, seed=seed), start_s=0.0)
+        assert found is not None
+        misses += abs(found.growth_1_s + 0.05) > 3.0 * found.error_1_s
+        errors.append(found.error_1_s)
+    assert misses <= 6
+    assert np.median(errors) < 0.002  # the motion is 35 times the noise, for 20 s
+
+
+def test_noise_that_outlasts_the_motion_is_not_taken_for_a_mode() -> None:
+    """Rounding of the telemetry stays when a fast motion is gone: 1e-4 of it, here for nine tenths of the time."""
+    found = fit_growth(motion((-3.0 + 4j, 1.0), noise=1e-4), start_s=0.0)
+    assert found is not None
+    assert found.growth_1_s == pytest.approx(-3.0, abs=0.01)
+    assert found.end_s < 3.0
+
+
+def test_nothing_that_moves_and_too_short_a_motion_have_no_rate() -> None:
+    assert fit_growth(motion((-0.1 + 4j, 0.0)), start_s=0.0) is None
+    assert fit_growth(motion((-0.1 + 4j, 1.0), seconds=0.2), start_s=0.0) is None
+    assert fit_growth(motion((-0.1 + 4j, 1.0)), start_s=5.0, end_s=5.1) is None
+
+
+def ticks_with_samples(boot_ms: NDArray[np.int64]) -> TickArray:
+    """A tick for each sample; the errors are a known oscillation at the samples."""
+    ticks = np.zeros(boot_ms.size, TICK)
+    ticks["system_id"], ticks["commanded"] = 2, True
+    ticks["time_s"] = PERIOD_S * np.arange(boot_ms.size)
+    ticks["sample_boot_ms"] = boot_ms
+    time_s = (boot_ms - boot_ms[0]) * 1e-3
+    for name, phase in (("spacing_error_north_m", 0.0), ("spacing_error_east_m", 1.0)):
+        ticks[name] = np.exp(-0.1 * time_s) * np.cos(3.0 * time_s + phase)
+    for name in ("velocity_error_north_m_s", "velocity_error_east_m_s"):
+        ticks[name] = 0.5 * ticks["spacing_error_east_m"]
+    return ticks
+
+
+def test_a_state_that_two_ticks_used_counts_once() -> None:
+    regular = np.arange(500) * 20 + 7
+    doubled = np.sort(np.concatenate([regular, regular[::3]]))
+    once = motion_of(ticks_with_samples(regular), [2], period_s=PERIOD_S)
+    twice = motion_of(ticks_with_samples(doubled), [2], period_s=PERIOD_S)
+    assert np.array_equal(once.values, twice.values)
+
+
+def test_irregular_samples_are_brought_to_equal_distances() -> None:
+    """Telemetry with gaps and samples up to 9 ms off: the rate is that of the motion, not of the sampling."""
+    rng = np.random.default_rng(3)
+    boot_ms = np.unique(np.arange(1000) * 20 + rng.integers(-9, 10, 1000) + 100)
+    kept = boot_ms[rng.random(boot_ms.size) > 0.1]
+    found = fit_growth(motion_of(ticks_with_samples(kept), [2], period_s=PERIOD_S), start_s=0.0)
+    assert found is not None
+    assert found.growth_1_s == pytest.approx(-0.1, abs=1e-3)
+
+
+def test_ticks_without_command_and_other_vehicles_are_left_out() -> None:
+    ticks = ticks_with_samples(np.arange(200) * 20)
+    ticks["commanded"][:50] = False
+    ticks["system_id"][150:] = 3
+    assert motion_of(ticks, [2], period_s=PERIOD_S).values.shape == (100, 4)
+
+
+@pytest.mark.parametrize("growth", [-0.4, 0.0, 0.7])
+def test_envelope_follows_an_oscillation(growth: float) -> None:
+    time_s = np.arange(0.0, 20.0, 0.25)
+    size = 5.0 * np.exp(growth * time_s) * np.abs(np.cos(3.7 * time_s))
+    found = envelope_growth(size, period_s=0.25, start_s=0.0)
+    assert found is not None
+    assert found.growth_1_s == pytest.approx(growth, abs=0.03)  # its ripple, over 20 s

@@ -1,0 +1,175 @@
+"""Reference flights: short scenarios in virtual time, known by the hash of their tick log and by where they end.
+
+If one changes, flights have changed. If that was the purpose, print the new references with
+
+    .venv/bin/python tests/test_reference_flights.py
+
+and put them below, in the commit that changed them.
+
+A hash of everything holds on one kind of processor only: another BLAS adds in another order, which moves a clock
+estimate by 1 ns and now and then a reported velocity by one float32, 8e-6 m/s (seen with OPENBLAS_CORETYPE=Haswell
+against a newer core). No rounding hides a value that falls on the other side. So the hash is over what is counted:
+ticks, times, modes, which states were used, which datagrams came. It does not depend on the processor, and every
+changed rule, draw or instant shows in it. Where the flight ends is compared as numbers, to `END_TOLERANCE`. That a
+flight is the same to the last bit on one machine is a test of its own. The gains are given: no solver has a part in it.
+"""
+
+import hashlib
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gcs.plan import flight_plan
+from gcs.record import TickArray
+from gcs.stress_axes import at_coordinates
+from gcs.trial import fly_virtual
+from scenarios.files import load
+from scenarios.schema import Control, FixedGains, Scenario
+
+SCENARIOS = Path(__file__).parent.parent / "scenarios"
+DURATION_S = 3.0
+COUNTED = (
+    "tick",
+    "due_ns",
+    "sent_ns",
+    "key_ms",
+    "system_id",
+    "mode",
+    "commanded",
+    "sample_boot_ms",
+    "received",
+    "lost",
+    "late",
+    "duplicate",
+)
+MEASURED = ("north_m", "east_m", "velocity_north_m_s", "velocity_east_m_s")
+END_TOLERANCE = 1e-3
+"""In m and m/s: a hundred float32 steps of telemetry."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    sha256: str
+    end: tuple[tuple[float, ...], ...]
+    """What the station knows last of each vehicle, in the order of the formation: north, east, and their velocities."""
+
+
+REFERENCES: dict[str, Reference] = {
+    "chain3, 40 ms": Reference(
+        sha256="cec1abbe5aba3859266acb2e3f4373c4178de674d5e6e3b22576e827b91c609f",
+        end=(
+            (273.30994, 0.0, 91.43999, 0.0),
+            (151.68462, 121.91952, 91.33514, 0.07032),
+            (29.4579, 243.62462, 90.87669, 0.35039),
+        ),
+    ),
+    "chain3, above the margin": Reference(
+        sha256="99cca8bbeaf4e4c62ac0262d174c83bb9d4a28f7902e1c785d3c5bc6bba907cf",
+        end=(
+            (273.31076, 0.0, 91.43999, 0.0),
+            (137.99808, 130.84561, 90.84874, 0.68185),
+            (99.01189, 206.6169, 49.68502, 14.31261),
+        ),
+    ),
+    "triangle5_scattered": Reference(
+        sha256="dfc5a4e78bcec929c74cdd9730f943e4f1471889f3f5415d2fbb847faf47ceb5",
+        end=(
+            (272.28738, 2.38694, 91.43999, 2e-05),
+            (149.40726, 124.33967, 90.94125, 0.24447),
+            (149.68086, -119.5315, 91.80235, 0.46195),
+            (28.9791, 245.26822, 88.74568, 1.84585),
+            (27.38549, -242.90445, 93.02668, 2.48053),
+        ),
+    ),
+    "triangle5, jitter and loss": Reference(
+        sha256="3dd0b77980eb436258a03110ab0e82f7d461b6277723758506df926e7d97d306",
+        end=(
+            (330.50595, 0.0, 91.44, 0.0),
+            (208.60362, 121.91928, 91.4753, -0.02388),
+            (209.41226, -121.91905, 91.39357, -0.01916),
+            (85.23631, 244.03331, 90.68704, 0.44578),
+            (86.3688, -243.66745, 91.66389, 0.39956),
+        ),
+    ),
+}
+
+
+def scenario(name: str) -> Scenario:
+    """The reference scenario of a name."""
+    file, changes = {
+        "chain3, 40 ms": ("chain3", {}),
+        "chain3, above the margin": ("chain3", {"delay": 0.5}),
+        "triangle5_scattered": ("triangle5_scattered", {}),
+        "triangle5, jitter and loss": ("triangle5", {"delay": 0.1, "jitter": 0.01, "loss": 0.05}),
+    }[name]
+    gains = Control(gains=FixedGains(K1=-3.4, K2=0.6, K3=5.6))
+    loaded = load(SCENARIOS / f"{file}.toml").model_copy(update={"control": gains, "duration_s": DURATION_S})
+    return at_coordinates(loaded, changes)
+
+
+def flown(name: str) -> TickArray:
+    _, plan = flight_plan(scenario(name))
+    return fly_virtual(plan).ticks
+
+
+def reference_of(ticks: TickArray) -> Reference:
+    """The hash of what is counted, and the end of what is measured."""
+    digest = hashlib.sha256()
+    for column in COUNTED:
+        digest.update(np.ascontiguousarray(ticks[column]).tobytes())
+    vehicles = len(np.unique(ticks["system_id"]))
+    end = tuple(tuple(round(float(row[name]), 5) for name in MEASURED) for row in ticks[-vehicles:])
+    return Reference(digest.hexdigest(), end)
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_flight_is_the_reference_flight(name: str) -> None:
+    found, known = reference_of(flown(name)), REFERENCES[name]
+    assert np.array(found.end) == pytest.approx(np.array(known.end), abs=END_TOLERANCE)
+    assert found.sha256 == known.sha256
+
+
+@pytest.mark.parametrize("changes", [{"seed": 2}, {"duration_s": DURATION_S + 0.02}])
+def test_reference_sees_another_seed_and_another_tick(changes: dict[str, Any]) -> None:
+    _, plan = flight_plan(scenario("triangle5, jitter and loss").model_copy(update=changes))
+    assert reference_of(fly_virtual(plan).ticks).sha256 != REFERENCES["triangle5, jitter and loss"].sha256
+
+
+def test_reference_sees_gains_that_differ_by_a_part_in_a_thousand() -> None:
+    _, plan = flight_plan(scenario("chain3, 40 ms"))
+    end = reference_of(fly_virtual(replace(plan, gain=1.001 * plan.gain)).ticks).end
+    known = REFERENCES["chain3, 40 ms"].end
+    assert float(np.abs(np.array(end) - np.array(known)).max()) > 2.0 * END_TOLERANCE
+
+
+def test_flight_is_the_same_to_the_last_bit_in_another_process() -> None:
+    """Another hash seed changes the order of sets; nothing flown may depend on it."""
+    name = "triangle5, jitter and loss"
+    here = hashlib.sha256(flown(name).tobytes()).hexdigest()
+    environment = {**os.environ, "PYTHONHASHSEED": "12345"}
+    command = [sys.executable, __file__, "--bits", name]
+    there = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout.strip()
+    assert there == here
+
+
+def print_references() -> None:
+    """As Python source, to be put above."""
+    for name in REFERENCES:
+        reference = reference_of(flown(name))
+        print(f'    "{name}": Reference(\n        sha256="{reference.sha256}",\n        end=(')
+        for row in reference.end:
+            print(f"            {row},")
+        print("        ),\n    ),")
+
+
+if __name__ == "__main__":
+    if "--bits" in sys.argv:
+        print(hashlib.sha256(flown(sys.argv[-1]).tobytes()).hexdigest())
+    else:
+        print_references()
