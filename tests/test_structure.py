@@ -15,6 +15,7 @@ from gains.structure import (
     project_out_equilibria,
     square_matrices,
     strongly_connected_blocks,
+    without_equilibria,
 )
 
 sparse_matrices = st.integers(1, 9).flatmap(
@@ -113,3 +114,30 @@ def test_wrong_matrices_are_named(matrices: dict[str, FloatArray], message: str)
 def test_nothing_but_equilibria_is_an_error() -> None:
     with pytest.raises(BadModelError, match="nothing but equilibria"):
         project_out_equilibria(np.zeros((2, 2)), np.zeros((2, 2)))
+
+
+def test_equilibria_go_block_by_block_and_the_other_roots_stay() -> None:
+    # two rings of consensus, the second driven by the first, and a lag: two common values go
+    ring = np.array([[-2.0, 1.0, 1.0], [1.0, -2.0, 1.0], [1.0, 1.0, -2.0]])
+    A1 = np.zeros((7, 7))
+    A1[:3, :3], A1[3:6, 3:6], A1[3, 0] = ring, 2.0 * ring, 0.5
+    A0 = np.diag([0.0] * 6 + [-1.0])
+    (now, late), gone = without_equilibria(A0, A1)
+    assert gone == 2
+    kept = np.sort(np.linalg.eigvals(now + late).real)
+    # eigenvalues of a ring of three: 0, -3, -3; double ones are known to half the digits
+    assert kept == pytest.approx([-6.0, -6.0, -3.0, -3.0, -1.0], abs=1e-7)
+
+
+def test_matrices_without_equilibria_come_back_as_they_were() -> None:
+    A0, A1 = np.array([[-1.0, 0.0], [5.0, 0.0]]), np.array([[0.0, 0.0], [0.0, -2.0]])
+    (now, late), gone = without_equilibria(A0, A1)
+    assert gone == 0
+    assert np.array_equal(now, A0)
+    assert np.array_equal(late, A1)
+
+
+def test_integrator_that_nobody_feeds_back_stays() -> None:
+    # nothing is left of its block without it, and the loop is not stable with it
+    _, gone = without_equilibria(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.zeros((2, 2)))
+    assert gone == 0

@@ -1,0 +1,185 @@
+"""Several independent delays, one for each link: which combinations does the loop take?
+
+x'(t) = A0 x(t) + A1 x(t - tau_1) + A2 x(t - tau_2) has a root j omega where det(j omega I - A0 - A1 e^{-j alpha} -
+A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. Fixing alpha leaves one delay and a complex A0, whose
+crossings are found along the unit circle of beta; from them the curves of solutions (omega, alpha, beta) are followed.
+Each solution belongs to the delays ((alpha + 2 pi p) / omega, (beta + 2 pi q) / omega), p and q whole: the crossing
+curves of the delay plane, across which the number of unstable roots changes. The edge of the stable region is made of
+the pieces with no root to the right of them.
+
+A leader-follower formation is block triangular, and when each block knows one delay only, the region is a rectangle
+(`delay_box`).
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import ceil, inf, isfinite, pi
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gains.delay import delay_margin
+from gains.delay_curves import Curve, crossing_solutions
+from gains.errors import BadModelError
+from gains.rightmost import rightmost_root
+from gains.structure import FloatArray, distinct_blocks, real_matrix, square_matrices
+
+# a rightmost root counts as on the axis when it is this close to it, relative to its own size
+_ON_AXIS = 1e-6
+# pieces of a crossing curve shorter than this many points are corners that touch the box
+_LEAST_POINTS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Polyline:
+    """Delays (tau_1, tau_2) `delays_s` (k, 2) with roots +-j `omega_rad_s` (k,) on the imaginary axis."""
+
+    delays_s: FloatArray
+    omega_rad_s: FloatArray
+
+
+@dataclass(frozen=True)
+class DelayBox:
+    """Which delays tau_1, ..., tau_m the loop takes independently of each other.
+
+    `limits_s` is the limit of each delay as far as blocks with that delay alone set it; `inf` without limit, and all
+    zero if a block is unstable without delay. `coupled` lists the sets of delays (indices into the delays) that meet
+    in one block, where the limits of one depend on the others. With `coupled` empty the box is exact: the loop is
+    stable at every delay inside, and loses stability on its faces.
+    """
+
+    limits_s: tuple[float, ...]
+    coupled: tuple[frozenset[int], ...]
+
+    @property
+    def is_exact(self) -> bool:
+        return not self.coupled
+
+
+def stable_at(A0: ArrayLike, late: Sequence[ArrayLike], delays_s: Sequence[float]) -> bool:
+    """Whether x'(t) = A0 x(t) + sum_k late[k] x(t - delays_s[k]) is asymptotically stable.
+
+    Raises
+    ------
+    BadModelError
+        As of `gains.rightmost.rightmost_root`, or as many delays as late matrices are not given.
+    """
+    if len(late) != len(delays_s):
+        raise BadModelError(f"delays_s has {len(delays_s)} delays; {len(late)} are wanted, as late matrices")
+    return rightmost_root([(A0, 0.0), *zip(late, delays_s, strict=True)]).real < 0.0
+
+
+def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
+    """The rectangle of delays that x'(t) = A0 x(t) + sum_k late[k] x(t - tau_k) takes, block by block.
+
+    Couplings between strongly connected blocks do not count: in a leader-follower tree with one delay for each vehicle
+    every block has one delay, and the box is exact.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size.
+    """
+    now, *delayed = square_matrices(A0=A0, **{f"late[{k}]": matrix for k, matrix in enumerate(late)})
+    limits_s = [inf] * len(delayed)
+    coupled: list[frozenset[int]] = []
+    for block in distinct_blocks(now, *delayed):
+        here, *parts = block.matrices
+        acting = [k for k, part in enumerate(parts) if part.any()]
+        if float(np.linalg.eigvals(here + sum(parts, np.zeros_like(here))).real.max()) >= 0.0:
+            return DelayBox((0.0,) * len(delayed), ())
+        if len(acting) == 1:
+            limits_s[acting[0]] = min(limits_s[acting[0]], delay_margin(here, parts[acting[0]]))
+        elif len(acting) > 1 and frozenset(acting) not in coupled:
+            coupled.append(frozenset(acting))
+    return DelayBox(tuple(limits_s), tuple(coupled))
+
+
+def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list[FloatArray]:
+    """The part of B K that each vehicle's command contributes, one matrix (n, n) a vehicle: its own delayed term.
+
+    Parameters
+    ----------
+    B, K
+        (n, p) and (p, n), u = K x.
+    inputs
+        For each vehicle the place of its command in u, as `gains.formation.FormationModel.input_slice`.
+    """
+    entry, feedback = real_matrix("B", B), real_matrix("K", K)
+    return [entry[:, place] @ feedback[place] for place in inputs]
+
+
+def crossing_curves(
+    A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, *, longest_s: tuple[float, float]
+) -> tuple[Polyline, ...]:
+    """All curves in the plane of two delays along which roots lie on the imaginary axis, up to `longest_s`.
+
+    On every point the least singular value of the characteristic matrix is zero to rounding. Curves are followed from
+    crossings on a grid of angles: a search, not a proof.
+
+    Parameters
+    ----------
+    A0, A1, A2
+        Real matrices (n, n), 1/s: what acts at once, tau_1 late and tau_2 late.
+    longest_s
+        The largest tau_1 and tau_2 of interest.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size, or a longest delay is not positive and finite.
+    """
+    if not all(isfinite(longest) and longest > 0.0 for longest in longest_s):
+        raise BadModelError(f"longest_s is {longest_s}; two positive numbers of seconds are wanted")
+    now, first, second = square_matrices(A0=A0, A1=A1, A2=A2)
+    lines: list[Polyline] = []
+    for block in distinct_blocks(now, first, second):
+        for curve in crossing_solutions(*block.matrices):
+            lines += _offspring(curve, longest_s)
+    return tuple(lines)
+
+
+def boundary_of_two_delays(
+    A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, *, longest_s: tuple[float, float]
+) -> tuple[Polyline, ...]:
+    """The edge of the stable region in the plane of two delays, up to `longest_s`: pieces of `crossing_curves`.
+
+    A piece is part of the edge when no root lies to the right of the axis on it. The edge may surround several
+    regions, and the axes and `longest_s` bound it where no piece does. Arguments and exceptions as of
+    `crossing_curves`.
+    """
+    pieces: list[Polyline] = []
+    for line in crossing_curves(A0, A1, A2, longest_s=longest_s):
+        edge = np.array([_is_edge(A0, A1, A2, pair) for pair in line.delays_s.tolist()])
+        pieces += _runs(line, edge)
+    return tuple(pieces)
+
+
+def _is_edge(A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, delays_s: list[float]) -> bool:
+    root = rightmost_root([(A0, 0.0), (A1, delays_s[0]), (A2, delays_s[1])])
+    return root.real <= _ON_AXIS * abs(root)
+
+
+def _offspring(curve: Curve, longest_s: tuple[float, float]) -> Iterator[Polyline]:
+    """The images of one curve of solutions in the box of delays, for all whole turns p and q."""
+    omega = curve.omega
+    turns = [
+        range(
+            ceil(float((-angle / (2.0 * pi)).min())),
+            int(np.floor(float(((longest * omega - angle) / (2.0 * pi)).max()))) + 1,
+        )
+        for angle, longest in ((curve.alpha, longest_s[0]), (curve.beta, longest_s[1]))
+    ]
+    for p in turns[0]:
+        for q in turns[1]:
+            delays_s = np.stack([(curve.alpha + 2.0 * pi * p) / omega, (curve.beta + 2.0 * pi * q) / omega], axis=1)
+            inside = np.all((delays_s >= 0.0) & (delays_s <= np.array(longest_s)), axis=1)
+            yield from _runs(Polyline(delays_s, omega), inside)
+
+
+def _runs(line: Polyline, kept: NDArray[np.bool_]) -> Iterator[Polyline]:
+    """The stretches of a polyline whose points are all kept."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(np.int8)))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if end - begin >= _LEAST_POINTS:
+            yield Polyline(line.delays_s[begin:end], line.omega_rad_s[begin:end])

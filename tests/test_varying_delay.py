@@ -1,0 +1,201 @@
+"""Bounds for delays that vary: published numbers, proofs below the exact margin, and delays that do their worst."""
+
+from itertools import pairwise
+from math import inf, isnan, sqrt
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gains.delay import delay_margin
+from gains.errors import BadModelError
+from gains.jitter import Jitter, bound_covering, spread_bound
+from gains.lmi import Unknown, positive_definite_solution
+from gains.varying_delay import hierarchy_bound, small_gain_bound, varying_delay_bound
+
+Matrix = NDArray[np.float64]
+A0: Matrix = np.array([[-2.0, 0.0], [0.0, -0.9]])
+A1: Matrix = np.array([[-1.0, 0.0], [-1.0, -1.0]])
+FOLLOWER = (np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0, 0.0], [1.0, -1.0]]))
+# bisections end at a part in 10^4
+BISECTION = 1.5e-4
+
+
+@pytest.mark.parametrize(
+    ("rate", "bound_s"), [(0.0, 6.059), (0.1, 4.703), (0.2, 3.834), (0.5, 2.420), (0.8, 2.137), (1.0, 2.128)]
+)
+def test_published_bounds_for_a_bounded_rate(rate: float, bound_s: float) -> None:
+    # Seuret and Gouaisbaut 2013, 4 digits; the solver's strictness is worth less than a part in 10^3
+    assert varying_delay_bound(A0, A1, rate=rate) == pytest.approx(bound_s, rel=1e-3)
+
+
+@pytest.mark.parametrize(("order", "bound_s"), [(0, 4.472), (1, 6.059), (2, 6.1689), (3, 6.1723)])
+def test_published_bounds_of_the_hierarchy(order: int, bound_s: float) -> None:
+    # the first two published with 4 digits, the others from an independent program
+    assert hierarchy_bound(A0, A1, order=order) == pytest.approx(bound_s, rel=3e-4)
+
+
+def test_hierarchy_converges_to_the_exact_margin() -> None:
+    exact_s = delay_margin(A0, A1)
+    assert exact_s * 0.9998 < hierarchy_bound(A0, A1, order=4) <= exact_s
+
+
+def test_small_gain_of_any_variation() -> None:
+    # at high frequency the gain is that of A1 under the best scaling, its spectral radius 1; an independent search
+    # over scalings came to 0.9974, unscaled it is 1 / ||A1|| = 0.618
+    found_s = small_gain_bound(A0, A1)
+    assert 0.9974 <= found_s <= 1.0
+    assert found_s == pytest.approx(1.0, rel=2.0 * BISECTION)
+
+
+def test_small_gain_of_one_signal_needs_no_scaling() -> None:
+    # follower: |s (s + 1) / (s^2 + s + 1)| on the axis, found on a fine grid
+    omega = np.logspace(-3.0, 3.0, 200_001)
+    s = 1j * omega
+    largest = float(np.abs(s * (s + 1.0) / (s * s + s + 1.0)).max())
+    assert small_gain_bound(*FOLLOWER) == pytest.approx(1.0 / largest, rel=2.0 * BISECTION)
+
+
+def test_bounds_fall_as_the_delay_may_do_more() -> None:
+    bounds = [varying_delay_bound(*FOLLOWER, rate=rate) for rate in (0.0, 0.3, 0.9, inf)]
+    assert delay_margin(*FOLLOWER) >= bounds[0]
+    assert all(more >= less * (1.0 - BISECTION) for more, less in pairwise(bounds))
+    # Wirtinger's inequality comes close for a follower
+    assert bounds[0] > 0.99 * delay_margin(*FOLLOWER)
+
+
+def test_bounds_scale_with_time() -> None:
+    for factor in (1e-4, 1e4):
+        slow, fast = (varying_delay_bound(f * A0, f * A1, rate=0.5) * f for f in (1.0, factor))
+        assert fast == pytest.approx(slow, rel=2.0 * BISECTION)
+
+
+def test_weak_delayed_part_takes_delays_of_any_length() -> None:
+    assert varying_delay_bound([[-2.0]], [[1.0]], rate=0.5) == inf
+    # 1 - mu < 1/4: the functional that does not ask for the length no longer proves it
+    assert varying_delay_bound([[-2.0]], [[1.0]], rate=0.8) < inf
+
+
+def test_unstable_loop_has_no_bound() -> None:
+    for bound in (small_gain_bound([[1.0]], [[-0.5]]), varying_delay_bound([[1.0]], [[-0.5]], rate=0.1)):
+        assert bound == 0.0
+
+
+def test_blocks_are_taken_one_by_one() -> None:
+    both0 = np.block([[A0, np.zeros((2, 2))], [np.ones((2, 2)), FOLLOWER[0]]])
+    both1 = np.block([[A1, np.zeros((2, 2))], [np.zeros((2, 2)), FOLLOWER[1]]])
+    alone = min(varying_delay_bound(A0, A1, rate=0.5), varying_delay_bound(*FOLLOWER, rate=0.5))
+    assert varying_delay_bound(both0, both1, rate=0.5) == alone
+
+
+def flown(loop: tuple[Matrix, Matrix], delay_s: NDArray[np.float64], step_s: float) -> float:
+    """Growth of x' = A0 x + A1 x(t - tau(t)) from x = 1 by Heun's method: last second over first second."""
+    now, late = loop
+    steps = delay_s.size
+    x = np.ones((steps + 1, len(now)))
+
+    def delayed(k: int) -> Matrix:
+        at = k - delay_s[min(k, steps - 1)] / step_s
+        low = int(np.floor(at))
+        older, newer = x[max(low, 0)], x[min(max(low + 1, 0), k)]
+        return older + (at - low) * (newer - older)
+
+    for k in range(steps):
+        slope = now @ x[k] + late @ delayed(k)
+        x[k + 1] = x[k] + step_s * slope
+        x[k + 1] = x[k] + step_s / 2.0 * (slope + now @ x[k + 1] + late @ delayed(k + 1))
+    second = round(1.0 / step_s)
+    return float(np.abs(x[-second:]).max() / np.abs(x[:second]).max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_follower_survives_jumping_delays_below_the_bound(seed: int) -> None:
+    bound_s = varying_delay_bound(*FOLLOWER, rate=inf)
+    rng = np.random.default_rng(seed)
+    step_s = 0.01
+    # a new delay every few hundredths of a second, often the largest
+    delays = np.repeat(np.minimum(rng.uniform(0.0, 1.6, 1000) * bound_s, bound_s), 4)
+    # forty seconds of a loop with time constants of a second or more
+    assert flown(FOLLOWER, delays, step_s) < 0.5
+
+
+def test_sawtooth_beyond_the_constant_margin_is_not_promised() -> None:
+    # the other way round: at 1.1 margins a constant delay does grow, so the simulation can tell
+    delay_s = 1.1 * delay_margin(*FOLLOWER)
+    assert flown(FOLLOWER, np.full(4000, delay_s), 0.01) > 2.0
+
+
+def test_constant_delay_is_covered_by_the_exact_margin() -> None:
+    verdict = bound_covering(A0, A1, Jitter(mean_s=6.1, spread_s=0.0, rate=0.0))
+    assert (verdict.cover, verdict.is_covered) == ("constant", True)
+    assert verdict.bound_s == delay_margin(A0, A1)
+
+
+@pytest.mark.parametrize(
+    ("jitter", "cover"),
+    [
+        (Jitter(2.0, 0.3, 0.5), "rate"),
+        (Jitter(2.0, 0.05, inf), "spread"),
+        (Jitter(1.0, 1.0, inf), "any"),
+        (Jitter(5.0, 0.8, inf), "none"),
+        (Jitter(6.3, 0.0, 0.0), "none"),
+        (Jitter(6.3, 0.01, 0.1), "none"),
+    ],
+)
+def test_first_bound_that_covers_a_jitter(jitter: Jitter, cover: str) -> None:
+    verdict = bound_covering(A0, A1, jitter)
+    assert verdict.cover == cover
+    assert verdict.is_covered == (cover != "none")
+    assert isnan(verdict.bound_s) if cover == "none" else verdict.largest_s <= verdict.bound_s
+    assert verdict.bound_s <= verdict.constant_margin_s or isnan(verdict.bound_s)
+
+
+def test_spread_of_a_scalar_loop_is_the_closed_form() -> None:
+    # x' = -x(t - mean): G = s / (s + e^{-s mean}), whose largest modulus a fine grid gives
+    omega = np.logspace(-3.0, 3.0, 400_001)
+    s = 1j * omega
+    largest = float(np.abs(s / (s + np.exp(-s * 0.8))).max())
+    # the grid of the function itself allows a part in a thousand
+    assert spread_bound([[0.0]], [[-1.0]], mean_s=0.8) == pytest.approx(1.0 / (sqrt(2.0) * largest), rel=2e-3)
+
+
+def test_spread_shrinks_to_nothing_at_the_margin() -> None:
+    margin_s = delay_margin(*FOLLOWER)
+    spreads = [spread_bound(*FOLLOWER, mean_s=share * margin_s) for share in (0.7, 0.9, 0.99, 0.999)]
+    assert all(a > b for a, b in pairwise(spreads))
+    assert all(
+        share * margin_s + spread <= margin_s for share, spread in zip((0.7, 0.9, 0.99, 0.999), spreads, strict=True)
+    )
+    assert spread_bound(*FOLLOWER, mean_s=1.01 * margin_s) == 0.0
+
+
+def test_inequality_without_solution_is_not_solved() -> None:
+    # X > 0 and -X > 0
+    assert positive_definite_solution([Unknown(2)], lambda unknowns: [unknowns[0], -unknowns[0]]) is None
+
+
+def test_lyapunov_equation_is_solved_where_it_can_be() -> None:
+    stable, unstable = np.array([[-1.0, 10.0], [0.0, -2.0]]), np.array([[0.1, 1.0], [0.0, -2.0]])
+    for matrix, exists in ((stable, True), (unstable, False)):
+        found = positive_definite_solution(
+            [Unknown(2)], lambda unknowns, A=matrix: [unknowns[0], -(A.T @ unknowns[0] + unknowns[0] @ A)]
+        )
+        assert (found is not None) == exists
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: varying_delay_bound(A0, A1, rate=-0.1), "rate is -0.1"),
+        (lambda: varying_delay_bound(A0, A1, rate=float("nan")), "rate is nan"),
+        (lambda: varying_delay_bound(np.ones((9, 9)), np.eye(9), rate=0.1), "block of 9 states"),
+        (lambda: hierarchy_bound(A0, A1, order=7), "order is 7"),
+        (lambda: bound_covering(A0, A1, Jitter(1.0, 2.0, 0.0)), "spread_s is 2.0"),
+        (lambda: bound_covering(A0, A1, Jitter(-1.0, 0.0, 0.0)), "mean_s is -1.0"),
+        (lambda: bound_covering(A0, A1, Jitter(1.0, 0.5, -1.0)), "rate is -1.0"),
+    ],
+)
+def test_wrong_questions_are_named(call: Any, message: str) -> None:
+    with pytest.raises(BadModelError, match=message):
+        call()
