@@ -137,7 +137,7 @@ def test_held_loop_gives_the_published_period() -> None:
 
 
 def test_held_loop_may_need_a_long_period() -> None:
-    # x'' = -x + k x(sample): undamped at T = 0; the map of a period is [[cos, sin], [-sin, cos]] + k [1 - cos; sin] [1, 0]
+    # x'' = -x + k x(sample): undamped at T = 0; a period maps by [[cos, sin], [-sin, cos]] + k [1 - cos; sin] [1, 0]
     k = -0.5
     result = result_of({"A": [[0, 1], [-1, 0]], "B": [[0], [1]], "K": [[k, 0]], "hold": True})
     assert result["delay_margin_s"] == 0.0
