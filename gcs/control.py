@@ -8,13 +8,16 @@ are brought. So the loop around vehicle i is late by vehicle i's own link only, 
 its margin.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import hypot, nan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gains.formation import FormationModel
-from gcs.telemetry import FloatArray, IntArray, StateHistory
+from gcs.telemetry import FloatArray, IntArray, Report, State, StateHistory
 
 LARGEST_COMMAND_M_S2 = 1e4
 """Limit on what is sent when the scenario sets none; beyond it a command is a fault, not a manoeuvre."""
@@ -41,33 +44,37 @@ class Formation:
         return place
 
 
-@dataclass(frozen=True)
-class FeedbackLaw:
-    """u = K e as a sum over pairs of vehicles: u_i = sum over k of G_ik (x_k - x*_k).
+Gain = tuple[float, float, float, float, float, float, float, float]
+"""A block G (2, 4), row by row: command (north, east) from position and velocity (north, east)."""
 
-    x_k = (position, velocity) of vehicle k and x*_k = (place in the formation, v_d). Pairs are sorted by i, and every
-    vehicle that flies has the pair (i, i) and, if somebody is ahead of it, the pair (i, one ahead).
+
+class Term(NamedTuple):
+    """What one vehicle's state adds to another's command."""
+
+    source: int
+    """The vehicle k whose state is used."""
+    offset_ne_m: tuple[float, float]
+    """Its wanted position relative to the commanded vehicle."""
+    gains: tuple[Gain, ...]
+    """The block of each set of the gain schedule."""
+
+
+class VehicleLaw(NamedTuple):
+    """u_i = sum over its terms of G_ik (x_k - x*_k), x_k = (position, velocity), x*_k = (place in formation, v_d).
+
+    Positions are taken against the vehicle's own, so its own term has velocity only.
     """
 
-    to: IntArray
-    """(pairs,) the commanded vehicle i."""
-    source: IntArray
-    """(pairs,) the vehicle k whose state is used."""
-    gain: FloatArray
-    """(sets, pairs, 2, 4) the blocks G_ik of each set of the gain schedule."""
-    first: IntArray
-    """(flying,) index of the first pair of each vehicle that flies."""
-    follower: IntArray
-    """(followers,) vehicles with one ahead."""
-    own_pair: IntArray
-    """(followers,) index of their pair (i, i)."""
-    ahead_pair: IntArray
-    """(followers,) index of their pair (i, one ahead)."""
-    place_ne_m: FloatArray
-    """(n, 2) wanted positions relative to the leader."""
+    terms: tuple[Term, ...]
+    ahead: int
+    """The vehicle that spacing is kept to, one of the terms; -1 if there is none."""
 
 
-def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: NDArray[np.bool_]) -> FeedbackLaw:
+FeedbackLaw = tuple[VehicleLaw | None, ...]
+"""The law of each vehicle; None if it is lost."""
+
+
+def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequence[bool]) -> FeedbackLaw:
     """The law of a schedule of gain matrices K, flown around lost vehicles.
 
     Each K is (inputs, states) in the order of `gains.formation.FormationModel`.
@@ -87,7 +94,7 @@ def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: NDAr
     def block(i: int, k: int) -> FloatArray:
         return blocks.setdefault((i, k), np.zeros((len(gains), 2, 4)))
 
-    for i in np.flatnonzero(~lost).tolist():
+    for i in (row for row, gone in enumerate(lost) if not gone):
         block(i, i)
         if in_front[i] >= 0:
             block(i, in_front[i])
@@ -102,92 +109,121 @@ def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: NDAr
                 # e_j^p = Z_ahead - Z_j - d
                 block(i, in_front[j])[:, :, :2] += on_spacing
                 block(i, j)[:, :, :2] -= on_spacing
-    return _law(blocks, [k if not gone else -1 for k, gone in zip(in_front, lost, strict=True)], formation.place_ne_m())
+    place = formation.place_ne_m()
+
+    def offset(i: int, k: int) -> tuple[float, float]:
+        north, east = (place[k] - place[i]).tolist()
+        return north, east
+
+    def law(i: int) -> VehicleLaw:
+        sources = sorted(k for to, k in blocks if to == i)
+        terms = tuple(Term(k, offset(i, k), tuple(tuple(G.ravel().tolist()) for G in blocks[i, k])) for k in sources)
+        return VehicleLaw(terms, in_front[i])
+
+    return tuple(None if lost[i] else law(i) for i in range(len(in_front)))
 
 
-def _law(blocks: dict[tuple[int, int], FloatArray], in_front: list[int], place_ne_m: FloatArray) -> FeedbackLaw:
-    pairs = sorted(blocks)
-    index = {pair: k for k, pair in enumerate(pairs)}
-    to = np.array([i for i, _ in pairs], dtype=np.int64)
-    followers = [i for i, ahead in enumerate(in_front) if ahead >= 0]
-    return FeedbackLaw(
-        to=to,
-        source=np.array([k for _, k in pairs], dtype=np.int64),
-        gain=np.stack([blocks[pair] for pair in pairs], axis=1) if pairs else np.zeros((1, 0, 2, 4)),
-        first=np.flatnonzero(np.diff(to, prepend=-1)),
-        follower=np.array(followers, dtype=np.int64),
-        own_pair=np.array([index[i, i] for i in followers], dtype=np.int64),
-        ahead_pair=np.array([index[i, in_front[i]] for i in followers], dtype=np.int64),
-        place_ne_m=place_ne_m,
-    )
+class Blend(NamedTuple):
+    """The gains one vehicle is flown with: `share` (0 to 1) of the set flown, the rest of the former one."""
+
+    flown: int = 0
+    former: int = 0
+    share: float = 1.0
 
 
-@dataclass(frozen=True)
-class FormationControl:
-    """What the law saw and wants: rows of vehicles, columns north and east; NaN where unknown or lost."""
+class VehicleControl(NamedTuple):
+    """What the law saw of one vehicle and wants of it, north and east; NaN where unknown or lost."""
 
-    sample_ns: IntArray
-    position_m: FloatArray
-    velocity_m_s: FloatArray
-    spacing_error_m: FloatArray
-    velocity_error_m_s: FloatArray
-    command_m_s2: FloatArray
+    sample_ns: int
+    """Instant of its newest state, station clock; 0 while there is none."""
+    state: State
+    spacing_error_m: tuple[float, float]
+    velocity_error_m_s: tuple[float, float]
+    command_m_s2: tuple[float, float]
 
 
-def blended_gain(law: FeedbackLaw, flown: IntArray, former: IntArray, share: FloatArray) -> FloatArray:
-    """The blocks (pairs, 2, 4) with which each vehicle is flown now.
-
-    `flown` and `former` (n,) are sets of the schedule, `share` (n,) is how much of the set flown is blended in, 0 to 1.
-    """
-    pair = np.arange(len(law.to))
-    mix = share[law.to][:, None, None]
-    return mix * law.gain[flown[law.to], pair] + (1.0 - mix) * law.gain[former[law.to], pair]
+_UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan, nan))
 
 
 def formation_control(
     history: StateHistory,
     law: FeedbackLaw,
-    gain: FloatArray,
+    blends: Sequence[Blend],
     *,
     nominal_velocity_m_s: tuple[float, float],
     limit_m_s2: float,
     opening: float = 1.0,
-) -> FormationControl:
+) -> list[VehicleControl]:
     """Errors and commands of every vehicle from the newest reported states.
 
-    `gain` (pairs, 2, 4) are the law's blocks as flown now. `opening` is a factor on the formation's spacing.
-    A vehicle whose law uses an unknown state has a NaN command; nothing is to be sent for it. A command longer than
-    `limit_m_s2` is shortened to it.
+    `blends` says with which gains each vehicle is flown. `opening` is a factor on the formation's spacing. A vehicle
+    whose law uses an unknown state has a NaN command; nothing is to be sent for it. A command longer than `limit_m_s2`
+    is shortened to it.
     """
-    sample_ns, position, velocity = history.newest()
-    # (pairs, 4): what each vehicle sees of the others at its own instant, against where they should be
-    seen = history.at(law.source, sample_ns[law.to])
-    place = opening * law.place_ne_m
-    seen[:, :2] -= place[law.source]
-    seen[:, 2:] -= nominal_velocity_m_s
-    spacing_error = np.full_like(position, np.nan)
-    spacing_error[law.follower] = seen[law.ahead_pair, :2] - seen[law.own_pair, :2]
-    command = np.full_like(position, np.nan)
-    if law.to.size:
+    controls: list[VehicleControl] = []
+    for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
+        newest = history.newest(row)
+        if newest is None:
+            controls.append(_UNKNOWN)
+            continue
+        sample_ns, state = newest
+        spacing_error = command = nan, nan
+        if own is not None:
+            spacing_error, command = _followed(history, own, newest, blend, nominal_velocity_m_s, opening)
+        velocity_error = state[2] - nominal_velocity_m_s[0], state[3] - nominal_velocity_m_s[1]
+        controls.append(
+            VehicleControl(sample_ns, state, spacing_error, velocity_error, _shortened(command, limit_m_s2))
+        )
+    return controls
+
+
+def _followed(
+    history: StateHistory,
+    law: VehicleLaw,
+    newest: Report,
+    blend: Blend,
+    nominal_velocity_m_s: tuple[float, float],
+    opening: float,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Spacing error and command of one vehicle: the sum of G_ik (x_k - x*_k) at the instant of its newest state."""
+    sample_ns, (north, east, _, _) = newest
+    nominal_north, nominal_east = nominal_velocity_m_s
+    command_north = command_east = 0.0
+    spacing_error = nan, nan
+    flown, former, share = blend
+    for source, (offset_north, offset_east), gains in law.terms:
+        other = history.at(source, sample_ns) or _UNKNOWN.state
         # Positions are taken against the vehicle's own: sums of large numbers would lose digits.
-        seen[:, :2] -= (position - place)[law.to]
-        command[law.to[law.first]] = np.add.reduceat((gain @ seen[:, :, None])[:, :, 0], law.first)
-    size = np.hypot(command[:, 0], command[:, 1])
-    command *= (limit_m_s2 / np.maximum(size, limit_m_s2))[:, None]
-    return FormationControl(sample_ns, position, velocity, spacing_error, velocity - nominal_velocity_m_s, command)
+        x, y = other[0] - north - opening * offset_north, other[1] - east - opening * offset_east
+        v_north, v_east = other[2] - nominal_north, other[3] - nominal_east
+        g = gains[flown]
+        if share < 1.0:
+            g = [share * new + (1.0 - share) * old for new, old in zip(g, gains[former], strict=True)]
+        command_north += g[0] * x + g[1] * y + g[2] * v_north + g[3] * v_east
+        command_east += g[4] * x + g[5] * y + g[6] * v_north + g[7] * v_east
+        if source == law.ahead:
+            spacing_error = x, y
+    return spacing_error, (command_north, command_east)
 
 
-def nearest_vehicle(control: FormationControl, now_ns: int) -> tuple[FloatArray, IntArray]:
-    """Distance (n,) in m of each vehicle to the one nearest to it, and that one's row; NaN where unknown.
+def _shortened(command: tuple[float, float], limit: float) -> tuple[float, float]:
+    north, east = command
+    size = hypot(north, east)
+    return (north * limit / size, east * limit / size) if size > limit else command
+
+
+def nearest_vehicle(controls: Sequence[VehicleControl], now_ns: int) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Distance (n,) in m of each vehicle to the one nearest to it, and that one's row; infinite where unknown.
 
     Positions are brought to `now_ns` along the reported velocities.
     """
-    age_s = (now_ns - control.sample_ns).astype(np.float64)[:, None] * 1e-9
-    position = control.position_m + control.velocity_m_s * age_s
-    north, east = position[:, 0], position[:, 1]
-    square = (north[:, None] - north) ** 2 + (east[:, None] - east) ** 2
-    np.fill_diagonal(square, np.inf)
-    square[np.isnan(square)] = np.inf
-    other = square.argmin(axis=1)
-    nearest = np.sqrt(square[np.arange(len(other)), other])
-    return np.where(np.isfinite(nearest), nearest, np.nan), other
+    position = np.empty(len(controls), dtype=np.complex128)
+    for row, control in enumerate(controls):
+        north, east, v_north, v_east = control.state
+        age_s = (now_ns - control.sample_ns) * 1e-9
+        position[row] = complex(north + v_north * age_s, east + v_east * age_s)
+    distance = np.abs(position[:, None] - position)
+    distance[np.isnan(distance)] = np.inf
+    np.fill_diagonal(distance, np.inf)
+    other = distance.argmin(axis=1)
+    return distance[np.arange(len(other)), other], other

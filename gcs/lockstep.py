@@ -44,11 +44,10 @@ def fly_lockstep(
     while station.phase is not Phase.ENDED:
         arrived = vehicles.step(to_vehicles, now_ns)
         datagrams = [Datagram(data, (_HOST, system_id), time_ns) for system_id, data, time_ns in arrived]
-        outgoing, rows = station.step(datagrams, now_ns)
+        outgoing, tick = station.step(datagrams, now_ns)
         to_vehicles = [(system_id, data, now_ns) for data, (_, system_id) in outgoing]
-        if rows is not None:
-            station.complete(rows, now_ns)
-            yield rows.copy()
+        if tick is not None:
+            yield station.complete(tick, now_ns)
             station.frames.clear()
         if not to_vehicles:
             now_ns = max(now_ns, min(vehicles.next_event_ns, station.next_event_ns))

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gcs.control import Blend
 from gcs.record import Mode
-from gcs.telemetry import FloatArray, IntArray
 from scenarios.schema import Monitor
 
 
@@ -174,8 +174,8 @@ class FleetView:
     silent: list[bool]
     guided: list[bool]
     failsafe: list[bool]
-    loop_delay_s: FloatArray
-    """(n,), NaN where unknown."""
+    loop_delay_s: list[float]
+    """NaN where unknown."""
 
 
 class FormationMonitor:
@@ -218,12 +218,13 @@ class FormationMonitor:
         self._open(view.time_s, flying=view.flying)
         return changes
 
-    def sets_and_blends(self, time_s: float) -> tuple[IntArray, IntArray, FloatArray]:
-        """For each vehicle the set flown, the former set, and the share (0 to 1) of the set flown in its gains."""
-        flown = np.array([state.gain_set for state in self.states])
-        former = np.array([state.former_set for state in self.states])
-        share = (time_s - np.array([state.changed_s for state in self.states])) / self._policy.blend_s
-        return flown, former, np.clip(share, 0.0, 1.0)
+    def blends(self, time_s: float) -> list[Blend]:
+        """The gains that each vehicle is flown with."""
+        blend_s = self._policy.blend_s
+        return [
+            Blend(state.gain_set, state.former_set, min(1.0, max(0.0, (time_s - state.changed_s) / blend_s)))
+            for state in self.states
+        ]
 
     def _judged_delay_s(self) -> list[float]:
         window = self._delays_s

@@ -1,31 +1,79 @@
 """Filling the rows of the tick record from what the station holds."""
 
-import numpy as np
-from numpy.typing import NDArray
+import struct
+from math import inf, nan
+from typing import NamedTuple
 
-from gcs.control import FormationControl
-from gcs.record import TickArray
+import numpy as np
+
+from gcs.control import VehicleControl
+from gcs.monitor import VehicleState, headroom
+from gcs.record import TICK, TickArray
 from gcs.vehicle import RemoteVehicle
 
-
-def write_control(rows: TickArray, control: FormationControl, commanded: NDArray[np.bool_]) -> None:
-    """States, errors and commands; a command that is not sent is NaN."""
-    rows["commanded"] = commanded
-    rows["sample_ns"] = np.maximum(control.sample_ns, 0)
-    rows["north_m"], rows["east_m"] = control.position_m.T
-    rows["velocity_north_m_s"], rows["velocity_east_m_s"] = control.velocity_m_s.T
-    rows["spacing_error_north_m"], rows["spacing_error_east_m"] = control.spacing_error_m.T
-    rows["velocity_error_north_m_s"], rows["velocity_error_east_m_s"] = control.velocity_error_m_s.T
-    command = np.where(commanded[:, None], control.command_m_s2, np.nan)
-    rows["command_north_m_s2"], rows["command_east_m_s2"] = command.T
+_CODES = {"<i8": "q", "<u4": "I", "<f8": "d", "|u1": "B", "|b1": "?"}
+_ROW = struct.Struct("<" + "".join(_CODES[np.dtype(TICK[name]).str] for name in TICK.names or ()))
 
 
-def write_links(rows: TickArray, vehicles: list[RemoteVehicle]) -> None:
-    """Delays, clocks and counts of each vehicle's link; NaN where nothing is known yet."""
-    clocks = [vehicle.clock for vehicle in vehicles]
-    rows["down_delay_s"] = [np.nan if c.down_ns is None else c.down_ns * 1e-9 for c in clocks]
-    known = [c.estimate if c.estimate.samples else None for c in clocks]
-    rows["clock_offset_s"] = [np.nan if e is None else e.offset_ns * 1e-9 for e in known]
-    rows["clock_offset_bound_s"] = [np.nan if e is None else e.bound_ns * 1e-9 for e in known]
-    for name in ("received", "lost", "late", "duplicate"):
-        rows[name] = [getattr(vehicle.frames, name) for vehicle in vehicles]
+class Reported(NamedTuple):
+    """What came with a vehicle's newest state."""
+
+    boot_ms: int = 0
+    down_m: float = nan
+    velocity_down_m_s: float = nan
+    queue_s: float = nan
+
+
+class VehicleTick(NamedTuple):
+    """One vehicle at one control tick, all but when its set-point was sent."""
+
+    vehicle: RemoteVehicle
+    monitored: VehicleState
+    control: VehicleControl
+    reported: Reported
+    rtt_s: float
+    """The round trip that ended since the tick before; NaN if none did."""
+    nearest_m: float
+    """Infinite while unknown."""
+    commanded: bool
+    margin_s: float
+    """Delay margin of the gains flown."""
+
+
+class Tick(NamedTuple):
+    """One control tick of the formation."""
+
+    number: int
+    time_s: float
+    due_ns: int
+    key_ms: int
+    vehicles: list[VehicleTick]
+
+
+def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
+    """The rows of a tick whose set-points were handed over at `sent_ns`, and the loop delay of each vehicle in s."""
+    packed: list[bytes] = []
+    delays_s: list[float] = []
+    for seen in tick.vehicles:
+        vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, margin_s = seen
+        clock, frames = vehicle.clock, vehicle.frames
+        estimate = clock.estimate
+        age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
+        down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
+        known = estimate.samples > 0
+        delays_s.append(age_s + down_s)
+        packed.append(
+            _ROW.pack(
+                tick.number, tick.time_s, tick.due_ns, sent_ns, tick.key_ms, vehicle.system_id,
+                monitored.mode, monitored.gain_set, commanded,
+                reported.boot_ms, control.sample_ns, age_s,
+                *control.state[:2], reported.down_m, *control.state[2:], reported.velocity_down_m_s,
+                *control.spacing_error_m, *control.velocity_error_m_s,
+                *(control.command_m_s2 if commanded else (nan, nan)),
+                nearest_m if nearest_m < inf else nan,
+                reported.queue_s, down_s, age_s + down_s, headroom(age_s + down_s, margin_s), rtt_s,
+                estimate.offset_ns * 1e-9 if known else nan, estimate.bound_ns * 1e-9 if known else nan,
+                frames.received, frames.lost, frames.late, frames.duplicate,
+            )
+        )  # fmt: skip
+    return np.frombuffer(bytearray().join(packed), TICK), delays_s

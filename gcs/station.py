@@ -6,15 +6,16 @@ or in virtual time, with the same bytes.
 
 from collections import Counter
 from collections.abc import Callable
+from math import hypot, isfinite, nan
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gcs import mavlink
 from gcs.control import (
     LARGEST_COMMAND_M_S2,
-    FormationControl,
-    blended_gain,
+    VehicleControl,
     feedback_law,
     formation_control,
     nearest_vehicle,
@@ -22,9 +23,9 @@ from gcs.control import (
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
-from gcs.record import TICK, TickArray
-from gcs.rows import write_control, write_links
-from gcs.telemetry import StateHistory
+from gcs.record import TickArray
+from gcs.rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.telemetry import FloatArray, StateHistory
 from gcs.vehicle import GUIDED, HOLD, Address, RemoteVehicle
 from scenarios.schema import NS_PER_S
 
@@ -73,7 +74,7 @@ class Station:
         n = len(self.vehicles)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
         self._history = StateHistory(n)
-        self._law = feedback_law(plan.formation, plan.gains, np.zeros(n, dtype=bool))
+        self._law = feedback_law(plan.formation, plan.gains, [False] * n)
         self._period_ns = round(NS_PER_S / rates.control_hz)
         self._monitor = FormationMonitor(
             n,
@@ -95,14 +96,11 @@ class Station:
         self._tick_count = 0
         self._stop = ""
         self._now_ns = start_ns
-        self._rows: TickArray = np.zeros(n, TICK)
-        self._rows["system_id"] = plan.formation.system_ids
-        self._rows["headroom"] = np.nan
-        self._boot_ms = [0] * n
-        self._queue_s = [np.nan] * n
+        self._reported = [Reported()] * n
         self._telemetry_ns = [0] * n
-        self._fresh_rtt_s = [np.nan] * n
-        self._lost = np.zeros(n, dtype=bool)
+        self._fresh_rtt_s = [nan] * n
+        self._loop_delay_s = [nan] * n
+        self._lost = [False] * n
 
     @property
     def next_event_ns(self) -> int:
@@ -113,35 +111,33 @@ class Station:
         """End the flight at the next tick: the vehicles are told to hold, and seen to."""
         self._stop = self._stop or reason
 
-    def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], TickArray | None]:
+    def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
         """Take datagrams in and do what is due.
 
         Returns
         -------
-        datagrams to send, and the rows of the control tick if one was due. The driver passes the rows to
-        `complete` once the datagrams are sent.
+        datagrams to send, and the control tick if one was due. The driver passes it to `complete` once the datagrams
+        are sent.
         """
         self._now_ns = now_ns
         outgoing: list[Outgoing] = []
         for datagram in datagrams:
             self._receive(datagram, outgoing)
-        rows = None
+        tick = None
         if now_ns >= self._next_tick_ns:
-            rows = self._tick(outgoing)
+            tick = self._tick(outgoing)
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
             for vehicle in self.vehicles:
                 self._send(vehicle, mavlink.HEARTBEAT, mavlink.heartbeat(), outgoing)
         while now_ns >= self._next_timesync_ns:
             self._request_timesync(outgoing)
-        return outgoing, rows
+        return outgoing, tick
 
-    def complete(self, rows: TickArray, sent_ns: int) -> None:
-        """Close a tick's rows with the time at which its set-points were sent: ages, loop delays, headroom."""
-        rows["sent_ns"] = sent_ns
-        rows["telemetry_age_s"] = np.where(rows["sample_ns"] > 0, (sent_ns - rows["sample_ns"]) * 1e-9, np.nan)
-        rows["loop_delay_s"] = rows["telemetry_age_s"] + rows["down_delay_s"]
-        rows["headroom"] = 1.0 - rows["loop_delay_s"] / np.array(self.plan.margins_s)[rows["gain_set"]]
+    def complete(self, tick: Tick, sent_ns: int) -> TickArray:
+        """The rows of a tick, now that it is known when its set-points were sent: ages, loop delays, headroom."""
+        rows, self._loop_delay_s = tick_rows(tick, sent_ns)
+        return rows
 
     def scenario_time_s(self, now_ns: int) -> float:
         """Time since the formation flight began; before that, time since the start minus the patience, below 0."""
@@ -211,9 +207,7 @@ class Station:
         sample_ns = clock.to_station_ns(boot_ms * 1_000_000)
         if not self._history.add(row, sample_ns, (north, east, v_north, v_east)):
             return
-        self._boot_ms[row] = boot_ms
-        self._queue_s[row] = (self._now_ns - received_ns) * 1e-9
-        self._rows["down_m"][row], self._rows["velocity_down_m_s"][row] = down, v_down
+        self._reported[row] = Reported(boot_ms, down, v_down, (self._now_ns - received_ns) * 1e-9)
 
     def _timesync_reply(self, row: int, vehicle: RemoteVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
         jumps = vehicle.clock.jumps
@@ -229,58 +223,58 @@ class Station:
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
-    def _tick(self, outgoing: list[Outgoing]) -> TickArray:
+    def _tick(self, outgoing: list[Outgoing]) -> Tick:
         due_ns = self._next_tick_ns
         behind = (self._now_ns - due_ns) // self._period_ns
         self._next_tick_ns = due_ns + (behind + 1) * self._period_ns  # ticks that were slept through are left out
         self._decide(due_ns)
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
-        flown, former, share = self._monitor.sets_and_blends(time_s)
-        limit = self.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2
-        control = formation_control(
+        controls = formation_control(
             self._history,
             self._law,
-            blended_gain(self._law, flown, former, share),
+            self._monitor.blends(time_s),
             nominal_velocity_m_s=self.plan.scenario.nominal_velocity_at(time_s),
-            limit_m_s2=limit,
+            limit_m_s2=self.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2,
             opening=self._monitor.opening,
         )
-        self._watch(control, due_ns, flying=flying)
+        nearest_m, other = nearest_vehicle(controls, due_ns)
+        if flying:
+            self._watch(controls, nearest_m, other)
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
-        released = np.array([state.released for state in self._monitor.states])
-        commanded = flying & ~self._lost & ~released & np.isfinite(control.command_m_s2).all(axis=1)
-        for row in np.flatnonzero(commanded).tolist():
-            north, east = control.command_m_s2[row].tolist()
-            fields = mavlink.acceleration_set_point(
-                key_ms=key_ms, target_system=self.vehicles[row].system_id, north_m_s2=north, east_m_s2=east
-            )
-            self._send(self.vehicles[row], mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
+        seen: list[VehicleTick] = []
+        for row, (vehicle, control, monitored, nearest) in enumerate(
+            zip(self.vehicles, controls, self._monitor.states, nearest_m.tolist(), strict=True)
+        ):
+            north, east = control.command_m_s2
+            commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
+            if commanded:
+                fields = mavlink.acceleration_set_point(
+                    key_ms=key_ms, target_system=vehicle.system_id, north_m_s2=north, east_m_s2=east
+                )
+                self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
+            margin_s = self.plan.margins_s[monitored.gain_set]
+            reported, rtt_s = self._reported[row], self._fresh_rtt_s[row]
+            seen.append(VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, margin_s))
         for vehicle in self.vehicles:
             frame = vehicle.converse(self._now_ns)
             if frame is not None and vehicle.address is not None:
                 outgoing.append(Outgoing(frame, vehicle.address))
-        rows = self._rows
-        rows["tick"], rows["time_s"], rows["due_ns"], rows["key_ms"] = self._tick_count, time_s, due_ns, key_ms
-        write_control(rows, control, commanded)
-        write_links(rows, self.vehicles)
-        rows["mode"] = [state.mode for state in self._monitor.states]
-        rows["gain_set"] = [state.gain_set for state in self._monitor.states]
-        rows["sample_boot_ms"], rows["queue_s"], rows["rtt_s"] = self._boot_ms, self._queue_s, self._fresh_rtt_s
-        self._fresh_rtt_s = [np.nan] * len(self.vehicles)
+        self._fresh_rtt_s = [nan] * len(self.vehicles)
+        tick = Tick(self._tick_count, time_s, due_ns, key_ms, seen)
         self._tick_count += 1 + behind
-        return rows
+        return tick
 
     def _decide(self, due_ns: int) -> None:
         """Modes, lost vehicles and the flight's phase."""
         flying = self.phase is Phase.FLYING
         silence_ns = SILENCE_S * NS_PER_S
         silent = [self._now_ns - heard_ns > silence_ns for heard_ns in self._telemetry_ns]
-        lost = np.array(silent) & flying
-        if (lost != self._lost).any():
-            for row in np.flatnonzero(lost != self._lost).tolist():
-                text = "is lost" if lost[row] else "is heard again"
-                self._report("vehicle", text, self.vehicles[row].system_id)
+        lost = silent if flying else [False] * len(silent)
+        if lost != self._lost:
+            for vehicle, gone, was in zip(self.vehicles, lost, self._lost, strict=True):
+                if gone != was:
+                    self._report("vehicle", "is lost" if gone else "is heard again", vehicle.system_id)
             self._lost = lost
             self._law = feedback_law(self.plan.formation, self.plan.gains, lost)
         view = FleetView(
@@ -289,7 +283,7 @@ class Station:
             silent=silent,
             guided=[vehicle.guided for vehicle in self.vehicles],
             failsafe=[vehicle.critical for vehicle in self.vehicles],
-            loop_delay_s=self._rows["loop_delay_s"],
+            loop_delay_s=self._loop_delay_s,
         )
         for row, before, after in self._monitor.update(view):
             vehicle = self.vehicles[row]
@@ -314,12 +308,11 @@ class Station:
             if waited_s >= self.plan.scenario.duration_s:
                 lost = ", ".join(str(v.system_id) for v, gone in zip(self.vehicles, self._lost, strict=True) if gone)
                 self.request_stop(f"lost: vehicles {lost}" if lost else "completed: duration reached")
-            elif self._lost.all():
+            elif all(self._lost):
                 self.request_stop("lost: all vehicles")
         phase = next_phase(
             self.phase,
-            all_ready=all(vehicle.ready for vehicle in self.vehicles)
-            and bool(np.isfinite(self._history.newest()[1]).all()),
+            all_ready=self._history.complete and all(vehicle.ready for vehicle in self.vehicles),
             stop=bool(self._stop),
             all_holding=all(v.custom_mode == HOLD for v in self.vehicles if v.address is not None),
             waited_s=waited_s,
@@ -336,26 +329,18 @@ class Station:
                 vehicle.wanted_mode = None if self._stop.startswith("broken") else HOLD
         self._report("phase", str(phase))
 
-    def _watch(self, control: FormationControl, due_ns: int, *, flying: bool) -> None:
-        """Note who is nearest to whom; in flight, end it on a collision or a spacing error past the limit."""
+    def _watch(self, controls: list[VehicleControl], nearest_m: FloatArray, other: NDArray[np.intp]) -> None:
+        """End the flight on a collision or a spacing error past the limit."""
         safety = self.plan.scenario.safety
-        nearest_m, other = nearest_vehicle(control, due_ns)
-        self._rows["nearest_m"] = nearest_m
-        if not flying:
-            return
-        closest = int(np.where(np.isfinite(nearest_m), nearest_m, np.inf).argmin())
+        closest = int(nearest_m.argmin())
         if nearest_m[closest] < safety.collision_distance_m:
             one, two = (self.vehicles[row].system_id for row in (closest, int(other[closest])))
             self.request_stop(f"broken: vehicles {one} and {two} have collided, {nearest_m[closest]:.1f} m apart")
-        error_m = np.hypot(control.spacing_error_m[:, 0], control.spacing_error_m[:, 1])
-        released = np.array([state.released for state in self._monitor.states])
-        error_m[self._lost | released | ~np.isfinite(error_m)] = 0.0
-        worst = int(error_m.argmax())
-        if error_m[worst] > safety.spacing_error_limit_m:
-            error, limit = f"{error_m[worst]:.0f} m", f"{safety.spacing_error_limit_m:g} m"
-            self.request_stop(
-                f"broken: spacing error of vehicle {self.vehicles[worst].system_id} is {error}, limit {limit}"
-            )
+        for vehicle, control, state in zip(self.vehicles, controls, self._monitor.states, strict=True):
+            error_m = hypot(*control.spacing_error_m)
+            if error_m > safety.spacing_error_limit_m and not state.released:
+                error, limit = f"{error_m:.0f} m", f"{safety.spacing_error_limit_m:g} m"
+                self.request_stop(f"broken: spacing error of vehicle {vehicle.system_id} is {error}, limit {limit}")
 
     # -- small things ----------------------------------------------------------------------------------------------
 

@@ -1,4 +1,9 @@
-"""The states that vehicles reported, kept long enough to bring two of them to one instant."""
+"""The states that vehicles reported, kept long enough to bring two of them to one instant.
+
+Scalars and plain tuples: with one report a call, numpy would cost ten times what is computed.
+"""
+
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,81 +11,75 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+State = tuple[float, float, float, float]
+"""Position north and east in m, velocity north and east in m/s."""
+Report = tuple[int, State]
+"""A state with its instant on the station's clock in ns."""
+
 HISTORY = 128
 """Reports kept for each vehicle: 2.6 s at 50 Hz, which bridges links whose delays differ by that much."""
-_NEVER_NS = np.iinfo(np.int64).min // 4
 
 
 class StateHistory:
-    """Newest reported states of n vehicles, each a planar position and velocity at an instant of the station's clock.
-
-    Instants are in ns; positions (n, 2) in m and velocities (n, 2) in m/s, north and east. A vehicle that has reported
-    nothing has NaN there.
-    """
+    """Newest reported states of n vehicles."""
 
     def __init__(self, vehicles: int) -> None:
-        self._rows = np.arange(vehicles)
-        self._time_ns = np.full((vehicles, HISTORY), _NEVER_NS, dtype=np.int64)
-        self._state = np.full((vehicles, HISTORY, 4), np.nan)
-        self._newest_slot = np.zeros(vehicles, dtype=np.int64)
-        self._newest_ns = [_NEVER_NS] * vehicles
+        self._reports: list[deque[Report]] = [deque(maxlen=HISTORY) for _ in range(vehicles)]
 
-    def add(self, vehicle: int, time_ns: int, state: tuple[float, float, float, float]) -> bool:
-        """Take in a report (north, east in m, then in m/s); one not newer than the newest is left out: False."""
-        if time_ns <= self._newest_ns[vehicle]:
+    def add(self, vehicle: int, time_ns: int, state: State) -> bool:
+        """Take in a report; one not newer than the newest is left out: False."""
+        reports = self._reports[vehicle]
+        if reports and time_ns <= reports[-1][0]:
             return False
-        slot = (int(self._newest_slot[vehicle]) + 1) % HISTORY
-        self._newest_slot[vehicle] = slot
-        self._newest_ns[vehicle] = time_ns
-        self._time_ns[vehicle, slot] = time_ns
-        self._state[vehicle, slot] = state
+        reports.append((time_ns, state))
         return True
 
     def forget(self, vehicle: int) -> None:
         """Drop what a vehicle reported, as when its clock has jumped."""
-        self._time_ns[vehicle] = _NEVER_NS
-        self._state[vehicle] = np.nan
-        self._newest_ns[vehicle] = _NEVER_NS
+        self._reports[vehicle].clear()
 
-    def newest(self) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Instants (n,), positions (n, 2) and velocities (n, 2) of the newest reports."""
-        state = self._state[self._rows, self._newest_slot]
-        return self._time_ns[self._rows, self._newest_slot], state[:, :2], state[:, 2:]
+    @property
+    def complete(self) -> bool:
+        """Whether every vehicle has reported."""
+        return all(self._reports)
 
-    def at(self, vehicles: IntArray, time_ns: IntArray) -> FloatArray:
-        """States (m, 4) of the given vehicles (m,), each at its given instant (m,).
+    def newest(self, vehicle: int) -> Report | None:
+        reports = self._reports[vehicle]
+        return reports[-1] if reports else None
+
+    def at(self, vehicle: int, time_ns: int) -> State | None:
+        """The state of a vehicle at an instant, None if it has reported nothing.
 
         Between two reports: the cubic through both positions and velocities, which is exact for a constant
         acceleration. After the newest one and before the oldest: straight on with that report's velocity.
         """
-        newest = self._newest_slot[vehicles]
-        slot, instant_ns = newest, self._time_ns[vehicles, newest]
-        for _ in range(HISTORY - 1):  # back to the newest report that is not after the instant: mostly one step or two
-            after = instant_ns > time_ns
-            if not after.any():
-                break
-            slot = np.where(after, slot - 1, slot) % HISTORY
-            instant_ns = self._time_ns[vehicles, slot]
-        missing = (instant_ns == _NEVER_NS) & (slot != newest)  # before the oldest report: use that one
-        slot = np.where(missing, slot + 1, slot) % HISTORY
-        state = self._state[vehicles, slot]
-        since_s = (time_ns - self._time_ns[vehicles, slot]).astype(np.float64)[:, None] * 1e-9
-        result = state.copy()
-        result[:, :2] += state[:, 2:] * since_s
-        between = np.flatnonzero((slot != newest) & (since_s[:, 0] >= 0))
-        if between.size:
-            who, start = vehicles[between], slot[between]
-            stop = (start + 1) % HISTORY
-            span_s = (self._time_ns[who, stop] - self._time_ns[who, start]).astype(np.float64)[:, None] * 1e-9
-            result[between] = _hermite(state[between], self._state[who, stop], since_s[between], span_s)
-        return result
+        reports = self._reports[vehicle]
+        if not reports:
+            return None
+        after = reports[-1]
+        if time_ns < after[0]:
+            for k in range(2, len(reports) + 1):  # mostly one step or two
+                before = reports[-k]
+                if before[0] <= time_ns:
+                    return _between(before, after, time_ns)
+                after = before
+        north, east, v_north, v_east = after[1]
+        since_s = (time_ns - after[0]) * 1e-9
+        return north + v_north * since_s, east + v_east * since_s, v_north, v_east
 
 
-def _hermite(a: FloatArray, b: FloatArray, since_s: FloatArray, span_s: FloatArray) -> FloatArray:
-    """Cubic Hermite interpolation of (position, velocity) rows between states a and b that lie span_s apart."""
-    x = since_s / span_s
-    p0, v0, p1, v1 = a[:, :2], a[:, 2:] * span_s, b[:, :2], b[:, 2:] * span_s
-    rise = p1 - p0
-    c2 = 3 * rise - 2 * v0 - v1
-    c3 = v0 + v1 - 2 * rise
-    return np.hstack([p0 + x * (v0 + x * (c2 + x * c3)), (v0 + x * (2 * c2 + 3 * x * c3)) / span_s])
+def _between(a: Report, b: Report, time_ns: int) -> State:
+    """Cubic Hermite interpolation of position and velocity between two reports."""
+    (a_ns, (north, east, v_north, v_east)), (b_ns, (north_b, east_b, v_north_b, v_east_b)) = a, b
+    span_s = (b_ns - a_ns) * 1e-9
+    x = (time_ns - a_ns) * 1e-9 / span_s
+    v0, v1, rise = v_north * span_s, v_north_b * span_s, north_b - north
+    w0, w1, rise_east = v_east * span_s, v_east_b * span_s, east_b - east
+    c2, c3 = 3.0 * rise - 2.0 * v0 - v1, v0 + v1 - 2.0 * rise
+    d2, d3 = 3.0 * rise_east - 2.0 * w0 - w1, w0 + w1 - 2.0 * rise_east
+    return (
+        north + x * (v0 + x * (c2 + x * c3)),
+        east + x * (w0 + x * (d2 + x * d3)),
+        (v0 + x * (2.0 * c2 + 3.0 * x * c3)) / span_s,
+        (w0 + x * (2.0 * d2 + 3.0 * x * d3)) / span_s,
+    )

@@ -112,12 +112,11 @@ def drive(station: Station, link: StationSocket, writer: RunWriter, stop_reason:
         link.wait(station.next_event_ns)
         datagrams = link.receive()
         now_ns = clock_ns()
-        outgoing, rows = station.step(datagrams, now_ns)
+        outgoing, tick = station.step(datagrams, now_ns)
         link.send(outgoing)
-        if rows is None:
+        if tick is None:
             continue
-        station.complete(rows, clock_ns())
-        writer.tick(rows)
+        writer.tick(station.complete(tick, clock_ns()))
         _log(station, writer, [data for data, _ in outgoing], now_ns)
         if reason := stop_reason():
             station.request_stop(reason)

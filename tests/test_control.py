@@ -1,17 +1,19 @@
 """The control law against the thesis's equations, written out vehicle by vehicle."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from gains.formation import FormationModel
-from gcs.control import Formation, FormationControl, feedback_law, formation_control
+from gcs.control import Blend, Formation, feedback_law, formation_control
 from gcs.telemetry import HISTORY, FloatArray, StateHistory
 
 MS = 1_000_000
 RNG = np.random.default_rng(11)
 K1, K2, K3 = (RNG.normal(size=(2, 2)) for _ in range(3))
-NOBODY = np.zeros(5, dtype=bool)
+NOBODY = (False,) * 5
+FASTEST = Blend()
 # 0 leads; 1 and 2 follow it; 3 follows 1; 4 follows 3
 TREE = Formation((9, 3, 4, 7, 5), np.array([-1, 0, 0, 1, 3]), np.vstack([np.zeros(2), RNG.normal(size=(4, 2)) * 100]))
 MODEL = FormationModel((-1, 0, 0, 1, 3))
@@ -25,16 +27,31 @@ def filled(states: FloatArray) -> StateHistory:
     return history
 
 
+@dataclass(frozen=True)
+class Controlled:
+    """What the law gave, a row (north, east) for each vehicle."""
+
+    command_m_s2: FloatArray
+    spacing_error_m: FloatArray
+    velocity_error_m_s: FloatArray
+
+
 def controlled(
     history: StateHistory,
-    K: FloatArray = OVERLAPPING,
-    lost: NDArray[np.bool_] = NOBODY,
+    K: tuple[FloatArray, ...] = (OVERLAPPING,),
+    lost: tuple[bool, ...] = NOBODY,
     *,
     v_d: tuple[float, float] = (1.0, 0.0),
     limit_m_s2: float = 1e9,
-) -> FormationControl:
-    law = feedback_law(TREE, (K,), lost)
-    return formation_control(history, law, law.gain[0], nominal_velocity_m_s=v_d, limit_m_s2=limit_m_s2)
+    blend: Blend = FASTEST,
+) -> Controlled:
+    law = feedback_law(TREE, K, lost)
+    controls = formation_control(history, law, [blend] * 5, nominal_velocity_m_s=v_d, limit_m_s2=limit_m_s2)
+    return Controlled(
+        np.array([control.command_m_s2 for control in controls]),
+        np.array([control.spacing_error_m for control in controls]),
+        np.array([control.velocity_error_m_s for control in controls]),
+    )
 
 
 def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:
@@ -51,13 +68,21 @@ def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:
 def test_commands_are_those_of_the_thesis(gain: FloatArray) -> None:
     states = RNG.normal(size=(5, 4)) * [1000, 1000, 50, 50] + [1e5, -1e5, 0, 0]
     v_d = (40.0, -3.0)
-    result = controlled(filled(states), gain, v_d=v_d)
+    result = controlled(filled(states), (gain,), v_d=v_d)
     e = errors(states, v_d)
     assert result.command_m_s2.ravel() == pytest.approx(gain @ e, rel=1e-9)
     for i in range(1, 5):
         assert result.spacing_error_m[i] == pytest.approx(e[MODEL.spacing_slice(i)], rel=1e-9)
     assert np.isnan(result.spacing_error_m[0]).all()
     assert result.velocity_error_m_s == pytest.approx(states[:, 2:] - v_d)
+
+
+def test_gains_are_blended_by_their_share() -> None:
+    history = filled(RNG.normal(size=(5, 4)) * 10)
+    fast, slow = (controlled(history, (K,)).command_m_s2 for K in (OVERLAPPING, OVERLAPPING / 4))
+    both = (OVERLAPPING, OVERLAPPING / 4)
+    assert controlled(history, both, blend=Blend(1, 0, 1.0)).command_m_s2 == pytest.approx(slow)
+    assert controlled(history, both, blend=Blend(1, 0, 0.25)).command_m_s2 == pytest.approx(0.25 * slow + 0.75 * fast)
 
 
 def test_command_is_shortened_to_the_limit_and_keeps_its_direction() -> None:
@@ -93,24 +118,24 @@ def test_lost_vehicles_are_flown_around_with_everybody_in_place() -> None:
     place = TREE.place_ne_m()
     states = np.hstack([place + np.array([500.0, 300.0]), np.tile([40.0, 2.0], (5, 1))])
     states[[1, 3]] = np.nan
-    result = controlled(filled(states), lost=np.array([False, True, False, True, False]), v_d=(40.0, 2.0))
+    result = controlled(filled(states), lost=(False, True, False, True, False), v_d=(40.0, 2.0))
     assert result.command_m_s2[[0, 2, 4]] == pytest.approx(np.zeros((3, 2)), abs=1e-9)
     assert np.isnan(result.command_m_s2[[1, 3]]).all()
     states[4] += [3.0, -4.0, 0.5, 0.25]  # vehicle 4 now keeps its distance to the leader
     states[0, 2:] += [0.125, 1.0]
-    result = controlled(filled(states), lost=np.array([False, True, False, True, False]), v_d=(40.0, 2.0))
+    result = controlled(filled(states), lost=(False, True, False, True, False), v_d=(40.0, 2.0))
     assert result.command_m_s2[4] == pytest.approx(K1 @ [0.5, 0.25] + K2 @ [0.125, 1.0] + K3 @ [-3.0, 4.0])
 
 
 def test_followers_of_a_lost_leader_keep_the_nominal_velocity() -> None:
     states = RNG.normal(size=(5, 4)) * 10
-    result = controlled(filled(states), lost=np.array([True, False, False, False, False]), v_d=(4.0, 2.0))
+    result = controlled(filled(states), lost=(True, False, False, False, False), v_d=(4.0, 2.0))
     assert result.command_m_s2[1] == pytest.approx(K1 @ (states[1, 2:] - [4.0, 2.0]))
     assert np.isnan(result.spacing_error_m[1]).all()
 
 
 def test_with_everybody_lost_nobody_is_commanded() -> None:
-    result = controlled(filled(RNG.normal(size=(5, 4))), lost=np.ones(5, dtype=bool))
+    result = controlled(filled(RNG.normal(size=(5, 4))), lost=(True,) * 5)
     assert np.isnan(result.command_m_s2).all()
 
 
@@ -126,14 +151,18 @@ def test_interpolation_is_exact_under_constant_acceleration() -> None:
     newest_s = 0.02 * (HISTORY + 49)
     for back_s in (0.0, 0.003, 0.4, 2.5):
         t_s = newest_s - back_s
-        found = history.at(np.array([0]), np.array([round(t_s * 1e9)]))[0]
+        found = history.at(0, round(t_s * 1e9))
         assert found == pytest.approx(state(t_s), rel=1e-9)
     oldest_s = newest_s - 0.02 * (HISTORY - 1)
-    found = history.at(np.array([0]), np.array([round((oldest_s - 0.5) * 1e9)]))[0]  # before the oldest report
-    assert found[:2] == pytest.approx(np.array(state(oldest_s)[:2]) - 0.5 * np.array(state(oldest_s)[2:]), rel=1e-9)
+    found = history.at(0, round((oldest_s - 0.5) * 1e9))  # before the oldest report
+    assert found is not None
+    assert found[:2] == pytest.approx(
+        tuple(np.array(state(oldest_s)[:2]) - 0.5 * np.array(state(oldest_s)[2:])), rel=1e-9
+    )
     ahead_s = newest_s + 0.01  # straight on: off by a t^2 / 2
-    found = history.at(np.array([0]), np.array([round(ahead_s * 1e9)]))[0]
-    assert found[:2] == pytest.approx(np.array(state(ahead_s)[:2]) - a * 0.01**2 / 2, rel=1e-9)
+    found = history.at(0, round(ahead_s * 1e9))
+    assert found is not None
+    assert found[:2] == pytest.approx(tuple(np.array(state(ahead_s)[:2]) - a * 0.01**2 / 2), rel=1e-9)
 
 
 def test_a_report_older_than_the_newest_changes_nothing() -> None:
@@ -141,11 +170,11 @@ def test_a_report_older_than_the_newest_changes_nothing() -> None:
     assert history.add(0, 100, (1.0, 2.0, 3.0, 4.0))
     assert not history.add(0, 100, (9.0, 9.0, 9.0, 9.0))
     assert not history.add(0, 50, (9.0, 9.0, 9.0, 9.0))
-    assert history.newest()[1].tolist() == [[1.0, 2.0]]
+    assert history.newest(0) == (100, (1.0, 2.0, 3.0, 4.0))
 
 
 def test_before_the_first_report_the_first_one_is_used() -> None:
     history = StateHistory(1)
     history.add(0, 1000 * MS, (10.0, 0.0, 2.0, 0.0))
     history.add(0, 1020 * MS, (10.04, 0.0, 2.0, 0.0))
-    assert history.at(np.array([0]), np.array([500 * MS]))[0] == pytest.approx([9.0, 0.0, 2.0, 0.0])
+    assert history.at(0, 500 * MS) == pytest.approx((9.0, 0.0, 2.0, 0.0))

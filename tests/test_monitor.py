@@ -166,7 +166,7 @@ def formation(n: int, *, separable: bool = True) -> FormationMonitor:
 
 def view(k: int, delays_s: list[float]) -> FleetView:
     n = len(delays_s)
-    return FleetView(0.02 * k, True, [False] * n, [True] * n, [False] * n, np.array(delays_s))
+    return FleetView(0.02 * k, True, [False] * n, [True] * n, [False] * n, delays_s)
 
 
 def test_one_late_vehicle_changes_its_own_gains_only_in_a_tree() -> None:
@@ -187,8 +187,8 @@ def test_share_of_the_new_gains_rises_without_a_jump() -> None:
     monitor, shares = formation(1), list[float]()
     for k in range(120):
         monitor.update(view(k, [0.29]))
-        flown, former, share = monitor.sets_and_blends(0.02 * k)
-        shares.append(float(flown[0] * share[0] + former[0] * (1 - share[0])))
+        flown, former, share = monitor.blends(0.02 * k)[0]
+        shares.append(flown * share + former * (1 - share))
     assert shares[0] == 0.0
     assert shares[-1] == 1.0
     assert max(np.diff(shares)) <= 0.02 / POLICY.blend_s + 1e-9

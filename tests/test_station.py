@@ -130,7 +130,7 @@ def test_ticks_that_were_slept_through_are_left_out_and_counted() -> None:
     station = Station(PLAN, start_ns=S)
     ticks = []
     for now_ns in (S, S + 20 * MS, S + 95 * MS, S + 100 * MS):
-        _, rows = station.step([], now_ns)
-        assert rows is not None
-        ticks.append((int(rows["tick"][0]), int(rows["due_ns"][0])))
+        _, tick = station.step([], now_ns)
+        assert tick is not None
+        ticks.append((tick.number, tick.due_ns))
     assert ticks == [(0, S), (1, S + 20 * MS), (2, S + 40 * MS), (5, S + 100 * MS)]

@@ -1,0 +1,65 @@
+"""Each value of the tick record is in the column of its name."""
+
+import numpy as np
+
+from gcs.clocks import ClockEstimate
+from gcs.control import VehicleControl
+from gcs.monitor import VehicleState
+from gcs.record import TICK, Mode
+from gcs.rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.vehicle import RemoteVehicle
+
+S = 1_000_000_000
+
+
+def ignored(kind: str, text: str) -> None:
+    """Nothing is told in these tests."""
+
+
+def test_every_column_holds_what_its_name_says() -> None:
+    vehicle = RemoteVehicle(7, telemetry_hz=50.0, report=ignored)
+    vehicle.clock.estimate = ClockEstimate(samples=9, offset_ns=3 * S, skew=0.0, bound_ns=5000, reference_ns=0)
+    vehicle.clock.down_ns = 30_000_000
+    for sequence in (1, 2, 5, 4, 4):
+        vehicle.frames.add(sequence)
+    control = VehicleControl(
+        sample_ns=10 * S,
+        state=(1.0, 2.0, 3.0, 4.0),
+        spacing_error_m=(5.0, 6.0),
+        velocity_error_m_s=(7.0, 8.0),
+        command_m_s2=(9.0, 10.0),
+    )
+    monitored = VehicleState(mode=Mode.CAUTION, gain_set=1)
+    reported = Reported(boot_ms=13_000, down_m=-100.0, velocity_down_m_s=0.5, queue_s=0.001)
+    seen = VehicleTick(vehicle, monitored, control, reported, 0.07, 121.5, True, 0.4)
+    tick = Tick(number=11, time_s=0.22, due_ns=10 * S + 40_000_000, key_ms=220, vehicles=[seen, seen])
+    rows, delays_s = tick_rows(tick, 10 * S + 50_000_000)
+    expected = {
+        "tick": 11, "time_s": 0.22, "due_ns": 10 * S + 40_000_000, "sent_ns": 10 * S + 50_000_000, "key_ms": 220,
+        "system_id": 7, "mode": 2, "gain_set": 1, "commanded": True,
+        "sample_boot_ms": 13_000, "sample_ns": 10 * S, "telemetry_age_s": 0.05,
+        "north_m": 1.0, "east_m": 2.0, "down_m": -100.0,
+        "velocity_north_m_s": 3.0, "velocity_east_m_s": 4.0, "velocity_down_m_s": 0.5,
+        "spacing_error_north_m": 5.0, "spacing_error_east_m": 6.0,
+        "velocity_error_north_m_s": 7.0, "velocity_error_east_m_s": 8.0,
+        "command_north_m_s2": 9.0, "command_east_m_s2": 10.0,
+        "nearest_m": 121.5, "queue_s": 0.001, "down_delay_s": 0.03, "loop_delay_s": 0.08, "headroom": 0.8,
+        "rtt_s": 0.07, "clock_offset_s": 3.0, "clock_offset_bound_s": 5e-6,
+        "received": 5, "lost": 1, "late": 1, "duplicate": 1,
+    }  # fmt: skip
+    assert list(expected) == list(TICK.names or ())
+    for row in rows:
+        found = {name: row[name].item() for name in expected}
+        assert all(np.isclose(found[name], expected[name], rtol=1e-12) for name in expected), found
+    assert delays_s == [0.08, 0.08]
+
+
+def test_what_is_not_known_is_not_a_number() -> None:
+    vehicle = RemoteVehicle(7, telemetry_hz=50.0, report=ignored)
+    nan, pair = np.nan, (np.nan, np.nan)
+    nothing = VehicleControl(0, (nan, nan, nan, nan), pair, pair, pair)
+    seen = VehicleTick(vehicle, VehicleState(), nothing, Reported(), np.nan, np.inf, False, 0.4)
+    rows, delays_s = tick_rows(Tick(0, -1.0, S, 0, [seen]), S)
+    unknown = {name for name in TICK.names or () if rows[name].dtype.kind == "f" and np.isnan(rows[name][0])}
+    assert unknown == {name for name in TICK.names or () if TICK[name].kind == "f"} - {"time_s"}
+    assert np.isnan(delays_s).all()
