@@ -14,7 +14,6 @@ from math import hypot, nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.formation import FormationModel
 from gcs.telemetry import FloatArray, IntArray, Report, State, StateHistory
@@ -212,18 +211,16 @@ def _shortened(command: tuple[float, float], limit: float) -> tuple[float, float
     return (north * limit / size, east * limit / size) if size > limit else command
 
 
-def nearest_vehicle(controls: Sequence[VehicleControl], now_ns: int) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Distance (n,) in m of each vehicle to the one nearest to it, and that one's row; infinite where unknown.
+def distances_m(controls: Sequence[VehicleControl], now_ns: int) -> FloatArray:
+    """Distances (n, n) between vehicles in m, NaN where unknown and to itself.
 
     Positions are brought to `now_ns` along the reported velocities.
     """
-    position = np.empty(len(controls), dtype=np.complex128)
-    for row, control in enumerate(controls):
-        north, east, v_north, v_east = control.state
-        age_s = (now_ns - control.sample_ns) * 1e-9
-        position[row] = complex(north + v_north * age_s, east + v_east * age_s)
+    positions: list[complex] = []
+    for sample_ns, (north, east, v_north, v_east), *_ in controls:
+        age_s = (now_ns - sample_ns) * 1e-9
+        positions.append(complex(north + v_north * age_s, east + v_east * age_s))
+    position = np.array(positions)
     distance = np.abs(position[:, None] - position)
-    distance[np.isnan(distance)] = np.inf
-    np.fill_diagonal(distance, np.inf)
-    other = distance.argmin(axis=1)
-    return distance[np.arange(len(other)), other], other
+    distance.flat[:: len(positions) + 1] = nan  # to itself
+    return distance

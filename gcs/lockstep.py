@@ -1,6 +1,8 @@
 """Vehicles, links and station on one virtual clock in one process: the same code and bytes as in real time.
 
-Deterministic: the same plan gives the same ticks to the last bit. Nothing waits, so it runs as fast as it computes.
+Deterministic: the same plan gives the same ticks to the last bit. Nothing waits, so it runs as fast as it computes. The
+station is called when it has something of its own to do; what arrives before waits until then with its receive stamp,
+as it would in a socket, and no decision is made in between.
 """
 
 from collections.abc import Iterator
@@ -23,9 +25,6 @@ Sent = list[tuple[int, bytes, int]]
 class Vehicles(Protocol):
     """The vehicles behind their links: takes the station's datagrams, gives those that arrive at the station."""
 
-    @property
-    def next_event_ns(self) -> int: ...
-
     def step(self, received: Sent, now_ns: int) -> Sent: ...
 
 
@@ -39,15 +38,14 @@ def fly_lockstep(
     """
     station = station or Station(plan, start_ns=START_NS)
     vehicles = vehicles or Fleet(plan.scenario, START_NS)
+    addresses = {system_id: (_HOST, system_id) for system_id in plan.formation.system_ids}
     to_vehicles: Sent = []
-    now_ns = station.next_event_ns
     while station.phase is not Phase.ENDED:
+        now_ns = station.next_event_ns
         arrived = vehicles.step(to_vehicles, now_ns)
-        datagrams = [Datagram(data, (_HOST, system_id), time_ns) for system_id, data, time_ns in arrived]
+        datagrams = [Datagram(data, addresses[system_id], time_ns) for system_id, data, time_ns in arrived]
         outgoing, tick = station.step(datagrams, now_ns)
         to_vehicles = [(system_id, data, now_ns) for data, (_, system_id) in outgoing]
         if tick is not None:
             yield station.complete(tick, now_ns)
             station.frames.clear()
-        if not to_vehicles:
-            now_ns = max(now_ns, min(vehicles.next_event_ns, station.next_event_ns))

@@ -13,6 +13,8 @@ As the link returns it is undone in the reverse order.
 """
 
 from dataclasses import dataclass, replace
+from math import isnan, nan
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,8 +40,7 @@ class VehicleState:
     released: bool = False
 
 
-@dataclass(frozen=True)
-class Observation:
+class Observation(NamedTuple):
     """What is known of one vehicle at a tick. `loop_delay_s` may be NaN (unknown)."""
 
     time_s: float
@@ -96,7 +97,14 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
         return _changed(replace(state, mode=Mode.RECOVERING), slowest, seen.time_s)
     if state.mode is Mode.WAITING:
         return replace(state, mode=Mode.NOMINAL)
-    return _by_headroom(state, seen, margins_s, slowest, policy)
+    calm = _is_calm(state, seen, margins_s, policy)
+    return state if calm else _by_headroom(state, seen, margins_s, slowest, policy)
+
+
+def _is_calm(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> bool:
+    """NOMINAL with enough headroom, or with an unknown one, and nothing being counted: most ticks of most flights."""
+    nominal = state.mode is Mode.NOMINAL and state.pressed_s is None and state.eased_s is None
+    return nominal and not headroom(seen.loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
 
 
 def _by_headroom(
@@ -196,6 +204,7 @@ class FormationMonitor:
         self._separable = separable
         self._period_s = period_s
         self._delays_s = np.full((max(1, round(policy.window_s / period_s)), vehicles), np.nan)
+        self._rank = min(len(self._delays_s) - 1, int(0.9 * len(self._delays_s)))
         self._tick = 0
 
     def update(self, view: FleetView) -> list[tuple[int, VehicleState, VehicleState]]:
@@ -204,17 +213,19 @@ class FormationMonitor:
         self._tick += 1
         delays_s = self._judged_delay_s()
         changes: list[tuple[int, VehicleState, VehicleState]] = []
-        next_to_release = self._next_to_release()
+        states: list[VehicleState] = []
         for row, before in enumerate(self.states):
             seen = Observation(
                 view.time_s, view.flying, view.silent[row], view.guided[row], view.failsafe[row], delays_s[row]
             )
             after = monitored(before, seen, self.margins_s, self._policy)
-            if after.released and not before.released and row != next_to_release:
-                after = replace(after, mode=Mode.CRITICAL, released=False)  # somebody behind goes first
-            self.states[row] = after
-            if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
-                changes.append((row, before, after))
+            if after is not before:
+                if after.released and not before.released and row != self._next_to_release():
+                    after = replace(after, mode=Mode.CRITICAL, released=False)  # somebody behind goes first
+                if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
+                    changes.append((row, before, after))
+            states.append(after)
+        self.states = states
         self._open(view.time_s, flying=view.flying)
         return changes
 
@@ -222,18 +233,18 @@ class FormationMonitor:
         """The gains that each vehicle is flown with."""
         blend_s = self._policy.blend_s
         return [
-            Blend(state.gain_set, state.former_set, min(1.0, max(0.0, (time_s - state.changed_s) / blend_s)))
-            for state in self.states
+            Blend(s.gain_set, s.former_set, min(1.0, max(0.0, (time_s - s.changed_s) / blend_s)))
+            if time_s - s.changed_s < blend_s
+            else Blend(s.gain_set, s.gain_set, 1.0)
+            for s in self.states
         ]
 
     def _judged_delay_s(self) -> list[float]:
-        window = self._delays_s
         # NaN sorts last: a vehicle with more than a tenth of unknown ticks has an unknown delay.
-        rank = min(len(window) - 1, int(0.9 * len(window)))
-        judged = np.partition(window, rank, axis=0)[rank]
-        if not self._separable:
-            judged = np.full_like(judged, judged.max())
-        return judged.tolist()
+        judged: list[float] = np.partition(self._delays_s, self._rank, axis=0)[self._rank].tolist()
+        if self._separable:
+            return judged
+        return [nan if any(map(isnan, judged)) else max(judged)] * len(judged)
 
     def _next_to_release(self) -> int:
         """The vehicle that may be released now: the CRITICAL one farthest down the tree."""

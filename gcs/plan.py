@@ -1,6 +1,7 @@
 """From a scenario to what is flown: formation, gains, margins."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,12 +27,12 @@ class FlightPlan:
     separable: bool = True
     """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
 
-    @property
+    @cached_property
     def gains(self) -> tuple[FloatArray, ...]:
         """The gain schedule, fastest first."""
         return (self.gain, *(gain for gain, _ in self.slower))
 
-    @property
+    @cached_property
     def margins_s(self) -> tuple[float, ...]:
         """The delay margins of the gain schedule."""
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))

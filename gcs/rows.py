@@ -1,7 +1,7 @@
 """Filling the rows of the tick record from what the station holds."""
 
 import struct
-from math import inf, nan
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ class VehicleTick(NamedTuple):
     rtt_s: float
     """The round trip that ended since the tick before; NaN if none did."""
     nearest_m: float
-    """Infinite while unknown."""
+    """NaN while unknown."""
     commanded: bool
     margin_s: float
     """Delay margin of the gains flown."""
@@ -70,8 +70,7 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
                 *control.state[:2], reported.down_m, *control.state[2:], reported.velocity_down_m_s,
                 *control.spacing_error_m, *control.velocity_error_m_s,
                 *(control.command_m_s2 if commanded else (nan, nan)),
-                nearest_m if nearest_m < inf else nan,
-                reported.queue_s, down_s, age_s + down_s, headroom(age_s + down_s, margin_s), rtt_s,
+                nearest_m, reported.queue_s, down_s, age_s + down_s, headroom(age_s + down_s, margin_s), rtt_s,
                 estimate.offset_ns * 1e-9 if known else nan, estimate.bound_ns * 1e-9 if known else nan,
                 frames.received, frames.lost, frames.late, frames.duplicate,
             )

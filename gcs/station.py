@@ -10,15 +10,14 @@ from math import hypot, isfinite, nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs import mavlink
 from gcs.control import (
     LARGEST_COMMAND_M_S2,
     VehicleControl,
+    distances_m,
     feedback_law,
     formation_control,
-    nearest_vehicle,
 )
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
@@ -36,11 +35,14 @@ _HEARTBEAT_NS = NS_PER_S
 
 
 class Datagram(NamedTuple):
-    """One received datagram; `received_ns` is the kernel's stamp, on the station's clock."""
+    """One received datagram."""
 
     data: bytes
     address: Address
     received_ns: int
+    """The kernel's stamp, on the station's clock."""
+    queued_ns: int = 0
+    """How long it waited in the socket after that for the station to be free."""
 
 
 class Event(NamedTuple):
@@ -180,7 +182,7 @@ class Station:
         fields = frame.fields
         match frame.msg_id:
             case mavlink.LOCAL_POSITION_NED:
-                self._position(row, vehicle, frame, datagram.received_ns)
+                self._position(row, vehicle, frame, datagram)
             case mavlink.TIMESYNC:
                 tc1_ns, ts1_ns = fields
                 if tc1_ns == 0:
@@ -198,16 +200,16 @@ class Station:
             case _:
                 pass
 
-    def _position(self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, received_ns: int) -> None:
+    def _position(self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram) -> None:
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
-        self._telemetry_ns[row] = received_ns
+        self._telemetry_ns[row] = datagram.received_ns
         clock = vehicle.clock.estimate
         if clock.samples == 0:
             return
         sample_ns = clock.to_station_ns(boot_ms * 1_000_000)
         if not self._history.add(row, sample_ns, (north, east, v_north, v_east)):
             return
-        self._reported[row] = Reported(boot_ms, down, v_down, (self._now_ns - received_ns) * 1e-9)
+        self._reported[row] = Reported(boot_ms, down, v_down, datagram.queued_ns * 1e-9)
 
     def _timesync_reply(self, row: int, vehicle: RemoteVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
         jumps = vehicle.clock.jumps
@@ -238,13 +240,14 @@ class Station:
             limit_m_s2=self.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2,
             opening=self._monitor.opening,
         )
-        nearest_m, other = nearest_vehicle(controls, due_ns)
+        distance_m = distances_m(controls, due_ns)
+        nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
         if flying:
-            self._watch(controls, nearest_m, other)
+            self._watch(controls, distance_m)
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
         seen: list[VehicleTick] = []
         for row, (vehicle, control, monitored, nearest) in enumerate(
-            zip(self.vehicles, controls, self._monitor.states, nearest_m.tolist(), strict=True)
+            zip(self.vehicles, controls, self._monitor.states, nearest_m, strict=True)
         ):
             north, east = control.command_m_s2
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
@@ -329,13 +332,13 @@ class Station:
                 vehicle.wanted_mode = None if self._stop.startswith("broken") else HOLD
         self._report("phase", str(phase))
 
-    def _watch(self, controls: list[VehicleControl], nearest_m: FloatArray, other: NDArray[np.intp]) -> None:
+    def _watch(self, controls: list[VehicleControl], distance_m: FloatArray) -> None:
         """End the flight on a collision or a spacing error past the limit."""
         safety = self.plan.scenario.safety
-        closest = int(nearest_m.argmin())
-        if nearest_m[closest] < safety.collision_distance_m:
-            one, two = (self.vehicles[row].system_id for row in (closest, int(other[closest])))
-            self.request_stop(f"broken: vehicles {one} and {two} have collided, {nearest_m[closest]:.1f} m apart")
+        closest_m = float(np.fmin.reduce(distance_m, axis=None))
+        if closest_m < safety.collision_distance_m:
+            one, two = (self.vehicles[row].system_id for row in divmod(int(np.nanargmin(distance_m)), len(controls)))
+            self.request_stop(f"broken: vehicles {one} and {two} have collided, {closest_m:.1f} m apart")
         for vehicle, control, state in zip(self.vehicles, controls, self._monitor.states, strict=True):
             error_m = hypot(*control.spacing_error_m)
             if error_m > safety.spacing_error_limit_m and not state.released:

@@ -85,7 +85,8 @@ class StationSocket:
                 self.send_errors += 1
                 continue
             seconds, nanoseconds = _TIMESPEC.unpack(ancillary[0][2])
-            datagrams.append(Datagram(data, address, seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns))
+            received_ns = seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns
+            datagrams.append(Datagram(data, address, received_ns, max(0, clock_ns() - received_ns)))
         return datagrams
 
     def send(self, outgoing: list[Outgoing]) -> None:

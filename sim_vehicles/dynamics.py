@@ -1,10 +1,11 @@
-"""One UAV: planar kinematics under the on-board feedback linearisation, with limits, integrated by RK4.
+"""One UAV: planar kinematics under the on-board feedback linearisation, with limits.
 
     X' = V cos ψ,   Y' = V sin ψ,   ψ' = ω,   V' = a                                   (thesis eq. 2.2-2.4)
     (a, ω) = M(ξ) u,   M = [[cos ψ, sin ψ], [-sin ψ / V, cos ψ / V]]                   (thesis eq. 2.6)
 
-u is the wanted acceleration (north, east). While no limit binds, the vehicle is exactly a planar double integrator.
-M is evaluated in every stage of the integration: the on-board loop is continuous, not sampled.
+u is the wanted acceleration (north, east). While no limit binds and u is constant, these equations have a solution in
+closed form, a planar double integrator, and it is used. Otherwise they are integrated by RK4, with M evaluated in every
+stage: the on-board loop is continuous, not sampled.
 
 Scalars and plain functions, because this is called for every sample and every set-point of every vehicle.
 """
@@ -72,52 +73,48 @@ def state_from(position_ne_m: tuple[float, float], velocity_ne_m_s: tuple[float,
 
 
 def advance(state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
-    """The state `duration_s` later, the command held; steps of at most 20 ms."""
+    """The state `duration_s` later, the command held."""
+    if _is_free(state[3], command, bounds, duration_s):
+        return _free_flight(state, command[0], command[1], duration_s)
     steps = max(1, math.ceil(duration_s / LONGEST_STEP_S))
     step_s = duration_s / steps
     for _ in range(steps):
-        if _is_free(state.speed_m_s, command, bounds, step_s):
-            state = _free_step(state, command[0], command[1], step_s)
+        if _is_free(state[3], command, bounds, step_s):
+            state = _free_flight(state, command[0], command[1], step_s)
         else:
             state = _limited_step(state, command, bounds, step_s)
     return state
 
 
-def _is_free(speed: float, command: Command, bounds: Bounds, h: float) -> bool:
-    """Whether u is constant and no limit can bind in any stage of a step."""
+def _is_free(speed: float, command: Command, bounds: Bounds, t: float) -> bool:
+    """Whether u is constant and no limit can bind within a time."""
+    if command[4] != 0.0:
+        return False
     speed_min, speed_max, acceleration_max, turn_rate_max = bounds
     wanted = math.hypot(command[0], command[1])
-    slowest = speed - wanted * h
+    slowest = speed - wanted * t
     return (
-        command[4] == 0.0
+        slowest > speed_min
         and wanted <= acceleration_max
-        and slowest > speed_min
-        and speed + wanted * h < speed_max
+        and speed + wanted * t < speed_max
         and wanted <= turn_rate_max * slowest
     )
 
 
-def _free_step(state: State, u_north: float, u_east: float, h: float) -> State:
-    """A Runge-Kutta step without feedback or limits: most steps are of this kind, so it is written out."""
-    north, east, yaw, v1 = state
-    half, sixth = 0.5 * h, h / 6.0
-    # Position does not enter the rates, so only yaw and speed have stage values.
-    c1, s1 = math.cos(yaw), math.sin(yaw)
-    a1, w1 = c1 * u_north + s1 * u_east, (c1 * u_east - s1 * u_north) / v1
-    v2, yaw2 = v1 + half * a1, yaw + half * w1
-    c2, s2 = math.cos(yaw2), math.sin(yaw2)
-    a2, w2 = c2 * u_north + s2 * u_east, (c2 * u_east - s2 * u_north) / v2
-    v3, yaw3 = v1 + half * a2, yaw + half * w2
-    c3, s3 = math.cos(yaw3), math.sin(yaw3)
-    a3, w3 = c3 * u_north + s3 * u_east, (c3 * u_east - s3 * u_north) / v3
-    v4, yaw4 = v1 + h * a3, yaw + h * w3
-    c4, s4 = math.cos(yaw4), math.sin(yaw4)
-    a4, w4 = c4 * u_north + s4 * u_east, (c4 * u_east - s4 * u_north) / v4
+def _free_flight(state: State, u_north: float, u_east: float, t: float) -> State:
+    """The solution without limits: the velocity changes by u t, along and across the way flown until now.
+
+    The way turns by less than half a circle, as u is constant, so the yaw needs no wrapping.
+    """
+    north, east, yaw, speed = state
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    along, across = speed + (cosine * u_north + sine * u_east) * t, (cosine * u_east - sine * u_north) * t
+    half = 0.5 * t
     return State(
-        north + sixth * (v1 * c1 + 2.0 * (v2 * c2 + v3 * c3) + v4 * c4),
-        east + sixth * (v1 * s1 + 2.0 * (v2 * s2 + v3 * s3) + v4 * s4),
-        yaw + sixth * (w1 + 2.0 * (w2 + w3) + w4),
-        v1 + sixth * (a1 + 2.0 * (a2 + a3) + a4),
+        north + t * (speed * cosine + half * u_north),
+        east + t * (speed * sine + half * u_east),
+        yaw + math.atan2(across, along),
+        math.hypot(along, across),
     )
 
 

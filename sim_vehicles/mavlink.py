@@ -5,6 +5,7 @@ next datagram. Its message tables, and its decoder for all but the one frequent 
 is counted by reason and never raised.
 """
 
+import struct
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -46,6 +47,7 @@ MESSAGE_INTERVAL = dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL
 _CRC_EXTRA: dict[int, bytes] = {number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items()}
 _LOCAL_POSITION = dialect.MAVLink_local_position_ned_message
 _SETPOINT = dialect.MAVLink_set_position_target_local_ned_message
+_TIMESYNC = dialect.MAVLink_timesync_message
 _DECODER = dialect.MAVLink(None)
 _CAPABILITIES = (
     dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
@@ -146,25 +148,33 @@ def _refusal(data: bytes, begin: int, checked: int) -> str:
 def _append(messages: list[Message], frame: bytes, checked: int, counters: Counter[str]) -> None:
     """Decode one frame whose checksum is right; `checked` is where its payload ends."""
     number = frame[7] | frame[8] << 8 | frame[9] << 16
+    # Most of the traffic is of these two messages: no object of pymavlink's is made for them.
     if number == SETPOINT:
-        # Trailing zeros are trimmed on the wire. This message is most of the traffic: no object of pymavlink's is made.
-        size = _SETPOINT.unpacker.size
-        values = _SETPOINT.unpacker.unpack(frame[HEADER_BYTES:checked].ljust(size, b"\0")[:size])
+        values = _values(_SETPOINT.unpacker, frame, checked)
         messages.append(Setpoint(values[0], values[4:7], values[7:10], *values[12:]))
-    elif number in (HEARTBEAT, TIMESYNC, COMMAND_LONG, COMMAND_INT):
-        messages.append(_decode(number, frame, checked))
+    elif number == TIMESYNC:
+        # The target is an extension field that this dialect does not know yet.
+        target = frame[HEADER_BYTES + 16] if checked > HEADER_BYTES + 16 else 0
+        tc1, ts1 = _values(_TIMESYNC.unpacker, frame, checked)
+        messages.append(Timesync(tc1, ts1, target))
+    elif number in (HEARTBEAT, COMMAND_LONG, COMMAND_INT):
+        messages.append(_decode(number, frame))
     else:
         counters["ignored_message"] += 1
 
 
-def _decode(number: int, frame: bytes, checked: int) -> Message:
+def _values(packing: struct.Struct, frame: bytes, checked: int) -> tuple[Any, ...]:
+    """A payload's values in wire order; trailing zeros are not sent, and extension fields are left out."""
+    size = packing.size
+    if checked - HEADER_BYTES >= size:
+        return packing.unpack_from(frame, HEADER_BYTES)
+    return packing.unpack(frame[HEADER_BYTES:checked].ljust(size, b"\0"))
+
+
+def _decode(number: int, frame: bytes) -> Message:
     decoded: Any = _DECODER.decode(bytearray(frame))
     if number == HEARTBEAT:
         return Heartbeat(decoded.type)
-    if number == TIMESYNC:
-        # The target is an extension field that this dialect does not know yet.
-        target = frame[HEADER_BYTES + 16] if checked > HEADER_BYTES + 16 else 0
-        return Timesync(decoded.tc1, decoded.ts1, target)
     return Command(
         (frame[5], frame[6]),
         decoded.target_system,
@@ -180,18 +190,13 @@ class Encoder:
 
     def __init__(self, system_id: int) -> None:
         self._pymavlink = dialect.MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_AUTOPILOT)
-        self._source = bytes([system_id, COMPONENT_AUTOPILOT, LOCAL_POSITION, 0, 0])
 
     def local_position(
         self, time_boot_ms: int, north_m: float, east_m: float, down_m: float, velocity_ne_m_s: tuple[float, float]
     ) -> bytes:
         """LOCAL_POSITION_NED; no vertical speed."""
         payload = _LOCAL_POSITION.unpacker.pack(time_boot_ms, north_m, east_m, down_m, *velocity_ne_m_s, 0.0)
-        payload = payload.rstrip(b"\0") or b"\0"
-        mav = self._pymavlink
-        body = bytes([len(payload), 0, 0, mav.seq]) + self._source + payload
-        mav.seq = (mav.seq + 1) & 0xFF
-        return b"\xfd" + body + mcrf4xx(body + _CRC_EXTRA[LOCAL_POSITION]).to_bytes(2, "little")
+        return self._frame(LOCAL_POSITION, payload)
 
     def global_position(
         self,
@@ -235,7 +240,7 @@ class Encoder:
 
     def timesync(self, tc1: int, ts1: int) -> bytes:
         """TIMESYNC, a request if tc1 is 0."""
-        return self._pack(dialect.MAVLink_timesync_message(tc1, ts1))
+        return self._frame(TIMESYNC, _TIMESYNC.unpacker.pack(tc1, ts1))
 
     def command_ack(self, command: int, result: int, requester: tuple[int, int]) -> bytes:
         """COMMAND_ACK to the (system, component) that asked."""
@@ -275,6 +280,14 @@ class Encoder:
                 *(0.0, 0.0, 0.0),
             )
         )
+
+    def _frame(self, number: int, payload: bytes) -> bytes:
+        """A frequent message, without an object of pymavlink's; `number` is below 256."""
+        payload = payload.rstrip(b"\0") or b"\0"
+        mav = self._pymavlink
+        body = bytes((len(payload), 0, 0, mav.seq, mav.srcSystem, COMPONENT_AUTOPILOT, number, 0, 0)) + payload
+        mav.seq = (mav.seq + 1) & 0xFF
+        return b"\xfd" + body + mcrf4xx(body + _CRC_EXTRA[number]).to_bytes(2, "little")
 
     def _pack(self, message: dialect.MAVLink_message) -> bytes:
         frame = message.pack(self._pymavlink)

@@ -26,7 +26,7 @@ def with_headroom(headroom: float, gain_set: int = 0) -> float:
 def after(state: VehicleState, *, seconds: float = 0.0, policy: Monitor = POLICY, **seen: object) -> VehicleState:
     """The state after the same observation at each tick (50 Hz) of a time; one tick if no time is given."""
     for k in range(max(1, round(seconds * 50) + 1)):
-        state = monitored(state, replace(SEEN, **seen, time_s=100.0 + 0.02 * k), MARGINS_S, policy)
+        state = monitored(state, SEEN._replace(**seen, time_s=100.0 + 0.02 * k), MARGINS_S, policy)
     return state
 
 
@@ -107,7 +107,7 @@ def test_recovery_from_the_slowest_gains_goes_up_set_by_set() -> None:
     state = VehicleState(mode=Mode.CAUTION, gain_set=2, former_set=1, changed_s=0.0)
     seen: list[tuple[Mode, int]] = []
     for k in range(600):
-        state = monitored(state, replace(SEEN, time_s=100.0 + 0.02 * k), MARGINS_S, POLICY)
+        state = monitored(state, SEEN._replace(time_s=100.0 + 0.02 * k), MARGINS_S, POLICY)
         if not seen or seen[-1] != (state.mode, state.gain_set):
             seen.append((state.mode, state.gain_set))
     assert seen == [

@@ -58,7 +58,7 @@ def test_what_is_not_known_is_not_a_number() -> None:
     vehicle = RemoteVehicle(7, telemetry_hz=50.0, report=ignored)
     nan, pair = np.nan, (np.nan, np.nan)
     nothing = VehicleControl(0, (nan, nan, nan, nan), pair, pair, pair)
-    seen = VehicleTick(vehicle, VehicleState(), nothing, Reported(), np.nan, np.inf, False, 0.4)
+    seen = VehicleTick(vehicle, VehicleState(), nothing, Reported(), nan, nan, False, 0.4)
     rows, delays_s = tick_rows(Tick(0, -1.0, S, 0, [seen]), S)
     unknown = {name for name in TICK.names or () if rows[name].dtype.kind == "f" and np.isnan(rows[name][0])}
     assert unknown == {name for name in TICK.names or () if TICK[name].kind == "f"} - {"time_s"}

@@ -25,9 +25,9 @@ def test_without_limits_it_is_a_planar_double_integrator(
     p, v, a = np.array(position), np.array(velocity), np.array(acceleration)
     expected = np.array([p + v * duration_s + 0.5 * a * duration_s**2, v + a * duration_s])
     reached = np.array([state[:2], state.velocity_ne_m_s()])
-    # RK4's own error at 20 ms steps; the scale is the distance flown and the speed.
+    # rounding; the scale is the distance flown and the speed
     scale = np.linalg.norm(expected, axis=1).max()
-    assert np.abs(reached - expected).max() < 1e-9 * scale
+    assert np.abs(reached - expected).max() < 1e-14 * scale
 
 
 def test_pieces_of_any_length_add_up_to_the_whole_flight() -> None:
@@ -98,11 +98,11 @@ def _limited_rates(y: npt.NDArray[np.float64], command: Command, bounds: Bounds)
 
 
 def test_a_limit_that_is_near_but_not_met_changes_nothing() -> None:
-    """The short form of the step and the full one are the same equations."""
+    """The closed form and the integration solve the same equations, up to RK4's own error at steps of 20 ms."""
     start, command = state_from((0.0, 0.0), (50.0, 0.0)), Command(0.0, 4.0)
     near = Bounds(1.0, 50.05, math.inf, 0.0801)  # 4 m/s² turns at 0.08 rad/s and leaves the speed at 50.03 m/s
     limited = advance(start, command, near, 0.4)
-    assert np.allclose(limited, advance(start, command, UNLIMITED, 0.4), rtol=1e-14, atol=1e-14)
+    assert np.allclose(limited, advance(start, command, UNLIMITED, 0.4), rtol=1e-10, atol=1e-10)
 
 
 numbers = st.floats(-1e4, 1e4)
