@@ -132,6 +132,7 @@ def _contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
     if control.gains is not None and (control.alpha is not None or control.delay_margin_s is not None):
         yield "control.gains", control.gains.model_dump(), "either gains or a requirement (alpha, delay_margin_s)"
     yield from _monitor_contradictions(scenario)
+    yield from _autopilot_contradictions(scenario)
     limits = scenario.limits
     if limits.speed_max_m_s is not None and limits.speed_max_m_s <= limits.speed_min_m_s:
         yield "limits.speed_max_m_s", limits.speed_max_m_s, f"more than speed_min_m_s = {limits.speed_min_m_s:g}"
@@ -170,6 +171,21 @@ def _formation_contradictions(scenario: Scenario) -> Iterator[tuple[str, object,
         yield "vehicles.follows", f"vehicles without it: {leaders}", "exactly one vehicle without it, the leader"
 
 
+def _autopilot_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+    times_s = [jump.at_s for jump in scenario.autopilot.clock_jumps]
+    if times_s != sorted(times_s):
+        yield "autopilot.clock_jumps", times_s, "times that do not go back"
+    if scenario.dynamics == "autopilot":
+        if scenario.altitude_m == 0:
+            yield "altitude_m", scenario.altitude_m, "an altitude to take off to, with dynamics autopilot"
+        return
+    for k, vehicle in enumerate(scenario.vehicles):
+        if vehicle.flavour is not None:
+            yield f"vehicles[{k}].flavour", vehicle.flavour, "nothing, without dynamics autopilot"
+    if scenario.response is not None:
+        yield "response", scenario.response.model_dump(), "nothing, without dynamics autopilot"
+
+
 def _velocity_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
     lowest, highest = scenario.limits.speed_min_m_s, scenario.limits.speed_max_m_s or math.inf
     wanted_speed = f"a speed within the limits, {lowest:g} to {highest:g} m/s"
@@ -180,7 +196,10 @@ def _velocity_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, 
         if not lowest <= math.hypot(*entry.velocity_ne_m_s) <= highest:
             yield f"nominal_velocity[{k}].velocity_ne_m_s", entry.velocity_ne_m_s, wanted_speed
     for k, vehicle in enumerate(scenario.vehicles):
-        if not lowest <= math.hypot(*vehicle.velocity_ne_m_s) <= highest:
+        if scenario.dynamics == "autopilot":
+            if vehicle.velocity_ne_m_s != (0.0, 0.0):
+                yield f"vehicles[{k}].velocity_ne_m_s", vehicle.velocity_ne_m_s, "[0, 0] with dynamics autopilot"
+        elif not lowest <= math.hypot(*vehicle.velocity_ne_m_s) <= highest:
             yield f"vehicles[{k}].velocity_ne_m_s", vehicle.velocity_ne_m_s, wanted_speed
 
 

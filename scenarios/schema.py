@@ -14,6 +14,7 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Rate = Annotated[float, Field(ge=1, le=500)]
 Probability = Annotated[float, Field(ge=0, le=1)]
+Flavour = Literal["ardupilot", "px4"]
 NS_PER_S = 1_000_000_000
 
 
@@ -33,6 +34,8 @@ class Vehicle(Part):
     """Wanted position relative to the vehicle in front (minus the spacing d of thesis eq. 2.10)."""
     position_ne_m: Pair
     velocity_ne_m_s: Pair
+    flavour: Flavour | None = None
+    """Whose autopilot it is, if not that of the others; only with dynamics autopilot."""
 
 
 class NominalVelocity(Part):
@@ -249,6 +252,51 @@ class Monitor(Part):
     """over this time."""
 
 
+class ClockJump(Part):
+    """A vehicle's boot clock is set, as that of a simulator that could not keep up."""
+
+    at_s: Positive
+    """Time since the vehicles were started."""
+    by_s: float
+
+
+class Autopilot(Part):
+    """A simulated multicopter with dynamics `autopilot`: how it starts, and how it answers to set-points.
+
+    It stands on the ground at its position until it is told to take off. The wanted acceleration is that of the
+    set-point plus `velocity_gain_1_s` times what is missing from its velocity; the real one follows with a lag.
+    """
+
+    flavour: Flavour = "ardupilot"
+    """Modes, numbers and rules of ArduCopter or of PX4."""
+    lag_s: Positive = 0.15
+    """Time constant from wanted to real acceleration."""
+    velocity_gain_1_s: Positive = 2.0
+    acceleration_max_m_s2: Positive = 5.0
+    speed_max_m_s: Positive = 12.0
+    climb_max_m_s: Positive = 2.5
+    telemetry_after_s: NotNegative = 1.0
+    """Until then it sends heartbeats only,"""
+    ready_after_s: NotNegative = 2.0
+    """and until then its estimator has no position and it refuses to arm."""
+    arming_refusals: Annotated[int, Field(ge=0)] = 0
+    """How often it then still refuses to arm."""
+    origin_spread_m: NotNegative = 20.0
+    """The origin of each vehicle's local frame is drawn within this of the common one, north and east."""
+    clock_jumps: tuple[ClockJump, ...] = ()
+
+
+class Response(Part):
+    """How a vehicle answers to set-points, as the control is designed for: acceleration a, velocity v.
+
+    lag a' = a_set + gain (v_set - v) - a. Without it the vehicles of a scenario with dynamics `autopilot` are asked to
+    show it before the formation flight.
+    """
+
+    lag_s: Positive
+    velocity_gain_1_s: NotNegative = 0.0
+
+
 class Scenario(Part):
     """One experiment: vehicles, wanted formation, control, links, seed, duration."""
 
@@ -265,6 +313,13 @@ class Scenario(Part):
     clocks: Clocks = Clocks()
     safety: Safety = Safety()
     monitor: Monitor = Monitor()
+    dynamics: Literal["double_integrator", "autopilot"] = "double_integrator"
+    """What the vehicles are: the source's UAVs, which follow an acceleration at once and are launched in the air, or
+    multicopters with an autopilot, which start on the ground."""
+    autopilot: Autopilot = Autopilot()
+    response: Response | None = None
+    at_end: Literal["hold", "land"] = "hold"
+    """What vehicles with an autopilot are told when the flight ends."""
 
     def leader_first(self) -> tuple[Vehicle, ...]:
         """Vehicles ordered so that each comes after the one it follows, by system id within a rank."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 
 from scenarios import schema
+from sim_vehicles.copter import Copter
 from sim_vehicles.dynamics import State
 from sim_vehicles.links import NEVER_NS, Link, LinkSet
 from sim_vehicles.truth import Record
@@ -24,7 +25,7 @@ _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 @dataclass(slots=True)
 class _Member:
-    vehicle: Vehicle
+    vehicle: Vehicle | Copter
     up: Link
     down: Link
     leaves_ns: int = NEVER_NS
@@ -54,7 +55,8 @@ class Fleet:
         """With channels only: (time, system id, number, data) of what the station has sent, earliest first."""
         self._entered = 0
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
-            vehicle = Vehicle(scenario, own, start_ns, record=record)
+            kind = Copter if scenario.dynamics == "autopilot" else Vehicle
+            vehicle = kind(scenario, own, start_ns, record=record)
             self._members[own.system_id] = _Member(vehicle, *self._links.of(own.system_id))
         for member in self._members.values():
             self._plan(member)
@@ -85,7 +87,7 @@ class Fleet:
             total.update(member.vehicle.counters)
         return total
 
-    def vehicle(self, system_id: int) -> Vehicle:
+    def vehicle(self, system_id: int) -> Vehicle | Copter:
         """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
         return self._members[system_id].vehicle
 

@@ -42,6 +42,10 @@ COMMAND_LONG, COMMAND_INT = dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK
 TIMESYNC = dialect.MAVLINK_MSG_ID_TIMESYNC
 AUTOPILOT_VERSION = dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION
 HOME_POSITION = dialect.MAVLINK_MSG_ID_HOME_POSITION
+EKF_STATUS = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
+ESTIMATOR_STATUS = dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS
+GLOBAL_ORIGIN = dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+COMMAND_TAKEOFF = dialect.MAV_CMD_NAV_TAKEOFF
 MESSAGE_INTERVAL = dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL
 
 _CRC_EXTRA: dict[int, bytes] = {number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items()}
@@ -77,6 +81,9 @@ class Command(NamedTuple):
     command: int
     param1: float
     param2: float
+    param3: float
+    param7: float
+    """z of a COMMAND_INT."""
 
 
 class Heartbeat(NamedTuple):
@@ -182,6 +189,8 @@ def _decode(number: int, frame: bytes) -> Message:
         decoded.command,
         decoded.param1,
         decoded.param2,
+        decoded.param3,
+        decoded.param7 if number == COMMAND_LONG else decoded.z,
     )
 
 
@@ -192,10 +201,17 @@ class Encoder:
         self._pymavlink = dialect.MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_AUTOPILOT)
 
     def local_position(
-        self, time_boot_ms: int, north_m: float, east_m: float, down_m: float, velocity_ne_m_s: tuple[float, float]
+        self,
+        time_boot_ms: int,
+        north_m: float,
+        east_m: float,
+        down_m: float,
+        velocity_ne_m_s: tuple[float, float],
+        velocity_down_m_s: float = 0.0,
     ) -> bytes:
-        """LOCAL_POSITION_NED; no vertical speed."""
-        payload = _LOCAL_POSITION.unpacker.pack(time_boot_ms, north_m, east_m, down_m, *velocity_ne_m_s, 0.0)
+        """LOCAL_POSITION_NED."""
+        velocity = (*velocity_ne_m_s, velocity_down_m_s)
+        payload = _LOCAL_POSITION.unpacker.pack(time_boot_ms, north_m, east_m, down_m, *velocity)
         return self._frame(LOCAL_POSITION, payload)
 
     def global_position(
@@ -225,12 +241,18 @@ class Encoder:
             )
         )
 
-    def heartbeat(self, base_mode: int, custom_mode: int, system_status: int) -> bytes:
-        """HEARTBEAT of an ArduCopter."""
+    def heartbeat(
+        self,
+        base_mode: int,
+        custom_mode: int,
+        system_status: int,
+        autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+    ) -> bytes:
+        """HEARTBEAT of a quadrotor, an ArduCopter's if not told otherwise."""
         return self._pack(
             dialect.MAVLink_heartbeat_message(
                 dialect.MAV_TYPE_QUADROTOR,
-                dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+                autopilot,
                 base_mode,
                 custom_mode,
                 system_status,
@@ -288,6 +310,18 @@ class Encoder:
         body = bytes((len(payload), 0, 0, mav.seq, mav.srcSystem, COMPONENT_AUTOPILOT, number, 0, 0)) + payload
         mav.seq = (mav.seq + 1) & 0xFF
         return b"\xfd" + body + mcrf4xx(body + _CRC_EXTRA[number]).to_bytes(2, "little")
+
+    def estimator_flags(self, message_id: int, time_us: int, flags: int) -> bytes:
+        """EKF_STATUS_REPORT or ESTIMATOR_STATUS with these flags, which mean the same in both."""
+        if message_id == EKF_STATUS:
+            return self._pack(dialect.MAVLink_ekf_status_report_message(flags, *(0.1,) * 5))
+        assert message_id == ESTIMATOR_STATUS
+        return self._pack(dialect.MAVLink_estimator_status_message(time_us, flags, *(0.1,) * 8))
+
+    def global_origin(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> bytes:
+        """GPS_GLOBAL_ORIGIN: where this vehicle's local frame begins."""
+        degrees = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
+        return self._pack(dialect.MAVLink_gps_global_origin_message(*degrees, round(altitude_m * 1e3)))
 
     def _pack(self, message: dialect.MAVLink_message) -> bytes:
         frame = message.pack(self._pymavlink)

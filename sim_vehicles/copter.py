@@ -1,0 +1,380 @@
+"""A simulated multicopter with an autopilot of its own: what ArduCopter or PX4 looks like from outside.
+
+It boots, sends heartbeats, then telemetry, then has a position; it may be armed, takes off to an altitude, follows
+velocity and acceleration set-points with a lag, and lands. Bytes and time in, bytes and time out, as `vehicle.Vehicle`,
+in whose place the fleet takes it when the scenario's dynamics are `autopilot`.
+"""
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from scenarios import schema
+from scenarios.schema import NS_PER_S
+from sim_vehicles import mavlink
+from sim_vehicles.clock import BootClock
+from sim_vehicles.copter_dynamics import Motion, Target, advance
+from sim_vehicles.copter_reports import Facts, report, reportable
+from sim_vehicles.copter_rules import (
+    FAILED,
+    GROUND_DISARM_S,
+    RULES,
+    TEMPORARILY_REJECTED,
+    commanded_mode,
+    setpoint_meaning,
+)
+from sim_vehicles.dynamics import State, state_from
+from sim_vehicles.links import NEVER_NS
+from sim_vehicles.schedule import Schedule
+from sim_vehicles.truth import ACTED, SAMPLED, Record
+from sim_vehicles.vehicle import (
+    ABSURD,
+    HEARTBEAT_INTERVAL_US,
+    LONGEST_HISTORY,
+    ORIGIN_ALTITUDE_M,
+    SHORTEST_INTERVAL_US,
+    TIMESYNC_INTERVAL_US,
+    Change,
+)
+
+ORIGIN_STREAM = 7
+"""Last word of the spawn key of the random stream of a vehicle's local origin."""
+TAKEN_OFF_M = 0.3
+SINK_FAST_M_S, SINK_M_S, SINK_SLOWLY_BELOW_M = 1.5, 0.7, 5.0
+
+
+class Copter:
+    """A multicopter with its autopilot, boot clock and counters; the latter as those of `vehicle.Vehicle`."""
+
+    def __init__(
+        self, scenario: schema.Scenario, own: schema.Vehicle, start_ns: int, *, record: Record | None = None
+    ) -> None:
+        self.system_id = own.system_id
+        self.settings = scenario.autopilot
+        self.rules = RULES[own.flavour or scenario.autopilot.flavour]
+        self.counters: Counter[str] = Counter()
+        self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
+        self.last_heard_ns = start_ns
+        self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
+        self.mode = self.rules.first_mode
+        self.armed = self.failsafe = False
+        self.landed = True
+        self.motion = Motion(*own.position_ne_m)
+        stream = np.random.SeedSequence(scenario.seed, spawn_key=(own.system_id, ORIGIN_STREAM))
+        spread = (2.0 * np.random.default_rng(stream).random(3) - 1.0) * self.settings.origin_spread_m
+        north_m, east_m, up_m = spread.tolist()
+        self.origin_neu_m: tuple[float, float, float] = (north_m, east_m, up_m)
+        """Where its local frame begins, in the frame of the scenario."""
+        self._record = record
+        self._encoder = mavlink.Encoder(own.system_id)
+        self._target = Target()
+        self._takeoff_m: float | None = None
+        self._motion_ns = start_ns
+        self._setpoint_ns: int | None = None
+        self._armed_ns = NEVER_NS
+        self._refusals_left = self.settings.arming_refusals
+        self._telemetry_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
+        self._ready_ns = start_ns + round(self.settings.ready_after_s * NS_PER_S)
+        self._jumps = deque(
+            (start_ns + round(j.at_s * NS_PER_S), round(j.by_s * NS_PER_S)) for j in self.settings.clock_jumps
+        )
+        self._timesync_ts1 = -1
+        self._out: list[tuple[bytes, int]] = []
+        self._answers: dict[int, Callable[[mavlink.Command, int], int]] = {
+            mavlink.COMMAND_ARM: self._arm,
+            mavlink.COMMAND_MODE: self._set_mode,
+            mavlink.COMMAND_TAKEOFF: self._take_off,
+            mavlink.COMMAND_INTERVAL: self._set_interval,
+            mavlink.COMMAND_REQUEST: self._request,
+        }
+        self._reportable = reportable(self.rules)
+        self._intervals_us = {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, mavlink.TIMESYNC: TIMESYNC_INTERVAL_US}
+        self._schedule = Schedule(self.clock)
+        self._schedule.add_once(mavlink.HEARTBEAT, start_ns)
+        self._plan_reports(start_ns)
+
+    @property
+    def next_event_ns(self) -> int:
+        """When it next does something if nothing arrives."""
+        return min(self._schedule.next_ns, self._deadline_ns())
+
+    def state_at(self, time_ns: int) -> State:
+        """The true state in the scenario's frame at a time not before the last event, if nothing arrives until then."""
+        motion = self.motion
+        if not self.landed and time_ns > self._motion_ns:
+            motion, _ = advance(motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
+        return state_from(motion[0:2], motion[2:4])
+
+    def step(self, datagrams: Iterable[tuple[bytes, int]], now_ns: int) -> list[tuple[bytes, int]]:
+        """Live until now: what arrives, as (datagram, instant) in order of time, to what is sent, likewise."""
+        self._out = []
+        for data, time_ns in datagrams:
+            self._run(time_ns)
+            self._receive(data, time_ns)
+        self._run(now_ns + 1)
+        return self._out
+
+    def _run(self, end_ns: int) -> None:
+        """Do what is due before the end."""
+        while (next_ns := self.next_event_ns) < end_ns:
+            if self._schedule.next_ns <= next_ns:
+                time_ns, message_id, boot_ms = self._schedule.pop()
+                self._advance(time_ns)
+                self._report(message_id, time_ns, boot_ms & 0xFFFFFFFF)
+            else:
+                self._advance(next_ns)
+                self._happen(next_ns)
+
+    # What happens by itself
+
+    def _deadline_ns(self) -> int:
+        """The next instant at which something happens that is not a report."""
+        deadline_ns = self._telemetry_ns
+        if self._jumps:
+            deadline_ns = min(deadline_ns, self._jumps[0][0])
+        if self._setpoint_ns is not None and not self.landed and self.mode == self.rules.guided_mode:
+            deadline_ns = min(deadline_ns, self._setpoint_ns + round(self.rules.setpoint_timeout_s * NS_PER_S))
+        if self.armed and self.landed:
+            deadline_ns = min(deadline_ns, self._armed_ns + round(GROUND_DISARM_S * NS_PER_S))
+        return deadline_ns
+
+    def _happen(self, time_ns: int) -> None:
+        if time_ns == self._telemetry_ns:
+            self._telemetry_ns = NEVER_NS
+            self._plan_reports(time_ns)
+        elif self._jumps and time_ns == self._jumps[0][0]:
+            _, by_ns = self._jumps.popleft()
+            self.clock = BootClock(time_ns, self.clock.boot_ns(time_ns) + by_ns, self.clock.drift_ppb)
+            self._schedule = Schedule(self.clock)
+            self._plan_reports(time_ns)
+            self._tell(time_ns, "clock jumped")
+        elif self.armed and self.landed:
+            self.armed = False
+            self._tell(time_ns, "disarmed: not taken off")
+        else:
+            self._lose_setpoints(time_ns)
+
+    def _plan_reports(self, time_ns: int) -> None:
+        for message_id, interval_us in self._intervals_us.items():
+            if message_id == mavlink.HEARTBEAT or self._telemetry_ns == NEVER_NS:
+                self._schedule.set_interval(message_id, interval_us, time_ns)
+
+    def _lose_setpoints(self, time_ns: int) -> None:
+        """ArduCopter stays guided and stops; PX4 leaves offboard and holds."""
+        self._setpoint_ns = None
+        self._target = self._stopped()
+        if self.rules.guided_mode != self.rules.takeoff_mode:
+            self.mode, self.failsafe = self.rules.hold_mode, True
+        self._tell(time_ns, "set-points stopped")
+        self._say(time_ns, "No offboard signal" if self.failsafe else "Guided: no set-points, stopping")
+
+    # What arrives
+
+    def _receive(self, data: bytes, time_ns: int) -> None:
+        for message in mavlink.read_datagram(data, self.counters):
+            if isinstance(message, mavlink.Heartbeat):
+                if message.vehicle_type == mavlink.TYPE_GCS:
+                    self.counters["heartbeats"] += 1
+                    self.last_heard_ns = time_ns
+                continue
+            if isinstance(message, mavlink.Timesync):
+                self._take_timesync(message, time_ns)
+                continue
+            if message.target_system != self.system_id or message.target_component not in (
+                0,
+                mavlink.COMPONENT_AUTOPILOT,
+            ):
+                self.counters["ignored_not_addressed"] += 1
+                continue
+            self.last_heard_ns = time_ns
+            at_ns = max(time_ns, self._motion_ns)
+            self._advance(at_ns)
+            if isinstance(message, mavlink.Setpoint):
+                self._take_setpoint(message, at_ns)
+            else:
+                self.counters["commands"] += 1
+                at = len(self._out)
+                answer = self._answers.get(message.command)
+                result = mavlink.UNSUPPORTED if answer is None else answer(message, at_ns)
+                ack = self._encoder.command_ack(message.command, result, message.source)
+                self._out.insert(at, (ack, at_ns))
+
+    def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
+        if message.target_system not in (0, self.system_id):
+            self.counters["ignored_not_addressed"] += 1
+        elif message.tc1 == 0:
+            self.counters["timesync_requests"] += 1
+            self.last_heard_ns = time_ns
+            self._send(self._encoder.timesync(max(1, self.clock.boot_ns(time_ns)), message.ts1), time_ns)
+        else:
+            known = message.ts1 == self._timesync_ts1
+            self.counters["timesync_replies" if known else "ignored_timesync_reply"] += 1
+
+    def _take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
+        vectors = (*setpoint.velocity_ned_m_s, *setpoint.acceleration_ned_m_s2)
+        reason, velocity, acceleration = setpoint_meaning(setpoint, self.rules)
+        if not math.hypot(*vectors) <= ABSURD:
+            reason = "refused_absurd"
+        guided = self.mode == self.rules.guided_mode
+        if reason:
+            self.counters[reason] += 1
+            if guided and self.rules.velocity_grows and not self.landed:
+                self._takeoff_m, self._target = None, self._stopped()  # ArduCopter's answer to what it does not take
+            return
+        self._setpoint_ns = time_ns  # PX4 also counts those that come before offboard: they let it enter
+        if not guided or not self.armed:
+            self.counters["ignored_not_guided" if not guided else "ignored_not_armed"] += 1
+            return
+        self.counters["setpoints"] += 1
+        if self.landed:
+            return
+        self._takeoff_m = None  # a set-point ends a guided take-off where it is
+        wanted = setpoint.acceleration_ned_m_s2 if acceleration else (0.0, 0.0, 0.0)
+        north, east, down = setpoint.velocity_ned_m_s if velocity else (0.0, 0.0, 0.0)
+        gain = self.settings.velocity_gain_1_s if velocity else 0.0
+        growth = 1.0 if velocity and self.rules.velocity_grows else 0.0
+        self._target = Target(wanted[0], wanted[1], north, east, gain, growth, -down)
+        if self._record is not None:
+            self._record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
+
+    # Commands
+
+    def _ready(self, time_ns: int) -> bool:
+        return time_ns >= self._ready_ns
+
+    def _arm(self, command: mavlink.Command, time_ns: int) -> int:
+        if command.param1 == 0.0:
+            if not self.landed:
+                return FAILED
+            self.armed = False
+            return mavlink.ACCEPTED
+        if self.armed:
+            return mavlink.ACCEPTED
+        if not self._ready(time_ns):
+            self._say(time_ns, "PreArm: Need Position Estimate")
+            return self.rules.arming_refused
+        if self._refusals_left:
+            self._refusals_left -= 1
+            self._say(time_ns, "Arm: Accels inconsistent")
+            return self.rules.arming_refused
+        self.armed, self._armed_ns = True, time_ns
+        self._tell(time_ns, "armed")
+        if self._takeoff_m is not None:
+            self._leave_ground(time_ns)
+        return mavlink.ACCEPTED
+
+    def _set_mode(self, command: mavlink.Command, time_ns: int) -> int:
+        mode = commanded_mode(command, self.rules)
+        if mode is None:
+            return mavlink.DENIED
+        if mode == self.mode:
+            return mavlink.ACCEPTED
+        if mode != self.rules.first_mode and not self._ready(time_ns):
+            return self.rules.arming_refused  # these modes need a position
+        streamed = (
+            self._setpoint_ns is not None and time_ns - self._setpoint_ns < self.rules.setpoint_timeout_s * NS_PER_S
+        )
+        if mode == self.rules.guided_mode != self.rules.takeoff_mode and not streamed:
+            self._say(time_ns, "Offboard needs set-points")
+            return TEMPORARILY_REJECTED
+        self.mode, self.failsafe, self._takeoff_m = mode, False, None
+        self._target = self._stopped()
+        if mode == self.rules.guided_mode == self.rules.takeoff_mode:
+            self._setpoint_ns = time_ns  # the time-out begins with the mode
+        self._tell(time_ns, self.rules.modes[mode])
+        return mavlink.ACCEPTED
+
+    def _take_off(self, command: mavlink.Command, time_ns: int) -> int:
+        """ArduCopter wants the altitude above home, armed and guided; PX4 the one above sea level, in any mode."""
+        own_mode = self.rules.takeoff_mode == self.rules.guided_mode
+        altitude_m = command.param7 - (0.0 if own_mode else ORIGIN_ALTITUDE_M)
+        if own_mode and not (self.armed and self.mode == self.rules.guided_mode):
+            return FAILED
+        if not (self.landed and self._ready(time_ns) and 0.0 < altitude_m < ABSURD):
+            return FAILED if own_mode else TEMPORARILY_REJECTED
+        self.mode, self._takeoff_m = self.rules.takeoff_mode, altitude_m
+        if self.armed:
+            self._leave_ground(time_ns)
+        return mavlink.ACCEPTED
+
+    def _set_interval(self, command: mavlink.Command, time_ns: int) -> int:
+        message_id, interval_us = command.param1, command.param2
+        if message_id not in self._reportable or not math.isfinite(interval_us):
+            return mavlink.DENIED
+        if interval_us > 0 and not SHORTEST_INTERVAL_US <= interval_us < 2**31:
+            return mavlink.DENIED
+        self._intervals_us[int(message_id)] = max(0, int(interval_us))
+        self._plan_reports(time_ns)
+        return mavlink.ACCEPTED
+
+    def _request(self, command: mavlink.Command, time_ns: int) -> int:
+        if command.param1 == mavlink.AUTOPILOT_VERSION:
+            self._send(self._encoder.autopilot_version(), time_ns)
+        elif command.param1 not in self._reportable or self._telemetry_ns != NEVER_NS:
+            return mavlink.DENIED
+        else:
+            self._schedule.add_once(int(command.param1), time_ns)
+        return mavlink.ACCEPTED
+
+    # What it sends
+
+    def _report(self, message_id: int, time_ns: int, boot_ms: int) -> None:
+        if message_id == mavlink.TIMESYNC:
+            self._timesync_ts1 = self.clock.boot_ns(time_ns)
+            self._send(self._encoder.timesync(0, self._timesync_ts1), time_ns)
+            return
+        facts = Facts(
+            self.motion, self.origin_neu_m, self.mode, self.armed, self.landed, self.failsafe, self._ready(time_ns)
+        )
+        frame = report(message_id, self._encoder, self.rules, facts, boot_ms)
+        if frame is None:
+            return
+        if message_id == mavlink.LOCAL_POSITION and self._record is not None:
+            self._record((SAMPLED, self.system_id, boot_ms, time_ns, time_ns, time_ns))
+        self._send(frame, time_ns)
+
+    # Motion
+
+    def _stopped(self) -> Target:
+        if self.mode == self.rules.land_mode:
+            return Target(velocity_gain_1_s=self.settings.velocity_gain_1_s, climb_m_s=-SINK_FAST_M_S)
+        return Target(velocity_gain_1_s=self.settings.velocity_gain_1_s)
+
+    def _leave_ground(self, time_ns: int) -> None:
+        self.landed = False
+        self._target = self._stopped()._replace(altitude_m=self._takeoff_m)
+        self._setpoint_ns = None
+        self._tell(time_ns, "takes off")
+
+    def _advance(self, time_ns: int) -> None:
+        if time_ns <= self._motion_ns:
+            return
+        duration_s, self._motion_ns = (time_ns - self._motion_ns) / NS_PER_S, time_ns
+        if self.landed:
+            return
+        self.motion, self._target = advance(self.motion, self._target, self.settings, duration_s)
+        altitude_m = self.motion.altitude_m
+        if self._takeoff_m is not None and altitude_m > self._takeoff_m - TAKEN_OFF_M:
+            self._takeoff_m = None
+            if self.rules.takeoff_mode != self.rules.guided_mode:
+                self.mode = self.rules.hold_mode
+                self._target = self._stopped()
+            self._tell(time_ns, "taken off")
+        elif self.mode == self.rules.land_mode:
+            sink = SINK_M_S if altitude_m < SINK_SLOWLY_BELOW_M else SINK_FAST_M_S
+            self._target = self._target._replace(climb_m_s=-sink)
+            if altitude_m <= 0.0:
+                self.landed, self.armed = True, False
+                self.motion = Motion(self.motion.north_m, self.motion.east_m)
+                self._tell(time_ns, "landed")
+
+    def _send(self, frame: bytes, time_ns: int) -> None:
+        self._out.append((frame, time_ns))
+
+    def _say(self, time_ns: int, text: str) -> None:
+        self._send(self._encoder.statustext(mavlink.SEVERITY_CRITICAL, text), time_ns)
+
+    def _tell(self, time_ns: int, text: str) -> None:
+        self.changes.append(Change(time_ns, self.system_id, text))

@@ -1,0 +1,109 @@
+"""How a multicopter under its autopilot moves: an acceleration that follows the wanted one with a lag, and limits.
+
+    w = a_set + g (v_set - v),  |w| cut to the limit;   lag a' = w - a,   v' = a,   p' = v
+
+north and east, g = 0 if no velocity is set. v_set grows with a_set between two set-points where the autopilot does so.
+The climb rate follows the wanted one with a lag of its own. Integrated by RK4 in steps of at most 10 ms.
+"""
+
+import math
+from typing import NamedTuple
+
+from scenarios import schema
+
+LONGEST_STEP_S = 0.01
+CLIMB_LAG_S = 0.3
+CLIMB_GAIN_1_S = 0.8
+"""A take-off slows down towards its altitude with this."""
+
+
+class Motion(NamedTuple):
+    """Where the vehicle is and how it moves; altitude above the ground it started from."""
+
+    north_m: float
+    east_m: float
+    velocity_north_m_s: float = 0.0
+    velocity_east_m_s: float = 0.0
+    acceleration_north_m_s2: float = 0.0
+    acceleration_east_m_s2: float = 0.0
+    altitude_m: float = 0.0
+    climb_m_s: float = 0.0
+
+
+class Target(NamedTuple):
+    """What the autopilot tries to do. The velocity target grows by `growth` times the acceleration."""
+
+    acceleration_north_m_s2: float = 0.0
+    acceleration_east_m_s2: float = 0.0
+    velocity_north_m_s: float = 0.0
+    velocity_east_m_s: float = 0.0
+    velocity_gain_1_s: float = 0.0
+    growth: float = 0.0
+    climb_m_s: float = 0.0
+    altitude_m: float | None = None
+    """Climb or sink to this altitude, at most with `climb_m_s`."""
+
+
+def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s: float) -> tuple[Motion, Target]:
+    """The motion `duration_s` later, and the target with the velocity it has grown to."""
+    steps = max(1, math.ceil(duration_s / LONGEST_STEP_S))
+    h = duration_s / steps
+    for _ in range(steps):
+        motion = _step(motion, target, limits, h)
+        grown = target.growth * h
+        target = target._replace(
+            velocity_north_m_s=target.velocity_north_m_s + grown * target.acceleration_north_m_s2,
+            velocity_east_m_s=target.velocity_east_m_s + grown * target.acceleration_east_m_s2,
+        )
+    return motion, target
+
+
+def _step(motion: Motion, target: Target, limits: schema.Autopilot, h: float) -> Motion:
+    north, east, v_n, v_e, a_n, a_e, altitude, climb = motion
+    half = 0.5 * h
+    # v' = a and lag a' = w - a; the position is the integral of the velocity
+    j1n, j1e = _jerk(v_n, v_e, a_n, a_e, target, limits, 0.0)
+    a2n, a2e, v2n, v2e = a_n + half * j1n, a_e + half * j1e, v_n + half * a_n, v_e + half * a_e
+    j2n, j2e = _jerk(v2n, v2e, a2n, a2e, target, limits, half)
+    a3n, a3e, v3n, v3e = a_n + half * j2n, a_e + half * j2e, v_n + half * a2n, v_e + half * a2e
+    j3n, j3e = _jerk(v3n, v3e, a3n, a3e, target, limits, half)
+    a4n, a4e, v4n, v4e = a_n + h * j3n, a_e + h * j3e, v_n + h * a3n, v_e + h * a3e
+    j4n, j4e = _jerk(v4n, v4e, a4n, a4e, target, limits, h)
+    sixth = h / 6.0
+    north += sixth * (v_n + 2.0 * (v2n + v3n) + v4n)
+    east += sixth * (v_e + 2.0 * (v2e + v3e) + v4e)
+    v_n += sixth * (a_n + 2.0 * (a2n + a3n) + a4n)
+    v_e += sixth * (a_e + 2.0 * (a2e + a3e) + a4e)
+    a_n += sixth * (j1n + 2.0 * (j2n + j3n) + j4n)
+    a_e += sixth * (j1e + 2.0 * (j2e + j3e) + j4e)
+    speed = math.hypot(v_n, v_e)
+    if speed > limits.speed_max_m_s:
+        v_n, v_e = v_n * limits.speed_max_m_s / speed, v_e * limits.speed_max_m_s / speed
+    altitude, climb = _climbed(altitude, climb, target, limits, h)
+    return Motion(north, east, v_n, v_e, a_n, a_e, altitude, climb)
+
+
+def _jerk(
+    v_n: float, v_e: float, a_n: float, a_e: float, target: Target, limits: schema.Autopilot, since_s: float
+) -> tuple[float, float]:
+    gain, grown = target.velocity_gain_1_s, target.growth * since_s
+    w_n, w_e = target.acceleration_north_m_s2, target.acceleration_east_m_s2
+    if gain:
+        w_n, w_e = (
+            w_n + gain * (target.velocity_north_m_s + grown * w_n - v_n),
+            w_e + gain * (target.velocity_east_m_s + grown * w_e - v_e),
+        )
+    size = math.hypot(w_n, w_e)
+    if size > limits.acceleration_max_m_s2:
+        w_n, w_e = w_n * limits.acceleration_max_m_s2 / size, w_e * limits.acceleration_max_m_s2 / size
+    return (w_n - a_n) / limits.lag_s, (w_e - a_e) / limits.lag_s
+
+
+def _climbed(altitude: float, climb: float, target: Target, limits: schema.Autopilot, h: float) -> tuple[float, float]:
+    """Altitude and climb rate a step later: exact for the wanted climb rate at the beginning of the step."""
+    wanted = target.climb_m_s
+    if target.altitude_m is not None:
+        wanted = CLIMB_GAIN_1_S * (target.altitude_m - altitude)
+    wanted = max(-limits.climb_max_m_s, min(limits.climb_max_m_s, wanted))
+    left = math.exp(-h / CLIMB_LAG_S)
+    return altitude + wanted * h + (climb - wanted) * CLIMB_LAG_S * (1.0 - left), wanted + (climb - wanted) * left

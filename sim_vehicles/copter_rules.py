@@ -1,0 +1,108 @@
+"""What two autopilots do with modes, arming, take-off and set-points: their rules, as data and pure functions.
+
+Read in ArduCopter's mode_guided.cpp and GCS_MAVLink_Copter.cpp, and in PX4's mavlink_receiver.cpp, Commander.cpp and
+offboardCheck.cpp.
+"""
+
+import math
+from dataclasses import dataclass
+
+from sim_vehicles import mavlink
+from sim_vehicles.mavlink import Command, Setpoint
+
+TEMPORARILY_REJECTED, FAILED = 1, 4
+FORCE_SET = 0x200
+POSITION_AXES, VELOCITY_AXES, ACCELERATION_AXES = 0x007, 0x038, 0x1C0
+LOCAL_FRAMES = (1, 7)
+"""LOCAL_NED and LOCAL_OFFSET_NED: the same for velocities and accelerations."""
+GROUND_DISARM_S = 10.0
+"""Armed and not taken off for this long, both disarm again (DISARM_DELAY, COM_DISARM_PRFLT)."""
+
+
+def px4_mode(main: int, sub: int = 0) -> int:
+    """HEARTBEAT.custom_mode of a PX4 mode."""
+    return main << 16 | sub << 24
+
+
+@dataclass(frozen=True)
+class Rules:
+    """One autopilot."""
+
+    autopilot: int
+    """MAV_AUTOPILOT"""
+    modes: dict[int, str]
+    first_mode: int
+    guided_mode: int
+    takeoff_mode: int
+    """In which a take-off is flown; a take-off command changes to it unless it is the guided mode."""
+    hold_mode: int
+    land_mode: int
+    estimator_message: int
+    """Reports the estimator's flags: EKF_STATUS_REPORT, ESTIMATOR_STATUS."""
+    arming_refused: int
+    """MAV_RESULT of what is refused because it is not ready."""
+    setpoint_timeout_s: float
+    velocity_grows: bool
+    """Whether the velocity target grows with the acceleration between two set-points."""
+
+
+ARDUPILOT = Rules(
+    autopilot=3,
+    modes={0: "STABILIZE", 4: "GUIDED", 5: "LOITER", 9: "LAND", 17: "BRAKE"},
+    first_mode=0,
+    guided_mode=4,
+    takeoff_mode=4,
+    hold_mode=17,
+    land_mode=9,
+    estimator_message=193,
+    arming_refused=FAILED,
+    setpoint_timeout_s=3.0,  # GUID_TIMEOUT
+    velocity_grows=True,
+)
+PX4 = Rules(
+    autopilot=12,
+    modes={
+        px4_mode(3): "POSCTL",
+        px4_mode(4, 2): "AUTO.TAKEOFF",
+        px4_mode(4, 3): "AUTO.LOITER",
+        px4_mode(4, 6): "AUTO.LAND",
+        px4_mode(6): "OFFBOARD",
+    },
+    first_mode=px4_mode(4, 3),
+    guided_mode=px4_mode(6),
+    takeoff_mode=px4_mode(4, 2),
+    hold_mode=px4_mode(4, 3),
+    land_mode=px4_mode(4, 6),
+    estimator_message=230,
+    arming_refused=TEMPORARILY_REJECTED,
+    setpoint_timeout_s=1.0,  # COM_OF_LOSS_T
+    velocity_grows=False,
+)
+RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
+
+
+def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]:
+    """What a set-point asks for: (why it is not flown or "", velocity counts, acceleration counts).
+
+    One ignored axis drops all three of its kind. What ArduCopter does not take makes it stop; PX4 ignores it.
+    """
+    mask = setpoint.type_mask
+    velocity, acceleration = not mask & VELOCITY_AXES, not mask & ACCELERATION_AXES
+    if setpoint.frame not in LOCAL_FRAMES:
+        return "refused_frame", False, False
+    if mask & FORCE_SET and (acceleration or rules is PX4):
+        return "refused_force", False, False
+    if not mask & POSITION_AXES or not (velocity or acceleration):
+        return "refused_mask", False, False  # flying to positions is not simulated
+    return "", velocity, acceleration
+
+
+def commanded_mode(command: Command, rules: Rules) -> int | None:
+    """The custom mode that a DO_SET_MODE asks for, None if there is none such."""
+    if not math.isfinite(command.param1 + command.param2 + command.param3):
+        return None
+    base, main, sub = int(command.param1), int(command.param2), int(command.param3)
+    if not base & mavlink.BASE_MODE_CUSTOM:
+        return None
+    mode = px4_mode(main, sub) if rules is PX4 else main
+    return mode if mode in rules.modes else None
