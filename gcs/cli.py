@@ -110,6 +110,27 @@ def margin(
 
 
 @app.command()
+def bench(
+    scenario_file: ScenarioFile,
+    vehicles: Annotated[
+        int, typer.Option(metavar="N", min=0, max=250, help="as many vehicles instead, in columns behind a leader")
+    ] = 0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="flight time of each flight")] = 8.0,
+    repeat: Annotated[int, typer.Option(metavar="N", min=1, help="flights; the fastest counts")] = 10,
+    as_json: AsJson = False,
+) -> None:
+    """How much faster than real time flights are computed, and what the station takes of its control period."""
+    from gcs.benchmark import benchmark, print_benchmark, with_vehicles
+
+    scenario = _scenario(scenario_file)
+    result = benchmark(with_vehicles(scenario, vehicles) if vehicles else scenario, seconds=seconds, repeat=repeat)
+    if as_json:
+        typer.echo(json.dumps(result, indent=2))
+    else:
+        print_benchmark(result)
+
+
+@app.command()
 def view(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder, or a .rrd file")],
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="write a picture; open no window")] = None,

@@ -195,14 +195,17 @@ def _followed(
         # Positions are taken against the vehicle's own: sums of large numbers would lose digits.
         x, y = other[0] - north - opening * offset_north, other[1] - east - opening * offset_east
         v_north, v_east = other[2] - nominal_north, other[3] - nominal_east
-        g = gains[flown]
-        if share < 1.0:
-            g = [share * new + (1.0 - share) * old for new, old in zip(g, gains[former], strict=True)]
+        g = gains[flown] if share >= 1.0 else _blended(gains[flown], gains[former], share)
         command_north += g[0] * x + g[1] * y + g[2] * v_north + g[3] * v_east
         command_east += g[4] * x + g[5] * y + g[6] * v_north + g[7] * v_east
         if source == law.ahead:
             spacing_error = x, y
     return spacing_error, (command_north, command_east)
+
+
+def _blended(new: Gain, old: Gain, share: float) -> Gain:
+    a, b, c, d, e, f, g, h = (share * one + (1.0 - share) * other for one, other in zip(new, old, strict=True))
+    return a, b, c, d, e, f, g, h
 
 
 def _shortened(command: tuple[float, float], limit: float) -> tuple[float, float]:

@@ -28,6 +28,11 @@ class Vehicles(Protocol):
     def step(self, received: Sent, now_ns: int) -> Sent: ...
 
 
+def vehicles_of(plan: FlightPlan) -> Vehicles:
+    """The simulated vehicles of a plan with their links, at the start."""
+    return Fleet(plan.scenario, START_NS)
+
+
 def fly_lockstep(
     plan: FlightPlan, *, station: Station | None = None, vehicles: Vehicles | None = None
 ) -> Iterator[TickArray]:
@@ -37,7 +42,7 @@ def fly_lockstep(
     already flown. The address of a vehicle is (a fixed name, its system id).
     """
     station = station or Station(plan, start_ns=START_NS)
-    vehicles = vehicles or Fleet(plan.scenario, START_NS)
+    vehicles = vehicles or vehicles_of(plan)
     addresses = {system_id: (_HOST, system_id) for system_id in plan.formation.system_ids}
     to_vehicles: Sent = []
     while station.phase is not Phase.ENDED:

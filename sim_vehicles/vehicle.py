@@ -239,7 +239,7 @@ class Vehicle:
             self._send(self._encoder.home_position(*home), time_ns)
         elif message_id == mavlink.MESSAGE_INTERVAL:
             asked = _whole(command.param2)
-            if asked not in (*DEFAULT_INTERVAL_US, mavlink.HEARTBEAT):
+            if asked not in DEFAULT_INTERVAL_US and asked != mavlink.HEARTBEAT:
                 return mavlink.DENIED
             interval_us = self._schedule.interval_us(asked) or -1
             self._send(self._encoder.message_interval(asked, interval_us), time_ns)

@@ -1,0 +1,95 @@
+"""How fast flights are computed: virtual time against real time, and what the station takes of its control period."""
+
+import time  # noqa: TID251 - the time it takes is what is measured; nothing flown depends on it
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from gcs import station
+from gcs.lockstep import Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan import FlightPlan, flight_plan
+from scenarios.schema import FixedGains, Scenario, Vehicle
+
+_COLUMN = 10
+"""Vehicles behind one another in a large formation; the columns follow one leader."""
+_SPACING_M = 100.0
+
+
+@dataclass
+class _Timed:
+    """Vehicles whose own computing time is added up."""
+
+    vehicles: Vehicles
+    taken_s: float = 0.0
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        begun_s = time.perf_counter()
+        sent = self.vehicles.step(received, now_ns)
+        self.taken_s += time.perf_counter() - begun_s
+        return sent
+
+
+def with_vehicles(scenario: Scenario, count: int) -> Scenario:
+    """The scenario with as many vehicles as wanted, in place, in columns behind one leader."""
+    velocity = scenario.nominal_velocity[0].velocity_ne_m_s
+    vehicles = [Vehicle(system_id=1, position_ne_m=(0.0, 0.0), velocity_ne_m_s=velocity)]
+    for k in range(count - 1):
+        column, place = divmod(k, _COLUMN)
+        aside = _SPACING_M * (column + 1)
+        vehicles.append(
+            Vehicle(
+                system_id=k + 2,
+                follows=1 if place == 0 else k + 1,
+                offset_ne_m=(-_SPACING_M, aside if place == 0 else 0.0),
+                position_ne_m=(-_SPACING_M * (place + 1), aside),
+                velocity_ne_m_s=velocity,
+            )
+        )
+    return scenario.model_copy(update={"vehicles": tuple(vehicles)})
+
+
+def benchmark(scenario: Scenario, *, seconds: float, repeat: int) -> dict[str, Any]:
+    """Fly `seconds` of a scenario `repeat` times in virtual time; figures of the fastest and of the median flight."""
+    gains = FixedGains(K1=-3.4, K2=0.6, K3=5.6)  # no solver is measured
+    control = scenario.control.model_copy(update={"gains": gains})
+    _, plan = flight_plan(scenario.model_copy(update={"duration_s": seconds, "control": control}))
+    flights = [_flight(plan) for _ in range(repeat)]
+    fastest = min(flights, key=lambda flight: flight["s_per_tick"])
+    period_s = 1.0 / scenario.rates.control_hz
+    return {
+        "vehicles": len(scenario.vehicles),
+        "control_hz": scenario.rates.control_hz,
+        "compiled": not str(Path(station.__file__)).endswith(".py"),
+        "real_time_factor": period_s / fastest["s_per_tick"],
+        "real_time_factor_p50": period_s / median(flight["s_per_tick"] for flight in flights),
+        "station_s_per_tick": fastest["station_s_per_tick"],
+        "station_share_of_period": fastest["station_s_per_tick"] / period_s,
+        "ticks": fastest["ticks"],
+        "flights": repeat,
+    }
+
+
+def _flight(plan: FlightPlan) -> dict[str, float]:
+    vehicles = _Timed(vehicles_of(plan))
+    begun_s = time.perf_counter()
+    ticks = sum(1 for _ in fly_lockstep(plan, vehicles=vehicles))
+    taken_s = time.perf_counter() - begun_s
+    return {
+        "ticks": ticks,
+        "s_per_tick": taken_s / ticks,
+        "station_s_per_tick": (taken_s - vehicles.taken_s) / ticks,
+    }
+
+
+def print_benchmark(result: dict[str, Any]) -> None:
+    how = "compiled" if result["compiled"] else "interpreted (python3 make.py compile makes it faster)"
+    print(f"{result['vehicles']} vehicles at {result['control_hz']:g} Hz, one core, hot path {how}")
+    print(
+        f"virtual time    {result['real_time_factor']:.3g} times real time "
+        f"(best of {result['flights']}; median {result['real_time_factor_p50']:.3g})"
+    )
+    print(
+        f"station alone   {1e6 * result['station_s_per_tick']:.0f} µs a tick, "
+        f"{100 * result['station_share_of_period']:.1f} % of its period"
+    )

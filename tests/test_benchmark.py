@@ -1,0 +1,28 @@
+"""`gcs bench`: what it says is measured, whatever the machine."""
+
+from pathlib import Path
+
+from gcs.benchmark import benchmark, with_vehicles
+from scenarios.files import load
+
+TRIANGLE = Path(__file__).parent.parent / "scenarios" / "triangle5.toml"
+
+
+def test_a_large_formation_is_flown_by_its_station() -> None:
+    result = benchmark(with_vehicles(load(TRIANGLE), 23), seconds=0.2, repeat=2)
+    assert result["vehicles"] == 23
+    assert result["ticks"] > 10
+    assert 0.0 < result["station_s_per_tick"] < 0.02 / result["real_time_factor"]
+    assert result["real_time_factor"] >= result["real_time_factor_p50"] > 0.0
+
+
+def test_columns_keep_their_places_behind_one_leader() -> None:
+    scenario = with_vehicles(load(TRIANGLE), 250)
+    place = {vehicle.system_id: vehicle.position_ne_m for vehicle in scenario.vehicles}
+    assert len(place) == 250
+    assert len(set(place.values())) == 250
+    for vehicle in scenario.vehicles[1:]:
+        assert vehicle.follows is not None
+        assert vehicle.offset_ne_m is not None
+        ahead = place[vehicle.follows]
+        assert tuple(a + b for a, b in zip(ahead, vehicle.offset_ne_m, strict=True)) == place[vehicle.system_id]
