@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gcs import mavlink
-from gcs.plan import FlightPlan
+from gcs.plan import FlightPlan, described
 from gcs.record import DESIGN_FILE, READY_FILE, SCENARIO_FILE, RunWriter
 from gcs.sitl import VehicleProcess
 from gcs.station import CONNECT_PATIENCE_S, Station
@@ -61,6 +61,9 @@ def fly(plan: FlightPlan, design: dict[str, Any], link: StationSocket, options: 
         prepare_real_time()
         station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS)
         drive(station, link, writer, stop_reason)
+        if plan.responses is None and station.plan.responses is not None:
+            known = described(design, station.plan)
+            (folder / DESIGN_FILE).write_text(json.dumps(known, indent=2), encoding="utf-8")
         writer.event(time_s=station.scenario_time_s(clock_ns()), kind="end", text=station.end_reason)
     return finish(folder)
 

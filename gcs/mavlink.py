@@ -18,10 +18,14 @@ STATION_COMPONENT_ID = 190
 HEARTBEAT = 0
 LOCAL_POSITION_NED = 32
 GLOBAL_POSITION_INT = 33
+GPS_GLOBAL_ORIGIN = 49
 COMMAND_LONG = 76
 COMMAND_ACK = 77
 SET_POSITION_TARGET_LOCAL_NED = 84
 TIMESYNC = 111
+EKF_STATUS_REPORT = 193
+ESTIMATOR_STATUS = 230
+HOME_POSITION = 242
 STATUSTEXT = 253
 
 _MAGIC = 0xFD
@@ -159,6 +163,7 @@ def command_long(
     return (*padded, command, target_system, 1, confirmation)
 
 
+IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION = 0x0C07
 IGNORE_ALL_BUT_ACCELERATION = 0x0C3F
 """type_mask of a set-point of which only the acceleration counts: the other bits set are ignore bits."""
 
@@ -168,4 +173,18 @@ def acceleration_set_point(*, key_ms: int, target_system: int, north_m_s2: float
     return (
         key_ms, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, north_m_s2, east_m_s2, 0.0, 0.0, 0.0,
         IGNORE_ALL_BUT_ACCELERATION, target_system, 1, dialect.MAV_FRAME_LOCAL_NED,
+    )  # fmt: skip
+
+
+def velocity_set_point(
+    *,
+    key_ms: int,
+    target_system: int,
+    velocity_ned_m_s: tuple[float, float, float],
+    acceleration_ne_m_s2: tuple[float, float],
+) -> tuple[Any, ...]:
+    """Fields of SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME_LOCAL_NED with velocity and acceleration."""
+    return (
+        key_ms, 0.0, 0.0, 0.0, *velocity_ned_m_s, *acceleration_ne_m_s2, 0.0, 0.0, 0.0,
+        IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION, target_system, 1, dialect.MAV_FRAME_LOCAL_NED,
     )  # fmt: skip

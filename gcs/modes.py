@@ -7,21 +7,27 @@ class Phase(StrEnum):
     """Where the flight stands."""
 
     CONNECTING = "connecting"  # until every vehicle is heard, its clock known, armed and guided
+    IDENTIFYING = "identifying"  # vehicles with autopilots show how they answer to set-points
     FLYING = "flying"
     ENDING = "ending"  # no more set-points; until every vehicle is seen to hold its velocity
     ENDED = "ended"
 
 
-def next_phase(phase: Phase, *, all_ready: bool, stop: bool, all_holding: bool, waited_s: float) -> Phase:
+def next_phase(
+    phase: Phase, *, all_ready: bool, stop: bool, all_holding: bool, waited_s: float, identified: bool = True
+) -> Phase:
     """The phase that follows.
 
-    CONNECTING goes to FLYING when all are ready; both go to ENDING when the flight is to stop, for whatever reason;
-    ENDING goes to ENDED when all vehicles hold, or after `END_PATIENCE_S`.
+    CONNECTING goes to FLYING when all are ready, by way of IDENTIFYING unless all are identified; all three go to
+    ENDING when the flight is to stop, for whatever reason; ENDING goes to ENDED when all vehicles hold, or after
+    `END_PATIENCE_S`.
     """
     match phase:
-        case Phase.CONNECTING | Phase.FLYING if stop:
+        case Phase.CONNECTING | Phase.IDENTIFYING | Phase.FLYING if stop:
             return Phase.ENDING
         case Phase.CONNECTING if all_ready:
+            return Phase.FLYING if identified else Phase.IDENTIFYING
+        case Phase.IDENTIFYING if identified:
             return Phase.FLYING
         case Phase.ENDING if all_holding or waited_s > END_PATIENCE_S:
             return Phase.ENDED

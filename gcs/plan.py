@@ -1,14 +1,17 @@
 """From a scenario to what is flown: formation, gains, margins."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from gains.behaviour import Gains
 from gains.design import Design, Requirement, design, evaluate_gains
 from gains.formation import FormationModel
+from gains.response import Response, continuous_margin, requirement_with
 from gcs.control import Formation
+from gcs.responses import Responses, given_responses, margins_with
 from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
 
@@ -26,6 +29,10 @@ class FlightPlan:
     """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
     separable: bool = True
     """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
+    blocks: tuple[Gains, ...] = ()
+    """(K1, K2, K3) of each set of the gain schedule."""
+    responses: Responses | None = None
+    """How the vehicles answer; None if at once, or not yet known."""
 
     @cached_property
     def gains(self) -> tuple[FloatArray, ...]:
@@ -36,6 +43,11 @@ class FlightPlan:
     def margins_s(self) -> tuple[float, ...]:
         """The delay margins of the gain schedule."""
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
+
+    def with_margins(self, margins_s: tuple[float, ...], responses: Responses) -> "FlightPlan":
+        """The same gains with the margins that they have on vehicles that answer so."""
+        slower = tuple((gain, s) for (gain, _), s in zip(self.slower, margins_s[1:], strict=True))
+        return replace(self, delay_margin_s=margins_s[0], slower=slower, responses=responses)
 
 
 def plan_formation(scenario: Scenario) -> Formation:
@@ -59,7 +71,8 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
     """
     formation = plan_formation(scenario)
     model = FormationModel(tuple(formation.predecessor.tolist()))
-    found = _design(scenario, model)
+    responses = given_responses(scenario)
+    found = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
     schedule = _schedule(scenario, model, found)
     plan = FlightPlan(
         scenario=scenario,
@@ -67,8 +80,38 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
         gain=model.overlapping_gain(found.K1, found.K2, found.K3),
         delay_margin_s=found.delay_margin_s,
         slower=tuple((model.overlapping_gain(s.K1, s.K2, s.K3), s.delay_margin_s) for _, s in schedule),
+        blocks=tuple((s.K1, s.K2, s.K3) for s in (found, *(slower for _, slower in schedule))),
     )
-    return found.to_dict() | {"schedule": [_entry(1.0, found), *(_entry(*slower) for slower in schedule)]}, plan
+    whole = found.to_dict() | {"schedule": [_entry(1.0, found), *(_entry(*slower) for slower in schedule)]}
+    if responses is None:
+        return whole, plan
+    margins_s = margins_with(plan.blocks, list(responses.of.values()), period_s=found.period_s)
+    plan = plan.with_margins(margins_s, responses)
+    return described(whole, plan), plan
+
+
+def described(design: dict[str, Any], plan: FlightPlan) -> dict[str, Any]:
+    """The design with the vehicles' responses in it: its margins become those with them.
+
+    `delay_margin_at_once_s` is the margin that the same gains have on vehicles that answer at once.
+    """
+    assert plan.responses is not None
+    every = list(plan.responses.of.values())
+    margins = [
+        {"delay_margin_s": sampled_s, "delay_margin_continuous_s": continuous_margin(gains, every)}
+        for gains, sampled_s in zip(plan.blocks, plan.margins_s, strict=True)
+    ]
+    schedule = [entry | margin for entry, margin in zip(design["schedule"], margins, strict=True)]
+    response = {
+        "source": plan.responses.source,
+        "model": "lag a' = u + g (v_s - v) - a, v_s' = u",
+        "vehicles": [
+            {"system_id": system_id, "lag_s": found.lag_s, "velocity_gain_1_s": found.velocity_gain_1_s}
+            for system_id, found in sorted(plan.responses.of.items())
+        ],
+        "delay_margin_at_once_s": design["delay_margin_s"],
+    }
+    return design | margins[0] | {"schedule": schedule, "response": response}
 
 
 def _schedule(scenario: Scenario, model: FormationModel, found: Design) -> list[tuple[float, Design]]:
@@ -89,7 +132,7 @@ def _entry(time_scale: float, design: Design) -> dict[str, Any]:
     return {"time_scale": time_scale} | {name: whole[name] for name in names}
 
 
-def _design(scenario: Scenario, model: FormationModel) -> Design:
+def _design(scenario: Scenario, model: FormationModel, response: Response | None) -> Design:
     control = scenario.control
     period_s = 1.0 / scenario.rates.control_hz
     if control.gains is not None:
@@ -98,4 +141,6 @@ def _design(scenario: Scenario, model: FormationModel) -> Design:
     requirement = Requirement(
         delay_margin_s=control.delay_margin_s, alpha=control.alpha, string_peak_max=control.string_peak_max
     )
+    if response is not None:
+        requirement = requirement_with(requirement, response, period_s=period_s)
     return design(model, requirement, period_s=period_s)

@@ -22,6 +22,7 @@ def print_design(design: dict[str, Any], console: Console | None = None) -> None
         f"margin   {_ms(design['delay_margin_s'])} of loop delay in the sampled loop, "
         f"{_ms(design['delay_margin_continuous_s'])} in the continuous model"
     )
+    console.print(_response(design.get("response")), end="")
     console.print(
         f"alpha    {design['alpha']:.4f} (robustness bound); spacing errors grow by {behaviour['string_peak']:.2f} "
         f"at most from vehicle to vehicle, decay {behaviour['decay_rate_1_s']:.2f} 1/s without delay"
@@ -46,6 +47,7 @@ def print_summary(summary: dict[str, Any], folder: Path, console: Console | None
         f"delay    loop {_ms(delay['p50'])} p50, {_ms(delay['p99'])} p99, {_ms(delay['max'])} max; "
         f"margin {_ms(summary['delay_margin_s'])}; least headroom {_percent(summary['headroom_min'])}"
     )
+    console.print(_response(summary.get("response")), end="")
     control = summary["control"]
     console.print(
         f"control  {control['ticks']} ticks at {control['rate_hz']:g} Hz, "
@@ -69,6 +71,19 @@ def print_summary(summary: dict[str, Any], folder: Path, console: Console | None
     console.print(f"files    {folder}: {', '.join(summary['files'])}")
     if "flight.rrd" in summary["files"]:
         console.print(f"look     gcs view {folder}")
+
+
+def _response(response: dict[str, Any] | None) -> str:
+    """A line on how the vehicles answer, if they do not do so at once."""
+    if response is None:
+        return ""
+    answers = sorted((vehicle["lag_s"], vehicle["velocity_gain_1_s"]) for vehicle in response["vehicles"])
+    (least_s, _), (most_s, gain_1_s) = answers[0], answers[-1]
+    lag = f"{least_s:.3f}" if least_s == most_s else f"{least_s:.3f} to {most_s:.3f}"
+    return (
+        f"response {response['source']}: lag {lag} s, velocity gain {gain_1_s:.2f} 1/s; in the margin, which would be "
+        f"{_ms(response['delay_margin_at_once_s'])} without it\n"
+    )
 
 
 def _ms(seconds: float | None, *, unit: str = " ms") -> str:

@@ -7,11 +7,12 @@ or in virtual time, with the same bytes.
 from collections import Counter
 from collections.abc import Callable
 from math import hypot, isfinite, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gcs import mavlink
+from gcs.autopilots import Goal
 from gcs.control import (
     LARGEST_COMMAND_M_S2,
     VehicleControl,
@@ -19,13 +20,15 @@ from gcs.control import (
     feedback_law,
     formation_control,
 )
+from gcs.copters import START_PATIENCE_S, Copters
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
 from gcs.record import TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.startup import Startup
 from gcs.telemetry import FloatArray, StateHistory
-from gcs.vehicle import GUIDED, HOLD, Address, RemoteVehicle
+from gcs.vehicle import Address, RemoteVehicle
 from scenarios.schema import NS_PER_S
 
 CONNECT_PATIENCE_S = 20.0
@@ -61,7 +64,9 @@ class Station:
     """Flies one formation. `start_ns` is the time of the first control tick."""
 
     def __init__(self, plan: FlightPlan, *, start_ns: int) -> None:
-        rates = plan.scenario.rates
+        scenario = plan.scenario
+        rates = scenario.rates
+        autopilots = scenario.dynamics == "autopilot"
         self.plan = plan
         self.phase = Phase.CONNECTING
         self.end_reason = ""
@@ -70,7 +75,15 @@ class Station:
         """Frames received since the driver last took them, with their receive time."""
         self.counters: Counter[str] = Counter()
         self.vehicles = [
-            RemoteVehicle(system_id, telemetry_hz=rates.telemetry_hz, report=self._reporter(system_id))
+            RemoteVehicle(
+                system_id,
+                telemetry_hz=rates.telemetry_hz,
+                report=self._reporter(system_id),
+                startup=Startup(altitude_m=scenario.altitude_m, telemetry_interval_us=1e6 / rates.telemetry_hz)
+                if autopilots
+                else None,
+                land=scenario.at_end == "land",
+            )
             for system_id in plan.formation.system_ids
         ]
         n = len(self.vehicles)
@@ -85,6 +98,8 @@ class Station:
             separable=plan.separable,
             period_s=self._period_ns / NS_PER_S,
         )
+        self._copters = Copters(plan, self.vehicles, self._report) if autopilots else None
+        self.patience_s = START_PATIENCE_S if autopilots else CONNECT_PATIENCE_S
         self._timesync_ns = round(NS_PER_S / rates.timesync_hz)
         self._start_ns = start_ns
         self._phase_since_ns = start_ns
@@ -144,7 +159,7 @@ class Station:
     def scenario_time_s(self, now_ns: int) -> float:
         """Time since the formation flight began; before that, time since the start minus the patience, below 0."""
         if self._flight_start_ns is None:
-            return (now_ns - self._start_ns) / NS_PER_S - CONNECT_PATIENCE_S
+            return (now_ns - self._start_ns) / NS_PER_S - self.patience_s
         return (now_ns - self._flight_start_ns) / NS_PER_S
 
     # -- receive ---------------------------------------------------------------------------------------------------
@@ -160,6 +175,7 @@ class Station:
                 self.counters["known system id from another address"] += 1
                 continue
             vehicle.heard_ns = datagram.received_ns
+            vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
             if frame.component_id == 1:
                 vehicle.frames.add(frame.sequence)
             self.frames.append((frame.data, datagram.received_ns))
@@ -199,6 +215,8 @@ class Station:
                 self.events.append(Event(self.scenario_time_s(self._now_ns), "statustext", text, vehicle.system_id))
             case _:
                 pass
+        if vehicle.startup is not None:
+            vehicle.startup.take(frame.msg_id, fields)
 
     def _position(self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram) -> None:
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
@@ -207,7 +225,8 @@ class Station:
         if clock.samples == 0:
             return
         sample_ns = clock.to_station_ns(boot_ms * 1_000_000)
-        if not self._history.add(row, sample_ns, (north, east, v_north, v_east)):
+        origin_north, origin_east = self._copters.frame_ne_m[row] if self._copters else (0.0, 0.0)
+        if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             return
         self._reported[row] = Reported(boot_ms, down, v_down, datagram.queued_ns * 1e-9)
 
@@ -230,6 +249,8 @@ class Station:
         behind = (self._now_ns - due_ns) // self._period_ns
         self._next_tick_ns = due_ns + (behind + 1) * self._period_ns  # ticks that were slept through are left out
         self._decide(due_ns)
+        if self._copters is not None and self.phase is Phase.CONNECTING:
+            self._copters.locate(self._history)
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
         controls = formation_control(
@@ -251,10 +272,8 @@ class Station:
         ):
             north, east = control.command_m_s2
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
-            if commanded:
-                fields = mavlink.acceleration_set_point(
-                    key_ms=key_ms, target_system=vehicle.system_id, north_m_s2=north, east_m_s2=east
-                )
+            fields = self._set_point(row, control, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
+            if fields is not None:
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
             margin_s = self.plan.margins_s[monitored.gain_set]
             reported, rtt_s = self._reported[row], self._fresh_rtt_s[row]
@@ -291,7 +310,7 @@ class Station:
         for row, before, after in self._monitor.update(view):
             vehicle = self.vehicles[row]
             if flying:
-                vehicle.wanted_mode = None if after.released else GUIDED
+                vehicle.goal = None if after.released else Goal.FLY
             if after.mode is not before.mode:
                 self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
             if after.released != before.released and flying:
@@ -304,9 +323,10 @@ class Station:
 
     def _next_phase(self, due_ns: int) -> None:
         waited_s = (due_ns - self._phase_since_ns) / NS_PER_S
-        if self.phase is Phase.CONNECTING and waited_s > CONNECT_PATIENCE_S:
-            unready = "; ".join(f"vehicle {v.system_id} {v.missing}" for v in self.vehicles if not v.ready)
-            self.request_stop(f"not ready: {unready}")
+        if self.phase is Phase.CONNECTING:
+            self._lose_patience(due_ns, waited_s)
+        if self.phase is Phase.IDENTIFYING:
+            self._identify(due_ns)
         if self.phase is Phase.FLYING:
             if waited_s >= self.plan.scenario.duration_s:
                 lost = ", ".join(str(v.system_id) for v, gone in zip(self.vehicles, self._lost, strict=True) if gone)
@@ -317,8 +337,9 @@ class Station:
             self.phase,
             all_ready=self._history.complete and all(vehicle.ready for vehicle in self.vehicles),
             stop=bool(self._stop),
-            all_holding=all(v.custom_mode == HOLD for v in self.vehicles if v.address is not None),
+            all_holding=all(v.custom_mode == v.end_mode for v in self.vehicles if v.address is not None),
             waited_s=waited_s,
+            identified=self._copters is None or self._copters.identified,
         )
         if phase is self.phase:
             return
@@ -328,9 +349,41 @@ class Station:
         if phase is Phase.ENDING:
             self.end_reason = self._stop
             for vehicle in self.vehicles:
-                # A formation that broke is left to its own failsafe: what broke may be the link.
-                vehicle.wanted_mode = None if self._stop.startswith("broken") else HOLD
+                # A formation that broke is left to its own failsafe: what broke may be the link. That of an autopilot
+                # may be to fly on.
+                alone = self._stop.startswith("broken") and self._copters is None
+                vehicle.goal = None if alone else Goal.END
         self._report("phase", str(phase))
+
+    def _lose_patience(self, due_ns: int, waited_s: float) -> None:
+        if self._copters is not None:
+            reason = self._copters.impatience(due_ns, self._start_ns)
+            if reason:
+                self.request_stop(reason)
+        elif waited_s > CONNECT_PATIENCE_S:
+            unready = "; ".join(f"vehicle {v.system_id} {v.missing}" for v in self.vehicles if not v.ready)
+            self.request_stop(f"not ready: {unready}")
+
+    def _identify(self, due_ns: int) -> None:
+        assert self._copters is not None
+        reason = self._copters.identify(due_ns, self._history)
+        if reason:
+            self.request_stop(reason)
+        self.plan = self._copters.plan
+        self._monitor.margins_s = self.plan.margins_s
+
+    def _set_point(
+        self, row: int, control: VehicleControl, *, commanded: bool, key_ms: int, due_ns: int
+    ) -> tuple[Any, ...] | None:
+        """Fields of the set-point that a vehicle is sent at this tick, if any."""
+        if self._copters is not None:
+            return self._copters.set_point(row, control, self.phase, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
+        if not commanded:
+            return None
+        north, east = control.command_m_s2
+        return mavlink.acceleration_set_point(
+            key_ms=key_ms, target_system=self.vehicles[row].system_id, north_m_s2=north, east_m_s2=east
+        )
 
     def _watch(self, controls: list[VehicleControl], distance_m: FloatArray) -> None:
         """End the flight on a collision or a spacing error past the limit."""

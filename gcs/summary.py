@@ -107,6 +107,7 @@ def summarise(
         "loop": scenario.control.loop,
         "delay_margin_s": _number(design["delay_margin_s"]),
         "delay_margin_continuous_s": _number(design["delay_margin_continuous_s"]),
+        "response": design.get("response"),
         "loop_delay_s": _spread(loop_delay),
         "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
         "settling_time_s": settled,

@@ -5,19 +5,24 @@ from dataclasses import dataclass
 from typing import Any
 
 from gcs import mavlink
+from gcs.autopilots import (
+    ARM_DISARM,
+    LAUNCHED,
+    SET_MESSAGE_INTERVAL,
+    SET_MODE,
+    Goal,
+    Kind,
+    Step,
+    commanded_mode,
+    mode_command,
+)
 from gcs.clocks import LEAST_SAMPLES, VehicleClock
 from gcs.sequence import SequenceCounter
+from gcs.startup import Startup
 
 Address = tuple[str, int]
 
-ARM_DISARM = 400
-SET_MODE = 176
-SET_MESSAGE_INTERVAL = 511
-
 ARMED = 0x80
-CUSTOM_MODE_ENABLED = 1.0
-GUIDED = 4
-HOLD = 5
 STATE_CRITICAL = 5
 
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
@@ -36,9 +41,20 @@ class _Command:
 
 
 class RemoteVehicle:
-    """What is known of one vehicle; `converse` brings it to the state the station wants."""
+    """What is known of one vehicle; `converse` brings it to the state the station wants.
 
-    def __init__(self, system_id: int, *, telemetry_hz: float, report: Callable[[str, str], None]) -> None:
+    A vehicle with an autopilot has a `startup`; `land` says how it is to end.
+    """
+
+    def __init__(
+        self,
+        system_id: int,
+        *,
+        telemetry_hz: float,
+        report: Callable[[str, str], None],
+        startup: Startup | None = None,
+        land: bool = False,
+    ) -> None:
         self.system_id = system_id
         self.address: Address | None = None
         self.heard_ns = 0  # newest valid frame
@@ -47,8 +63,13 @@ class RemoteVehicle:
         self.armed = False
         self.custom_mode = -1
         self.critical = False
-        self.wanted_mode: int | None = GUIDED
+        self.goal: Goal | None = Goal.FLY
+        """None: it is left to itself."""
+        self.startup = startup
+        self.first_heard_ns: int | None = None
         self.rates_set = False
+        self._land = land
+        self._now_ns = 0
         self._telemetry_interval_us = 1e6 / telemetry_hz
         self._report = report
         self._sequence = 0
@@ -57,11 +78,22 @@ class RemoteVehicle:
         self._acknowledged_ns = 0
 
     @property
+    def kind(self) -> Kind:
+        return LAUNCHED if self.startup is None else self.startup.kind or LAUNCHED
+
+    @property
+    def end_mode(self) -> int:
+        """The mode it is to end in."""
+        return self.kind.land_mode if self._land else self.kind.hold_mode
+
+    @property
     def guided(self) -> bool:
-        return self.armed and self.custom_mode == GUIDED
+        return self.armed and self.custom_mode == self.kind.guided_mode
 
     @property
     def ready(self) -> bool:
+        if self.startup is not None:
+            return not self._next(self.startup).missing
         return self.guided and self.rates_set and self.clock.estimate.samples >= LEAST_SAMPLES
 
     @property
@@ -69,11 +101,13 @@ class RemoteVehicle:
         """What keeps it from being ready, in words."""
         if self.address is None:
             return "not heard"
+        if self.startup is not None:
+            return self._next(self.startup).missing
         if not self.rates_set:
             return "does not accept the telemetry rate"
         if self.clock.estimate.samples < LEAST_SAMPLES:
             return "does not answer TIMESYNC"
-        if self.custom_mode != GUIDED:
+        if self.custom_mode != self.kind.guided_mode:
             return "does not enter GUIDED"
         return "" if self.armed else "does not arm"
 
@@ -86,14 +120,16 @@ class RemoteVehicle:
         """Take in a HEARTBEAT. One sent before the vehicle took a command in does not undo what its ACK said."""
         if now_ns - self._acknowledged_ns < _NS + 2 * (self.clock.rtt_ns or 0):
             return
-        custom_mode, _, _, base_mode, system_status, _ = fields
+        custom_mode, vehicle_type, autopilot, base_mode, system_status, _ = fields
+        if self.startup is not None:
+            self.startup.heartbeat(autopilot, vehicle_type)
         was_guided = self.guided
         self.custom_mode, self.armed = custom_mode, bool(base_mode & ARMED)
         critical = system_status == STATE_CRITICAL
         if critical and not self.critical:
             self._report("vehicle", "is in failsafe")
         elif was_guided and not self.guided and not critical:
-            self._report("vehicle", "left GUIDED")
+            self._report("vehicle", f"left {self.kind.guided_name}")
         self.critical = critical
 
     def acknowledge(self, fields: tuple[Any, ...], now_ns: int) -> None:
@@ -109,12 +145,16 @@ class RemoteVehicle:
         if result != _ACCEPTED:
             name = RESULTS[result] if result < len(RESULTS) else str(result)
             self._report("vehicle", f"answered {name} to command {command}")
+            if self.startup is not None:
+                self.startup.refused(command, waiting.parameters)
             self._not_before_ns = now_ns + _NS
             return
+        if self.startup is not None:
+            self.startup.accepted(command, waiting.parameters, now_ns)
         if command == SET_MESSAGE_INTERVAL:
-            self.rates_set = True
+            self.rates_set = self.startup is None or self.startup.rates_set
         elif command == SET_MODE:
-            self.custom_mode = int(waiting.parameters[1])
+            self.custom_mode = commanded_mode(self.kind, waiting.parameters)
             self.critical = False
             self._acknowledged_ns = now_ns
         elif command == ARM_DISARM:
@@ -127,6 +167,7 @@ class RemoteVehicle:
         One command is in flight at a time (an ACK carries no request id); it is sent again, with the confirmation
         raised, when three round trips or 1 s have passed without an answer.
         """
+        self._now_ns = now_ns
         if self.address is None or now_ns < self._not_before_ns:
             return None
         waiting = self._command
@@ -135,7 +176,7 @@ class RemoteVehicle:
                 return None
             waiting.sent_ns = now_ns
             waiting.confirmation = (waiting.confirmation + 1) & 0xFF
-            if waiting.command == SET_MODE and waiting.parameters[1] != self.wanted_mode:
+            if waiting.command == SET_MODE and (waiting.command, waiting.parameters) != self._wanted():
                 self._command = waiting = None
         if waiting is None:
             wanted = self._wanted()
@@ -153,17 +194,29 @@ class RemoteVehicle:
         )
 
     def _wanted(self) -> tuple[int, tuple[float, ...]] | None:
-        if self.wanted_mode is None:
+        if self.goal is None:
             return None
-        if self.wanted_mode == GUIDED and not self.rates_set:
+        if self.goal is Goal.END:
+            return mode_command(self.kind, self.end_mode) if self.custom_mode != self.end_mode else None
+        if self.startup is not None:
+            return self._next(self.startup).command
+        if not self.rates_set:
             return SET_MESSAGE_INTERVAL, (float(mavlink.LOCAL_POSITION_NED), self._telemetry_interval_us)
-        if self.custom_mode != self.wanted_mode:
-            return SET_MODE, (CUSTOM_MODE_ENABLED, float(self.wanted_mode))
-        if self.wanted_mode == GUIDED and not self.armed:
-            return ARM_DISARM, (1.0,)
-        return None
+        if self.custom_mode != self.kind.guided_mode:
+            return mode_command(self.kind, self.kind.guided_mode)
+        return (ARM_DISARM, (1.0,)) if not self.armed else None
+
+    def _next(self, startup: Startup) -> Step:
+        return startup.next(
+            custom_mode=self.custom_mode,
+            armed=self.armed,
+            clock_known=self.clock.estimate.samples >= LEAST_SAMPLES,
+            now_ns=self._now_ns,
+        )
 
     def forget_rates(self) -> None:
         """The vehicle seems to have started anew: its rates have to be set again."""
         self.rates_set = False
+        if self.startup is not None:
+            self.startup.forget_rates()
         self._command = None

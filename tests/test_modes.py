@@ -7,14 +7,19 @@ from gcs.modes import END_PATIENCE_S, Phase, next_phase
 
 def test_phases_follow_each_other_in_one_order_only() -> None:
     order = list(Phase)
-    flags = product((False, True), repeat=3)
-    for phase, (ready, stop, holding), waited_s in product(order, list(flags), (0.0, END_PATIENCE_S + 1)):
-        after = next_phase(phase, all_ready=ready, stop=stop, all_holding=holding, waited_s=waited_s)
-        assert order.index(after) - order.index(phase) in {0, 1, 2}
-        if stop and phase in {Phase.CONNECTING, Phase.FLYING}:
+    flags = product((False, True), repeat=4)
+    for phase, (ready, stop, holding, identified), waited_s in product(order, list(flags), (0.0, END_PATIENCE_S + 1)):
+        after = next_phase(
+            phase, all_ready=ready, stop=stop, all_holding=holding, waited_s=waited_s, identified=identified
+        )
+        assert order.index(after) >= order.index(phase)
+        if stop and phase in {Phase.CONNECTING, Phase.IDENTIFYING, Phase.FLYING}:
             assert after is Phase.ENDING
         elif phase is Phase.CONNECTING:
-            assert after is (Phase.FLYING if ready else Phase.CONNECTING)
+            unidentified = Phase.FLYING if identified else Phase.IDENTIFYING
+            assert after is (unidentified if ready else Phase.CONNECTING)
+        elif phase is Phase.IDENTIFYING:
+            assert after is (Phase.FLYING if identified else Phase.IDENTIFYING)
         elif phase is Phase.FLYING:
             assert after is Phase.FLYING
         elif phase is Phase.ENDING:

@@ -1,0 +1,94 @@
+"""What the station does for vehicles with autopilots only: patience, one common frame, identification, set-points."""
+
+from collections.abc import Callable
+from math import hypot
+from typing import Any
+
+from gcs.control import VehicleControl
+from gcs.identification import Identification
+from gcs.modes import Phase
+from gcs.pilots import Pilots
+from gcs.plan import FlightPlan
+from gcs.startup import between
+from gcs.telemetry import StateHistory
+from gcs.vehicle import RemoteVehicle
+from scenarios.schema import NS_PER_S
+
+PATIENCE_S = 120.0
+"""How long a vehicle may take from its first heartbeat until it is in the air and takes set-points."""
+START_PATIENCE_S = 360.0
+"""How long all of them may take, whenever each was first heard."""
+_FRAME_RESOLUTION_M = 0.005
+"""Half of the last digit of a latitude: smaller changes of an origin are none."""
+
+
+class Copters:
+    """The autopilots of a flight. `plan` becomes that with the margins of what was identified."""
+
+    def __init__(
+        self, plan: FlightPlan, vehicles: list[RemoteVehicle], report: Callable[[str, str, int], None]
+    ) -> None:
+        self.plan = plan
+        self.frame_ne_m = [(0.0, 0.0)] * len(vehicles)
+        """Where each vehicle's local frame begins, in that of the first vehicle."""
+        self._vehicles = vehicles
+        self._pilots = Pilots(len(vehicles), period_s=1.0 / plan.scenario.rates.control_hz)
+        self._identification = Identification(plan, vehicles, report) if plan.responses is None else None
+
+    def impatience(self, due_ns: int, start_ns: int) -> str:
+        """Why the start has to be given up: a vehicle cannot be flown or has had its time. Empty if it has not."""
+        refused = [v for v in self._vehicles if v.startup is not None and v.startup.refusal]
+        if refused:
+            return "refused: " + "; ".join(f"vehicle {v.system_id} {v.missing}" for v in refused)
+        out_of_time = due_ns - start_ns > START_PATIENCE_S * NS_PER_S
+
+        def late(vehicle: RemoteVehicle) -> bool:
+            heard_ns = start_ns if vehicle.first_heard_ns is None else vehicle.first_heard_ns
+            return not vehicle.ready and (out_of_time or due_ns - heard_ns > PATIENCE_S * NS_PER_S)
+
+        unready = [f"vehicle {v.system_id} {v.missing}" for v in self._vehicles if late(v)]
+        return "not ready: " + "; ".join(unready) if unready else ""
+
+    def locate(self, history: StateHistory) -> None:
+        """Bring the vehicles' local frames to that of the first one, as their origins become known."""
+        origins = [vehicle.startup.origin if vehicle.startup else None for vehicle in self._vehicles]
+        for row, origin in enumerate(origins):
+            if origins[0] is None or origin is None:
+                continue
+            north, east = between(origins[0], origin)
+            before = self.frame_ne_m[row]
+            if hypot(north - before[0], east - before[1]) > _FRAME_RESOLUTION_M:
+                self.frame_ne_m[row] = north, east
+                history.forget(row)
+
+    @property
+    def identified(self) -> bool:
+        """Whether it is known how all vehicles answer."""
+        return self._identification is None
+
+    def identify(self, due_ns: int, history: StateHistory) -> str:
+        """Move the identification on by a tick; why it failed, if it has."""
+        if self._identification is None:
+            return ""
+        found = self._identification.next(due_ns, history)
+        if isinstance(found, str):
+            return found
+        if found is not None:
+            self.plan, self._identification = found, None
+        return ""
+
+    def set_point(
+        self, row: int, control: VehicleControl, phase: Phase, *, commanded: bool, key_ms: int, due_ns: int
+    ) -> tuple[Any, ...] | None:
+        """Fields of the set-point that a vehicle is sent at this tick, if any: to hover, to be identified, to fly."""
+        vehicle, command = self._vehicles[row], control.command_m_s2
+        airborne = vehicle.startup is not None and vehicle.startup.airborne
+        if phase is Phase.CONNECTING and airborne:
+            return self._pilots.hover(row, vehicle, key_ms=key_ms)
+        if phase is Phase.IDENTIFYING and self._identification is not None:
+            command, commanded = self._identification.command(due_ns), True
+        if not commanded or control.sample_ns <= 0:
+            self._pilots.rest(row)
+            return None
+        velocity = control.state[2:4]
+        return self._pilots.accelerate(row, vehicle, command, velocity, key_ms=key_ms, now_ns=due_ns)
