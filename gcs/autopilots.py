@@ -6,6 +6,7 @@ Commander.cpp, offboardCheck.cpp).
 
 from dataclasses import dataclass
 from enum import Enum
+from math import nan
 from typing import NamedTuple
 
 from gcs import mavlink
@@ -20,7 +21,7 @@ CUSTOM_MODE_ENABLED = 1.0
 ARDUPILOT, PX4 = 3, 12
 """MAV_AUTOPILOT"""
 _MULTICOPTERS = {2: "quadrotor", 3: "coaxial", 4: "helicopter", 13: "hexarotor", 14: "octorotor", 15: "tricopter"}
-_FIXED_WING = 1
+_NOT_YET_KNOWN, _FIXED_WING = 0, 1
 
 _POSITION_FLAGS, _CONSTANT_POSITION = 0x08 | 0x10, 0x80
 """Estimator flags: horizontal position, relative and absolute, and that it only pretends to have one. The same bits in
@@ -84,8 +85,10 @@ PX4_COPTER = Kind(
 )
 
 
-def kind_of(autopilot: int, vehicle_type: int) -> Kind | str:
-    """The kind of vehicle that a HEARTBEAT shows, or why it cannot be flown."""
+def kind_of(autopilot: int, vehicle_type: int) -> Kind | str | None:
+    """The kind of vehicle that a HEARTBEAT shows, or why it cannot be flown; None if it does not know yet itself."""
+    if vehicle_type == _NOT_YET_KNOWN:
+        return None  # ArduPilot before its motors are set up
     if vehicle_type == _FIXED_WING and autopilot == ARDUPILOT:
         return (
             "is an ArduPlane, which takes no velocity set-points but speed, heading and altitude "
@@ -150,8 +153,9 @@ def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
     if not seen.armed:
         return Step("does not arm", (ARM_DISARM, (1.0,)))
     if not seen.took_off and not seen.airborne:
-        above_m = seen.sea_level_m if kind.altitude_above_sea else 0.0
-        return Step("does not take off", (TAKE_OFF, (0.0,) * 6 + (altitude_m + above_m,)))
+        # PX4 would take off towards a latitude, longitude and yaw that are numbers; NaN is where it stands.
+        where = (0.0, 0.0, 0.0, nan, nan, nan, altitude_m + seen.sea_level_m)
+        return Step("does not take off", (TAKE_OFF, where if kind.altitude_above_sea else (0.0,) * 6 + (altitude_m,)))
     climbs = f"climbs to {altitude_m:g} m, is at {seen.relative_altitude_m or 0.0:.1f} m"
     return Step("" if seen.airborne else climbs)
 

@@ -90,5 +90,7 @@ class Copters:
         if not commanded or control.sample_ns <= 0:
             self._pilots.rest(row)
             return None
+        if not vehicle.guided:
+            self._pilots.rest(row)  # what it is told shows that set-points come; it begins where the vehicle is
         velocity = control.state[2:4]
         return self._pilots.accelerate(row, vehicle, command, velocity, key_ms=key_ms, now_ns=due_ns)

@@ -50,8 +50,8 @@ class Startup:
         if self.kind is not None or self.refusal:
             return
         found = kind_of(autopilot, vehicle_type)
-        if isinstance(found, str):
-            self.refusal = found
+        if not isinstance(found, Kind):
+            self.refusal = found or ""
             return
         self.kind = found
         self._rates = {
@@ -100,10 +100,15 @@ class Startup:
         elif command == TAKE_OFF:
             self._took_off_ns = now_ns
 
-    def refused(self, command: int, parameters: tuple[float, ...]) -> None:
-        """Note that a command was refused: an origin that is not sent is found in another way."""
+    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
+        """Note that a command was refused: an origin that is not sent is found in another way.
+
+        A take-off told twice is refused by a vehicle that had heard it the first time, and whose answer was lost.
+        """
         if command == SET_MESSAGE_INTERVAL and parameters[0] == mavlink.GPS_GLOBAL_ORIGIN:
             self._accepted.add(parameters[0])
+        elif command == TAKE_OFF and repeated:
+            self._took_off_ns = now_ns
 
     def forget_rates(self) -> None:
         """The vehicle seems to have started anew."""

@@ -34,6 +34,8 @@ from scenarios.schema import NS_PER_S
 CONNECT_PATIENCE_S = 20.0
 SILENCE_S = 1.5
 """A vehicle whose telemetry has not come for this long is lost: it gets no more set-points and is flown around."""
+AUTOPILOT_COMPONENT = 1
+"""A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
 _HEARTBEAT_NS = NS_PER_S
 
 
@@ -176,9 +178,11 @@ class Station:
                 continue
             vehicle.heard_ns = datagram.received_ns
             vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
-            if frame.component_id == 1:
-                vehicle.frames.add(frame.sequence)
             self.frames.append((frame.data, datagram.received_ns))
+            if frame.component_id != AUTOPILOT_COMPONENT:
+                self.counters["other component"] += 1
+                continue
+            vehicle.frames.add(frame.sequence)
             self._handle(row, vehicle, frame, datagram, outgoing)
 
     def _is_from(self, vehicle: RemoteVehicle, datagram: Datagram, msg_id: int) -> bool:

@@ -184,6 +184,9 @@ def _study(options: StressOptions) -> "tuple[Study, dict[str, Any]]":
     from scenarios.files import load
 
     scenario = load(options.scenario_file)
+    if scenario.dynamics == "autopilot":
+        wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
+        raise typer.BadParameter(f"{options.scenario_file}: dynamics: read 'autopilot', wanted {wanted}")
     # the slower gains of the schedule are not flown here, and need not be designed
     scheduled = scenario.model_copy(
         update={"monitor": scenario.monitor.model_copy(update={"time_scales": (1.0,), "act": False})}

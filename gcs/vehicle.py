@@ -146,7 +146,8 @@ class RemoteVehicle:
             name = RESULTS[result] if result < len(RESULTS) else str(result)
             self._report("vehicle", f"answered {name} to command {command}")
             if self.startup is not None:
-                self.startup.refused(command, waiting.parameters)
+                repeated = waiting.confirmation > 0
+                self.startup.refused(command, waiting.parameters, now_ns, repeated=repeated)
             self._not_before_ns = now_ns + _NS
             return
         if self.startup is not None:

@@ -292,6 +292,8 @@ class Copter:
         altitude_m = command.param7 - (0.0 if own_mode else ORIGIN_ALTITUDE_M)
         if own_mode and not (self.armed and self.mode == self.rules.guided_mode):
             return FAILED
+        if not own_mode and math.isfinite(command.param5 + command.param6):
+            return mavlink.DENIED  # it would take off towards that latitude and longitude, which is not simulated
         if not (self.landed and self._ready(time_ns) and 0.0 < altitude_m < ABSURD):
             return FAILED if own_mode else TEMPORARILY_REJECTED
         self.mode, self._takeoff_m = self.rules.takeoff_mode, altitude_m

@@ -82,8 +82,10 @@ class Command(NamedTuple):
     param1: float
     param2: float
     param3: float
+    param5: float
+    param6: float
     param7: float
-    """z of a COMMAND_INT."""
+    """Parameters 5 to 7 are x, y and z of a COMMAND_INT."""
 
 
 class Heartbeat(NamedTuple):
@@ -182,6 +184,7 @@ def _decode(number: int, frame: bytes) -> Message:
     decoded: Any = _DECODER.decode(bytearray(frame))
     if number == HEARTBEAT:
         return Heartbeat(decoded.type)
+    long = number == COMMAND_LONG
     return Command(
         (frame[5], frame[6]),
         decoded.target_system,
@@ -190,7 +193,7 @@ def _decode(number: int, frame: bytes) -> Message:
         decoded.param1,
         decoded.param2,
         decoded.param3,
-        decoded.param7 if number == COMMAND_LONG else decoded.z,
+        *((decoded.param5, decoded.param6, decoded.param7) if long else (decoded.x, decoded.y, decoded.z)),
     )
 
 

@@ -47,13 +47,17 @@ def px4_mode(main: int, sub: int = 0) -> bytes:
     return command(176, 1, main, sub)
 
 
+def take_off_px4(altitude_m: float, place: float = math.nan) -> bytes:
+    return command(22, 0, 0, 0, math.nan, place, place, GROUND_M + altitude_m)
+
+
 def airborne(flavour: Flavour = "ardupilot", **settings: Any) -> tuple[Copter, float]:
     """A vehicle that hovers at 20 m, under velocity control and at rest, and the time in s since its start."""
     vehicle = copter(flavour, **settings)
     if flavour == "ardupilot":
         told = [mode(4), arm(), command(22, 0, 0, 0, 0, 0, 0, 20)]
     else:
-        told = [arm(), command(22, 0, 0, 0, 0, 0, 0, GROUND_M + 20)]
+        told = [arm(), take_off_px4(20.0)]
     assert [result(vehicle, data, 5.0 + 0.1 * k) for k, data in enumerate(told)] == [0] * len(told)
     tell(vehicle, setpoint(mask=VELOCITY_ACCELERATION), 30.0)
     assert vehicle.motion.altitude_m == pytest.approx(20.0, abs=0.5)
@@ -104,8 +108,9 @@ def test_guided_and_take_off_need_position_arming_and_mode_in_ardupilot() -> Non
 
 def test_px4_takes_off_to_an_altitude_above_sea_level_and_then_holds() -> None:
     vehicle = copter("px4")
-    assert result(vehicle, command(22, 0, 0, 0, 0, 0, 0, 20.0), 5.0) == 1  # below the ground
-    assert result(vehicle, command(22, 0, 0, 0, 0, 0, 0, GROUND_M + 20.0), 5.1) == 0
+    assert result(vehicle, take_off_px4(20.0 - GROUND_M), 5.0) == 1  # below the ground
+    assert result(vehicle, take_off_px4(20.0, 0.0), 5.05) == 2  # at latitude and longitude 0
+    assert result(vehicle, take_off_px4(20.0), 5.1) == 0
     assert vehicle.mode == PX4_TAKEOFF
     assert result(vehicle, arm(), 5.2) == 0
     vehicle.step([], START + 30 * SECOND)

@@ -1,0 +1,152 @@
+"""What the station tells a vehicle of each kind next, as a table; and what it refuses to fly."""
+
+import math
+
+import pytest
+
+from gcs.autopilots import ARDUCOPTER, PX4_COPTER, Kind, Seen, commanded_mode, kind_of, mode_command, next_step
+from gcs.startup import Startup, between, shifted
+
+ALTITUDE_M = 20.0
+GOOD = 0x33F
+BEFORE = Seen(
+    interval_due=None,
+    clock_known=True,
+    position_heard=True,
+    estimator_flags=GOOD,
+    origin_known=True,
+    custom_mode=0,
+    armed=False,
+    took_off=False,
+    airborne=False,
+    relative_altitude_m=0.0,
+    sea_level_m=584.0,
+)
+OFFBOARD = 6 << 16
+
+
+def told(kind: Kind, seen: Seen) -> tuple[str, tuple[int, tuple[float, ...]] | None]:
+    step = next_step(kind, seen, altitude_m=ALTITUDE_M)
+    return step.missing, step.command
+
+
+def test_arducopter_goes_guided_arms_takes_off_and_is_ready_in_this_order() -> None:
+    seen = BEFORE
+    assert told(ARDUCOPTER, seen) == ("does not enter GUIDED", (176, (1.0, 4.0)))
+    seen = seen._replace(custom_mode=4)
+    assert told(ARDUCOPTER, seen) == ("does not arm", (400, (1.0,)))
+    seen = seen._replace(armed=True)
+    assert told(ARDUCOPTER, seen) == ("does not take off", (22, (0.0,) * 6 + (20.0,)))
+    seen = seen._replace(took_off=True, relative_altitude_m=7.31)
+    assert told(ARDUCOPTER, seen) == ("climbs to 20 m, is at 7.3 m", None)
+    assert told(ARDUCOPTER, seen._replace(airborne=True)) == ("", None)
+
+
+def test_px4_arms_takes_off_to_an_altitude_above_the_sea_and_enters_offboard_in_the_air() -> None:
+    seen = BEFORE._replace(custom_mode=4 << 16 | 3 << 24)
+    assert told(PX4_COPTER, seen) == ("does not arm", (400, (1.0,)))
+    seen = seen._replace(armed=True)
+    _, command = told(PX4_COPTER, seen)
+    assert command is not None
+    assert (command[0], command[1][6]) == (22, 604.0)
+    assert all(math.isnan(value) for value in command[1][3:6])  # numbers would be a place to fly to
+    seen = seen._replace(took_off=True, custom_mode=4 << 16 | 2 << 24)
+    assert told(PX4_COPTER, seen)[1] is None
+    seen = seen._replace(airborne=True, custom_mode=4 << 16 | 3 << 24)
+    assert told(PX4_COPTER, seen) == ("does not enter OFFBOARD", (176, (1.0, 6.0, 0.0)))
+    assert told(PX4_COPTER, seen._replace(custom_mode=OFFBOARD)) == ("", None)
+
+
+@pytest.mark.parametrize(
+    ("flags", "ready"), [(0x33F, True), (0x18, True), (0x08, False), (0x10, False), (0x98, False), (0x481, False)]
+)
+def test_nothing_is_armed_before_the_estimator_has_a_position(flags: int, ready: bool) -> None:
+    for kind in (ARDUCOPTER, PX4_COPTER):
+        missing, command = told(kind, BEFORE._replace(estimator_flags=flags))
+        assert (command is not None) == ready
+        assert ready or missing == f"has no position yet (estimator flags 0x{flags:x})"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"interval_due": (32.0, 20000.0)}, "does not accept the rate of message 32"),
+        ({"clock_known": False}, "does not answer TIMESYNC"),
+        ({"estimator_flags": None}, "sends no estimator status (message 193)"),
+        ({"position_heard": False}, "sends no LOCAL_POSITION_NED"),
+        ({"relative_altitude_m": None}, "sends no GLOBAL_POSITION_INT"),
+        ({"origin_known": False}, "does not say where its local origin is"),
+    ],
+)
+def test_what_is_missing_is_named(change: dict[str, object], words: str) -> None:
+    assert told(ARDUCOPTER, BEFORE._replace(**change))[0] == words  # pyright: ignore[reportArgumentType]
+
+
+def test_a_vehicle_found_flying_is_not_told_to_take_off() -> None:
+    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup.heartbeat(3, 2)
+    startup.take(33, (1000, -353632620, 1491652370, 596_000, 12_000, 0, 0, 0, 0))
+    startup.next(custom_mode=4, armed=True, clock_known=True, now_ns=0)
+    assert startup.airborne
+
+
+def test_a_take_off_whose_answer_was_lost_counts_although_the_second_is_refused() -> None:
+    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup.heartbeat(3, 2)
+    startup.refused(22, (0.0,) * 7, 0, repeated=True)
+    startup.take(33, (1000, -353632620, 1491652370, 589_000, 5_000, 0, 0, 0, 0))
+    startup.next(custom_mode=4, armed=True, clock_known=True, now_ns=0)
+    assert not startup.airborne  # a set-point now would end its take-off at 5 m
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "vehicle_type", "words"),
+    [(3, 1, "is an ArduPlane"), (12, 1, "type 1 with autopilot 12"), (3, 10, "type 10"), (8, 2, "autopilot 8")],
+)
+def test_what_cannot_be_flown_is_refused_by_name(autopilot: int, vehicle_type: int, words: str) -> None:
+    found = kind_of(autopilot, vehicle_type)
+    assert isinstance(found, str)
+    assert words in found
+
+
+def test_a_vehicle_that_does_not_know_its_type_yet_is_waited_for() -> None:
+    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup.heartbeat(3, 0)
+    assert (startup.kind, startup.refusal) == (None, "")
+    startup.heartbeat(3, 13)
+    assert startup.kind is ARDUCOPTER
+
+
+@pytest.mark.parametrize("kind", [ARDUCOPTER, PX4_COPTER])
+def test_a_mode_command_is_read_back_as_its_mode(kind: Kind) -> None:
+    for mode in (kind.guided_mode, kind.hold_mode, kind.land_mode):
+        assert commanded_mode(kind, mode_command(kind, mode)[1]) == mode
+
+
+def test_origin_from_a_moving_vehicle_takes_the_time_between_both_positions_into_account() -> None:
+    origin = (47.397742, 8.545594)
+    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup.take(32, (10_000, 100.0, -40.0, -5.0, 12.0, -3.0, 0.0))
+    place = shifted(origin, 100.0 + 0.5 * 12.0, -40.0 - 0.5 * 3.0)
+    startup.take(33, (10_500, round(place[0] * 1e7), round(place[1] * 1e7), 500_000, 5_000, 0, 0, 0, 0))
+    assert startup.origin is not None
+    assert between(origin, startup.origin) == pytest.approx((0.0, 0.0), abs=0.012)  # 1e-7 degrees are 11 mm
+
+
+def test_the_origin_a_vehicle_says_wins_over_home_and_over_one_that_is_computed() -> None:
+    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup.take(242, (470000000, 80000000, 400_000, 3.0, 4.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0))
+    assert startup.origin is not None
+    assert between(startup.origin, (47.0, 8.0)) == pytest.approx((3.0, 4.0), abs=1e-3)
+    startup.take(49, (471000000, 81000000, 400_000, 0))
+    startup.take(32, (10_000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    startup.take(33, (10_000, 470000000, 80000000, 400_000, 0, 0, 0, 0, 0))
+    assert startup.origin == pytest.approx((47.1, 8.1))
+
+
+def test_a_position_of_zeros_is_none() -> None:
+    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup.take(32, (10_000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    startup.take(33, (10_000, 0, 0, 0, 0, 0, 0, 0, 0))
+    assert startup.origin is None
+    assert startup.relative_altitude_m is None

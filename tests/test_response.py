@@ -1,0 +1,120 @@
+"""The margin of vehicles that answer with a lag: closed forms, the spectrum, a simulation, and limits of the model."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from gains.delay import delay_margin
+from gains.design import Requirement, design
+from gains.errors import BadModelError, InfeasibleError
+from gains.formation import FormationModel
+from gains.response import (
+    Response,
+    continuous_margin,
+    follower_loop,
+    leader_loop,
+    requirement_with,
+    sampled_margin,
+)
+from gains.rightmost import rightmost_root
+
+GAINS = (-2.1 * np.eye(2), 0.6 * np.eye(2), 2.0 * np.eye(2))
+RESPONSES = [Response(0.08, 1.67), Response(0.15, 2.0), Response(0.3, 0.5), Response(0.15, 0.0)]
+
+
+def crossing_margin(response: Response) -> float:
+    """The follower's margin on a frequency grid: u/e of the loop on the unit circle, the least phase over frequency."""
+    omega = np.geomspace(0.05, 50.0, 2_000_001)
+    s = 1j * omega
+    lag, gain = response.lag_s, response.velocity_gain_1_s
+    answer = (s + gain) / (lag * s**2 + s + gain)
+    loop = answer * (2.1 * s + 2.0) / s**2
+    beyond = np.flatnonzero(np.diff(np.sign(np.abs(loop) - 1.0)))
+    phases = (np.angle(loop[beyond]) + math.pi) % (2.0 * math.pi)
+    return float((phases / omega[beyond]).min())
+
+
+@pytest.mark.parametrize("response", RESPONSES)
+def test_continuous_margin_is_the_least_phase_over_frequency_of_the_transfer_function(response: Response) -> None:
+    A, B, K = follower_loop(GAINS, response)
+    assert delay_margin(A, B @ K) == pytest.approx(crossing_margin(response), rel=1e-5)  # the grid's cell: 3e-6
+
+
+@pytest.mark.parametrize("response", RESPONSES)
+def test_rightmost_root_crosses_the_axis_at_the_margin(response: Response) -> None:
+    margin_s = continuous_margin(GAINS, [response])
+    for factor, stable in ((0.99, True), (1.01, False)):
+        roots = []
+        for A, B, K in (leader_loop(GAINS, response), follower_loop(GAINS, response)):
+            roots.append(rightmost_root([(A, 0.0), (B @ K, factor * margin_s)]).real)
+        assert (max(roots) < 0.0) == stable
+
+
+def grows(response: Response, delay_s: float, period_s: float) -> bool:
+    """Whether a follower's error grows in a step by step simulation with held commands that act late."""
+    A, B, K = (matrix[::2, ::2] for matrix in follower_loop(GAINS, response))
+    n, steps = len(A), 10
+    h = period_s / steps
+    generator = np.zeros((n + 1, n + 1))
+    generator[:n, :n], generator[:n, n:] = h * A, h * B
+    Phi, G = (M := expm(generator))[:n, :n], M[:n, n]
+    late = round(delay_s / h)
+    x = np.eye(n)[0]
+    commands: list[float] = [0.0] * (late // steps + 2)
+    size: list[float] = []
+    for k in range(round(60.0 / h)):
+        if k % steps == 0:
+            commands.append(float(K[0] @ x))
+        sent = (k - late) // steps
+        command = commands[late // steps + 2 + sent] if k >= late else 0.0
+        x = Phi @ x + G * command
+        size.append(abs(x[0]))
+    half = len(size) // 2
+    return max(size[half:]) > max(size[half // 2 : half])
+
+
+@pytest.mark.parametrize("response", RESPONSES)
+def test_a_simulated_follower_diverges_beyond_the_sampled_margin_and_not_below(response: Response) -> None:
+    period_s = 0.02
+    margin_s = sampled_margin(GAINS, [response], period_s=period_s)
+    assert not grows(response, 0.97 * margin_s, period_s)
+    assert grows(response, 1.03 * margin_s, period_s)
+
+
+def test_a_very_short_lag_leaves_the_margin_of_vehicles_that_answer_at_once() -> None:
+    model = FormationModel((-1, 0, 1))
+    at_once = delay_margin(*model.ground_loop(*GAINS))
+    assert continuous_margin(GAINS, [Response(1e-5, 0.0)]) == pytest.approx(at_once, abs=2e-5)
+
+
+def test_a_lag_costs_about_its_length() -> None:
+    without = continuous_margin(GAINS, [Response(1e-5, 0.0)])
+    assert without - continuous_margin(GAINS, [Response(0.02, 0.0)]) == pytest.approx(0.02, rel=0.05)
+
+
+def test_the_slowest_vehicle_has_the_margin_of_all() -> None:
+    each = [sampled_margin(GAINS, [response], period_s=0.02) for response in RESPONSES]
+    assert sampled_margin(GAINS, RESPONSES, period_s=0.02) == min(each)
+
+
+@pytest.mark.parametrize("response", RESPONSES[:2])
+def test_a_design_for_a_response_has_the_margin_asked_for(response: Response) -> None:
+    model, period_s = FormationModel((-1, 0)), 0.02
+    wanted = Requirement(delay_margin_s=0.4, string_peak_max=1.0)
+    found = design(model, requirement_with(wanted, response, period_s=period_s), period_s=period_s)
+    margin_s = sampled_margin((found.K1, found.K2, found.K3), [response], period_s=period_s)
+    assert margin_s == pytest.approx(0.4, abs=1e-7)
+    assert found.delay_margin_s > 0.4
+
+
+def test_a_margin_that_no_gains_have_is_refused_with_the_response_named() -> None:
+    with pytest.raises(InfeasibleError, match=r"lag_s = 0\.15"):
+        requirement_with(Requirement(delay_margin_s=29.9), Response(0.15, 2.0), period_s=0.02)
+
+
+@pytest.mark.parametrize(("lag_s", "gain"), [(0.0, 1.0), (math.nan, 1.0), (0.1, -1.0), (0.1, math.inf)])
+def test_a_response_that_is_none_is_refused(lag_s: float, gain: float) -> None:
+    with pytest.raises(BadModelError):
+        Response(lag_s, gain)
