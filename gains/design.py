@@ -11,7 +11,7 @@ Source: Sahoo 2012 (see `gains.formation`), sections 3 and 5.
 """
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,9 @@ from gains.behaviour import Behaviour, BlockMargin, Gains, behaviour, block_marg
 from gains.delay import delay_margin
 from gains.errors import BadModelError, DisagreementError, InfeasibleError
 from gains.formation import FormationModel, checked_gain
+from gains.graph_design import GraphDesign, GraphMethod, graph_design
+from gains.pattern import Pattern, leader_follower
+from gains.requirement import ALPHA_MIN, DELAY_MARGIN_MAX_S, Requirement, plain
 from gains.robust import Certificate, SolverFacts, certify, robustness
 from gains.sampled import sampled_delay_margin
 from gains.search import ScalarGains, largest_alpha, largest_margin
@@ -27,51 +30,11 @@ from gains.search import ScalarGains, largest_alpha, largest_margin
 FloatArray = NDArray[np.float64]
 
 PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
-DEFAULT_DELAY_MARGIN_S = 0.3
 # The certificate proves this share of α: at α itself the proof is on the edge of existence.
 _CERTIFIED_SHARE = 1 - 1e-4
-# Below this α, which belongs to margins beyond 30 s, the numbers in a proof spread too far for the solver.
-_ALPHA_MIN, _DELAY_MARGIN_MAX_S = 5e-4, 30.0
 # The search aims this much above a margin asked for, so that rounding cannot leave it below.
 _MARGIN_AIM_S = 2e-10
 _TRADE_OFF_MARGINS_S = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
-
-
-@dataclass(frozen=True)
-class Requirement:
-    """What the design must reach.
-
-    With `delay_margin_s` given, α is made as large as possible; with `alpha` alone, the delay margin; with both, α is
-    made as large as possible and must reach `alpha`. With neither, a margin of 0.3 s is wanted.
-
-    Attributes
-    ----------
-    delay_margin_s
-        Least sampled delay margin, up to 30 s.
-    alpha
-        Least sector bound, from 5e-4.
-    string_peak_max
-        Limit, at least 1, on the growth of spacing errors from vehicle to vehicle, without delay and at half the
-        margin. 1 lets no error grow down the chain and costs little α. Not limited if None.
-    """
-
-    delay_margin_s: float | None = None
-    alpha: float | None = None
-    string_peak_max: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("delay_margin_s", "alpha"):
-            wanted = getattr(self, name)
-            if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
-                raise BadModelError(f"{name} = {wanted}; wanted a positive number")
-        if self.delay_margin_s is not None and self.delay_margin_s > _DELAY_MARGIN_MAX_S:
-            raise BadModelError(f"delay_margin_s = {self.delay_margin_s}; wanted at most {_DELAY_MARGIN_MAX_S} s")
-        if self.alpha is not None and self.alpha < _ALPHA_MIN:
-            raise BadModelError(f"alpha = {self.alpha}; wanted at least {_ALPHA_MIN}")
-        if self.string_peak_max is not None and not 1 <= self.string_peak_max < np.inf:
-            raise BadModelError(f"string_peak_max = {self.string_peak_max}; wanted a number of at least 1")
-        if self.delay_margin_s is None and self.alpha is None:
-            object.__setattr__(self, "delay_margin_s", DEFAULT_DELAY_MARGIN_S)
 
 
 @dataclass(frozen=True)
@@ -123,9 +86,8 @@ class Design:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings, for JSON; a number that is not finite becomes None."""
-        plain = asdict(self)
         renamed = {"K1": "K1_1_s", "K2": "K2_1_s", "K3": "K3_1_s2"}
-        return {renamed.get(name, name): _plain(value) for name, value in plain.items()}
+        return {renamed.get(name, name): plain(value) for name, value in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
@@ -163,7 +125,35 @@ class Design:
             raise BadModelError(f"the design is not as to_dict writes it: {error}") from error
 
 
-def design(formation: FormationModel, requirement: Requirement | None = None, *, period_s: float) -> Design:
+@overload
+def design(
+    formation: FormationModel,
+    requirement: Requirement | None = None,
+    *,
+    period_s: float,
+    method: Literal["inclusion"] = "inclusion",
+) -> Design: ...
+
+
+@overload
+def design(
+    formation: FormationModel,
+    requirement: Requirement | None = None,
+    *,
+    period_s: float,
+    method: GraphMethod,
+    pattern: Pattern | None = None,
+) -> GraphDesign: ...
+
+
+def design(
+    formation: FormationModel,
+    requirement: Requirement | None = None,
+    *,
+    period_s: float,
+    method: Literal["inclusion"] | GraphMethod = "inclusion",
+    pattern: Pattern | None = None,
+) -> Design | GraphDesign:
     """Return the gains that meet the requirement and are the best in what it leaves open.
 
     Parameters
@@ -174,12 +164,19 @@ def design(formation: FormationModel, requirement: Requirement | None = None, *,
         A sampled delay margin of 0.3 s if not given.
     period_s
         Period of the control loop: sample, hold.
+    method
+        The inclusion principle, or a method of the graph route, see `gains.graph_design`.
+    pattern
+        For the graph route, who may use whose output; the leader-follower pattern (4.6) if not given.
 
     Raises
     ------
     InfeasibleError
         If no gains meet the requirement; the message says what can be reached.
     """
+    if method != "inclusion":
+        links = leader_follower(formation) if pattern is None else pattern
+        return graph_design(formation, links, requirement, method=method, period_s=period_s)
     wanted = Requirement() if requirement is None else requirement
     _check_period(period_s)
     gains = _best_gains(wanted, period_s)
@@ -192,7 +189,8 @@ def design(formation: FormationModel, requirement: Requirement | None = None, *,
         method="inclusion",
     )
     short_of_margin = wanted.delay_margin_s is not None and result.delay_margin_s < wanted.delay_margin_s
-    if short_of_margin or (wanted.alpha is not None and result.alpha < wanted.alpha):
+    short_of_alpha = wanted.alpha is not None and result.alpha < wanted.alpha
+    if short_of_margin or short_of_alpha:
         raise DisagreementError(
             f"the search found gains for {wanted}, but the exact analysis gives them delay_margin_s = "
             f"{result.delay_margin_s!r} and alpha = {result.alpha!r}"
@@ -217,6 +215,8 @@ def evaluate_gains(
 def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains:
     """Gains that meet the requirement, or InfeasibleError with what can be reached."""
     limit = wanted.string_peak_max
+    if wanted.decay_rate_1_s is not None:
+        return _fast_gains(wanted, period_s)
     if wanted.delay_margin_s is None:
         assert wanted.alpha is not None
         found = largest_margin(wanted.alpha, period_s, limit)
@@ -241,6 +241,46 @@ def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains:
             f"alpha at that margin is {gains.alpha:.4f}, and {at_alpha}"
         )
     return gains
+
+
+def _fast_gains(wanted: Requirement, period_s: float) -> ScalarGains:
+    """The most robust gains of the wanted margin if they decay fast enough, or of the largest margin at which they do.
+
+    Along the curve of the most robust gains both α and the decay rate fall as the margin grows.
+    """
+    limit, decay, alpha = wanted.string_peak_max, wanted.decay_rate_1_s or 0.0, wanted.alpha or 0.0
+
+    def gains_at(margin_s: float) -> ScalarGains | None:
+        found = largest_alpha(margin_s, period_s, limit)
+        return found if found is not None and _decay_rate(found) >= decay and found.alpha >= alpha else None
+
+    if wanted.delay_margin_s is not None:
+        gains = gains_at(wanted.delay_margin_s + _MARGIN_AIM_S)
+        if gains is None:
+            best = largest_alpha(wanted.delay_margin_s, period_s, limit)
+            reached = "nothing" if best is None else f"{_decay_rate(best):.4f} 1/s with alpha = {best.alpha:.4f}"
+            raise InfeasibleError(
+                f"decay_rate_1_s = {decay} (with alpha = {wanted.alpha}) and delay_margin_s = {wanted.delay_margin_s} "
+                f"exclude each other: the most robust gains of that margin reach {reached}; lower delay_margin_s"
+            )
+        return gains
+    low, high = period_s / 10.0, DELAY_MARGIN_MAX_S
+    gains = gains_at(low)
+    if gains is None:
+        raise InfeasibleError(
+            f"decay_rate_1_s = {decay} (with alpha = {wanted.alpha}) leaves no delay margin with period_s = "
+            f"{period_s}; lower it, or period_s"
+        )
+    while high > low * (1.0 + 1e-6):
+        middle = (low * high) ** 0.5
+        found = gains_at(middle)
+        low, high, gains = (middle, high, found) if found is not None else (low, middle, gains)
+    return gains
+
+
+def _decay_rate(gains: ScalarGains) -> float:
+    """Decay rate (1/s) without delay: the slower of leader, s + k1, and follower, s² + k1 s + k3."""
+    return min(gains.k1, -float(np.roots([1.0, gains.k1, gains.k3]).real.max()))
 
 
 def _alpha_limit(period_s: float, string_peak_max: float | None) -> str:
@@ -289,7 +329,7 @@ def _assess(
         leader=leader,
         follower=follower,
         behaviour=behaviour(gains, (margin_s + period_s) / 2),
-        certificate=certify(*gains, _CERTIFIED_SHARE * alpha) if alpha >= _ALPHA_MIN else None,
+        certificate=certify(*gains, _CERTIFIED_SHARE * alpha) if alpha >= ALPHA_MIN else None,
         requirement=requirement,
         trade_off=trade_off(period_s=period_s, string_peak_max=requirement.string_peak_max if requirement else None),
         method=method,
@@ -305,19 +345,6 @@ def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple
 def _check_period(period_s: float) -> None:
     if not (np.isfinite(period_s) and period_s > 0):
         raise BadModelError(f"period_s = {period_s}; wanted a positive number of seconds")
-
-
-def _plain(value: Any) -> Any:
-    """Lists, numbers, strings and None in place of arrays, tuples, numpy numbers and numbers that are not finite."""
-    if isinstance(value, dict):
-        return {str(name): _plain(entry) for name, entry in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value
 
 
 def _number(value: float | None) -> float:

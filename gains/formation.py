@@ -91,6 +91,11 @@ class FormationModel:
         start = self.axes * (2 * vehicle - 1)
         return slice(start, start + self.axes)
 
+    def output_slice(self, vehicle: int) -> slice:
+        """Place of all errors of a vehicle in the state: e_i^p and e_i^v, for the leader e_0^v."""
+        start = 0 if self._known(vehicle) == 0 else self.spacing_slice(vehicle).start
+        return slice(start, self.velocity_slice(vehicle).stop)
+
     def input_slice(self, vehicle: int) -> slice:
         """Place of u_i in the input."""
         start = self.axes * self._known(vehicle)

@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,6 +20,15 @@ app = typer.Typer(
 
 ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file, as scenarios/triangle5.toml")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
+
+
+class Method(Enum):
+    """How gains are found, as `control.method` of a scenario."""
+
+    INCLUSION = "inclusion"
+    GRAPH_DK = "graph-dk"
+    GRAPH_LQR = "graph-lqr"
+
 
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
@@ -83,11 +93,21 @@ def fly(
 
 
 @app.command()
-def design(scenario_file: ScenarioFile, as_json: AsJson = False) -> None:
+def design(
+    scenario_file: ScenarioFile,
+    method: Annotated[
+        Method | None, typer.Option(help="in place of the scenario's: inclusion principle, or a graph method")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
     """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
     from gcs.plan import flight_plan
 
-    result, _ = flight_plan(_scenario(scenario_file))
+    scenario = _scenario(scenario_file)
+    if method is not None:
+        control = scenario.control.model_copy(update={"method": method.value, "gains": None, "blocks": ()})
+        scenario = scenario.model_copy(update={"control": control})
+    result, _ = flight_plan(scenario)
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     else:

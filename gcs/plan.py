@@ -7,13 +7,20 @@ from typing import Any
 import numpy as np
 
 from gains.behaviour import Gains
-from gains.design import Design, Requirement, design, evaluate_gains
+from gains.design import Design, design, evaluate_gains
 from gains.formation import FormationModel
+from gains.graph_design import evaluate_graph_gain, time_scaled
+from gains.pattern import Pattern, leader_follower, with_links, without_links
+from gains.requirement import Requirement
 from gains.response import Response, continuous_margin, requirement_with
+from gains.structure import strongly_connected_blocks
 from gcs.control import Formation
 from gcs.responses import Responses, given_responses, margins_with
 from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
+
+_MARGINS_AROUND_LOSS_S = 0.1, 30.0
+"""Least and largest delay margin of the gains flown around a lost vehicle."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +37,13 @@ class FlightPlan:
     separable: bool = True
     """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
     blocks: tuple[Gains, ...] = ()
-    """(K1, K2, K3) of each set of the gain schedule."""
+    """(K1, K2, K3) of each set of the gain schedule; empty for gains on another pattern."""
     responses: Responses | None = None
     """How the vehicles answer; None if at once, or not yet known."""
+    around_loss: tuple[FloatArray, ...] = ()
+    """In place of `gains` while a vehicle is lost; empty if they serve. A leader-follower tree stays stable when the
+    nearest vehicle ahead stands in for a lost one; gains on another pattern may not without all of their terms, so
+    they are left for the inclusion gains of the same delay margin. The step in the commands is accepted."""
 
     @cached_property
     def gains(self) -> tuple[FloatArray, ...]:
@@ -71,6 +82,8 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
     """
     formation = plan_formation(scenario)
     model = FormationModel(tuple(formation.predecessor.tolist()))
+    if scenario.control.method != "inclusion" or scenario.control.blocks:
+        return _graph_plan(scenario, formation, model)
     responses = given_responses(scenario)
     found = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
     schedule = _schedule(scenario, model, found)
@@ -138,9 +151,97 @@ def _design(scenario: Scenario, model: FormationModel, response: Response | None
     if control.gains is not None:
         own, front, spacing = (gain * np.eye(2) for gain in (control.gains.K1, control.gains.K2, control.gains.K3))
         return evaluate_gains(model, own, front, spacing, period_s=period_s)
-    requirement = Requirement(
-        delay_margin_s=control.delay_margin_s, alpha=control.alpha, string_peak_max=control.string_peak_max
-    )
+    requirement = _requirement(scenario)
     if response is not None:
         requirement = requirement_with(requirement, response, period_s=period_s)
     return design(model, requirement, period_s=period_s)
+
+
+def _requirement(scenario: Scenario) -> Requirement:
+    control = scenario.control
+    return Requirement(
+        delay_margin_s=control.delay_margin_s,
+        alpha=control.alpha,
+        decay_rate_1_s=control.decay_rate_1_s,
+        string_peak_max=control.string_peak_max,
+    )
+
+
+def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel) -> tuple[dict[str, Any], FlightPlan]:
+    """Design and plan on an information pattern, designed or given block by block."""
+    control, period_s = scenario.control, 1.0 / scenario.rates.control_hz
+    pattern = _pattern(scenario, formation, model)
+    if control.blocks:
+        found = evaluate_graph_gain(model, pattern, _given_gain(scenario, formation, model), period_s=period_s)
+    else:
+        assert control.method != "inclusion"
+        found = design(model, _requirement(scenario), method=control.method, pattern=pattern, period_s=period_s)
+    scales = scenario.monitor.time_scales
+    gains = [time_scaled(model, found.K, scale) for scale in scales]
+    slower = [evaluate_graph_gain(model, pattern, gain, period_s=period_s) for gain in gains[1:]]
+    plan = FlightPlan(
+        scenario=scenario,
+        formation=formation,
+        gain=found.K,
+        delay_margin_s=found.delay_margin_s,
+        slower=tuple((entry.K, entry.delay_margin_s) for entry in slower),
+        separable=len(_loops(model, found.K)) == model.vehicles,
+        around_loss=_around_loss(model, found.delay_margin_s, scales, period_s),
+    )
+    names = ("alpha", "decay_rate_1_s", "delay_margin_s", "delay_margin_continuous_s")
+    schedule = [
+        {"time_scale": scale, "blocks": _blocks(entry.K, formation, model, pattern)}
+        | {name: entry.to_dict()[name] for name in names}
+        for scale, entry in zip(scales, [found, *slower], strict=True)
+    ]
+    ids = formation.system_ids
+    result = found.to_dict() | {
+        "links": [[ids[i], ids[j]] for i, j in found.links],
+        "blocks": schedule[0]["blocks"],
+        "schedule": schedule,
+    }
+    return result, plan
+
+
+def _pattern(scenario: Scenario, formation: Formation, model: FormationModel) -> Pattern:
+    """Who may use whose errors."""
+    row = {system_id: k for k, system_id in enumerate(formation.system_ids)}
+    tree = leader_follower(model)
+    if scenario.control.blocks:
+        none = without_links(tree, tree.links)
+        return with_links(none, [(row[block.vehicle], row[block.of]) for block in scenario.control.blocks])
+    return with_links(tree, [(row[v.system_id], row[heard]) for v in scenario.vehicles for heard in v.hears])
+
+
+def _given_gain(scenario: Scenario, formation: Formation, model: FormationModel) -> FloatArray:
+    row = {system_id: k for k, system_id in enumerate(formation.system_ids)}
+    K = np.zeros((model.inputs, model.states))
+    for block in scenario.control.blocks:
+        K[model.input_slice(row[block.vehicle]), model.output_slice(row[block.of])] = block.gain
+    return K
+
+
+def _blocks(K: FloatArray, formation: Formation, model: FormationModel, pattern: Pattern) -> list[dict[str, Any]]:
+    """The gain matrix block by block, as a scenario gives it."""
+    ids = formation.system_ids
+    return [
+        {"vehicle": ids[i], "of": ids[j], "gain": K[model.input_slice(i), model.output_slice(j)].tolist()}
+        for i, j in pattern.links
+    ]
+
+
+def _loops(model: FormationModel, K: FloatArray) -> list[Any]:
+    """Groups of vehicles that act on each other."""
+    outputs = [model.output_slice(i) for i in range(model.vehicles)]
+    pattern = np.abs(model.A) + np.abs(model.B @ K)
+    return strongly_connected_blocks(np.array([[pattern[own, other].sum() for other in outputs] for own in outputs]))
+
+
+def _around_loss(
+    model: FormationModel, delay_margin_s: float, scales: tuple[float, ...], period_s: float
+) -> tuple[FloatArray, ...]:
+    """Inclusion gains of the same delay margin, as far as they can have it, slowed down by each factor."""
+    margin_s = min(max(delay_margin_s, _MARGINS_AROUND_LOSS_S[0]), _MARGINS_AROUND_LOSS_S[1])
+    found = design(model, Requirement(delay_margin_s=margin_s, string_peak_max=1.0), period_s=period_s)
+    K = model.overlapping_gain(found.K1, found.K2, found.K3)
+    return tuple(time_scaled(model, K, scale) for scale in scales)

@@ -1,5 +1,6 @@
 """What the terminal shows before and after a flight."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,15 @@ UNKNOWN = "–"
 def print_design(design: dict[str, Any], console: Console | None = None) -> None:
     """Gains, robustness, both margins, and the trade-off between robustness and margin."""
     console = console or Console(highlight=False, soft_wrap=True)
+    console.print(f"design   {design['method']}, loop {design['loop']}, period {design['period_s'] * 1e3:g} ms")
+    if "blocks" in design:
+        _print_graph_design(design, console)
+        return
     own, front, spacing = (design[name][0][0] for name in ("K1_1_s", "K2_1_s", "K3_1_s2"))
     behaviour = design["behaviour"]
-    console.print(f"design   {design['method']}, loop {design['loop']}, period {design['period_s'] * 1e3:g} ms")
     console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
     console.print("         u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike")
-    console.print(
-        f"margin   {_ms(design['delay_margin_s'])} of loop delay in the sampled loop, "
-        f"{_ms(design['delay_margin_continuous_s'])} in the continuous model"
-    )
+    _print_margins(design, console)
     console.print(_response(design.get("response")), end="")
     console.print(
         f"alpha    {design['alpha']:.4f} (robustness bound); spacing errors grow by {behaviour['string_peak']:.2f} "
@@ -35,6 +36,38 @@ def print_design(design: dict[str, Any], console: Console | None = None) -> None
     for point in design["trade_off"]:
         table.add_row(_ms(point["delay_margin_s"], unit=""), f"{point['alpha']:.3f}")
     console.print(table)
+
+
+def _print_margins(design: dict[str, Any], console: Console) -> None:
+    console.print(
+        f"margin   {_ms(design['delay_margin_s'])} of loop delay in the sampled loop, "
+        f"{_ms(design['delay_margin_continuous_s'])} in the continuous model"
+    )
+
+
+def _print_graph_design(design: dict[str, Any], console: Console) -> None:
+    """The gain matrix by blocks: who uses whose errors, and how."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("vehicle", "uses", "spacing error, 1/s²", "velocity error, 1/s"):
+        table.add_column(heading, justify="right")
+    for block in design["blocks"]:
+        *spacing, north, east = zip(*block["gain"], strict=True)
+        table.add_row(str(block["vehicle"]), str(block["of"]), _matrix(spacing), _matrix([north, east]))
+    console.print(table)
+    _print_margins(design, console)
+    loss = "" if design["cost_loss"] is None else f"; costs {design['cost_loss']:.1%} more than with all information"
+    console.print(
+        f"alpha    {design['alpha']:.4f} (robustness bound of the whole formation), decay "
+        f"{design['decay_rate_1_s']:.2f} 1/s without delay{loss}"
+    )
+
+
+def _matrix(columns: Sequence[Sequence[float]]) -> str:
+    """A block as one number where it is that on each axis alike, else with all of its numbers."""
+    if not columns:
+        return UNKNOWN
+    (a, c), (b, d) = columns
+    return f"{a:+.4f}" if a == d and b == c == 0.0 else f"[{a:+.4f} {b:+.4f}; {c:+.4f} {d:+.4f}]"
 
 
 def print_summary(summary: dict[str, Any], folder: Path, console: Console | None = None) -> None:

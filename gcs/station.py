@@ -302,7 +302,8 @@ class Station:
                 if gone != was:
                     self._report("vehicle", "is lost" if gone else "is heard again", vehicle.system_id)
             self._lost = lost
-            self._law = feedback_law(self.plan.formation, self.plan.gains, lost)
+            gains = self.plan.around_loss if any(lost) and self.plan.around_loss else self.plan.gains
+            self._law = feedback_law(self.plan.formation, gains, lost)
         view = FleetView(
             time_s=self.scenario_time_s(due_ns),
             flying=flying,

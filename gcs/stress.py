@@ -284,7 +284,7 @@ def _result(
         "delay_margin_s": design["delay_margin_s"],
         "delay_margin_continuous_s": design["delay_margin_continuous_s"],
         "period_s": design["period_s"],
-        "gains": {name: design[name] for name in ("K1_1_s", "K2_1_s", "K3_1_s2")},
+        "gains": {name: design[name] for name in ("K1_1_s", "K2_1_s", "K3_1_s2", "blocks") if name in design},
         "real_time": options.real_time,
         "axes": dict(options.axes),
         "onset": None if onset is None else onset.to_dict(),

@@ -128,14 +128,56 @@ def _contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
     yield from _formation_contradictions(scenario)
     yield from _velocity_contradictions(scenario)
     yield from _links_contradictions(scenario)
-    control = scenario.control
-    if control.gains is not None and (control.alpha is not None or control.delay_margin_s is not None):
-        yield "control.gains", control.gains.model_dump(), "either gains or a requirement (alpha, delay_margin_s)"
+    yield from _control_contradictions(scenario)
     yield from _monitor_contradictions(scenario)
     yield from _autopilot_contradictions(scenario)
     limits = scenario.limits
     if limits.speed_max_m_s is not None and limits.speed_max_m_s <= limits.speed_min_m_s:
         yield "limits.speed_max_m_s", limits.speed_max_m_s, f"more than speed_min_m_s = {limits.speed_min_m_s:g}"
+
+
+def _control_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+    control, vehicles = scenario.control, {vehicle.system_id: vehicle for vehicle in scenario.vehicles}
+    requirements = ("alpha", "delay_margin_s", "decay_rate_1_s")
+    required = any(getattr(control, name) is not None for name in requirements)
+    if control.gains is not None and required:
+        yield "control.gains", control.gains.model_dump(), f"either gains or a requirement ({', '.join(requirements)})"
+    if control.blocks and (required or control.gains is not None):
+        wanted = f"either blocks, or gains, or a requirement ({', '.join(requirements)})"
+        yield "control.blocks", f"{len(control.blocks)} blocks", wanted
+    if scenario.dynamics == "autopilot" and (control.method != "inclusion" or control.blocks):
+        wanted = "inclusion without blocks, with dynamics autopilot: margins with a lag are those of its gains"
+        yield "control.method", control.method, wanted
+    if control.gains is not None and control.method != "inclusion":
+        yield "control.method", control.method, "inclusion, with gains given; a graph's gains are given as blocks"
+    yield from _block_contradictions(scenario)
+    known = "the system_id of a vehicle of this scenario"
+    for k, vehicle in enumerate(scenario.vehicles):
+        for other in vehicle.hears:
+            if other not in vehicles or other in (vehicle.system_id, vehicle.follows):
+                yield f"vehicles[{k}].hears", other, f"{known}, neither its own nor that it follows"
+        if vehicle.hears and (control.method == "inclusion" or control.blocks):
+            wanted = "nothing, without control.method graph-lqr or graph-dk; blocks say themselves who is heard"
+            yield f"vehicles[{k}].hears", list(vehicle.hears), wanted
+
+
+def _block_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+    vehicles = {vehicle.system_id: vehicle for vehicle in scenario.vehicles}
+    seen: set[tuple[int, int]] = set()
+    for k, block in enumerate(scenario.control.blocks):
+        for name, system_id in (("vehicle", block.vehicle), ("of", block.of)):
+            if system_id not in vehicles:
+                yield f"control.blocks[{k}].{name}", system_id, "the system_id of a vehicle of this scenario"
+        if block.of in vehicles:
+            columns = 2 if vehicles[block.of].follows is None else 4
+            if any(len(row) != columns for row in block.gain):
+                wanted = (
+                    f"two rows of {columns} numbers, as vehicle {block.of} {'leads' if columns == 2 else 'follows'}"
+                )
+                yield f"control.blocks[{k}].gain", [list(row) for row in block.gain], wanted
+        if (block.vehicle, block.of) in seen:
+            yield f"control.blocks[{k}]", (block.vehicle, block.of), "each pair of vehicles once"
+        seen.add((block.vehicle, block.of))
 
 
 def _monitor_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:

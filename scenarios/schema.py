@@ -32,6 +32,8 @@ class Vehicle(Part):
     """System id of the vehicle in front; the one vehicle without it is the leader."""
     offset_ne_m: Pair | None = None
     """Wanted position relative to the vehicle in front (minus the spacing d of thesis eq. 2.10)."""
+    hears: tuple[SystemId, ...] = ()
+    """Vehicles besides the one in front whose errors its command may use; with a graph method only."""
     position_ne_m: Pair
     velocity_ne_m_s: Pair
     flavour: Flavour | None = None
@@ -70,22 +72,40 @@ class FixedGains(Part):
     K3: float
 
 
+class GainBlock(Part):
+    """What one vehicle's errors add to another's command, or to its own: a block of the gain matrix K of u = K e."""
+
+    vehicle: SystemId
+    """Whose command."""
+    of: SystemId
+    """Whose errors."""
+    gain: tuple[tuple[float, ...], tuple[float, ...]]
+    """Rows for north and east; columns for the spacing error (north, east) and the velocity error (north, east). The
+    leader has a velocity error only."""
+
+
 class Control(Part):
     """How the gains are found and where the loop is closed.
 
-    With neither requirement nor gains, a delay margin of 0.3 s is required. One requirement given: the other quantity
-    is made as large as possible. Both given: both are met or the design says that they cannot be.
+    With neither requirement nor gains, a delay margin of 0.3 s is required. With a delay margin required, robustness is
+    made as large as possible; without, the delay margin. What is required is met or the design says why it cannot be.
     """
 
-    method: Literal["inclusion"] = "inclusion"
+    method: Literal["inclusion", "graph-dk", "graph-lqr"] = "inclusion"
+    """inclusion: every vehicle uses its own errors and the velocity error of the one in front. The graph methods use
+    all errors of these two, and of those it hears."""
     loop: Literal["ground"] = "ground"
     delay_margin_s: Positive | None = None
     """Least delay margin of the sampled loop."""
     alpha: Annotated[float, Field(gt=0, lt=1)] | None = None
     """Least robustness bound (thesis eq. 3.29)."""
+    decay_rate_1_s: Positive | None = None
+    """Least decay rate of the continuous loop without delay."""
     string_peak_max: Annotated[float, Field(ge=1)] = 1.0
     """Most that spacing errors may grow from one vehicle to the next, whatever their frequency: with 1 not at all."""
     gains: FixedGains | None = None
+    blocks: tuple[GainBlock, ...] = ()
+    """In place of a design, the gain matrix block by block; blocks left out are zero."""
 
 
 class Jitter(Part):

@@ -59,7 +59,7 @@ class Without:
         return [d for d in datagrams if d[0] not in self.cut or not self.from_ns <= d[2] < self.until_ns]
 
 
-@pytest.mark.parametrize("name", ["triangle5", "triangle5_scattered", "chain3", "chain20"])
+@pytest.mark.parametrize("name", ["triangle5", "triangle5_scattered", "chain3", "chain20", "chain3_bidirectional"])
 def test_formation_settles_below_one_percent_of_the_spacing(name: str) -> None:
     plan, design = planned(name)
     _, summary = flown(plan, design)
@@ -162,6 +162,18 @@ def test_a_lost_vehicle_is_named_and_flown_around() -> None:
     # Vehicle 3 stays where it was, two spacings from the leader; 91 m/s times 20 ms apart in sampling instant.
     assert gap == pytest.approx([2 * 121.92, -2 * 121.92], abs=2.0)
     assert all(last[k]["mode"] == Mode.NOMINAL for k in (1, 3, 4, 5))
+
+
+def test_coupled_formation_keeps_its_places_around_a_lost_vehicle() -> None:
+    plan, design = planned("chain3_bidirectional", duration_s=20.0)
+    assert not plan.separable
+    vehicles = Without(plan.scenario, {2}, from_ns=START_NS + 8 * S)
+    ticks, _ = flown(plan, design, vehicles=vehicles)
+    last = {int(row["system_id"]): row for row in ticks[ticks["time_s"] <= 20.0][-3:]}
+    gap = [last[1][name] - last[3][name] for name in ("north_m", "east_m")]
+    # two spacings, as with vehicle 2 between them; 91 m/s times 20 ms apart in sampling instant
+    assert gap == pytest.approx([2 * 121.92, -2 * 121.92], abs=2.0)
+    assert last[2]["mode"] == Mode.LOST
 
 
 def test_a_vehicle_that_is_heard_again_is_taken_back() -> None:
