@@ -30,7 +30,8 @@ _MOST_SAMPLES = 300
 _ENVELOPE_S = 1.0
 _FEWEST_ENVELOPE = 4
 _LONGEST_HANKEL = 120
-_ORDER = 4
+FOLLOWER_MODES = 4
+"""Two of its own and two of what is late: enough for a vehicle that nobody behind acts on."""
 _RANK_FLOOR = 1e-9
 _LEAST_SHARE = 0.1
 """A mode counts when it carries this part of the motion: what rounding and noise of the clock add carries less."""
@@ -97,11 +98,11 @@ def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -
     return Motion(np.arange(count, dtype=np.float64) * period_s, values, period_s)
 
 
-def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Growth | None:
+def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: int = FOLLOWER_MODES) -> Growth | None:
     """The growth rate of a motion from `start_s` on, when faster modes have died away.
 
-    The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. None if fewer than `FEWEST_SAMPLES`
-    are left or nothing moves.
+    The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. `modes` is how many are looked for: a
+    loop of several vehicles has more that last. None if fewer than `FEWEST_SAMPLES` are left or nothing moves.
     """
     inside = (motion.time_s >= start_s) & (motion.time_s < end_s)
     values, time_s = motion.values[inside], motion.time_s[inside]
@@ -114,11 +115,11 @@ def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Grow
     scale = np.sqrt((kept**2).mean(axis=0))
     kept = kept[:, scale > 0.0] / scale[scale > 0.0]
     period_s = motion.period_s * step
-    fitted = _slowest_mode(kept, period_s)
+    fitted = _slowest_mode(kept, period_s, modes)
     if fitted is None:
         return None
     mode, misfit_error = fitted
-    halves = [_slowest_mode(part, period_s) for part in np.array_split(kept, 2)] if len(kept) >= 24 else []
+    halves = [_slowest_mode(part, period_s, modes) for part in np.array_split(kept, 2)] if len(kept) >= 24 else []
     rates = [half[0].real for half in halves if half is not None]
     drift = abs(rates[0] - rates[1]) / 2.0 if len(rates) == 2 else abs(mode.real) / 10.0
     return Growth(
@@ -180,32 +181,32 @@ def _count_before_rest(values: FloatArray) -> int:
     return int(np.count_nonzero(still_to_come >= DECAY_KEPT * size.max()))
 
 
-def _slowest_mode(values: FloatArray, period_s: float) -> tuple[complex, float] | None:
+def _slowest_mode(values: FloatArray, period_s: float, modes: int) -> tuple[complex, float] | None:
     """s = ln z / T of the slowest mode that carries a share of the motion, and the standard error of its real part."""
     if len(values) < FEWEST_SAMPLES or not values.any():
         return None
     time_s = np.arange(len(values)) * period_s
-    z = _modes(values)
+    z = _modes(values, modes)
     if z is None:
         return None
     slowest = _slowest(z, values)
     trend_1_s = float(np.log(abs(slowest)) / period_s)
     # relative to the middle of the window, so that no weight overflows
     flattened = values * np.exp(np.clip(-trend_1_s * (time_s - time_s.mean()), -300.0, 300.0))[:, np.newaxis]
-    z = _modes(flattened)
+    z = _modes(flattened, modes)
     if z is None:
         return None
     z, error = _with_error(z, flattened, period_s)
     return complex(trend_1_s, 0.0) + complex(np.log(z)) / period_s, error
 
 
-def _modes(values: FloatArray) -> ComplexArray | None:
-    """Modes z shared by all channels, ESPRIT of order `_ORDER` or less."""
+def _modes(values: FloatArray, most: int) -> ComplexArray | None:
+    """Modes z shared by all channels, ESPRIT of order `most` or less."""
     count = len(values)
     rows = min(count // 2, _LONGEST_HANKEL)
     windows = np.lib.stride_tricks.sliding_window_view(values, count - rows + 1, axis=0)  # (rows, channels, columns)
     left, singular, _ = np.linalg.svd(windows.reshape(rows, -1), full_matrices=False)
-    order = min(_ORDER, int(np.count_nonzero(singular > _RANK_FLOOR * singular[0])), rows - 1)
+    order = min(most, int(np.count_nonzero(singular > _RANK_FLOOR * singular[0])), rows - 1)
     if order == 0:
         return None
     shift = np.linalg.lstsq(left[:-1, :order], left[1:, :order], rcond=None)[0]

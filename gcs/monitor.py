@@ -173,8 +173,7 @@ def _lasted(since_s: float | None, wanted_s: float, now_s: float) -> bool:
     return since_s is not None and now_s - since_s >= wanted_s
 
 
-@dataclass(frozen=True)
-class FleetView:
+class FleetView(NamedTuple):
     """What the station knows of all vehicles at a tick, in the order of the formation."""
 
     time_s: float
@@ -204,13 +203,16 @@ class FormationMonitor:
         self._separable = separable
         self._period_s = period_s
         self._delays_s = np.full((max(1, round(policy.window_s / period_s)), vehicles), np.nan)
-        self._rank = min(len(self._delays_s) - 1, int(0.9 * len(self._delays_s)))
-        self._tick = 0
+        self._judged = 0
+        """Ticks of this flight so far."""
 
     def update(self, view: FleetView) -> list[tuple[int, VehicleState, VehicleState]]:
         """Judge a tick; returns the vehicles whose mode, gain set or release changed, with both states."""
-        self._delays_s[self._tick % len(self._delays_s)] = view.loop_delay_s
-        self._tick += 1
+        if view.flying:
+            self._delays_s[self._judged % len(self._delays_s)] = view.loop_delay_s
+            self._judged += 1
+        else:
+            self._judged = 0  # before the flight telemetry is slow, which says nothing of the loop that is not closed
         delays_s = self._judged_delay_s()
         changes: list[tuple[int, VehicleState, VehicleState]] = []
         states: list[VehicleState] = []
@@ -240,8 +242,12 @@ class FormationMonitor:
         ]
 
     def _judged_delay_s(self) -> list[float]:
+        count = min(self._judged, len(self._delays_s))
+        if count == 0:
+            return [nan] * len(self.states)
         # NaN sorts last: a vehicle with more than a tenth of unknown ticks has an unknown delay.
-        judged: list[float] = np.partition(self._delays_s, self._rank, axis=0)[self._rank].tolist()
+        rank = min(count - 1, int(0.9 * count))
+        judged: list[float] = np.partition(self._delays_s[:count], rank, axis=0)[rank].tolist()
         if self._separable:
             return judged
         return [nan if any(map(isnan, judged)) else max(judged)] * len(judged)

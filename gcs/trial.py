@@ -16,7 +16,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from gcs.growth import FloatArray, Growth, envelope_growth, fit_growth, motion_of
+from gcs.growth import FOLLOWER_MODES, FloatArray, Growth, envelope_growth, fit_growth, motion_of
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.onset import Loop, critical_loop, loops_of
 from gcs.plan import FlightPlan, plan_formation
@@ -40,6 +40,8 @@ _BEGUN_LOOP_DELAYS = 2.0
 """Nothing that a vehicle did at the start is left to be acted on after this many."""
 _WANTED_LOOP_DELAYS = 8.0
 _WANTED_SAMPLES = 60
+_WANTED_ERROR = 0.01
+"""Standard error of a growth rate as a share of it: with several vehicles in a loop other modes take long to go."""
 _TRACE_PERIOD_S = 0.25
 
 
@@ -301,7 +303,9 @@ def _with_growth(plan: FlightPlan, loop: Loop, flight: Flight, outcome: Outcome)
     delay_s = max(_median_delays(own, loop.system_ids).values())
     start_s = _SETTLED_LOOP_DELAYS * delay_s + 2.0 * loop.period_s
     end_s = linear_until_s(plan.scenario, own)
-    growth = fit_growth(motion_of(ticks, loop.system_ids, period_s=loop.period_s), start_s=start_s, end_s=end_s)
+    modes = len(loop.A) // 2 + 2  # those of one axis, and two of what is late; the other axis has the same
+    motion = motion_of(ticks, loop.system_ids, period_s=loop.period_s)
+    growth = fit_growth(motion, start_s=start_s, end_s=end_s, modes=max(modes, FOLLOWER_MODES))
     if growth is None:
         return replace(outcome, fit_start_s=round(start_s, 6), fit_end_s=round(min(end_s, since_s[-1]), 6))
     window = own[(since_s >= growth.start_s) & (since_s <= growth.end_s)]
@@ -335,6 +339,9 @@ def _left_linear_range_too_soon(outcome: Outcome) -> bool:
         return outcome.fit_end_s < PROBE_S / 2.0
     short = (outcome.fit_samples or 0) < _WANTED_SAMPLES
     short |= outcome.fit_end_s - outcome.fit_start_s < _WANTED_LOOP_DELAYS * (outcome.loop_delay_s or 0.0)
+    short |= (
+        outcome.fit_end_s < PROBE_S / 2.0 and (outcome.growth_error_1_s or 0.0) > _WANTED_ERROR * outcome.growth_1_s
+    )
     return short and outcome.growth_1_s > 0.0
 
 

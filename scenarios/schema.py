@@ -253,7 +253,7 @@ class Monitor(Part):
     critical_headroom: Annotated[float, Field(lt=1)] = 0.15
     hysteresis: NotNegative = 0.05
     window_s: Positive = 1.0
-    """The loop delay judged is the one that nine tenths of the ticks of this window stay below."""
+    """The loop delay judged is the one that nine tenths of the flight's ticks in this window stay below."""
     hold_s: NotNegative = 0.3
     """How long a condition holds before the slower side is taken,"""
     ease_s: NotNegative = 3.0

@@ -71,7 +71,7 @@ def test_without_its_action_caution_and_critical_come_before_the_error_and_the_f
     assert first_time_s(station, Mode.CAUTION) < first_time_s(station, Mode.CRITICAL) < out_s
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", sorted({*SEEDS, 105}))  # 105: slow telemetry before the flight was judged
 def test_no_false_alarm_in_a_nominal_flight_with_jitter(seed: int) -> None:
     """20 ms each way, and 10 ms of exponential jitter on top of each: a loop delay of about 80 ms against 300 ms."""
     link = Link(delay_s=0.02, jitter=Jitter(distribution="exponential", scale_s=0.01))

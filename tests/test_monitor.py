@@ -194,6 +194,15 @@ def test_share_of_the_new_gains_rises_without_a_jump() -> None:
     assert max(np.diff(shares)) <= 0.02 / POLICY.blend_s + 1e-9
 
 
+def test_delays_before_the_flight_are_not_judged() -> None:
+    monitor = formation(1)
+    for k in range(100):  # slow telemetry of a vehicle that is getting ready
+        monitor.update(view(k, [2.0])._replace(flying=False))
+    for k in range(100, 200):
+        monitor.update(view(k, [0.05]))
+        assert monitor.states[0].mode is Mode.NOMINAL
+
+
 def test_release_goes_from_the_end_of_the_tree_forwards() -> None:
     monitor, order = formation(4), list[int]()
     for k in range(600):
