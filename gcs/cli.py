@@ -115,6 +115,32 @@ def design(
 
 
 @app.command()
+def compare(
+    scenario_file: ScenarioFile,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="where page, figures and JSON go")] = None,
+    sizes: Annotated[bool, typer.Option(help="also time designs of growing chains")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Design and fly a scenario by the inclusion principle and on the graph, side by side."""
+    from dataclasses import asdict
+
+    from gcs import compare as comparing
+    from gcs.fly import new_folder
+
+    scenario = _scenario(scenario_file)
+    folder = _out_folder(out) if out is not None else new_folder(f"{scenario.name}-compare")
+    routes, flights = comparing.compare(scenario)
+    grown = comparing.sizes() if sizes else []
+    comparing.write_comparison(folder, scenario, routes, flights, grown)
+    if as_json:
+        typer.echo(json.dumps({"routes": [asdict(route) for route in routes], "files": str(folder)}, indent=2))
+    else:
+        comparing.print_comparison(scenario, routes, grown)
+        typer.echo(f"files    {folder}: {comparing.REPORT_FILE}, {comparing.RESULT_FILE}, PNG")
+    raise typer.Exit(0 if flights else EXIT_FAILED)
+
+
+@app.command()
 def margin(
     model_file: Annotated[Path, typer.Argument(metavar="MODEL.json", help="matrices and delays of any linear loop")],
     as_json: AsJson = False,

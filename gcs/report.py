@@ -62,6 +62,10 @@ def _print_graph_design(design: dict[str, Any], console: Console) -> None:
     )
 
 
+def number_text(value: float | None, form: str = ".5f") -> str:
+    return UNKNOWN if value is None else format(value, form)
+
+
 def _matrix(columns: Sequence[Sequence[float]]) -> str:
     """A block as one number where it is that on each axis alike, else with all of its numbers."""
     if not columns:

@@ -33,7 +33,7 @@ def growth_figure(
     measured = np.array([o.growth_1_s for o in probes], dtype=float)
     predicted = np.array([o.predicted_growth_1_s for o in probes], dtype=float)
     error = np.array([o.growth_error_1_s for o in probes], dtype=float)
-    figure, (above, below) = _figure(2, (9.0, 6.4), heights=(3.2, 1.0))
+    figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
     room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 160)
     sampled, continuous = _curves(distinct(plan_loops(study.plan)), grid_s)
@@ -62,7 +62,7 @@ def growth_figure(
     below.set_xlabel("loop delay, as measured in flight [s]")
     below.ticklabel_format(axis="y", scilimits=(-2, 2))
     above.sharex(below)
-    return _saved(figure, file)
+    return saved(figure, file)
 
 
 def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path | None:
@@ -70,7 +70,7 @@ def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path 
     probes = [o for o in outcomes if o.growth_1_s is not None]
     if not probes:
         return None
-    figure, (plot,) = _figure(1, (9.0, 4.2))
+    figure, (plot,) = figure_of(1, (9.0, 4.2))
     at = [o.coordinates[axis.name] for o in probes]
     plot.axhline(0.0, color=_LIMIT, linewidth=0.8)
     plot.plot(at, [o.predicted_growth_1_s for o in probes], "_", color=_SAMPLED, markersize=14, label="sampled model")
@@ -83,7 +83,7 @@ def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path 
     plot.set_xlabel(axis.label)
     plot.set_ylabel("growth rate of errors [1/s]")
     plot.legend(frameon=False)
-    return _saved(figure, file)
+    return saved(figure, file)
 
 
 def map_figure(
@@ -98,7 +98,7 @@ def map_figure(
     if not np.isfinite(measured).any():
         return None
     across, up = (np.array(axis.values) for axis in axes)
-    figure, (plot,) = _figure(1, (9.0, 5.6))
+    figure, (plot,) = figure_of(1, (9.0, 5.6))
     reach = max(1e-6, min(float(np.nanmax(np.abs(measured))), 1.0))
     colors = plot.pcolormesh(across, up, measured.T, cmap="RdBu_r", vmin=-reach, vmax=reach, shading="nearest")
     figure.colorbar(colors, ax=plot, label="growth rate in flight [1/s]: red grows", extend="both")
@@ -118,7 +118,7 @@ def map_figure(
         "flights: × unstable, • stable;  boundaries: — in flight, - - predicted (sampled, at the measured loop delay)",
         fontsize=9,
     )
-    return _saved(figure, file)
+    return saved(figure, file)
 
 
 def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
@@ -126,7 +126,7 @@ def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
     worst = worst_of(outcomes)
     if not worst:
         return None
-    figure, (plot,) = _figure(1, (9.0, 4.2))
+    figure, (plot,) = figure_of(1, (9.0, 4.2))
     for outcome in worst:
         error_m = np.maximum(np.array(outcome.trace_m), 1e-6)
         time_s = outcome.trace_period_s * (np.arange(error_m.size) + 0.5)
@@ -134,7 +134,7 @@ def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
     plot.set_xlabel("scenario time [s]")
     plot.set_ylabel("largest spacing error of all vehicles [m]")
     plot.legend(frameon=False, fontsize=8)
-    return _saved(figure, file)
+    return saved(figure, file)
 
 
 def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -182,7 +182,7 @@ def _verdicts(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> NDArray[np.s
     return worst
 
 
-def _figure(rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,)) -> tuple[Any, Any]:
+def figure_of(rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,)) -> tuple[Any, Any]:
     """A figure that needs no screen, and its plots from the top."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -220,6 +220,6 @@ def _link_delay_axis(plot: Any, onset: Onset) -> None:
     top.set_xlabel(f"link delay of vehicle {onset.critical}, up + down [s]: {1e3 * onset.waiting_s:.1f} ms less")
 
 
-def _saved(figure: Any, file: Path) -> Path:
+def saved(figure: Any, file: Path) -> Path:
     figure.savefig(file, dpi=_DPI)
     return file

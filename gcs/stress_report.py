@@ -1,11 +1,14 @@
 """What a campaign shows: lines on the terminal, one HTML page that needs nothing else, JUnit XML for CI."""
 
-import base64
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from gcs.page import data_uri, rendered
+from gcs.page import milliseconds_text as _ms
+from gcs.report import UNKNOWN
+from gcs.report import number_text as _number
 from gcs.stress_axes import Axis
 from gcs.study import Onset, Study
 from gcs.trial import Outcome
@@ -13,7 +16,6 @@ from gcs.trial import Outcome
 REPORT_FILE = "report.html"
 _TEMPLATE = "stress_report.html.j2"
 _MOST_ROWS = 200
-UNKNOWN = "–"
 
 
 def write_report(
@@ -26,8 +28,6 @@ def write_report(
     onset: Onset | None,
 ) -> Path:
     """The page report.html with its figures inside, and the figures as PNG files beside it."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
-
     # matplotlib takes half a second to import: only when there is something to draw
     from gcs.stress_figures import axis_figure, growth_figure, map_figure, worst_figure, worst_of
 
@@ -51,14 +51,11 @@ def write_report(
         drawn = map_figure(folder / "map.png", axes=axes, outcomes=points, verdicts=own or points)
         figures["map"] = ("Map", drawn)
     figures["worst"] = ("The worst flights", worst_figure(folder / "worst.png", everything))
-    environment = Environment(
-        loader=PackageLoader("gcs", "."), autoescape=select_autoescape(["j2"]), undefined=StrictUndefined
-    )
-    environment.filters |= {"ms": _ms, "number": _number, "percent": _percent}
-    page = environment.get_template(_TEMPLATE).render(
+    page = rendered(
+        _TEMPLATE,
         result=result,
         onset=onset,
-        figures={name: (title, _data_uri(file)) for name, (title, file) in figures.items() if file is not None},
+        figures={name: (title, data_uri(file)) for name, (title, file) in figures.items() if file is not None},
         large=large if len(axes) < 2 else [],
         points=points[:_MOST_ROWS],
         left_out=max(0, len(points) - _MOST_ROWS),
@@ -167,19 +164,3 @@ def write_junit(result: dict[str, Any], file: Path) -> None:
 
 def _along_delay(axes: Sequence[Axis]) -> bool:
     return len(axes) == 1 and axes[0].name == "delay"
-
-
-def _data_uri(png: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(png.read_bytes()).decode("ascii")
-
-
-def _ms(seconds: float | None, *, unit: str = " ms") -> str:
-    return UNKNOWN if seconds is None else f"{1e3 * seconds:.2f}{unit}"
-
-
-def _number(value: float | None, form: str = ".5f") -> str:
-    return UNKNOWN if value is None else format(value, form)
-
-
-def _percent(value: float | None, form: str = "+.3%") -> str:
-    return UNKNOWN if value is None else format(value, form)
