@@ -88,6 +88,21 @@ def continuous_margin(gains: Gains, responses: Sequence[Response]) -> float:
     return float(min(delay_margin(A, B @ K) for A, B, K in loops))
 
 
+def string_peak(gains: Gains, response: Response, *, delay_s: float) -> float:
+    """Largest growth of a spacing error from one vehicle to the next, as `gains.behaviour.string_peak`, with response.
+
+    Γ(s) = (s² I - h (s K1 - K3))^{-1} (s K2 + K3) h, h = e^{-sτ} (s + g) / (lag s² + s + g); at least |Γ(0)| = 1.
+    """
+    own, front, spacing = gains
+    fastest = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)) + 1.0 / (delay_s + response.lag_s))
+    s = 1j * np.geomspace(1e-4 * fastest, 10.0 * fastest, 4000)[:, None, None]
+    g = response.velocity_gain_1_s
+    h = np.exp(-s * delay_s) * (s + g) / (response.lag_s * s**2 + s + g)
+    loop = s**2 * np.eye(own.shape[0]) - h * (s * own - spacing)
+    growth = np.linalg.norm(np.linalg.solve(loop, h * (s * front + spacing)), ord=2, axis=(1, 2))
+    return max(1.0, float(growth.max()))
+
+
 def requirement_with(requirement: Requirement, response: Response, *, period_s: float) -> Requirement:
     """The requirement on vehicles that answer at once whose design has the wanted margin with this response.
 

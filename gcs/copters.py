@@ -18,6 +18,7 @@ PATIENCE_S = 120.0
 """How long a vehicle may take from its first heartbeat until it is in the air and takes set-points."""
 START_PATIENCE_S = 360.0
 """How long all of them may take, whenever each was first heard."""
+_SILENT_S = 3.0
 _FRAME_RESOLUTION_M = 0.005
 """Half of the last digit of a latitude: smaller changes of an origin are none."""
 
@@ -32,6 +33,9 @@ class Copters:
         self.frame_ne_m = [(0.0, 0.0)] * len(vehicles)
         """Where each vehicle's local frame begins, in that of the first vehicle."""
         self._vehicles = vehicles
+        self._report = report
+        self._waits_for = [("", 0)] * len(vehicles)
+        """What each vehicle is missing, and since when; 0 when that has been said."""
         self._pilots = Pilots(len(vehicles), period_s=1.0 / plan.scenario.rates.control_hz)
         self._identification = Identification(plan, vehicles, report) if plan.responses is None else None
 
@@ -40,6 +44,7 @@ class Copters:
         refused = [v for v in self._vehicles if v.startup is not None and v.startup.refusal]
         if refused:
             return "refused: " + "; ".join(f"vehicle {v.system_id} {v.missing}" for v in refused)
+        self._say_what_is_missing(due_ns)
         out_of_time = due_ns - start_ns > START_PATIENCE_S * NS_PER_S
 
         def late(vehicle: RemoteVehicle) -> bool:
@@ -48,6 +53,17 @@ class Copters:
 
         unready = [f"vehicle {v.system_id} {v.missing}" for v in self._vehicles if late(v)]
         return "not ready: " + "; ".join(unready) if unready else ""
+
+    def _say_what_is_missing(self, due_ns: int) -> None:
+        """A line for what a vehicle has waited for long enough that somebody would ask."""
+        for row, vehicle in enumerate(self._vehicles):
+            missing, _, _ = vehicle.missing.partition(",")  # without how far it has climbed
+            before, since_ns = self._waits_for[row]
+            if missing != before:
+                self._waits_for[row] = missing, due_ns
+            elif since_ns and (not missing or due_ns - since_ns > _SILENT_S * NS_PER_S):
+                self._waits_for[row] = missing, 0
+                self._report("start", missing or "is ready", vehicle.system_id)
 
     def locate(self, history: StateHistory) -> None:
         """Bring the vehicles' local frames to that of the first one, as their origins become known."""

@@ -12,7 +12,7 @@ from gains.formation import FormationModel
 from gains.graph_design import evaluate_graph_gain, time_scaled
 from gains.pattern import Pattern, leader_follower, with_links, without_links
 from gains.requirement import Requirement
-from gains.response import Response, continuous_margin, requirement_with
+from gains.response import Response, continuous_margin, requirement_with, string_peak
 from gains.structure import strongly_connected_blocks
 from gcs.control import Formation
 from gcs.responses import Responses, given_responses, margins_with
@@ -123,6 +123,7 @@ def described(design: dict[str, Any], plan: FlightPlan) -> dict[str, Any]:
             for system_id, found in sorted(plan.responses.of.items())
         ],
         "delay_margin_at_once_s": design["delay_margin_s"],
+        "string_peak": max(string_peak(plan.blocks[0], response, delay_s=0.0) for response in set(every)),
     }
     return design | margins[0] | {"schedule": schedule, "response": response}
 

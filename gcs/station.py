@@ -340,9 +340,11 @@ class Station:
                 self.request_stop("lost: all vehicles")
         phase = next_phase(
             self.phase,
-            all_ready=self._history.complete and all(vehicle.ready for vehicle in self.vehicles),
+            all_ready=self.phase is Phase.CONNECTING
+            and self._history.complete
+            and all(vehicle.ready for vehicle in self.vehicles),
             stop=bool(self._stop),
-            all_holding=all(v.custom_mode == v.end_mode for v in self.vehicles if v.address is not None),
+            all_holding=all(v.ended for v in self.vehicles if v.address is not None),
             waited_s=waited_s,
             identified=self._copters is None or self._copters.identified,
         )

@@ -87,6 +87,13 @@ class RemoteVehicle:
         return self.kind.land_mode if self._land else self.kind.hold_mode
 
     @property
+    def ended(self) -> bool:
+        """Whether it is seen to hold or land, or never took off: what was not flown is told nothing."""
+        if self.startup is not None and (self.startup.kind is None or not self.armed):
+            return True
+        return self.custom_mode == self.end_mode
+
+    @property
     def guided(self) -> bool:
         return self.armed and self.custom_mode == self.kind.guided_mode
 
@@ -198,7 +205,7 @@ class RemoteVehicle:
         if self.goal is None:
             return None
         if self.goal is Goal.END:
-            return mode_command(self.kind, self.end_mode) if self.custom_mode != self.end_mode else None
+            return None if self.ended else mode_command(self.kind, self.end_mode)
         if self.startup is not None:
             return self._next(self.startup).command
         if not self.rates_set:

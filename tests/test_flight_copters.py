@@ -182,6 +182,7 @@ def test_a_vehicle_that_never_gets_a_position_ends_the_start_in_its_own_time_and
     flight = fly(plan_for(scenario))
     reason = flight.station.end_reason
     assert reason.startswith("not ready: vehicle 1 has no position yet (estimator flags 0x481); vehicle 2 ")
+    assert "has no position yet (estimator flags 0x481)" in flight.texts("start")
     assert flight.ticks["due_ns"][-1] == pytest.approx(START_NS + 120e9, abs=10e9)
     assert all(not flight.copter(k).armed for k in (1, 2, 3))
 
@@ -203,6 +204,7 @@ def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str,
     flight = fly(plan_for(scenario))
     assert flight.station.end_reason == "completed: duration reached"
     assert flight.texts("vehicle").count("its clock jumped") == 3
+    assert all(flight.copter(k).counters["timesync_replies"] >= 2 for k in (1, 2, 3))  # to requests of their own
     time_s = flight.flown["time_s"]
     assert time_s[0] + 2.0 < 25.0 - (flight.flown["due_ns"][0] - START_NS) * 1e-9 < time_s[-1]  # it was in flight
     assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
@@ -248,8 +250,9 @@ def test_told_to_land_at_the_end_they_do(flavour: str) -> None:
 def test_an_arduplane_is_refused_at_once_and_by_name() -> None:
     station, plane = Station(planned("ardupilot"), start_ns=START_NS), Peer(2)
     station.step([plane.datagram(plane.link.heartbeat_encode(1, 3, 1, 0, 3), START_NS)], START_NS)
-    station.step([], START_NS + 20_000_000)
+    told = [station.step([], START_NS + 20_000_000 * k)[0] for k in range(1, 60)]
     assert station.end_reason.startswith("refused: vehicle 2 is an ArduPlane")
+    assert not any(messages(outgoing, "COMMAND_LONG") for outgoing in told)  # whoever flies it is not disturbed
 
 
 def test_a_gimbal_with_the_vehicles_system_id_is_not_taken_for_the_vehicle() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from gains.behaviour import string_peak as string_peak_at_once
 from gains.delay import delay_margin
 from gains.design import Requirement, design
 from gains.errors import BadModelError, InfeasibleError
@@ -17,6 +18,7 @@ from gains.response import (
     leader_loop,
     requirement_with,
     sampled_margin,
+    string_peak,
 )
 from gains.rightmost import rightmost_root
 
@@ -112,6 +114,19 @@ def test_a_design_for_a_response_has_the_margin_asked_for(response: Response) ->
 def test_a_margin_that_no_gains_have_is_refused_with_the_response_named() -> None:
     with pytest.raises(InfeasibleError, match=r"lag_s = 0\.15"):
         requirement_with(Requirement(delay_margin_s=29.9), Response(0.15, 2.0), period_s=0.02)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.2])
+def test_string_growth_tends_to_that_of_vehicles_that_answer_at_once(delay_s: float) -> None:
+    at_once = string_peak_at_once(GAINS, delay_s)
+    assert string_peak(GAINS, Response(1e-6, 0.0), delay_s=delay_s) == pytest.approx(at_once, rel=1e-4)
+
+
+def test_a_lag_makes_spacing_errors_grow_more_as_a_delay_of_its_length_does() -> None:
+    gains = (GAINS[0], 1.6 * np.eye(2), GAINS[2])  # more of the velocity in front: errors grow
+    with_lag = string_peak(gains, Response(0.05, 0.0), delay_s=0.2)
+    assert with_lag == pytest.approx(string_peak_at_once(gains, 0.25), rel=0.02)
+    assert with_lag > 1.05 * string_peak_at_once(gains, 0.2)
 
 
 @pytest.mark.parametrize(("lag_s", "gain"), [(0.0, 1.0), (math.nan, 1.0), (0.1, -1.0), (0.1, math.inf)])
