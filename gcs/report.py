@@ -114,11 +114,13 @@ def _response(response: dict[str, Any] | None) -> str:
     """A line on how the vehicles answer, if they do not do so at once."""
     if response is None:
         return ""
-    answers = sorted((vehicle["lag_s"], vehicle["velocity_gain_1_s"]) for vehicle in response["vehicles"])
-    (least_s, _), (most_s, gain_1_s) = answers[0], answers[-1]
-    lag = f"{least_s:.3f}" if least_s == most_s else f"{least_s:.3f} to {most_s:.3f}"
+    lags, gains = (
+        sorted(f"{vehicle[name]:.{digits}f}" for vehicle in response["vehicles"])
+        for name, digits in (("lag_s", 3), ("velocity_gain_1_s", 2))
+    )
+    lag, gain = (" to ".join(dict.fromkeys((each[0], each[-1]))) for each in (lags, gains))
     return (
-        f"response {response['source']}: lag {lag} s, velocity gain {gain_1_s:.2f} 1/s; in the margin, which would be "
+        f"response {response['source']}: lag {lag} s, velocity gain {gain} 1/s; in the margin, which would be "
         f"{_ms(response['delay_margin_at_once_s'])} without it; spacing errors grow by {response['string_peak']:.2f} "
         "at most from vehicle to vehicle with it\n"
     )
