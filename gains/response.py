@@ -95,7 +95,7 @@ def string_peak(gains: Gains, response: Response, *, delay_s: float) -> float:
     """
     own, front, spacing = gains
     fastest = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)) + 1.0 / (delay_s + response.lag_s))
-    s = 1j * np.geomspace(1e-4 * fastest, 10.0 * fastest, 4000)[:, None, None]
+    s = 1j * np.geomspace(1e-4 * fastest, 10.0 * fastest, 1000)[:, None, None]
     g = response.velocity_gain_1_s
     h = np.exp(-s * delay_s) * (s + g) / (response.lag_s * s**2 + s + g)
     loop = s**2 * np.eye(own.shape[0]) - h * (s * own - spacing)

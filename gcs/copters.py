@@ -30,7 +30,7 @@ class Copters:
         self, plan: FlightPlan, vehicles: list[RemoteVehicle], report: Callable[[str, str, int], None]
     ) -> None:
         self.plan = plan
-        self.frame_ne_m = [(0.0, 0.0)] * len(vehicles)
+        self.frame_ned_m = [(0.0, 0.0, 0.0)] * len(vehicles)
         """Where each vehicle's local frame begins, in that of the first vehicle."""
         self._vehicles = vehicles
         self._report = report
@@ -67,15 +67,18 @@ class Copters:
 
     def locate(self, history: StateHistory) -> None:
         """Bring the vehicles' local frames to that of the first one, as their origins become known."""
-        origins = [vehicle.startup.origin if vehicle.startup else None for vehicle in self._vehicles]
-        for row, origin in enumerate(origins):
-            if origins[0] is None or origin is None:
+        starts = [vehicle.startup for vehicle in self._vehicles]
+        first = starts[0]
+        for row, startup in enumerate(starts):
+            if first is None or first.origin is None or startup is None or startup.origin is None:
                 continue
-            north, east = between(origins[0], origin)
-            before = self.frame_ne_m[row]
-            if hypot(north - before[0], east - before[1]) > _FRAME_RESOLUTION_M:
-                self.frame_ne_m[row] = north, east
+            north, east = between(first.origin, startup.origin)
+            known_north, known_east, _ = self.frame_ned_m[row]
+            if hypot(north - known_north, east - known_east) > _FRAME_RESOLUTION_M:
                 history.forget(row)
+            else:
+                north, east = known_north, known_east
+            self.frame_ned_m[row] = north, east, first.origin_altitude_m - startup.origin_altitude_m
 
     @property
     def identified(self) -> bool:

@@ -15,7 +15,7 @@ from typing import Any
 
 from gcs import mavlink
 from gcs.plan import FlightPlan, described
-from gcs.record import DESIGN_FILE, READY_FILE, SCENARIO_FILE, RunWriter
+from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter
 from gcs.sitl import VehicleProcess
 from gcs.station import CONNECT_PATIENCE_S, Station
 from gcs.summary import finish
@@ -60,10 +60,13 @@ def fly(plan: FlightPlan, design: dict[str, Any], link: StationSocket, options: 
             writer.event(time_s=-CONNECT_PATIENCE_S, kind="vehicle", text=text)
         prepare_real_time()
         station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS)
-        drive(station, link, writer, stop_reason)
-        if plan.responses is None and station.plan.responses is not None:
-            known = described(design, station.plan)
-            (folder / DESIGN_FILE).write_text(json.dumps(known, indent=2), encoding="utf-8")
+
+        def new_plan(found: FlightPlan) -> None:
+            _write_whole(folder / DESIGN_FILE, described(design, found))
+            text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
+            writer.event(time_s=station.scenario_time_s(clock_ns()), kind=NEW_DESIGN, text=text)
+
+        drive(station, link, writer, stop_reason, new_plan)
         writer.event(time_s=station.scenario_time_s(clock_ns()), kind="end", text=station.end_reason)
     return finish(folder)
 
@@ -93,6 +96,13 @@ def _stop_signals() -> Generator[Callable[[], str]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _write_whole(file: Path, data: dict[str, Any]) -> None:
+    """In one step, for those who read it meanwhile."""
+    part = file.with_suffix(".new")
+    part.write_text(json.dumps(data, indent=2), encoding="utf-8")
+    part.replace(file)
 
 
 def _vehicles_heard(link: StationSocket, plan: FlightPlan) -> list[int]:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from gcs.grid import WholeTicks
-from gcs.record import DESIGN_FILE, READY_FILE, RECORDING_FILE, SCENARIO_FILE, RunTail
+from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE, SCENARIO_FILE, RunTail
 from gcs.recording import Recording
 from gcs.summary import finish, read_ticks
 from gcs.table import Display, FlightState
@@ -93,6 +93,10 @@ def observe(folder: Path, scenario: Scenario, design: dict[str, Any], *, parent:
             ended = last_look or any(event["kind"] == "end" for event in events)
             if ended:
                 ticks = np.concatenate([ticks, whole.rest()])
+            if any(event["kind"] == NEW_DESIGN for event in events):
+                design = json.loads((folder / DESIGN_FILE).read_text(encoding="utf-8"))
+                state.redesigned(design)
+                recording.redesigned(design)
             state.add(ticks, events)
             recording.add(ticks, events)
             display.events(events)

@@ -25,6 +25,8 @@ EVENTS_FILE = "events.jsonl"
 TLOG_FILE = "flight.tlog"
 RECORDING_FILE = "flight.rrd"
 SUMMARY_FILE = "summary.json"
+NEW_DESIGN = "design"
+"""Kind of the event that DESIGN_FILE has been written anew."""
 READY_FILE = ".observer-ready"
 """There while an observer follows the run."""
 

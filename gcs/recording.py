@@ -81,6 +81,7 @@ class Recording:
 
         count = len(scenario.vehicles)
         self._folder = folder
+        self._scenario = scenario
         self._tree = tree_of(scenario)
         self._labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
         self._levels = _levels(scenario, design)
@@ -114,6 +115,12 @@ class Recording:
         if ticks.size:
             self._ticks.append(ticks)
         self._events += events
+
+    def redesigned(self, design: dict[str, Any]) -> None:
+        """Compare with the margins of another design; for before anything is flown."""
+        self._levels = _levels(self._scenario, design)
+        self._log_plot_styles()
+        self._stream.send_blueprint(_blueprint(self._scenario, self._levels))
 
     def send(self) -> None:
         """Write what was added."""

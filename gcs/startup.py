@@ -35,11 +35,13 @@ class Startup:
         self.relative_altitude_m: float | None = None
         self.airborne = False
         self.origin: Degrees | None = None
+        self.origin_altitude_m = 0.0
+        """Above sea level; only with an origin."""
         self._origin_said = False
         self._sea_level_m = 0.0
         self._flags: int | None = None
-        self._local: tuple[int, float, float, float, float] | None = None
-        """Newest local position: boot time in ms, north, east, and velocities."""
+        self._local: tuple[int, float, float, float, float, float] | None = None
+        """Newest local position: boot time in ms, north, east, down, and velocities north and east."""
         self._took_off_ns: int | None = None
         self._telemetry_interval_us = telemetry_interval_us
         self._rates: dict[float, float] = {}
@@ -65,8 +67,7 @@ class Startup:
         """Take in a message that is of interest while starting; others are left alone."""
         match msg_id:
             case mavlink.LOCAL_POSITION_NED:
-                boot_ms, north, east, _, v_north, v_east, _ = fields
-                self._local = (boot_ms, north, east, v_north, v_east)
+                self._local = fields[:6]
             case mavlink.GLOBAL_POSITION_INT:
                 self._global(fields)
             case mavlink.EKF_STATUS_REPORT:
@@ -75,8 +76,10 @@ class Startup:
                 self._flags = fields[9]
             case mavlink.GPS_GLOBAL_ORIGIN:
                 self.origin, self._origin_said = (fields[0] * 1e-7, fields[1] * 1e-7), True
-            case mavlink.HOME_POSITION if not self._origin_said and isfinite(fields[3] + fields[4]):
+                self.origin_altitude_m = fields[2] * 1e-3
+            case mavlink.HOME_POSITION if not self._origin_said and isfinite(sum(fields[3:6])):
                 self.origin = shifted((fields[0] * 1e-7, fields[1] * 1e-7), -fields[3], -fields[4])
+                self.origin_altitude_m = fields[2] * 1e-3 + fields[5]
             case _:
                 pass
 
@@ -87,11 +90,12 @@ class Startup:
         self.relative_altitude_m = relative_mm * 1e-3
         self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
         if self._local is not None and not self._origin_said and not self.airborne:
-            local_ms, north, east, v_north, v_east = self._local
+            local_ms, north, east, down, v_north, v_east = self._local
             since_s = (boot_ms - local_ms) * 1e-3
             place = latitude * 1e-7, longitude * 1e-7
             if abs(since_s) < 1.0:
                 self.origin = shifted(place, -north - v_north * since_s, -east - v_east * since_s)
+                self.origin_altitude_m = altitude_mm * 1e-3 + down
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:
         """Note that a command was accepted."""

@@ -229,10 +229,10 @@ class Station:
         if clock.samples == 0:
             return
         sample_ns = clock.to_station_ns(boot_ms * 1_000_000)
-        origin_north, origin_east = self._copters.frame_ne_m[row] if self._copters else (0.0, 0.0)
+        origin_north, origin_east, origin_down = self._copters.frame_ned_m[row] if self._copters else (0.0, 0.0, 0.0)
         if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             return
-        self._reported[row] = Reported(boot_ms, down, v_down, datagram.queued_ns * 1e-9)
+        self._reported[row] = Reported(boot_ms, down + origin_down, v_down, datagram.queued_ns * 1e-9)
 
     def _timesync_reply(self, row: int, vehicle: RemoteVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
         jumps = vehicle.clock.jumps

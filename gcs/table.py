@@ -62,9 +62,9 @@ class FlightState:
 
     def __init__(self, scenario: Scenario, design: dict[str, Any]) -> None:
         self.scenario = scenario
-        schedule = design.get("schedule") or [design]
-        self.margins_s = [np.nan if s["delay_margin_s"] is None else float(s["delay_margin_s"]) for s in schedule]
+        self.margins_s: list[float] = []
         """Delay margin of each gain set, the fastest first."""
+        self.redesigned(design)
         self.phase = UNKNOWN
         self.time_s = np.nan
         self.skipped = 0
@@ -77,6 +77,11 @@ class FlightState:
         self.newest = unknown(self.system_ids)
         self.rtt_s = self.newest["rtt_s"]
         self._window: TickArray = np.empty((0, len(self.system_ids)), TICK)
+
+    def redesigned(self, design: dict[str, Any]) -> None:
+        """Compare with the margins of a design."""
+        schedule = design.get("schedule") or [design]
+        self.margins_s = [np.nan if s["delay_margin_s"] is None else float(s["delay_margin_s"]) for s in schedule]
 
     def add(self, ticks: TickArray, events: list[dict[str, Any]]) -> None:
         """Take whole ticks, shape (ticks, vehicles), and events."""

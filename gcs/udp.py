@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Self
 
 from gcs.modes import Phase
+from gcs.plan import FlightPlan
 from gcs.record import RunWriter
 from gcs.station import Datagram, Outgoing, Station
 from gcs.vehicle import Address
@@ -104,11 +105,19 @@ def prepare_real_time() -> None:
     gc.freeze()
 
 
-def drive(station: Station, link: StationSocket, writer: RunWriter, stop_reason: Callable[[], str]) -> None:
+def drive(
+    station: Station,
+    link: StationSocket,
+    writer: RunWriter,
+    stop_reason: Callable[[], str],
+    new_plan: Callable[[FlightPlan], None],
+) -> None:
     """Run the station in real time until its flight has ended.
 
-    `stop_reason` is asked at every tick; a text other than "" ends the flight for that reason.
+    `stop_reason` is asked at every tick; a text other than "" ends the flight for that reason. `new_plan` is told when
+    the station has found more out about what it flies.
     """
+    plan = station.plan
     while station.phase is not Phase.ENDED:
         link.wait(station.next_event_ns)
         datagrams = link.receive()
@@ -119,6 +128,9 @@ def drive(station: Station, link: StationSocket, writer: RunWriter, stop_reason:
             continue
         writer.tick(station.complete(tick, clock_ns()))
         _log(station, writer, [data for data, _ in outgoing], now_ns)
+        if station.plan is not plan:
+            plan = station.plan
+            new_plan(plan)
         if reason := stop_reason():
             station.request_stop(reason)
 

@@ -96,6 +96,8 @@ def test_the_distances_flown_are_true_although_each_vehicle_has_its_own_origin()
     # the last positions in the scenario's frame, braking by then in the same way
     place = {k: np.array(flight.copter(k).motion[:2]) for k in (1, 2, 3)}
     assert place[2] - place[1] == pytest.approx([-12.0, 12.0], abs=0.05)  # origins are said to 11 mm
+    down_m = flight.flown["down_m"][-3:]
+    assert np.ptp(down_m) == pytest.approx(0.0, abs=0.1)  # all at 20 m above one ground
     assert place[3] - place[2] == pytest.approx([-12.0, 12.0], abs=0.05)
 
 
