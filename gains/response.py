@@ -6,19 +6,19 @@ A vehicle takes an acceleration u and the velocity v_s that goes with it, v_s' =
 
 so a / u = (s + g) / (lag s² + s + g), which is 1 / (lag s + 1) for g = 0. In place of v_s the state holds the velocity
 still owed, d = v_s - v, d' = u - a. With A, B of this and u = K e the margin is that of `gains.delay` and
-`gains.sampled`: one delay, exact. A leader-follower tree is block triangular, so the leader's block and one follower's
-of each kind of vehicle decide, see `gains.behaviour`.
+`gains.sampled`: one delay, exact.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gains.behaviour import Gains
 from gains.delay import delay_margin
-from gains.design import Requirement
 from gains.errors import BadModelError, InfeasibleError
+from gains.formation import FormationModel
+from gains.requirement import Requirement
 from gains.sampled import sampled_delay_margin
 from gains.search import largest_alpha
 from gains.structure import FloatArray
@@ -42,50 +42,45 @@ class Response:
                 raise BadModelError(f"{name} = {value}; wanted a number of at least {least:g}")
 
 
-def leader_loop(gains: Gains, response: Response) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(A, B, K) of the leader: state (e^v, a, d), without d if g = 0; u = K1 e^v."""
-    own, _, _ = gains
-    A, B = _answer(response)
-    K = np.zeros((1, len(A)))
-    K[0, 0] = 1.0
-    return _on_axes(A, own.shape[0]), _on_axes(B, own.shape[0]), np.asarray(np.kron(K, own), dtype=np.float64)
+def formation_loop(
+    model: FormationModel, K: FloatArray, responses: Sequence[Response]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(A, B, K) of the formation u = K e whose vehicles answer so, one response for each in the model's order.
+
+    The state is e of `gains.formation`, followed by a and d of each vehicle; a vehicle with g = 0 has no d.
+    """
+    if len(responses) != model.vehicles:
+        raise BadModelError(f"there are {len(responses)} responses; wanted one for each of {model.vehicles} vehicles")
+    axes = model.axes
+    n = model.states + axes * sum(2 if response.velocity_gain_1_s > 0.0 else 1 for response in responses)
+    A, B = np.zeros((n, n)), np.zeros((n, model.inputs))
+    A[: model.states, : model.states] = model.A
+    identity, at = np.eye(axes), model.states
+    for vehicle, response in enumerate(responses):
+        rate, gain = 1.0 / response.lag_s, response.velocity_gain_1_s
+        own, command = slice(at, at + axes), model.input_slice(vehicle)
+        A[model.velocity_slice(vehicle), own] = identity
+        A[own, own] = -rate * identity
+        B[own, command] = rate * identity
+        at += axes
+        if gain > 0.0:
+            owed = slice(at, at + axes)
+            A[own, owed] = gain * rate * identity
+            A[owed, own] = -identity
+            B[owed, command] = identity
+            at += axes
+    return A, B, np.hstack([K, np.zeros((model.inputs, n - model.states))])
 
 
-def follower_loop(gains: Gains, response: Response) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(A, B, K) of a follower: state (e^p, e^v, a, d), without d if g = 0; u = K3 e^p + K1 e^v."""
-    own, _, spacing = gains
-    A_answer, B_answer = _answer(response)
-    n = len(A_answer) + 1
-    A, B, position, velocity = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((1, n)), np.zeros((1, n))
-    A[0, 1] = -1.0
-    A[1:, 1:], B[1:] = A_answer, B_answer
-    position[0, 0] = velocity[0, 1] = 1.0
-    K = np.kron(position, spacing) + np.kron(velocity, own)
-    return _on_axes(A, own.shape[0]), _on_axes(B, own.shape[0]), np.asarray(K, dtype=np.float64)
+def sampled_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response], *, period_s: float) -> float:
+    """The least delay (s) at which the sampled and held loop of these vehicles loses stability."""
+    return float(sampled_delay_margin(*formation_loop(model, K, responses), period_s=period_s))
 
 
-def _on_axes(matrix: FloatArray, axes: int) -> FloatArray:
-    return np.asarray(np.kron(matrix, np.eye(axes)), dtype=np.float64)
-
-
-def _answer(response: Response) -> tuple[FloatArray, FloatArray]:
-    """A and B of (v, a, d) for one axis."""
-    rate, gain = 1.0 / response.lag_s, response.velocity_gain_1_s
-    A = np.array([[0.0, 1.0, 0.0], [0.0, -rate, gain * rate], [0.0, -1.0, 0.0]])
-    B = np.array([[0.0], [rate], [1.0]])
-    return (A, B) if gain > 0.0 else (A[:2, :2], B[:2])
-
-
-def sampled_margin(gains: Gains, responses: Sequence[Response], *, period_s: float) -> float:
-    """The least delay (s) at which the sampled and held loop of one of the vehicles loses stability."""
-    loops = [loop(gains, response) for response in _distinct(responses) for loop in (leader_loop, follower_loop)]
-    return float(min(sampled_delay_margin(*loop, period_s=period_s) for loop in loops))
-
-
-def continuous_margin(gains: Gains, responses: Sequence[Response]) -> float:
+def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response]) -> float:
     """The same of the continuous loop."""
-    loops = [loop(gains, response) for response in _distinct(responses) for loop in (leader_loop, follower_loop)]
-    return float(min(delay_margin(A, B @ K) for A, B, K in loops))
+    A, B, K_all = formation_loop(model, K, responses)
+    return float(delay_margin(A, B @ K_all))
 
 
 def string_peak(gains: Gains, response: Response, *, delay_s: float) -> float:
@@ -118,12 +113,14 @@ def requirement_with(requirement: Requirement, response: Response, *, period_s: 
     if wanted_s is None:
         return requirement
 
+    pair = FormationModel((-1, 0), axes=1)  # a leader-follower tree has the roots of these two, whatever its size
+
     def excess(without_s: float) -> float:
         found = largest_alpha(without_s, period_s, requirement.string_peak_max)
         if found is None:
             return -np.inf
-        gains = (-found.k1 * np.eye(1), found.k2 * np.eye(1), found.k3 * np.eye(1))
-        return sampled_margin(gains, [response], period_s=period_s) - wanted_s
+        K = pair.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
+        return sampled_margin(pair, K, [response] * 2, period_s=period_s) - wanted_s
 
     low, high = 0.0, wanted_s
     while excess(high) < 0.0:
@@ -138,10 +135,4 @@ def requirement_with(requirement: Requirement, response: Response, *, period_s: 
             break
         middle = (low + high) / 2.0
         low, high = (low, middle) if excess(middle) >= 0.0 else (middle, high)
-    return Requirement(delay_margin_s=high, alpha=requirement.alpha, string_peak_max=requirement.string_peak_max)
-
-
-def _distinct(responses: Sequence[Response]) -> list[Response]:
-    if not responses:
-        raise BadModelError("there is no response; wanted one for each kind of vehicle")
-    return sorted(set(responses), key=lambda response: (response.lag_s, response.velocity_gain_1_s))
+    return replace(requirement, delay_margin_s=high)

@@ -1,7 +1,6 @@
 """The identification manoeuvre of all vehicles at once, tick by tick, and what it makes of the flight plan."""
 
 from collections.abc import Callable, Iterator, Sequence
-from math import inf
 
 import numpy as np
 
@@ -64,7 +63,6 @@ class Identification:
         """The result, after a None for each piece of work before it."""
         found: dict[int, Response] = {}
         period_s = 1.0 / self._plan.scenario.rates.control_hz
-        least_s = [inf] * len(self._plan.blocks)
         for row, vehicle in enumerate(self._vehicles):
             seen = self._fit(row)
             if seen is None:
@@ -80,10 +78,12 @@ class Identification:
             answer = f"lag {response.lag_s:.3f} s, velocity gain {response.velocity_gain_1_s:.2f} 1/s"
             self._report("response", f"{answer}, misfit {seen.misfit:.1%}", vehicle.system_id)
             yield None
-            for k, gains in enumerate(self._plan.blocks):
-                least_s[k] = min(least_s[k], sampled_margin(gains, [response], period_s=period_s))
-                yield None
-        yield self._plan.with_margins(tuple(least_s), Responses("identified", found))
+        responses = Responses("identified", found)
+        of, margins_s = responses.in_order(self._plan.formation.system_ids), list[float]()
+        for K in self._plan.gains:
+            margins_s.append(sampled_margin(self._plan.model, K, of, period_s=period_s))
+            yield None
+        yield self._plan.with_margins(tuple(margins_s), responses)
 
     def _observe(self, history: StateHistory) -> None:
         for row, samples in enumerate(self._samples):

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from gains.behaviour import Gains
 from gains.design import Design, design, evaluate_gains
 from gains.formation import FormationModel
 from gains.graph_design import evaluate_graph_gain, time_scaled
@@ -36,8 +35,6 @@ class FlightPlan:
     """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
     separable: bool = True
     """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
-    blocks: tuple[Gains, ...] = ()
-    """(K1, K2, K3) of each set of the gain schedule; empty for gains on another pattern."""
     responses: Responses | None = None
     """How the vehicles answer; None if at once, or not yet known."""
     around_loss: tuple[FloatArray, ...] = ()
@@ -54,6 +51,10 @@ class FlightPlan:
     def margins_s(self) -> tuple[float, ...]:
         """The delay margins of the gain schedule."""
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
+
+    @cached_property
+    def model(self) -> FormationModel:
+        return FormationModel(tuple(self.formation.predecessor.tolist()))
 
     def with_margins(self, margins_s: tuple[float, ...], responses: Responses) -> "FlightPlan":
         """The same gains with the margins that they have on vehicles that answer so."""
@@ -93,13 +94,20 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
         gain=model.overlapping_gain(found.K1, found.K2, found.K3),
         delay_margin_s=found.delay_margin_s,
         slower=tuple((model.overlapping_gain(s.K1, s.K2, s.K3), s.delay_margin_s) for _, s in schedule),
-        blocks=tuple((s.K1, s.K2, s.K3) for s in (found, *(slower for _, slower in schedule))),
     )
     whole = found.to_dict() | {"schedule": [_entry(1.0, found), *(_entry(*slower) for slower in schedule)]}
+    return _with_responses(whole, plan, responses)
+
+
+def _with_responses(
+    whole: dict[str, Any], plan: FlightPlan, responses: Responses | None
+) -> tuple[dict[str, Any], FlightPlan]:
+    """Design and plan with the margins of given responses."""
     if responses is None:
         return whole, plan
-    margins_s = margins_with(plan.blocks, list(responses.of.values()), period_s=found.period_s)
-    plan = plan.with_margins(margins_s, responses)
+    period_s = 1.0 / plan.scenario.rates.control_hz
+    of = responses.in_order(plan.formation.system_ids)
+    plan = plan.with_margins(margins_with(plan.model, plan.gains, of, period_s=period_s), responses)
     return described(whole, plan), plan
 
 
@@ -109,13 +117,14 @@ def described(design: dict[str, Any], plan: FlightPlan) -> dict[str, Any]:
     `delay_margin_at_once_s` is the margin that the same gains have on vehicles that answer at once.
     """
     assert plan.responses is not None
-    every = list(plan.responses.of.values())
+    every = plan.responses.in_order(plan.formation.system_ids)
     margins = [
-        {"delay_margin_s": sampled_s, "delay_margin_continuous_s": continuous_margin(gains, every)}
-        for gains, sampled_s in zip(plan.blocks, plan.margins_s, strict=True)
+        {"delay_margin_s": sampled_s, "delay_margin_continuous_s": continuous_margin(plan.model, K, every)}
+        for K, sampled_s in zip(plan.gains, plan.margins_s, strict=True)
     ]
+    blocks = [np.array(design[name]) for name in ("K1_1_s", "K2_1_s", "K3_1_s2") if name in design]
     schedule = [entry | margin for entry, margin in zip(design["schedule"], margins, strict=True)]
-    response = {
+    response: dict[str, Any] = {
         "source": plan.responses.source,
         "model": "lag a' = u + g (v_s - v) - a, v_s' = u",
         "vehicles": [
@@ -123,8 +132,11 @@ def described(design: dict[str, Any], plan: FlightPlan) -> dict[str, Any]:
             for system_id, found in sorted(plan.responses.of.items())
         ],
         "delay_margin_at_once_s": design["delay_margin_s"],
-        "string_peak": max(string_peak(plan.blocks[0], response, delay_s=0.0) for response in set(every)),
     }
+    if len(blocks) == 3:  # the same for each vehicle, as on a leader-follower tree only
+        own, front, spacing = blocks
+        peaks = [string_peak((own, front, spacing), answer, delay_s=0.0) for answer in set(every)]
+        response["string_peak"] = max(peaks)
     return design | margins[0] | {"schedule": schedule, "response": response}
 
 
@@ -201,7 +213,7 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
         "blocks": schedule[0]["blocks"],
         "schedule": schedule,
     }
-    return result, plan
+    return _with_responses(result, plan, given_responses(scenario))
 
 
 def _pattern(scenario: Scenario, formation: Formation, model: FormationModel) -> Pattern:

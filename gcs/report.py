@@ -118,11 +118,12 @@ def _response(response: dict[str, Any] | None) -> str:
         sorted(f"{vehicle[name]:.{digits}f}" for vehicle in response["vehicles"])
         for name, digits in (("lag_s", 3), ("velocity_gain_1_s", 2))
     )
+    peak = response.get("string_peak")
+    grows = "" if peak is None else f"; spacing errors grow by {peak:.2f} at most from vehicle to vehicle with it"
     lag, gain = (" to ".join(dict.fromkeys((each[0], each[-1]))) for each in (lags, gains))
     return (
         f"response {response['source']}: lag {lag} s, velocity gain {gain} 1/s; in the margin, which would be "
-        f"{_ms(response['delay_margin_at_once_s'])} without it; spacing errors grow by {response['string_peak']:.2f} "
-        "at most from vehicle to vehicle with it\n"
+        f"{_ms(response['delay_margin_at_once_s'])} without it{grows}\n"
     )
 
 

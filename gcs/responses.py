@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from gains.behaviour import Gains
+from gains.formation import FormationModel
 from gains.response import Response, sampled_margin
+from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
 
 
@@ -15,6 +16,10 @@ class Responses:
 
     source: Literal["given", "identified"]
     of: Mapping[int, Response]
+
+    def in_order(self, system_ids: Sequence[int]) -> list[Response]:
+        """The responses of these vehicles."""
+        return [self.of[system_id] for system_id in system_ids]
 
 
 def given_responses(scenario: Scenario) -> Responses | None:
@@ -26,6 +31,8 @@ def given_responses(scenario: Scenario) -> Responses | None:
     return Responses("given", {vehicle.system_id: response for vehicle in scenario.vehicles})
 
 
-def margins_with(schedule: Sequence[Gains], responses: Sequence[Response], *, period_s: float) -> tuple[float, ...]:
-    """The sampled delay margin of each set of gains, that of the vehicle with the least."""
-    return tuple(sampled_margin(gains, responses, period_s=period_s) for gains in schedule)
+def margins_with(
+    model: FormationModel, gains: Sequence[FloatArray], responses: Sequence[Response], *, period_s: float
+) -> tuple[float, ...]:
+    """The sampled delay margin of each gain matrix with these responses, one for each vehicle of the model."""
+    return tuple(sampled_margin(model, K, responses, period_s=period_s) for K in gains)

@@ -133,6 +133,17 @@ def test_design_of_a_flight_names_what_was_identified() -> None:
     assert known["schedule"][2]["delay_margin_s"] == flight.station.plan.margins_s[2]
 
 
+def test_gains_on_a_graph_get_the_margin_with_the_response_too() -> None:
+    control = COPTERS5.control.model_copy(update={"method": "graph-lqr", "delay_margin_s": 0.5})
+    design, plan = flight_plan(three().model_copy(update={"control": control}))
+    flight = fly(plan)
+    assert flight.station.end_reason == "completed: duration reached"
+    assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
+    known = described(design, flight.station.plan)
+    assert known["delay_margin_s"] < design["delay_margin_s"] - TRUTH.lag_s / 2
+    assert known["delay_margin_s"] < known["delay_margin_continuous_s"]
+
+
 def settled(flight: Flight) -> bool:
     rows = max(float(flight.error_m(system_id)[-100:].max()) for system_id in (2, 3))
     return rows < 0.01 * 17.0

@@ -8,14 +8,14 @@ from scipy.linalg import expm
 
 from gains.behaviour import string_peak as string_peak_at_once
 from gains.delay import delay_margin
-from gains.design import Requirement, design
+from gains.design import design
 from gains.errors import BadModelError, InfeasibleError
 from gains.formation import FormationModel
+from gains.requirement import Requirement
 from gains.response import (
     Response,
     continuous_margin,
-    follower_loop,
-    leader_loop,
+    formation_loop,
     requirement_with,
     sampled_margin,
     string_peak,
@@ -23,11 +23,13 @@ from gains.response import (
 from gains.rightmost import rightmost_root
 
 GAINS = (-2.1 * np.eye(2), 0.6 * np.eye(2), 2.0 * np.eye(2))
+PAIR = FormationModel((-1, 0))
+K = PAIR.overlapping_gain(*GAINS)
 RESPONSES = [Response(0.08, 1.67), Response(0.15, 2.0), Response(0.3, 0.5), Response(0.15, 0.0)]
 
 
 def crossing_margin(response: Response) -> float:
-    """The follower's margin on a frequency grid: u/e of the loop on the unit circle, the least phase over frequency."""
+    """The follower's margin, less than the leader's, on a frequency grid: least phase over frequency at gain 1."""
     omega = np.geomspace(0.05, 50.0, 2_000_001)
     s = 1j * omega
     lag, gain = response.lag_s, response.velocity_gain_1_s
@@ -40,35 +42,36 @@ def crossing_margin(response: Response) -> float:
 
 @pytest.mark.parametrize("response", RESPONSES)
 def test_continuous_margin_is_the_least_phase_over_frequency_of_the_transfer_function(response: Response) -> None:
-    A, B, K = follower_loop(GAINS, response)
-    assert delay_margin(A, B @ K) == pytest.approx(crossing_margin(response), rel=1e-5)  # the grid's cell: 3e-6
+    assert continuous_margin(PAIR, K, [response] * 2) == pytest.approx(
+        crossing_margin(response), rel=1e-5
+    )  # the grid's cell: 3e-6
 
 
 @pytest.mark.parametrize("response", RESPONSES)
 def test_rightmost_root_crosses_the_axis_at_the_margin(response: Response) -> None:
-    margin_s = continuous_margin(GAINS, [response])
+    margin_s = continuous_margin(PAIR, K, [response] * 2)
+    A, B, K_all = formation_loop(PAIR, K, [response] * 2)
     for factor, stable in ((0.99, True), (1.01, False)):
-        roots = []
-        for A, B, K in (leader_loop(GAINS, response), follower_loop(GAINS, response)):
-            roots.append(rightmost_root([(A, 0.0), (B @ K, factor * margin_s)]).real)
-        assert (max(roots) < 0.0) == stable
+        root = rightmost_root([(A, 0.0), (B @ K_all, factor * margin_s)])
+        assert (root.real < 0.0) == stable
 
 
 def grows(response: Response, delay_s: float, period_s: float) -> bool:
     """Whether a follower's error grows in a step by step simulation with held commands that act late."""
-    A, B, K = (matrix[::2, ::2] for matrix in follower_loop(GAINS, response))
-    n, steps = len(A), 10
+    lag, g = response.lag_s, response.velocity_gain_1_s
+    A = np.array([[0, -1, 0, 0], [0, 0, 1, 0], [0, 0, -1 / lag, g / lag], [0, 0, -1, 0]])  # e^p, e^v, a, d
+    steps = 10
     h = period_s / steps
-    generator = np.zeros((n + 1, n + 1))
-    generator[:n, :n], generator[:n, n:] = h * A, h * B
-    Phi, G = (M := expm(generator))[:n, :n], M[:n, n]
+    generator = np.zeros((5, 5))
+    generator[:4, :4], generator[:4, 4] = h * A, h * np.array([0.0, 0.0, 1 / lag, 1.0])
+    Phi, G = (M := expm(generator))[:4, :4], M[:4, 4]
     late = round(delay_s / h)
-    x = np.eye(n)[0]
+    x = np.eye(4)[0]
     commands: list[float] = [0.0] * (late // steps + 2)
     size: list[float] = []
     for k in range(round(60.0 / h)):
         if k % steps == 0:
-            commands.append(float(K[0] @ x))
+            commands.append(float(2.0 * x[0] - 2.1 * x[1]))
         sent = (k - late) // steps
         command = commands[late // steps + 2 + sent] if k >= late else 0.0
         x = Phi @ x + G * command
@@ -80,25 +83,43 @@ def grows(response: Response, delay_s: float, period_s: float) -> bool:
 @pytest.mark.parametrize("response", RESPONSES)
 def test_a_simulated_follower_diverges_beyond_the_sampled_margin_and_not_below(response: Response) -> None:
     period_s = 0.02
-    margin_s = sampled_margin(GAINS, [response], period_s=period_s)
+    margin_s = sampled_margin(PAIR, K, [response] * 2, period_s=period_s)
     assert not grows(response, 0.97 * margin_s, period_s)
     assert grows(response, 1.03 * margin_s, period_s)
 
 
 def test_a_very_short_lag_leaves_the_margin_of_vehicles_that_answer_at_once() -> None:
-    model = FormationModel((-1, 0, 1))
-    at_once = delay_margin(*model.ground_loop(*GAINS))
-    assert continuous_margin(GAINS, [Response(1e-5, 0.0)]) == pytest.approx(at_once, abs=2e-5)
+    at_once = delay_margin(*PAIR.ground_loop(*GAINS))
+    assert continuous_margin(PAIR, K, [Response(1e-5, 0.0)] * 2) == pytest.approx(at_once, abs=2e-5)
 
 
 def test_a_lag_costs_about_its_length() -> None:
-    without = continuous_margin(GAINS, [Response(1e-5, 0.0)])
-    assert without - continuous_margin(GAINS, [Response(0.02, 0.0)]) == pytest.approx(0.02, rel=0.05)
+    without = continuous_margin(PAIR, K, [Response(1e-5, 0.0)] * 2)
+    assert without - continuous_margin(PAIR, K, [Response(0.02, 0.0)] * 2) == pytest.approx(0.02, rel=0.05)
 
 
-def test_the_slowest_vehicle_has_the_margin_of_all() -> None:
-    each = [sampled_margin(GAINS, [response], period_s=0.02) for response in RESPONSES]
-    assert sampled_margin(GAINS, RESPONSES, period_s=0.02) == min(each)
+def test_the_margin_of_a_tree_is_that_of_the_vehicle_with_the_least() -> None:
+    tree = FormationModel((-1, 0, 1, 0, 3))
+    of = [RESPONSES[0], *RESPONSES]
+    each = [sampled_margin(PAIR, K, [response] * 2, period_s=0.02) for response in RESPONSES]
+    together = sampled_margin(tree, tree.overlapping_gain(*GAINS), of, period_s=0.02)
+    assert together == pytest.approx(min(each), rel=1e-9)
+
+
+def test_vehicles_that_act_on_each_other_have_a_margin_of_their_own_kind() -> None:
+    # the leader also feels the follower's spacing error, so that no vehicle's loop stands alone
+    coupled = K.copy()
+    coupled[PAIR.input_slice(0), PAIR.spacing_slice(1)] = -0.4 * np.eye(2)
+    of = [Response(0.3, 1.0), Response(0.1, 2.0)]
+    A, B, K_all = formation_loop(PAIR, coupled, of)
+    margin_s = continuous_margin(PAIR, coupled, of)
+    for factor, stable in ((0.99, True), (1.01, False)):
+        assert (rightmost_root([(A, 0.0), (B @ K_all, factor * margin_s)]).real < 0.0) == stable
+
+
+def test_a_response_for_each_vehicle_is_wanted() -> None:
+    with pytest.raises(BadModelError, match="1 responses"):
+        formation_loop(PAIR, K, [Response(0.1, 1.0)])
 
 
 @pytest.mark.parametrize("response", RESPONSES[:2])
@@ -106,7 +127,9 @@ def test_a_design_for_a_response_has_the_margin_asked_for(response: Response) ->
     model, period_s = FormationModel((-1, 0)), 0.02
     wanted = Requirement(delay_margin_s=0.4, string_peak_max=1.0)
     found = design(model, requirement_with(wanted, response, period_s=period_s), period_s=period_s)
-    margin_s = sampled_margin((found.K1, found.K2, found.K3), [response], period_s=period_s)
+    margin_s = sampled_margin(
+        model, model.overlapping_gain(found.K1, found.K2, found.K3), [response] * 2, period_s=period_s
+    )
     assert margin_s == pytest.approx(0.4, abs=1e-7)
     assert found.delay_margin_s > 0.4
 
