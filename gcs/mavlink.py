@@ -155,6 +155,11 @@ def timesync(*, tc1_ns: int, ts1_ns: int) -> tuple[Any, ...]:
     return (tc1_ns, ts1_ns)
 
 
+def statustext(severity: int, text: str) -> tuple[Any, ...]:
+    """Fields of STATUSTEXT; the message holds 50 bytes of text."""
+    return (severity, text.encode()[:50], 0, 0)
+
+
 def command_long(
     command: int, *, target_system: int, confirmation: int = 0, parameters: tuple[float, ...] = ()
 ) -> tuple[Any, ...]:

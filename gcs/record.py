@@ -46,6 +46,17 @@ class Mode(IntEnum):
     RECOVERING = 6  # flying, its gains on the way back to faster ones
 
 
+SEVERITY = {
+    Mode.WAITING: 6,
+    Mode.NOMINAL: 6,
+    Mode.RECOVERING: 5,
+    Mode.CAUTION: 4,
+    Mode.LOST: 3,
+    Mode.CRITICAL: 2,
+    Mode.FAILSAFE: 1,
+}
+"""How serious a change to the mode is, as MAV_SEVERITY: 6 info, 5 notice, 4 warning, 3 error, 2 critical, 1 alert."""
+
 TICK = np.dtype(
     [
         ("tick", "<i8"),  # counts control ticks, from 0; a number left out is a tick that was skipped

@@ -1,6 +1,7 @@
 """Loss, lateness and duplication from MAVLink's 8-bit sequence numbers."""
 
 _WINDOW = 128
+NEW, LATE, DUPLICATE = 0, 1, 2
 
 
 class SequenceCounter:
@@ -18,22 +19,28 @@ class SequenceCounter:
         self._newest = -1
         self._seen = 0  # bit k: the number `newest - k` has come
 
-    def add(self, sequence: int) -> None:
+    def add(self, sequence: int) -> int:
+        """Count a frame; NEW if it is newer than all before it, LATE, or DUPLICATE."""
         self.received += 1
         if self._newest < 0:
             self._newest = sequence
             self._seen = 1
-            return
+            return NEW
         ahead = (sequence - self._newest) & 0xFF
         if 0 < ahead < _WINDOW:
             self.lost += ahead - 1
             self._seen = (self._seen << ahead | 1) & ((1 << _WINDOW) - 1)
             self._newest = sequence
-            return
+            return NEW
         bit = 1 << (-ahead & 0xFF)
         if self._seen & bit:
             self.duplicate += 1
-        else:
-            self.late += 1
-            self.lost = max(0, self.lost - 1)
-            self._seen |= bit
+            return DUPLICATE
+        self.late += 1
+        self.lost = max(0, self.lost - 1)
+        self._seen |= bit
+        return LATE
+
+    def restart(self) -> None:
+        """The sender has begun anew: its next frame is its newest."""
+        self._newest = -1

@@ -24,8 +24,9 @@ from gcs.copters import START_PATIENCE_S, Copters
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
-from gcs.record import TickArray
+from gcs.record import SEVERITY, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.sequence import DUPLICATE, LATE
 from gcs.startup import Startup
 from gcs.telemetry import FloatArray, StateHistory
 from gcs.vehicle import Address, RemoteVehicle
@@ -37,6 +38,7 @@ SILENCE_S = 1.5
 AUTOPILOT_COMPONENT = 1
 """A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
 _HEARTBEAT_NS = NS_PER_S
+_FORGET_NUMBERS_NS = 3 * NS_PER_S
 
 
 class Datagram(NamedTuple):
@@ -182,7 +184,9 @@ class Station:
             if frame.component_id != AUTOPILOT_COMPONENT:
                 self.counters["other component"] += 1
                 continue
-            vehicle.frames.add(frame.sequence)
+            if self._is_replay(vehicle, frame, datagram.received_ns):
+                self.counters["replayed or overtaken"] += 1
+                continue
             self._handle(row, vehicle, frame, datagram, outgoing)
 
     def _is_from(self, vehicle: RemoteVehicle, datagram: Datagram, msg_id: int) -> bool:
@@ -195,6 +199,21 @@ class Station:
         self.events.append(Event(self.scenario_time_s(self._now_ns), "vehicle", "found", vehicle.system_id))
         vehicle.address = datagram.address
         return True
+
+    def _is_replay(self, vehicle: RemoteVehicle, frame: mavlink.Frame, now_ns: int) -> bool:
+        """Whether a frame has been heard before, or is a heartbeat that a newer frame has overtaken.
+
+        A vehicle that was started anew numbers its frames anew: after some time without a good heartbeat any is taken.
+        """
+        heartbeat = frame.msg_id == mavlink.HEARTBEAT
+        order = vehicle.frames.add(frame.sequence)
+        replayed = order == DUPLICATE or (heartbeat and order == LATE)
+        if replayed and heartbeat and now_ns - vehicle.heartbeat_ns > _FORGET_NUMBERS_NS:
+            vehicle.frames.restart()
+            return False
+        if heartbeat and not replayed:
+            vehicle.heartbeat_ns = now_ns
+        return replayed
 
     def _handle(
         self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]
@@ -224,14 +243,15 @@ class Station:
 
     def _position(self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram) -> None:
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
-        self._telemetry_ns[row] = datagram.received_ns
         clock = vehicle.clock.estimate
         if clock.samples == 0:
+            self._telemetry_ns[row] = datagram.received_ns
             return
         sample_ns = clock.to_station_ns(boot_ms * 1_000_000)
         origin_north, origin_east, origin_down = self._copters.frame_ned_m[row] if self._copters else (0.0, 0.0, 0.0)
         if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             return
+        self._telemetry_ns[row] = datagram.received_ns  # only what is new: a replay does not make up for silence
         self._reported[row] = Reported(boot_ms, down + origin_down, v_down, datagram.queued_ns * 1e-9)
 
     def _timesync_reply(self, row: int, vehicle: RemoteVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
@@ -252,7 +272,7 @@ class Station:
         due_ns = self._next_tick_ns
         behind = (self._now_ns - due_ns) // self._period_ns
         self._next_tick_ns = due_ns + (behind + 1) * self._period_ns  # ticks that were slept through are left out
-        self._decide(due_ns)
+        self._decide(due_ns, outgoing)
         if self._copters is not None and self.phase is Phase.CONNECTING:
             self._copters.locate(self._history)
         flying = self.phase is Phase.FLYING
@@ -291,7 +311,7 @@ class Station:
         self._tick_count += 1 + behind
         return tick
 
-    def _decide(self, due_ns: int) -> None:
+    def _decide(self, due_ns: int, outgoing: list[Outgoing]) -> None:
         """Modes, lost vehicles and the flight's phase."""
         flying = self.phase is Phase.FLYING
         silence_ns = SILENCE_S * NS_PER_S
@@ -318,6 +338,8 @@ class Station:
                 vehicle.goal = None if after.released else Goal.FLY
             if after.mode is not before.mode:
                 self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
+                told = mavlink.statustext(SEVERITY[after.mode], f"vehicle {vehicle.system_id}: {after.mode.name}")
+                self._send(vehicle, mavlink.STATUSTEXT, told, outgoing)
             if after.released != before.released and flying:
                 text = "is released to its failsafe" if after.released else "is called back"
                 self._report("vehicle", text, vehicle.system_id)

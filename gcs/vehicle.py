@@ -58,6 +58,7 @@ class RemoteVehicle:
         self.system_id = system_id
         self.address: Address | None = None
         self.heard_ns = 0  # newest valid frame
+        self.heartbeat_ns = 0  # newest heartbeat
         self.frames = SequenceCounter()
         self.clock = VehicleClock()
         self.armed = False

@@ -4,15 +4,16 @@
 """
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.lockstep import START_NS, fly_lockstep
+from gcs.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import Mode, TickArray
 from gcs.station import Station
@@ -103,3 +104,31 @@ def test_release_when_even_the_slowest_gains_have_no_headroom_leaves_vehicles_in
     assert float(np.nanmin(ticks["nearest_m"])) > 50.0
     last = ticks[ticks["time_s"] < 90.0][-5:]
     assert set(last["mode"]) <= {Mode.NOMINAL, Mode.CAUTION, Mode.RECOVERING}
+
+
+@dataclass
+class Overheard:
+    """Vehicles, and all that the station sends them."""
+
+    vehicles: Vehicles
+    sent: list[bytes] = field(default_factory=list)
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        self.sent += [data for _, data, _ in received]
+        return self.vehicles.step(received, now_ns)
+
+
+def test_every_mode_change_is_an_event_and_a_statustext() -> None:
+    plan = replace(planned(), scenario=TRIANGLE.model_copy(update={"duration_s": 45.0, "links": ramp(0.44)}))
+    station, vehicles = Station(plan, start_ns=START_NS), Overheard(vehicles_of(plan))
+    for _ in fly_lockstep(plan, station=station, vehicles=vehicles):
+        pass
+    changes = [f"vehicle {e.system_id}: {e.text.split('-> ')[1]}" for e in station.events if e.kind == "mode"]
+    parsed = [dialect.MAVLink(None).parse_buffer(data) or [] for data in vehicles.sent]  # checksum and layout: theirs
+    messages: list[Any] = [message for some in parsed for message in some]
+    told = [message for message in messages if message.get_type() == "STATUSTEXT"]
+    # What is decided in the flight's last tick is no longer seen to be sent.
+    assert [message.text for message in told] == changes[: len(told)]
+    assert len(told) >= len(changes) - len(plan.formation.system_ids)
+    assert {m.severity for m in told if m.text.endswith("CRITICAL")} == {dialect.MAV_SEVERITY_CRITICAL}
+    assert {m.severity for m in told if m.text.endswith("CAUTION")} == {dialect.MAV_SEVERITY_WARNING}

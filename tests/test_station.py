@@ -28,7 +28,9 @@ class Peer:
         self.address = address
 
     def datagram(self, message: Any, time_ns: int) -> Datagram:
-        return Datagram(bytes(message.pack(self.link)), self.address, time_ns)
+        data = bytes(message.pack(self.link))
+        self.link.seq = (self.link.seq + 1) % 256  # pymavlink counts only what it sends itself
+        return Datagram(data, self.address, time_ns)
 
     def heartbeat(self, time_ns: int, *, base_mode: int = 1, custom_mode: int = 0, status: int = 3) -> Datagram:
         return self.datagram(self.link.heartbeat_encode(2, 3, base_mode, custom_mode, status), time_ns)
@@ -90,6 +92,27 @@ def test_timesync_request_of_a_vehicle_is_answered_with_the_receive_time() -> No
     outgoing, _ = station.step([peer.heartbeat(S), request], S + 5 * MS)
     (reply,) = messages(outgoing, "TIMESYNC")
     assert (reply.tc1, reply.ts1) == (S + 3 * MS, 777)
+
+
+def test_a_heartbeat_that_is_replayed_or_overtaken_undoes_nothing() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
+    old, overtaken, new = (peer.heartbeat(S, base_mode=mode, custom_mode=4) for mode in (1, 1, 129))
+    station.step([old, new, old, overtaken], S + 5 * MS)
+    assert vehicle.armed
+    assert station.counters["replayed or overtaken"] == 2
+
+
+def test_a_vehicle_that_begins_anew_to_count_its_frames_is_heard() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
+    peer.link.seq = 100
+    station.step([peer.heartbeat(S, base_mode=129)], S)
+    peer.link.seq = 0
+    for second in (2, 3, 4, 5):
+        station.step([peer.heartbeat(second * S, base_mode=1)], second * S)
+    assert not vehicle.armed
+    assert vehicle.frames.lost == 0
 
 
 def test_unknown_system_id_is_counted_and_not_answered() -> None:
