@@ -28,7 +28,8 @@ ESTIMATOR_STATUS = 230
 HOME_POSITION = 242
 STATUSTEXT = 253
 
-_MAGIC = 0xFD
+_MAGIC, MAGIC_1 = 0xFD, 0xFE
+_OVERHEAD_1 = 8
 _HEADER = struct.Struct("<BBBBBBBHB")
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
@@ -100,6 +101,21 @@ def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
             if frame is not None:
                 frames.append(frame)
         at = stop
+    return frames
+
+
+def first_heartbeats(datagram: bytes) -> list[Frame]:
+    """The MAVLink 1 heartbeats of a datagram: a PX4 speaks that until it hears MAVLink 2."""
+    frames: list[Frame] = []
+    packing, length, crc_extra = _LAYOUTS[HEARTBEAT]
+    at = 0
+    while at + _OVERHEAD_1 <= len(datagram) and datagram[at] == MAGIC_1:
+        data = datagram[at : at + _OVERHEAD_1 + datagram[at + 1]]
+        at += len(data)
+        if data[1] != length or data[5] != HEARTBEAT or len(data) != _OVERHEAD_1 + length:
+            continue
+        if mcrf4xx(data[1:-2] + crc_extra) == int.from_bytes(data[-2:], "little"):
+            frames.append(Frame(HEARTBEAT, data[3], data[4], data[2], packing.unpack_from(data, 6), data))
     return frames
 
 

@@ -18,6 +18,7 @@ from gcs.responses import Responses, given_responses, margins_with
 from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
 
+NOT_YET_KNOWN = "not yet known"
 _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
 
@@ -104,7 +105,8 @@ def _with_responses(
 ) -> tuple[dict[str, Any], FlightPlan]:
     """Design and plan with the margins of given responses."""
     if responses is None:
-        return whole, plan
+        unknown = {"response": {"source": NOT_YET_KNOWN}} if plan.scenario.dynamics == "autopilot" else {}
+        return whole | unknown, plan
     period_s = 1.0 / plan.scenario.rates.control_hz
     of = responses.in_order(plan.formation.system_ids)
     plan = plan.with_margins(margins_with(plan.model, plan.gains, of, period_s=period_s), responses)

@@ -114,6 +114,9 @@ def _response(response: dict[str, Any] | None) -> str:
     """A line on how the vehicles answer, if they do not do so at once."""
     if response is None:
         return ""
+    if "vehicles" not in response:
+        text = "this margin is of vehicles that answer at once; theirs is found before the formation flight"
+        return f"response {response['source']}: {text}\n"
     lags, gains = (
         sorted(f"{vehicle[name]:.{digits}f}" for vehicle in response["vehicles"])
         for name, digits in (("lag_s", 3), ("velocity_gain_1_s", 2))

@@ -169,7 +169,11 @@ class Station:
     # -- receive ---------------------------------------------------------------------------------------------------
 
     def _receive(self, datagram: Datagram, outgoing: list[Outgoing]) -> None:
-        for frame in mavlink.decode(datagram.data, self.counters):
+        if self._copters is not None and datagram.data[:1] == b"\xfe":
+            frames = mavlink.first_heartbeats(datagram.data)  # answered in MAVLink 2, it goes on with that
+        else:
+            frames = mavlink.decode(datagram.data, self.counters)
+        for frame in frames:
             row = self._row.get(frame.system_id)
             if row is None:
                 self.counters["unknown system id"] += 1

@@ -80,6 +80,7 @@ class Copter:
         self._jumps = deque(
             (start_ns + round(j.at_s * NS_PER_S), round(j.by_s * NS_PER_S)) for j in self.settings.clock_jumps
         )
+        self._speaks_version_1 = self.rules.version_1_first
         self._timesync_ts1 = -1
         self._out: list[tuple[bytes, int]] = []
         self._answers: dict[int, Callable[[mavlink.Command, int], int]] = {
@@ -174,6 +175,7 @@ class Copter:
 
     def _receive(self, data: bytes, time_ns: int) -> None:
         for message in mavlink.read_datagram(data, self.counters):
+            self._speaks_version_1 = False
             if isinstance(message, mavlink.Heartbeat):
                 if message.vehicle_type == mavlink.TYPE_GCS:
                     self.counters["heartbeats"] += 1
@@ -323,6 +325,8 @@ class Copter:
     # What it sends
 
     def _report(self, message_id: int, time_ns: int, boot_ms: int) -> None:
+        if self._speaks_version_1 and message_id != mavlink.HEARTBEAT:
+            return  # nobody listens yet who could want it
         if message_id == mavlink.TIMESYNC:
             self._timesync_ts1 = self.clock.boot_ns(time_ns)
             self._send(self._encoder.timesync(0, self._timesync_ts1), time_ns)
@@ -333,6 +337,8 @@ class Copter:
         frame = report(message_id, self._encoder, self.rules, facts, boot_ms)
         if frame is None:
             return
+        if self._speaks_version_1:
+            frame = mavlink.in_version_1(frame)
         if message_id == mavlink.LOCAL_POSITION and self._record is not None:
             self._record((SAMPLED, self.system_id, boot_ms, time_ns, time_ns, time_ns))
         self._send(frame, time_ns)

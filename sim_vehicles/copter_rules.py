@@ -44,6 +44,8 @@ class Rules:
     setpoint_timeout_s: float
     velocity_grows: bool
     """Whether the velocity target grows with the acceleration between two set-points."""
+    version_1_first: bool
+    """Whether it speaks MAVLink 1 until it hears MAVLink 2 (MAV_PROTO_VER 0)."""
 
 
 ARDUPILOT = Rules(
@@ -58,6 +60,7 @@ ARDUPILOT = Rules(
     arming_refused=FAILED,
     setpoint_timeout_s=3.0,  # GUID_TIMEOUT
     velocity_grows=True,
+    version_1_first=False,
 )
 PX4 = Rules(
     autopilot=12,
@@ -77,6 +80,7 @@ PX4 = Rules(
     arming_refused=TEMPORARILY_REJECTED,
     setpoint_timeout_s=1.0,  # COM_OF_LOSS_T
     velocity_grows=False,
+    version_1_first=True,
 )
 RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
 

@@ -138,6 +138,14 @@ def read_datagram(data: bytes, counters: Counter[str]) -> list[Message]:
     return messages
 
 
+def in_version_1(frame: bytes) -> bytes:
+    """A HEARTBEAT of ours as a MAVLink 1 frame."""
+    size = dialect.MAVLink_heartbeat_message.unpacker.size
+    payload = frame[HEADER_BYTES:-CHECKSUM_BYTES].ljust(size, b"\0")
+    body = bytes([size, frame[4], frame[5], frame[6], HEARTBEAT]) + payload
+    return bytes([MAGIC_1]) + body + mcrf4xx(body + _CRC_EXTRA[HEARTBEAT]).to_bytes(2, "little")
+
+
 def message_id(data: bytes) -> int:
     """Message id of a datagram's first frame, 0xFFFFFF if it has none."""
     return int.from_bytes(data[7:10], "little") if len(data) >= HEADER_BYTES and data[0] == MAGIC_2 else 0xFFFFFF

@@ -66,6 +66,14 @@ def airborne(flavour: Flavour = "ardupilot", **settings: Any) -> tuple[Copter, f
     return vehicle, 30.2
 
 
+def test_a_px4_speaks_mavlink_1_until_it_hears_mavlink_2() -> None:
+    vehicle = copter("px4")
+    before = [data[0] for data, _ in vehicle.step([], START + 3 * SECOND)]
+    assert set(before) == {0xFE}
+    after = vehicle.step([(command(400, 0.0), START + 3 * SECOND)], START + 6 * SECOND)
+    assert {data[0] for data, _ in after} == {0xFD}
+
+
 def test_telemetry_begins_late_and_heartbeats_at_once() -> None:
     vehicle = copter(telemetry_after_s=40.0, ready_after_s=45.0)
     tell(vehicle, command(511, 32, 20_000), 1.0)

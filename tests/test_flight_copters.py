@@ -12,13 +12,13 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.plan import FlightPlan, described, flight_plan
 from gcs.record import TickArray
-from gcs.station import Event, Station
+from gcs.station import Datagram, Event, Station
 from gcs.summary import verdict
 from scenarios.files import load
 from scenarios.schema import ClockJump, Link, Links, Outage, Response, Scenario, VehicleLinks
 from sim_vehicles.copter import Copter
 from sim_vehicles.fleet import Fleet
-from tests.test_station import Peer, messages
+from tests.test_station import HOME, Peer, messages
 
 COPTERS5 = load(Path(__file__).parent.parent / "scenarios" / "copters5.toml")
 PERIOD_S = 0.02
@@ -266,6 +266,22 @@ def test_an_arduplane_is_refused_at_once_and_by_name() -> None:
     told = [station.step([], START_NS + 20_000_000 * k)[0] for k in range(1, 60)]
     assert station.end_reason.startswith("refused: vehicle 2 is an ArduPlane")
     assert not any(messages(outgoing, "COMMAND_LONG") for outgoing in told)  # whoever flies it is not disturbed
+
+
+def test_a_px4_that_speaks_mavlink_1_at_first_is_heard_and_answered_in_mavlink_2() -> None:
+    first = dialect.MAVLink(None, srcSystem=2, srcComponent=1)
+    heartbeat = bytes(first.heartbeat_encode(2, 12, 1, 4 << 16 | 3 << 24, 3).pack(first, force_mavlink1=True))
+    assert heartbeat[0] == 0xFE
+    station = Station(planned("px4"), start_ns=START_NS)
+    damaged = heartbeat[:-1] + bytes([heartbeat[-1] ^ 1])
+    station.step([Datagram(damaged, HOME, START_NS)], START_NS)
+    assert station.vehicles[1].address is None
+    outgoing, _ = station.step([Datagram(b"\xfe" + bytes(30) + heartbeat, HOME, START_NS)], START_NS + 20_000_000)
+    assert station.vehicles[1].address is None  # no frame begins where one should
+    outgoing, _ = station.step([Datagram(heartbeat * 2, HOME, START_NS)], START_NS + 1_100_000_000)
+    assert station.vehicles[1].kind.name == "PX4 multicopter"
+    assert all(data[0] == 0xFD for data, _ in outgoing)
+    assert messages(outgoing, "HEARTBEAT")
 
 
 def test_a_gimbal_with_the_vehicles_system_id_is_not_taken_for_the_vehicle() -> None:
