@@ -1,0 +1,129 @@
+"""Measured latencies against what the emulated links and vehicles wrote down, in virtual time, over a grid of links."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcs.grade import FloatArray, Truth, graded, true_loop_delays_s
+from gcs.lockstep import START_NS, fly_lockstep
+from gcs.plan import flight_plan
+from gcs.record import TickArray
+from gcs.station import Station
+from scenarios.files import load
+from scenarios.schema import Clocks, FixedGains, Jitter, Link, Links, Monitor, Safety
+from sim_vehicles.fleet import Fleet
+from sim_vehicles.truth import DTYPE, LINK_DOWN, LINK_UP, Row
+
+CHAIN = load(Path(__file__).parent.parent / "scenarios" / "chain3.toml")
+WEAK = FixedGains(K1=-0.05, K2=0.0, K3=0.001)
+"""A loop with a margin of many seconds, so that any link can be flown."""
+TIMESYNC = 111
+JITTER = Jitter(distribution="uniform", scale_s=0.01)
+GRID = {
+    "0.2 ms": (Link(delay_s=0.0001), Link(delay_s=0.0001), 20.0),
+    "40 ms": (Link(delay_s=0.02), Link(delay_s=0.02), 20.0),
+    "asymmetric": (Link(delay_s=0.09), Link(delay_s=0.01), 20.0),
+    "5 s": (Link(delay_s=2.5), Link(delay_s=2.5), 20.0),
+    "30 % loss": (Link(delay_s=0.05, loss_probability=0.3), Link(delay_s=0.05, loss_probability=0.3), 20.0),
+    "drift 300 ppm": (Link(delay_s=0.05), Link(delay_s=0.02), 300.0),
+    "reordering": (
+        Link(delay_s=0.05, jitter=JITTER, reordering=True, duplicate_probability=0.05),
+        Link(delay_s=0.05, jitter=JITTER, reordering=True),
+        20.0,
+    ),
+}
+CONSTANT = [name for name in GRID if name != "reordering"]
+
+
+@cache
+def flown(name: str) -> tuple[TickArray, Truth]:
+    up, down, drift_ppm = GRID[name]
+    scenario = CHAIN.model_copy(
+        update={
+            "duration_s": 20.0 if name == "5 s" else 8.0,
+            "control": CHAIN.control.model_copy(update={"gains": WEAK}),
+            "links": Links(up=up, down=down),
+            "clocks": Clocks(drift_max_ppm=drift_ppm),
+            "monitor": Monitor(act=False),
+            "safety": Safety(setpoint_timeout_s=30.0, heartbeat_timeout_s=30.0),
+        }
+    )
+    _, plan = flight_plan(scenario)
+    rows: list[Row] = []
+    station, fleet = Station(plan, start_ns=START_NS), Fleet(scenario, START_NS, record=rows.append)
+    ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=fleet)))
+    assert station.end_reason == "completed: duration reached"
+    return ticks, np.array([row if len(row) == 8 else (*row, 0, 0) for row in rows], DTYPE)
+
+
+def true_round_trips_s(truth: Truth, system_id: int) -> FloatArray:
+    """Of requests that the vehicle answered at once: from the request's entry to when the reply is due."""
+    own = truth[(truth["system_id"] == system_id) & (truth["key"] == TIMESYNC)]
+    asked, answered = own[own["kind"] == LINK_DOWN], own[own["kind"] == LINK_UP]
+    sent_ns = dict(zip(asked["due_ns"].tolist(), asked["entered_ns"].tolist(), strict=True))
+    trips = [
+        due_ns - sent_ns[entered_ns]
+        for entered_ns, due_ns in zip(answered["entered_ns"].tolist(), answered["due_ns"].tolist(), strict=True)
+        if entered_ns in sent_ns
+    ]
+    return np.unique(trips) * 1e-9
+
+
+@pytest.mark.parametrize("name", GRID)
+def test_every_round_trip_is_that_of_the_links_to_the_microsecond(name: str) -> None:
+    ticks, truth = flown(name)
+    for system_id in (1, 2, 3):
+        measured = ticks["rtt_s"][(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
+        real = true_round_trips_s(truth, system_id)
+        assert measured.size > 20
+        assert np.abs(measured[:, None] - real[None, :]).min(axis=1).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", CONSTANT)
+def test_loop_delay_is_exact_to_the_microsecond_where_links_are_constant(name: str) -> None:
+    ticks, truth = flown(name)
+    grade = graded(ticks["loop_delay_s"], true_loop_delays_s(ticks, truth))
+    assert grade["samples"] > 700
+    assert grade["error_p50_s"] < 1e-6
+    # Two clocks' rates are told apart only after a second; until then drift counts: 300 ppm of some 0.2 s.
+    assert grade["error_max_s"] < 1e-4
+
+
+def test_with_jitter_loop_delay_is_off_by_no_more_than_set_points_and_exchanges_differ() -> None:
+    """The down delay is that of the newest exchange; the set-point's own is known to nobody when it is sent."""
+    ticks, truth = flown("reordering")
+    grade = graded(ticks["loop_delay_s"], true_loop_delays_s(ticks, truth))
+    assert grade["samples"] > 700
+    assert 1e-3 < grade["error_p50_s"] < grade["error_max_s"] < 0.02 + 0.01  # jitter, and the clock's own error by it
+
+
+@pytest.mark.parametrize("name", GRID)
+def test_the_clock_offset_is_never_outside_its_bound(name: str) -> None:
+    ticks, truth = flown(name)
+    known = np.isfinite(ticks["clock_offset_s"]) & (ticks["sample_ns"] > 0)
+    sampled = truth[truth["kind"] == 1]
+    when = {(s, k): t for s, k, t in zip(*(sampled[n].tolist() for n in ("system_id", "key", "time_ns")), strict=True)}
+    rows = ticks[known & ticks["commanded"]]
+    error_s = [(int(row["sample_ns"]) - when[int(row["system_id"]), int(row["sample_boot_ms"])]) * 1e-9 for row in rows]
+    assert len(error_s) > 700
+    assert (np.abs(error_s) <= rows["clock_offset_bound_s"] + 1e-4).all()  # drift until it is known, as above
+
+
+def test_loss_and_duplicates_are_those_of_the_links_though_they_reorder() -> None:
+    ticks, truth = flown("reordering")
+    last = ticks[ticks["tick"] == ticks["tick"].max()]
+    up = truth[truth["kind"] == LINK_UP]
+    for row in last:
+        own = up[up["system_id"] == row["system_id"]]
+        doubled = int((own["fate"] & 1 != 0).sum())
+        # Frames still under way at the end, or newer ones that came before, differ by what one jitter holds.
+        assert int(row["duplicate"]) == pytest.approx(doubled, abs=3)
+        assert int(row["lost"]) <= 5
+
+
+def test_an_unknown_is_none_and_not_zero() -> None:
+    nothing = graded(np.full(3, np.nan), np.zeros(3))
+    assert nothing["status"] == "unknown"
+    assert [nothing[key] for key in ("error_p50_s", "error_p99_s", "error_max_s")] == [None] * 3
