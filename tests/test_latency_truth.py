@@ -108,7 +108,7 @@ def test_the_clock_offset_is_never_outside_its_bound(name: str) -> None:
     rows = ticks[known & ticks["commanded"]]
     error_s = [(int(row["sample_ns"]) - when[int(row["system_id"]), int(row["sample_boot_ms"])]) * 1e-9 for row in rows]
     assert len(error_s) > 700
-    assert (np.abs(error_s) <= rows["clock_offset_bound_s"] + 1e-4).all()  # drift until it is known, as above
+    assert (np.abs(error_s) <= rows["clock_offset_bound_s"]).all()
 
 
 def test_loss_and_duplicates_are_those_of_the_links_though_they_reorder() -> None:
