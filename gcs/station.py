@@ -24,7 +24,7 @@ from gcs.copters import START_PATIENCE_S, Copters
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
-from gcs.record import SEVERITY, TickArray
+from gcs.record import CLOCK_JUMPED, SEVERITY, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
 from gcs.sequence import DUPLICATE, LATE
 from gcs.startup import Startup
@@ -266,9 +266,7 @@ class Station:
         if vehicle.clock.jumps != jumps:
             self._history.forget(row)
             vehicle.forget_rates()
-            self.events.append(
-                Event(self.scenario_time_s(self._now_ns), "vehicle", "its clock jumped", vehicle.system_id)
-            )
+            self.events.append(Event(self.scenario_time_s(self._now_ns), "vehicle", CLOCK_JUMPED, vehicle.system_id))
 
     # -- the control tick ------------------------------------------------------------------------------------------
 

@@ -4,6 +4,7 @@ Works from the files alone, so a run whose station was killed is finished by the
 """
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs.record import (
+    CLOCK_JUMPED,
     DESIGN_FILE,
     PARQUET_FILE,
     SCENARIO_FILE,
@@ -98,6 +100,7 @@ def summarise(
     followers = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
     errors = {system_id: _error(flown, system_id) for system_id in followers}
     settled = _settling_time_s(errors, followers, scenario.safety.settled_fraction)
+    jumps = Counter(event["system_id"] for event in events if event["text"] == CLOCK_JUMPED)
     loop_delay = flown["loop_delay_s"][flown["commanded"]]
     headroom = flown["headroom"][flown["commanded"]]
     return {
@@ -113,7 +116,10 @@ def summarise(
         "settling_time_s": settled,
         "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,
         "duration_s": _number(flown["time_s"].max()) if flown.size else 0.0,
-        "vehicles": [_vehicle(ticks, flown, v.system_id, errors.get(v.system_id)) for v in scenario.vehicles],
+        "vehicles": [
+            _vehicle(ticks, flown, v.system_id, errors.get(v.system_id), jumps=jumps[v.system_id])
+            for v in scenario.vehicles
+        ],
         "control": _control(scenario, flown),
         "mode_changes": [e for e in events if e["kind"] == "mode" and e["time_s"] >= 0],
         "files": [],
@@ -157,7 +163,7 @@ def _settling_time_s(errors: dict[int, Errors], spacing_m: dict[int, float], fra
     return round(latest, 6)
 
 
-def _vehicle(ticks: TickArray, flown: TickArray, system_id: int, error: Errors | None) -> dict[str, Any]:
+def _vehicle(ticks: TickArray, flown: TickArray, system_id: int, error: Errors | None, *, jumps: int) -> dict[str, Any]:
     rows = ticks[ticks["system_id"] == system_id]
     rtt = rows["rtt_s"]
     own = flown[flown["system_id"] == system_id]
@@ -167,10 +173,34 @@ def _vehicle(ticks: TickArray, flown: TickArray, system_id: int, error: Errors |
         "system_id": system_id,
         "spacing_error_final_m": None if error_m is None else _number(error_m[-1]),
         "spacing_error_max_m": None if error_m is None else _number(error_m.max()),
-        "rtt_s": _spread(rtt) | {"samples": int(np.isfinite(rtt).sum())},
-        "loop_delay_s": _spread(own["loop_delay_s"][own["commanded"]]),
+        "rtt_s": _counted(rtt),
+        "loop_delay_s": _counted(own["loop_delay_s"][own["commanded"]]),
+        "down_delay_s": _counted(own["down_delay_s"][own["commanded"]]),
+        "telemetry_age_s": _counted(own["telemetry_age_s"][own["commanded"]]),
+        "station_queue_s": _counted(own["queue_s"][own["commanded"]]),
+        "clock": _clock(own, int(np.isfinite(rtt).sum())) | {"jumps": jumps},
         "mode_final": None if not rows.size else Mode(int(rows["mode"][-1])).name,
         **counted,
+    }
+
+
+def _counted(values: NDArray[np.float64]) -> dict[str, Any]:
+    """The spread of an estimate with its status and the number of its samples."""
+    samples = int(np.isfinite(values).sum())
+    return _spread(values) | {"samples": samples, "status": "measured" if samples else "unknown"}
+
+
+def _clock(own: TickArray, exchanges: int) -> dict[str, Any]:
+    """The vehicle's boot clock against the station's, as last estimated, and how wrong the offset may be."""
+    known = own[np.isfinite(own["clock_offset_s"])]
+    if not known.size:
+        return {"status": "unknown", "samples": 0, "offset_s": None, "bound_s": None}
+    offset_s, bound_s = known["clock_offset_s"][-1], known["clock_offset_bound_s"][-1]
+    return {
+        "status": "measured",
+        "samples": exchanges,
+        "offset_s": _number(offset_s),
+        "bound_s": _number(bound_s),
     }
 
 
@@ -191,9 +221,9 @@ def _control(scenario: Scenario, flown: TickArray) -> dict[str, Any]:
 def _spread(values: NDArray[np.float64]) -> dict[str, float | None]:
     known = values[np.isfinite(values)]
     if not known.size:
-        return {"p50": None, "p99": None, "max": None}
-    p50, p99 = np.percentile(known, [50, 99])
-    return {"p50": _number(p50), "p99": _number(p99), "max": _number(known.max())}
+        return {"p50": None, "p95": None, "p99": None, "max": None}
+    p50, p95, p99 = np.percentile(known, [50, 95, 99])
+    return {"p50": _number(p50), "p95": _number(p95), "p99": _number(p99), "max": _number(known.max())}
 
 
 def _number(value: Any) -> float | None:
