@@ -1,5 +1,9 @@
-"""Random loops: three independent methods agree, and the margin transforms as it must."""
+"""Random loops: three independent methods agree, the margin transforms as it must, and no lower bound is above it.
 
+`RANDOM_LOOPS=1000 python3 make.py test tests/test_delay_opinions.py` takes a thousand; 200 are taken by default.
+"""
+
+import os
 from math import inf, isfinite
 
 import numpy as np
@@ -10,8 +14,11 @@ from gains.delay import analyse_delay, delay_margin, frequency_sweep_margin
 from gains.delay_opinions import checked_delay_margin
 from gains.errors import BadModelError
 from gains.rightmost import rightmost_root
+from gains.varying_delay import hierarchy_bound, small_gain_bound, varying_delay_bound
 
 Matrix = NDArray[np.float64]
+RANDOM_LOOPS = int(os.environ.get("RANDOM_LOOPS", "200"))
+PARTS = range(RANDOM_LOOPS // 50)
 
 
 def random_loop(seed: int) -> tuple[Matrix, Matrix]:
@@ -25,7 +32,7 @@ def random_loop(seed: int) -> tuple[Matrix, Matrix]:
     return A0 - (rightmost + rng.uniform(-0.3, 0.6)) * np.eye(n), A1
 
 
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize("part", PARTS)
 def test_three_opinions_agree_on_random_loops(part: int) -> None:
     margins = [checked_delay_margin(*random_loop(seed)) for seed in range(50 * part, 50 * part + 50)]
     # the sample means something only if every verdict occurs
@@ -46,25 +53,43 @@ def test_windows_of_random_loops_are_those_of_the_rightmost_root(seed: int) -> N
             assert (rightmost_root([(A0, 0.0), (A1, float(delay_s))]).real < 0.0) == stable
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_margin_scales_with_time(seed: int) -> None:
-    A0, A1 = random_loop(seed)
-    # a factor that is no power of two changes every rounding
-    assert delay_margin(7.3e3 * A0, 7.3e3 * A1) == pytest.approx(delay_margin(A0, A1) / 7.3e3, rel=1e-9)
+@pytest.mark.parametrize("part", PARTS)
+def test_margin_scales_with_time(part: int) -> None:
+    for seed in range(50 * part, 50 * part + 50):
+        A0, A1 = random_loop(seed)
+        # a factor that is no power of two changes every rounding
+        assert delay_margin(7.3e3 * A0, 7.3e3 * A1) == pytest.approx(delay_margin(A0, A1) / 7.3e3, rel=1e-9), seed
 
 
-@pytest.mark.parametrize("seed", range(30))
-def test_margin_does_not_depend_on_coordinates(seed: int) -> None:
-    A0, A1 = random_loop(seed)
-    n = len(A0)
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(n)
-    T = rng.normal(size=(n, n)) + 3.0 * np.eye(n)
+@pytest.mark.parametrize("part", PARTS)
+def test_margin_does_not_depend_on_coordinates(part: int) -> None:
+    for seed in range(50 * part, 50 * part + 50):
+        A0, A1 = random_loop(seed)
+        n = len(A0)
+        rng = np.random.default_rng(seed)
+        order = rng.permutation(n)
+        T = rng.normal(size=(n, n)) + 3.0 * np.eye(n)
+        margin_s = delay_margin(A0, A1)
+        permuted = delay_margin(A0[np.ix_(order, order)], A1[np.ix_(order, order)])
+        assert permuted == pytest.approx(margin_s, rel=1e-9), seed
+        # a similarity costs as many digits as its condition number has
+        similar = [np.linalg.solve(T, matrix @ T) for matrix in (A0, A1)]
+        assert delay_margin(*similar) == pytest.approx(margin_s, rel=1e-11 * np.linalg.cond(T) ** 2 + 1e-8), seed
+
+
+@pytest.mark.parametrize("seed", range(RANDOM_LOOPS if RANDOM_LOOPS >= 1000 else 6))  # some seconds each
+def test_no_lower_bound_is_above_the_margin(seed: int) -> None:
+    A0, A1 = random_loop(5000 + seed)
     margin_s = delay_margin(A0, A1)
-    assert delay_margin(A0[np.ix_(order, order)], A1[np.ix_(order, order)]) == pytest.approx(margin_s, rel=1e-9)
-    # a similarity of condition number up to some hundreds costs as many digits
-    similar = [np.linalg.solve(T, matrix @ T) for matrix in (A0, A1)]
-    assert delay_margin(*similar) == pytest.approx(margin_s, rel=1e-8)
+    slow = varying_delay_bound(A0, A1, rate=0.1)
+    any_s = varying_delay_bound(A0, A1, rate=inf)
+    constant = [hierarchy_bound(A0, A1, order=order) for order in (0, 2)]
+    rounding = 1.0 + 1e-9
+    assert small_gain_bound(A0, A1) <= any_s * (1.0 + 1e-3)  # both are ends of bisections
+    assert any_s <= margin_s * rounding
+    assert slow <= margin_s * rounding
+    assert constant[0] <= constant[1] * (1.0 + 1e-3)
+    assert constant[1] <= margin_s * rounding
 
 
 @pytest.mark.parametrize("size", [12, 20])
