@@ -156,6 +156,29 @@ def margin(
 
 
 @app.command()
+def thesis(
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="where page and figures go")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Reproduce the figures and numbers of the source, published and computed side by side."""
+    from dataclasses import asdict
+
+    from gcs import thesis as source
+    from gcs.fly import new_folder
+
+    folder = _out_folder(out) if out is not None else new_folder("thesis")
+    found = source.claims()
+    page = source.write_page(folder, found)
+    if as_json:
+        typer.echo(json.dumps([asdict(claim) for claim in found], indent=2, ensure_ascii=False))
+        return
+    for claim in found:
+        typer.echo(f"{claim.place}  {claim.subject}: {claim.verdict}")
+        typer.echo(f"    published {claim.published}; computed {claim.computed}; {claim.second}")
+    typer.echo(f"files    {page} and its figures")
+
+
+@app.command()
 def bench(
     scenario_file: ScenarioFile,
     vehicles: Annotated[

@@ -182,19 +182,21 @@ def _verdicts(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> NDArray[np.s
     return worst
 
 
-def figure_of(rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,)) -> tuple[Any, Any]:
-    """A figure that needs no screen, and its plots from the top."""
+def figure_of(
+    rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
+) -> tuple[Any, Any]:
+    """A figure that needs no screen, and its plots: a list from the top, or rows of columns if there are several."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
     FigureCanvasAgg(figure)
-    plots = figure.subplots(rows, 1, squeeze=False, height_ratios=heights)[:, 0]
-    for plot in plots:
+    plots = figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
+    for plot in plots.flat:
         plot.grid(visible=True, color="#dddddd", linewidth=0.6)
         plot.spines[["top", "right"]].set_visible(False)
         plot.set_axisbelow(True)
-    return figure, plots
+    return figure, plots if columns > 1 else plots[:, 0]
 
 
 def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
