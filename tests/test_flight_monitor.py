@@ -17,6 +17,7 @@ from gcs.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import Mode, TickArray
 from gcs.station import Station
+from gcs.summary import summarise
 from scenarios.files import load
 from scenarios.schema import DelayPoint, Jitter, Link, Links, Monitor, Safety
 
@@ -132,3 +133,15 @@ def test_every_mode_change_is_an_event_and_a_statustext() -> None:
     assert len(told) >= len(changes) - len(plan.formation.system_ids)
     assert {m.severity for m in told if m.text.endswith("CRITICAL")} == {dialect.MAV_SEVERITY_CRITICAL}
     assert {m.severity for m in told if m.text.endswith("CAUTION")} == {dialect.MAV_SEVERITY_WARNING}
+
+
+def test_a_collision_ends_the_flight_as_broken_and_the_least_distance_is_in_the_summary() -> None:
+    # Vehicles that stand nearer to each other than is allowed, from the flight's first tick on.
+    ticks, station = flown(duration_s=5.0, safety=Safety(collision_distance_m=150.0))
+    assert station.end_reason.startswith("broken: vehicles")
+    assert "have collided" in station.end_reason
+    events = [{"time_s": 0.0, "kind": "end", "text": station.end_reason, "system_id": None}]
+    design = {"delay_margin_s": 0.3, "delay_margin_continuous_s": 0.3}
+    summary = summarise(planned().scenario, design, ticks, events)
+    assert summary["verdict"] == "unstable"
+    assert 0.0 < summary["distance_min_m"] < 150.0
