@@ -356,9 +356,9 @@ chapters 3 and 4 are not printed there: the states are ours, the gains are desig
 ## Figures 3.2-3.6: inclusion gains at alpha = {alpha}
 
 Snapshots of the five vehicles and the distances V1-V2 and V2-V3 of the nonlinear vehicles, flown over MAVLink in
-virtual time without link delay: two sets of initial states, and the course with heading -60, 0 and +60 degrees. (The course is
-printed with the heading -60 degrees in all three legs, a slip.) Distances are between states as reported, up to 20 ms
-and so 6 ft apart.
+virtual time without link delay: two sets of initial states, and the course with heading -60, 0 and +60 degrees. (The
+course is printed with the heading -60 degrees in all three legs, a slip.) Distances are between states as reported,
+up to 20 ms and so 6 ft apart.
 
 ![inclusion](inclusion.png)
 
@@ -368,8 +368,8 @@ and so 6 ft apart.
 
 ## Figures 5.2-5.4: printed gains, neighbours' information late
 
-The nonlinear model with h = 0.17 s, as published; and with 0.9 s, which by the published margin of 0.19 s should not hold,
-and 1.1 s, which is beyond the computed one.
+The nonlinear model with h = 0.17 s, as published; and with 0.9 s, which by the published margin of 0.19 s should not
+hold, and 1.1 s, which is beyond the computed one.
 
 ![responses](responses.png)
 """
