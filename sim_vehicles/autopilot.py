@@ -55,6 +55,14 @@ class Autopilot:
             return STATUS_STANDBY
         return STATUS_CRITICAL if self.failsafe else STATUS_ACTIVE
 
+    def set_timeouts(self, setpoint_s: float, heartbeat_s: float, now_ns: int) -> None:
+        """How long the station may be silent from now on; both timers begin anew if that is a change."""
+        timeouts_ns = round(setpoint_s * NS_PER_S), round(heartbeat_s * NS_PER_S)
+        if timeouts_ns != (self._setpoint_timeout_ns, self._heartbeat_timeout_ns):
+            self._setpoint_timeout_ns, self._heartbeat_timeout_ns = timeouts_ns
+            self._setpoint_ns = self._heartbeat_ns = now_ns
+            self._set_deadline()
+
     def hear_heartbeat(self, now_ns: int) -> None:
         """A station's heartbeat arrived."""
         self._heartbeat_ns = max(self._heartbeat_ns, now_ns)

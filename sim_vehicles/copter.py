@@ -27,7 +27,9 @@ from sim_vehicles.copter_rules import (
 )
 from sim_vehicles.dynamics import State, state_from
 from sim_vehicles.links import NEVER_NS
+from sim_vehicles.parameters import LIST_INTERVAL_US, Parameters, fixed, timeout
 from sim_vehicles.schedule import Schedule
+from sim_vehicles.service_messages import PARAMETER_VALUE, ParameterSet, Request
 from sim_vehicles.truth import ACTED, SAMPLED, Record
 from sim_vehicles.vehicle import (
     ABSURD,
@@ -58,6 +60,14 @@ class Copter:
         self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
         self.last_heard_ns = start_ns
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
+        self.parameters = Parameters(
+            (
+                fixed(self.rules.system_id_parameter, own.system_id),
+                timeout(self.rules.setpoint_timeout_parameter, self.rules.setpoint_timeout_s),
+                timeout(self.rules.ground_disarm_parameter, GROUND_DISARM_S),
+            ),
+            bytewise=self.rules.parameters_bytewise,
+        )
         self.mode = self.rules.first_mode
         self.armed = self.failsafe = False
         self.landed = True
@@ -74,6 +84,7 @@ class Copter:
         self._motion_ns = start_ns
         self._setpoint_ns: int | None = None
         self._armed_ns = NEVER_NS
+        self._read_timeouts()
         self._refusals_left = self.settings.arming_refusals
         self._telemetry_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
         self._ready_ns = start_ns + round(self.settings.ready_after_s * NS_PER_S)
@@ -136,9 +147,9 @@ class Copter:
         if self._jumps:
             deadline_ns = min(deadline_ns, self._jumps[0][0])
         if self._setpoint_ns is not None and not self.landed and self.mode == self.rules.guided_mode:
-            deadline_ns = min(deadline_ns, self._setpoint_ns + round(self.rules.setpoint_timeout_s * NS_PER_S))
+            deadline_ns = min(deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)
         if self.armed and self.landed:
-            deadline_ns = min(deadline_ns, self._armed_ns + round(GROUND_DISARM_S * NS_PER_S))
+            deadline_ns = min(deadline_ns, self._armed_ns + self._ground_disarm_ns)
         return deadline_ns
 
     def _happen(self, time_ns: int) -> None:
@@ -195,6 +206,8 @@ class Copter:
             self._advance(at_ns)
             if isinstance(message, mavlink.Setpoint):
                 self._take_setpoint(message, at_ns)
+            elif not isinstance(message, mavlink.Command):
+                self._take_request(message, at_ns)
             else:
                 self.counters["commands"] += 1
                 at = len(self._out)
@@ -241,6 +254,23 @@ class Copter:
         if self._record is not None:
             self._record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
 
+    def _take_request(self, request: Request, time_ns: int) -> None:
+        for frame in self.parameters.answer(request, self._encoder, self.counters):
+            self._send(frame, time_ns)
+        if self.parameters.listing:
+            self._intervals_us[PARAMETER_VALUE] = LIST_INTERVAL_US
+            self._plan_reports(time_ns)
+        if isinstance(request, ParameterSet):
+            before = self._setpoint_timeout_ns, self._ground_disarm_ns
+            self._read_timeouts()
+            if (self._setpoint_timeout_ns, self._ground_disarm_ns) != before:
+                self._armed_ns = time_ns  # timers begin anew, so that none ends in the past
+                self._setpoint_ns = None if self._setpoint_ns is None else time_ns
+
+    def _read_timeouts(self) -> None:
+        self._setpoint_timeout_ns = round(self.parameters[self.rules.setpoint_timeout_parameter] * NS_PER_S)
+        self._ground_disarm_ns = round(self.parameters[self.rules.ground_disarm_parameter] * NS_PER_S)
+
     # Commands
 
     def _ready(self, time_ns: int) -> bool:
@@ -275,9 +305,7 @@ class Copter:
             return mavlink.ACCEPTED
         if mode != self.rules.first_mode and not self._ready(time_ns):
             return self.rules.arming_refused  # these modes need a position
-        streamed = (
-            self._setpoint_ns is not None and time_ns - self._setpoint_ns < self.rules.setpoint_timeout_s * NS_PER_S
-        )
+        streamed = self._setpoint_ns is not None and time_ns - self._setpoint_ns < self._setpoint_timeout_ns
         if mode == self.rules.guided_mode != self.rules.takeoff_mode and not streamed:
             self._say(time_ns, "Offboard needs set-points")
             return TEMPORARILY_REJECTED
@@ -330,6 +358,12 @@ class Copter:
         if message_id == mavlink.TIMESYNC:
             self._timesync_ts1 = self.clock.boot_ns(time_ns)
             self._send(self._encoder.timesync(0, self._timesync_ts1), time_ns)
+            return
+        if message_id == PARAMETER_VALUE:
+            self._send(self.parameters.next_of_list(self._encoder), time_ns)
+            if not self.parameters.listing:
+                del self._intervals_us[PARAMETER_VALUE]
+                self._schedule.set_interval(PARAMETER_VALUE, 0, time_ns)
             return
         facts = Facts(
             self.motion, self.origin_neu_m, self.mode, self.armed, self.landed, self.failsafe, self._ready(time_ns)

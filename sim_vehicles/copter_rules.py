@@ -16,7 +16,7 @@ POSITION_AXES, VELOCITY_AXES, ACCELERATION_AXES = 0x007, 0x038, 0x1C0
 LOCAL_FRAMES = (1, 7)
 """LOCAL_NED and LOCAL_OFFSET_NED: the same for velocities and accelerations."""
 GROUND_DISARM_S = 10.0
-"""Armed and not taken off for this long, both disarm again (DISARM_DELAY, COM_DISARM_PRFLT)."""
+"""Armed and not taken off for this long, both disarm again."""
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
@@ -41,6 +41,11 @@ class Rules:
     """Reports the estimator's flags: EKF_STATUS_REPORT, ESTIMATOR_STATUS."""
     arming_refused: int
     """MAV_RESULT of what is refused because it is not ready."""
+    parameters_bytewise: bool
+    """How it sends integers as parameters."""
+    system_id_parameter: str
+    setpoint_timeout_parameter: str
+    ground_disarm_parameter: str
     setpoint_timeout_s: float
     velocity_grows: bool
     """Whether the velocity target grows with the acceleration between two set-points."""
@@ -58,7 +63,11 @@ ARDUPILOT = Rules(
     land_mode=9,
     estimator_message=193,
     arming_refused=FAILED,
-    setpoint_timeout_s=3.0,  # GUID_TIMEOUT
+    parameters_bytewise=False,
+    system_id_parameter="SYSID_THISMAV",
+    setpoint_timeout_parameter="GUID_TIMEOUT",
+    ground_disarm_parameter="DISARM_DELAY",
+    setpoint_timeout_s=3.0,
     velocity_grows=True,
     version_1_first=False,
 )
@@ -78,7 +87,11 @@ PX4 = Rules(
     land_mode=px4_mode(4, 6),
     estimator_message=230,
     arming_refused=TEMPORARILY_REJECTED,
-    setpoint_timeout_s=1.0,  # COM_OF_LOSS_T
+    parameters_bytewise=True,
+    system_id_parameter="MAV_SYS_ID",
+    setpoint_timeout_parameter="COM_OF_LOSS_T",
+    ground_disarm_parameter="COM_DISARM_PRFLT",
+    setpoint_timeout_s=1.0,
     velocity_grows=False,
     version_1_first=True,
 )

@@ -1,4 +1,4 @@
-"""The vehicles' side of MAVLink 2: datagrams to typed messages, and reports to frames. The one user of pymavlink here.
+"""The vehicles' side of MAVLink 2: datagrams to typed messages, and reports to frames.
 
 Datagrams are cut into frames here, each on its own: pymavlink's stream parser would let a frame cut short swallow the
 next datagram. Its message tables, and its decoder for all but the one frequent message, do the rest. What is refused
@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from sim_vehicles.service_messages import REQUESTS, Request, request
 
 MAGIC_1, MAGIC_2 = dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2
 HEADER_BYTES, CHECKSUM_BYTES, SIGNATURE_BYTES = dialect.HEADER_LEN_V2, 2, dialect.MAVLINK_SIGNATURE_BLOCK_LEN
@@ -102,7 +104,7 @@ class Timesync(NamedTuple):
     target_system: int
 
 
-Message = Setpoint | Command | Heartbeat | Timesync
+Message = Setpoint | Command | Heartbeat | Timesync | Request
 
 
 def read_datagram(data: bytes, counters: Counter[str]) -> list[Message]:
@@ -176,6 +178,8 @@ def _append(messages: list[Message], frame: bytes, checked: int, counters: Count
         messages.append(Timesync(tc1, ts1, target))
     elif number in (HEARTBEAT, COMMAND_LONG, COMMAND_INT):
         messages.append(_decode(number, frame))
+    elif number in REQUESTS:
+        messages.append(request(number, frame[HEADER_BYTES:checked]))
     else:
         counters["ignored_message"] += 1
 
@@ -223,7 +227,7 @@ class Encoder:
         """LOCAL_POSITION_NED."""
         velocity = (*velocity_ne_m_s, velocity_down_m_s)
         payload = _LOCAL_POSITION.unpacker.pack(time_boot_ms, north_m, east_m, down_m, *velocity)
-        return self._frame(LOCAL_POSITION, payload)
+        return self.frame(LOCAL_POSITION, payload)
 
     def global_position(
         self,
@@ -238,7 +242,7 @@ class Encoder:
     ) -> bytes:
         """GLOBAL_POSITION_INT; what does not fit a field is cut to its largest value."""
         north, east = velocity_ne_m_s
-        return self._pack(
+        return self.pack(
             dialect.MAVLink_global_position_int_message(
                 time_boot_ms,
                 _clipped(latitude_deg * 1e7, 2**31 - 1),
@@ -260,7 +264,7 @@ class Encoder:
         autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
     ) -> bytes:
         """HEARTBEAT of a quadrotor, an ArduCopter's if not told otherwise."""
-        return self._pack(
+        return self.pack(
             dialect.MAVLink_heartbeat_message(
                 dialect.MAV_TYPE_QUADROTOR,
                 autopilot,
@@ -273,11 +277,11 @@ class Encoder:
 
     def timesync(self, tc1: int, ts1: int) -> bytes:
         """TIMESYNC, a request if tc1 is 0."""
-        return self._frame(TIMESYNC, _TIMESYNC.unpacker.pack(tc1, ts1))
+        return self.frame(TIMESYNC, _TIMESYNC.unpacker.pack(tc1, ts1))
 
     def command_ack(self, command: int, result: int, requester: tuple[int, int]) -> bytes:
         """COMMAND_ACK to the (system, component) that asked."""
-        return self._pack(
+        return self.pack(
             dialect.MAVLink_command_ack_message(
                 command, result, target_system=requester[0], target_component=requester[1]
             )
@@ -287,23 +291,23 @@ class Encoder:
         """STATUSTEXT in one chunk."""
         encoded = text.encode("ascii")
         assert len(encoded) <= 50
-        return self._pack(dialect.MAVLink_statustext_message(severity, encoded))
+        return self.pack(dialect.MAVLink_statustext_message(severity, encoded))
 
     def message_interval(self, number: int, interval_us: int) -> bytes:
         """MESSAGE_INTERVAL."""
-        return self._pack(dialect.MAVLink_message_interval_message(number, interval_us))
+        return self.pack(dialect.MAVLink_message_interval_message(number, interval_us))
 
     def autopilot_version(self) -> bytes:
         """AUTOPILOT_VERSION: the capabilities, and zeros for hardware that is not there."""
         none: Sequence[int] = (0,) * 8
         uid = self._pymavlink.srcSystem
-        return self._pack(
+        return self.pack(
             dialect.MAVLink_autopilot_version_message(_CAPABILITIES, 0, 0, 0, 0, none, none, none, 0, 0, uid)
         )
 
     def home_position(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> bytes:
         """HOME_POSITION at the origin of the local frame."""
-        return self._pack(
+        return self.pack(
             dialect.MAVLink_home_position_message(
                 round(latitude_deg * 1e7),
                 round(longitude_deg * 1e7),
@@ -314,7 +318,7 @@ class Encoder:
             )
         )
 
-    def _frame(self, number: int, payload: bytes) -> bytes:
+    def frame(self, number: int, payload: bytes) -> bytes:
         """A frequent message, without an object of pymavlink's; `number` is below 256."""
         payload = payload.rstrip(b"\0") or b"\0"
         mav = self._pymavlink
@@ -325,16 +329,17 @@ class Encoder:
     def estimator_flags(self, message_id: int, time_us: int, flags: int) -> bytes:
         """EKF_STATUS_REPORT or ESTIMATOR_STATUS with these flags, which mean the same in both."""
         if message_id == EKF_STATUS:
-            return self._pack(dialect.MAVLink_ekf_status_report_message(flags, *(0.1,) * 5))
+            return self.pack(dialect.MAVLink_ekf_status_report_message(flags, *(0.1,) * 5))
         assert message_id == ESTIMATOR_STATUS
-        return self._pack(dialect.MAVLink_estimator_status_message(time_us, flags, *(0.1,) * 8))
+        return self.pack(dialect.MAVLink_estimator_status_message(time_us, flags, *(0.1,) * 8))
 
     def global_origin(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> bytes:
         """GPS_GLOBAL_ORIGIN: where this vehicle's local frame begins."""
         degrees = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
-        return self._pack(dialect.MAVLink_gps_global_origin_message(*degrees, round(altitude_m * 1e3)))
+        return self.pack(dialect.MAVLink_gps_global_origin_message(*degrees, round(altitude_m * 1e3)))
 
-    def _pack(self, message: dialect.MAVLink_message) -> bytes:
+    def pack(self, message: dialect.MAVLink_message) -> bytes:
+        """Any message, from one of pymavlink's."""
         frame = message.pack(self._pymavlink)
         self._pymavlink.seq = (self._pymavlink.seq + 1) & 0xFF
         return frame

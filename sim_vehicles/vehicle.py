@@ -16,7 +16,9 @@ from sim_vehicles import mavlink
 from sim_vehicles.autopilot import MODE_NAMES, Autopilot
 from sim_vehicles.clock import BootClock
 from sim_vehicles.dynamics import COAST, VELOCITY_GAIN_1_S, Command, State, advance, bounds_of, state_from
+from sim_vehicles.parameters import LIST_INTERVAL_US, Parameters, of_vehicle
 from sim_vehicles.schedule import US_PER_MS, Schedule
+from sim_vehicles.service_messages import PARAMETER_VALUE, ParameterSet, Request
 from sim_vehicles.truth import ACTED, SAMPLED, Record
 
 ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M = -35.363262, 149.165237, 584.0
@@ -61,6 +63,7 @@ class Vehicle:
         """When the last valid frame for this vehicle, or for all, arrived."""
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.autopilot = Autopilot(scenario.safety)
+        self.parameters = Parameters(of_vehicle(own.system_id, scenario.safety))
         self._record = record
         self._encoder = mavlink.Encoder(own.system_id)
         self._altitude_m = scenario.altitude_m
@@ -135,6 +138,10 @@ class Vehicle:
                     self._take_command(message, time_ns)
             elif isinstance(message, mavlink.Timesync):
                 self._take_timesync(message, time_ns)
+            elif not isinstance(message, mavlink.Heartbeat):
+                if self._is_for_us(message.target_system, message.target_component):
+                    self.last_heard_ns = time_ns
+                    self._take_request(message, max(time_ns, self._state_ns))
             elif message.vehicle_type == mavlink.TYPE_GCS:
                 self.counters["heartbeats"] += 1
                 self.last_heard_ns = time_ns
@@ -182,6 +189,15 @@ class Vehicle:
             self.last_heard_ns = time_ns
         else:
             self.counters["ignored_timesync_reply"] += 1  # to another vehicle, or a duplicate
+
+    def _take_request(self, request: Request, time_ns: int) -> None:
+        for frame in self.parameters.answer(request, self._encoder, self.counters):
+            self._send(frame, time_ns)
+        if self.parameters.listing:
+            self._schedule.set_interval(PARAMETER_VALUE, LIST_INTERVAL_US, time_ns)
+        if isinstance(request, ParameterSet):
+            timeouts_s = self.parameters["GUID_TIMEOUT"], self.parameters["FS_GCS_TIMEOUT"]
+            self.autopilot.set_timeouts(*timeouts_s, time_ns)
 
     # Commands
 
@@ -272,6 +288,10 @@ class Vehicle:
         elif message_id == mavlink.TIMESYNC:
             self._timesync_ts1 = self.clock.boot_ns(time_ns)
             frame = self._encoder.timesync(0, self._timesync_ts1)
+        elif message_id == PARAMETER_VALUE:
+            frame = self.parameters.next_of_list(self._encoder)
+            if not self.parameters.listing:
+                self._schedule.set_interval(PARAMETER_VALUE, 0, time_ns)
         else:
             autopilot = self.autopilot
             frame = self._encoder.heartbeat(autopilot.base_mode, autopilot.mode, autopilot.system_status)
