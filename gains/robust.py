@@ -188,8 +188,8 @@ def certify(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, alpha: float, W: ArrayL
     t = cp.Variable()
     corner: Any = (A.T @ P + P @ A) / alpha + W_.T @ W_
     s_procedure = cp.bmat([[corner, P], [P, -np.eye(m)]])
-    problem = cp.Problem(cp.Maximize(t), [_negative(s_procedure, t * np.eye(2 * m)), P - t * np.eye(m) >> 0])
-    solver = _solved(problem, advice=f"alpha = {alpha} may be too near its limit; try one smaller by 1e-4 of itself")
+    problem = cp.Problem(cp.Maximize(t), [negative(s_procedure, t * np.eye(2 * m)), P - t * np.eye(m) >> 0])
+    solver = solved(problem, advice=f"alpha = {alpha} may be too near its limit; try one smaller by 1e-4 of itself")
     if float(np.asarray(t.value)) <= 0:
         raise InfeasibleError(f"no quadratic Lyapunov function proves alpha = {alpha:.6g} for these gains; lower alpha")
     return _checked_certificate(A, W_, alpha, alpha * np.asarray(P.value, dtype=float), solver)
@@ -246,11 +246,11 @@ def robust_lmi(
     gain_limit = cp.bmat([[gain_bound * np.eye(m), L.T], [L, gain_bound * np.eye(2 * axes)]])
     lyapunov_limit = cp.bmat([[Y, np.eye(m)], [np.eye(m), lyapunov_bound * np.eye(m)]])
     constraints: list[Any] = [
-        _negative(sector, _LMI_SLACK * np.eye(m + len(W_z))),
+        negative(sector, _LMI_SLACK * np.eye(m + len(W_z))),
         gain_limit >> 0,
         lyapunov_limit >> 0,
     ]
-    solver = _solved(
+    solver = solved(
         cp.Problem(cp.Minimize(gamma), constraints),
         advice=f"raise gain_bound = {gain_bound} or lyapunov_bound = {lyapunov_bound}, or move shear = {shear} to zero",
     )
@@ -296,12 +296,12 @@ def _checked_weight(W: ArrayLike | None, m: int) -> FloatArray:
     return weight
 
 
-def _negative(matrix: Any, slack: Any) -> Any:
+def negative(matrix: Any, slack: Any) -> Any:
     """Constraint matrix ⪯ −slack; the mean with the transpose tells cvxpy what it cannot see: that it is symmetric."""
     return (matrix + matrix.T) / 2 + slack << 0
 
 
-def _solved(problem: Any, *, advice: str) -> SolverFacts:
+def solved(problem: Any, *, advice: str) -> SolverFacts:
     """Solve with Clarabel and return the facts; every status but "optimal" is an error."""
     from importlib.metadata import version
 

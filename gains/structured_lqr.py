@@ -248,7 +248,7 @@ def structured_lqr(
     return StructuredLqr(
         K=point.K,
         cost=point.cost,
-        cost_centralised=centralised_cost(plant, weights),
+        cost_centralised=centralised_lqr(plant, weights)[1],
         decrement=decrement,
         gradient_norm=float(np.linalg.norm(point.gradient)),
         costs=tuple(costs),
@@ -263,13 +263,23 @@ def lqr_cost(plant: Plant, pattern: Pattern, weights: Weights, K: ArrayLike) -> 
     return (np.inf, np.zeros(pattern.mask.shape)) if point is None else (point.cost, point.gradient)
 
 
-def centralised_cost(plant: Plant, weights: Weights) -> float:
-    """Least cost of all gains on the full state: trace(P X0) with P of the algebraic Riccati equation.
+def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
+    """The optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P X0), of the algebraic Riccati equation.
 
     Raises
     ------
     InfeasibleError
         If the Riccati equation has no stabilising solution.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.pattern import Plant
+    >>> from gains.structured_lqr import Weights, centralised_lqr
+    >>> integrator = Plant(A=np.zeros((1, 1)), B=np.eye(1), C=np.eye(1))
+    >>> K, cost = centralised_lqr(integrator, Weights(Q=4 * np.eye(1), R=np.eye(1), X0=np.eye(1)))
+    >>> K.round(12).tolist(), round(cost, 12)
+    ([[-2.0]], 2.0)
     """
     weights.check_fits(plant)
     try:
@@ -279,7 +289,7 @@ def centralised_cost(plant: Plant, weights: Weights) -> float:
             f"the Riccati equation has no stabilising solution ({error}): (A, B) must be stabilisable and Q must weigh "
             "every mode on the imaginary axis"
         ) from error
-    return float(np.sum(P * weights.X0))
+    return -np.linalg.solve(weights.R, plant.B.T @ P), float(np.sum(P * weights.X0))
 
 
 def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatArray:

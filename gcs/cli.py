@@ -125,12 +125,13 @@ def compare(
     from dataclasses import asdict
 
     from gcs import compare as comparing
+    from gcs.design_cost import design_costs
     from gcs.fly import new_folder
 
     scenario = _scenario(scenario_file)
     folder = _out_folder(out) if out is not None else new_folder(f"{scenario.name}-compare")
     routes, flights = comparing.compare(scenario)
-    grown = comparing.sizes() if sizes else []
+    grown = design_costs() if sizes else []
     comparing.write_comparison(folder, scenario, routes, flights, grown)
     if as_json:
         typer.echo(json.dumps({"routes": [asdict(route) for route in routes], "files": str(folder)}, indent=2))

@@ -13,13 +13,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.design import design
 from gains.dk_iteration import LARGEST_STATES, abscissa
 from gains.errors import GainsError
 from gains.formation import FormationModel
-from gains.pattern import bidirectional, leader_follower
-from gains.requirement import Requirement
 from gains.robust import disturbance_bound
+from gcs.design_cost import RATIO, DesignCost, ratios
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import TickArray
 from gcs.report import UNKNOWN, number_text
@@ -32,9 +30,6 @@ FloatArray = NDArray[np.float64]
 Method = Literal["inclusion", "graph-lqr", "graph-dk"]
 METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr", "graph-dk")
 REPORT_FILE, RESULT_FILE = "compare.html", "compare.json"
-_SIZES = (3, 5, 10, 20, 40, 80)
-_LONGEST_DESIGN_S = 10.0
-"""A method that took longer than this is not tried on more vehicles."""
 
 
 @dataclass(frozen=True)
@@ -72,16 +67,6 @@ class Route:
     string_peak: float | None = None
     links: int | None = None
     numbers_used: int | None = None
-
-
-@dataclass(frozen=True)
-class Size:
-    """What a design costs for a chain of so many vehicles: time and the number of free gains."""
-
-    method: str
-    vehicles: int
-    design_s: float
-    free_gains: int
 
 
 Flights = dict[Method, TickArray]
@@ -185,32 +170,8 @@ def string_peak(model: FormationModel, K: FloatArray) -> float | None:
     return max(float((size[i] / size[j]).max()) for i, j in pairs)
 
 
-def sizes() -> list[Size]:
-    """Design time of chains of growing length for a margin of 0.3 s at 50 Hz, and the number of free gains an axis."""
-    found: list[Size] = []
-    for label in ("inclusion", "graph-lqr", "graph-lqr, bidirectional", "graph-dk"):
-        for vehicles in _SIZES:
-            chain = FormationModel(tuple(range(-1, vehicles - 1)))
-            pattern = bidirectional(chain) if "bidirectional" in label else leader_follower(chain)
-            if label == "graph-dk" and 2 * vehicles - 1 > LARGEST_STATES // 2:
-                break
-            begun_s = time.perf_counter()
-            wanted = Requirement(delay_margin_s=0.3)
-            if label == "inclusion":
-                design(chain, wanted, period_s=0.02)
-            else:
-                method = "graph-dk" if label == "graph-dk" else "graph-lqr"
-                design(chain, wanted, method=method, pattern=pattern, period_s=0.02)
-            taken_s = time.perf_counter() - begun_s
-            free = 3 if label == "inclusion" else int(pattern.mask.sum()) // chain.axes**2
-            found.append(Size(label, vehicles, taken_s, free))
-            if taken_s * 4.0 > _LONGEST_DESIGN_S:
-                break
-    return found
-
-
 def write_comparison(
-    folder: Path, scenario: Scenario, routes: list[Route], flights: Flights, grown: list[Size]
+    folder: Path, scenario: Scenario, routes: list[Route], flights: Flights, grown: list[DesignCost]
 ) -> None:
     """compare.json, the figures, and the page compare.html."""
     from gcs.compare_figures import errors_figure, sizes_figure
@@ -232,7 +193,8 @@ def write_comparison(
         rows=rows(routes),
         methods=[route.method for route in routes],
         failed=[route for route in routes if route.failed],
-        sizes=grown,
+        sizes=list(zip(grown, ratios(grown), strict=True)),
+        ratio=RATIO,
         figures={title: data_uri(file) for title, file in figures.items()},
     )
     (folder / REPORT_FILE).write_text(page, encoding="utf-8")
@@ -266,7 +228,7 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
     return table
 
 
-def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Size]) -> None:
+def print_comparison(scenario: Scenario, routes: list[Route], grown: list[DesignCost]) -> None:
     """The tables on the terminal."""
     from rich import box
     from rich.console import Console
@@ -284,8 +246,8 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Size])
             console.print(f"{route.method}: {route.failed}", markup=False)
     if grown:
         table = Table(box=box.SIMPLE_HEAD)
-        for heading in ("design of a chain", "vehicles", "free gains an axis", "time, s"):
-            table.add_column(heading, justify="right")
-        for size in grown:
-            table.add_row(size.method, str(size.vehicles), str(size.free_gains), f"{size.design_s:.2f}")
+        for heading in ("design of a chain", "vehicles", "free gains an axis", "time, s", RATIO):
+            table.add_column(heading, justify="right", no_wrap=not table.columns)
+        for size, ratio in zip(grown, ratios(grown), strict=True):
+            table.add_row(size.method, str(size.vehicles), str(size.free_gains), f"{size.design_s:.3f}", f"{ratio:.2f}")
         console.print(table)

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs.compare import Flights, Size
+from gcs.compare import Flights
+from gcs.design_cost import DesignCost
 from gcs.stress_figures import figure_of, saved
 
-_COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c")
+_COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#777777", "#b8860b")
 _FLOOR_M = 1e-3
 """Less than this is rounding of the telemetry."""
 
@@ -31,7 +32,7 @@ def errors_figure(file: Path, flights: Flights) -> Path:
     return saved(figure, file)
 
 
-def sizes_figure(file: Path, grown: list[Size]) -> Path:
+def sizes_figure(file: Path, grown: list[DesignCost]) -> Path:
     """Design time against the number of vehicles in a chain."""
     figure, (plot,) = figure_of(1, (9.0, 3.8))
     labels = list(dict.fromkeys(size.method for size in grown))

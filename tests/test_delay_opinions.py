@@ -77,7 +77,8 @@ def test_margin_does_not_depend_on_coordinates(part: int) -> None:
         assert delay_margin(*similar) == pytest.approx(margin_s, rel=1e-11 * np.linalg.cond(T) ** 2 + 1e-8), seed
 
 
-@pytest.mark.parametrize("seed", range(RANDOM_LOOPS if RANDOM_LOOPS >= 1000 else 6))  # some seconds each
+@pytest.mark.timeout(900)  # some seconds each, a minute for the slowest of a thousand
+@pytest.mark.parametrize("seed", range(RANDOM_LOOPS if RANDOM_LOOPS >= 1000 else 6))
 def test_no_lower_bound_is_above_the_margin(seed: int) -> None:
     A0, A1 = random_loop(5000 + seed)
     margin_s = delay_margin(A0, A1)
