@@ -19,7 +19,7 @@ from gains.delay_crossings import separating_points
 from gains.delay_loci import ComplexArray, Loci, bracketed_roots, delay_loci, unit_crossings
 from gains.delay_sweep import near_unit_extrema, sweep_frequencies
 from gains.errors import DisagreementError
-from gains.sampled_loop import HeldPlant, block_radius, split_delay
+from gains.sampled_loop import SampledPlant, block_radius, split_delay
 from gains.structure import FloatArray
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
@@ -33,7 +33,7 @@ _BELOW, _ABOVE = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0 - 1e-6), 1.0 + 1e-6
 _FAR_FROM_ONE = 0.5
 
 
-def block_delay_margin(plant: HeldPlant) -> float:
+def block_delay_margin(plant: SampledPlant) -> float:
     """The least delay tau (s) at which the block loses stability; 0 when unstable at once, `inf` when never.
 
     Raises
@@ -56,7 +56,7 @@ def block_delay_margin(plant: HeldPlant) -> float:
     raise DisagreementError(contradiction)
 
 
-def _least_delay_off_the_real_axis(plant: HeldPlant, refinement: int) -> float:
+def _least_delay_off_the_real_axis(plant: SampledPlant, refinement: int) -> float:
     """The least tau >= 0 with an eigenvalue of the one-period map on the unit circle, +-1 excepted."""
     best_s = inf
     for delay_s, angle in sorted(_starts(plant, refinement)):
@@ -68,7 +68,7 @@ def _least_delay_off_the_real_axis(plant: HeldPlant, refinement: int) -> float:
     return best_s
 
 
-def _starts(plant: HeldPlant, refinement: int) -> list[tuple[float, float]]:
+def _starts(plant: SampledPlant, refinement: int) -> list[tuple[float, float]]:
     """Delays (s) and angles near every possible first crossing.
 
     At a fraction m a crossing of the angle phi and the locus e^{j theta} belongs to q = theta / phi - 1, which must be
@@ -98,7 +98,7 @@ def _starts(plant: HeldPlant, refinement: int) -> list[tuple[float, float]]:
 
 
 def _between(
-    plant: HeldPlant, q: tuple[float, float], angle: tuple[float, float], m: float, step: float
+    plant: SampledPlant, q: tuple[float, float], angle: tuple[float, float], m: float, step: float
 ) -> list[tuple[float, float]]:
     """Linear interpolation of the delay and angle where q passes a whole number >= 0 between m and m + step."""
     change = q[1] - q[0]
@@ -111,7 +111,7 @@ def _between(
     return starts
 
 
-def _unit_angles(plant: HeldPlant, m: float) -> list[tuple[float, complex]]:
+def _unit_angles(plant: SampledPlant, m: float) -> list[tuple[float, complex]]:
     """Angles 0 < phi < pi at which H_m(e^{j phi}) has an eigenvalue of modulus one, each with this eigenvalue.
 
     By Tustin's map z = (1 + w T/2) / (1 - w T/2) the unit circle becomes the imaginary axis w = j Omega,
@@ -130,7 +130,7 @@ def _unit_angles(plant: HeldPlant, m: float) -> list[tuple[float, complex]]:
     ]
 
 
-def _tustin(plant: HeldPlant, m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _tustin(plant: SampledPlant, m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """F (n, n), G (n, r), D (r, r) of H_m in the variable w."""
     period_s = plant.period_s
     Phi, hold = plant.transition(np.array([period_s, period_s * (1.0 - m)]))
@@ -178,7 +178,7 @@ def _hamiltonian_points(F: FloatArray, G: FloatArray, K: FloatArray, D: float, p
     return separating_points(omega, highest)
 
 
-def _sweep_points(plant: HeldPlant, loci: Loci) -> FloatArray:
+def _sweep_points(plant: SampledPlant, loci: Loci) -> FloatArray:
     """Frequencies dense enough to see every crossing, extrema near one included."""
     angle = sweep_frequencies(plant.A, plant.B @ plant.K) * plant.period_s
     angle = np.union1d(angle[angle < pi * 0.99], np.linspace(0.01, pi - 1e-4, 200))
@@ -186,7 +186,7 @@ def _sweep_points(plant: HeldPlant, loci: Loci) -> FloatArray:
     return np.union1d(omega, near_unit_extrema(loci, omega))
 
 
-def _newton(plant: HeldPlant, delay_s: float, angle: float) -> float:
+def _newton(plant: SampledPlant, delay_s: float, angle: float) -> float:
     """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by.
 
     Newton's method for u*M(phi, tau)v = 0 with the singular vectors of the least singular value of
@@ -222,7 +222,7 @@ def _newton(plant: HeldPlant, delay_s: float, angle: float) -> float:
     return np.nan
 
 
-def _least_delay_at_minus_one(plant: HeldPlant, refinement: int) -> float:
+def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
     """The least tau > 0 with an eigenvalue of the one-period map at z = -1.
 
     There H_m is real, H_m(-1) = K (I + Phi)^-1 (G0 - G1), and must have the eigenvalue (-1)^{q+1}: one equation for m.
@@ -246,13 +246,13 @@ def _least_delay_at_minus_one(plant: HeldPlant, refinement: int) -> float:
     return best_s
 
 
-def _loops_at_minus_one(plant: HeldPlant, m: FloatArray) -> FloatArray:
+def _loops_at_minus_one(plant: SampledPlant, m: FloatArray) -> FloatArray:
     """H_m(-1), shape (k, r, r), for k fractions of a period."""
     states, hold = plant.transition(np.concatenate([[1.0], 1.0 - m]) * plant.period_s)
     return plant.K @ np.linalg.solve(np.eye(plant.A.shape[0]) + states[0], 2.0 * hold[1:] - hold[0])
 
 
-def _contradiction(plant: HeldPlant, margin_s: float) -> str:
+def _contradiction(plant: SampledPlant, margin_s: float) -> str:
     """What the spectral radius of the one-period map below and above the margin says against it; nothing if empty."""
     known_s = margin_s if margin_s < inf else 5.0 * plant.period_s
     if plant.A.shape[0] + plant.B.shape[1] * (known_s / plant.period_s + 2.0) > _LARGEST_CHECK:

@@ -1,6 +1,7 @@
 """The sampled and held loop in matrices: one block, its hold integrals and its one-period map."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -9,6 +10,27 @@ from gains.structure import FloatArray, balanced, distinct_blocks
 
 # a delay this close to a whole number of periods (in periods) is that number: (3 * 0.02) / 0.02 is not exactly 3
 _WHOLE = 1e-12
+
+
+class SampledPlant(Protocol):
+    """What is under a held command: one block, linear, and the same in every period."""
+
+    @property
+    def A(self) -> FloatArray: ...  # noqa: N802 - the source's letter
+
+    @property
+    def B(self) -> FloatArray: ...  # noqa: N802 - the source's letter
+
+    @property
+    def K(self) -> FloatArray: ...  # noqa: N802 - the source's letter
+
+    @property
+    def period_s(self) -> float: ...
+
+    def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the last `duration_s` (k,) of a period do to the state at their beginning, (k, n, n), and with an input
+        held over them, (k, n, r)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -56,7 +78,7 @@ def held_blocks(A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float)
     return plants
 
 
-def block_radius(plant: HeldPlant, delay_s: float) -> float:
+def block_radius(plant: SampledPlant, delay_s: float) -> float:
     """Spectral radius of the one-period map of one block."""
     return float(np.abs(np.linalg.eigvals(lifted_map(plant, delay_s))).max())
 
@@ -71,7 +93,7 @@ def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
     return whole, min(max(delay_s - whole * period_s, 0.0), period_s)
 
 
-def lifted_map(plant: HeldPlant, delay_s: float) -> FloatArray:
+def lifted_map(plant: SampledPlant, delay_s: float) -> FloatArray:
     """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one period on, see `gains.sampled.period_map`."""
     whole, rest_s = split_delay(delay_s, plant.period_s)
     Phi, G = plant.transition(np.array([plant.period_s, plant.period_s - rest_s]))

@@ -1,0 +1,211 @@
+"""The onboard loop as it is flown: own errors fed back at the vehicle, those of others by a station, late.
+
+Every vehicle uses its own errors at once, those of others tau late (Sahoo 2012, eqs. 5.1, 5.2)::
+
+    x'(t) = (A + B K_own) x(t) + B K_others x(t - tau)
+
+As it is flown nothing of it is continuous. With the control period T of the station:
+
+* The vehicle computes its own part of the command `steps` times in T and holds it. Its velocity error it knows at that
+  instant. Its spacing error it knows from its sensor, which looks at every `steps_per_sample`-th step; between two
+  looks the spacing is carried on with the relative velocity that the sensor saw.
+* The station computes its part from states that all vehicles sampled at one instant t_k = k T, with the first of the
+  vehicles' steps. It acts from t_k + tau on, at that very instant, and is held for T.
+
+So over one period T the local loop is a linear map of the state alone, and what is late enters it as the command of a
+held loop enters a plant: everything that `gains.sampled_crossings` says of such loops holds for this one too. The
+vehicles' steps are taken to be in step with each other; clocks that are apart by less than a step change the margin in
+the second order of the step.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf
+
+import numpy as np
+
+from gains.delay import delay_margin
+from gains.delay_loci import factor_rank
+from gains.errors import BadModelError
+from gains.formation import FloatArray, FormationModel
+from gains.rightmost import rightmost_root
+from gains.sampled_crossings import block_delay_margin
+from gains.sampled_loop import HeldPlant, block_radius, matrix_exponentials
+from gains.structure import balanced, distinct_blocks
+
+# an instant this close to a step (in steps) is that of the step
+_SAME_INSTANT = 1e-9
+
+
+@dataclass(frozen=True)
+class OnboardTiming:
+    """How often things happen.
+
+    Attributes
+    ----------
+    control_s
+        Period (s) of telemetry, of what the station computes, and of its hold.
+    steps
+        Steps of the vehicle's own loop in a control period.
+    steps_per_sample
+        Its sensor looks at every so manieth step; a whole number of times in a control period.
+    """
+
+    control_s: float
+    steps: int = 1
+    steps_per_sample: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.control_s < inf:
+            raise BadModelError(f"control_s is {self.control_s}; a positive number of seconds is wanted")
+        if self.steps < 1 or self.steps_per_sample < 1 or self.steps % self.steps_per_sample:
+            raise BadModelError(
+                f"steps is {self.steps} and steps_per_sample {self.steps_per_sample}; positive whole numbers are "
+                "wanted, the second a divisor of the first"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class OnboardLoop:
+    """Matrices (n, n) of x' = A x + sensed x + known x + late x(t - tau), and when their parts act.
+
+    `sensed` is B K_own on the spacing errors, `known` on the velocity errors, `late` is B K_others.
+    """
+
+    A: FloatArray
+    sensed: FloatArray
+    known: FloatArray
+    late: FloatArray
+    timing: OnboardTiming
+
+    def continuous_margin_s(self) -> float:
+        """The least delay tau at which (5.2) loses stability."""
+        return delay_margin(self.A + self.sensed + self.known, self.late)
+
+    def sampled_margin_s(self) -> float:
+        """The least delay tau at which the loop as flown loses stability; 0 if at once, `inf` if never.
+
+        Raises
+        ------
+        gains.errors.DisagreementError
+            See `gains.sampled.sampled_delay_margin`.
+        """
+        return min(block_delay_margin(plant) for plant in self._plants())
+
+    def growth_1_s(self, delay_s: float) -> float:
+        """Exponential rate of the slowest motion of the loop as flown: negative when stable."""
+        radius = max(block_radius(plant, delay_s) for plant in self._plants())
+        return float(np.log(radius)) / self.timing.control_s if radius > 0.0 else -inf
+
+    def growth_continuous_1_s(self, delay_s: float) -> float:
+        """Real part of the rightmost root of the continuous model; a hold counts as half its period of delay."""
+        step_s = self.timing.control_s / self.timing.steps
+        own, late_s = self.sensed + self.known, delay_s + self.timing.control_s / 2.0
+        return rightmost_root([(self.A, 0.0), (own, step_s / 2.0), (self.late, late_s)]).real
+
+    def _plants(self) -> "list[LocalPlant]":
+        plants: list[LocalPlant] = []
+        for block in distinct_blocks(self.A, self.sensed, self.known, self.late):
+            A, sensed, known, late = balanced(*block.matrices)
+            plants.append(LocalPlant(A, sensed, known, late, self.timing))
+        return plants
+
+
+@dataclass(frozen=True, eq=False)
+class LocalPlant:
+    """One block with its local loop closed, as a `gains.sampled_loop.SampledPlant`: only what is late is missing."""
+
+    free: FloatArray
+    sensed: FloatArray
+    known: FloatArray
+    late: FloatArray
+    timing: OnboardTiming
+
+    @property
+    def period_s(self) -> float:
+        return self.timing.control_s
+
+    @property
+    def A(self) -> FloatArray:  # noqa: N802 - the source's letter
+        """A + B K_own: what the sampled local loop comes close to."""
+        return self.free + self.sensed + self.known
+
+    @property
+    def B(self) -> FloatArray:  # noqa: N802 - the source's letter
+        return self._factors[0]
+
+    @property
+    def K(self) -> FloatArray:  # noqa: N802 - the source's letter
+        return self._factors[1]
+
+    @cached_property
+    def _factors(self) -> tuple[FloatArray, FloatArray]:
+        return factor_rank(self.late)
+
+    def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The state at a period's end, of that `duration_s` earlier and of an input held since then.
+
+        Shapes (k, n, n) and (k, n, r) for k durations up to the period. The steps still to come answer to both. For a
+        whole period the first is the map of the local loop from its first step on, sensor and all.
+        """
+        step_s = self.period_s / self.timing.steps
+        begin = (self.period_s - duration_s) / step_s
+        following = np.ceil(begin - _SAME_INSTANT).astype(np.int64)
+        rest_s = np.maximum(following - begin, 0.0) * step_s
+        flow, held = HeldPlant(self.free, self.B, self.K, self.period_s).transition(rest_s)
+        from_step, from_input = self._ends
+        return from_step[following] @ flow, from_input[following] + from_step[following] @ held
+
+    @cached_property
+    def _ends(self) -> tuple[FloatArray, FloatArray]:
+        """The state at the period's end, of the state just before each step and of an input held from then on.
+
+        The last entries are those of the end itself. The state is all there is to remember before each step: what the
+        sensor saw at an earlier one is no answer to what comes in after that.
+        """
+        n, steps = len(self.free), self.timing.steps
+        step_s = self.period_s / steps
+        generator = np.zeros((2 * n, 2 * n))
+        generator[:n, :n], generator[:n, n:] = self.free, np.eye(n)
+        [exponential] = matrix_exponentials(step_s * generator[np.newaxis])
+        Phi, Gamma = exponential[:n, :n], exponential[:n, n:]
+        on_state, on_input = [np.eye(n)], [np.zeros_like(self.B)]
+        from_both = np.hstack([np.eye(n), np.zeros((n, n))])  # of the state and of what the sensor saw last
+        for step in reversed(range(steps)):
+            age_s = step % self.timing.steps_per_sample * step_s
+            seen = Gamma @ self.sensed @ (np.eye(n) + age_s * self.free)
+            on_input.append(on_input[-1] + on_state[-1] @ Gamma @ self.B)
+            flown = Phi + Gamma @ self.known
+            none, same = np.zeros((n, n)), np.eye(n)
+            looks = step % self.timing.steps_per_sample == 0
+            one_step = [[flown + seen, none], [same, none]] if looks else [[flown, seen], [none, same]]
+            from_both = from_both @ np.block(one_step)
+            on_state.append(from_both[:, :n])
+        return np.array(on_state[::-1]), np.array(on_input[::-1])
+
+
+def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) -> OnboardLoop:
+    """The onboard loop of a formation with the gain K (inputs, states) of u = K e.
+
+    The own part K_own are its blocks (i, i), by which vehicle i uses its own errors; the rest is K_others.
+    """
+    B, own = model.B, own_part(model, K)
+    spacing = np.zeros(model.states, dtype=bool)
+    for i in model.followers:
+        spacing[model.spacing_slice(i)] = True
+    return OnboardLoop(
+        A=model.A,
+        sensed=B @ np.where(spacing, own, 0.0),
+        known=B @ np.where(spacing, 0.0, own),
+        late=B @ (K - own),
+        timing=timing,
+    )
+
+
+def own_part(model: FormationModel, K: FloatArray) -> FloatArray:
+    """K with its blocks (i, i) only."""
+    own = np.zeros_like(K)
+    for i in range(model.vehicles):
+        block = model.input_slice(i), model.output_slice(i)
+        own[block] = K[block]
+    return own
