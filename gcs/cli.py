@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from gcs.stress import stress
+from gcs.watch_command import monitor
 
 app = typer.Typer(
     add_completion=False,
@@ -61,22 +62,17 @@ def fly(
     as_json: AsJson = False,
 ) -> None:
     """Design the control, start the vehicles, fly, show, record."""
+    from gcs.addresses import listening
     from gcs.fly import FlyOptions, new_folder
     from gcs.fly import fly as fly_now
     from gcs.plan import flight_plan
-    from gcs.udp import StationSocket
 
     scenario = _scenario(scenario_file)
     if link_delay is not None:
         if not 0 <= link_delay < 60:
             raise InputError(f"--link-delay: read {link_delay}, wanted seconds from 0 to 60")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
-    address = _address("--connect", connect) if connect else _address("--listen", listen)
-    try:
-        link = StationSocket(*address)
-    except OSError as error:
-        raise InputError(f"{address[0]}:{address[1]}: {error.strerror}; wanted a free UDP port") from None
-    with link:
+    with listening("--connect", connect) if connect else listening("--listen", listen) as link:
         design, plan = flight_plan(scenario)
         if not as_json:
             _print_design(design)
@@ -238,6 +234,7 @@ def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a
 
 
 app.command()(stress)
+app.command()(monitor)
 
 
 def main() -> None:
@@ -269,13 +266,6 @@ def _scenario(file: Path) -> Any:
     from scenarios.files import load
 
     return load(file)
-
-
-def _address(option: str, text: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or not 0 <= int(port) < 65536:
-        raise InputError(f"{option}: read {text!r}, wanted HOST:PORT, as 127.0.0.1:14550")
-    return host, int(port)
 
 
 def _out_folder(out: Path) -> Path:

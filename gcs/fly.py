@@ -46,7 +46,7 @@ def fly(plan: FlightPlan, design: dict[str, Any], link: StationSocket, options: 
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
     (folder / DESIGN_FILE).write_text(json.dumps(design, indent=2), encoding="utf-8")
     with contextlib.ExitStack() as stack:
-        stop_reason = stack.enter_context(_stop_signals())
+        stop_reason = stack.enter_context(stop_signals())
         heard = _vehicles_heard(link, plan)
         # Left in the reverse order: the log is closed, the vehicles end, the observer has finished the recording.
         observer = stack.enter_context(_observer(folder, show_table=options.show_table))
@@ -83,7 +83,7 @@ def new_folder(scenario_name: str) -> Path:
 
 
 @contextlib.contextmanager
-def _stop_signals() -> Generator[Callable[[], str]]:
+def stop_signals() -> Generator[Callable[[], str]]:
     """While entered, Ctrl-C and SIGTERM raise nothing: they become a reason to end the flight, vehicles holding."""
     asked: list[str] = []
 

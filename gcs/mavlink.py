@@ -28,7 +28,7 @@ ESTIMATOR_STATUS = 230
 HOME_POSITION = 242
 STATUSTEXT = 253
 
-_MAGIC, MAGIC_1 = 0xFD, 0xFE
+MAGIC, MAGIC_1 = 0xFD, 0xFE
 _OVERHEAD_1 = 8
 _HEADER = struct.Struct("<BBBBBBBHB")
 _SIGNED = 0x01
@@ -77,13 +77,13 @@ def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     is NaN or infinite in one of the messages used for control is refused, as its checksum says nothing about that.
     """
     end = len(datagram)
-    if end >= _OVERHEAD and datagram[0] == _MAGIC and end == _OVERHEAD + datagram[1] and not datagram[2]:
+    if end >= _OVERHEAD and datagram[0] == MAGIC and end == _OVERHEAD + datagram[1] and not datagram[2]:
         frame = _checked(datagram, datagram[1], refused)  # the usual case: one unsigned frame
         return [] if frame is None else [frame]
     frames: list[Frame] = []
     at = 0
     while at < end:
-        if datagram[at] != _MAGIC:
+        if datagram[at] != MAGIC:
             refused["not MAVLink 2"] += 1
             break
         if end - at < _OVERHEAD:
@@ -104,18 +104,37 @@ def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     return frames
 
 
+def decode_either(datagram: bytes, refused: Counter[str]) -> list[Frame]:
+    """The valid frames of a datagram of MAVLink 1 or of MAVLink 2."""
+    return decode_1(datagram, refused) if datagram[:1] == b"\xfe" else decode(datagram, refused)
+
+
 def first_heartbeats(datagram: bytes) -> list[Frame]:
     """The MAVLink 1 heartbeats of a datagram: a PX4 speaks that until it hears MAVLink 2."""
+    return [frame for frame in decode_1(datagram, Counter()) if frame.msg_id == HEARTBEAT]
+
+
+def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
+    """The valid MAVLink 1 frames of one datagram; what is refused is counted by reason."""
     frames: list[Frame] = []
-    packing, length, crc_extra = _LAYOUTS[HEARTBEAT]
-    at = 0
-    while at + _OVERHEAD_1 <= len(datagram) and datagram[at] == MAGIC_1:
+    at, end = 0, len(datagram)
+    while at < end:
+        if datagram[at] != MAGIC_1 or end - at < _OVERHEAD_1 + datagram[at + 1]:
+            refused["not MAVLink 1" if datagram[at] != MAGIC_1 else "truncated"] += 1
+            break
         data = datagram[at : at + _OVERHEAD_1 + datagram[at + 1]]
         at += len(data)
-        if data[1] != length or data[5] != HEARTBEAT or len(data) != _OVERHEAD_1 + length:
-            continue
-        if mcrf4xx(data[1:-2] + crc_extra) == int.from_bytes(data[-2:], "little"):
-            frames.append(Frame(HEARTBEAT, data[3], data[4], data[2], packing.unpack_from(data, 6), data))
+        layout = _LAYOUTS.get(data[5])
+        if layout is None:
+            refused["unknown message"] += 1
+        elif mcrf4xx(data[1:-2] + layout.crc_extra) != int.from_bytes(data[-2:], "little"):
+            refused["bad checksum"] += 1
+        else:
+            fields = layout.packing.unpack(data[6:-2][: layout.length].ljust(layout.length, b"\0"))
+            if data[5] == LOCAL_POSITION_NED and not isfinite(sum(fields)):
+                refused["not finite"] += 1
+            else:
+                frames.append(Frame(data[5], data[3], data[4], data[2], fields, data))
     return frames
 
 
@@ -142,17 +161,17 @@ def _checked(data: bytes, length: int, refused: Counter[str]) -> Frame | None:
     return Frame(msg_id, system_id, component_id, sequence, fields, data)
 
 
-def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int) -> bytes:
-    """One frame from the station; `fields` in wire order."""
+def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int, system_id: int = STATION_SYSTEM_ID) -> bytes:
+    """One frame, from the station unless said otherwise; `fields` in wire order."""
     layout = _LAYOUTS[msg_id]
     payload = layout.packing.pack(*fields).rstrip(b"\0") or b"\0"
     header = _HEADER.pack(
-        _MAGIC,
+        MAGIC,
         len(payload),
         0,
         0,
         sequence & 0xFF,
-        STATION_SYSTEM_ID,
+        system_id,
         STATION_COMPONENT_ID,
         msg_id & 0xFFFF,
         msg_id >> 16,

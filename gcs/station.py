@@ -26,7 +26,6 @@ from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
 from gcs.record import CLOCK_JUMPED, SEVERITY, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
-from gcs.sequence import DUPLICATE, LATE
 from gcs.startup import Startup
 from gcs.telemetry import FloatArray, StateHistory
 from gcs.vehicle import Address, RemoteVehicle
@@ -38,7 +37,6 @@ SILENCE_S = 1.5
 AUTOPILOT_COMPONENT = 1
 """A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
 _HEARTBEAT_NS = NS_PER_S
-_FORGET_NUMBERS_NS = 3 * NS_PER_S
 
 
 class Datagram(NamedTuple):
@@ -188,7 +186,7 @@ class Station:
             if frame.component_id != AUTOPILOT_COMPONENT:
                 self.counters["other component"] += 1
                 continue
-            if self._is_replay(vehicle, frame, datagram.received_ns):
+            if vehicle.is_replay(frame, datagram.received_ns):
                 self.counters["replayed or overtaken"] += 1
                 continue
             self._handle(row, vehicle, frame, datagram, outgoing)
@@ -203,21 +201,6 @@ class Station:
         self.events.append(Event(self.scenario_time_s(self._now_ns), "vehicle", "found", vehicle.system_id))
         vehicle.address = datagram.address
         return True
-
-    def _is_replay(self, vehicle: RemoteVehicle, frame: mavlink.Frame, now_ns: int) -> bool:
-        """Whether a frame has been heard before, or is a heartbeat that a newer frame has overtaken.
-
-        A vehicle that was started anew numbers its frames anew: after some time without a good heartbeat any is taken.
-        """
-        heartbeat = frame.msg_id == mavlink.HEARTBEAT
-        order = vehicle.frames.add(frame.sequence)
-        replayed = order == DUPLICATE or (heartbeat and order == LATE)
-        if replayed and heartbeat and now_ns - vehicle.heartbeat_ns > _FORGET_NUMBERS_NS:
-            vehicle.frames.restart()
-            return False
-        if heartbeat and not replayed:
-            vehicle.heartbeat_ns = now_ns
-        return replayed
 
     def _handle(
         self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]

@@ -173,18 +173,18 @@ def _vehicle(ticks: TickArray, flown: TickArray, system_id: int, error: Errors |
         "system_id": system_id,
         "spacing_error_final_m": None if error_m is None else _number(error_m[-1]),
         "spacing_error_max_m": None if error_m is None else _number(error_m.max()),
-        "rtt_s": _counted(rtt),
-        "loop_delay_s": _counted(own["loop_delay_s"][own["commanded"]]),
-        "down_delay_s": _counted(own["down_delay_s"][own["commanded"]]),
-        "telemetry_age_s": _counted(own["telemetry_age_s"][own["commanded"]]),
-        "station_queue_s": _counted(own["queue_s"][own["commanded"]]),
+        "rtt_s": spread_with_status(rtt),
+        "loop_delay_s": spread_with_status(own["loop_delay_s"][own["commanded"]]),
+        "down_delay_s": spread_with_status(own["down_delay_s"][own["commanded"]]),
+        "telemetry_age_s": spread_with_status(own["telemetry_age_s"][own["commanded"]]),
+        "station_queue_s": spread_with_status(own["queue_s"][own["commanded"]]),
         "clock": _clock(own, int(np.isfinite(rtt).sum())) | {"jumps": jumps},
         "mode_final": None if not rows.size else Mode(int(rows["mode"][-1])).name,
         **counted,
     }
 
 
-def _counted(values: NDArray[np.float64]) -> dict[str, Any]:
+def spread_with_status(values: NDArray[np.float64]) -> dict[str, Any]:
     """The spread of an estimate with its status and the number of its samples."""
     samples = int(np.isfinite(values).sum())
     return _spread(values) | {"samples": samples, "status": "measured" if samples else "unknown"}

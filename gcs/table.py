@@ -212,8 +212,8 @@ def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int
             _number(1e3 * figures.loop_delay_s_p50[k], ".1f"),
             _number(1e3 * figures.loop_delay_s_p99[k], ".1f"),
             *[_number(1e3 * state.margins_s[state.newest["gain_set"][k]], ".0f")] * wide,
-            Text(_number(100 * headroom, ".0f"), _headroom_style(headroom)),
-            *[Text(_bar(headroom), _headroom_style(headroom))] * widest,
+            Text(_number(100 * headroom, ".0f"), headroom_style(headroom)),
+            *[Text(_bar(headroom), headroom_style(headroom))] * widest,
             str(figures.lost[k]),
             str(figures.late[k]),
             Text(mode.name, MODE_STYLES[mode]),
@@ -330,7 +330,7 @@ def _number(value: float, form: str) -> str:
     return UNKNOWN if np.isnan(value) else format(value, form)
 
 
-def _headroom_style(headroom: float) -> str:
+def headroom_style(headroom: float) -> str:
     if np.isnan(headroom):
         return "dim"
     return "green" if headroom >= HEADROOM_GOOD else "yellow" if headroom >= 0 else "bold red"

@@ -17,7 +17,7 @@ from gcs.autopilots import (
     mode_command,
 )
 from gcs.clocks import LEAST_SAMPLES, VehicleClock
-from gcs.sequence import SequenceCounter
+from gcs.sequence import DUPLICATE, LATE, SequenceCounter
 from gcs.startup import Startup
 
 Address = tuple[str, int]
@@ -28,6 +28,7 @@ STATE_CRITICAL = 5
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 _ACCEPTED, _IN_PROGRESS = 0, 5
 _NS = 1_000_000_000
+_FORGET_NUMBERS_NS = 3 * _NS
 
 
 @dataclass
@@ -123,6 +124,21 @@ class RemoteVehicle:
         """A frame to this vehicle; each vehicle sees a sequence of its own, so it can count losses."""
         self._sequence = (self._sequence + 1) & 0xFF
         return mavlink.encode(msg_id, fields, sequence=self._sequence)
+
+    def is_replay(self, frame: mavlink.Frame, now_ns: int) -> bool:
+        """Whether a frame has been heard before, or is a heartbeat that a newer frame has overtaken.
+
+        A vehicle that was started anew numbers its frames anew: after some time without a good heartbeat any is taken.
+        """
+        heartbeat = frame.msg_id == mavlink.HEARTBEAT
+        order = self.frames.add(frame.sequence)
+        replayed = order == DUPLICATE or (heartbeat and order == LATE)
+        if replayed and heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
+            self.frames.restart()
+            return False
+        if heartbeat and not replayed:
+            self.heartbeat_ns = now_ns
+        return replayed
 
     def heartbeat(self, fields: tuple[Any, ...], now_ns: int) -> None:
         """Take in a HEARTBEAT. One sent before the vehicle took a command in does not undo what its ACK said."""

@@ -1,0 +1,256 @@
+"""What the frames on a link say of its vehicles' latencies, without a say in what they do.
+
+Pure: frames and times in, figures out. `gcs monitor` feeds it from a socket, `gcs replay` from a log.
+
+A TIMESYNC exchange counts whoever asked: this watch, or a ground station whose requests are on the same stream. Until
+one has been seen the vehicle's clock is unknown, and delays are told against the fastest of the last frames: what is
+measured then is a lower bound.
+"""
+
+from array import array
+from collections import Counter
+from collections.abc import Iterable
+from math import nan
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs import mavlink
+from gcs.monitor import headroom
+from gcs.station import Outgoing
+from gcs.summary import spread_with_status
+from gcs.vehicle import Address, RemoteVehicle
+from scenarios.schema import NS_PER_S
+
+SYSTEM_ID = 254
+"""Whose name requests of a watch bear: vehicles number a station's frames, and this is none."""
+SILENT_NS = 3 * NS_PER_S
+"""A vehicle not heard for this long counts as silent."""
+SAMPLE_NS = NS_PER_S // 10
+"""Mean time between two looks at the ages of what was received."""
+_GOLDEN = 0.6180339887498949
+_ASKED = 4096
+"""Requests remembered: those of 250 vehicles at 10 Hz over 1.6 s, of five over 80 s."""
+_LEAST_NS = 10 * NS_PER_S
+"""The fastest frame is that of the last one or two of these; a clock that drifts by 20 ppm is off by 0.4 ms then."""
+_AUTOPILOT, _NO_AUTOPILOT, _STATION = 1, 8, 6
+"""Component id of an autopilot; MAV_AUTOPILOT_INVALID; MAV_TYPE_GCS."""
+_POSITIONS = (mavlink.LOCAL_POSITION_NED, mavlink.GLOBAL_POSITION_INT)
+
+Figures = dict[str, Any]
+
+
+class WatchedVehicle:
+    """One vehicle as it is seen from aside: what it sent, and how late that was."""
+
+    def __init__(self, system_id: int) -> None:
+        self.remote = RemoteVehicle(system_id, telemetry_hz=1.0, report=lambda _kind, _text: None)
+        self.remote.goal = None  # nothing is wanted of it
+        self.rtt_s = array("d")
+        self.age_s = array("d")
+        self.loop_delay_s = array("d")
+        self.states = 0
+        """Position reports received."""
+        self.first_state_ns = 0
+        self.state_ns = 0
+        """When the newest one was received."""
+        self.boot_ns = 0
+        """Its instant on the vehicle's clock."""
+        self._kind = mavlink.GLOBAL_POSITION_INT
+        self._least_since_ns = 0
+        self._least_ns: tuple[int, int] = (1 << 62, 1 << 62)
+
+    def state(self, frame: mavlink.Frame, received_ns: int) -> None:
+        """Take in a position report; the local one counts where it is sent, as it is what formations fly by."""
+        if frame.msg_id == mavlink.LOCAL_POSITION_NED != self._kind:
+            self._kind, self.states = mavlink.LOCAL_POSITION_NED, 0
+        boot_ns = frame.fields[0] * 1_000_000
+        if frame.msg_id != self._kind or (self.states and boot_ns == self.boot_ns):
+            return
+        if boot_ns < self.boot_ns < boot_ns + NS_PER_S:
+            return  # overtaken
+        if boot_ns < self.boot_ns:
+            self._least_ns = (1 << 62, 1 << 62)  # started anew
+        self.first_state_ns = self.first_state_ns if self.states else received_ns
+        self.states += 1
+        self.state_ns, self.boot_ns = received_ns, boot_ns
+        if received_ns - self._least_since_ns > _LEAST_NS:
+            self._least_since_ns, self._least_ns = received_ns, (1 << 62, self._least_ns[0])
+        self._least_ns = min(self._least_ns[0], received_ns - boot_ns), self._least_ns[1]
+
+    def look(self, now_ns: int) -> None:
+        """Note how old the newest state is, and how late a command computed from it would act."""
+        clock = self.remote.clock
+        age_s = down_s = nan
+        if now_ns - self.state_ns > SILENT_NS:
+            pass  # that nothing comes is no latency
+        elif self.states and clock.estimate.samples:
+            age_s = (now_ns - clock.estimate.to_station_ns(self.boot_ns)) * 1e-9
+            down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
+        elif self.states:
+            age_s, down_s = (now_ns - self.boot_ns - min(self._least_ns)) * 1e-9, 0.0
+        self.age_s.append(age_s)
+        self.loop_delay_s.append(age_s + down_s)
+
+    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> Figures:
+        """The figures as plain types, of the whole time or of the last so many looks; an unknown is None."""
+        clock, frames = self.remote.clock, self.remote.frames
+        estimate = clock.estimate
+        measured = estimate.samples > 0
+        rtt_s, age_s, loop_s = (_spread(values, last) for values in (self.rtt_s, self.age_s, self.loop_delay_s))
+        if not measured:
+            age_s["status"] = loop_s["status"] = "lower bound" if self.states else "unknown"
+        span_s = (self.state_ns - self.first_state_ns) * 1e-9
+        worst_s = loop_s["p99"]
+        left = None if margin_s is None or worst_s is None else headroom(worst_s, margin_s)
+        return {
+            "system_id": self.remote.system_id,
+            "status": self._status(now_ns, left),
+            "telemetry_hz": round((self.states - 1) / span_s, 3) if self.states > 1 and span_s > 0 else None,
+            "rtt_s": rtt_s,
+            "telemetry_age_s": age_s,
+            "loop_delay_s": loop_s,
+            "headroom": left,
+            "received": frames.received,
+            "lost": frames.lost,
+            "late": frames.late,
+            "duplicate": frames.duplicate,
+            "clock": {
+                "status": "measured" if measured else "unknown",
+                "samples": len(self.rtt_s),
+                "offset_s": estimate.offset_ns * 1e-9 if measured else None,
+                "bound_s": estimate.bound_ns * 1e-9 if measured else None,
+                "skew_ppm": round(estimate.skew * 1e6, 3) if measured else None,
+                "jumps": clock.jumps,
+            },
+        }
+
+    def _status(self, now_ns: int, left: float | None) -> str:
+        if not self.remote.heard_ns:
+            return "not heard"
+        if now_ns - self.remote.heard_ns > SILENT_NS:
+            return "silent"
+        if left is not None and left < 0:
+            return "past the margin"
+        if not self.remote.clock.estimate.samples:
+            return "no exchange"
+        return "measured" if self.states else "no position"
+
+
+class Watch:
+    """All vehicles of a stream. Those in `system_ids` are expected; others are added when their heartbeat is heard."""
+
+    def __init__(self, system_ids: Iterable[int] = ()) -> None:
+        self.vehicles = {system_id: WatchedVehicle(system_id) for system_id in system_ids}
+        self.stations: set[int] = set()
+        """System ids of the ground stations on the stream."""
+        self.counters: Counter[str] = Counter()
+        self._asked: dict[int, int] = {}
+        self._looks = 0
+        self._look_ns = 0
+
+    def ask(self, now_ns: int) -> int:
+        """Note a TIMESYNC request of our own that is sent now; returns its ts1."""
+        while now_ns in self._asked:
+            now_ns += 1
+        self._note_request(now_ns, now_ns)
+        return now_ns
+
+    def take(self, frame: mavlink.Frame, time_ns: int, address: Address | None = None) -> WatchedVehicle | None:
+        """Take in a frame received, or sent by a station, at a time; returns its vehicle if it tells something new."""
+        vehicle = self._vehicle(frame)
+        if vehicle is None:
+            if frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0:
+                self._note_request(frame.fields[1], time_ns)
+            return None
+        remote = vehicle.remote
+        remote.heard_ns, remote.address = time_ns, address
+        if frame.component_id != _AUTOPILOT:
+            self.counters["other component"] += 1
+            return None
+        if remote.is_replay(frame, time_ns):
+            self.counters["replayed or overtaken"] += 1
+            return None
+        if frame.msg_id == mavlink.HEARTBEAT:
+            remote.heartbeat(frame.fields, time_ns)
+        elif frame.msg_id in _POSITIONS:
+            vehicle.state(frame, time_ns)
+        elif frame.msg_id == mavlink.TIMESYNC and frame.fields[0] != 0:
+            self._reply(vehicle, frame.fields[0], frame.fields[1], time_ns)
+        return vehicle
+
+    def look(self, now_ns: int) -> int:
+        """Look at the ages of all vehicles' states if that is due; returns when it is due next.
+
+        At uneven times, so that a telemetry rate cannot be in step with them.
+        """
+        if now_ns >= self._look_ns:
+            self._looks += 1
+            self._look_ns = now_ns + round(SAMPLE_NS * (0.5 + self._looks * _GOLDEN % 1.0))
+            for vehicle in self.vehicles.values():
+                vehicle.look(now_ns)
+        return self._look_ns
+
+    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> list[Figures]:
+        """The figures of each vehicle, in order of system id."""
+        return [self.vehicles[system_id].figures(now_ns, margin_s, last) for system_id in sorted(self.vehicles)]
+
+    def _vehicle(self, frame: mavlink.Frame) -> WatchedVehicle | None:
+        known = self.vehicles.get(frame.system_id)
+        if known is not None or frame.msg_id != mavlink.HEARTBEAT:
+            return known
+        _, vehicle_type, autopilot = frame.fields[:3]
+        if vehicle_type == _STATION:
+            self.stations.add(frame.system_id)
+        if autopilot == _NO_AUTOPILOT or frame.component_id != _AUTOPILOT:
+            return None
+        return self.vehicles.setdefault(frame.system_id, WatchedVehicle(frame.system_id))
+
+    def _note_request(self, ts1_ns: int, time_ns: int) -> None:
+        self._asked.setdefault(ts1_ns, time_ns)
+        if len(self._asked) > _ASKED:
+            del self._asked[next(iter(self._asked))]
+
+    def _reply(self, vehicle: WatchedVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
+        asked_ns = self._asked.get(ts1_ns)
+        if asked_ns is None:
+            self.counters["reply to an unseen request"] += 1
+            return
+        clock = vehicle.remote.clock
+        rtt_ns = clock.reply(tc1_ns=tc1_ns, ts1_ns=clock.request(asked_ns), received_ns=received_ns)
+        if rtt_ns is not None:
+            vehicle.rtt_s.append(rtt_ns * 1e-9)
+
+
+class Requests:
+    """TIMESYNC requests, spread over the addresses that vehicles send from: all vehicles behind one answer.
+
+    With a rate of 0 there are none.
+    """
+
+    def __init__(self, timesync_hz: float) -> None:
+        self.sent = 0
+        self.next_ns = 0 if timesync_hz else 1 << 62
+        self._period_ns = NS_PER_S / (timesync_hz or 1.0)
+        self._sequences: Counter[Address] = Counter()
+
+    def due(self, watch: Watch, now_ns: int) -> list[Outgoing]:
+        """The request to be sent now, if any."""
+        addresses = {vehicle.remote.address for vehicle in watch.vehicles.values()} - {None}
+        if now_ns < self.next_ns:
+            return []
+        self.next_ns = now_ns + round(self._period_ns / max(1, len(addresses)))
+        if not addresses:
+            return []
+        address = min((a for a in addresses if a is not None), key=lambda a: (self._sequences[a], a))
+        self._sequences[address] += 1
+        self.sent += 1
+        fields = mavlink.timesync(tc1_ns=0, ts1_ns=watch.ask(now_ns))
+        sequence = self._sequences[address]
+        return [Outgoing(mavlink.encode(mavlink.TIMESYNC, fields, sequence=sequence, system_id=SYSTEM_ID), address)]
+
+
+def _spread(values: "array[float]", last: int) -> dict[str, Any]:
+    seen: NDArray[np.float64] = np.array(values[-last:] if last else values, dtype=np.float64)
+    return spread_with_status(seen)

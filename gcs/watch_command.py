@@ -1,0 +1,104 @@
+"""`gcs monitor`: its options; the work is in `gcs.watch` (what frames say) and `gcs.watch_live` (the socket)."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+_FAILED, _INTERRUPTED = 1, 130
+_TIMESYNC_HZ = 10.0
+
+
+def monitor(
+    scenario_file: Annotated[
+        Path | None, typer.Argument(metavar="[SCENARIO]", help="the vehicles expected, and the margin of their gains")
+    ] = None,
+    listen: Annotated[
+        str, typer.Option("--listen", "--connect", metavar="HOST:PORT", help="where vehicles or a mirror send to")
+    ] = "127.0.0.1:14550",
+    margin: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="compare with this delay margin", min=0.0)
+    ] = None,
+    design: Annotated[
+        Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margin of a run's design.json")
+    ] = None,
+    silent: Annotated[bool, typer.Option("--silent", help="send nothing: delays are lower bounds then")] = False,
+    seconds: Annotated[
+        float, typer.Option("--for", metavar="SECONDS", help="end by itself after this time", min=0.1)
+    ] = float("inf"),
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
+) -> None:
+    """Watch the latencies of vehicles against a margin, without commanding anything.
+
+    All that is sent are TIMESYNC requests (10 a second to each address), which vehicles answer with their clock. No
+    heartbeat is sent. With --silent nothing is sent: exchanges of a station on the same stream are used if there are
+    any; otherwise delays are told against the fastest frames, and are lower bounds.
+
+    Exit code 1 if an expected vehicle, or any at all, was not heard, or if the loop delay (p99) was past the margin.
+    """
+    if margin is not None and design is not None:
+        raise typer.BadParameter("read --margin and --design, wanted one of them")
+    from gcs.addresses import listening
+
+    with listening("--listen", listen) as link:
+        scenario, margin_s, margin_of = _compared_with(scenario_file, margin, design)
+        # After the socket: what comes while these load keeps its receive stamp.
+        from gcs.fly import stop_signals
+        from gcs.watch import Watch
+        from gcs.watch_live import MonitorOptions, monitor_links
+        from gcs.watch_table import print_report
+
+        asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
+        options = MonitorOptions(
+            margin_s=margin_s,
+            margin_of=margin_of,
+            timesync_hz=0.0 if silent else asked_hz,
+            seconds=seconds,
+            shown=not as_json,
+        )
+        watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
+        with stop_signals() as stop_reason:
+            report = monitor_links(link, watch, options, stop_reason)
+            interrupted = bool(stop_reason())
+    if as_json:
+        typer.echo(json.dumps(report, indent=2, allow_nan=False))
+    else:
+        print_report(report)
+    raise typer.Exit(_INTERRUPTED if interrupted else _exit_code(report))
+
+
+def _exit_code(report: dict[str, Any]) -> int:
+    bad = {"not heard", "past the margin"} & {vehicle["status"] for vehicle in report["vehicles"]}
+    return _FAILED if bad or not report["vehicles"] else 0
+
+
+def _compared_with(scenario_file: Path | None, margin: float | None, design: Path | None) -> tuple[Any, Any, str]:
+    """The scenario, the margin in s (None: none is known) and in words where it is from."""
+    scenario = None
+    if scenario_file is not None:
+        from scenarios.files import load
+
+        scenario = load(scenario_file)
+    if margin is not None:
+        return scenario, margin, "given"
+    if design is not None:
+        return scenario, margin_of_design(design), f"of {design}"
+    if scenario is not None:
+        from gcs.plan import flight_plan
+
+        return scenario, flight_plan(scenario)[0]["delay_margin_s"], f"of {scenario.name}'s gains"
+    return None, None, ""
+
+
+def margin_of_design(file: Path) -> float | None:
+    """The delay margin that a design.json says; None if it is unbounded."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))["delay_margin_s"]
+    except (OSError, UnicodeDecodeError) as error:
+        raise typer.BadParameter(f"--design: {file}: {error}; wanted the design.json of a run") from None
+    except (json.JSONDecodeError, KeyError, TypeError):
+        raise typer.BadParameter(f"--design: {file}: no delay_margin_s, wanted the design.json of a run") from None
+    if found is not None and not (isinstance(found, int | float) and found > 0):
+        raise typer.BadParameter(f"--design: {file}: delay_margin_s: read {found!r}, wanted seconds above 0")
+    return found

@@ -1,0 +1,86 @@
+"""`gcs monitor`: the driver that watches the links of a socket and commands nothing.
+
+All that it sends are TIMESYNC requests, one at a time to each address that vehicles send from, under a system id that
+is not a station's. No heartbeat: a vehicle whose station has gone has to notice.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+
+from gcs import mavlink
+from gcs.udp import StationSocket, clock_ns
+from gcs.watch import Requests, Watch
+from gcs.watch_table import plain_line, render
+from scenarios.schema import NS_PER_S
+
+_SHOW_NS = NS_PER_S // 4
+_PLAIN_NS = 5 * NS_PER_S
+_WINDOW_LOOKS = 50
+"""Looks in the live figures: those of the last five seconds."""
+
+
+@dataclass(frozen=True)
+class MonitorOptions:
+    """How links are watched."""
+
+    margin_s: float | None
+    margin_of: str
+    """Where the margin is from."""
+    timesync_hz: float
+    """Requests a second to each address; 0 to send nothing at all."""
+    seconds: float
+    shown: bool
+
+
+def monitor_links(
+    link: StationSocket, watch: Watch, options: MonitorOptions, stop_reason: Callable[[], str]
+) -> dict[str, Any]:
+    """Watch until the time is over or a reason to stop is given; returns the figures of the whole time."""
+    requests = Requests(options.timesync_hz)
+    start_ns = now_ns = clock_ns()
+    end_ns = start_ns + round(options.seconds * NS_PER_S) if math.isfinite(options.seconds) else 1 << 62
+    console = Console()
+    live = Live(console=console, auto_refresh=False, transient=True) if options.shown and console.is_terminal else None
+    show_ns = start_ns + _SHOW_NS if live else start_ns + _PLAIN_NS
+
+    def report(last: int = 0) -> dict[str, Any]:
+        return {
+            "listening": "{}:{}".format(*link.address),
+            "duration_s": round((now_ns - start_ns) / NS_PER_S, 3),
+            "delay_margin_s": options.margin_s,
+            "margin_of": options.margin_of,
+            "silent": options.timesync_hz == 0,
+            "sent": {"TIMESYNC": requests.sent},
+            "send_errors": link.send_errors,
+            "stations": sorted(watch.stations),
+            "refused": dict(watch.counters),
+            "vehicles": watch.figures(now_ns, options.margin_s, last),
+        }
+
+    if live is not None:
+        live.start()
+    try:
+        look_ns = start_ns
+        while now_ns < end_ns and not stop_reason():
+            link.wait(min(look_ns, end_ns, requests.next_ns))  # not long: a signal does not end the wait
+            for datagram in link.receive():
+                for frame in mavlink.decode_either(datagram.data, watch.counters):
+                    watch.take(frame, datagram.received_ns, datagram.address)
+            now_ns = clock_ns()
+            look_ns = watch.look(now_ns)
+            link.send(requests.due(watch, now_ns))
+            if now_ns >= show_ns and live is not None:
+                show_ns = now_ns + _SHOW_NS
+                live.update(render(report(_WINDOW_LOOKS), width=console.width, height=console.height - 1), refresh=True)
+            elif now_ns >= show_ns and options.shown:
+                show_ns = now_ns + _PLAIN_NS
+                print(plain_line(report(_WINDOW_LOOKS)), flush=True)
+    finally:
+        if live is not None:
+            live.stop()
+    return report()
