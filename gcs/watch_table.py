@@ -34,8 +34,10 @@ def plain_line(report: dict[str, Any]) -> str:
     vehicles: list[Figures] = report["vehicles"]
     if not vehicles:
         return f"{report['duration_s']:8.1f} s  no vehicle heard"
-    rtt_s = max((v["rtt_s"]["p99"] or 0.0 for v in vehicles), default=0.0)
-    loop_s = max((v["loop_delay_s"]["p99"] or 0.0 for v in vehicles), default=0.0)
+    rtt_s, loop_s = (
+        max((v[name]["p99"] for v in vehicles if v[name]["p99"] is not None), default=None)
+        for name in ("rtt_s", "loop_delay_s")
+    )
     least = min((v["headroom"] for v in vehicles if v["headroom"] is not None), default=None)
     states = sorted({v["status"] for v in vehicles})
     return (
