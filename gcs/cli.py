@@ -197,6 +197,35 @@ def bench(
 
 
 @app.command()
+def capacity(
+    scenario_file: ScenarioFile,
+    rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
+    most: Annotated[int, typer.Option(metavar="N", min=2, max=250, help="largest formation tried")] = 100,
+    as_json: AsJson = False,
+) -> None:
+    """How many vehicles, at which rate, the scenario's links carry before the delay margin is gone."""
+    from gcs import capacity as carrying
+
+    scenario = _scenario(scenario_file)
+    found = carrying.capacity(scenario, rates_hz=_rates(rates), most=most)
+    if as_json:
+        typer.echo(json.dumps(carrying.to_dict(found), indent=2))
+    else:
+        carrying.print_capacity(scenario, found)
+
+
+def _rates(text: str) -> list[float]:
+    """Rates in Hz from a list with commas."""
+    try:
+        rates = [float(part) for part in text.split(",")]
+    except ValueError:
+        rates = []
+    if not rates or not all(0.1 <= rate <= 1000.0 for rate in rates):
+        raise typer.BadParameter(f"--rates: {text}, wanted numbers from 0.1 to 1000 with commas, for example 2,5,10")
+    return rates
+
+
+@app.command()
 def view(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder, or a .rrd file")],
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="write a picture; open no window")] = None,

@@ -13,6 +13,7 @@ from gcs.plan import FlightPlan
 from gcs.record import TickArray
 from gcs.station import Datagram, Station
 from sim_vehicles.fleet import Fleet
+from sim_vehicles.truth import DROPPED, LINK_DOWN, LINK_UP, Record, Row
 
 START_NS = 1_000_000_000
 """Virtual time at which vehicles and station start; not zero, so that a forgotten time shows."""
@@ -28,9 +29,34 @@ class Vehicles(Protocol):
     def step(self, received: Sent, now_ns: int) -> Sent: ...
 
 
-def vehicles_of(plan: FlightPlan) -> Vehicles:
-    """The simulated vehicles of a plan with their links, at the start."""
-    return Fleet(plan.scenario, START_NS)
+class LinkLosses:
+    """Counts of what the links did, from the truth that `vehicles_of` records: datagrams in all, and lost ones."""
+
+    def __init__(self) -> None:
+        self.entered = {LINK_UP: 0, LINK_DOWN: 0}
+        self.lost = {LINK_UP: 0, LINK_DOWN: 0}
+
+    def record(self, row: Row) -> None:
+        """Take one record of the truth."""
+        kind = row[0]
+        if kind in (LINK_UP, LINK_DOWN):
+            self.entered[kind] += 1
+            self.lost[kind] += len(row) == 8 and row[6] & DROPPED != 0
+
+    @property
+    def share_up(self) -> float:
+        """Share of the datagrams from vehicles that were lost."""
+        return self.lost[LINK_UP] / max(self.entered[LINK_UP], 1)
+
+    @property
+    def share_down(self) -> float:
+        """Share of the datagrams to vehicles that were lost."""
+        return self.lost[LINK_DOWN] / max(self.entered[LINK_DOWN], 1)
+
+
+def vehicles_of(plan: FlightPlan, *, record: Record | None = None) -> Vehicles:
+    """The simulated vehicles of a plan with their links, at the start; `record` takes the truth of what they do."""
+    return Fleet(plan.scenario, START_NS, record=record)
 
 
 def fly_lockstep(
