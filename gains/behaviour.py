@@ -9,7 +9,7 @@ Source: Sahoo 2012 (see `gains.formation`), eq. (2.11) with the gains (3.26).
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gains.delay import analyse_delay
 from gains.rightmost import rightmost_root
@@ -41,7 +41,8 @@ class Behaviour:
         Largest growth of a spacing error from one vehicle to the next, over all frequencies, without delay and at
         `delay_s`; down a chain of n followers errors grow by its (n − 1)th power at most.
     delay_s
-        The constant delay of the figures with delay: half the sampled margin, plus half a period for the hold.
+        The constant delay of the figures with delay; `gains.design` takes half the sampled margin, plus half a period
+        for the hold.
     """
 
     decay_rate_1_s: float
@@ -54,23 +55,76 @@ class Behaviour:
 
 
 def leader_block(gains: Gains) -> tuple[FloatArray, FloatArray]:
+    """(A0, A1) of e_0^v: e_0^v' = K1 e_0^v, late. `gains` are K1, K2, K3, each of shape (axes, axes).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.behaviour import leader_block
+    >>> A0, A1 = leader_block((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
+    >>> A0.tolist(), A1.tolist()
+    ([[0.0]], [[-1.0]])
+    """
     return np.zeros_like(gains[0]), gains[0]
 
 
 def follower_block(gains: Gains) -> tuple[FloatArray, FloatArray]:
-    """(A0, A1) of (e_i^p, e_i^v): e_i^p' = −e_i^v, e_i^v' = K3 e_i^p + K1 e_i^v, the latter late."""
+    """(A0, A1) of (e_i^p, e_i^v): e_i^p' = −e_i^v, e_i^v' = K3 e_i^p + K1 e_i^v, the latter late.
+
+    `gains` are K1, K2, K3, each of shape (axes, axes); K2 couples blocks and is in none.
+
+    Examples
+    --------
+    e^p' = -e^v at once, e^v' = e^p - e^v late:
+
+    >>> import numpy as np
+    >>> from gains.behaviour import follower_block
+    >>> A0, A1 = follower_block((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
+    >>> (A0 + A1).tolist()
+    [[0.0, -1.0], [1.0, -1.0]]
+    """
     own, _, spacing = gains
     zero, identity = np.zeros_like(own), np.eye(own.shape[0])
     return np.block([[zero, -identity], [zero, zero]]), np.block([[zero, zero], [spacing, own]])
 
 
-def block_margin(A0: FloatArray, A1: FloatArray) -> BlockMargin:
+def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
+    """Margin of x'(t) = A0 x(t) + A1 x(t − τ) and the crossing at its end. Arguments as of `gains.delay.analyse_delay`.
+
+    The frequency is NaN if there is no crossing.
+
+    Examples
+    --------
+    s² + (s + 1) e^{−sτ} has roots on the axis at ω² = (1 + √5) / 2 and τ = atan(ω) / ω:
+
+    >>> from gains.behaviour import block_margin
+    >>> found = block_margin([[0, -1], [0, 0]], [[0, 0], [1, -1]])
+    >>> round(found.delay_margin_s, 6), round(found.crossing_rad_s, 6)
+    (0.711119, 1.27202)
+    """
     analysis = analyse_delay(A0, A1, horizon_s=1e-300)
     first = min(analysis.crossings, key=lambda crossing: abs(crossing.delay_s - analysis.delay_margin_s), default=None)
     return BlockMargin(analysis.delay_margin_s, first.omega_rad_s if first else float("nan"))
 
 
 def behaviour(gains: Gains, delay_s: float) -> Behaviour:
+    """Behaviour of a formation whose leader and followers have the gains K1, K2, K3, each of shape (axes, axes).
+
+    Parameters
+    ----------
+    delay_s
+        Constant delay of all feedback for the figures with delay.
+
+    Examples
+    --------
+    The leader's root is −1, the follower's s² + s + 1 has damping 1/2:
+
+    >>> import numpy as np
+    >>> from gains.behaviour import behaviour
+    >>> found = behaviour((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), delay_s=0.3)
+    >>> round(found.decay_rate_1_s, 6), round(found.damping, 6)
+    (0.5, 0.5)
+    """
     roots = np.linalg.eigvals(subsystem_loop(*gains))
     late = [rightmost_root([(A0, 0.0), (A1, delay_s)]) for A0, A1 in (leader_block(gains), follower_block(gains))]
     return Behaviour(
@@ -85,10 +139,19 @@ def behaviour(gains: Gains, delay_s: float) -> Behaviour:
 
 
 def string_peak(gains: Gains, delay_s: float) -> float:
-    """Return the largest singular value of Γ(jω) over ω, at least |Γ(0)| = 1.
+    """Return the largest singular value of Γ(jω) over ω, at least |Γ(0)| = 1: a search on a grid, refined once.
 
     Γ(s) = (s² I − (s K1 − K3) e^{−sτ})^{-1} (s K2 + K3) e^{−sτ} takes the velocity error of the vehicle in front to the
     own one, and for gains that act on every axis alike also the spacing error in front to the own one.
+
+    Examples
+    --------
+    |1 / (s² + s + 1)| peaks at 2 / √3:
+
+    >>> import numpy as np
+    >>> from gains.behaviour import string_peak
+    >>> round(string_peak((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), 0.0), 4)
+    1.1547
     """
     own, front, spacing = gains
     fastest = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)) + 1 / (delay_s + 1))

@@ -54,6 +54,12 @@ class Partition:
         How it was found.
     lower_bound
         No partition has fewer subgraphs than this.
+
+    Examples
+    --------
+    >>> from gains.bipartite import Partition, Subgraph
+    >>> Partition((Subgraph((0, 1), (0,)),), "by output", lower_bound=1).smallest
+    True
     """
 
     subgraphs: tuple[Subgraph, ...]
@@ -76,6 +82,19 @@ class ExpandedGain:
         0/1 matrices, shapes (inputs, expanded inputs) and (expanded outputs, outputs).
     mask
         Entries of K̄ that may differ from zero: block diagonal, shape (expanded inputs, expanded outputs).
+
+    Examples
+    --------
+    Back and forth gives the gain again:
+
+    >>> from gains.bipartite import expanded_gain, partition_by_input
+    >>> from gains.pattern import Pattern
+    >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 1))
+    >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
+    >>> expanded.expand([[-1, 0], [2, -3]]).tolist()
+    [[-1.0, 0.0, 0.0], [0.0, 2.0, -3.0]]
+    >>> expanded.contract([[-1, 0, 0], [0, 2, -3]]).tolist()
+    [[-1.0, 0.0], [2.0, -3.0]]
     """
 
     pattern: Pattern
@@ -121,6 +140,14 @@ def partition_by_input(pattern: Pattern) -> Partition:
     """One subgraph for each input with the outputs it uses: φ1 = I if every input uses one.
 
     For the pattern (4.6) {K11}, {K21, K22}, {K32, K33}.
+
+    Examples
+    --------
+    >>> from gains.bipartite import partition_by_input
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import leader_follower
+    >>> [graph.links for graph in partition_by_input(leader_follower(FormationModel((-1, 0, 1)))).subgraphs]
+    [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
     """
     rows = [Subgraph((i,), tuple(np.flatnonzero(row).tolist())) for i, row in enumerate(pattern.blocks) if row.any()]
     return Partition(tuple(rows), "by input", _rank_bound(pattern.blocks))
@@ -133,6 +160,17 @@ def smallest_partition(pattern: Pattern) -> Partition:
     first) is the smallest if it meets the rank of the pattern, below which no partition goes (Graham and Pollak's
     bound). If not, and there are at most `LARGEST_SEARCH_LINKS` different links, all smaller ones are tried, within a
     fixed number of steps.
+
+    Examples
+    --------
+    All to all is one subgraph, whatever the number of vehicles:
+
+    >>> from gains.bipartite import smallest_partition
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import all_to_all
+    >>> found = smallest_partition(all_to_all(FormationModel((-1, 0, 1))))
+    >>> len(found.subgraphs), found.smallest
+    (1, True)
     """
     core, row_class, column_class = _without_repeats(pattern.blocks)
     bound = _rank_bound(core)
@@ -162,6 +200,19 @@ def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
     ------
     BadModelError
         If the partition does not hold every link of the pattern exactly once.
+
+    Examples
+    --------
+    The sizes of (4.7), and φ1 = I:
+
+    >>> import numpy as np
+    >>> from gains.bipartite import expanded_gain, partition_by_input
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import leader_follower
+    >>> pattern = leader_follower(FormationModel((-1, 0, 1)))
+    >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
+    >>> expanded.mask.shape, expanded.phi2.shape, np.array_equal(expanded.phi1, np.eye(6))
+    ((6, 16), (16, 10), True)
     """
     _check_partition(pattern, partition)
     graphs = partition.subgraphs
@@ -183,6 +234,15 @@ def verify_expansion(plant: Plant, expanded: ExpandedGain, K: ArrayLike) -> floa
     ------
     DisagreementError
         If it is more than rounding.
+
+    Examples
+    --------
+    >>> from gains.bipartite import expanded_gain, partition_by_input, verify_expansion
+    >>> from gains.pattern import Pattern, Plant
+    >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 1))
+    >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
+    >>> verify_expansion(Plant([[0, 0], [1, 0]], [[1, 0], [0, 1]]), expanded, [[-1, 0], [2, -3]])
+    0.0
     """
     gain = checked_pattern_gain(expanded.pattern, K)
     closed = plant.closed_loop(gain)

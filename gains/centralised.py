@@ -50,6 +50,16 @@ def centralised_lmi(plant: Plant, *, gain_bound: float, lyapunov_bound: float) -
         If a bound is not a positive number.
     SolverError
         If the solver does not end with status "optimal", or the exact bound of K is below the one claimed.
+
+    Examples
+    --------
+    x' = u + w: L = −2 and Y = 1/2 give K = −4 and γ = Y² / (−2 L − 1) = 1/12.
+
+    >>> from gains.centralised import centralised_lmi
+    >>> from gains.pattern import Plant
+    >>> found = centralised_lmi(Plant([[0]], [[1]]), gain_bound=2.0, lyapunov_bound=2.0)
+    >>> found.K.round(3).tolist(), round(found.alpha, 3)
+    ([[-4.0]], 3.464)
     """
     import cvxpy as cp
 

@@ -56,6 +56,15 @@ def analyse_commensurate(matrices: Sequence[ArrayLike], *, horizon_s: float | No
         No matrix, matrices that are not square, finite and of one size, or m n too large.
     DisagreementError
         Crossings and eigenvalues contradict each other (a loop at the limit of double precision).
+
+    Examples
+    --------
+    x'(t) = -x(t - tau) - x(t - 2 tau) is stable up to tau = pi / (3 sqrt(3)), where it oscillates at sqrt(3) rad/s:
+
+    >>> from gains.commensurate import analyse_commensurate
+    >>> found = analyse_commensurate([[[0]], [[-1]], [[-1]]])
+    >>> round(found.delay_margin_s, 6), round(found.crossings[0].omega_rad_s, 6)
+    (0.6046, 1.732051)
     """
     if horizon_s is not None and not horizon_s > 0.0:
         raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
@@ -90,6 +99,14 @@ def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
     at j omega, tau = theta / omega is critical. Sorted real parts are continuous in the angle, so crossings are
     bracketed, and local extrema near zero are refined. It is a search, not a proof. Arguments as of
     `analyse_commensurate`.
+
+    Examples
+    --------
+    The margin pi / (3 sqrt(3)) of x'(t) = -x(t - tau) - x(t - 2 tau):
+
+    >>> from gains.commensurate import circle_sweep_margin
+    >>> round(circle_sweep_margin([[[0]], [[-1]], [[-1]]]), 6)
+    0.6046
     """
     blocks = distinct_blocks(*_checked(matrices))
     return min(_circle_margin(balanced(*block.matrices)) for block in blocks)

@@ -89,6 +89,17 @@ def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = Non
         The matrices are not square, finite and of one size, or the horizon is not a positive number.
     DisagreementError
         Crossings and eigenvalues contradict each other (a loop at the limit of double precision).
+
+    Examples
+    --------
+    x'' - 0.1 x' + 2 x = x(t - tau) is stable for delays between 0.1 s and 1.7 s only:
+
+    >>> from gains.delay import analyse_delay
+    >>> found = analyse_delay([[0, 1], [-2, 0.1]], [[0, 0], [1, 0]])
+    >>> [(round(start_s, 4), round(end_s, 4)) for start_s, end_s in found.stable_intervals_s]
+    [(0.1002, 1.7179)]
+    >>> found.unstable_roots_at_zero_delay, found.delay_margin_s
+    (2, 0.0)
     """
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
     if horizon_s is not None and not horizon_s > 0.0:
@@ -116,7 +127,15 @@ def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = Non
 def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """The least delay (s) at which x'(t) = A0 x(t) + A1 x(t - tau) loses stability.
 
-    `inf` if no delay does, 0 if the loop is unstable without delay. Exceptions as of `analyse_delay`.
+    `inf` if no delay does, 0 if the loop is unstable without delay. Arguments and exceptions as of `analyse_delay`.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau) is stable up to tau = pi / 2:
+
+    >>> from gains.delay import delay_margin
+    >>> round(delay_margin([[0]], [[-1]]), 6)
+    1.570796
     """
     # the first critical delay is wanted only: the shortest horizon lists the fewest windows
     return analyse_delay(A0, A1, horizon_s=1e-300).delay_margin_s

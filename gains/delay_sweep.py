@@ -28,6 +28,24 @@ def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     0 when A0 + A1 is not Hurwitz, `inf` when no modulus reaches one. The sweep is dense near the natural frequencies
     of A0 and of A0 + A1, and every local extremum of every sorted modulus near one is located, so that two crossings
     between neighbouring grid points are seen. It is a search, not a proof.
+
+    Parameters
+    ----------
+    A0, A1
+        Real matrices (n, n), 1/s.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau) is stable up to tau = pi / 2:
+
+    >>> from gains.delay_sweep import frequency_sweep_margin
+    >>> round(frequency_sweep_margin([[0]], [[-1]]), 6)
+    1.570796
     """
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
     return min(_block_margin(*balanced(*block.matrices)) for block in blocks)

@@ -99,6 +99,18 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
         If plant and pattern do not fit.
     DisagreementError
         If the rank test and the random gains contradict each other: λ is fixed to rounding, or nearly so.
+
+    Examples
+    --------
+    A leader that may not use its own velocity error keeps its integrator, unless a link is added:
+
+    >>> from gains.fixed_modes import fixed_modes
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import formation_plant, leader_follower, without_links
+    >>> pair = FormationModel((-1, 0), axes=1)
+    >>> [found] = fixed_modes(formation_plant(pair), without_links(leader_follower(pair), [(0, 0)]))
+    >>> abs(found.mode) < 1e-9, found.states, found.remedies
+    (True, (0,), (((0, 0),), ((0, 1),)))
     """
     check_fits(plant, pattern)
     gains = _random_gains(plant, pattern, seed)
@@ -128,6 +140,17 @@ def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tupl
     ------
     InfeasibleError
         If a fixed mode is unstable; the message names the links of which one or all have to be added.
+
+    Examples
+    --------
+    The leader-follower pattern leaves no fixed mode:
+
+    >>> from gains.fixed_modes import check_stabilisable
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import formation_plant, leader_follower
+    >>> pair = FormationModel((-1, 0), axes=1)
+    >>> check_stabilisable(formation_plant(pair), leader_follower(pair))
+    ()
     """
     modes = fixed_modes(plant, pattern, seed=seed)
     unstable = [mode for mode in modes if mode.unstable]

@@ -132,6 +132,18 @@ def graph_design(
     InfeasibleError
         If a mode cannot be moved by the pattern (the message names the missing link), or the requirement cannot be met
         (the message says what to relax).
+
+    Examples
+    --------
+    A chain of three in which each vehicle sees its neighbours on both sides:
+
+    >>> from gains.formation import FormationModel
+    >>> from gains.graph_design import graph_design
+    >>> from gains.pattern import bidirectional
+    >>> chain = FormationModel((-1, 0, 1))
+    >>> found = graph_design(chain, bidirectional(chain), method="graph-lqr", period_s=0.02)
+    >>> round(found.delay_margin_s, 6), found.K.shape
+    (0.3, (6, 10))
     """
     wanted = requirement or Requirement()
     single = FormationModel(formation.predecessors, axes=1)
@@ -153,6 +165,16 @@ def evaluate_graph_gain(formation: FormationModel, pattern: Pattern, K: ArrayLik
     """Return margins, robustness and decay rate of a given gain K (inputs, states) with a pattern.
 
     Gains of an unstable loop are reported too: alpha and the margins are 0 and there is no certificate.
+
+    Examples
+    --------
+    >>> from gains.formation import FormationModel
+    >>> from gains.graph_design import evaluate_graph_gain
+    >>> from gains.pattern import leader_follower
+    >>> pair = FormationModel((-1, 0), axes=1)
+    >>> found = evaluate_graph_gain(pair, leader_follower(pair), [[-1, 0, 0], [0, 1, -1]], period_s=0.02)
+    >>> round(found.delay_margin_continuous_s, 6), round(found.decay_rate_1_s, 6)
+    (0.711119, 0.5)
     """
     gain = checked_pattern_gain(pattern, K)
     return _assess(
@@ -161,7 +183,16 @@ def evaluate_graph_gain(formation: FormationModel, pattern: Pattern, K: ArrayLik
 
 
 def time_scaled(formation: FormationModel, K: FloatArray, scale: float) -> FloatArray:
-    """The gain with which the loop does the same `scale` times slower: K_v / scale, K_p / scale²."""
+    """The gain with which the loop does the same `scale` times slower: K_v / scale, K_p / scale².
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.formation import FormationModel
+    >>> from gains.graph_design import time_scaled
+    >>> time_scaled(FormationModel((-1, 0), axes=1), np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]), 2.0).tolist()
+    [[-0.5, 0.0, 0.0], [0.0, 0.25, -0.5]]
+    """
     scaled = K / scale
     for i in formation.followers:
         scaled[:, formation.spacing_slice(i)] /= scale

@@ -44,6 +44,17 @@ class Expansion:
         type (b), N = 0.
     restriction
         "a": A~V = VA and B~R = VB. "b": A~V = VA and B~ = VBQ (Theorem 2).
+
+    Examples
+    --------
+    U takes the mean of the copies that V makes, UV = I:
+
+    >>> import numpy as np
+    >>> from gains.formation import FormationModel
+    >>> from gains.inclusion import expand
+    >>> expansion = expand(FormationModel((-1, 0, 1)))
+    >>> np.array_equal((expansion.U @ expansion.V).toarray(), np.eye(10))
+    True
     """
 
     V: Sparse
@@ -89,6 +100,16 @@ def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansi
     The expanded state is (e_0^v) and then (e_j^v, e_i^p, e_i^v) for every follower i behind j, the expanded input (u_0)
     and then (u_j, u_i) (3.11-3.13). Of type (a), A~ and B~ are block diagonal with the blocks (3.25). Of type (b), A~
     is the same and B~ = VBQ, which is not block diagonal: a vehicle's copies move by the mean of its inputs' copies.
+
+    Examples
+    --------
+    A chain of three: e_0^v, e_1^v, u_0 and u_1 are there twice.
+
+    >>> from gains.formation import FormationModel
+    >>> from gains.inclusion import expand
+    >>> expansion = expand(FormationModel((-1, 0, 1)))
+    >>> expansion.V.shape, expansion.R.shape
+    ((14, 10), (10, 6))
     """
     if restriction not in ("a", "b"):
         raise BadModelError(f"restriction = {restriction!r}; wanted 'a' or 'b'")
@@ -112,6 +133,15 @@ def expanded_gain(formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: A
 
     The block of {e_0^v} is K1, that of every follower [K1 0 0; K2 K3 K1] (3.26): in its subsystem the vehicle in front
     is governed by K1 alone.
+
+    Examples
+    --------
+    A leader and one follower of one axis: [K1] and [K1 0 0; K2 K3 K1].
+
+    >>> from gains.formation import FormationModel
+    >>> from gains.inclusion import expanded_gain
+    >>> expanded_gain(FormationModel((-1, 0), axes=1), [[-3]], [[2]], [[1]]).toarray().tolist()
+    [[-3.0, 0.0, 0.0, 0.0], [0.0, -3.0, 0.0, 0.0], [0.0, 2.0, 1.0, -3.0]]
     """
     n = formation.axes
     own, front, spacing = (checked_gain(name, gain, n) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3)))
@@ -128,6 +158,16 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
 
     Without this the copies of u_j disagree (K1 e_j^v in the subsystem of the vehicle behind j, the full law in j's
     own), K~V = RK has no solution K, and the contracted gain would be a mean of the two (3.17-3.19).
+
+    Examples
+    --------
+    In a chain of three the copy of u_1 in the subsystem behind gets the law of vehicle 1:
+
+    >>> from gains.formation import FormationModel
+    >>> from gains.inclusion import expanded_gain, modified_gain
+    >>> chain = FormationModel((-1, 0, 1), axes=1)
+    >>> modified_gain(chain, expanded_gain(chain, [[-3]], [[2]], [[1]])).toarray()[3].tolist()
+    [0.0, 2.0, 1.0, -3.0, 0.0, 0.0, 0.0]
     """
     n = formation.axes
     own_row = [0] + [2 * i for i in formation.followers]
@@ -139,7 +179,18 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
 
 
 def contracted_gain(expansion: Expansion, gain: Sparse) -> FloatArray:
-    """Return K = Q K~ V as an array of shape (inputs, states)."""
+    """Return K = Q K~ V as an array of shape (inputs, states).
+
+    Examples
+    --------
+    Back to the gain (3.19) of the formation, u_1 = 2 e_0^v + e_1^p − 3 e_1^v:
+
+    >>> from gains.formation import FormationModel
+    >>> from gains.inclusion import contracted_gain, expand, expanded_gain, modified_gain
+    >>> pair = FormationModel((-1, 0), axes=1)
+    >>> contracted_gain(expand(pair), modified_gain(pair, expanded_gain(pair, [[-3]], [[2]], [[1]]))).tolist()
+    [[-3.0, 0.0, 0.0], [2.0, 1.0, -3.0]]
+    """
     return np.asarray((expansion.Q @ csr_array(gain) @ expansion.V).toarray(), dtype=float)
 
 
@@ -169,6 +220,15 @@ def verify_inclusion(
     ------
     BadModelError
         If a condition is missed; the message names it, its residual and the tolerance.
+
+    Examples
+    --------
+    >>> from gains.formation import FormationModel
+    >>> from gains.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
+    >>> chain, gains = FormationModel((-1, 0, 1), axes=1), ([[-3]], [[2]], [[1]])
+    >>> K, K_expanded = chain.overlapping_gain(*gains), modified_gain(chain, expanded_gain(chain, *gains))
+    >>> verify_inclusion(expand(chain), chain.A, chain.B, K=K, K_expanded=K_expanded).gain_map
+    0.0
     """
     V, U, R, Q = expansion.V, expansion.U, expansion.R, expansion.Q
     A_, B_, K_, K_e = csr_array(A), csr_array(B), csr_array(K), csr_array(K_expanded)

@@ -36,7 +36,16 @@ class Jitter:
     """An observed effective delay: `mean_s`, the largest distance `spread_s` from it, and the largest |d delay / dt|.
 
     `rate` (s/s) is inf for a delay that jumps from message to message, as delays of queued datagrams do; a sampled and
-    held loop has a sawtooth of rate 1 and jumps.
+    held loop has a sawtooth of rate 1 and jumps. Values out of range are reported by the functions that take it.
+
+    Examples
+    --------
+    A delay of 80 to 120 ms that jumps from message to message:
+
+    >>> from math import inf
+    >>> from gains.jitter import Jitter
+    >>> Jitter(mean_s=0.1, spread_s=0.02, rate=inf)
+    Jitter(mean_s=0.1, spread_s=0.02, rate=inf)
     """
 
     mean_s: float
@@ -79,10 +88,25 @@ class CoveringBound:
 def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBound:
     """The least demanding bound that proves x'(t) = A0 x(t) + A1 x(t - tau(t)) stable under `jitter`.
 
+    Parameters
+    ----------
+    A0, A1
+        Real matrices (n, n), 1/s; up to 8 states in a strongly connected block.
+
     Raises
     ------
     BadModelError
-        Matrices that do not fit, or a jitter that is negative, not a number, or has a spread above the mean.
+        Matrices that do not fit, a block too large, or a jitter that is negative, not a number, or has a spread above
+        the mean.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau(t)): a constant delay may come near pi / 2, one that jumps may not.
+
+    >>> from math import inf
+    >>> from gains.jitter import Jitter, bound_covering
+    >>> [bound_covering([[0]], [[-1]], Jitter(1.4, spread_s, inf)).cover for spread_s in (0.0, 0.02, 0.15)]
+    ['constant', 'spread', 'none']
     """
     _check(jitter)
     analysis = analyse_delay(A0, A1)
@@ -114,13 +138,26 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float) -> float:
     With v(t) = C (x(t - mean) - x(t - tau(t))), A1 = B C, the loop is G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B
     closed by the integral over the deviation, whose gain is at most sqrt(2) times the spread (each instant lies in the
     integral for at most twice the spread of time). So the spread is 1 / (sqrt(2) max over omega of
-    ||D G(j omega) D^{-1}||) for any D. 0 if the loop is unstable at the mean delay. The maximum is read from a fine
-    grid, with a part in a thousand allowed for what lies between: a search, not a proof.
+    ||D G(j omega) D^{-1}||) for any D, and at most the mean. 0 if the loop is unstable at the mean delay. The maximum
+    is read from a fine grid, with a part in a thousand allowed for what lies between: a search, not a proof.
+
+    Parameters
+    ----------
+    A0, A1
+        Real matrices (n, n), 1/s.
 
     Raises
     ------
     BadModelError
         Matrices that do not fit, or a mean that is negative or not finite.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
+
+    >>> from gains.jitter import spread_bound
+    >>> round(spread_bound([[0]], [[-1]], mean_s=0.5), 2)
+    0.44
     """
     _check(Jitter(mean_s, 0.0, 0.0))
     if not _is_inside(analyse_delay(A0, A1).stable_intervals_s, mean_s):

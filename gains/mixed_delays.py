@@ -32,7 +32,16 @@ _DETERMINANT_TURN, _HALVINGS = 0.5, 40
 
 @dataclass(frozen=True)
 class MixedTerm:
-    """A x(t - known_s - multiple * tau): `matrix` A real (n, n) in 1/s, `known_s` >= 0, `multiple` whole and >= 0."""
+    """A x(t - known_s - multiple * tau): `matrix` A real (n, n) in 1/s, `known_s` >= 0, `multiple` whole and >= 0.
+
+    Examples
+    --------
+    -x(t - 0.5 - 2 tau):
+
+    >>> from gains.mixed_delays import MixedTerm
+    >>> MixedTerm([[-1]], known_s=0.5, multiple=2)
+    MixedTerm(matrix=[[-1]], known_s=0.5, multiple=2)
+    """
 
     matrix: ArrayLike
     known_s: float
@@ -45,6 +54,13 @@ def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None)
     `unstable_roots_at_zero_delay` counts the roots at tau = 0, with the known delays. Crossing frequencies come from
     a sweep: a search, not a proof.
 
+    Parameters
+    ----------
+    terms
+        At least one.
+    horizon_s
+        As of `gains.delay.analyse_delay`.
+
     Raises
     ------
     BadModelError
@@ -52,6 +68,14 @@ def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None)
         delays so long that the sweep would be too large.
     DisagreementError
         A root too close to the imaginary axis at tau = 0 to count it on either side.
+
+    Examples
+    --------
+    x'(t) = -x(t - 0.5 - tau) leaves pi / 2 - 0.5 for tau:
+
+    >>> from gains.mixed_delays import MixedTerm, analyse_mixed
+    >>> round(analyse_mixed([MixedTerm([[-1]], known_s=0.5, multiple=1)]).delay_margin_s, 6)
+    1.070796
     """
     matrices = _checked(terms)
     known_s, multiples = np.array([t.known_s for t in terms]), [t.multiple for t in terms]

@@ -67,6 +67,13 @@ def parse_model(text: str) -> DelayModel | HeldModel:
     ------
     BadModelError
         One line: the key, what was read, what was wanted.
+
+    Examples
+    --------
+    >>> from gains.model_file import parse_model
+    >>> model = parse_model('{"terms": [{"A": [[-1]], "delay": "0.1 + 2*tau"}]}')
+    >>> model.unknown, model.terms[0].fixed_s, model.terms[0].multiple
+    ('tau', 0.1, Fraction(2, 1))
     """
     data = _parsed(text)
     if not isinstance(data, dict):

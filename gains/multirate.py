@@ -48,6 +48,20 @@ class Timing:
         How long (s) after a command's instant the first sample is taken, 0 <= phase < T / p.
     up_s, down_s
         Delay (s) of a sample on its way to the station and of a command on its way to the vehicle.
+
+    Raises
+    ------
+    BadModelError
+        A number out of its range; the message names it.
+
+    Examples
+    --------
+    Five samples and two commands in 0.1 s: 50 Hz and 20 Hz. The command at 0.05 s uses the sample of 0.04 s.
+
+    >>> from gains.multirate import Timing
+    >>> timing = Timing(0.1, samples=5, commands=2)
+    >>> timing.sampling_s, timing.control_s, timing.sample_used(1)
+    (0.02, 0.05, 2)
     """
 
     common_period_s: float
@@ -74,10 +88,12 @@ class Timing:
 
     @property
     def sampling_s(self) -> float:
+        """From one sample to the next, s."""
         return self.common_period_s / self.samples
 
     @property
     def control_s(self) -> float:
+        """From one command to the next, s."""
         return self.common_period_s / self.commands
 
     def sample_used(self, command: int) -> int:
@@ -108,12 +124,31 @@ def multirate_spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: 
     ------
     BadModelError
         Naming the argument, what was read and what was wanted.
+
+    Examples
+    --------
+    x' = u, u = -x with one sample and two commands in 0.5 s: both commands use the one sample, x_{k+1} = (1 - T) x_k.
+
+    >>> from gains.multirate import Timing, multirate_spectral_radius
+    >>> round(multirate_spectral_radius([[0]], [[1]], [[-1]], Timing(0.5, samples=1, commands=2)), 6)
+    0.5
     """
     return max(_radius(plant, timing) for plant in _blocks(A, B, K, timing))
 
 
 def multirate_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> FloatArray:
-    """The matrix that takes (x, K x(sample -1), K x(sample -2), ...) one common period on. Arguments as above."""
+    """The matrix that takes (x, K x(sample -1), K x(sample -2), ...) one common period on.
+
+    Arguments and exceptions as of `multirate_spectral_radius`.
+
+    Examples
+    --------
+    x' = u, u = -x with one sample and two commands in 0.5 s, the sample used 0.25 s after it was taken:
+
+    >>> from gains.multirate import Timing, multirate_map
+    >>> multirate_map([[0]], [[1]], [[-1]], Timing(0.5, samples=1, commands=2, up_s=0.25)).round(6).tolist()
+    [[0.75, 0.25], [-1.0, 0.0]]
+    """
     return _lifted(HeldPlant(*checked_loop(A, B, K), timing.common_period_s), timing)
 
 
@@ -124,12 +159,20 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
     command finds, so the spectral radius jumps with it; between jumps it is continuous. Every jump is looked at from
     both sides, the stretches between at a sixteenth of a period, peaks refined: a search, not a proof. 0 if the loop is
     unstable as it is, `inf` if no limit is found within three times the margin of the continuous loop and ten common
-    periods.
+    periods. Arguments as of `multirate_spectral_radius`.
 
     Raises
     ------
     BadModelError
         Naming the argument, what was read and what was wanted.
+
+    Examples
+    --------
+    x' = u, u = -x at one rate, all delay on the way down: the margin of `gains.sampled`, 1 s with a period of 1 s.
+
+    >>> from gains.multirate import Timing, multirate_delay_margin
+    >>> round(multirate_delay_margin([[0]], [[1]], [[-1]], Timing(1.0, samples=1, commands=1), up_share=0.0), 6)
+    1.0
     """
     if not 0.0 <= up_share <= 1.0:
         raise BadModelError(f"up_share is {up_share}; 0 (all on the way down) to 1 is wanted")

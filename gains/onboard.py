@@ -49,6 +49,14 @@ class OnboardTiming:
         Steps of the vehicle's own loop in a control period.
     steps_per_sample
         Its sensor looks at every so manieth step; a whole number of times in a control period.
+
+    Examples
+    --------
+    A station at 10 Hz, vehicles at 50 Hz:
+
+    >>> from gains.onboard import OnboardTiming
+    >>> OnboardTiming(control_s=0.1, steps=5)
+    OnboardTiming(control_s=0.1, steps=5, steps_per_sample=1)
     """
 
     control_s: float
@@ -188,6 +196,18 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
     """The onboard loop of a formation with the gain K (inputs, states) of u = K e.
 
     The own part K_own are its blocks (i, i), by which vehicle i uses its own errors; the rest is K_others.
+
+    Examples
+    --------
+    A follower uses what is its own at once, and its leader needs nobody: no delay destabilises the pair.
+
+    >>> import numpy as np
+    >>> from gains.formation import FormationModel
+    >>> from gains.onboard import OnboardTiming, onboard_loop
+    >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
+    >>> loop = onboard_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
+    >>> loop.late.tolist(), loop.continuous_margin_s(), loop.sampled_margin_s()
+    ([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], inf, inf)
     """
     B, own = model.B, own_part(model, K)
     spacing = np.zeros(model.states, dtype=bool)
@@ -203,7 +223,16 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
 
 
 def own_part(model: FormationModel, K: FloatArray) -> FloatArray:
-    """K with its blocks (i, i) only."""
+    """K with its blocks (i, i) only.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.formation import FormationModel
+    >>> from gains.onboard import own_part
+    >>> own_part(FormationModel((-1, 0), axes=1), np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])).tolist()
+    [[-1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]
+    """
     own = np.zeros_like(K)
     for i in range(model.vehicles):
         block = model.input_slice(i), model.output_slice(i)

@@ -37,6 +37,15 @@ class Plant:
     ------
     BadModelError
         If a matrix is not finite and real or the shapes do not fit.
+
+    Examples
+    --------
+    Two integrators in a row of which the position is measured:
+
+    >>> from gains.pattern import Plant
+    >>> plant = Plant([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
+    >>> plant.closed_loop([[-4]]).tolist()
+    [[0.0, 1.0], [-4.0, 0.0]]
     """
 
     A: FloatArray
@@ -79,6 +88,15 @@ class Pattern:
     ------
     BadModelError
         If an entry is not 0 or 1, a size is not a positive whole number, or shape and sizes do not fit.
+
+    Examples
+    --------
+    u_0 uses y_0, u_1 uses both outputs; y_1 has two entries:
+
+    >>> from gains.pattern import Pattern
+    >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 2))
+    >>> pattern.links, pattern.mask.astype(int).tolist()
+    (((0, 0), (1, 0), (1, 1)), [[1, 0, 0], [1, 1, 1]])
     """
 
     blocks: BoolArray
@@ -129,6 +147,13 @@ def leader_follower(formation: FormationModel) -> Pattern:
     """The pattern (4.6): every vehicle uses its own output and that of the vehicle in front.
 
     The output of the leader is its velocity error, of a follower its spacing and velocity errors: C = I.
+
+    Examples
+    --------
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import leader_follower
+    >>> leader_follower(FormationModel((-1, 0, 1))).links
+    ((0, 0), (1, 0), (1, 1), (2, 1), (2, 2))
     """
     blocks = np.eye(formation.vehicles, dtype=bool)
     for i in formation.followers:
@@ -140,13 +165,28 @@ def bidirectional(formation: FormationModel) -> Pattern:
     """Every vehicle uses its own output, that of the vehicle in front and those of the vehicles behind it.
 
     For a chain of three this is the pattern of section 5: vehicle 2 uses 1, 2, 3, vehicles 1 and 3 use 2.
+
+    Examples
+    --------
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import bidirectional
+    >>> bidirectional(FormationModel((-1, 0, 1))).blocks.astype(int).tolist()
+    [[1, 1, 0], [1, 1, 1], [0, 1, 1]]
     """
     pattern = leader_follower(formation)
     return replace(pattern, blocks=pattern.blocks | pattern.blocks.T)
 
 
 def all_to_all(formation: FormationModel) -> Pattern:
-    """Every vehicle uses all outputs: the centralised controller."""
+    """Every vehicle uses all outputs: the centralised controller.
+
+    Examples
+    --------
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import all_to_all
+    >>> all_to_all(FormationModel((-1, 0))).links
+    ((0, 0), (0, 1), (1, 0), (1, 1))
+    """
     return Pattern(np.ones((formation.vehicles, formation.vehicles), dtype=bool), *_formation_sizes(formation))
 
 
@@ -157,17 +197,43 @@ def with_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
     ------
     BadModelError
         If a link names a vehicle that is not in the pattern.
+
+    Examples
+    --------
+    Vehicle 2 sees the leader as well:
+
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import leader_follower, with_links
+    >>> with_links(leader_follower(FormationModel((-1, 0, 1))), [(2, 0)]).blocks.astype(int).tolist()
+    [[1, 0, 0], [1, 1, 0], [1, 1, 1]]
     """
     return replace(pattern, blocks=_set(pattern, links, True))
 
 
 def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
-    """The pattern in which, for every (i, j) given, u_i may not use y_j. Exceptions as of `with_links`."""
+    """The pattern in which, for every (i, j) given, u_i may not use y_j. Exceptions as of `with_links`.
+
+    Examples
+    --------
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import leader_follower, without_links
+    >>> without_links(leader_follower(FormationModel((-1, 0, 1))), [(2, 1)]).links
+    ((0, 0), (1, 0), (1, 1), (2, 2))
+    """
     return replace(pattern, blocks=_set(pattern, links, False))
 
 
 def formation_plant(formation: FormationModel, C: ArrayLike | None = None) -> Plant:
-    """The error model of the formation with outputs y = C e; C = I if not given."""
+    """The error model of the formation with outputs y = C e; C = I if not given.
+
+    Examples
+    --------
+    >>> from gains.formation import FormationModel
+    >>> from gains.pattern import formation_plant
+    >>> plant = formation_plant(FormationModel((-1, 0, 1)))
+    >>> plant.A.shape, plant.B.shape, plant.C.shape
+    ((10, 10), (10, 6), (10, 10))
+    """
     return Plant(formation.A, formation.B, C)
 
 
@@ -182,6 +248,13 @@ def split_own(pattern: Pattern, K: ArrayLike) -> tuple[FloatArray, FloatArray]:
     ------
     BadModelError
         If K does not have the pattern.
+
+    Examples
+    --------
+    >>> from gains.pattern import Pattern, split_own
+    >>> own, others = split_own(Pattern([[1, 1], [1, 1]], (1, 1), (1, 1)), [[-2, 1], [1, -2]])
+    >>> own.tolist(), others.tolist()
+    ([[-2.0, 0.0], [0.0, -2.0]], [[0.0, 1.0], [1.0, 0.0]])
     """
     gain = checked_pattern_gain(pattern, K)
     own = replace(pattern, blocks=np.eye(*pattern.blocks.shape, dtype=bool)).mask

@@ -64,6 +64,15 @@ def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
     ------
     BadModelError
         Naming the matrix, what was read and what was wanted.
+
+    Examples
+    --------
+    x' = u, u = -x: x_{k+1} = (1 - T) x_k is stable up to T = 2, where it changes sign from sample to sample.
+
+    >>> from gains.period_windows import analyse_period
+    >>> found = analyse_period([[0]], [[1]], [[-1]])
+    >>> round(found.limit_s, 6), [(round(c.omega_rad_s, 4), c.direction) for c in found.crossings]
+    (2.0, [(1.5708, 1)])
     """
     plant, entry, feedback = checked_loop(A, B, K)
     loop_roots = np.linalg.eigvals(plant + entry @ feedback).astype(np.complex128)

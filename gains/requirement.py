@@ -31,6 +31,14 @@ class Requirement:
     string_peak_max
         Limit, at least 1, on the growth of spacing errors from vehicle to vehicle, without delay and at half the
         margin. 1 lets no error grow down the chain and costs little α. Not limited if None.
+
+    Examples
+    --------
+    A delay margin of 0.3 s is wanted when nothing is given:
+
+    >>> from gains.requirement import Requirement
+    >>> Requirement().delay_margin_s, Requirement(alpha=0.4).delay_margin_s
+    (0.3, None)
     """
 
     delay_margin_s: float | None = None

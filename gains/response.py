@@ -30,7 +30,16 @@ _MARGIN_RESOLUTION = 1e-9
 
 @dataclass(frozen=True)
 class Response:
-    """How one vehicle answers: `lag_s` > 0 from wanted to real acceleration, velocity gain g >= 0 in 1/s."""
+    """How one vehicle answers: `lag_s` > 0 from wanted to real acceleration, velocity gain g >= 0 in 1/s.
+
+    Examples
+    --------
+    An autopilot with a lag of 0.2 s that also corrects the velocity:
+
+    >>> from gains.response import Response
+    >>> Response(lag_s=0.2, velocity_gain_1_s=1.5)
+    Response(lag_s=0.2, velocity_gain_1_s=1.5)
+    """
 
     lag_s: float
     velocity_gain_1_s: float
@@ -48,6 +57,17 @@ def formation_loop(
     """(A, B, K) of the formation u = K e whose vehicles answer so, one response for each in the model's order.
 
     The state is e of `gains.formation`, followed by a and d of each vehicle; a vehicle with g = 0 has no d.
+
+    Examples
+    --------
+    A leader by itself, of one axis: e' = a, 0.5 a' = u − a, u = −e.
+
+    >>> import numpy as np
+    >>> from gains.formation import FormationModel
+    >>> from gains.response import Response, formation_loop
+    >>> A, B, K = formation_loop(FormationModel((-1,), axes=1), np.array([[-1.0]]), [Response(0.5, 0.0)])
+    >>> (A + B @ K).tolist()
+    [[0.0, 1.0], [-2.0, -2.0]]
     """
     if len(responses) != model.vehicles:
         raise BadModelError(f"there are {len(responses)} responses; wanted one for each of {model.vehicles} vehicles")
@@ -73,12 +93,35 @@ def formation_loop(
 
 
 def sampled_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response], *, period_s: float) -> float:
-    """The least delay (s) at which the sampled and held loop of these vehicles loses stability."""
+    """The least delay (s) at which the sampled and held loop of these vehicles loses stability.
+
+    Examples
+    --------
+    The same leader, sampled: 1.1506 s less half a period or so.
+
+    >>> import numpy as np
+    >>> from gains.formation import FormationModel
+    >>> from gains.response import Response, sampled_margin
+    >>> leader, K = FormationModel((-1,), axes=1), np.array([[-1.0]])
+    >>> round(sampled_margin(leader, K, [Response(1.0, 0.0)], period_s=0.02), 3)
+    1.141
+    """
     return float(sampled_delay_margin(*formation_loop(model, K, responses), period_s=period_s))
 
 
 def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response]) -> float:
-    """The same of the continuous loop."""
+    """The same of the continuous loop.
+
+    Examples
+    --------
+    A leader with s (s + 1) + e^{−sτ} = 0: ω² (1 + ω²) = 1 and τ = (π/2 − atan ω) / ω.
+
+    >>> import numpy as np
+    >>> from gains.formation import FormationModel
+    >>> from gains.response import Response, continuous_margin
+    >>> round(continuous_margin(FormationModel((-1,), axes=1), np.array([[-1.0]]), [Response(1.0, 0.0)]), 4)
+    1.1506
+    """
     A, B, K_all = formation_loop(model, K, responses)
     return float(delay_margin(A, B @ K_all))
 
@@ -87,10 +130,22 @@ def string_peak(gains: Gains, response: Response, *, delay_s: float) -> float:
     """Largest growth of a spacing error from one vehicle to the next, as `gains.behaviour.string_peak`, with response.
 
     Γ(s) = (s² I - h (s K1 - K3))^{-1} (s K2 + K3) h, h = e^{-sτ} (s + g) / (lag s² + s + g); at least |Γ(0)| = 1.
+
+    Examples
+    --------
+    Vehicles with a short lag have the peak 2 / √3 of |1 / (s² + s + 1)|, others a larger one:
+
+    >>> import numpy as np
+    >>> from gains.response import Response, string_peak
+    >>> gains = (np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]]))
+    >>> [round(string_peak(gains, Response(lag_s, 0.0), delay_s=0.0), 3) for lag_s in (1e-6, 0.3)]
+    [1.155, 1.431]
     """
     own, front, spacing = gains
-    fastest = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)) + 1.0 / (delay_s + response.lag_s))
-    s = 1j * np.geomspace(1e-4 * fastest, 10.0 * fastest, 1000)[:, None, None]
+    at_once = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)))
+    fastest = at_once + 1.0 / (delay_s + response.lag_s)
+    # a very short lag is far above the frequencies of the loop, which are looked at all the same
+    s = 1j * np.geomspace(1e-4 * (at_once or fastest), 10.0 * fastest, 1000)[:, None, None]
     g = response.velocity_gain_1_s
     h = np.exp(-s * delay_s) * (s + g) / (response.lag_s * s**2 + s + g)
     loop = s**2 * np.eye(own.shape[0]) - h * (s * own - spacing)
@@ -108,6 +163,15 @@ def requirement_with(requirement: Requirement, response: Response, *, period_s: 
     ------
     InfeasibleError
         If no gains have this margin with this response.
+
+    Examples
+    --------
+    Without a delay margin there is nothing to find:
+
+    >>> from gains.requirement import Requirement
+    >>> from gains.response import Response, requirement_with
+    >>> requirement_with(Requirement(alpha=0.4), Response(0.1, 0.0), period_s=0.02) == Requirement(alpha=0.4)
+    True
     """
     wanted_s = requirement.delay_margin_s
     if wanted_s is None:

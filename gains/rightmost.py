@@ -34,6 +34,16 @@ def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
     BadModelError
         No term, matrices that are not square, finite and of one size, a delay that is negative or not finite, or
         delays so long against the time constants that the discretisation would be too large.
+
+    Examples
+    --------
+    At tau = pi / 2 x'(t) = -x(t - tau) has the roots +-j, and with tau = 1 one that is Lambert's W(-1):
+
+    >>> from math import pi
+    >>> from gains.rightmost import rightmost_root
+    >>> rightmost, later = (rightmost_root([([[-1]], delay_s)]) for delay_s in (1, pi / 2))
+    >>> round(rightmost.real, 6), round(rightmost.imag, 6), round(later.imag, 6)
+    (-0.318132, 1.337236, 1.0)
     """
     if len(terms) == 0:
         raise BadModelError("terms is empty; at least one pair (matrix, delay) is wanted")

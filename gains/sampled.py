@@ -38,6 +38,14 @@ def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, del
     ------
     BadModelError
         Naming the argument, what was read and what was wanted.
+
+    Examples
+    --------
+    x' = u, u = -x with T = 1 s and tau = 0.25 s: x_{k+1} = x_k + 0.75 u_k + 0.25 u_{k-1}.
+
+    >>> from gains.sampled import period_map
+    >>> period_map([[0]], [[1]], [[-1]], period_s=1.0, delay_s=0.25).round(6).tolist()
+    [[0.25, 0.25], [-1.0, 0.0]]
     """
     plant = HeldPlant(*checked_loop(A, B, K), _checked_period(period_s))
     return lifted_map(plant, _checked_delay(delay_s))
@@ -47,6 +55,14 @@ def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float
     """Factor by which the slowest motion shrinks (< 1) or grows (> 1) in one period. Arguments as of `period_map`.
 
     Strongly connected blocks are taken one by one: identical followers do not spoil each other's eigenvalues.
+
+    Examples
+    --------
+    x' = u, u = -x without delay: x_{k+1} = (1 - T) x_k.
+
+    >>> from gains.sampled import spectral_radius
+    >>> round(spectral_radius([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.0), 6)
+    0.5
     """
     plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
     return max(block_radius(plant, _checked_delay(delay_s)) for plant in plants)
@@ -57,6 +73,14 @@ def growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, de
 
     -inf, or very negative by rounding, for a loop at rest after finitely many periods (deadbeat). Arguments as of
     `period_map`.
+
+    Examples
+    --------
+    x' = u, u = -x without delay: ln(1 - T) / T.
+
+    >>> from gains.sampled import growth_rate
+    >>> round(growth_rate([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.0), 6)
+    -1.386294
     """
     radius = spectral_radius(A, B, K, period_s=period_s, delay_s=delay_s)
     return float(np.log(radius)) / period_s if radius > 0.0 else -np.inf
@@ -81,22 +105,40 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
         Naming the argument, what was read and what was wanted.
     DisagreementError
         The eigenvalues of the one-period map contradict the crossings found.
+
+    Examples
+    --------
+    x' = u, u = -x with a period of 1 s takes a delay of 1 s; with a short one pi / 2 - T / 2 or so:
+
+    >>> from gains.sampled import sampled_delay_margin
+    >>> [round(sampled_delay_margin([[0]], [[1]], [[-1]], period_s=period_s), 3) for period_s in (1.0, 0.02)]
+    [1.0, 1.561]
     """
     plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
-    return min(block_delay_margin(plant) for plant in plants)
+    return float(min(block_delay_margin(plant) for plant in plants))
 
 
 def sampling_period_limit(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> float:
     """The least period T (s) at which the sampled and held loop without further delay loses stability.
 
     0 if A + B K is not Hurwitz (no period is short enough), `inf` if every period is. Found by a march through T that
-    resolves every motion of the plant and of the loop, with peaks of the spectral radius near one refined.
+    resolves every motion of the plant and of the loop, with peaks of the spectral radius below one refined.
     Arguments as of `period_map`.
 
     Raises
     ------
     BadModelError
         Naming the argument, what was read and what was wanted.
+    GainsError
+        The march, some ten thousand periods long, ends without a limit.
+
+    Examples
+    --------
+    x' = u, u = -x: x_{k+1} = (1 - T) x_k is stable up to T = 2.
+
+    >>> from gains.sampled import sampling_period_limit
+    >>> round(sampling_period_limit([[0]], [[1]], [[-1]]), 6)
+    2.0
     """
     plant, entry, feedback = checked_loop(A, B, K)
     blocks = distinct_blocks(plant, entry @ feedback)

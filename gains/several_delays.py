@@ -63,6 +63,14 @@ def stable_at(A0: ArrayLike, late: Sequence[ArrayLike], delays_s: Sequence[float
     ------
     BadModelError
         As of `gains.rightmost.rightmost_root`, or as many delays as late matrices are not given.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau_1) - x(t - tau_2) is stable up to pi / 4 = 0.785 if the delays are equal:
+
+    >>> from gains.several_delays import stable_at
+    >>> stable_at([[0]], [[[-1]], [[-1]]], [0.78, 0.78]), stable_at([[0]], [[[-1]], [[-1]]], [0.79, 0.79])
+    (True, False)
     """
     if len(late) != len(delays_s):
         raise BadModelError(f"delays_s has {len(delays_s)} delays; {len(late)} are wanted, as late matrices")
@@ -75,10 +83,24 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
     Couplings between strongly connected blocks do not count: in a leader-follower tree with one delay for each vehicle
     every block has one delay, and the box is exact.
 
+    Parameters
+    ----------
+    A0, late
+        Real matrices (n, n), 1/s: what acts at once, and what acts tau_1, tau_2, ... late.
+
     Raises
     ------
     BadModelError
         The matrices are not square, finite and of one size.
+
+    Examples
+    --------
+    x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2): up to pi / 2 and pi / 4, whatever the other delay.
+
+    >>> from gains.several_delays import delay_box
+    >>> box = delay_box([[0, 0], [1, 0]], [[[-1, 0], [0, 0]], [[0, 0], [0, -2]]])
+    >>> [round(limit_s, 6) for limit_s in box.limits_s], box.is_exact
+    ([1.570796, 0.785398], True)
     """
     now, *delayed = square_matrices(A0=A0, **{f"late[{k}]": matrix for k, matrix in enumerate(late)})
     limits_s = [inf] * len(delayed)
@@ -104,6 +126,19 @@ def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list
         (n, p) and (p, n), u = K x.
     inputs
         For each vehicle the place of its command in u, as `gains.formation.FormationModel.input_slice`.
+
+    Raises
+    ------
+    BadModelError
+        B or K is not a matrix of finite numbers.
+
+    Examples
+    --------
+    Two vehicles of one axis, each with a command of its own:
+
+    >>> from gains.several_delays import late_by_vehicle
+    >>> [late.tolist() for late in late_by_vehicle([[1, 0], [0, 1]], [[-1, 0], [1, -1]], [slice(0, 1), slice(1, 2)])]
+    [[[-1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [1.0, -1.0]]]
     """
     entry, feedback = real_matrix("B", B), real_matrix("K", K)
     return [entry[:, place] @ feedback[place] for place in inputs]
@@ -128,6 +163,15 @@ def crossing_curves(
     ------
     BadModelError
         The matrices are not square, finite and of one size, or a longest delay is not positive and finite.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) has roots +-j omega with 0.5 <= omega <= 1.5 only:
+
+    >>> from gains.several_delays import crossing_curves
+    >>> curves = crossing_curves([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
+    >>> all(0.49 < line.omega_rad_s.min() <= line.omega_rad_s.max() < 1.51 for line in curves)
+    True
     """
     if not all(isfinite(longest) and longest > 0.0 for longest in longest_s):
         raise BadModelError(f"longest_s is {longest_s}; two positive numbers of seconds are wanted")
@@ -147,6 +191,16 @@ def boundary_of_two_delays(
     A piece is part of the edge when no root lies to the right of the axis on it. The edge may surround several
     regions, and the axes and `longest_s` bound it where no piece does. Arguments and exceptions as of
     `crossing_curves`.
+
+    Examples
+    --------
+    Without tau_2 the loop x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) takes tau_1 up to acos(-0.5) / sqrt(0.75) = 2.4184:
+
+    >>> from gains.several_delays import boundary_of_two_delays
+    >>> edge = boundary_of_two_delays([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
+    >>> at_once = min((pair for line in edge for pair in line.delays_s.tolist()), key=lambda pair: pair[1])
+    >>> round(at_once[0], 1)
+    2.4
     """
     pieces: list[Polyline] = []
     for line in crossing_curves(A0, A1, A2, longest_s=longest_s):

@@ -48,6 +48,19 @@ class Follower:
         Delay (s) of all feedback.
     headway_s
         h (s): the wanted spacing grows by h times the own speed, the command passing a filter 1 / (h s + 1).
+
+    Raises
+    ------
+    BadModelError
+        A gain is not finite, or a time is negative or not finite.
+
+    Examples
+    --------
+    Stable for k2² ≤ k1² − 2 k3, which is k2 ≤ √2 here:
+
+    >>> from gains.string_stability import Follower
+    >>> round(Follower(own=2.0, front=2.0, spacing=1.0).low_frequency_coefficient, 6)
+    2.0
     """
 
     own: float
@@ -112,6 +125,15 @@ def string_verdict(follower: Follower) -> StringVerdict:
     ------
     BadModelError
         The spacing gain is zero: nothing holds the distance.
+
+    Examples
+    --------
+    Velocity relative to the vehicle in front lets errors grow whatever the gains, velocity relative to v_d need not:
+
+    >>> from gains.string_stability import Follower, string_verdict
+    >>> relative, to_v_d = (string_verdict(Follower(own=2.0, front=front, spacing=1.0)) for front in (2.0, 0.0))
+    >>> relative.is_string_stable, round(relative.peak, 4), to_v_d.is_string_stable, to_v_d.peak
+    (False, 1.1547, True, 1.0)
     """
     if follower.spacing == 0.0:
         raise BadModelError("spacing is 0; a gain that holds the distance is wanted")
@@ -132,6 +154,27 @@ def response_peak(response: Response, *, near_rad_s: float) -> tuple[float, floa
     """Largest |Gamma(j omega)| over all frequencies and where, at least 1 at 0 rad/s for Gamma(0) = 1.
 
     Frequencies from four decades below `near_rad_s` to two above, every local maximum refined: a search, not a proof.
+
+    Parameters
+    ----------
+    response
+        Frequencies (k,) in rad/s to the complex Gamma (k,).
+    near_rad_s
+        A frequency around which the response changes.
+
+    Raises
+    ------
+    BadModelError
+        `near_rad_s` is not a positive number.
+
+    Examples
+    --------
+    |1 / (s² + s + 1)| peaks at 2 / √3, where ω² = 1/2:
+
+    >>> from gains.string_stability import response_peak
+    >>> peak, peak_rad_s = response_peak(lambda omega: 1 / (1 - omega**2 + 1j * omega), near_rad_s=1.0)
+    >>> round(peak, 6), round(peak_rad_s, 4)
+    (1.154701, 0.7071)
     """
     omega = _frequencies(near_rad_s)
 
@@ -145,7 +188,15 @@ def response_peak(response: Response, *, near_rad_s: float) -> tuple[float, floa
 def low_frequency_coefficient(response: Response, *, near_rad_s: float) -> float:
     """Limit of (|Gamma(j omega)|^2 - 1) / omega^2 at zero (s^2) of any response with Gamma(0) = 1, to about 1e-8.
 
-    `near_rad_s` is a frequency around which the response changes.
+    Arguments as of `response_peak`.
+
+    Examples
+    --------
+    |1 / (s² + s + 1)|² is 1 + ω² near zero:
+
+    >>> from gains.string_stability import low_frequency_coefficient
+    >>> round(low_frequency_coefficient(lambda omega: 1 / (1 - omega**2 + 1j * omega), near_rad_s=1.0), 6)
+    1.0
     """
     omega = near_rad_s * np.array(_SMALL)
     # even in the frequency: one step of Richardson's extrapolation
@@ -159,7 +210,16 @@ def least_headway(response: Response, *, near_rad_s: float) -> float:
 
     With spacing that grows by h times the speed, Gamma = Q / (h s + 1), Q the complementary sensitivity of the loop
     (the response without headway), so h^2 is the least upper bound of (|Q|^2 - 1) / omega^2, its limit at zero
-    included. 0 if no headway is needed. Q includes the delay and the lag of the vehicle.
+    included. 0 if no headway is needed. Q includes the delay and the lag of the vehicle. Arguments and exceptions as of
+    `response_peak`, with Q in place of Gamma.
+
+    Examples
+    --------
+    Q = 1 / (s² + s + 1): (|Q|² − 1) / ω² = (1 − ω²) / (1 − ω² + ω⁴) is largest, 1, at zero.
+
+    >>> from gains.string_stability import least_headway
+    >>> round(least_headway(lambda omega: 1 / (1 - omega**2 + 1j * omega), near_rad_s=1.0), 6)
+    1.0
     """
     omega = _frequencies(near_rad_s)
     # below this the difference to one is rounding; the limit stands for it
@@ -175,7 +235,16 @@ def least_headway(response: Response, *, near_rad_s: float) -> float:
 def vehicle_with_lag(*, proportional: float, derivative: float, lag_s: float, delay_s: float) -> Response:
     """Q of a vehicle e^{-s delay} / (s^2 (lag s + 1)) behind another under proportional + derivative s, no headway.
 
-    J. Ploeg et al.'s vehicle for adaptive cruise control.
+    J. Ploeg et al.'s vehicle for adaptive cruise control; gains in 1/s² and 1/s, times in s.
+
+    Examples
+    --------
+    The loop of Ploeg et al. 2014 needs a headway of 3.16 s:
+
+    >>> from gains.string_stability import least_headway, vehicle_with_lag
+    >>> vehicle = vehicle_with_lag(proportional=0.2, derivative=0.7, lag_s=0.1, delay_s=0.2)
+    >>> round(least_headway(vehicle, near_rad_s=1.0), 2)
+    3.16
     """
 
     def response(omega: FloatArray) -> ComplexArray:

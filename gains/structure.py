@@ -87,6 +87,15 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     State j drives state i where the entry (i, j) of any matrix is not exactly zero. The sets come drivers first, so
     that taking the states in this order makes every matrix block lower triangular; ties are broken by the lowest
     index. Indices within a set ascend.
+
+    Examples
+    --------
+    x_1 and x_2 drive each other, x_0 drives both:
+
+    >>> import numpy as np
+    >>> from gains.structure import strongly_connected_blocks
+    >>> [block.tolist() for block in strongly_connected_blocks(np.array([[-1, 0, 0], [1, 0, 1], [0, 1, 0]]))]
+    [[0], [1, 2]]
     """
     pattern = np.any([matrix != 0.0 for matrix in matrices], axis=0)
     label = _labels_by_closure(pattern) if pattern.shape[0] <= _LARGEST_CLOSURE else _labels_by_graph(pattern)
@@ -105,6 +114,16 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
 
     Equal means equal to the last bit with the states in ascending order, as identical vehicles described one after
     the other are. 400 identical followers give one block.
+
+    Examples
+    --------
+    A chain of three equal followers:
+
+    >>> import numpy as np
+    >>> from gains.structure import distinct_blocks
+    >>> [block] = distinct_blocks(np.array([[-1, 0, 0], [1, -1, 0], [0, 1, -1]]))
+    >>> block.copies, block.indices.tolist(), block.matrices[0].tolist()
+    (3, [0], [[-1.0]])
     """
     first: dict[bytes, IntArray] = {}
     copies: dict[bytes, int] = {}
@@ -136,6 +155,15 @@ def project_out_equilibria(*matrices: ArrayLike) -> tuple[FloatArray, ...]:
     ------
     BadModelError
         The matrices are not square, finite and of one size, or nothing but equilibria is left.
+
+    Examples
+    --------
+    x_1' = x_2 - x_1, x_2' = x_1 - x_2: the difference decays like e^{-2t}.
+
+    >>> from gains.structure import project_out_equilibria
+    >>> [difference] = project_out_equilibria([[-1, 1], [1, -1]])
+    >>> difference.round(6).tolist()
+    [[-2.0]]
     """
     left = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
     while True:
@@ -159,6 +187,15 @@ def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], in
     ------
     BadModelError
         The matrices are not square, finite and of one size.
+
+    Examples
+    --------
+    A consensus of two vehicles beside a loop of its own:
+
+    >>> from gains.structure import without_equilibria
+    >>> [moving], taken_out = without_equilibria([[-1, 1, 0], [1, -1, 0], [0, 0, -3]])
+    >>> moving.round(6).tolist(), taken_out
+    ([[-2.0, 0.0], [0.0, -3.0]], 1)
     """
     checked = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
     size = checked[0].shape[0]

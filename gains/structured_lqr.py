@@ -46,6 +46,12 @@ class Weights:
     ------
     BadModelError
         If a weight is not symmetric, Q or X0 not positive semidefinite, or R not positive definite.
+
+    Examples
+    --------
+    >>> from gains.structured_lqr import Weights
+    >>> Weights([[1, 0], [0, 2]], [[1]]).X0.tolist()
+    [[1.0, 0.0], [0.0, 1.0]]
     """
 
     Q: FloatArray
@@ -228,6 +234,16 @@ def structured_lqr(
         If no stabilising gain is found.
     SolverError
         If the descent ends where the cost is not stationary.
+
+    Examples
+    --------
+    x' = u with ∫ x² + u² dt: u = −x, and the cost is x(0)².
+
+    >>> from gains.pattern import Pattern, Plant
+    >>> from gains.structured_lqr import Weights, structured_lqr
+    >>> found = structured_lqr(Plant([[0]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]))
+    >>> found.K.round(4).tolist(), round(found.cost, 6)
+    ([[-1.0]], 1.0)
     """
     check_fits(plant, pattern)
     weights.check_fits(plant)
@@ -256,7 +272,18 @@ def structured_lqr(
 
 
 def lqr_cost(plant: Plant, pattern: Pattern, weights: Weights, K: ArrayLike) -> tuple[float, FloatArray]:
-    """J(K) and its gradient, zero outside the pattern; infinity and zeros for a gain that does not stabilise."""
+    """J(K) and its gradient, zero outside the pattern; infinity and zeros for a gain that does not stabilise.
+
+    Examples
+    --------
+    x' = u, u = −2 x: ∫ (1 + 4) e^{−4t} dt.
+
+    >>> from gains.pattern import Pattern, Plant
+    >>> from gains.structured_lqr import Weights, lqr_cost
+    >>> cost, gradient = lqr_cost(Plant([[0]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]), [[-2]])
+    >>> round(cost, 6), gradient.round(6).tolist()
+    (1.25, [[-0.375]])
+    """
     check_fits(plant, pattern)
     weights.check_fits(plant)
     point = _Cost(plant, pattern.mask, weights).at(checked_pattern_gain(pattern, K))
@@ -303,6 +330,16 @@ def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatA
     InfeasibleError
         If the homotopy stops at a σ > 0. To decide whether any static gain stabilises is NP-hard in general: there
         may be one all the same, but none exists if `gains.fixed_modes` finds an unstable mode.
+
+    Examples
+    --------
+    x' = x + u needs a gain below −1:
+
+    >>> from gains.pattern import Pattern, Plant
+    >>> from gains.structured_lqr import Weights, stabilising_gain
+    >>> gain = stabilising_gain(Plant([[1]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]))
+    >>> bool(gain[0, 0] < -1)
+    True
     """
     check_fits(plant, pattern)
     weights.check_fits(plant)

@@ -41,7 +41,7 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     `rate` inf admits any variation, jumps included; the better of the functional without use of the rate and the small
     gain is returned. `inf` when one functional proves stability whatever the length of the delay; 0 when the loop is
     unstable without delay. The bound is the end of a bisection, so a functional for every delay below it is implied by
-    the one found at it.
+    the one found at it. Finite bounds are not looked for beyond 1000 / (||A0|| + ||A1||).
 
     Parameters
     ----------
@@ -54,6 +54,14 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     ------
     BadModelError
         Matrices that do not fit, a rate that is negative or not a number, or a block too large.
+
+    Examples
+    --------
+    A loop of the paper of 2013: 6.059 s for a constant delay, where the exact margin is 6.1726 s.
+
+    >>> from gains.varying_delay import varying_delay_bound
+    >>> round(varying_delay_bound([[-2, 0], [0, -0.9]], [[-1, 0], [-1, -1]], rate=0.0), 2)
+    6.06
     """
     if not rate >= 0.0:
         raise BadModelError(f"rate is {rate}; a number >= 0 is wanted, inf for any variation")
@@ -64,12 +72,28 @@ def hierarchy_bound(A0: ArrayLike, A1: ArrayLike, *, order: int) -> float:
     """The largest constant delay (s), up to the exact margin, that the Legendre functional of this order proves.
 
     Order 0 is Jensen's inequality, 1 Wirtinger's; the bounds grow with the order. Each proves stability at the delay
-    itself; for all shorter delays that is the exact margin's to say, which is the limit of the bisection.
+    itself; for all shorter delays that is the exact margin's to say, which is the limit of the bisection. Never more
+    than 1000 / (||A0|| + ||A1||), also for a loop that is stable at every delay.
+
+    Parameters
+    ----------
+    A0, A1
+        As of `varying_delay_bound`.
+    order
+        N from 0 to 6.
 
     Raises
     ------
     BadModelError
         Matrices that do not fit, a block too large, or an order that is not from 0 to 6.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau): Jensen's inequality proves sqrt(2), the exact margin is pi / 2.
+
+    >>> from gains.varying_delay import hierarchy_bound
+    >>> [round(hierarchy_bound([[0]], [[-1]], order=order), 3) for order in (0, 2)]
+    [1.414, 1.571]
     """
     if not 0 <= order <= _MOST_ORDERS:
         raise BadModelError(f"order is {order}; a whole number from 0 to {_MOST_ORDERS} is wanted")
@@ -89,6 +113,24 @@ def small_gain_bound(A0: ArrayLike, A1: ArrayLike) -> float:
     h = 1 / min over D of max over omega of ||D C j omega (j omega I - A0 - A1)^{-1} B D^{-1}||, A1 = B C of full rank;
     D is a full matrix because the delay acts on all signals alike. The minimum is found, and proved, by the bounded
     real lemma with the unknown P = D'D. 0 when the loop is unstable without delay, `inf` without a delayed part.
+
+    Parameters
+    ----------
+    A0, A1
+        As of `varying_delay_bound`.
+
+    Raises
+    ------
+    BadModelError
+        Matrices that do not fit, or a block too large.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau(t)): the largest |j omega / (j omega + 1)| is 1.
+
+    >>> from gains.varying_delay import small_gain_bound
+    >>> round(small_gain_bound([[0]], [[-1]]), 3)
+    1.0
     """
     return min(_small_gain_of_block(now, late) / unit for now, late, unit in _checked_blocks(A0, A1))
 

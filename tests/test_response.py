@@ -140,9 +140,11 @@ def test_a_margin_that_no_gains_have_is_refused_with_the_response_named() -> Non
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.2])
-def test_string_growth_tends_to_that_of_vehicles_that_answer_at_once(delay_s: float) -> None:
-    at_once = string_peak_at_once(GAINS, delay_s)
-    assert string_peak(GAINS, Response(1e-6, 0.0), delay_s=delay_s) == pytest.approx(at_once, rel=1e-4)
+@pytest.mark.parametrize("front_1_s", [0.6, 1.6])  # errors shrink, errors grow
+def test_string_growth_tends_to_that_of_vehicles_that_answer_at_once(front_1_s: float, delay_s: float) -> None:
+    gains = (GAINS[0], front_1_s * np.eye(2), GAINS[2])
+    at_once = string_peak_at_once(gains, delay_s)
+    assert string_peak(gains, Response(1e-6, 0.0), delay_s=delay_s) == pytest.approx(at_once, rel=1e-4)
 
 
 def test_a_lag_makes_spacing_errors_grow_more_as_a_delay_of_its_length_does() -> None:
