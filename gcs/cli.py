@@ -58,6 +58,9 @@ def fly(
     listen: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="listen here for the vehicles that this command starts")
     ] = "127.0.0.1:14550",
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="sign, and take only what is signed with this key")
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="run folder; default runs/<scenario>-<time>")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -65,20 +68,23 @@ def fly(
     from gcs.addresses import listening
     from gcs.fly import FlyOptions, new_folder
     from gcs.fly import fly as fly_now
+    from gcs.guard import open_guard
     from gcs.plan import flight_plan
+    from gcs.udp import realtime_offset_ns
 
     scenario = _scenario(scenario_file)
     if link_delay is not None:
         if not 0 <= link_delay < 60:
             raise InputError(f"--link-delay: read {link_delay}, wanted seconds from 0 to 60")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
+    guard = None if key is None else open_guard(key, epoch_ns=realtime_offset_ns())
     with listening("--connect", connect) if connect else listening("--listen", listen) as link:
         design, plan = flight_plan(scenario)
         if not as_json:
             _print_design(design)
         folder = _out_folder(out) if out is not None else new_folder(scenario.name)
-        options = FlyOptions(folder=folder, start_vehicles=not connect, show_table=not as_json)
-        summary = fly_now(plan, design, link, options)
+        options = FlyOptions(folder=folder, start_vehicles=not connect, show_table=not as_json, key_file=key)
+        summary = fly_now(plan, design, link, options, guard)
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:
@@ -262,6 +268,14 @@ def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a
     print_summary(summary, run)
 
 
+@app.command()
+def key(file: Annotated[Path, typer.Argument(metavar="FILE", help="a new file")]) -> None:
+    """Make a key for signing (--key) that only you can read."""
+    from signing.keys import make_key
+
+    make_key(file)
+
+
 app.command()(stress)
 app.command()(monitor)
 
@@ -270,10 +284,11 @@ def main() -> None:
     """Entry point: bad input is one line and exit code 2."""
     from gains.errors import GainsError
     from scenarios.files import ScenarioError
+    from signing.keys import KeyFileError
 
     try:
         code = app(standalone_mode=False)
-    except (InputError, ScenarioError, GainsError) as error:
+    except (InputError, ScenarioError, GainsError, KeyFileError) as error:
         code = _fail(str(error))
     except typer.TyperException as error:  # an unknown option, a missing argument
         code = _fail(error.format_message() if isinstance(error, typer.BadParameter) else str(error))

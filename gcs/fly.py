@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gcs import mavlink
+from gcs.guard import Guard
 from gcs.plan import FlightPlan, described
 from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter
 from gcs.sitl import VehicleProcess
@@ -38,20 +39,27 @@ class FlyOptions:
     """Whether to start simulated vehicles when none are heard."""
     show_table: bool
     """Whether the live table (or, without a terminal, its plain lines) is shown."""
+    key_file: Path | None = None
+    """The key of the guard, which vehicles that are started are to have as well."""
 
 
-def fly(plan: FlightPlan, design: dict[str, Any], link: StationSocket, options: FlyOptions) -> dict[str, Any]:
+def fly(
+    plan: FlightPlan, design: dict[str, Any], link: StationSocket, options: FlyOptions, guard: Guard | None = None
+) -> dict[str, Any]:
     """Fly a designed scenario in real time and return the summary of the run left in the folder."""
     folder = options.folder
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
     (folder / DESIGN_FILE).write_text(json.dumps(design, indent=2), encoding="utf-8")
     with contextlib.ExitStack() as stack:
         stop_reason = stack.enter_context(stop_signals())
-        heard = _vehicles_heard(link, plan)
+        heard = _vehicles_heard(link, plan, guard)
         # Left in the reverse order: the log is closed, the vehicles end, the observer has finished the recording.
         observer = stack.enter_context(_observer(folder, show_table=options.show_table))
         if options.start_vehicles and not heard:
-            stack.enter_context(VehicleProcess(folder / SCENARIO_FILE, station=link.address, folder=folder))
+            start = VehicleProcess(
+                folder / SCENARIO_FILE, station=link.address, folder=folder, key_file=options.key_file
+            )
+            stack.enter_context(start)
         writer = RunWriter(folder)
         stack.callback(writer.close)
         _wait_until_ready(observer, folder)
@@ -66,7 +74,7 @@ def fly(plan: FlightPlan, design: dict[str, Any], link: StationSocket, options: 
             text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
             writer.event(time_s=station.scenario_time_s(clock_ns()), kind=NEW_DESIGN, text=text)
 
-        drive(station, link, writer, stop_reason, new_plan)
+        drive(station, link, writer, stop_reason, new_plan, guard)
         writer.event(time_s=station.scenario_time_s(clock_ns()), kind="end", text=station.end_reason)
     return finish(folder)
 
@@ -105,11 +113,14 @@ def _write_whole(file: Path, data: dict[str, Any]) -> None:
     part.replace(file)
 
 
-def _vehicles_heard(link: StationSocket, plan: FlightPlan) -> list[int]:
+def _vehicles_heard(link: StationSocket, plan: FlightPlan, guard: Guard | None) -> list[int]:
     """System ids of the scenario that already send to our port, as after a station was killed in flight."""
     while (until_ns := link.bound_ns + round(_HEARTBEAT_PERIOD_S * _NS)) > clock_ns():
         time.sleep((until_ns - clock_ns()) * 1e-9)
-    frames = [frame for datagram in link.receive() for frame in mavlink.decode(datagram.data, Counter())]
+    datagrams = link.receive()
+    if guard is not None:
+        datagrams = guard.received(datagrams, clock_ns(), Counter())
+    frames = [frame for datagram in datagrams for frame in mavlink.decode(datagram.data, Counter())]
     return sorted({frame.system_id for frame in frames} & set(plan.formation.system_ids))
 
 

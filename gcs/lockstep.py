@@ -8,6 +8,7 @@ as it would in a socket, and no decision is made in between.
 from collections.abc import Iterator
 from typing import Protocol
 
+from gcs.guard import Guard
 from gcs.modes import Phase
 from gcs.plan import FlightPlan
 from gcs.record import TickArray
@@ -60,12 +61,17 @@ def vehicles_of(plan: FlightPlan, *, record: Record | None = None) -> Vehicles:
 
 
 def fly_lockstep(
-    plan: FlightPlan, *, station: Station | None = None, vehicles: Vehicles | None = None
+    plan: FlightPlan,
+    *,
+    station: Station | None = None,
+    vehicles: Vehicles | None = None,
+    guard: Guard | None = None,
 ) -> Iterator[TickArray]:
     """Fly a plan in virtual time, giving each control tick's rows (a fresh copy) as it is done.
 
     A station may be passed in, so that its events and end reason can be read afterwards, and vehicles that have
-    already flown. The address of a vehicle is (a fixed name, its system id).
+    already flown, and a guard that signs and verifies at the station's end. The address of a vehicle is (a fixed name,
+    its system id).
     """
     station = station or Station(plan, start_ns=START_NS)
     vehicles = vehicles or vehicles_of(plan)
@@ -75,7 +81,11 @@ def fly_lockstep(
         now_ns = station.next_event_ns
         arrived = vehicles.step(to_vehicles, now_ns)
         datagrams = [Datagram(data, addresses[system_id], time_ns) for system_id, data, time_ns in arrived]
+        if guard is not None:
+            datagrams = guard.received(datagrams, now_ns, station.counters)
         outgoing, tick = station.step(datagrams, now_ns)
+        if guard is not None:
+            outgoing = guard.sent(outgoing, now_ns)
         to_vehicles = [(system_id, data, now_ns) for data, (_, system_id) in outgoing]
         if tick is not None:
             yield station.complete(tick, now_ns)

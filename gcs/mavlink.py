@@ -42,15 +42,21 @@ class _Layout(NamedTuple):
     crc_extra: bytes
 
 
+SETUP_SIGNING = 256
+"""Holds a key. It is neither sent nor taken, and so never logged."""
+
+
 def _layouts() -> dict[int, _Layout]:
     messages: dict[int, Any] = dialect.mavlink_map
     return {
         msg_id: _Layout(message.unpacker, message.unpacker.size, bytes([message.crc_extra]))
         for msg_id, message in messages.items()
+        if msg_id != SETUP_SIGNING
     }
 
 
 _LAYOUTS = _layouts()
+CRC_EXTRA = {msg_id: layout.crc_extra for msg_id, layout in _LAYOUTS.items()}
 
 
 class Frame(NamedTuple):
@@ -144,7 +150,7 @@ def _checked(data: bytes, length: int, refused: Counter[str]) -> Frame | None:
     msg_id = id_low | id_high << 16
     layout = _LAYOUTS.get(msg_id)
     if layout is None:
-        refused["unknown message"] += 1
+        refused["SETUP_SIGNING" if msg_id == SETUP_SIGNING else "unknown message"] += 1
         return None
     packing, full_length, crc_extra = layout
     body_end = 10 + length

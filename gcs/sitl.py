@@ -21,13 +21,14 @@ class VehicleProcess:
     they end after a minute.
     """
 
-    def __init__(self, scenario_file: Path, *, station: Address, folder: Path) -> None:
+    def __init__(self, scenario_file: Path, *, station: Address, folder: Path, key_file: Path | None = None) -> None:
         host, port = station
         with (folder / VEHICLES_LOG).open("wb") as log:
             self._process = subprocess.Popen(
                 [
                     sys.executable, "-m", "sim_vehicles.cli", str(scenario_file), "--station", f"{host}:{port}",
                     "--truth", str(folder / TRUTH_FILE), "--stop-after-silence", str(_SILENCE_S),
+                    *([] if key_file is None else ["--key", str(key_file)]),
                 ],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
                 start_new_session=True,  # Ctrl-C is the station's to answer: it brings them to safety first

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from gcs.guard import Guard
 from gcs.modes import Phase
 from gcs.plan import FlightPlan
 from gcs.record import RunWriter
@@ -111,19 +112,22 @@ def drive(
     writer: RunWriter,
     stop_reason: Callable[[], str],
     new_plan: Callable[[FlightPlan], None],
+    guard: Guard | None = None,
 ) -> None:
     """Run the station in real time until its flight has ended.
 
     `stop_reason` is asked at every tick; a text other than "" ends the flight for that reason. `new_plan` is told when
-    the station has found more out about what it flies.
+    the station has found more out about what it flies. With a guard, what is sent and received is signed.
     """
     plan = station.plan
     while station.phase is not Phase.ENDED:
         link.wait(station.next_event_ns)
         datagrams = link.receive()
         now_ns = clock_ns()
+        if guard is not None:
+            datagrams = guard.received(datagrams, now_ns, station.counters)
         outgoing, tick = station.step(datagrams, now_ns)
-        link.send(outgoing)
+        link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
         if tick is None:
             continue
         writer.tick(station.complete(tick, clock_ns()))

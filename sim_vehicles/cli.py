@@ -40,9 +40,12 @@ def run(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.links_only != bool(options.vehicle_port):
         parser.error("read one of --links-only and --vehicle-port, wanted both or neither")
+    if options.links_only and options.key:
+        parser.error("read --key with --links-only, wanted one of them: links pass signed frames on as they are")
     with _signals() as signals, contextlib.ExitStack() as opened:
         # After parsing, so that --help and a mistyped option answer at once.
         from scenarios.files import ScenarioError, load
+        from signing.keys import KeyFileError
         from sim_vehicles.truth import TruthLog
 
         try:
@@ -59,7 +62,7 @@ def run(arguments: list[str]) -> int:
         try:
             run_it = _links_only if options.links_only else _fly
             run_it(scenario, log, signals, options, opened)
-        except _AddressError as error:
+        except (_AddressError, KeyFileError) as error:
             return _complain(str(error))
     return INTERRUPTED if signal.SIGINT in signals else SUCCESS
 
@@ -76,17 +79,22 @@ def _fly(
     opened: contextlib.ExitStack,
 ) -> None:
     from sim_vehicles.fleet import Fleet
+    from sim_vehicles.guard import open_links
     from sim_vehicles.udp import Ports, fly
 
+    system_ids = tuple(sorted(v.system_id for v in scenario.vehicles))
+    epoch_ns = time.time_ns() - time.monotonic_ns()
+    signed = open_links(options.key, system_ids, epoch_ns=epoch_ns) if options.key else None
     try:
-        ports = Ports(tuple(sorted(v.system_id for v in scenario.vehicles)), options.station)
+        ports = Ports(system_ids, options.station)
     except OSError as error:
         raise _AddressError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
     opened.callback(ports.close)
     start_ns = time.monotonic_ns()
-    fleet = Fleet(scenario, start_ns, record=log.record if log else None)
+    fleet = Fleet(scenario, start_ns, record=log.record if log else None, signed=signed)
     say = _Lines(start_ns)
-    say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}")
+    how = ", signed" if signed else ""
+    say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
     fly(fleet, ports, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log, ports.sockets))
     say.changes(fleet.take_changes())
     say.summary(fleet.counters + ports.counters, log)
@@ -210,6 +218,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="HOST:PORT",
         help="where the station listens (127.0.0.1:14550)",
     )
+    parser.add_argument("--key", type=Path, metavar="FILE", help="sign, and take only what is signed with this key")
     parser.add_argument("--truth", type=Path, metavar="FILE", help="write what really happened when; continues a log")
     parser.add_argument(
         "--stop-after-silence",

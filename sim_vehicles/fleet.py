@@ -6,11 +6,12 @@ same bytes at the same instants.
 
 import heapq
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 
 from scenarios import schema
+from signing.link import SignedLink
 from sim_vehicles.copter import Copter
 from sim_vehicles.dynamics import State
 from sim_vehicles.links import NEVER_NS, Link, LinkSet
@@ -28,6 +29,7 @@ class _Member:
     vehicle: Vehicle | Copter
     up: Link
     down: Link
+    signed: SignedLink | None = None
     leaves_ns: int = NEVER_NS
     """The earliest instant at which a datagram of this vehicle can leave its up link."""
     acts_ns: int = NEVER_NS
@@ -41,9 +43,19 @@ class Fleet:
     in order of that time and of system id; nothing is late for it, since everything it does has its exact instant.
     Only where links have channels does what one vehicle sends delay the others: then all that happens is done in order
     of time, and at one instant first what the station sends and then the vehicles by system id.
+
+    Vehicles with an end of a signed link, by system id, sign what they send and are given what could be verified.
     """
 
-    def __init__(self, scenario: schema.Scenario, start_ns: int, *, record: Record | None = None) -> None:
+    def __init__(
+        self,
+        scenario: schema.Scenario,
+        start_ns: int,
+        *,
+        record: Record | None = None,
+        signed: Mapping[int, SignedLink] | None = None,
+    ) -> None:
+        self._refused: Counter[str] = Counter()
         self._record = record
         self._members: dict[int, _Member] = {}
         self._heap: list[tuple[int, int]] = []
@@ -57,7 +69,9 @@ class Fleet:
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
             kind = Copter if scenario.dynamics == "autopilot" else Vehicle
             vehicle = kind(scenario, own, start_ns, record=record)
-            self._members[own.system_id] = _Member(vehicle, *self._links.of(own.system_id))
+            self._members[own.system_id] = _Member(
+                vehicle, *self._links.of(own.system_id), signed[own.system_id] if signed else None
+            )
         for member in self._members.values():
             self._plan(member)
 
@@ -83,6 +97,7 @@ class Fleet:
     def counters(self) -> Counter[str]:
         """The vehicles' counters added up, with the links' (LinkSet.counters)."""
         total = self._links.counters()
+        total.update({f"refused_{reason.lower().replace(' ', '_')}": count for reason, count in self._refused.items()})
         for member in self._members.values():
             total.update(member.vehicle.counters)
         return total
@@ -176,8 +191,11 @@ class Fleet:
                 arrived.append((entry[3], entry[0]))
                 if self._record is not None:
                     self._record(member.down.row(entry, entry[0]))
+        if member.signed is not None:
+            arrived = [(member.signed.verify(data, time_ns, self._refused), time_ns) for data, time_ns in arrived]
+            arrived = [(data, time_ns) for data, time_ns in arrived if data]
         for data, time_ns in member.vehicle.step(arrived, now_ns):
-            member.up.send(data, time_ns)
+            member.up.send(data if member.signed is None else member.signed.sign(data, time_ns), time_ns)
 
     def _plan(self, member: _Member) -> None:
         """Note when a datagram of the vehicle can leave next. Comparisons, not min(): every datagram comes by here."""

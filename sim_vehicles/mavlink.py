@@ -50,7 +50,11 @@ GLOBAL_ORIGIN = dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
 COMMAND_TAKEOFF = dialect.MAV_CMD_NAV_TAKEOFF
 MESSAGE_INTERVAL = dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL
 
-_CRC_EXTRA: dict[int, bytes] = {number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items()}
+SETUP_SIGNING = dialect.MAVLINK_MSG_ID_SETUP_SIGNING
+CRC_EXTRA: dict[int, bytes] = {
+    number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items() if number != SETUP_SIGNING
+}
+"""Of the messages that are taken: no key is, from a link."""
 _LOCAL_POSITION = dialect.MAVLink_local_position_ned_message
 _SETPOINT = dialect.MAVLink_set_position_target_local_ned_message
 _TIMESYNC = dialect.MAVLink_timesync_message
@@ -112,7 +116,7 @@ def read_datagram(data: bytes, counters: Counter[str]) -> list[Message]:
 
     Everything else is counted: `refused_empty`, `refused_mavlink1`, `refused_garbage` (no frame begins where one
     should), `refused_truncated`, `refused_incompatible` (unknown flags), `refused_unknown` (message id not in the
-    dialect), `refused_crc`, and `ignored_message` (valid, but nothing for a vehicle).
+    dialect), `refused_setup_signing`, `refused_crc`, and `ignored_message` (valid, but nothing for a vehicle).
     """
     messages: list[Message] = []
     begin, end = 0, len(data)
@@ -145,7 +149,7 @@ def in_version_1(frame: bytes) -> bytes:
     size = dialect.MAVLink_heartbeat_message.unpacker.size
     payload = frame[HEADER_BYTES:-CHECKSUM_BYTES].ljust(size, b"\0")
     body = bytes([size, frame[4], frame[5], frame[6], HEARTBEAT]) + payload
-    return bytes([MAGIC_1]) + body + mcrf4xx(body + _CRC_EXTRA[HEARTBEAT]).to_bytes(2, "little")
+    return bytes([MAGIC_1]) + body + mcrf4xx(body + CRC_EXTRA[HEARTBEAT]).to_bytes(2, "little")
 
 
 def message_id(data: bytes) -> int:
@@ -156,9 +160,10 @@ def message_id(data: bytes) -> int:
 def _refusal(data: bytes, begin: int, checked: int) -> str:
     if data[begin + 2] & ~SIGNED:
         return "refused_incompatible"
-    extra = _CRC_EXTRA.get(data[begin + 7] | data[begin + 8] << 8 | data[begin + 9] << 16)
+    extra = CRC_EXTRA.get(data[begin + 7] | data[begin + 8] << 8 | data[begin + 9] << 16)
     if extra is None:
-        return "refused_unknown"
+        number = int.from_bytes(data[begin + 7 : begin + 10], "little")
+        return "refused_setup_signing" if number == SETUP_SIGNING else "refused_unknown"
     if mcrf4xx(data[begin + 1 : checked] + extra) != data[checked] | data[checked + 1] << 8:
         return "refused_crc"
     return ""
@@ -324,7 +329,7 @@ class Encoder:
         mav = self._pymavlink
         body = bytes((len(payload), 0, 0, mav.seq, mav.srcSystem, COMPONENT_AUTOPILOT, number, 0, 0)) + payload
         mav.seq = (mav.seq + 1) & 0xFF
-        return b"\xfd" + body + mcrf4xx(body + _CRC_EXTRA[number]).to_bytes(2, "little")
+        return b"\xfd" + body + mcrf4xx(body + CRC_EXTRA[number]).to_bytes(2, "little")
 
     def estimator_flags(self, message_id: int, time_us: int, flags: int) -> bytes:
         """EKF_STATUS_REPORT or ESTIMATOR_STATUS with these flags, which mean the same in both."""

@@ -1,0 +1,45 @@
+"""Signing at the station's socket: verified datagrams in, signed ones out. Stations know nothing of it."""
+
+from collections import Counter
+from pathlib import Path
+
+from gcs import mavlink
+from gcs.station import Datagram, Outgoing
+from signing.keys import Key, read_key
+from signing.link import SignedLink
+from signing.stamps import Stamps, open_stamps
+
+LINK_ID = 0
+"""Of the one socket over which a station speaks to its vehicles."""
+
+
+class Guard:
+    """What the station sends is signed; what it receives is verified, and unsigned when it is passed on."""
+
+    def __init__(self, key: Key, *, epoch_ns: int, stamps: Stamps) -> None:
+        self._link = SignedLink(key, link_id=LINK_ID, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
+
+    def received(self, datagrams: list[Datagram], now_ns: int, refused: Counter[str]) -> list[Datagram]:
+        """The datagrams with what could be verified of them; what is refused is counted by reason."""
+        verified: list[Datagram] = []
+        for data, address, received_ns, queued_ns in datagrams:
+            good = self._link.verify(data, now_ns, refused)
+            if good:
+                verified.append(Datagram(good, address, received_ns, queued_ns))
+        return verified
+
+    def sent(self, outgoing: list[Outgoing], now_ns: int) -> list[Outgoing]:
+        """The datagrams with their signatures."""
+        return [Outgoing(self._link.sign(data, now_ns), address) for data, address in outgoing]
+
+
+def open_guard(key_file: Path, *, epoch_ns: int) -> Guard:
+    """The guard with the key in a file; the timestamps it has heard are kept beside it.
+
+    Raises
+    ------
+    KeyFileError
+        If one of the files cannot be used.
+    """
+    key = read_key(key_file)
+    return Guard(key, epoch_ns=epoch_ns, stamps=open_stamps(key_file.with_name(key_file.name + ".station")))

@@ -1,0 +1,181 @@
+"""MAVLink 2 signing: what one system sends over one link is signed, and what reaches it there is verified.
+
+A layer outside of stations and vehicles: they are given frames that were verified, without their signatures, and so
+have no state that anything else could change. After the MAVLink guide, "Message Signing".
+
+Decisions where the guide leaves some:
+
+* A timestamp must be newer than all accepted ones of its stream (system, component, link id), as the guide demands. A
+  frame that was overtaken on its way is thus refused: there is no window in which older ones are taken. It is counted
+  apart, as `overtaken`, when its timestamp is among the last `REMEMBERED` and was not seen: jitter, not an attack.
+* A stream heard for the first time may be one minute behind. One known from before a restart is not new.
+* Nothing is looked up, noted or adopted before the signature has been verified.
+* No unsigned message is excepted, RADIO_STATUS neither: nothing here reads it.
+* SETUP_SIGNING is refused even if rightly signed: keys are not taken from a link.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Mapping
+from hmac import compare_digest
+
+from fastcrc.crc16 import mcrf4xx
+
+from signing.keys import Key
+from signing.stamps import Stamps
+
+MAGIC_1, MAGIC = 0xFE, 0xFD
+SIGNED = 0x01
+HEADER, CHECKSUM, SIGNATURE = 10, 2, 13
+SETUP_SIGNING = 256
+
+EPOCH_NS = 1_420_070_400 * 10**9
+"""2015-01-01, since when timestamps count, in ns since 1970."""
+TICK_NS = 10_000
+MINUTE = 6_000_000
+LARGEST = 2**48 - 1
+REMEMBERED = 512
+
+NOT_MAVLINK, VERSION_1, TRUNCATED, FLAGS = "not MAVLink", "MAVLink 1", "truncated", "unknown flags"
+UNKNOWN, CHECKSUM_WRONG, UNSIGNED, WRONG = "unknown message", "bad checksum", "unsigned", "wrong signature"
+REPLAYED, OVERTAKEN, TOO_OLD, SETUP = "replayed", "overtaken", "too old", "SETUP_SIGNING"
+TOO_MANY = "too many signing streams"
+
+
+class SignedLink:
+    """One system's end of one link.
+
+    Parameters
+    ----------
+    crc_extra
+        What the checksum of each message id ends with.
+    epoch_ns
+        The time, in ns since 1970, at which the clock of `now_ns` is 0.
+    owner
+        System id of whose end this is, where several keep their timestamps together.
+    """
+
+    def __init__(
+        self,
+        key: Key,
+        *,
+        link_id: int,
+        crc_extra: Mapping[int, bytes],
+        epoch_ns: int,
+        stamps: Stamps,
+        owner: int = 0,
+    ) -> None:
+        self._key = key
+        self._crc_extra = crc_extra
+        self._offset_ns = epoch_ns - EPOCH_NS
+        self._link_id = bytes([link_id])
+        self._stamps = stamps
+        self._streams = 1 << 32 | owner << 24
+        """With system, component and link id below: a stream that is heard."""
+        self._own = 1 << 33 | owner << 24
+        self._timestamp = stamps.known.get(self._own, 0)
+        stamps.keep(self._own, self._timestamp)
+        self._recent: dict[int, _Recent] = {}
+
+    def sign(self, frame: bytes, now_ns: int) -> bytes:
+        """An unsigned frame of ours as a signed one, newer than whatever this end has sent or heard."""
+        timestamp = min(LARGEST, max(self._timestamp + 1, (now_ns + self._offset_ns) // TICK_NS))
+        self._timestamp = timestamp
+        self._stamps.keep(self._own, timestamp)
+        signed = self._with_flags(frame, SIGNED) + self._link_id + timestamp.to_bytes(6, "little")
+        return signed + self._signature(signed)
+
+    def verify(self, datagram: bytes, now_ns: int, refused: Counter[str]) -> bytes:
+        """The good frames of a datagram, without their signatures; the others are counted by reason."""
+        good: list[bytes] = []
+        at, end = 0, len(datagram)
+        while at < end:
+            if datagram[at] != MAGIC:
+                refused[VERSION_1 if datagram[at] == MAGIC_1 else NOT_MAVLINK] += 1
+                break
+            if end - at < HEADER + CHECKSUM:
+                refused[TRUNCATED] += 1
+                break
+            stop = at + HEADER + datagram[at + 1] + CHECKSUM + (SIGNATURE if datagram[at + 2] & SIGNED else 0)
+            if stop > end:
+                refused[TRUNCATED] += 1
+                break
+            frame = datagram[at:stop]
+            reason = self._malformed(frame) or self._forged(frame) or self._stale(frame, now_ns)
+            if reason:
+                refused[reason] += 1
+            else:
+                good.append(self._with_flags(frame[:-SIGNATURE], 0))
+            at = stop
+        return b"".join(good)
+
+    def _malformed(self, frame: bytes) -> str:
+        number = frame[7] | frame[8] << 8 | frame[9] << 16
+        if frame[2] & ~SIGNED:
+            return FLAGS
+        if number == SETUP_SIGNING:
+            return SETUP
+        return "" if number in self._crc_extra else UNKNOWN
+
+    def _forged(self, frame: bytes) -> str:
+        """Why a frame may be anybody's. What the checksum says counts only if the frame is not good: it names why."""
+        if not frame[2]:
+            return UNSIGNED if self._checksum_right(frame) else CHECKSUM_WRONG
+        if compare_digest(self._signature(frame[:-6]), frame[-6:]):
+            return ""
+        return WRONG if self._checksum_right(frame[:-SIGNATURE]) else CHECKSUM_WRONG
+
+    def _stale(self, frame: bytes, now_ns: int) -> str:
+        """Why a verified frame is too old. One that is not is the newest of its stream from now on."""
+        stream = self._streams | frame[5] << 16 | frame[6] << 8 | frame[-13]
+        timestamp = int.from_bytes(frame[-12:-6], "little")
+        newest = self._stamps.known.get(stream, -1)
+        recent = self._recent.get(stream)
+        if timestamp <= newest:
+            return OVERTAKEN if recent is not None and recent.was_overtaken(timestamp) else REPLAYED
+        if newest < 0 and timestamp + MINUTE < max(self._timestamp, (now_ns + self._offset_ns) // TICK_NS):
+            return TOO_OLD
+        if not self._stamps.keep(stream, timestamp):
+            return TOO_MANY
+        if recent is None:
+            recent = self._recent[stream] = _Recent(newest)
+        recent.add(timestamp)
+        self._timestamp = max(self._timestamp, timestamp)
+        return ""
+
+    def _signature(self, data: bytes) -> bytes:
+        return hashlib.sha256(self._key.secret + data).digest()[:6]
+
+    def _checksum_right(self, frame: bytes) -> bool:
+        return self._with_flags(frame, frame[2]) == frame
+
+    def _with_flags(self, frame: bytes, flags: int) -> bytes:
+        """A frame without signature, with other incompatibility flags and the checksum for them."""
+        body = frame[1:2] + bytes([flags]) + frame[3:-CHECKSUM]
+        extra = self._crc_extra[frame[7] | frame[8] << 8 | frame[9] << 16]
+        return b"\xfd" + body + mcrf4xx(body + extra).to_bytes(2, "little")
+
+
+class _Recent:
+    """The last accepted timestamps of a stream, at least REMEMBERED of them once there were as many."""
+
+    __slots__ = ("_after", "_newer", "_older")
+
+    def __init__(self, newest: int) -> None:
+        self._after = newest
+        """What is newer than this, and was seen, is remembered."""
+        self._newer: set[int] = set()
+        self._older: set[int] = set()
+
+    def add(self, timestamp: int) -> None:
+        if len(self._newer) == REMEMBERED:
+            self._older, self._newer = self._newer, set()
+            self._after = max(self._after, min(self._older) - 1)
+        self._newer.add(timestamp)
+
+    def was_overtaken(self, timestamp: int) -> bool:
+        """Whether an older timestamp has not been seen; from now on it has."""
+        if timestamp <= self._after or timestamp in self._newer or timestamp in self._older:
+            return False
+        self._older.add(timestamp)
+        return True
