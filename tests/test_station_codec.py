@@ -72,8 +72,10 @@ def test_several_frames_in_one_datagram_are_all_read() -> None:
     assert not refused
 
 
-def test_every_message_of_the_dialect_can_be_read() -> None:
+def test_every_message_of_the_dialect_but_a_key_can_be_read() -> None:
     for msg_id, message in dialect.mavlink_map.items():
+        if msg_id == dialect.MAVLINK_MSG_ID_SETUP_SIGNING:
+            continue
         payload = bytes(range(1, 1 + message.unpacker.size))
         header = bytes([0xFD, len(payload), 0, 0, 0, 7, 1]) + msg_id.to_bytes(3, "little")
         crc = dialect.x25crc(header[1:] + payload + bytes([message.crc_extra])).crc
