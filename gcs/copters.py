@@ -1,6 +1,6 @@
 """What the station does for vehicles with autopilots only: patience, one common frame, identification, set-points."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import hypot
 from typing import Any
 
@@ -9,7 +9,7 @@ from gcs.identification import Identification
 from gcs.modes import Phase
 from gcs.pilots import Pilots
 from gcs.plan import FlightPlan
-from gcs.startup import between
+from gcs.startup import Startup, between
 from gcs.telemetry import StateHistory
 from gcs.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S
@@ -67,18 +67,7 @@ class Copters:
 
     def locate(self, history: StateHistory) -> None:
         """Bring the vehicles' local frames to that of the first one, as their origins become known."""
-        starts = [vehicle.startup for vehicle in self._vehicles]
-        first = starts[0]
-        for row, startup in enumerate(starts):
-            if first is None or first.origin is None or startup is None or startup.origin is None:
-                continue
-            north, east = between(first.origin, startup.origin)
-            known_north, known_east, _ = self.frame_ned_m[row]
-            if hypot(north - known_north, east - known_east) > _FRAME_RESOLUTION_M:
-                history.forget(row)
-            else:
-                north, east = known_north, known_east
-            self.frame_ned_m[row] = north, east, first.origin_altitude_m - startup.origin_altitude_m
+        locate([vehicle.startup for vehicle in self._vehicles], self.frame_ned_m, history)
 
     @property
     def identified(self) -> bool:
@@ -113,3 +102,23 @@ class Copters:
             self._pilots.rest(row)  # what it is told shows that set-points come; it begins where the vehicle is
         velocity = control.state[2:4]
         return self._pilots.accelerate(row, vehicle, command, velocity, key_ms=key_ms, now_ns=due_ns)
+
+
+def locate(
+    starts: Sequence[Startup | None], frame_ned_m: list[tuple[float, float, float]], history: StateHistory
+) -> None:
+    """Say where each vehicle's local frame begins in that of the first one, as far as their origins are known.
+
+    What a vehicle whose frame has moved reported before is forgotten.
+    """
+    first = starts[0]
+    for row, startup in enumerate(starts):
+        if first is None or first.origin is None or startup is None or startup.origin is None:
+            continue
+        north, east = between(first.origin, startup.origin)
+        known_north, known_east, _ = frame_ned_m[row]
+        if hypot(north - known_north, east - known_east) > _FRAME_RESOLUTION_M:
+            history.forget(row)
+        else:
+            north, east = known_north, known_east
+        frame_ned_m[row] = north, east, first.origin_altitude_m - startup.origin_altitude_m

@@ -110,6 +110,20 @@ def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     return frames
 
 
+def is_magic(data: bytes, at: int) -> bool:
+    """Whether a frame may begin there, or the data end."""
+    return at >= len(data) or data[at] in (MAGIC, MAGIC_1)
+
+
+def frame_end(data: bytes, at: int) -> int:
+    """Where the frame that may begin there ends; 0 if none does, or not all of it is there."""
+    if at + _OVERHEAD_1 > len(data) or data[at] not in (MAGIC, MAGIC_1):
+        return 0
+    signature = _SIGNATURE_LENGTH if data[at] == MAGIC and data[at + 2] & _SIGNED else 0
+    stop = at + data[at + 1] + (_OVERHEAD + signature if data[at] == MAGIC else _OVERHEAD_1)
+    return stop if stop <= len(data) else 0
+
+
 def decode_either(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     """The valid frames of a datagram of MAVLink 1 or of MAVLink 2."""
     return decode_1(datagram, refused) if datagram[:1] == b"\xfe" else decode(datagram, refused)

@@ -24,7 +24,7 @@ from gcs.copters import START_PATIENCE_S, Copters
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
-from gcs.record import CLOCK_JUMPED, SEVERITY, TickArray
+from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
 from gcs.startup import Startup
 from gcs.telemetry import FloatArray, StateHistory
@@ -323,14 +323,14 @@ class Station:
                 vehicle.goal = None if after.released else Goal.FLY
             if after.mode is not before.mode:
                 self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
-                told = mavlink.statustext(SEVERITY[after.mode], f"vehicle {vehicle.system_id}: {after.mode.name}")
-                self._send(vehicle, mavlink.STATUSTEXT, told, outgoing)
+                self._tell(vehicle, after.mode, after.mode.name, outgoing)
             if after.released != before.released and flying:
                 text = "is released to its failsafe" if after.released else "is called back"
                 self._report("vehicle", text, vehicle.system_id)
             if after.gain_set != before.gain_set and flying:
                 margin_s = self.plan.margins_s[after.gain_set]
                 self._report("gains", f"gain set {after.gain_set}, delay margin {margin_s:.3f} s", vehicle.system_id)
+                self._tell(vehicle, after.mode, f"{GAIN_SET}{after.gain_set}", outgoing)
         self._next_phase(due_ns)
 
     def _next_phase(self, due_ns: int) -> None:
@@ -425,6 +425,11 @@ class Station:
     def _send(self, vehicle: RemoteVehicle, msg_id: int, fields: tuple[object, ...], outgoing: list[Outgoing]) -> None:
         if vehicle.address is not None:
             outgoing.append(Outgoing(vehicle.encode(msg_id, fields), vehicle.address))
+
+    def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
+        """Say over the link what has changed: for others on it, and in the telemetry log."""
+        fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
+        self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
 
     def _report(self, kind: str, text: str, system_id: int | None = None) -> None:
         self.events.append(Event(self.scenario_time_s(self._now_ns), kind, text, system_id))

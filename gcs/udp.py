@@ -120,6 +120,8 @@ def drive(
     the station has found more out about what it flies. With a guard, what is sent and received is signed.
     """
     plan = station.plan
+    log: list[tuple[bytes, int]] = []
+    """Frames since the last tick, in the order in which they were taken in and sent, with their times."""
     while station.phase is not Phase.ENDED:
         link.wait(station.next_event_ns)
         datagrams = link.receive()
@@ -128,10 +130,14 @@ def drive(
             datagrams = guard.received(datagrams, now_ns, station.counters)
         outgoing, tick = station.step(datagrams, now_ns)
         link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
+        sent_ns = clock_ns()
+        log += station.frames
+        log += [(data, sent_ns) for data, _ in outgoing]
+        station.frames.clear()
         if tick is None:
             continue
-        writer.tick(station.complete(tick, clock_ns()))
-        _log(station, writer, [data for data, _ in outgoing], now_ns)
+        writer.tick(station.complete(tick, sent_ns))
+        _log(station, writer, log)
         if station.plan is not plan:
             plan = station.plan
             new_plan(plan)
@@ -139,12 +145,11 @@ def drive(
             station.request_stop(reason)
 
 
-def _log(station: Station, writer: RunWriter, sent: list[bytes], now_ns: int) -> None:
-    """Write the frames of this tick, in the order of their times, and the events."""
+def _log(station: Station, writer: RunWriter, frames: list[tuple[bytes, int]]) -> None:
+    """Write the frames and the events since the last tick."""
     offset_ns = realtime_offset_ns()
-    frames = [(frame, received_ns + offset_ns) for frame, received_ns in station.frames]
-    writer.frames(frames + [(frame, now_ns + offset_ns) for frame in sent])
-    station.frames.clear()
+    writer.frames([(frame, time_ns + offset_ns) for frame, time_ns in frames])
+    frames.clear()
     for event in station.events:
         writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
     station.events.clear()

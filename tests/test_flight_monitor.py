@@ -119,12 +119,17 @@ class Overheard:
         return self.vehicles.step(received, now_ns)
 
 
-def test_every_mode_change_is_an_event_and_a_statustext() -> None:
+def test_every_change_of_mode_and_gains_is_an_event_and_a_statustext() -> None:
     plan = replace(planned(), scenario=TRIANGLE.model_copy(update={"duration_s": 45.0, "links": ramp(0.44)}))
     station, vehicles = Station(plan, start_ns=START_NS), Overheard(vehicles_of(plan))
     for _ in fly_lockstep(plan, station=station, vehicles=vehicles):
         pass
-    changes = [f"vehicle {e.system_id}: {e.text.split('-> ')[1]}" for e in station.events if e.kind == "mode"]
+    changes = [
+        f"vehicle {e.system_id}: {e.text.split('-> ')[-1].split(',')[0]}"
+        for e in station.events
+        if e.kind in ("mode", "gains")
+    ]
+    assert sum("gain set" in change for change in changes) > 5
     parsed = [dialect.MAVLink(None).parse_buffer(data) or [] for data in vehicles.sent]  # checksum and layout: theirs
     messages: list[Any] = [message for some in parsed for message in some]
     told = [message for message in messages if message.get_type() == "STATUSTEXT"]

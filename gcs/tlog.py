@@ -1,0 +1,95 @@
+"""Telemetry logs (.tlog) of any tool: big-endian µs since 1970, then a MAVLink 1 or 2 frame, and so on.
+
+What is damaged is left out and counted: reading goes on at the next place where a frame with a good checksum begins.
+
+TlogError(Exception)    a file that has no frame in it, in one line
+"""
+
+import re
+import struct
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gcs import mavlink
+
+_STAMP = struct.Struct(">Q")
+_MAGIC = re.compile(b"[\xfd\xfe]")
+_WRONG_STAMP_US = 1_000_000
+"""A stamp this far from those of both neighbours is wrong: no checksum covers it."""
+
+
+class TlogError(Exception):
+    """A file that is no telemetry log."""
+
+
+@dataclass(frozen=True)
+class TelemetryLog:
+    """The frames of a log in its order, each with its time in ns since 1970, and what could not be used."""
+
+    frames: list[tuple[int, mavlink.Frame]]
+    counters: Counter[str]
+
+
+def read_tlog(file: Path) -> TelemetryLog:
+    """Read what can be read of a log.
+
+    Raises
+    ------
+    TlogError
+        If the file cannot be read or there is no frame in it.
+    """
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise TlogError(f"{file}: {error.strerror}, wanted a telemetry log") from None
+    log = parse_tlog(data)
+    if not log.frames:
+        raise TlogError(f"{file}: read no MAVLink frame in {len(data)} bytes, wanted a telemetry log (.tlog)")
+    return log
+
+
+def parse_tlog(data: bytes) -> TelemetryLog:
+    """The frames of a log's bytes."""
+    stamps_us: list[int] = []
+    frames: list[mavlink.Frame] = []
+    counters: Counter[str] = Counter()
+    at, damaged = 0, False
+    while at + _STAMP.size < len(data):
+        start = at + _STAMP.size
+        stop = mavlink.frame_end(data, start)
+        refused: Counter[str] = Counter()
+        found = mavlink.decode_either(data[start:stop], refused) if stop else []
+        unusable = refused and not refused["bad checksum"]
+        if found:
+            stamps_us.append(_STAMP.unpack_from(data, at)[0])
+            frames.append(found[0])
+        elif unusable and mavlink.is_magic(data, stop + _STAMP.size):
+            counters.update(refused)
+        else:
+            following = _MAGIC.search(data, start + 1)
+            after = len(data) if following is None else following.start() - _STAMP.size
+            counters["damaged places"] += not damaged
+            counters["damaged bytes"] += after - at
+            at, damaged = after, True
+            continue
+        at, damaged = stop, False
+    if at < len(data):
+        counters["damaged places"] += not damaged
+        counters["damaged bytes"] += len(data) - at
+    good = _plausible(stamps_us)
+    counters["wrong time stamps"] += len(good) - sum(good)
+    kept = [(us * 1000, frame) for us, frame, ok in zip(stamps_us, frames, good, strict=True) if ok]
+    return TelemetryLog(kept, +counters)
+
+
+def _plausible(stamps_us: list[int]) -> list[bool]:
+    """Which stamps are not far from the middle one of themselves and their two neighbours."""
+    if len(stamps_us) < 3:
+        return [True] * len(stamps_us)
+    t = np.array(stamps_us, dtype=np.uint64).astype(np.float64)
+    around = np.stack([np.concatenate([t[2:3], t[:-1]]), t, np.concatenate([t[1:], t[-3:-2]])])
+    good: list[bool] = (np.abs(t - np.median(around, axis=0)) < _WRONG_STAMP_US).tolist()
+    return good
