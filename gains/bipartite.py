@@ -137,7 +137,7 @@ class ExpandedGain:
 
 
 def partition_by_input(pattern: Pattern) -> Partition:
-    """One subgraph for each input with the outputs it uses: φ1 = I if every input uses one.
+    """One subgraph for each input with the outputs it uses: φ1 = I if no input is without outputs.
 
     For the pattern (4.6) {K11}, {K21, K22}, {K32, K33}.
 
@@ -230,8 +230,15 @@ def verify_expansion(plant: Plant, expanded: ExpandedGain, K: ArrayLike) -> floa
 
     Their modes are then the same to the conditioning of the eigenvalues.
 
+    Parameters
+    ----------
+    K
+        Gain with the pattern, shape (inputs, outputs).
+
     Raises
     ------
+    BadModelError
+        If K does not have the pattern, or the plant does not fit it.
     DisagreementError
         If it is more than rounding.
 

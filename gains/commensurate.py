@@ -15,7 +15,7 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gains.delay import Crossing, DelayAnalysis, stability_windows
+from gains.delay import Crossing, DelayAnalysis, check_horizon, stability_windows
 from gains.delay_crossings import AxisCrossing, axis_crossings, crossings_of_loci, polish
 from gains.delay_loci import ComplexArray, Loci, unit_crossings
 from gains.delay_sweep import near_unit_extrema
@@ -53,7 +53,8 @@ def analyse_commensurate(matrices: Sequence[ArrayLike], *, horizon_s: float | No
     Raises
     ------
     BadModelError
-        No matrix, matrices that are not square, finite and of one size, or m n too large.
+        No matrix, matrices that are not square, finite and of one size, m n too large, or a horizon that is not a
+        positive number.
     DisagreementError
         Crossings and eigenvalues contradict each other (a loop at the limit of double precision).
 
@@ -66,8 +67,7 @@ def analyse_commensurate(matrices: Sequence[ArrayLike], *, horizon_s: float | No
     >>> round(found.delay_margin_s, 6), round(found.crossings[0].omega_rad_s, 6)
     (0.6046, 1.732051)
     """
-    if horizon_s is not None and not horizon_s > 0.0:
-        raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
+    check_horizon(horizon_s)
     crossings: list[Crossing] = []
     unstable, fixed_on_axis = 0, False
     for block in distinct_blocks(*_checked(matrices)):
@@ -97,8 +97,8 @@ def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
 
     The eigenvalues s of A(theta) = sum_k A_k e^{-j k theta} on a grid of angles; where one crosses the imaginary axis
     at j omega, tau = theta / omega is critical. Sorted real parts are continuous in the angle, so crossings are
-    bracketed, and local extrema near zero are refined. It is a search, not a proof. Arguments as of
-    `analyse_commensurate`.
+    bracketed, and local extrema near zero are refined. It is a search, not a proof. 0 if the loop is unstable without
+    delay, `inf` if no crossing is found. Arguments and exceptions as of `analyse_commensurate`.
 
     Examples
     --------

@@ -102,8 +102,7 @@ def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = Non
     (2, 0.0)
     """
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
-    if horizon_s is not None and not horizon_s > 0.0:
-        raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
+    check_horizon(horizon_s)
     crossings: list[Crossing] = []
     unstable, fixed_on_axis = 0, False
     for block in blocks:
@@ -139,6 +138,12 @@ def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """
     # the first critical delay is wanted only: the shortest horizon lists the fewest windows
     return analyse_delay(A0, A1, horizon_s=1e-300).delay_margin_s
+
+
+def check_horizon(horizon_s: float | None) -> None:
+    """Raise BadModelError unless the horizon is a positive number of seconds, or None for all windows."""
+    if horizon_s is not None and not horizon_s > 0.0:
+        raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
 
 
 def _analyse_block(block: Block) -> tuple[list[Crossing], int, bool]:

@@ -171,8 +171,12 @@ def design(
 
     Raises
     ------
+    BadModelError
+        If the formation has no follower, or the period is not positive.
     InfeasibleError
         If no gains meet the requirement; the message says what can be reached.
+    DisagreementError
+        If the exact analysis contradicts the search.
 
     Examples
     --------
@@ -215,6 +219,11 @@ def evaluate_gains(
     """Return margins, α and behaviour of given gains, each of shape (axes, axes).
 
     Gains of an unstable loop are reported too: α and the continuous margin are 0 and there is no certificate.
+
+    Raises
+    ------
+    BadModelError
+        If a gain is not finite or not of that shape, the formation has no follower, or the period is not positive.
 
     Examples
     --------
@@ -360,6 +369,18 @@ def _assess(
 def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple[TradeOffPoint, ...]:
     """Return the largest α at sampled delay margins from 0.05 to 1 s; margins no gains have are left out.
 
+    Parameters
+    ----------
+    period_s
+        Period of the control loop: sample, hold.
+    string_peak_max
+        As in `gains.requirement.Requirement`.
+
+    Raises
+    ------
+    BadModelError
+        If the period is not positive or the limit is below 1.
+
     Examples
     --------
     >>> from gains.design import trade_off
@@ -367,7 +388,9 @@ def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple
     >>> points[0].delay_margin_s, points[-1].delay_margin_s, points[0].alpha > points[-1].alpha
     (0.05, 1.0, True)
     """
-    points = ((margin_s, largest_alpha(margin_s, period_s, string_peak_max)) for margin_s in _TRADE_OFF_MARGINS_S)
+    _check_period(period_s)
+    limit = Requirement(string_peak_max=string_peak_max).string_peak_max
+    points = ((margin_s, largest_alpha(margin_s, period_s, limit)) for margin_s in _TRADE_OFF_MARGINS_S)
     return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)
 
 
@@ -377,7 +400,7 @@ def _check_period(period_s: float) -> None:
 
 
 def _number(value: float | None) -> float:
-    """Inverse of `_plain` for a number; which kind of not finite it was is not kept, except that no margin ends: ∞."""
+    """Inverse of `plain` for a number; which kind of not finite it was is not kept, except that no margin ends: ∞."""
     return float("inf") if value is None else float(value)
 
 

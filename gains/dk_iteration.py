@@ -287,7 +287,7 @@ def _proved_alpha(closed_loop: FloatArray, P: FloatArray) -> float:
 
 
 def abscissa(closed_loop: FloatArray) -> float:
-    """Largest real part of an eigenvalue (1/s), by strongly connected blocks: see `gains.structure`.
+    """Largest real part of an eigenvalue (1/s) of A (n, n), by strongly connected blocks: see `gains.structure`.
 
     Examples
     --------
@@ -301,7 +301,7 @@ def abscissa(closed_loop: FloatArray) -> float:
 
 
 def decay_proof(closed_loop: FloatArray, P: FloatArray) -> DecayProof:
-    """The least α that P proves for a closed loop A_K, checked by numpy's eigenvalues alone.
+    """The least α that P proves for a closed loop A_K, both (n, n), checked by numpy's eigenvalues alone.
 
     Raises
     ------

@@ -134,7 +134,7 @@ def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tupl
     """The fixed modes, all stable.
 
     Without unstable fixed modes dynamic controllers with the pattern stabilise the plant; that a static gain does is
-    not implied.
+    not implied. Arguments and further exceptions as of `fixed_modes`.
 
     Raises
     ------

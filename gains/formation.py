@@ -148,6 +148,11 @@ class FormationModel:
         K1, K2, K3
             Gains on the own velocity error (1/s), the velocity error of the vehicle in front (1/s) and the spacing
             error (1/s²), each of shape (axes, axes).
+
+        Raises
+        ------
+        BadModelError
+            If a gain is not finite or not of that shape.
         """
         own, front, spacing = (
             checked_gain(name, gain, self.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
@@ -163,7 +168,7 @@ class FormationModel:
     def ground_loop(self, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return (A0, A1) of e'(t) = A0 e(t) + A1 e(t − τ) when a ground station closes every loop.
 
-        All feedback is late: A0 = A, A1 = B K.
+        All feedback is late: A0 = A, A1 = B K, both (states, states). Arguments as of `overlapping_gain`.
         """
         return self.A, self.B @ self.overlapping_gain(K1, K2, K3)
 

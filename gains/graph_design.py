@@ -129,9 +129,13 @@ def graph_design(
 
     Raises
     ------
+    BadModelError
+        If the pattern is not one of the formation, or the period is not positive.
     InfeasibleError
         If a mode cannot be moved by the pattern (the message names the missing link), or the requirement cannot be met
         (the message says what to relax).
+    SolverError
+        If the base gain is not found: see `gains.structured_lqr` and `gains.dk_iteration`.
 
     Examples
     --------
@@ -166,6 +170,11 @@ def evaluate_graph_gain(formation: FormationModel, pattern: Pattern, K: ArrayLik
 
     Gains of an unstable loop are reported too: alpha and the margins are 0 and there is no certificate.
 
+    Raises
+    ------
+    BadModelError
+        If K does not have the pattern, or the period is not positive.
+
     Examples
     --------
     >>> from gains.formation import FormationModel
@@ -184,6 +193,8 @@ def evaluate_graph_gain(formation: FormationModel, pattern: Pattern, K: ArrayLik
 
 def time_scaled(formation: FormationModel, K: FloatArray, scale: float) -> FloatArray:
     """The gain with which the loop does the same `scale` times slower: K_v / scale, K_p / scale².
+
+    K is of shape (any, states): K_v are its columns of velocity errors, K_p those of spacing errors.
 
     Examples
     --------

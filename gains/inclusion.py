@@ -101,6 +101,11 @@ def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansi
     and then (u_j, u_i) (3.11-3.13). Of type (a), A~ and B~ are block diagonal with the blocks (3.25). Of type (b), A~
     is the same and B~ = VBQ, which is not block diagonal: a vehicle's copies move by the mean of its inputs' copies.
 
+    Raises
+    ------
+    BadModelError
+        If the restriction is neither "a" nor "b".
+
     Examples
     --------
     A chain of three: e_0^v, e_1^v, u_0 and u_1 are there twice.
@@ -129,10 +134,10 @@ def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansi
 
 
 def expanded_gain(formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> Sparse:
-    """Return the block-diagonal gain K~ of the disjoint subsystems.
+    """Return the block-diagonal gain K~ of the disjoint subsystems, sparse, shape (expanded inputs, expanded states).
 
     The block of {e_0^v} is K1, that of every follower [K1 0 0; K2 K3 K1] (3.26): in its subsystem the vehicle in front
-    is governed by K1 alone.
+    is governed by K1 alone. Arguments and exceptions as of `gains.formation.FormationModel.overlapping_gain`.
 
     Examples
     --------
@@ -157,7 +162,8 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
     """Return K~_M: the expanded gain in which every copy of an input gets the command of the vehicle's own subsystem.
 
     Without this the copies of u_j disagree (K1 e_j^v in the subsystem of the vehicle behind j, the full law in j's
-    own), K~V = RK has no solution K, and the contracted gain would be a mean of the two (3.17-3.19).
+    own), K~V = RK has no solution K, and the contracted gain would be a mean of the two (3.17-3.19). `gain` is that of
+    `expanded_gain`.
 
     Examples
     --------
@@ -179,7 +185,7 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
 
 
 def contracted_gain(expansion: Expansion, gain: Sparse) -> FloatArray:
-    """Return K = Q K~ V as an array of shape (inputs, states).
+    """Return K = Q K~ V as an array of shape (inputs, states), K~ of shape (expanded inputs, expanded states).
 
     Examples
     --------

@@ -25,7 +25,16 @@ _EPS = float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True)
 class Unknown:
-    """An unknown matrix: symmetric of one size, or any of shape (rows, columns)."""
+    """An unknown matrix: symmetric of one size, or any of shape (rows, columns).
+
+    Examples
+    --------
+    A symmetric 2×2 matrix has three independent entries:
+
+    >>> from gains.lmi import Unknown
+    >>> Unknown(2).count, Unknown(2, 3).count
+    (3, 6)
+    """
 
     rows: int
     columns: int = 0
@@ -58,6 +67,18 @@ def positive_definite_solution(unknowns: Sequence[Unknown], inequalities: Inequa
         Their shapes, in the order in which `inequalities` takes them.
     inequalities
         Unknown matrices to symmetric matrices, linear and homogeneous.
+
+    Examples
+    --------
+    x' = a x is stable if there is a p > 0 with −2 a p > 0:
+
+    >>> import numpy as np
+    >>> from gains.lmi import Unknown, positive_definite_solution
+    >>> [
+    ...     positive_definite_solution([Unknown(1)], lambda x: [x[0], -2 * a * x[0]]) is not None
+    ...     for a in (-1.0, 1.0)
+    ... ]
+    [True, False]
     """
     entries = _largest_least_eigenvalue(unknowns, inequalities)
     if entries is None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.commensurate import column_space, companion_loci, highest_frequency
-from gains.delay import Crossing, DelayAnalysis, stability_windows
+from gains.delay import Crossing, DelayAnalysis, check_horizon, stability_windows
 from gains.delay_loci import ComplexArray, Loci, unit_crossings, without_limits_at_zero
 from gains.delay_sweep import near_unit_extrema
 from gains.errors import BadModelError, DisagreementError
@@ -64,8 +64,8 @@ def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None)
     Raises
     ------
     BadModelError
-        No term, matrices that are not square, finite and of one size, a delay that is negative or not finite, or known
-        delays so long that the sweep would be too large.
+        No term, matrices that are not square, finite and of one size, a delay that is negative or not finite, known
+        delays so long that the sweep would be too large, or a horizon that is not a positive number.
     DisagreementError
         A root too close to the imaginary axis at tau = 0 to count it on either side.
 
@@ -78,6 +78,7 @@ def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None)
     1.070796
     """
     matrices = _checked(terms)
+    check_horizon(horizon_s)
     known_s, multiples = np.array([t.known_s for t in terms]), [t.multiple for t in terms]
     crossings: list[Crossing] = []
     unstable, on_axis = 0, False

@@ -48,7 +48,7 @@ class OnboardTiming:
     steps
         Steps of the vehicle's own loop in a control period.
     steps_per_sample
-        Its sensor looks at every so manieth step; a whole number of times in a control period.
+        The sensor looks at one of so many steps; a divisor of `steps`.
 
     Examples
     --------

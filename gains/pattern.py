@@ -224,7 +224,7 @@ def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
 
 
 def formation_plant(formation: FormationModel, C: ArrayLike | None = None) -> Plant:
-    """The error model of the formation with outputs y = C e; C = I if not given.
+    """The error model of the formation with outputs y = C e, C of shape (outputs, states); C = I if not given.
 
     Examples
     --------

@@ -55,6 +55,8 @@ class PeriodAnalysis:
 def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
     """Windows of the period of the loop x' = A x + B u, u = K x sampled and held.
 
+    Listed up to twenty times the first limit at least. Found by a march through the periods: a search, not a proof.
+
     Parameters
     ----------
     A, B, K

@@ -25,12 +25,17 @@ class Requirement:
     delay_margin_s
         Least sampled delay margin, up to 30 s.
     alpha
-        Least sector bound, from 5e-4.
+        Least sector bound, from 5e-4 (1/s).
     decay_rate_1_s
         Least decay rate of the continuous loop without delay, 1/s.
     string_peak_max
         Limit, at least 1, on the growth of spacing errors from vehicle to vehicle, without delay and at half the
         margin. 1 lets no error grow down the chain and costs little α. Not limited if None.
+
+    Raises
+    ------
+    BadModelError
+        If a number is out of its range.
 
     Examples
     --------

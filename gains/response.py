@@ -32,6 +32,11 @@ _MARGIN_RESOLUTION = 1e-9
 class Response:
     """How one vehicle answers: `lag_s` > 0 from wanted to real acceleration, velocity gain g >= 0 in 1/s.
 
+    Raises
+    ------
+    BadModelError
+        If the lag is below 1e-6 s, the gain negative, or either not finite.
+
     Examples
     --------
     An autopilot with a lag of 0.2 s that also corrects the velocity:
@@ -58,6 +63,16 @@ def formation_loop(
 
     The state is e of `gains.formation`, followed by a and d of each vehicle; a vehicle with g = 0 has no d.
 
+    Parameters
+    ----------
+    K
+        Gain of u = K e, shape (inputs, states) of the model.
+
+    Raises
+    ------
+    BadModelError
+        If K is of another shape or there is not one response for each vehicle.
+
     Examples
     --------
     A leader by itself, of one axis: e' = a, 0.5 a' = u − a, u = −e.
@@ -71,6 +86,8 @@ def formation_loop(
     """
     if len(responses) != model.vehicles:
         raise BadModelError(f"there are {len(responses)} responses; wanted one for each of {model.vehicles} vehicles")
+    if K.shape != (model.inputs, model.states):
+        raise BadModelError(f"K has shape {K.shape}; wanted {(model.inputs, model.states)}")
     axes = model.axes
     n = model.states + axes * sum(2 if response.velocity_gain_1_s > 0.0 else 1 for response in responses)
     A, B = np.zeros((n, n)), np.zeros((n, model.inputs))
@@ -95,9 +112,11 @@ def formation_loop(
 def sampled_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response], *, period_s: float) -> float:
     """The least delay (s) at which the sampled and held loop of these vehicles loses stability.
 
+    Arguments and exceptions as of `formation_loop` and `gains.sampled.sampled_delay_margin`.
+
     Examples
     --------
-    The same leader, sampled: 1.1506 s less half a period or so.
+    The leader of `continuous_margin`, sampled: 1.1506 s less half a period or so.
 
     >>> import numpy as np
     >>> from gains.formation import FormationModel
@@ -110,7 +129,9 @@ def sampled_margin(model: FormationModel, K: FloatArray, responses: Sequence[Res
 
 
 def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response]) -> float:
-    """The same of the continuous loop.
+    """The least delay (s) at which the continuous loop of these vehicles loses stability.
+
+    Arguments and exceptions as of `formation_loop` and `gains.delay.delay_margin`.
 
     Examples
     --------
@@ -129,7 +150,8 @@ def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[
 def string_peak(gains: Gains, response: Response, *, delay_s: float) -> float:
     """Largest growth of a spacing error from one vehicle to the next, as `gains.behaviour.string_peak`, with response.
 
-    Γ(s) = (s² I - h (s K1 - K3))^{-1} (s K2 + K3) h, h = e^{-sτ} (s + g) / (lag s² + s + g); at least |Γ(0)| = 1.
+    Γ(s) = (s² I - h (s K1 - K3))^{-1} (s K2 + K3) h, h = e^{-sτ} (s + g) / (lag s² + s + g); at least |Γ(0)| = 1. On a
+    grid of frequencies: a search, not a proof. `gains` are K1, K2, K3, each of shape (axes, axes).
 
     Examples
     --------

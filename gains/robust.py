@@ -104,6 +104,8 @@ class RobustGains:
 def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
     """Closed loop A_cl = [[K1, 0, 0], [I, 0, −I], [K2, K3, K1]] of the subsystem (3.25, 3.26), shape (3 n, 3 n).
 
+    Arguments and exceptions as of `robustness`.
+
     Examples
     --------
     >>> from gains.robust import subsystem_loop
@@ -133,6 +135,11 @@ def robustness(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, W: ArrayLike | None 
     W
         Weight of the sector, shape (q, 3 n); the identity if not given.
 
+    Raises
+    ------
+    BadModelError
+        If a gain or W is not finite or not of its shape.
+
     Examples
     --------
     These gains are weakest at ω = 0, where α is the least singular value of A_cl:
@@ -149,6 +156,8 @@ def robustness(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, W: ArrayLike | None 
 
 def disturbance_bound(A: FloatArray, W: FloatArray) -> float:
     """Return 1 / ‖W (sI − A)^{-1}‖∞ by level sets of the frequency response, 0 if A is not Hurwitz.
+
+    A and W are finite, of shapes (n, n) and (q, n).
 
     γ is a singular value of W (jωI − A)^{-1} if and only if jω is an eigenvalue of [[A, I/γ], [−W'W/γ, −A']]. From a
     lower bound γ, the frequencies at which the level is crossed bound the intervals above it; the response at their
@@ -193,10 +202,13 @@ def certify(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, alpha: float, W: ArrayL
     """Prove that the gains withstand the sector bound α: a full P from an LMI, checked by plain eigenvalues.
 
     With time in units of 1/α, maximise t subject to [[A_cl'P + P A_cl + W'W, P], [P, −I]] ⪯ −t I, P ⪰ t I. This does
-    not use `robustness`, with which it agrees: α below the exact bound has a proof, α above has none.
+    not use `robustness`, with which it agrees: α below the exact bound has a proof, α above has none. Gains and W as of
+    `robustness`.
 
     Raises
     ------
+    BadModelError
+        If α is not positive, or a gain or W is not finite or not of its shape.
     InfeasibleError
         If no quadratic Lyapunov function proves α.
     SolverError

@@ -78,6 +78,17 @@ def gains_of_margin(share: FloatArray, delay_margin_s: FloatArray, period_s: flo
     tuple
         k1 and k3. Only those with k1 > 0, k3 > 0 and, sampled, k1 T < 2 (stable without delay)
         are gains of that margin.
+
+    Examples
+    --------
+    A crossing at ω = π/4 with a margin of 1 s:
+
+    >>> import numpy as np
+    >>> from gains.delay import delay_margin
+    >>> from gains.search import gains_of_margin
+    >>> k1, k3 = gains_of_margin(np.array(0.5), np.array(1.0), 0.0)
+    >>> round(delay_margin([[0, -1], [0, 0]], [[0, 0], [k3, -k1]]), 6)
+    1.0
     """
     if period_s == 0:
         angle = share * np.pi / 2
@@ -109,6 +120,15 @@ def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string
     -------
     array
         Of the shape of `k1`; NaN where no k2 will do.
+
+    Examples
+    --------
+    Without delay √(k1² − 2 k3):
+
+    >>> import numpy as np
+    >>> from gains.search import front_gain_limit
+    >>> front_gain_limit(np.array([2.0]), np.array([1.0]), np.array([0.0]), 1.0).round(6).tolist()
+    [1.414214]
     """
     # Above ω = 2 k1 + √(2 k3) the bound grows with ω for every delay: ω² outgrows 2 (k3 + k1 ω).
     highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
@@ -134,6 +154,18 @@ def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: 
 
     σ_min² is the least root of λ³ − c2 λ² + c1 λ − c0, whose coefficients are the sums of the squared 1×1, 2×2 and 3×3
     minors of jωI − A_cl. Newton's iteration from λ = 0 rises to it without overshoot, because all roots are real.
+
+    Examples
+    --------
+    The same as of `gains.robust.subsystem_loop` with K1 = −k1, K2 = k2, K3 = k3:
+
+    >>> import numpy as np
+    >>> from gains.robust import subsystem_loop
+    >>> from gains.search import least_singular_value
+    >>> least = np.linalg.svd(1j * np.eye(3) - subsystem_loop(-3, 2, 2), compute_uv=False)[-1]
+    >>> found = least_singular_value(np.array(3.0), np.array(2.0), np.array(2.0), np.array(1.0))
+    >>> round(float(found), 6) == round(float(least), 6)
+    True
     """
     x, a2 = omega**2, k1**2
     own = x + a2
@@ -148,7 +180,20 @@ def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: 
 
 
 def alpha_of(k1: FloatArray, k2: FloatArray, k3: FloatArray) -> FloatArray:
-    """Return α for W = I, the least of σ_min(jωI − A_cl) over ω, for each of the gains (broadcast)."""
+    """Return α for W = I, the least of σ_min(jωI − A_cl) over ω, for each of the gains (broadcast).
+
+    Examples
+    --------
+    The same as `gains.robust.robustness`, for many gains at a time:
+
+    >>> import numpy as np
+    >>> from gains.robust import robustness
+    >>> from gains.search import alpha_of
+    >>> alpha_of(np.array([3.0, 2.0]), np.array([2.0, 1.0]), np.array([2.0, 1.0])).round(6).tolist()
+    [0.532094, 0.39909]
+    >>> round(robustness(-3, 2, 2), 6), round(robustness(-2, 1, 1), 6)
+    (0.532094, 0.39909)
+    """
     k1, k2, k3 = (gain[..., None] for gain in np.broadcast_arrays(k1, k2, k3))
     slow, fast = min(1.0, np.sqrt(k3.min()), k1.min()), max(1.0, np.sqrt(k3.max()), k1.max())
     omega = np.broadcast_to(
@@ -178,6 +223,16 @@ def largest_alpha(delay_margin_s: float, period_s: float, string_peak_max: float
     string_peak_max
         Largest growth of spacing errors from vehicle to vehicle, both without delay and with half the margin as loop
         delay (plus half a period for the hold); not limited if None.
+
+    Examples
+    --------
+    The gains found have the margin asked for:
+
+    >>> from gains.delay import delay_margin
+    >>> from gains.search import largest_alpha
+    >>> gains = largest_alpha(0.3, 0.0)
+    >>> round(delay_margin([[0, -1], [0, 0]], [[0, 0], [gains.k3, -gains.k1]]), 6)
+    0.3
     """
     # Axes of the scan: share of the crossing angle, k2 as a share of its limit, margin left over in periods.
     spare_max = _SPARE_MAX if delay_margin_s <= _SHORT_MARGIN * period_s else 0.0
@@ -207,6 +262,15 @@ def largest_margin(
     """Return the largest delay margin (s) at which α can be reached, and the gains; None if no margin is left.
 
     The largest α falls as the margin grows, so this is its inverse, by false position with halved ends (Illinois).
+
+    Examples
+    --------
+    The way back: the α that is reached at a margin is reached at no longer one.
+
+    >>> from gains.search import largest_alpha, largest_margin
+    >>> margin_s, _ = largest_margin(largest_alpha(0.3, 0.02).alpha, 0.02)
+    >>> round(margin_s, 4)
+    0.3
     """
 
     def excess_at(margin_s: float) -> tuple[float, ScalarGains | None]:

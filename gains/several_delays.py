@@ -53,16 +53,22 @@ class DelayBox:
 
     @property
     def is_exact(self) -> bool:
+        """Whether no limit depends on another delay."""
         return not self.coupled
 
 
 def stable_at(A0: ArrayLike, late: Sequence[ArrayLike], delays_s: Sequence[float]) -> bool:
     """Whether x'(t) = A0 x(t) + sum_k late[k] x(t - delays_s[k]) is asymptotically stable.
 
+    Parameters
+    ----------
+    A0, late
+        Real matrices (n, n), 1/s: what acts at once, and what acts late, one for each delay.
+
     Raises
     ------
     BadModelError
-        As of `gains.rightmost.rightmost_root`, or as many delays as late matrices are not given.
+        As of `gains.rightmost.rightmost_root`, or there are not as many delays as late matrices.
 
     Examples
     --------
@@ -130,7 +136,7 @@ def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list
     Raises
     ------
     BadModelError
-        B or K is not a matrix of finite numbers.
+        B or K is not a matrix of finite numbers, or their shapes do not fit.
 
     Examples
     --------
@@ -141,6 +147,8 @@ def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list
     [[[-1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [1.0, -1.0]]]
     """
     entry, feedback = real_matrix("B", B), real_matrix("K", K)
+    if feedback.shape != entry.shape[::-1]:
+        raise BadModelError(f"K has shape {feedback.shape}; {entry.shape[::-1]} is wanted, the transpose of B's")
     return [entry[:, place] @ feedback[place] for place in inputs]
 
 

@@ -40,7 +40,9 @@ _HOMOTOPY_DISTANCE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of the cost: Q on states (n, n), R on inputs, and the covariance X0 (n, n) of initial states.
+    """Weights of the cost: Q (n, n) on states, R (inputs, inputs), and the covariance X0 (n, n) of initial states.
+
+    X0 = I if not given.
 
     Raises
     ------
@@ -273,6 +275,13 @@ def structured_lqr(
 
 def lqr_cost(plant: Plant, pattern: Pattern, weights: Weights, K: ArrayLike) -> tuple[float, FloatArray]:
     """J(K) and its gradient, zero outside the pattern; infinity and zeros for a gain that does not stabilise.
+
+    Both K and the gradient are of shape (inputs, outputs).
+
+    Raises
+    ------
+    BadModelError
+        If sizes do not fit or K does not have the pattern.
 
     Examples
     --------

@@ -175,3 +175,11 @@ def test_unstable_roots_are_counted_with_the_known_delay() -> None:
 def test_wrong_mixed_terms_are_named(term: MixedTerm, message: str) -> None:
     with pytest.raises(BadModelError, match=message):
         analyse_mixed([term])
+
+
+@pytest.mark.parametrize("horizon_s", [0.0, -1.0, float("nan")])
+def test_horizon_must_be_positive(horizon_s: float) -> None:
+    with pytest.raises(BadModelError, match="horizon_s is"):
+        analyse_mixed([MixedTerm([[-1.0]], 0.1, 1)], horizon_s=horizon_s)
+    with pytest.raises(BadModelError, match="horizon_s is"):
+        analyse_commensurate([[[0.0]], [[-1.0]]], horizon_s=horizon_s)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gains.delay import delay_margin
-from gains.design import Design, Requirement, design, evaluate_gains
+from gains.design import Design, Requirement, design, evaluate_gains, trade_off
 from gains.errors import BadModelError, InfeasibleError
 from gains.formation import FormationModel
 from gains.robust import robustness
@@ -219,6 +219,10 @@ def test_period_and_formation_are_checked() -> None:
         design(FormationModel((-1,)), period_s=PERIOD_S)
     with pytest.raises(BadModelError, match="K1 has shape"):
         evaluate_gains(TRIANGLE, [[1.0]], EYE, EYE, period_s=PERIOD_S)
+    with pytest.raises(BadModelError, match="period_s = -1"):
+        trade_off(period_s=-1.0)
+    with pytest.raises(BadModelError, match=r"string_peak_max = 0\.5"):
+        trade_off(period_s=PERIOD_S, string_peak_max=0.5)
 
 
 def test_importing_the_design_imports_no_slow_library() -> None:

@@ -20,11 +20,9 @@ INTERNAL_MODULES = {
     "delay_crossings",
     "delay_curves",
     "delay_loci",
-    "lmi",
     "sampled_crossings",
     "sampled_loop",
     "sampled_period",
-    "search",
 }
 INTERNAL_FUNCTIONS = {
     "commensurate.block_crossings",
@@ -32,6 +30,7 @@ INTERNAL_FUNCTIONS = {
     "commensurate.companion_loci",
     "commensurate.has_fixed_root",
     "commensurate.highest_frequency",
+    "delay.check_horizon",
     "delay.stability_windows",
     "delay_sweep.near_unit_extrema",
     "delay_sweep.sweep_frequencies",

@@ -122,6 +122,11 @@ def test_a_response_for_each_vehicle_is_wanted() -> None:
         formation_loop(PAIR, K, [Response(0.1, 1.0)])
 
 
+def test_a_gain_of_another_formation_is_refused() -> None:
+    with pytest.raises(BadModelError, match=r"K has shape \(4, 6\); wanted \(6, 10\)"):
+        formation_loop(FormationModel((-1, 0, 1)), K, [Response(0.1, 1.0)] * 3)
+
+
 @pytest.mark.parametrize("response", RESPONSES[:2])
 def test_a_design_for_a_response_has_the_margin_asked_for(response: Response) -> None:
     model, period_s = FormationModel((-1, 0)), 0.02

@@ -145,6 +145,11 @@ def test_leader_follower_formation_takes_a_rectangle_of_delays() -> None:
         assert not stable_at(formation.A, late, outside)
 
 
+def test_a_gain_that_does_not_fit_the_inputs_is_refused() -> None:
+    with pytest.raises(BadModelError, match=r"K has shape \(3, 3\); \(2, 3\) is wanted"):
+        late_by_vehicle(np.ones((3, 2)), np.eye(3), [slice(0, 1), slice(1, 2)])
+
+
 def test_vehicles_that_know_each_other_have_no_rectangle() -> None:
     # vehicle 1 also uses the spacing of vehicle 2: both delays act in one block
     formation, K = formation_with_k3((1.0, 1.0))
