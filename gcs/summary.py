@@ -4,7 +4,7 @@ Works from the files alone, so a run whose station was killed is finished by the
 """
 
 import json
-from collections import Counter
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ from gcs.record import (
 from scenarios import files as scenario_files
 from scenarios.schema import Scenario
 
+_SKEW_SPAN_S = 1.0
+"""A clock's rate is not told from less than this."""
 SILENT_END = "interrupted: the station ended without a word"
 
 
@@ -100,7 +102,10 @@ def summarise(
     followers = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
     errors = {system_id: _error(flown, system_id) for system_id in followers}
     settled = _settling_time_s(errors, followers, scenario.safety.settled_fraction)
-    jumps = Counter(event["system_id"] for event in events if event["text"] == CLOCK_JUMPED)
+    jumps: dict[int, list[float]] = defaultdict(list)
+    for event in events:
+        if event["text"] == CLOCK_JUMPED:
+            jumps[event["system_id"]].append(event["time_s"])
     loop_delay = flown["loop_delay_s"][flown["commanded"]]
     headroom = flown["headroom"][flown["commanded"]]
     return {
@@ -117,7 +122,7 @@ def summarise(
         "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,
         "duration_s": _number(flown["time_s"].max()) if flown.size else 0.0,
         "vehicles": [
-            _vehicle(ticks, flown, v.system_id, errors.get(v.system_id), jumps=jumps[v.system_id])
+            _vehicle(ticks, flown, v.system_id, errors.get(v.system_id), jumps_s=jumps[v.system_id])
             for v in scenario.vehicles
         ],
         "control": _control(scenario, flown),
@@ -163,7 +168,9 @@ def _settling_time_s(errors: dict[int, Errors], spacing_m: dict[int, float], fra
     return round(latest, 6)
 
 
-def _vehicle(ticks: TickArray, flown: TickArray, system_id: int, error: Errors | None, *, jumps: int) -> dict[str, Any]:
+def _vehicle(
+    ticks: TickArray, flown: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float]
+) -> dict[str, Any]:
     rows = ticks[ticks["system_id"] == system_id]
     rtt = rows["rtt_s"]
     own = flown[flown["system_id"] == system_id]
@@ -178,7 +185,7 @@ def _vehicle(ticks: TickArray, flown: TickArray, system_id: int, error: Errors |
         "down_delay_s": spread_with_status(own["down_delay_s"][own["commanded"]]),
         "telemetry_age_s": spread_with_status(own["telemetry_age_s"][own["commanded"]]),
         "station_queue_s": spread_with_status(own["queue_s"][own["commanded"]]),
-        "clock": _clock(own, int(np.isfinite(rtt).sum())) | {"jumps": jumps},
+        "clock": _clock(own, int(np.isfinite(rtt).sum()), jumps_s) | {"jumps": len(jumps_s)},
         "mode_final": None if not rows.size else Mode(int(rows["mode"][-1])).name,
         **counted,
     }
@@ -190,17 +197,32 @@ def spread_with_status(values: NDArray[np.float64]) -> dict[str, Any]:
     return _spread(values) | {"samples": samples, "status": "measured" if samples else "unknown"}
 
 
-def _clock(own: TickArray, exchanges: int) -> dict[str, Any]:
-    """The vehicle's boot clock against the station's, as last estimated, and how wrong the offset may be."""
+def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> dict[str, Any]:
+    """The vehicle's boot clock against the station's: offset as last estimated, skew since the last jump, and bounds.
+
+    The skew is that of the straight line between the first and the last offset, each wrong by its bound at most.
+    """
     known = own[np.isfinite(own["clock_offset_s"])]
     if not known.size:
-        return {"status": "unknown", "samples": 0, "offset_s": None, "bound_s": None}
-    offset_s, bound_s = known["clock_offset_s"][-1], known["clock_offset_bound_s"][-1]
+        return {"status": "unknown", "samples": 0} | dict.fromkeys(
+            ("offset_s", "bound_s", "skew_ppm", "skew_bound_ppm")
+        )
+    offset_s, bound_s = known["clock_offset_s"], known["clock_offset_bound_s"]
+    steady = np.flatnonzero(known["time_s"] > max(jumps_s, default=-np.inf))
+    skew_ppm = skew_bound_ppm = None
+    if steady.size:
+        first = steady[0]
+        span_s = (known["due_ns"][-1] - known["due_ns"][first]) * 1e-9
+        if span_s > _SKEW_SPAN_S:
+            skew_ppm = _number(1e6 * (offset_s[-1] - offset_s[first]) / span_s)
+            skew_bound_ppm = _number(1e6 * (bound_s[-1] + bound_s[first]) / span_s)
     return {
         "status": "measured",
         "samples": exchanges,
-        "offset_s": _number(offset_s),
-        "bound_s": _number(bound_s),
+        "offset_s": _number(offset_s[-1]),
+        "bound_s": _number(bound_s[-1]),
+        "skew_ppm": skew_ppm,
+        "skew_bound_ppm": skew_bound_ppm,
     }
 
 

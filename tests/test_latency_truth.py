@@ -11,10 +11,11 @@ from gcs.lockstep import START_NS, fly_lockstep
 from gcs.plan import flight_plan
 from gcs.record import TickArray
 from gcs.station import Station
+from gcs.summary import summarise
 from scenarios.files import load
 from scenarios.schema import Clocks, FixedGains, Jitter, Link, Links, Monitor, Safety
 from sim_vehicles.fleet import Fleet
-from sim_vehicles.truth import DTYPE, LINK_DOWN, LINK_UP, Row
+from sim_vehicles.truth import DTYPE, LINK_DOWN, LINK_UP, SAMPLED, Row
 
 CHAIN = load(Path(__file__).parent.parent / "scenarios" / "chain3.toml")
 WEAK = FixedGains(K1=-0.05, K2=0.0, K3=0.001)
@@ -109,6 +110,20 @@ def test_the_clock_offset_is_never_outside_its_bound(name: str) -> None:
     error_s = [(int(row["sample_ns"]) - when[int(row["system_id"]), int(row["sample_boot_ms"])]) * 1e-9 for row in rows]
     assert len(error_s) > 700
     assert (np.abs(error_s) <= rows["clock_offset_bound_s"]).all()
+
+
+@pytest.mark.parametrize("name", ["drift 300 ppm", "asymmetric"])
+def test_the_skew_of_a_clock_is_that_of_its_time_stamps(name: str) -> None:
+    ticks, truth = flown(name)
+    events = [{"time_s": 8.0, "kind": "end", "text": "completed: duration reached"}]
+    summary = summarise(CHAIN, {"delay_margin_s": 1.0, "delay_margin_continuous_s": 1.0}, ticks, events)
+    for vehicle in summary["vehicles"]:
+        own = truth[(truth["kind"] == SAMPLED) & (truth["system_id"] == vehicle["system_id"])]
+        slope, _ = np.polyfit((own["time_ns"] - own["time_ns"][0]) * 1e-9, own["key"] * 1e-3, 1)
+        clock = vehicle["clock"]
+        # stamps are whole milliseconds, over 8 s and more
+        assert clock["skew_ppm"] == pytest.approx(1e6 * (slope - 1.0), abs=30.0)
+        assert abs(clock["skew_ppm"] - 1e6 * (slope - 1.0)) < clock["skew_bound_ppm"]
 
 
 def test_loss_and_duplicates_are_those_of_the_links_though_they_reorder() -> None:

@@ -22,7 +22,9 @@ def test_each_estimate_bears_its_status_and_samples_and_an_unknown_is_none() -> 
     rtt = of[2]["rtt_s"]
     # numpy's percentile of 1..200 ms: 1 + 199 * 0.95
     assert (rtt["status"], rtt["samples"], rtt["max"], rtt["p95"]) == ("measured", 200, 0.2, 0.19005)
-    assert of[2]["clock"] == {"status": "measured", "samples": 200, "offset_s": 3.0, "bound_s": 0.02, "jumps": 1}
+    clock = of[2]["clock"]
+    assert (clock["status"], clock["samples"], clock["jumps"]) == ("measured", 200, 1)
+    assert (clock["offset_s"], clock["bound_s"]) == (3.0, 0.02)
     assert of[2]["station_queue_s"]["p50"] == 0.0002
     nothing = {"p50": None, "p95": None, "p99": None, "max": None, "samples": 0, "status": "unknown"}
     for name in ("rtt_s", "down_delay_s", "telemetry_age_s", "loop_delay_s"):
