@@ -1,5 +1,7 @@
 """How fast flights are computed: virtual time against real time, and what the station takes of its control period."""
 
+import os
+import tempfile
 import time  # noqa: TID251 - the time it takes is what is measured; nothing flown depends on it
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,9 +53,7 @@ def with_vehicles(scenario: Scenario, count: int) -> Scenario:
 
 def benchmark(scenario: Scenario, *, seconds: float, repeat: int) -> dict[str, Any]:
     """Fly `seconds` of a scenario `repeat` times in virtual time; figures of the fastest and of the median flight."""
-    gains = FixedGains(K1=-3.4, K2=0.6, K3=5.6)  # no solver is measured
-    control = scenario.control.model_copy(update={"gains": gains})
-    _, plan = flight_plan(scenario.model_copy(update={"duration_s": seconds, "control": control}))
+    _, plan = flight_plan(_without_solver(scenario, seconds))
     flights = [_flight(plan) for _ in range(repeat)]
     fastest = min(flights, key=lambda flight: flight["s_per_tick"])
     period_s = 1.0 / scenario.rates.control_hz
@@ -68,6 +68,34 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int) -> dict[str, A
         "ticks": fastest["ticks"],
         "flights": repeat,
     }
+
+
+def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]:
+    """Fly `seconds` of a scenario over UDP: how punctual the station was, and its latencies against the truth."""
+    from gcs.grade import grade
+    from gcs.summary import finish
+    from gcs.trial_realtime import fly_real_time
+
+    designed, plan = flight_plan(_without_solver(scenario, seconds))
+    with tempfile.TemporaryDirectory(prefix="bench-") as name:
+        folder = Path(name) / "run"
+        _, _, steal_share = fly_real_time(plan, designed, folder)
+        summary, graded = finish(folder), grade(folder)
+    return {
+        "control": summary["control"],
+        "reason": summary["reason"],
+        "steal_share": steal_share,
+        "load_average": os.getloadavg()[0],
+        **graded,
+    }
+
+
+def _without_solver(scenario: Scenario, seconds: float) -> Scenario:
+    gains = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
+    control = scenario.control.model_copy(
+        update={"gains": gains, "alpha": None, "delay_margin_s": None, "decay_rate_1_s": None}
+    )
+    return scenario.model_copy(update={"duration_s": seconds, "control": control})
 
 
 def _flight(plan: FlightPlan) -> dict[str, float]:
@@ -93,3 +121,17 @@ def print_benchmark(result: dict[str, Any]) -> None:
         f"station alone   {1e6 * result['station_s_per_tick']:.0f} µs a tick, "
         f"{100 * result['station_share_of_period']:.1f} % of its period"
     )
+
+
+def print_real_time(result: dict[str, Any]) -> None:
+    """How punctual the station was, then the errors of what it measured."""
+    from gcs.grade import print_grade
+
+    control = result["control"]
+    late = control["lateness_s"]
+    print(f"{result['reason']}; load {result['load_average']:.1f}, {result['steal_share']:.1%} taken by the host")
+    print(
+        f"set-points sent after they were due: p50 {1e3 * late['p50']:.3f} ms, p99 {1e3 * late['p99']:.3f} ms, "
+        f"{control['deadline_misses']} deadline misses of {control['ticks']} ticks"
+    )
+    print_grade(result)

@@ -189,17 +189,27 @@ def bench(
     ] = 0,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="flight time of each flight")] = 8.0,
     repeat: Annotated[int, typer.Option(metavar="N", min=1, help="flights; the fastest counts")] = 10,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="one flight over UDP instead: is it punctual, are its latencies true?")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """How much faster than real time flights are computed, and what the station takes of its control period."""
-    from gcs.benchmark import benchmark, print_benchmark, with_vehicles
+    from gcs import benchmark
 
     scenario = _scenario(scenario_file)
-    result = benchmark(with_vehicles(scenario, vehicles) if vehicles else scenario, seconds=seconds, repeat=repeat)
+    if vehicles:
+        scenario = benchmark.with_vehicles(scenario, vehicles)
+    if real_time:
+        result = benchmark.benchmark_real_time(scenario, seconds=seconds)
+    else:
+        result = benchmark.benchmark(scenario, seconds=seconds, repeat=repeat)
     if as_json:
         typer.echo(json.dumps(result, indent=2))
+    elif real_time:
+        benchmark.print_real_time(result)
     else:
-        print_benchmark(result)
+        benchmark.print_benchmark(result)
 
 
 @app.command()
@@ -229,6 +239,23 @@ def _rates(text: str) -> list[float]:
     if not rates or not all(0.1 <= rate <= 1000.0 for rate in rates):
         raise typer.BadParameter(f"--rates: {text}, wanted numbers from 0.1 to 1000 with commas, for example 2,5,10")
     return rates
+
+
+@app.command()
+def grade(run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder")], as_json: AsJson = False) -> None:
+    """How true a flight's latencies were, and how punctual its emulated links: errors against the truth log."""
+    from gcs.grade import grade as graded
+    from gcs.grade import print_grade
+    from gcs.summary import RunError
+
+    try:
+        result = graded(run)
+    except RunError as error:
+        raise typer.BadParameter(str(error)) from None
+    if as_json:
+        typer.echo(json.dumps(result, indent=2))
+    else:
+        print_grade(result)
 
 
 @app.command()

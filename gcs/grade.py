@@ -1,27 +1,100 @@
-"""What a flight measured of its links, graded against the truth that the emulated links wrote down.
+"""`gcs grade`: what a flight measured of its links, against the truth that vehicles and emulated links wrote down.
 
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
 loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
 acts; both are in the truth by the time_boot_ms that the messages bear.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gcs.record import TickArray
+from gcs.report import UNKNOWN
+from gcs.sitl import TRUTH_FILE
+from gcs.summary import RunError, read_ticks
+from sim_vehicles.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
 
 FloatArray = NDArray[np.float64]
 Truth = NDArray[np.void]
-"""Records as sim_vehicles.truth.DTYPE lays them out; kinds 1 SAMPLED and 2 ACTED."""
+"""Records as sim_vehicles.truth.DTYPE lays them out."""
 
-_SAMPLED, _ACTED = 1, 2
+_TIMESYNC = 111
+
+
+def grade(folder: Path) -> dict[str, Any]:
+    """Grade a run: the loop delays and round trips it measured, and how punctual its emulated links were.
+
+    Raises
+    ------
+    RunError
+        If the folder is not a run, or has no truth log.
+    """
+    try:
+        truth = read_truth(folder / TRUTH_FILE)
+    except (OSError, ValueError):
+        raise RunError(
+            f"{folder}: read no {TRUTH_FILE}, wanted the folder of a run whose vehicles the station started"
+        ) from None
+    ticks = read_ticks(folder)
+    flown = ticks[ticks["time_s"] >= 0.0]
+    system_ids = np.unique(ticks["system_id"]).tolist()
+    trip_errors_s = np.concatenate([_trip_errors_s(ticks, truth, system_id) for system_id in system_ids])
+    left = truth[(truth["kind"] == LINK_UP) & (truth["fate"] & DROPPED == 0)]
+    late_s = (left["time_ns"] - left["due_ns"]) * 1e-9
+    return {
+        "vehicles": len(system_ids),
+        "loop_delay": graded(flown["loop_delay_s"], true_loop_delays_s(flown, truth)),
+        "rtt": graded(trip_errors_s, np.zeros(len(trip_errors_s))),
+        "link_delay": graded(late_s, np.zeros(len(late_s))),
+    }
+
+
+def print_grade(result: dict[str, Any]) -> None:
+    """One line for each quantity."""
+    kinds = {
+        "loop_delay": "loop delay, measured",
+        "rtt": "round trip, measured",
+        "link_delay": "link delay, applied upwards",
+    }
+    print(f"errors against the truth, {result['vehicles']} vehicles, ms")
+    for name, title in kinds.items():
+        own = result[name]
+        figures = [_ms(own[f"error_{part}_s"]) for part in ("p50", "p99", "max")]
+        print(f"{title:<28} p50 {figures[0]}  p99 {figures[1]}  max {figures[2]}  of {own['samples']}")
+
+
+def _ms(value_s: float | None) -> str:
+    return UNKNOWN if value_s is None else f"{1e3 * value_s:.3f}"
+
+
+def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:
+    """Each measured round trip against that of the newest reply which had left before the tick that logs it."""
+    rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
+    due_ns, trip_s = true_round_trips(truth, system_id)
+    newest = np.searchsorted(due_ns, rows["sent_ns"]) - 1
+    known = newest >= 0
+    return rows["rtt_s"][known] - trip_s[newest[known]]
+
+
+def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """TIMESYNC requests that the vehicle answered at once: when each reply was due (ns), and its round trip (s)."""
+    own = truth[(truth["system_id"] == system_id) & (truth["key"] == _TIMESYNC) & (truth["fate"] & DROPPED == 0)]
+    asked, answered = own[own["kind"] == LINK_DOWN], own[own["kind"] == LINK_UP]
+    sent_ns = dict(zip(asked["due_ns"].tolist(), asked["entered_ns"].tolist(), strict=True))
+    replies = sorted(
+        (due_ns, (due_ns - sent_ns[entered_ns]) * 1e-9)
+        for entered_ns, due_ns in zip(answered["entered_ns"].tolist(), answered["due_ns"].tolist(), strict=True)
+        if entered_ns in sent_ns
+    )
+    return np.array([due for due, _ in replies], dtype=np.int64), np.array([trip for _, trip in replies])
 
 
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
     """The true loop delay of each row of ticks, in s; NaN where its set-point never acted or no state is known."""
-    sampled, acted = (_instants(truth, kind) for kind in (_SAMPLED, _ACTED))
+    sampled, acted = (_instants(truth, kind) for kind in (SAMPLED, ACTED))
     out = np.full(len(ticks), np.nan)
     for k in np.flatnonzero(ticks["commanded"]):
         row = ticks[k]

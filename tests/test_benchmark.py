@@ -1,8 +1,13 @@
 """`gcs bench`: what it says is measured, whatever the machine."""
 
+import json
 from pathlib import Path
 
+import pytest
+from typer.testing import CliRunner
+
 from gcs.benchmark import benchmark, with_vehicles
+from gcs.cli import app
 from scenarios.files import load
 
 TRIANGLE = Path(__file__).parent.parent / "scenarios" / "triangle5.toml"
@@ -26,3 +31,23 @@ def test_columns_keep_their_places_behind_one_leader() -> None:
         assert vehicle.offset_ne_m is not None
         ahead = place[vehicle.follows]
         assert tuple(a + b for a, b in zip(ahead, vehicle.offset_ne_m, strict=True)) == place[vehicle.system_id]
+
+
+@pytest.mark.realtime
+def test_in_real_time_latencies_are_graded_against_the_truth() -> None:
+    result = CliRunner().invoke(app, ["bench", str(TRIANGLE), "--real-time", "--seconds", "3", "--json"])
+    assert result.exit_code == 0, result.output
+    grade = json.loads(result.stdout)
+    assert grade["reason"].startswith("completed")
+    assert grade["control"]["ticks"] + grade["control"]["deadline_misses"] >= 150
+    # each state in each tick, ten round trips a second of each vehicle, each report and reply
+    assert grade["loop_delay"]["samples"] > 600
+    assert grade["rtt"]["samples"] > 100
+    assert grade["link_delay"]["samples"] > 800
+    assert grade["loop_delay"]["error_p50_s"] < 0.005
+
+
+def test_a_run_without_truth_is_refused_in_one_line(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["grade", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "read no truth.bin" in result.output
