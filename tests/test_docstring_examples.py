@@ -70,11 +70,11 @@ def classes_taken(functions: dict[str, Any]) -> dict[str, Any]:
     return {full: value for full, value in classes.items() if full in named}
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", ["gains", *(f"gains.{name}" for name in MODULES)])
 def test_the_examples_of_a_module_run_as_they_stand_in_an_empty_session(name: str) -> None:
     report: list[str] = []
     runner = doctest.DocTestRunner(verbose=False)
-    for example in doctest.DocTestFinder().find(import_module(f"gains.{name}"), globs={}):
+    for example in doctest.DocTestFinder().find(import_module(name), globs={}):
         runner.run(example, out=report.append)
     assert runner.failures == 0, "".join(report)
 
@@ -91,6 +91,10 @@ def test_every_function_that_is_called_and_every_class_it_takes_has_an_example()
         or not doctest.DocTestParser().get_examples(doc)
     ]
     assert without == []
+
+
+def test_the_package_names_every_module_that_is_called() -> None:
+    assert set(re.findall(r"`(\w+)`", gains.__doc__ or "")) == {*MODULES} - INTERNAL_MODULES
 
 
 def test_what_is_called_internal_is_there() -> None:
