@@ -1,7 +1,8 @@
 """Curves of solutions (omega, alpha, beta) of det(j omega I - A0 - A1 e^{-j alpha} - A2 e^{-j beta}) = 0, omega > 0.
 
-Two real equations in three unknowns: curves on the torus of the two angles. Starting points come from a grid of alpha;
-each curve is followed by a predictor along its tangent and a Newton corrector until it closes or omega reaches zero.
+Two real equations in three unknowns: curves on the torus of the two angles. Starting points come from a grid of alpha
+and one of beta; each curve is followed by a predictor along its tangent and a Newton corrector until it closes or omega
+reaches zero.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from gains.delay_loci import ComplexArray, UnitCrossing, unit_crossings
 from gains.delay_sweep import near_unit_extrema
 from gains.structure import FloatArray
 
-# angles alpha from which curves are looked for, and angles beta of each search
+# angles from which curves are looked for, and angles of the other delay in each search
 _SEED_ANGLES, _SEARCH_ANGLES = 48, 160
 # a local extremum of a real part closer to the axis than this, relative to the norm, is refined
 _NEAR_AXIS = 0.1
@@ -46,8 +47,10 @@ def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[C
     terms = np.array([A0, A1, A2]) / scale
     curves: list[FloatArray] = []
     # an angle off the round ones, where curves of symmetric loops meet
-    for alpha in (np.arange(_SEED_ANGLES) + 0.37) * (2.0 * pi / _SEED_ANGLES):
-        for start in _solutions_at(terms, float(alpha)):
+    for angle in ((np.arange(_SEED_ANGLES) + 0.37) * (2.0 * pi / _SEED_ANGLES)).tolist():
+        # from a grid of beta as well: where A2 has no part, a curve has one alpha, which no grid meets
+        swapped = [start[[0, 2, 1]] for start in _solutions_at(terms[[0, 2, 1]], angle)]
+        for start in [*_solutions_at(terms, angle), *swapped]:
             if not any(_passes(curve, start) for curve in curves):
                 curves.append(_followed(terms, start))
     return [Curve(curve[:, 0] * scale, curve[:, 1], curve[:, 2]) for curve in curves if len(curve) > 1]

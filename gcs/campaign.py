@@ -16,7 +16,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from gcs.trial import Outcome, Trial, fly_trial
+from gcs.measure import fly_trial
+from gcs.trial import Outcome, Trial
 
 TRIALS_FILE = "trials.jsonl"
 PARQUET_FILE = "trials.parquet"

@@ -18,11 +18,11 @@ from gains.errors import GainsError
 from gains.formation import FormationModel
 from gains.robust import disturbance_bound
 from gcs.design_cost import RATIO, DesignCost, ratios
+from gcs.flown import fly_virtual
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import TickArray
 from gcs.report import UNKNOWN, number_text
 from gcs.summary import summarise
-from gcs.trial import fly_virtual
 from scenarios.files import dump
 from scenarios.schema import Control, Scenario
 

@@ -94,7 +94,7 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
 
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
     """The true loop delay of each row of ticks, in s; NaN where its set-point never acted or no state is known."""
-    sampled, acted = (_instants(truth, kind) for kind in (SAMPLED, ACTED))
+    sampled, acted = (instants(truth, kind) for kind in (SAMPLED, ACTED))
     out = np.full(len(ticks), np.nan)
     for k in np.flatnonzero(ticks["commanded"]):
         row = ticks[k]
@@ -106,15 +106,15 @@ def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
     return out
 
 
-def _instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
+def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
     """(System id, time_boot_ms) to the first instant with that key."""
     own = truth[truth["kind"] == kind]
-    instants: dict[tuple[int, int], int] = {}
+    found: dict[tuple[int, int], int] = {}
     for system_id, key, time_ns in zip(
         own["system_id"].tolist(), own["key"].tolist(), own["time_ns"].tolist(), strict=True
     ):
-        instants.setdefault((system_id, key), time_ns)
-    return instants
+        found.setdefault((system_id, key), time_ns)
+    return found
 
 
 def graded(measured_s: FloatArray, true_s: FloatArray) -> dict[str, Any]:

@@ -35,7 +35,7 @@ FOLLOWER_MODES = 4
 _RANK_FLOOR = 1e-9
 _LEAST_SHARE = 0.1
 """A mode counts when it carries this part of the motion: what rounding and noise of the clock add carries less."""
-_CHANNELS = (
+CHANNELS = (
     "spacing_error_north_m",
     "spacing_error_east_m",
     "velocity_error_north_m_s",
@@ -67,7 +67,8 @@ class Growth:
     """Rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
 
     `error_1_s` is the standard error: the larger of what the misfit allows and of half the difference between the
-    first and the second half of the window. The window is `start_s` to `end_s` of the motion's time.
+    first and the second half of the window. The window is `start_s` to `end_s` of the motion's time. A rate that is no
+    mode's has the frequency 0.
     """
 
     growth_1_s: float
@@ -90,7 +91,7 @@ def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -
         rows = ticks[(ticks["system_id"] == system_id) & ticks["commanded"] & (ticks["time_s"] >= 0.0)]
         boot_ms, first = np.unique(rows["sample_boot_ms"], return_index=True)
         rows, time_s = rows[first], (boot_ms - boot_ms[:1]) * 1e-3
-        values = np.stack([rows[name] for name in _CHANNELS], axis=1).astype(np.float64)
+        values = np.stack([rows[name] for name in CHANNELS], axis=1).astype(np.float64)
         values = values[:, np.isfinite(values).all(axis=0)]  # the leader has no spacing error
         columns.append(_equally_spaced(time_s, values, period_s))
     count = min((len(column) for column in columns), default=0)
@@ -104,10 +105,7 @@ def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: 
     The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. `modes` is how many are looked for: a
     loop of several vehicles has more that last. None if fewer than `FEWEST_SAMPLES` are left or nothing moves.
     """
-    inside = (motion.time_s >= start_s) & (motion.time_s < end_s)
-    values, time_s = motion.values[inside], motion.time_s[inside]
-    values = values[: _count_before_rest(values)]
-    time_s = time_s[: len(values)]
+    time_s, values = _window(motion, start_s, end_s)
     if len(values) < FEWEST_SAMPLES:
         return None
     step = max(1, len(values) // _MOST_SAMPLES)
@@ -132,6 +130,19 @@ def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: 
     )
 
 
+def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Growth | None:
+    """The growth rate of a motion through delays that vary: slope of the logarithm of its size, all channels together.
+
+    Such a motion has no modes of its own, only a mean rate; to fit modes to it finds some that are not there. The
+    window is that of `fit_growth`, the standard error half the difference between its halves.
+    """
+    time_s, values = _window(motion, start_s, end_s)
+    scale = np.sqrt((values**2).mean(axis=0)) if len(values) else np.zeros(0)
+    size = np.linalg.norm(values[:, scale > 0.0] / scale[scale > 0.0], axis=1)
+    time_s, size = time_s[size > 0.0], size[size > 0.0]
+    return None if size.size < FEWEST_SAMPLES else _slope(time_s, np.log(size))
+
+
 def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Growth | None:
     """The growth rate of a whole formation's errors, from their size at every `period_s`: slope of ln(envelope).
 
@@ -148,6 +159,11 @@ def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Gro
     time_s, level = time_s[inside], np.log(envelope[inside])
     if time_s.size < _FEWEST_ENVELOPE:
         return None
+    return _slope(time_s, level)
+
+
+def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
+    """The slope of a logarithm over time, and half the difference of its halves."""
     slopes = [float(np.polyfit(t, y, 1)[0]) for t, y in _whole_and_halves(time_s, level)]
     return Growth(
         growth_1_s=slopes[0],
@@ -162,6 +178,14 @@ def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Gro
 def _whole_and_halves(time_s: FloatArray, level: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     half = time_s.size // 2
     return [(time_s, level), (time_s[:half], level[:half]), (time_s[half:], level[half:])]
+
+
+def _window(motion: Motion, start_s: float, end_s: float) -> tuple[FloatArray, FloatArray]:
+    """Instants and values from the start to the end, or until the motion has died away."""
+    inside = (motion.time_s >= start_s) & (motion.time_s < end_s)
+    values = motion.values[inside]
+    values = values[: _count_before_rest(values)]
+    return motion.time_s[inside][: len(values)], values
 
 
 def _equally_spaced(time_s: FloatArray, values: FloatArray, period_s: float) -> FloatArray:

@@ -5,7 +5,7 @@ vehicle is a loop of its own. The formation is stable exactly when every loop is
 loop with the least room, margin minus loop delay, is the one that breaks first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gains.formation import FormationModel
 from gains.rightmost import rightmost_root
 from gains.sampled import growth_rate, sampled_delay_margin
+from gains.several_delays import late_by_vehicle
 from gains.structure import strongly_connected_blocks
 
 FloatArray = NDArray[np.float64]
@@ -39,8 +40,26 @@ class Loop:
 
     def growth_continuous_1_s(self, delay_s: float) -> float:
         """Real part of the rightmost root of the continuous model; the hold counts as half a period of delay."""
-        late = self.B @ self.K
-        return rightmost_root([(self.A, 0.0), (late, delay_s + self.period_s / 2.0)]).real
+        return self.growth_continuous_at_1_s(dict.fromkeys(self.system_ids, delay_s))
+
+    def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
+        """The same with a loop delay of its own for each vehicle's command, as in `gains.several_delays`."""
+        late = late_by_vehicle(self.B, self.K, [slice(2 * k, 2 * k + 2) for k in range(len(self.system_ids))])
+        delays_s = [loop_delay_s[system_id] + self.period_s / 2.0 for system_id in self.system_ids]
+        return rightmost_root([(self.A, 0.0), *zip(late, delays_s, strict=True)]).real
+
+    def growth_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
+        """Growth rate of the sampled loop with a loop delay of its own for each vehicle.
+
+        Exact where they are equal; elsewhere that at their mean, and what the continuous model says their differences
+        add to it.
+        """
+        delays_s = [loop_delay_s[system_id] for system_id in self.system_ids]
+        mean_s = sum(delays_s) / len(delays_s)
+        rate_1_s = self.growth_1_s(mean_s)
+        if max(delays_s) == min(delays_s):
+            return rate_1_s
+        return rate_1_s + self.growth_continuous_at_1_s(loop_delay_s) - self.growth_continuous_1_s(mean_s)
 
     def same_as(self, other: "Loop") -> bool:
         """Whether the other loop is the same system, of other vehicles."""
@@ -111,16 +130,16 @@ def distinct(loops: Sequence[Loop]) -> list[Loop]:
     return kinds
 
 
-def critical_loop(loops: Sequence[Loop], loop_delay_s: dict[int, float]) -> Loop:
-    """The loop of largest predicted growth, each at the largest loop delay of its vehicles; the first in a tie."""
+def critical_loop(loops: Sequence[Loop], loop_delay_s: Mapping[int, float]) -> Loop:
+    """The loop of largest predicted growth at the loop delays of its vehicles; the first in a tie."""
     rates: list[float] = []
-    known: list[tuple[Loop, float, float]] = []
+    known: list[tuple[Loop, list[float], float]] = []
     for loop in loops:
-        delay_s = max(loop_delay_s[system_id] for system_id in loop.system_ids)
-        rate = next((r for other, d, r in known if abs(d - delay_s) < 1e-9 and other.same_as(loop)), None)
+        delays_s = [round(loop_delay_s[system_id], 9) for system_id in loop.system_ids]
+        rate = next((r for other, d, r in known if d == delays_s and other.same_as(loop)), None)
         if rate is None:
-            rate = loop.growth_1_s(delay_s)
-            known.append((loop, delay_s, rate))
+            rate = loop.growth_at_1_s(loop_delay_s)
+            known.append((loop, delays_s, rate))
         rates.append(rate)
     return loops[int(np.argmax(rates))]
 

@@ -26,23 +26,17 @@ from gcs.record import TickArray
 from scenarios.schema import Link, Scenario, Vehicle
 
 PROBE_S = 20.0
-_LINEAR_SHARE = 0.2
-"""Part of the nominal speed that an error may reach: far from the singularity of the kinematics at speed zero."""
 
 
-def probe_scenario(
-    plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float, links: tuple[Link, Link], waiting_s: float
-) -> Scenario:
-    """The plan's scenario with every vehicle in place, but for an error of the given vehicles.
+def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
+    """The plan's scenario with every vehicle in place at its nominal velocity, but for an error of the given vehicles.
 
     The error is in the position of a follower (m) and in the velocity of the leader (m/s), whose position is not
-    controlled; north and east alike, and different for each vehicle. All vehicles get `links` (up, down), changed so
-    that telemetry waits `waiting_s` for the control tick.
+    controlled; north and east alike, and different for each vehicle.
     """
     scenario, place = plan.scenario, plan.formation.place_ne_m()
     row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
-    up, down = with_waiting(*links, period_s=1.0 / scenario.rates.control_hz, waiting_s=waiting_s)
     vehicles: list[Vehicle] = []
     for vehicle in scenario.vehicles:
         position = np.array(leader.position_ne_m) + place[row[vehicle.system_id]]
@@ -60,6 +54,20 @@ def probe_scenario(
         "vehicles": tuple(vehicles),
         "nominal_velocity": scenario.nominal_velocity[:1],
         "duration_s": PROBE_S,
+    }
+    return scenario.model_copy(update=update)
+
+
+def probe_scenario(
+    plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float, links: tuple[Link, Link], waiting_s: float
+) -> Scenario:
+    """The plan's scenario `in_place`, with one clock, and for all vehicles the same `links` (up, down).
+
+    The links are changed so that telemetry waits `waiting_s` for the control tick.
+    """
+    scenario = in_place(plan, system_ids, amplitude=amplitude)
+    up, down = with_waiting(*links, period_s=1.0 / scenario.rates.control_hz, waiting_s=waiting_s)
+    update = {
         "links": scenario.links.model_copy(update={"up": up, "down": down, "vehicles": ()}),
         "clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0, "offset_max_s": 0.0}),
     }
@@ -86,17 +94,18 @@ def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> 
     return moved(up, -from_up_s), moved(down, to_down_s)
 
 
-def linear_until_s(scenario: Scenario, own: TickArray) -> float:
+def linear_until_s(scenario: Scenario, own: TickArray, *, share: float) -> float:
     """Time since the first of the rows at which an error leaves the range in which no limit and no singularity is near.
 
-    `own` are rows of the probed vehicles, in order of time; infinity if none leaves it.
+    `own` are rows of the probed vehicles, in order of time; infinity if none leaves it. `share` is the part of the
+    nominal speed that an error may reach: the kinematics are singular at speed zero.
     """
     limits = scenario.limits
     speed = float(np.hypot(*scenario.nominal_velocity[0].velocity_ne_m_s))
-    room_m_s = [_LINEAR_SHARE * speed, speed - limits.speed_min_m_s, (limits.speed_max_m_s or np.inf) - speed]
+    room_m_s = [share * speed, speed - limits.speed_min_m_s, (limits.speed_max_m_s or np.inf) - speed]
     command_m_s2 = 0.9 * min(
         limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2,
-        (limits.turn_rate_max_rad_s or np.inf) * (1.0 - _LINEAR_SHARE) * speed,
+        (limits.turn_rate_max_rad_s or np.inf) * (1.0 - share) * speed,
     )
     error_m_s = np.hypot(own["velocity_error_north_m_s"], own["velocity_error_east_m_s"])
     size_m_s2 = np.hypot(own["command_north_m_s2"], own["command_east_m_s2"])

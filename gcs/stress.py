@@ -315,9 +315,9 @@ def _fly_again(options: StressOptions, folder: Path, wanted: str, *, as_json: bo
     from dataclasses import replace
 
     from gcs.campaign import Store
+    from gcs.measure import fly_trial
     from gcs.observer import record_run
     from gcs.summary import finish
-    from gcs.trial import fly_trial
 
     study, _ = _study(options)
     with contextlib.closing(Store(folder)) as store:

@@ -108,7 +108,7 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
     return scenario
 
 
-def has_regular_links(scenario: Scenario) -> bool:
+def has_constant_links(scenario: Scenario) -> bool:
     """Whether every link has a constant delay and nothing else, so that the models say exactly what it does."""
     links = scenario.links
     every = [links.up, links.down, *(link for v in links.vehicles for link in (v.up, v.down) if link is not None)]

@@ -14,7 +14,7 @@ from gcs.trial import Outcome, plan_loops
 
 FloatArray = NDArray[np.float64]
 
-_SAMPLED, _CONTINUOUS, _MEASURED, _LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
+SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
 _DPI = 130
 _WORST = 6
 
@@ -37,26 +37,26 @@ def growth_figure(
     room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 160)
     sampled, continuous = _curves(distinct(plan_loops(study.plan)), grid_s)
-    above.axhline(0.0, color=_LIMIT, linewidth=0.8)
-    above.plot(grid_s, continuous, color=_CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
-    above.plot(grid_s, sampled, color=_SAMPLED, linewidth=1.4, label="sampled model, exact")
-    style: dict[str, Any] = {"fmt": "o", "color": _MEASURED, "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0}
+    above.axhline(0.0, color=LIMIT, linewidth=0.8)
+    above.plot(grid_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
+    above.plot(grid_s, sampled, color=SAMPLED, linewidth=1.4, label="sampled model, exact")
+    style: dict[str, Any] = {"fmt": "o", "color": MEASURED, "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0}
     above.errorbar(delay_s, measured, yerr=error, label="flights", zorder=3, **style)
     _mark_own(above, own)
     margin_s = study.plan.delay_margin_s
     if grid_s[0] <= margin_s <= grid_s[-1]:
-        above.axvline(margin_s, color=_SAMPLED, linestyle="--", linewidth=1.0)
+        above.axvline(margin_s, color=SAMPLED, linestyle="--", linewidth=1.0)
         text = f" margin {margin_s:.4f} s"
-        above.annotate(text, (margin_s, float(measured.min())), color=_SAMPLED, ha="left", va="bottom", fontsize=9)
+        above.annotate(text, (margin_s, float(measured.min())), color=SAMPLED, ha="left", va="bottom", fontsize=9)
     if onset is not None:
-        above.plot([onset.loop_delay_s], [0.0], marker="D", color="none", markeredgecolor=_MEASURED, markersize=11)
+        above.plot([onset.loop_delay_s], [0.0], marker="D", color="none", markeredgecolor=MEASURED, markersize=11)
         text = f"onset in flight {onset.loop_delay_s:.4f} s"
         at = (onset.loop_delay_s, 0.0)
-        above.annotate(text, at, xytext=(-14, 16), textcoords="offset points", color=_MEASURED, ha="right", fontsize=9)
+        above.annotate(text, at, xytext=(-14, 16), textcoords="offset points", color=MEASURED, ha="right", fontsize=9)
         _link_delay_axis(above, onset)
     above.set_ylabel("growth rate of errors [1/s]\n< 0 they die away, > 0 they grow")
     above.legend(loc="upper left", frameon=False)
-    below.axhline(0.0, color=_LIMIT, linewidth=0.8)
+    below.axhline(0.0, color=LIMIT, linewidth=0.8)
     below.errorbar(delay_s, measured - predicted, yerr=error, **style)
     below.set_ylabel("flight − sampled\n[1/s]")
     below.set_xlabel("loop delay, as measured in flight [s]")
@@ -72,52 +72,17 @@ def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path 
         return None
     figure, (plot,) = figure_of(1, (9.0, 4.2))
     at = [o.coordinates[axis.name] for o in probes]
-    plot.axhline(0.0, color=_LIMIT, linewidth=0.8)
-    plot.plot(at, [o.predicted_growth_1_s for o in probes], "_", color=_SAMPLED, markersize=14, label="sampled model")
+    plot.axhline(0.0, color=LIMIT, linewidth=0.8)
+    plot.plot(at, [o.predicted_growth_1_s for o in probes], "_", color=SAMPLED, markersize=14, label="sampled model")
     plot.errorbar(
         at,
         [o.growth_1_s for o in probes],
         yerr=[o.growth_error_1_s for o in probes],
-        fmt="o", color=_MEASURED, markersize=4.0, capsize=2.0, label="flights",
+        fmt="o", color=MEASURED, markersize=4.0, capsize=2.0, label="flights",
     )  # fmt: skip
     plot.set_xlabel(axis.label)
     plot.set_ylabel("growth rate of errors [1/s]")
     plot.legend(frameon=False)
-    return saved(figure, file)
-
-
-def map_figure(
-    file: Path, *, axes: Sequence[Axis], outcomes: Sequence[Outcome], verdicts: Sequence[Outcome]
-) -> Path | None:
-    """Measured growth over two axes, mean of the seeds, with the boundary in flight and the predicted one.
-
-    The marks are of the flights `verdicts`, of which the worst seed counts.
-    """
-    measured = _cells(axes, outcomes, "growth_1_s")
-    predicted = _cells(axes, outcomes, "predicted_growth_1_s")
-    if not np.isfinite(measured).any():
-        return None
-    across, up = (np.array(axis.values) for axis in axes)
-    figure, (plot,) = figure_of(1, (9.0, 5.6))
-    reach = max(1e-6, min(float(np.nanmax(np.abs(measured))), 1.0))
-    colors = plot.pcolormesh(across, up, measured.T, cmap="RdBu_r", vmin=-reach, vmax=reach, shading="nearest")
-    figure.colorbar(colors, ax=plot, label="growth rate in flight [1/s]: red grows", extend="both")
-    for values, color, dashes in ((measured, _MEASURED, "solid"), (predicted, "black", "dashed")):
-        if np.nanmin(values) < 0.0 < np.nanmax(values) and min(values.shape) > 1:
-            plot.contour(across, up, values.T, levels=[0.0], colors=[color], linestyles=[dashes], linewidths=2.0)
-    found = _verdicts(axes, verdicts)
-    for verdict, marker, size in (("unstable", "x", 22), ("stable", "o", 8)):
-        at = np.argwhere(found == verdict)
-        # on the dark ends of the colours, light marks
-        dark = np.abs(measured[at[:, 0], at[:, 1]]) > 0.6 * reach
-        ink = np.where(dark, "white", "#222222")
-        plot.scatter(across[at[:, 0]], up[at[:, 1]], marker=marker, s=size, c=ink, linewidths=0.9)
-    plot.set_xlabel(axes[0].label)
-    plot.set_ylabel(axes[1].label)
-    plot.set_title(
-        "flights: × unstable, • stable;  boundaries: — in flight, - - predicted (sampled, at the measured loop delay)",
-        fontsize=9,
-    )
     return saved(figure, file)
 
 
@@ -160,28 +125,6 @@ def _curves(kinds: Sequence[Loop], delay_s: FloatArray) -> tuple[FloatArray, Flo
     return sampled.max(axis=0), continuous.max(axis=0)
 
 
-def _cells(axes: Sequence[Axis], outcomes: Sequence[Outcome], field: str) -> FloatArray:
-    """A field as an array over two axes, mean of the seeds; NaN where no seed has it."""
-    values = np.full([len(axis.values) for axis in axes], np.nan)
-    for place in np.ndindex(*values.shape):
-        at = {axis.name: axis.values[k] for axis, k in zip(axes, place, strict=True)}
-        known = [getattr(o, field) for o in outcomes if o.coordinates == at]
-        known = [value for value in known if value is not None]
-        if known:
-            values[place] = float(np.mean(known))
-    return values
-
-
-def _verdicts(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> NDArray[np.str_]:
-    """The worst verdict of all seeds at each point, empty where nothing was flown."""
-    worst = np.full([len(axis.values) for axis in axes], "", dtype="U16")
-    for place in np.ndindex(*worst.shape):
-        at = {axis.name: axis.values[k] for axis, k in zip(axes, place, strict=True)}
-        found = {outcome.verdict for outcome in outcomes if outcome.coordinates == at}
-        worst[place] = next((verdict for verdict in ("unstable", "aborted", "stable") if verdict in found), "")
-    return worst
-
-
 def figure_of(
     rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
 ) -> tuple[Any, Any]:
@@ -201,7 +144,7 @@ def figure_of(
 
 def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
     """Verdicts of flights with large errors, at the link delay's loop delay, along the lower edge."""
-    for verdict, marker, color in (("stable", "o", _SAMPLED), ("unstable", "x", _MEASURED)):
+    for verdict, marker, color in (("stable", "o", SAMPLED), ("unstable", "x", MEASURED)):
         at = [o.loop_delay_s for o in own if o.verdict == verdict and o.loop_delay_s is not None]
         if at:
             label = f"own initial states: {verdict}"

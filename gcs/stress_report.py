@@ -29,7 +29,8 @@ def write_report(
 ) -> Path:
     """The page report.html with its figures inside, and the figures as PNG files beside it."""
     # matplotlib takes half a second to import: only when there is something to draw
-    from gcs.stress_figures import axis_figure, growth_figure, map_figure, worst_figure, worst_of
+    from gcs.stress_figures import axis_figure, growth_figure, worst_figure, worst_of
+    from gcs.stress_map import map_figure
 
     probes = [outcome for outcome in sweep if outcome.kind == "probe"]
     own = [outcome for outcome in sweep if outcome.kind == "own"]
@@ -48,7 +49,7 @@ def write_report(
     if len(axes) == 1 and not fitted:
         figures["axis"] = ("Growth of errors", axis_figure(folder / "axis.png", axis=axes[0], outcomes=points))
     if len(axes) == 2:
-        drawn = map_figure(folder / "map.png", axes=axes, outcomes=points, verdicts=own or points)
+        drawn = map_figure(folder / "map.png", study=study, axes=axes, outcomes=points, verdicts=own or points)
         figures["map"] = ("Map", drawn)
     figures["worst"] = ("The worst flights", worst_figure(folder / "worst.png", everything))
     page = rendered(

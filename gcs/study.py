@@ -11,7 +11,7 @@ from gains.delay import delay_margin
 from gcs.campaign import Run
 from gcs.onset import GrowthPoint, Loop, Zero, distinct, locate_zero
 from gcs.plan import FlightPlan
-from gcs.stress_axes import Axis, at_coordinates, has_regular_links
+from gcs.stress_axes import Axis, at_coordinates, has_constant_links
 from gcs.trial import CRITICAL, Kind, Outcome, Trial, plan_loops, sparse_gain
 
 _ROUNDS = 8
@@ -43,13 +43,12 @@ class Study:
     def sweep(self, axes: Sequence[Axis], *, seeds: int) -> list[Trial]:
         """The trials of a sweep (one axis) or map (two), with the scenario's seed and those that follow it.
 
-        At every point a probe, and, in a sweep and where links differ from vehicle to vehicle, the scenario's own
-        flight too. With links that lose or delay at random there is no free response to probe: then only the latter.
+        At every point a probe and the scenario's own flight. In real time links that lose or delay at random leave no
+        free response to probe, since no two flights have the same delays: then only the latter.
         """
         points = [dict(zip([a.name for a in axes], at, strict=True)) for at in product(*(a.values for a in axes))]
-        regular = all(has_regular_links(at_coordinates(self.plan.scenario, point)) for point in points)
-        both = len(axes) == 1 or any(axis.name.startswith("delay_") for axis in axes)
-        kinds: tuple[Kind, ...] = ("own",) if not regular else ("probe", "own") if both else ("probe",)
+        constant = all(has_constant_links(at_coordinates(self.plan.scenario, point)) for point in points)
+        kinds: tuple[Kind, ...] = ("own",) if self.real_time and not constant else ("probe", "own")
         first = self.plan.scenario.seed
         return [self.trial(kind, point, seed=first + k) for kind, point, k in product(kinds, points, range(seeds))]
 

@@ -27,11 +27,11 @@ from gains.pattern import Pattern, bidirectional, formation_plant, leader_follow
 from gains.requirement import Requirement
 from gains.rightmost import rightmost_root
 from gains.robust import robust_lmi
+from gcs.flown import fly_virtual
 from gcs.plan import flight_plan
 from gcs.record import TickArray
 from gcs.summary import summarise
 from gcs.thesis_flight import fly_with_late_neighbours
-from gcs.trial import fly_virtual
 from scenarios.files import load
 from scenarios.schema import Scenario
 

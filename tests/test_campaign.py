@@ -22,8 +22,9 @@ from gcs.campaign import (
     run_campaign,
     write_parquet,
 )
+from gcs.measure import fly_trial
 from gcs.study import Study
-from gcs.trial import Outcome, Trial, fly_trial
+from gcs.trial import Outcome, Trial
 
 TESTS = Path(__file__).parent
 

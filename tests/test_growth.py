@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from gcs.growth import Motion, envelope_growth, fit_growth, motion_of
+from gcs.growth import Motion, envelope_growth, fit_growth, motion_of, norm_growth
 from gcs.record import TICK, TickArray
 
 PERIOD_S = 0.02
@@ -73,6 +73,30 @@ def test_nothing_that_moves_and_too_short_a_motion_have_no_rate() -> None:
     assert fit_growth(motion((-0.1 + 4j, 0.0)), start_s=0.0) is None
     assert fit_growth(motion((-0.1 + 4j, 1.0), seconds=0.2), start_s=0.0) is None
     assert fit_growth(motion((-0.1 + 4j, 1.0)), start_s=5.0, end_s=5.1) is None
+    assert norm_growth(motion((-0.1 + 4j, 0.0)), start_s=0.0) is None
+    assert norm_growth(motion((-0.1 + 4j, 1.0)), start_s=25.0) is None
+
+
+@pytest.mark.parametrize("growth", [-0.3, 0.0, 0.4])
+def test_rate_of_a_motion_through_varying_delays_is_its_mean_rate_and_the_error_is_of_the_right_size(
+    growth: float,
+) -> None:
+    """A rate that wanders, over many seeds: no modes to fit."""
+    rng = np.random.default_rng(2)
+    time_s = np.arange(500, dtype=np.float64) * PERIOD_S
+    off: list[float] = []
+    errors: list[float] = []
+    for _ in range(60):
+        wander = 0.1 * np.cumsum(rng.standard_normal(time_s.size)) * np.sqrt(PERIOD_S)
+        angle = 3.7 * time_s + wander
+        values = np.exp(growth * time_s + wander)[:, None] * np.stack([np.cos(angle), 3.7 * np.sin(angle)], axis=1)
+        found = norm_growth(Motion(time_s, values, PERIOD_S), start_s=0.0)
+        assert found is not None
+        off.append(found.growth_1_s - growth)
+        errors.append(found.error_1_s)
+    spread = float(np.std(off))
+    assert abs(np.mean(off)) < 3.0 * spread / np.sqrt(60.0)
+    assert spread / 2.0 < np.sqrt(np.mean(np.square(errors))) < 2.0 * spread
 
 
 def ticks_with_samples(boot_ms: NDArray[np.int64]) -> TickArray:

@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gcs.flown import fly_virtual
 from gcs.plan import flight_plan
 from gcs.record import TickArray
 from gcs.stress_axes import at_coordinates
-from gcs.trial import fly_virtual
 from scenarios.files import load
 from scenarios.schema import Control, FixedGains, Scenario
 

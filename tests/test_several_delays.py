@@ -150,6 +150,22 @@ def test_a_gain_that_does_not_fit_the_inputs_is_refused() -> None:
         late_by_vehicle(np.ones((3, 2)), np.eye(3), [slice(0, 1), slice(1, 2)])
 
 
+def test_edge_of_two_delays_in_blocks_of_their_own_is_the_rectangle() -> None:
+    """Both sides, whichever matrix is called the first."""
+    formation, K = formation_with_k3((1.0, 0.5))
+    leader, *late = late_by_vehicle(formation.B, K, [formation.input_slice(i) for i in range(3)])
+    limits_s = delay_box(formation.A + leader, late).limits_s
+    for order in ((0, 1), (1, 0)):
+        first, second = (late[k] for k in order)
+        lines = boundary_of_two_delays(formation.A + leader, first, second, longest_s=(1.5, 1.5))
+        points = np.concatenate([line.delays_s for line in lines])
+        off_s = points - np.array([limits_s[k] for k in order])
+        for side, along in ((0, 1), (1, 0)):
+            on_side = np.abs(off_s[:, side]) < 1e-9
+            assert np.ptp(points[on_side, along]) > 0.8 * limits_s[order[along]]  # but for a step at each end
+        assert np.abs(off_s).min(axis=1).max() < 1e-9
+
+
 def test_vehicles_that_know_each_other_have_no_rectangle() -> None:
     # vehicle 1 also uses the spacing of vehicle 2: both delays act in one block
     formation, K = formation_with_k3((1.0, 1.0))

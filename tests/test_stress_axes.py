@@ -8,7 +8,7 @@ from stress_pair import SCENARIO
 from gcs.stress_axes import (
     AxisError,
     at_coordinates,
-    has_regular_links,
+    has_constant_links,
     parse_axis,
     parse_vehicle_axis,
     split_delay,
@@ -51,8 +51,8 @@ def test_every_coordinate_reaches_its_links_and_leaves_the_others() -> None:
     noisy = Link(jitter=Jitter(distribution="uniform", scale_s=0.01), loss_probability=0.1)
     for system_id, delay_s in ((1, 0.1), (2, 0.03)):
         assert scenario.link_of(system_id) == (noisy.model_copy(update={"delay_s": delay_s}),) * 2
-    assert not has_regular_links(scenario)
-    assert has_regular_links(at_coordinates(scenario, {"jitter": 0.0, "loss": 0.0}))
+    assert not has_constant_links(scenario)
+    assert has_constant_links(at_coordinates(scenario, {"jitter": 0.0, "loss": 0.0}))
 
 
 def test_jitter_keeps_the_distribution_that_a_link_has() -> None:

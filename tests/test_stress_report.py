@@ -93,13 +93,13 @@ def test_assert_onset_fails_where_the_margin_does_not_hold(tmp_path: Path) -> No
     assert "not met" in (out / "report.html").read_text(encoding="utf-8")
 
 
-def test_map_of_random_links_flies_the_scenarios_own_states_with_each_seed(tmp_path: Path) -> None:
+def test_map_of_random_links_flies_probes_and_the_scenarios_own_states_with_each_seed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ["--delay", "0,0.4", "--jitter", "0,0.01", "--seeds", "2", "--out", str(out), "--json"]
     result = json.loads(run(tmp_path, *options))
-    assert len(result["points"]) == 8
-    assert {point["seed"] for point in result["points"]} == {SCENARIO.seed, SCENARIO.seed + 1}
-    assert {point["kind"] for point in result["points"]} == {"own"}
+    for kind in ("probe", "own"):
+        seeds = [point["seed"] for point in result["points"] if point["kind"] == kind]
+        assert sorted(seeds) == 4 * [SCENARIO.seed] + 4 * [SCENARIO.seed + 1]
     verdicts = {(p["coordinates"]["delay"], p["verdict"]) for p in result["points"]}
     assert verdicts == {(0.0, "stable"), (0.4, "unstable")}
     assert (out / "map.png").stat().st_size > 0

@@ -1,0 +1,40 @@
+"""The constant loop delay that a vehicle's commands stand for, whatever their links did to each of them."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs.grade import ACTED, SAMPLED, Truth, instants
+from gcs.record import TickArray
+
+_TRUTH = np.dtype([("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_ns", "<i8")])
+
+
+def truth_of(records: Iterable[Sequence[int]]) -> Truth:
+    """Of the records of simulated vehicles those that say when states were sampled and set-points acted."""
+    return np.array([tuple(record[:4]) for record in records if record[0] in (SAMPLED, ACTED)], _TRUTH)
+
+
+def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
+    """(k, 2) instants in ns at which a vehicle's commands acted and at which the states used were sampled, in order."""
+    sampled, acted = (instants(truth[truth["system_id"] == system_id], kind) for kind in (SAMPLED, ACTED))
+    rows = ticks[(ticks["system_id"] == system_id) & ticks["commanded"]]
+    keys = zip(rows["key_ms"].tolist(), rows["sample_boot_ms"].tolist(), strict=True)
+    known = [((system_id, key), (system_id, boot)) for key, boot in keys]
+    pairs = [(acted[key], sampled[boot]) for key, boot in known if key in acted and boot in sampled]
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+
+
+def effective_delay_s(commands: NDArray[np.int64], *, period_s: float) -> float:
+    """The constant loop delay that commands like these stand for: mean age of the state behind them, less T / 2.
+
+    The command in action grows older until the next one acts, T / 2 more in the mean when all arrive. Unlike the
+    median of the loop delays this counts commands that never came. Where delays change fast against the loop's motion
+    only the mean age matters, to first order.
+    """
+    if len(commands) < 2:
+        return 0.0
+    acted_ns, sampled_ns = commands[:, 0], commands[:-1, 1]
+    held_s, late_s = np.diff(acted_ns) * 1e-9, (acted_ns[:-1] - sampled_ns) * 1e-9
+    return float((held_s * (late_s + held_s / 2.0)).sum() / held_s.sum()) - period_s / 2.0
