@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs.flown import Flight, fly_plan, fly_virtual, median_delays_s
 from gcs.effective_delay import commands_of, effective_delay_s
+from gcs.flown import Flight, fly_plan, fly_virtual, median_delays_s
 from gcs.growth import CHANNELS
 from gcs.plan import FlightPlan
 from gcs.probe import in_place, linear_until_s
@@ -85,7 +85,7 @@ def response_paired(
 def effective_delays_s(
     plan: FlightPlan, rows: TickArray, flight: Flight, system_ids: tuple[int, ...]
 ) -> dict[int, float]:
-    """What constant loop delay each vehicle's commands in these rows stand for, see `gcs.effective_delay.effective_delay_s`."""
+    """The constant loop delay that each vehicle's commands in these rows stand for."""
     assert flight.truth is not None
     period_s = 1.0 / plan.scenario.rates.control_hz
     return {

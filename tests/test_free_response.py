@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import expm
 from stress_pair import SCENARIO, pair_plan
 
-from gcs.free_response import FreeResponse, fly_calm, response_paired
 from gcs.effective_delay import commands_of, effective_delay_s
+from gcs.free_response import FreeResponse, fly_calm, response_paired
 from gcs.growth import CHANNELS, FloatArray
 from gcs.measure import fly_trial
 from gcs.onset import Loop
