@@ -7,6 +7,9 @@ where that modulus falls with the frequency, whatever the delay. Everything else
 
 The frequencies come from a pencil, see `_pencil_angles`. A sweep along the unit circle, which shares no algebra
 with it, is the second opinion.
+
+See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, for the same problem as a
+polynomial eigenvalue problem.
 """
 
 from collections.abc import Callable, Sequence

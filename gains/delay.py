@@ -4,6 +4,10 @@ The roots of det(sI - A0 - A1 e^{-s tau}) move continuously with tau and change 
 axis, at delays that come in arithmetic sequences (theta + 2 pi k) / omega. Starting from the unstable eigenvalues of
 A0 + A1 and counting crossings in and out gives every window of stability. Strongly connected blocks are analysed one
 by one, see `gains.structure`.
+
+Methods of this kind are set side by side in E. Jarlebring and M. E. Hochstenbach, "Polynomial two-parameter eigenvalue
+problems and matrix pencil methods for stability of delay-differential equations", arXiv:0809.3634. The test
+used here is derived in `gains.delay_crossings`.
 """
 
 from collections.abc import Sequence

@@ -82,6 +82,7 @@ class CoveringBound:
 
     @property
     def is_covered(self) -> bool:
+        """Whether some bound proves the loop stable under the jitter."""
         return self.cover != "none"
 
 

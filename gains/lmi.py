@@ -41,10 +41,12 @@ class Unknown:
 
     @property
     def is_symmetric(self) -> bool:
+        """Whether it was given one size only."""
         return self.columns == 0
 
     @property
     def count(self) -> int:
+        """How many independent entries it has."""
         return self.rows * (self.rows + 1) // 2 if self.is_symmetric else self.rows * self.columns
 
     def matrix(self, entries: FloatArray) -> FloatArray:

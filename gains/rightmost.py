@@ -3,6 +3,9 @@
 x'(t) = sum_k A_k x(t - tau_k) is the abstract ordinary equation u' = D u on functions over [-tau_max, 0] with the
 equation itself as boundary condition. On Chebyshev points D is a matrix whose eigenvalues approximate the roots;
 Newton's method on the characteristic matrix makes the rightmost ones exact.
+
+This approach and others are compared in D. Breda, "Methods for numerical computation of characteristic roots for delay
+differential equations: experimental comparison", Scientiae Mathematicae Japonicae Online 8 (2003), 317-328.
 """
 
 from collections.abc import Sequence

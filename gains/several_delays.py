@@ -9,6 +9,9 @@ the pieces with no root to the right of them.
 
 A leader-follower formation is block triangular, and when each block knows one delay only, the region is a rectangle
 (`delay_box`).
+
+See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, which parameterises the
+same curves.
 """
 
 from collections.abc import Iterator, Sequence

@@ -239,12 +239,12 @@ def vehicle_with_lag(*, proportional: float, derivative: float, lag_s: float, de
 
     Examples
     --------
-    The loop of Ploeg et al. 2014 needs a headway of 3.16 s:
+    The limit at zero frequency decides, which is 2 / proportional whatever the rest:
 
     >>> from gains.string_stability import least_headway, vehicle_with_lag
     >>> vehicle = vehicle_with_lag(proportional=0.2, derivative=0.7, lag_s=0.1, delay_s=0.2)
-    >>> round(least_headway(vehicle, near_rad_s=1.0), 2)
-    3.16
+    >>> round(least_headway(vehicle, near_rad_s=1.0) ** 2, 4)
+    10.0
     """
 
     def response(omega: FloatArray) -> ComplexArray:
