@@ -1,6 +1,6 @@
 """Whom the vehicle obeys and when: arming, modes, the beginning of the flight, the failsafe. No bytes, no motion.
 
-on the launcher ──first accepted set-point, armed and GUIDED──► flying (GUIDED) ◄──commanded──► flying (LOITER)
+on the launcher ──first set-point or take-off, armed, GUIDED──► flying (GUIDED) ◄──commanded──► flying (LOITER)
                                                                       │                             │
                                    set-points or station's heartbeat stop             station's heartbeat stops
                                                                       ▼                             ▼
@@ -76,12 +76,22 @@ class Autopilot:
             return "ignored_not_armed"
         if self.mode != MODE_GUIDED:
             return "ignored_not_guided"
-        self._setpoint_ns = max(self._setpoint_ns, now_ns)
         if not self.flying:
             self.flying = True
             self._heartbeat_ns = now_ns  # a station that was silent before the flight has its full time from here
+        if now_ns > self._setpoint_ns or self._setpoint_ns == NEVER_NS:
+            self._setpoint_ns = now_ns
         self._set_deadline()
         return ""
+
+    def take_off(self, now_ns: int) -> int:
+        """Begin the flight on command: the MAV_RESULT. No set-points are missed before the first."""
+        if self.flying or not self.armed or self.mode != MODE_GUIDED:
+            return DENIED
+        self.flying = True
+        self._heartbeat_ns, self._setpoint_ns = now_ns, NEVER_NS
+        self._set_deadline()
+        return ACCEPTED
 
     def arm(self, wanted: bool) -> int:
         """Arm or disarm: the MAV_RESULT. Not disarmed in flight, forced or not: it would fall."""

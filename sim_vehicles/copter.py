@@ -16,27 +16,27 @@ from scenarios.schema import NS_PER_S
 from sim_vehicles import mavlink
 from sim_vehicles.clock import BootClock
 from sim_vehicles.copter_dynamics import Motion, Target, advance
-from sim_vehicles.copter_reports import Facts, report, reportable
+from sim_vehicles.copter_reports import Facts, intervals_us, report
 from sim_vehicles.copter_rules import (
     FAILED,
-    GROUND_DISARM_S,
+    PX4_TAKEOFF_ALTITUDE,
     RULES,
     TEMPORARILY_REJECTED,
     commanded_mode,
+    parameters,
     setpoint_meaning,
 )
 from sim_vehicles.dynamics import State, state_from
+from sim_vehicles.earth import ORIGIN_ALTITUDE_M
 from sim_vehicles.links import NEVER_NS
-from sim_vehicles.parameters import LIST_INTERVAL_US, Parameters, fixed, timeout
 from sim_vehicles.schedule import Schedule
-from sim_vehicles.service_messages import PARAMETER_VALUE, ParameterSet, Request
+from sim_vehicles.service_messages import PARAMETER_VALUE, ParameterSet, Request, SetMode
+from sim_vehicles.services import Services
+from sim_vehicles.setpoints import ABSURD, YAW_IGNORED, YAW_RATE_IGNORED, to_local
 from sim_vehicles.truth import ACTED, SAMPLED, Record
 from sim_vehicles.vehicle import (
-    ABSURD,
     HEARTBEAT_INTERVAL_US,
     LONGEST_HISTORY,
-    ORIGIN_ALTITUDE_M,
-    SHORTEST_INTERVAL_US,
     TIMESYNC_INTERVAL_US,
     Change,
 )
@@ -44,6 +44,8 @@ from sim_vehicles.vehicle import (
 ORIGIN_STREAM = 7
 """Last word of the spawn key of the random stream of a vehicle's local origin."""
 TAKEN_OFF_M = 0.3
+HOME_M = 0.5
+"""Nearer to home than this, it lands."""
 SINK_FAST_M_S, SINK_M_S, SINK_SLOWLY_BELOW_M = 1.5, 0.7, 5.0
 
 
@@ -60,17 +62,11 @@ class Copter:
         self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
         self.last_heard_ns = start_ns
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
-        self.parameters = Parameters(
-            (
-                fixed(self.rules.system_id_parameter, own.system_id),
-                timeout(self.rules.setpoint_timeout_parameter, self.rules.setpoint_timeout_s),
-                timeout(self.rules.ground_disarm_parameter, GROUND_DISARM_S),
-            ),
-            bytewise=self.rules.parameters_bytewise,
-        )
+        self.parameters = parameters(self.rules, own.system_id)
         self.mode = self.rules.first_mode
         self.armed = self.failsafe = False
         self.landed = True
+        self.home_ne_m = own.position_ne_m
         self.motion = Motion(*own.position_ne_m)
         stream = np.random.SeedSequence(scenario.seed, spawn_key=(own.system_id, ORIGIN_STREAM))
         spread = (2.0 * np.random.default_rng(stream).random(3) - 1.0) * self.settings.origin_spread_m
@@ -86,7 +82,6 @@ class Copter:
         self._armed_ns = NEVER_NS
         self._read_timeouts()
         self._refusals_left = self.settings.arming_refusals
-        self._telemetry_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
         self._ready_ns = start_ns + round(self.settings.ready_after_s * NS_PER_S)
         self._jumps = deque(
             (start_ns + round(j.at_s * NS_PER_S), round(j.by_s * NS_PER_S)) for j in self.settings.clock_jumps
@@ -98,14 +93,17 @@ class Copter:
             mavlink.COMMAND_ARM: self._arm,
             mavlink.COMMAND_MODE: self._set_mode,
             mavlink.COMMAND_TAKEOFF: self._take_off,
-            mavlink.COMMAND_INTERVAL: self._set_interval,
-            mavlink.COMMAND_REQUEST: self._request,
+            mavlink.COMMAND_LAND: lambda _, time_ns: self._change_mode(self.rules.land_mode, time_ns),
+            mavlink.COMMAND_RETURN: lambda _, time_ns: self._change_mode(self.rules.return_mode, time_ns),
         }
-        self._reportable = reportable(self.rules)
-        self._intervals_us = {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, mavlink.TIMESYNC: TIMESYNC_INTERVAL_US}
+        telemetry_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
         self._schedule = Schedule(self.clock)
         self._schedule.add_once(mavlink.HEARTBEAT, start_ns)
-        self._plan_reports(start_ns)
+        self._schedule.set_interval(mavlink.HEARTBEAT, HEARTBEAT_INTERVAL_US, start_ns)
+        self._schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, telemetry_ns)
+        self._services = Services(
+            self._encoder, self._schedule, self.parameters, self.rules.version, intervals_us(self.rules), telemetry_ns
+        )
 
     @property
     def next_event_ns(self) -> int:
@@ -143,9 +141,7 @@ class Copter:
 
     def _deadline_ns(self) -> int:
         """The next instant at which something happens that is not a report."""
-        deadline_ns = self._telemetry_ns
-        if self._jumps:
-            deadline_ns = min(deadline_ns, self._jumps[0][0])
+        deadline_ns = self._jumps[0][0] if self._jumps else NEVER_NS
         if self._setpoint_ns is not None and not self.landed and self.mode == self.rules.guided_mode:
             deadline_ns = min(deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)
         if self.armed and self.landed:
@@ -153,25 +149,16 @@ class Copter:
         return deadline_ns
 
     def _happen(self, time_ns: int) -> None:
-        if time_ns == self._telemetry_ns:
-            self._telemetry_ns = NEVER_NS
-            self._plan_reports(time_ns)
-        elif self._jumps and time_ns == self._jumps[0][0]:
+        if self._jumps and time_ns == self._jumps[0][0]:
             _, by_ns = self._jumps.popleft()
             self.clock = BootClock(time_ns, self.clock.boot_ns(time_ns) + by_ns, self.clock.drift_ppb)
-            self._schedule = Schedule(self.clock)
-            self._plan_reports(time_ns)
+            self._schedule.set_clock(self.clock, time_ns)
             self._tell(time_ns, "clock jumped")
         elif self.armed and self.landed:
             self.armed = False
             self._tell(time_ns, "disarmed: not taken off")
         else:
             self._lose_setpoints(time_ns)
-
-    def _plan_reports(self, time_ns: int) -> None:
-        for message_id, interval_us in self._intervals_us.items():
-            if message_id == mavlink.HEARTBEAT or self._telemetry_ns == NEVER_NS:
-                self._schedule.set_interval(message_id, interval_us, time_ns)
 
     def _lose_setpoints(self, time_ns: int) -> None:
         """ArduCopter stays guided and stops; PX4 leaves offboard and holds."""
@@ -212,9 +199,13 @@ class Copter:
                 self.counters["commands"] += 1
                 at = len(self._out)
                 answer = self._answers.get(message.command)
-                result = mavlink.UNSUPPORTED if answer is None else answer(message, at_ns)
+                if answer is None:
+                    result, frames = self._services.command(message, at_ns)
+                else:
+                    result, frames = answer(message, at_ns), []
                 ack = self._encoder.command_ack(message.command, result, message.source)
                 self._out.insert(at, (ack, at_ns))
+                self._out += [(frame, at_ns) for frame in frames]
 
     def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
         if message.target_system not in (0, self.system_id):
@@ -228,7 +219,12 @@ class Copter:
             self.counters["timesync_replies" if known else "ignored_timesync_reply"] += 1
 
     def _take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
-        vectors = (*setpoint.velocity_ned_m_s, *setpoint.acceleration_ned_m_s2)
+        vectors = (
+            *setpoint.velocity_ned_m_s,
+            *setpoint.acceleration_ned_m_s2,
+            setpoint.yaw_rad,
+            setpoint.yaw_rate_rad_s,
+        )
         reason, velocity, acceleration = setpoint_meaning(setpoint, self.rules)
         if not math.hypot(*vectors) <= ABSURD:
             reason = "refused_absurd"
@@ -246,20 +242,24 @@ class Copter:
         if self.landed:
             return
         self._takeoff_m = None  # a set-point ends a guided take-off where it is
+        setpoint = to_local(setpoint, self.motion.yaw_rad)
         wanted = setpoint.acceleration_ned_m_s2 if acceleration else (0.0, 0.0, 0.0)
         north, east, down = setpoint.velocity_ned_m_s if velocity else (0.0, 0.0, 0.0)
         gain = self.settings.velocity_gain_1_s if velocity else 0.0
         growth = 1.0 if velocity and self.rules.velocity_grows else 0.0
-        self._target = Target(wanted[0], wanted[1], north, east, gain, growth, -down)
+        yaw = None if setpoint.type_mask & YAW_IGNORED else setpoint.yaw_rad
+        rate = 0.0 if setpoint.type_mask & YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
+        self._target = Target(wanted[0], wanted[1], north, east, gain, growth, -down, None, yaw, rate)
         if self._record is not None:
             self._record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
 
     def _take_request(self, request: Request, time_ns: int) -> None:
-        for frame in self.parameters.answer(request, self._encoder, self.counters):
+        if isinstance(request, SetMode):
+            if request.base_mode & mavlink.BASE_MODE_CUSTOM:
+                self._change_mode(request.custom_mode, time_ns)
+            return
+        for frame in self._services.answer(request, self.counters, time_ns):
             self._send(frame, time_ns)
-        if self.parameters.listing:
-            self._intervals_us[PARAMETER_VALUE] = LIST_INTERVAL_US
-            self._plan_reports(time_ns)
         if isinstance(request, ParameterSet):
             before = self._setpoint_timeout_ns, self._ground_disarm_ns
             self._read_timeouts()
@@ -298,8 +298,10 @@ class Copter:
         return mavlink.ACCEPTED
 
     def _set_mode(self, command: mavlink.Command, time_ns: int) -> int:
-        mode = commanded_mode(command, self.rules)
-        if mode is None:
+        return self._change_mode(commanded_mode(command, self.rules), time_ns)
+
+    def _change_mode(self, mode: int | None, time_ns: int) -> int:
+        if mode not in self.rules.modes:
             return mavlink.DENIED
         if mode == self.mode:
             return mavlink.ACCEPTED
@@ -320,6 +322,8 @@ class Copter:
         """ArduCopter wants the altitude above home, armed and guided; PX4 the one above sea level, in any mode."""
         own_mode = self.rules.takeoff_mode == self.rules.guided_mode
         altitude_m = command.param7 - (0.0 if own_mode else ORIGIN_ALTITUDE_M)
+        if not own_mode and math.isnan(altitude_m):
+            altitude_m = self.parameters[PX4_TAKEOFF_ALTITUDE]
         if own_mode and not (self.armed and self.mode == self.rules.guided_mode):
             return FAILED
         if not own_mode and math.isfinite(command.param5 + command.param6):
@@ -329,25 +333,6 @@ class Copter:
         self.mode, self._takeoff_m = self.rules.takeoff_mode, altitude_m
         if self.armed:
             self._leave_ground(time_ns)
-        return mavlink.ACCEPTED
-
-    def _set_interval(self, command: mavlink.Command, time_ns: int) -> int:
-        message_id, interval_us = command.param1, command.param2
-        if message_id not in self._reportable or not math.isfinite(interval_us):
-            return mavlink.DENIED
-        if interval_us > 0 and not SHORTEST_INTERVAL_US <= interval_us < 2**31:
-            return mavlink.DENIED
-        self._intervals_us[int(message_id)] = max(0, int(interval_us))
-        self._plan_reports(time_ns)
-        return mavlink.ACCEPTED
-
-    def _request(self, command: mavlink.Command, time_ns: int) -> int:
-        if command.param1 == mavlink.AUTOPILOT_VERSION:
-            self._send(self._encoder.autopilot_version(), time_ns)
-        elif command.param1 not in self._reportable or self._telemetry_ns != NEVER_NS:
-            return mavlink.DENIED
-        else:
-            self._schedule.add_once(int(command.param1), time_ns)
         return mavlink.ACCEPTED
 
     # What it sends
@@ -360,14 +345,10 @@ class Copter:
             self._send(self._encoder.timesync(0, self._timesync_ts1), time_ns)
             return
         if message_id == PARAMETER_VALUE:
-            self._send(self.parameters.next_of_list(self._encoder), time_ns)
-            if not self.parameters.listing:
-                del self._intervals_us[PARAMETER_VALUE]
-                self._schedule.set_interval(PARAMETER_VALUE, 0, time_ns)
+            self._send(self._services.next_parameter(time_ns), time_ns)
             return
-        facts = Facts(
-            self.motion, self.origin_neu_m, self.mode, self.armed, self.landed, self.failsafe, self._ready(time_ns)
-        )
+        state = self.mode, self.armed, self.landed, self.failsafe, self.home_ne_m
+        facts = Facts(self.motion, self.origin_neu_m, *state, self._ready(time_ns))
         frame = report(message_id, self._encoder, self.rules, facts, boot_ms)
         if frame is None:
             return
@@ -380,9 +361,10 @@ class Copter:
     # Motion
 
     def _stopped(self) -> Target:
-        if self.mode == self.rules.land_mode:
-            return Target(velocity_gain_1_s=self.settings.velocity_gain_1_s, climb_m_s=-SINK_FAST_M_S)
-        return Target(velocity_gain_1_s=self.settings.velocity_gain_1_s)
+        """What it does in a mode by itself: nothing, sink, or fly home."""
+        gain, place = self.settings.velocity_gain_1_s, self.home_ne_m if self.mode == self.rules.return_mode else None
+        climb_m_s = -SINK_FAST_M_S if self.mode == self.rules.land_mode else 0.0
+        return Target(velocity_gain_1_s=gain, climb_m_s=climb_m_s, place_ne_m=place)
 
     def _leave_ground(self, time_ns: int) -> None:
         self.landed = False
@@ -409,8 +391,12 @@ class Copter:
             self._target = self._target._replace(climb_m_s=-sink)
             if altitude_m <= 0.0:
                 self.landed, self.armed = True, False
-                self.motion = Motion(self.motion.north_m, self.motion.east_m)
+                self.motion = Motion(self.motion.north_m, self.motion.east_m, yaw_rad=self.motion.yaw_rad)
                 self._tell(time_ns, "landed")
+        elif self.mode == self.rules.return_mode and math.dist(self.motion[:2], self.home_ne_m) < HOME_M:
+            self.mode = self.rules.land_mode
+            self._target = self._stopped()
+            self._tell(time_ns, self.rules.modes[self.mode])
 
     def _send(self, frame: bytes, time_ns: int) -> None:
         self._out.append((frame, time_ns))

@@ -15,6 +15,9 @@ LONGEST_STEP_S = 0.01
 CLIMB_LAG_S = 0.3
 CLIMB_GAIN_1_S = 0.8
 """A take-off slows down towards its altitude with this."""
+PLACE_GAIN_1_S = 0.3
+"""A flight to a place slows down towards it with this."""
+YAW_RATE_MAX_RAD_S = 1.5
 
 
 class Motion(NamedTuple):
@@ -28,6 +31,7 @@ class Motion(NamedTuple):
     acceleration_east_m_s2: float = 0.0
     altitude_m: float = 0.0
     climb_m_s: float = 0.0
+    yaw_rad: float = 0.0
 
 
 class Target(NamedTuple):
@@ -42,6 +46,11 @@ class Target(NamedTuple):
     climb_m_s: float = 0.0
     altitude_m: float | None = None
     """Climb or sink to this altitude, at most with `climb_m_s`."""
+    yaw_rad: float | None = None
+    yaw_rate_rad_s: float = 0.0
+    """Turn to this yaw, or if there is none with this rate."""
+    place_ne_m: tuple[float, float] | None = None
+    """Fly to this place; then the velocity is found from the way that is left."""
 
 
 def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s: float) -> tuple[Motion, Target]:
@@ -49,6 +58,8 @@ def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s
     steps = max(1, math.ceil(duration_s / LONGEST_STEP_S))
     h = duration_s / steps
     for _ in range(steps):
+        if target.place_ne_m is not None:
+            target = _towards(motion, target, target.place_ne_m, limits.speed_max_m_s)
         motion = _step(motion, target, limits, h)
         grown = target.growth * h
         target = target._replace(
@@ -59,7 +70,7 @@ def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s
 
 
 def _step(motion: Motion, target: Target, limits: schema.Autopilot, h: float) -> Motion:
-    north, east, v_n, v_e, a_n, a_e, altitude, climb = motion
+    north, east, v_n, v_e, a_n, a_e, altitude, climb, _ = motion
     half = 0.5 * h
     # v' = a and lag a' = w - a; the position is the integral of the velocity
     j1n, j1e = _jerk(v_n, v_e, a_n, a_e, target, limits, 0.0)
@@ -80,7 +91,7 @@ def _step(motion: Motion, target: Target, limits: schema.Autopilot, h: float) ->
     if speed > limits.speed_max_m_s:
         v_n, v_e = v_n * limits.speed_max_m_s / speed, v_e * limits.speed_max_m_s / speed
     altitude, climb = _climbed(altitude, climb, target, limits, h)
-    return Motion(north, east, v_n, v_e, a_n, a_e, altitude, climb)
+    return Motion(north, east, v_n, v_e, a_n, a_e, altitude, climb, _turned(motion.yaw_rad, target, h))
 
 
 def _jerk(
@@ -107,3 +118,19 @@ def _climbed(altitude: float, climb: float, target: Target, limits: schema.Autop
     wanted = max(-limits.climb_max_m_s, min(limits.climb_max_m_s, wanted))
     left = math.exp(-h / CLIMB_LAG_S)
     return altitude + wanted * h + (climb - wanted) * CLIMB_LAG_S * (1.0 - left), wanted + (climb - wanted) * left
+
+
+def _towards(motion: Motion, target: Target, place_ne_m: tuple[float, float], speed_max_m_s: float) -> Target:
+    """The target with the velocity of a vehicle on its way to a place."""
+    north, east = place_ne_m[0] - motion.north_m, place_ne_m[1] - motion.east_m
+    gain = min(PLACE_GAIN_1_S, speed_max_m_s / max(math.hypot(north, east), 1e-9))
+    return target._replace(velocity_north_m_s=gain * north, velocity_east_m_s=gain * east)
+
+
+def _turned(yaw_rad: float, target: Target, h: float) -> float:
+    """The yaw a step later, from -pi to pi, turned the shorter way."""
+    turn = target.yaw_rate_rad_s * h
+    if target.yaw_rad is not None:
+        turn = math.remainder(target.yaw_rad - yaw_rad, math.tau)
+    largest = YAW_RATE_MAX_RAD_S * h
+    return math.remainder(yaw_rad + max(-largest, min(largest, turn)), math.tau)

@@ -3,10 +3,11 @@
 import math
 from typing import NamedTuple
 
-from sim_vehicles import mavlink
+from sim_vehicles import mavlink, services
 from sim_vehicles.copter_dynamics import Motion
 from sim_vehicles.copter_rules import Rules
-from sim_vehicles.vehicle import EARTH_RADIUS_M, ORIGIN_ALTITUDE_M, ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG
+from sim_vehicles.earth import ORIGIN_ALTITUDE_M, degrees
+from sim_vehicles.vehicle import GRAVITY_M_S2, HEARTBEAT_INTERVAL_US
 
 READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
 """Estimator flags with all that is wanted; and attitude only, constant position mode, uninitialised."""
@@ -21,40 +22,47 @@ class Facts(NamedTuple):
     armed: bool
     landed: bool
     failsafe: bool
+    home_ne_m: tuple[float, float]
+    """Where it stood on the ground first, in the scenario's frame."""
     ready: bool
     """It has a position. Without one it sends a global position of zeros and no local one, as ArduPilot does."""
 
 
-def reportable(rules: Rules) -> tuple[int, ...]:
-    """The messages that can be asked for."""
-    return (
-        mavlink.HEARTBEAT,
+def intervals_us(rules: Rules) -> dict[int, int]:
+    """The messages that can be asked for, with the intervals they have unasked, 0 for none."""
+    silent = (
         mavlink.LOCAL_POSITION,
         mavlink.GLOBAL_POSITION,
         mavlink.GLOBAL_ORIGIN,
         mavlink.HOME_POSITION,
         rules.estimator_message,
     )
+    return {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, **dict.fromkeys(silent, 0)}
 
 
 def report(message_id: int, encoder: mavlink.Encoder, rules: Rules, facts: Facts, boot_ms: int) -> bytes | None:
     """The frame of one of the messages, None if there is nothing to say yet."""
     motion, (origin_north_m, origin_east_m, origin_up_m) = facts.motion, facts.origin_neu_m
+    frame: bytes | None = None
     if message_id == mavlink.HEARTBEAT:
-        return encoder.heartbeat(_base_mode(facts), facts.mode, _status(facts), rules.autopilot)
-    if message_id == rules.estimator_message:
-        return encoder.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if facts.ready else NOT_READY_FLAGS)
-    if message_id == mavlink.GLOBAL_POSITION:
-        return _global_position(encoder, motion, boot_ms, known=facts.ready)
-    if not facts.ready:
-        return None
-    if message_id == mavlink.LOCAL_POSITION:
+        frame = encoder.heartbeat(_base_mode(facts), facts.mode, _status(facts), rules.autopilot)
+    elif message_id == rules.estimator_message:
+        frame = encoder.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if facts.ready else NOT_READY_FLAGS)
+    elif message_id == mavlink.GLOBAL_POSITION:
+        frame = _global_position(encoder, motion, boot_ms, known=facts.ready)
+    elif message_id in services.EXTRA:
+        frame = services.report(message_id, encoder, _condition(facts, boot_ms))
+    elif message_id == mavlink.LOCAL_POSITION and facts.ready:
         north, east = motion.north_m - origin_north_m, motion.east_m - origin_east_m
         down = origin_up_m - motion.altitude_m
-        return encoder.local_position(boot_ms, north, east, down, motion[2:4], -motion.climb_m_s)
-    assert message_id in (mavlink.GLOBAL_ORIGIN, mavlink.HOME_POSITION)
-    origin = encoder.global_origin if message_id == mavlink.GLOBAL_ORIGIN else encoder.home_position
-    return origin(*_degrees(origin_north_m, origin_east_m), ORIGIN_ALTITUDE_M + origin_up_m)
+        frame = encoder.local_position(boot_ms, north, east, down, motion[2:4], -motion.climb_m_s)
+    elif message_id == mavlink.GLOBAL_ORIGIN and facts.ready:
+        frame = encoder.global_origin(*degrees(origin_north_m, origin_east_m), ORIGIN_ALTITUDE_M + origin_up_m)
+    elif message_id == mavlink.HOME_POSITION and facts.ready:
+        north, east = facts.home_ne_m
+        local = north - origin_north_m, east - origin_east_m, origin_up_m
+        frame = encoder.home_position(*degrees(north, east), ORIGIN_ALTITUDE_M, local)
+    return frame
 
 
 def _base_mode(facts: Facts) -> int:
@@ -68,7 +76,7 @@ def _status(facts: Facts) -> int:
 
 
 def _global_position(encoder: mavlink.Encoder, motion: Motion, boot_ms: int, *, known: bool) -> bytes:
-    latitude, longitude = _degrees(motion.north_m, motion.east_m) if known else (0.0, 0.0)
+    latitude, longitude = degrees(motion.north_m, motion.east_m) if known else (0.0, 0.0)
     return encoder.global_position(
         time_boot_ms=boot_ms,
         latitude_deg=latitude,
@@ -76,14 +84,22 @@ def _global_position(encoder: mavlink.Encoder, motion: Motion, boot_ms: int, *, 
         altitude_m=ORIGIN_ALTITUDE_M + motion.altitude_m,
         relative_altitude_m=motion.altitude_m,
         velocity_ne_m_s=motion[2:4],
-        heading_deg=0.0,
+        heading_deg=math.degrees(motion.yaw_rad) % 360.0,
     )
 
 
-def _degrees(north_m: float, east_m: float) -> tuple[float, float]:
-    """Latitude and longitude of a place in the scenario's frame, on a flat earth."""
-    east_per_radian_m = EARTH_RADIUS_M * math.cos(math.radians(ORIGIN_LATITUDE_DEG))
-    return (
-        ORIGIN_LATITUDE_DEG + math.degrees(north_m / EARTH_RADIUS_M),
-        ORIGIN_LONGITUDE_DEG + math.degrees(east_m / east_per_radian_m),
+def _condition(facts: Facts, boot_ms: int) -> services.Condition:
+    """What it reports to other stations: it leans into its acceleration."""
+    motion = facts.motion
+    cosine, sine = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
+    north, east = motion.acceleration_north_m_s2 / GRAVITY_M_S2, motion.acceleration_east_m_s2 / GRAVITY_M_S2
+    roll_rad, pitch_rad = math.atan(cosine * east - sine * north), -math.atan(cosine * north + sine * east)
+    return services.Condition(
+        boot_ms,
+        degrees(motion.north_m, motion.east_m),
+        ORIGIN_ALTITUDE_M + motion.altitude_m,
+        (*motion[2:4], -motion.climb_m_s),
+        (roll_rad, pitch_rad, motion.yaw_rad),
+        flying=not facts.landed,
+        has_position=facts.ready,
     )

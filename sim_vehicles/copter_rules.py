@@ -7,14 +7,21 @@ offboardCheck.cpp.
 import math
 from dataclasses import dataclass
 
-from sim_vehicles import mavlink
+from sim_vehicles import mavlink, setup_parameters
 from sim_vehicles.mavlink import Command, Setpoint
+from sim_vehicles.parameters import Parameter, Parameters, fixed, timeout
+from sim_vehicles.setpoints import (
+    ACCELERATION_AXES,
+    BODY_FRAMES,
+    FORCE_SET,
+    LOCAL_FRAMES,
+    POSITION_AXES,
+    VELOCITY_AXES,
+)
 
 TEMPORARILY_REJECTED, FAILED = 1, 4
-FORCE_SET = 0x200
-POSITION_AXES, VELOCITY_AXES, ACCELERATION_AXES = 0x007, 0x038, 0x1C0
-LOCAL_FRAMES = (1, 7)
-"""LOCAL_NED and LOCAL_OFFSET_NED: the same for velocities and accelerations."""
+PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
+"""Parameter: the altitude above the ground, in m, of a take-off whose command names none."""
 GROUND_DISARM_S = 10.0
 """Armed and not taken off for this long, both disarm again."""
 
@@ -37,12 +44,15 @@ class Rules:
     """In which a take-off is flown; a take-off command changes to it unless it is the guided mode."""
     hold_mode: int
     land_mode: int
+    return_mode: int
     estimator_message: int
     """Reports the estimator's flags: EKF_STATUS_REPORT, ESTIMATOR_STATUS."""
     arming_refused: int
     """MAV_RESULT of what is refused because it is not ready."""
     parameters_bytewise: bool
     """How it sends integers as parameters."""
+    version: tuple[int, int, int]
+    """What AUTOPILOT_VERSION says; stations warn of what they hold to be older than their oldest."""
     system_id_parameter: str
     setpoint_timeout_parameter: str
     ground_disarm_parameter: str
@@ -55,15 +65,17 @@ class Rules:
 
 ARDUPILOT = Rules(
     autopilot=3,
-    modes={0: "STABILIZE", 4: "GUIDED", 5: "LOITER", 9: "LAND", 17: "BRAKE"},
+    modes={0: "STABILIZE", 4: "GUIDED", 5: "LOITER", 6: "RTL", 9: "LAND", 17: "BRAKE"},
     first_mode=0,
     guided_mode=4,
     takeoff_mode=4,
     hold_mode=17,
     land_mode=9,
+    return_mode=6,
     estimator_message=193,
     arming_refused=FAILED,
     parameters_bytewise=False,
+    version=(4, 6, 0),
     system_id_parameter="SYSID_THISMAV",
     setpoint_timeout_parameter="GUID_TIMEOUT",
     ground_disarm_parameter="DISARM_DELAY",
@@ -77,6 +89,7 @@ PX4 = Rules(
         px4_mode(3): "POSCTL",
         px4_mode(4, 2): "AUTO.TAKEOFF",
         px4_mode(4, 3): "AUTO.LOITER",
+        px4_mode(4, 5): "AUTO.RTL",
         px4_mode(4, 6): "AUTO.LAND",
         px4_mode(6): "OFFBOARD",
     },
@@ -85,9 +98,11 @@ PX4 = Rules(
     takeoff_mode=px4_mode(4, 2),
     hold_mode=px4_mode(4, 3),
     land_mode=px4_mode(4, 6),
+    return_mode=px4_mode(4, 5),
     estimator_message=230,
     arming_refused=TEMPORARILY_REJECTED,
     parameters_bytewise=True,
+    version=(1, 16, 0),
     system_id_parameter="MAV_SYS_ID",
     setpoint_timeout_parameter="COM_OF_LOSS_T",
     ground_disarm_parameter="COM_DISARM_PRFLT",
@@ -98,6 +113,20 @@ PX4 = Rules(
 RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
 
 
+def parameters(rules: Rules, system_id: int) -> Parameters:
+    """What a multicopter of this autopilot has."""
+    known = [
+        fixed(rules.system_id_parameter, system_id),
+        timeout(rules.setpoint_timeout_parameter, rules.setpoint_timeout_s),
+        timeout(rules.ground_disarm_parameter, GROUND_DISARM_S),
+    ]
+    if rules is PX4:
+        known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *setup_parameters.of_px4()]
+    else:
+        known += setup_parameters.of_ardupilot()
+    return Parameters(known, bytewise=rules.parameters_bytewise)
+
+
 def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]:
     """What a set-point asks for: (why it is not flown or "", velocity counts, acceleration counts).
 
@@ -105,7 +134,7 @@ def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]
     """
     mask = setpoint.type_mask
     velocity, acceleration = not mask & VELOCITY_AXES, not mask & ACCELERATION_AXES
-    if setpoint.frame not in LOCAL_FRAMES:
+    if setpoint.frame not in LOCAL_FRAMES and setpoint.frame not in BODY_FRAMES:
         return "refused_frame", False, False
     if mask & FORCE_SET and (acceleration or rules is PX4):
         return "refused_force", False, False

@@ -122,10 +122,10 @@ def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> S
     """A Runge-Kutta step with everything in it."""
     north, east, yaw, speed = state
     half = 0.5 * h
-    n1, e1, w1, a1 = _rates(yaw, speed, command, bounds)
-    n2, e2, w2, a2 = _rates(yaw + half * w1, speed + half * a1, command, bounds)
-    n3, e3, w3, a3 = _rates(yaw + half * w2, speed + half * a2, command, bounds)
-    n4, e4, w4, a4 = _rates(yaw + h * w3, speed + h * a3, command, bounds)
+    n1, e1, w1, a1 = rates(yaw, speed, command, bounds)
+    n2, e2, w2, a2 = rates(yaw + half * w1, speed + half * a1, command, bounds)
+    n3, e3, w3, a3 = rates(yaw + half * w2, speed + half * a2, command, bounds)
+    n4, e4, w4, a4 = rates(yaw + h * w3, speed + h * a3, command, bounds)
     sixth = h / 6.0
     speed += sixth * (a1 + 2.0 * (a2 + a3) + a4)
     # A step across a limit overshoots it by less than one step's change; the limit holds at every step's end.
@@ -141,7 +141,7 @@ def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> S
     )
 
 
-def _rates(yaw: float, speed: float, command: Command, bounds: Bounds) -> tuple[float, float, float, float]:
+def rates(yaw: float, speed: float, command: Command, bounds: Bounds) -> tuple[float, float, float, float]:
     """Rates of (north, east, yaw, speed).
 
     The acceleration limit shortens the wanted acceleration vector before the linearisation and keeps its direction:

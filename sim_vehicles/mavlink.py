@@ -29,9 +29,12 @@ STATUS_STANDBY, STATUS_ACTIVE = dialect.MAV_STATE_STANDBY, dialect.MAV_STATE_ACT
 STATUS_CRITICAL = dialect.MAV_STATE_CRITICAL
 SEVERITY_CRITICAL = dialect.MAV_SEVERITY_CRITICAL
 FRAME_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
-MASK_ACCELERATION, MASK_VELOCITY_ACCELERATION = 0x0C3F, 0x0C07
 
 COMMAND_MODE, COMMAND_ARM = dialect.MAV_CMD_DO_SET_MODE, dialect.MAV_CMD_COMPONENT_ARM_DISARM
+COMMAND_TAKEOFF, COMMAND_LAND = dialect.MAV_CMD_NAV_TAKEOFF, dialect.MAV_CMD_NAV_LAND
+COMMAND_RETURN = dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH
+COMMAND_CAPABILITIES = dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
+COMMAND_GET_HOME, COMMAND_GET_INTERVAL = dialect.MAV_CMD_GET_HOME_POSITION, dialect.MAV_CMD_GET_MESSAGE_INTERVAL
 COMMAND_INTERVAL, COMMAND_REQUEST = dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialect.MAV_CMD_REQUEST_MESSAGE
 ACCEPTED, DENIED = dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_DENIED
 UNSUPPORTED = dialect.MAV_RESULT_UNSUPPORTED
@@ -47,7 +50,6 @@ HOME_POSITION = dialect.MAVLINK_MSG_ID_HOME_POSITION
 EKF_STATUS = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
 ESTIMATOR_STATUS = dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS
 GLOBAL_ORIGIN = dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
-COMMAND_TAKEOFF = dialect.MAV_CMD_NAV_TAKEOFF
 MESSAGE_INTERVAL = dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL
 
 SETUP_SIGNING = dialect.MAVLINK_MSG_ID_SETUP_SIGNING
@@ -63,7 +65,10 @@ _CAPABILITIES = (
     dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+    | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
 )
+_BYTEWISE = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+_C_CAST = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
 
 
 class Setpoint(NamedTuple):
@@ -72,6 +77,8 @@ class Setpoint(NamedTuple):
     time_boot_ms: int
     velocity_ned_m_s: tuple[float, float, float]
     acceleration_ned_m_s2: tuple[float, float, float]
+    yaw_rad: float
+    yaw_rate_rad_s: float
     type_mask: int
     target_system: int
     target_component: int
@@ -175,7 +182,7 @@ def _append(messages: list[Message], frame: bytes, checked: int, counters: Count
     # Most of the traffic is of these two messages: no object of pymavlink's is made for them.
     if number == SETPOINT:
         values = _values(_SETPOINT.unpacker, frame, checked)
-        messages.append(Setpoint(values[0], values[4:7], values[7:10], *values[12:]))
+        messages.append(Setpoint(values[0], values[4:7], values[7:10], *values[10:]))
     elif number == TIMESYNC:
         # The target is an extension field that this dialect does not know yet.
         target = frame[HEADER_BYTES + 16] if checked > HEADER_BYTES + 16 else 0
@@ -184,7 +191,7 @@ def _append(messages: list[Message], frame: bytes, checked: int, counters: Count
     elif number in (HEARTBEAT, COMMAND_LONG, COMMAND_INT):
         messages.append(_decode(number, frame))
     elif number in REQUESTS:
-        messages.append(request(number, frame[HEADER_BYTES:checked]))
+        messages.append(request(number, (frame[5], frame[6]), frame[HEADER_BYTES:checked]))
     else:
         counters["ignored_message"] += 1
 
@@ -302,22 +309,32 @@ class Encoder:
         """MESSAGE_INTERVAL."""
         return self.pack(dialect.MAVLink_message_interval_message(number, interval_us))
 
-    def autopilot_version(self) -> bytes:
-        """AUTOPILOT_VERSION: the capabilities, and zeros for hardware that is not there."""
+    def autopilot_version(self, version: tuple[int, int, int], *, parameters_bytewise: bool) -> bytes:
+        """AUTOPILOT_VERSION: capabilities, the version as one under development, zeros for what is not there."""
+        major, minor, patch = version
+        encoding = _BYTEWISE if parameters_bytewise else _C_CAST
         none: Sequence[int] = (0,) * 8
         uid = self._pymavlink.srcSystem
         return self.pack(
-            dialect.MAVLink_autopilot_version_message(_CAPABILITIES, 0, 0, 0, 0, none, none, none, 0, 0, uid)
+            dialect.MAVLink_autopilot_version_message(
+                _CAPABILITIES | encoding, major << 24 | minor << 16 | patch << 8, 0, 0, 0, none, none, none, 0, 0, uid
+            )
         )
 
-    def home_position(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> bytes:
-        """HOME_POSITION at the origin of the local frame."""
+    def home_position(
+        self,
+        latitude_deg: float,
+        longitude_deg: float,
+        altitude_m: float,
+        local_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> bytes:
+        """HOME_POSITION, on the globe and in the local frame."""
         return self.pack(
             dialect.MAVLink_home_position_message(
                 round(latitude_deg * 1e7),
                 round(longitude_deg * 1e7),
                 round(altitude_m * 1e3),
-                *(0.0, 0.0, 0.0),
+                *local_ned_m,
                 (1.0, 0.0, 0.0, 0.0),
                 *(0.0, 0.0, 0.0),
             )

@@ -61,7 +61,7 @@ class Parameters:
             name: known.value if known.whole else _FLOAT.unpack(_FLOAT.pack(known.value))[0]
             for name, known in self._known.items()
         }
-        self._bytewise = bytewise
+        self.bytewise = bytewise
         self._listed = len(self._names)
         """Index of the next one of a list that was asked for."""
 
@@ -108,16 +108,16 @@ class Parameters:
     def _frame(self, name: str, encoder: Encoder) -> bytes:
         kind = INT32 if self._known[name].whole else REAL32
         value = self._values[name]
-        data = _INT.pack(int(value)) if self._bytewise and kind == INT32 else _FLOAT.pack(value)
+        data = _INT.pack(int(value)) if self.bytewise and kind == INT32 else _FLOAT.pack(value)
         payload = parameter_value(name, data, kind, self._names.index(name), len(self._names))
         return encoder.frame(PARAMETER_VALUE, payload)
 
     def _read(self, message: ParameterSet) -> float:
         """The value that a message sets, NaN if there is none."""
         whole = self._known[message.name].whole
-        if self._bytewise and message.kind != (INT32 if whole else REAL32):
+        if self.bytewise and message.kind != (INT32 if whole else REAL32):
             return math.nan
-        value = float((_INT if self._bytewise and whole else _FLOAT).unpack(message.value)[0])
+        value = float((_INT if self.bytewise and whole else _FLOAT).unpack(message.value)[0])
         return value if math.isfinite(value) else math.nan
 
 

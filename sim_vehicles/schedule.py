@@ -21,6 +21,8 @@ class Schedule:
         self._queue: list[tuple[int, int, int, int]] = []
         """(host time, message id, boot time in ms, period's number), earliest first; number is ONCE for a single."""
         self._interval_us: dict[int, int] = {}
+        self._from_ns: dict[int, int] = {}
+        """When each message began to be periodic."""
         self.next_ns = NEVER_NS
         """Host time of the next message."""
 
@@ -33,10 +35,20 @@ class Schedule:
         self._queue = [entry for entry in self._queue if entry[1] != message_id or entry[3] == ONCE]
         heapq.heapify(self._queue)
         self._interval_us[message_id] = interval_us
+        self._from_ns[message_id] = now_ns
         if interval_us:
             number = self._clock.boot_ns(now_ns) // (interval_us * 1000) + 1
             heapq.heappush(self._queue, self._entry(message_id, interval_us, number))
         self.next_ns = self._queue[0][0] if self._queue else NEVER_NS
+
+    def set_clock(self, clock: BootClock, now_ns: int) -> None:
+        """Go on with a clock that was set: what was to be sent still is, its instants now those of this clock."""
+        singles = [(message_id, host_ns) for host_ns, message_id, _, number in self._queue if number == ONCE]
+        self._clock, self._queue = clock, []
+        for message_id, interval_us in self._interval_us.items():
+            self.set_interval(message_id, interval_us, max(now_ns, self._from_ns[message_id]))
+        for message_id, host_ns in singles:
+            self.add_once(message_id, host_ns)
 
     def add_once(self, message_id: int, now_ns: int) -> None:
         """Send a message at the next whole millisecond, at once if now is one."""

@@ -15,25 +15,30 @@ from scenarios.schema import NS_PER_S
 from sim_vehicles import mavlink
 from sim_vehicles.autopilot import MODE_NAMES, Autopilot
 from sim_vehicles.clock import BootClock
-from sim_vehicles.dynamics import COAST, VELOCITY_GAIN_1_S, Command, State, advance, bounds_of, state_from
-from sim_vehicles.parameters import LIST_INTERVAL_US, Parameters, of_vehicle
-from sim_vehicles.schedule import US_PER_MS, Schedule
-from sim_vehicles.service_messages import PARAMETER_VALUE, ParameterSet, Request
+from sim_vehicles.dynamics import COAST, VELOCITY_GAIN_1_S, Command, State, advance, bounds_of, rates, state_from
+from sim_vehicles.earth import ORIGIN_ALTITUDE_M, ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, degrees
+from sim_vehicles.parameters import Parameters, of_vehicle
+from sim_vehicles.schedule import Schedule
+from sim_vehicles.service_messages import PARAMETER_VALUE, ParameterSet, Request, SetMode
+from sim_vehicles.services import EXTRA, Condition, Services, report, whole
+from sim_vehicles.setpoints import ACCELERATION, AXES, VELOCITY, fault, to_local
+from sim_vehicles.setup_parameters import of_ardupilot
 from sim_vehicles.truth import ACTED, SAMPLED, Record
-
-ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M = -35.363262, 149.165237, 584.0
-"""Origin of the local frame of all vehicles, on the ground: where ArduPilot's simulator starts."""
-EARTH_RADIUS_M = 6_378_137.0
 
 TIMESYNC_INTERVAL_US = 10_000_000
 HEARTBEAT_INTERVAL_US = 1_000_000
-DEFAULT_INTERVAL_US = {mavlink.LOCAL_POSITION: 250_000, mavlink.GLOBAL_POSITION: 1_000_000}
+DEFAULT_INTERVAL_US = {
+    mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US,
+    mavlink.LOCAL_POSITION: 250_000,
+    mavlink.GLOBAL_POSITION: 1_000_000,
+    mavlink.HOME_POSITION: 0,
+}
 """Sent unasked, slowly, as an autopilot does on a telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes it."""
-SHORTEST_INTERVAL_US = US_PER_MS
+VERSION = (4, 6, 0)
+"""Of the ArduCopter whose messages and modes it has."""
+GRAVITY_M_S2 = 9.80665
 LONGEST_HISTORY = 1000
 """Changes kept if nobody reads them; a hostile sender can cause them without end."""
-ABSURD = 1e4
-"""A set-point with more m/s² or m/s than this is refused."""
 
 
 class Change(NamedTuple):
@@ -63,7 +68,7 @@ class Vehicle:
         """When the last valid frame for this vehicle, or for all, arrived."""
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.autopilot = Autopilot(scenario.safety)
-        self.parameters = Parameters(of_vehicle(own.system_id, scenario.safety))
+        self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot()])
         self._record = record
         self._encoder = mavlink.Encoder(own.system_id)
         self._altitude_m = scenario.altitude_m
@@ -76,15 +81,16 @@ class Vehicle:
         self._answers: dict[int, Callable[[mavlink.Command, int], int]] = {
             mavlink.COMMAND_ARM: self._arm,
             mavlink.COMMAND_MODE: self._set_mode,
-            mavlink.COMMAND_INTERVAL: self._set_interval,
-            mavlink.COMMAND_REQUEST: self._request,
+            mavlink.COMMAND_TAKEOFF: self._take_off,
         }
         self._schedule = Schedule(self.clock)
         self._schedule.add_once(mavlink.HEARTBEAT, start_ns)  # found at once, not after up to a second
-        self._schedule.set_interval(mavlink.HEARTBEAT, HEARTBEAT_INTERVAL_US, start_ns)
         self._schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, start_ns)
         for message_id, interval_us in DEFAULT_INTERVAL_US.items():
             self._schedule.set_interval(message_id, interval_us, start_ns)
+        self._services = Services(
+            self._encoder, self._schedule, self.parameters, VERSION, DEFAULT_INTERVAL_US, start_ns
+        )
 
     @property
     def next_event_ns(self) -> int:
@@ -158,7 +164,7 @@ class Vehicle:
     def _take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
         time_ns = max(time_ns, self._state_ns)
         on_launcher = not self.autopilot.flying
-        reason = _setpoint_fault(setpoint) or self.autopilot.accept_setpoint(time_ns)
+        reason = fault(setpoint) or self.autopilot.accept_setpoint(time_ns)
         if reason:
             self.counters[reason] += 1
             return
@@ -167,9 +173,14 @@ class Vehicle:
             self._state_ns = time_ns  # its state is the initial one until now
             self._tell(time_ns, "flying")
         self._advance(time_ns)
+        if setpoint.frame != mavlink.FRAME_LOCAL_NED:
+            setpoint = to_local(setpoint, self._state.yaw_rad)
         north, east, _ = setpoint.acceleration_ned_m_s2
-        if setpoint.type_mask == mavlink.MASK_ACCELERATION:
+        counts = setpoint.type_mask & AXES
+        if counts == ACCELERATION:
             self._command = Command(north, east)
+        elif counts == VELOCITY:
+            self._command = Command(0.0, 0.0, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
         else:
             self._command = Command(north, east, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
         if self._record is not None:
@@ -191,10 +202,11 @@ class Vehicle:
             self.counters["ignored_timesync_reply"] += 1  # to another vehicle, or a duplicate
 
     def _take_request(self, request: Request, time_ns: int) -> None:
-        for frame in self.parameters.answer(request, self._encoder, self.counters):
+        if isinstance(request, SetMode):
+            self._change_mode(request.base_mode, request.custom_mode, time_ns)
+            return
+        for frame in self._services.answer(request, self.counters, time_ns):
             self._send(frame, time_ns)
-        if self.parameters.listing:
-            self._schedule.set_interval(PARAMETER_VALUE, LIST_INTERVAL_US, time_ns)
         if isinstance(request, ParameterSet):
             timeouts_s = self.parameters["GUID_TIMEOUT"], self.parameters["FS_GCS_TIMEOUT"]
             self.autopilot.set_timeouts(*timeouts_s, time_ns)
@@ -205,10 +217,14 @@ class Vehicle:
         self.counters["commands"] += 1
         answer = self._answers.get(command.command)
         time_ns = max(time_ns, self._state_ns)
+        if answer is None:
+            result, frames = self._services.command(command, time_ns)
+        else:
+            result, frames = answer(command, time_ns), []
         # The acknowledgement goes before what the command asks for, as request and reply are read.
-        at = len(self._out)
-        result = mavlink.UNSUPPORTED if answer is None else answer(command, time_ns)
-        self._out.insert(at, (self._encoder.command_ack(command.command, result, command.source), time_ns))
+        self._send(self._encoder.command_ack(command.command, result, command.source), time_ns)
+        for frame in frames:
+            self._send(frame, time_ns)
 
     def _arm(self, command: mavlink.Command, time_ns: int) -> int:
         if command.param1 not in (0.0, 1.0):
@@ -219,8 +235,18 @@ class Vehicle:
             self._tell(time_ns, "armed" if self.autopilot.armed else "disarmed")
         return result
 
+    def _take_off(self, _: mavlink.Command, time_ns: int) -> int:
+        """Leave the launcher, at the altitude and with the velocity that it has there, whatever altitude is wanted."""
+        result = self.autopilot.take_off(time_ns)
+        if result == mavlink.ACCEPTED:
+            self._state_ns = time_ns
+            self._tell(time_ns, "flying")
+        return result
+
     def _set_mode(self, command: mavlink.Command, time_ns: int) -> int:
-        base_mode, mode = _whole(command.param1), _whole(command.param2)
+        return self._change_mode(whole(command.param1), whole(command.param2), time_ns)
+
+    def _change_mode(self, base_mode: int | None, mode: int | None, time_ns: int) -> int:
         if base_mode is None or mode is None or not base_mode & mavlink.BASE_MODE_CUSTOM:
             return mavlink.DENIED
         before = (self.autopilot.mode, self.autopilot.failsafe)
@@ -230,38 +256,6 @@ class Vehicle:
             self._command = COAST
             self._tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
         return result
-
-    def _set_interval(self, command: mavlink.Command, time_ns: int) -> int:
-        message_id, interval_us = _whole(command.param1), _whole(command.param2)
-        if message_id not in DEFAULT_INTERVAL_US or interval_us is None:
-            return mavlink.DENIED
-        if interval_us == 0:
-            interval_us = DEFAULT_INTERVAL_US[message_id]
-        elif interval_us == -1:
-            interval_us = 0
-        elif not SHORTEST_INTERVAL_US <= interval_us < 2**31:
-            return mavlink.DENIED
-        self._schedule.set_interval(message_id, interval_us, time_ns)
-        return mavlink.ACCEPTED
-
-    def _request(self, command: mavlink.Command, time_ns: int) -> int:
-        message_id = _whole(command.param1)
-        if message_id in DEFAULT_INTERVAL_US or message_id == mavlink.HEARTBEAT:
-            self._schedule.add_once(message_id, time_ns)
-        elif message_id == mavlink.AUTOPILOT_VERSION:
-            self._send(self._encoder.autopilot_version(), time_ns)
-        elif message_id == mavlink.HOME_POSITION:
-            home = (ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M)
-            self._send(self._encoder.home_position(*home), time_ns)
-        elif message_id == mavlink.MESSAGE_INTERVAL:
-            asked = _whole(command.param2)
-            if asked not in DEFAULT_INTERVAL_US and asked != mavlink.HEARTBEAT:
-                return mavlink.DENIED
-            interval_us = self._schedule.interval_us(asked) or -1
-            self._send(self._encoder.message_interval(asked, interval_us), time_ns)
-        else:
-            return mavlink.DENIED
-        return mavlink.ACCEPTED
 
     # What happens by itself
 
@@ -289,22 +283,40 @@ class Vehicle:
             self._timesync_ts1 = self.clock.boot_ns(time_ns)
             frame = self._encoder.timesync(0, self._timesync_ts1)
         elif message_id == PARAMETER_VALUE:
-            frame = self.parameters.next_of_list(self._encoder)
-            if not self.parameters.listing:
-                self._schedule.set_interval(PARAMETER_VALUE, 0, time_ns)
+            frame = self._services.next_parameter(time_ns)
+        elif message_id == mavlink.HOME_POSITION:
+            frame = self._encoder.home_position(ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M)
+        elif message_id in EXTRA:
+            self._advance(time_ns)
+            frame = report(message_id, self._encoder, self._condition(boot_ms))
         else:
             autopilot = self.autopilot
             frame = self._encoder.heartbeat(autopilot.base_mode, autopilot.mode, autopilot.system_status)
         self._send(frame, time_ns)
 
+    def _condition(self, boot_ms: int) -> Condition:
+        """What it reports to other stations: in flight it banks as in a coordinated turn."""
+        state, roll_rad = self._state, 0.0
+        if self.autopilot.flying:
+            _, _, turn_rate_rad_s, _ = rates(state.yaw_rad, state.speed_m_s, self._command, self._bounds)
+            roll_rad = math.atan2(state.speed_m_s * turn_rate_rad_s, GRAVITY_M_S2)
+        return Condition(
+            boot_ms,
+            degrees(state.north_m, state.east_m),
+            ORIGIN_ALTITUDE_M + self._altitude_m,
+            (*state.velocity_ne_m_s(), 0.0),
+            (roll_rad, 0.0, math.remainder(state.yaw_rad, math.tau)),
+            flying=self.autopilot.flying,
+            has_position=True,
+        )
+
     def _global_position(self, boot_ms: int) -> bytes:
-        """The local position on a flat earth around the origin."""
         state = self._state
-        east_per_radian_m = EARTH_RADIUS_M * math.cos(math.radians(ORIGIN_LATITUDE_DEG))
+        latitude_deg, longitude_deg = degrees(state.north_m, state.east_m)
         return self._encoder.global_position(
             time_boot_ms=boot_ms,
-            latitude_deg=ORIGIN_LATITUDE_DEG + math.degrees(state.north_m / EARTH_RADIUS_M),
-            longitude_deg=ORIGIN_LONGITUDE_DEG + math.degrees(state.east_m / east_per_radian_m),
+            latitude_deg=latitude_deg,
+            longitude_deg=longitude_deg,
             altitude_m=ORIGIN_ALTITUDE_M + self._altitude_m,
             relative_altitude_m=self._altitude_m,
             velocity_ne_m_s=state.velocity_ne_m_s(),
@@ -322,20 +334,3 @@ class Vehicle:
 
     def _tell(self, time_ns: int, text: str) -> None:
         self.changes.append(Change(time_ns, self.system_id, text))
-
-
-def _setpoint_fault(setpoint: mavlink.Setpoint) -> str:
-    """What is wrong with a set-point, or an empty string. NaN fails every comparison, so it counts as absurd."""
-    if setpoint.frame != mavlink.FRAME_LOCAL_NED:
-        return "refused_frame"
-    if setpoint.type_mask == mavlink.MASK_VELOCITY_ACCELERATION:
-        if not math.hypot(*setpoint.velocity_ned_m_s) <= ABSURD:
-            return "refused_absurd"
-    elif setpoint.type_mask != mavlink.MASK_ACCELERATION:
-        return "refused_mask"
-    return "" if math.hypot(*setpoint.acceleration_ned_m_s2) <= ABSURD else "refused_absurd"
-
-
-def _whole(parameter: float) -> int | None:
-    """A command's parameter that has to be a whole number, or None."""
-    return int(parameter) if math.isfinite(parameter) and parameter == int(parameter) else None

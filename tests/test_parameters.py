@@ -9,21 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from sim_client import SECOND, START, a_vehicle, arm, heartbeat, mode, pack, parse_all, scenario, setpoint, take_off
+from sim_client import SECOND, START, a_vehicle, arm, heartbeat, mode, pack, parse_all, setpoint, take_off
 
-from scenarios.schema import Autopilot, Flavour
 from sim_vehicles.copter import Copter
 from sim_vehicles.vehicle import Vehicle
+from tests.vehicle_kinds import VEHICLES, copter
 
 REAL32, INT32 = dialect.MAV_PARAM_TYPE_REAL32, dialect.MAV_PARAM_TYPE_INT32
 
 
-def copter(flavour: Flavour) -> Copter:
-    flown = scenario().model_copy(update={"dynamics": "autopilot", "autopilot": Autopilot(flavour=flavour)})
-    return Copter(flown, flown.vehicles[0], START)
-
-
-VEHICLES = {"plain": a_vehicle, "ardupilot": lambda: copter("ardupilot"), "px4": lambda: copter("px4")}
 TIMEOUT = {"plain": "GUID_TIMEOUT", "ardupilot": "GUID_TIMEOUT", "px4": "COM_OF_LOSS_T"}
 
 

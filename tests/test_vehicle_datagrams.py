@@ -85,8 +85,8 @@ FAULTY = [
     (setpoint(8e3, 8e3), "refused_absurd"),
     (setpoint(velocity=(0.0, NAN), mask=0x0C07), "refused_absurd"),
     (setpoint(velocity=(-10_001.0, 0.0), mask=0x0C07), "refused_absurd"),
-    (setpoint(3.0, frame=8), "refused_frame"),
-    (setpoint(3.0, mask=0x0DC7), "refused_mask"),
+    (setpoint(3.0, frame=6), "refused_frame"),
+    (setpoint(3.0, mask=0x0DCF), "refused_mask"),
     (setpoint(3.0, mask=0x0E3F), "refused_mask"),  # with FORCE_SET
     (setpoint(3.0, mask=0), "refused_mask"),
     (setpoint(3.0, system=2), "ignored_not_addressed"),
