@@ -4,7 +4,7 @@ from collections import Counter
 from pathlib import Path
 
 from gcs import mavlink
-from gcs.station import Datagram, Outgoing
+from gcs.station import ANOTHER_ADDRESS, Datagram, Outgoing, Station
 from signing.keys import Key, read_key
 from signing.link import SignedLink
 from signing.stamps import Stamps, open_stamps
@@ -19,14 +19,22 @@ class Guard:
     def __init__(self, key: Key, *, epoch_ns: int, stamps: Stamps) -> None:
         self._link = SignedLink(key, link_id=LINK_ID, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
 
-    def received(self, datagrams: list[Datagram], now_ns: int, refused: Counter[str]) -> list[Datagram]:
-        """The datagrams with what could be verified of them; what is refused is counted by reason."""
+    def received(self, datagrams: list[Datagram], now_ns: int, station: Station) -> list[Datagram]:
+        """The datagrams with what could be verified of them; what is refused the station's counters count by reason."""
         verified: list[Datagram] = []
-        for data, address, received_ns, queued_ns in datagrams:
-            good = self._link.verify(data, now_ns, refused)
+        for datagram in datagrams:
+
+            def unwanted(system_id: int, datagram: Datagram = datagram) -> str:
+                return ANOTHER_ADDRESS if station.is_another(system_id, datagram) else ""
+
+            good = self._link.verify(datagram.data, now_ns, station.counters, unwanted)
             if good:
-                verified.append(Datagram(good, address, received_ns, queued_ns))
+                verified.append(Datagram(good, *datagram[1:]))
         return verified
+
+    def heard(self, datagrams: list[Datagram], now_ns: int) -> list[bytes]:
+        """What could be verified of datagrams that came before there is a station."""
+        return [self._link.verify(datagram.data, now_ns, Counter()) for datagram in datagrams]
 
     def sent(self, outgoing: list[Outgoing], now_ns: int) -> list[Outgoing]:
         """The datagrams with their signatures."""

@@ -115,8 +115,18 @@ class RunWriter:
     def tick(self, rows: TickArray) -> None:
         os.write(self._ticks, rows.tobytes())
 
-    def event(self, *, time_s: float, kind: str, text: str, system_id: int | None = None) -> None:
-        line = {"time_s": round(time_s, 6), "kind": kind, "system_id": system_id, "text": text}
+    def event(
+        self,
+        *,
+        time_s: float,
+        kind: str,
+        text: str,
+        system_id: int | None = None,
+        counts: dict[str, int] | None = None,
+    ) -> None:
+        line: dict[str, Any] = {"time_s": round(time_s, 6), "kind": kind, "system_id": system_id, "text": text}
+        if counts is not None:
+            line["counts"] = counts
         os.write(self._events, (json.dumps(line) + "\n").encode())
 
     def frames(self, frames: Iterable[tuple[bytes, int]]) -> None:

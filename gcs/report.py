@@ -8,6 +8,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from gcs.refusals import in_words
+
 UNKNOWN = "–"
 
 
@@ -90,6 +92,9 @@ def print_summary(summary: dict[str, Any], folder: Path, console: Console | None
         f"control  {control['ticks']} ticks at {control['rate_hz']:g} Hz, "
         f"{control['deadline_misses']} deadline misses; settled {_after(summary['settling_time_s'])}"
     )
+    for who, counts in (("station", summary.get("refused")), ("vehicles", summary.get("refused_by_vehicles"))):
+        if counts:
+            console.print(f"refused  by the {who}: {in_words(counts)}")
     table = Table(box=box.SIMPLE_HEAD)
     for name in ("vehicle", "final error, m", "largest, m", "RTT p50, ms", "loop p50, ms", "p99, ms", "lost", "late"):
         table.add_column(name, justify="right")

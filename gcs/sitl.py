@@ -6,6 +6,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from gcs.refusals import VEHICLES_FILE
 from gcs.vehicle import Address
 
 VEHICLES_LOG = "vehicles.log"
@@ -28,6 +29,7 @@ class VehicleProcess:
                 [
                     sys.executable, "-m", "sim_vehicles.cli", str(scenario_file), "--station", f"{host}:{port}",
                     "--truth", str(folder / TRUTH_FILE), "--stop-after-silence", str(_SILENCE_S),
+                    "--counters", str(folder / VEHICLES_FILE),
                     *([] if key_file is None else ["--key", str(key_file)]),
                 ],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,

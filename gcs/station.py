@@ -28,14 +28,13 @@ from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
 from gcs.startup import Startup
 from gcs.telemetry import FloatArray, StateHistory
-from gcs.vehicle import Address, RemoteVehicle
+from gcs.vehicle import SILENCE_S, Address, RemoteVehicle
 from scenarios.schema import NS_PER_S
 
 CONNECT_PATIENCE_S = 20.0
-SILENCE_S = 1.5
-"""A vehicle whose telemetry has not come for this long is lost: it gets no more set-points and is flown around."""
 AUTOPILOT_COMPONENT = 1
 """A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
+ANOTHER_ADDRESS = "known system id from another address"
 _HEARTBEAT_NS = NS_PER_S
 
 
@@ -164,6 +163,11 @@ class Station:
             return (now_ns - self._start_ns) / NS_PER_S - self.patience_s
         return (now_ns - self._flight_start_ns) / NS_PER_S
 
+    def is_another(self, system_id: int, datagram: Datagram) -> bool:
+        """Whether a frame claims the system id of a vehicle that is known to speak from another address."""
+        row = self._row.get(system_id)
+        return row is not None and self.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
+
     # -- receive ---------------------------------------------------------------------------------------------------
 
     def _receive(self, datagram: Datagram, outgoing: list[Outgoing]) -> None:
@@ -177,9 +181,12 @@ class Station:
                 self.counters["unknown system id"] += 1
                 continue
             vehicle = self.vehicles[row]
-            if not self._is_from(vehicle, datagram, frame.msg_id):
-                self.counters["known system id from another address"] += 1
+            if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
+                self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
                 continue
+            if vehicle.address != datagram.address:
+                vehicle.address = datagram.address
+                self._report("vehicle", "found", vehicle.system_id)
             vehicle.heard_ns = datagram.received_ns
             vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
             self.frames.append((frame.data, datagram.received_ns))
@@ -190,17 +197,6 @@ class Station:
                 self.counters["replayed or overtaken"] += 1
                 continue
             self._handle(row, vehicle, frame, datagram, outgoing)
-
-    def _is_from(self, vehicle: RemoteVehicle, datagram: Datagram, msg_id: int) -> bool:
-        """Whether the datagram comes from the vehicle's address; its first heartbeat, or one after silence, sets it."""
-        if vehicle.address == datagram.address:
-            return True
-        silent = datagram.received_ns - vehicle.heard_ns > SILENCE_S * NS_PER_S
-        if msg_id != mavlink.HEARTBEAT or (vehicle.address is not None and not silent):
-            return False
-        self.events.append(Event(self.scenario_time_s(self._now_ns), "vehicle", "found", vehicle.system_id))
-        vehicle.address = datagram.address
-        return True
 
     def _handle(
         self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]

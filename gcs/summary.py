@@ -23,6 +23,7 @@ from gcs.record import (
     RunTail,
     TickArray,
 )
+from gcs.refusals import counts_of, refused_by_vehicles
 from scenarios import files as scenario_files
 from scenarios.schema import Scenario
 
@@ -51,6 +52,7 @@ def finish(folder: Path) -> dict[str, Any]:
     ticks = read_ticks(folder)
     summary = summarise(scenario, design, ticks, tail.events())
     _write_parquet(folder, ticks)
+    summary["refused_by_vehicles"] = refused_by_vehicles(folder)
     summary["files"] = sorted(file.name for file in folder.iterdir() if not file.name.startswith("."))
     if SUMMARY_FILE not in summary["files"]:
         summary["files"] = sorted([*summary["files"], SUMMARY_FILE])
@@ -126,6 +128,7 @@ def summarise(
             for v in scenario.vehicles
         ],
         "control": _control(scenario, flown),
+        "refused": counts_of(events),
         "mode_changes": [e for e in events if e["kind"] == "mode" and e["time_s"] >= 0],
         "files": [],
     }

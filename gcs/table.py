@@ -21,6 +21,7 @@ from rich.text import Text
 
 from gcs.grid import unknown
 from gcs.record import TICK, Mode, TickArray
+from gcs.refusals import REFUSED
 from scenarios.schema import Scenario
 
 Floats = NDArray[np.float64]
@@ -66,6 +67,8 @@ class FlightState:
         """Delay margin of each gain set, the fastest first."""
         self.redesigned(design)
         self.phase = UNKNOWN
+        self.refused = ""
+        """What did not get in, in words."""
         self.time_s = np.nan
         self.skipped = 0
         """Ticks that were left out."""
@@ -88,7 +91,10 @@ class FlightState:
         for event in events:
             if event["kind"] == "phase":
                 self.phase = event["text"]
-            self._add_news(event)
+            if event["kind"] == REFUSED:
+                self.refused = event["text"]
+            else:
+                self._add_news(event)
         if not ticks.size:
             return
         numbers = np.concatenate([self._window["tick"][-1:, 0], ticks["tick"][:, 0]])
@@ -228,7 +234,8 @@ def _footer(state: FlightState, figures: Figures) -> list[Text]:
     line.append(f"   tick lateness p99 {_number(1e3 * figures.lateness_s_p99, '.2f')} ms")
     if state.skipped:
         line.append(f"   {state.skipped} ticks skipped", style="yellow")
-    return [line, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
+    refused = [Text(f"refused: {state.refused}", style="yellow", no_wrap=True)] if state.refused else []
+    return [line, *refused, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
 
 
 def plain_line(state: FlightState) -> str:

@@ -18,6 +18,7 @@ from gcs.guard import Guard
 from gcs.modes import Phase
 from gcs.plan import FlightPlan
 from gcs.record import RunWriter
+from gcs.refusals import REFUSED, Refusals, in_words
 from gcs.station import Datagram, Outgoing, Station
 from gcs.vehicle import Address
 
@@ -122,12 +123,19 @@ def drive(
     plan = station.plan
     log: list[tuple[bytes, int]] = []
     """Frames since the last tick, in the order in which they were taken in and sent, with their times."""
+    refusals = Refusals()
+
+    def log_refusals(now_ns: int, *, last: bool = False) -> None:
+        if counts := refusals.news(station.counters, now_ns, last=last):
+            time_s = station.scenario_time_s(now_ns)
+            writer.event(time_s=time_s, kind=REFUSED, text=in_words(counts), counts=counts)
+
     while station.phase is not Phase.ENDED:
         link.wait(station.next_event_ns)
         datagrams = link.receive()
         now_ns = clock_ns()
         if guard is not None:
-            datagrams = guard.received(datagrams, now_ns, station.counters)
+            datagrams = guard.received(datagrams, now_ns, station)
         outgoing, tick = station.step(datagrams, now_ns)
         link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
         sent_ns = clock_ns()
@@ -138,11 +146,13 @@ def drive(
             continue
         writer.tick(station.complete(tick, sent_ns))
         _log(station, writer, log)
+        log_refusals(now_ns)
         if station.plan is not plan:
             plan = station.plan
             new_plan(plan)
         if reason := stop_reason():
             station.request_stop(reason)
+    log_refusals(clock_ns(), last=True)
 
 
 def _log(station: Station, writer: RunWriter, frames: list[tuple[bytes, int]]) -> None:

@@ -29,6 +29,9 @@ RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED"
 _ACCEPTED, _IN_PROGRESS = 0, 5
 _NS = 1_000_000_000
 _FORGET_NUMBERS_NS = 3 * _NS
+SILENCE_S = 1.5
+"""A vehicle whose telemetry has not come for this long is lost: it gets no more set-points and is flown around. One of
+which nothing has come may be found at another address."""
 
 
 @dataclass
@@ -124,6 +127,16 @@ class RemoteVehicle:
         """A frame to this vehicle; each vehicle sees a sequence of its own, so it can count losses."""
         self._sequence = (self._sequence + 1) & 0xFF
         return mavlink.encode(msg_id, fields, sequence=self._sequence)
+
+    def is_elsewhere(self, address: Address, received_ns: int) -> bool:
+        """Whether the vehicle is known to speak from another address, and has not been silent."""
+        return self.address not in {None, address} and received_ns - self.heard_ns <= SILENCE_S * _NS
+
+    def may_speak_from(self, address: Address, msg_id: int, received_ns: int) -> bool:
+        """Whether a frame from an address can be this vehicle's: its first heartbeat, or one after silence, sets it."""
+        if self.address == address:
+            return True
+        return msg_id == mavlink.HEARTBEAT and not self.is_elsewhere(address, received_ns)
 
     def is_replay(self, frame: mavlink.Frame, now_ns: int) -> bool:
         """Whether a frame has been heard before, or is a heartbeat that a newer frame has overtaken.

@@ -16,7 +16,7 @@ Decisions where the guide leaves some:
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from hmac import compare_digest
 
 from fastcrc.crc16 import mcrf4xx
@@ -85,8 +85,18 @@ class SignedLink:
         signed = self._with_flags(frame, SIGNED) + self._link_id + timestamp.to_bytes(6, "little")
         return signed + self._signature(signed)
 
-    def verify(self, datagram: bytes, now_ns: int, refused: Counter[str]) -> bytes:
-        """The good frames of a datagram, without their signatures; the others are counted by reason."""
+    def verify(
+        self,
+        datagram: bytes,
+        now_ns: int,
+        refused: Counter[str],
+        unwanted: Callable[[int], str] | None = None,
+    ) -> bytes:
+        """The good frames of a datagram, without their signatures; the others are counted by reason.
+
+        `unwanted` may give another reason to refuse the genuine frames of a system id, as that they are copies from
+        elsewhere: one that came first would make the frame itself a replay.
+        """
         good: list[bytes] = []
         at, end = 0, len(datagram)
         while at < end:
@@ -101,7 +111,10 @@ class SignedLink:
                 refused[TRUNCATED] += 1
                 break
             frame = datagram[at:stop]
-            reason = self._malformed(frame) or self._forged(frame) or self._stale(frame, now_ns)
+            reason = self._malformed(frame) or self._forged(frame)
+            if not reason and unwanted is not None:
+                reason = unwanted(frame[5])
+            reason = reason or self._stale(frame, now_ns)
             if reason:
                 refused[reason] += 1
             else:

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import json
 import math
 import signal
 import socket
@@ -97,7 +98,11 @@ def _fly(
     say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
     fly(fleet, ports, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log, ports.sockets))
     say.changes(fleet.take_changes())
-    say.summary(fleet.counters + ports.counters, log)
+    counters = fleet.counters + ports.counters
+    say.summary(counters, log)
+    if options.counters:
+        with contextlib.suppress(OSError):  # the flight is over: the line above has said it
+            options.counters.write_text(json.dumps(counters))
 
 
 def _links_only(
@@ -220,6 +225,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--key", type=Path, metavar="FILE", help="sign, and take only what is signed with this key")
     parser.add_argument("--truth", type=Path, metavar="FILE", help="write what really happened when; continues a log")
+    parser.add_argument("--counters", type=Path, metavar="FILE", help="at the end, write what was counted, as JSON")
     parser.add_argument(
         "--stop-after-silence",
         type=_seconds,

@@ -1,10 +1,11 @@
 """MAVLink systems of pymavlink's that sign what they send, for the tests."""
 
+import hashlib
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
+KEY, OTHER_KEY = (hashlib.sha256(name.encode()).digest() for name in ("a key", "another"))
 EPOCH_NS = 1_800_000_000 * 10**9
 NOW_NS = 5 * 10**9
 NOW = (EPOCH_NS + NOW_NS - 1_420_070_400 * 10**9) // 10_000

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+from signed_peer import EPOCH_NS, KEY, NOW, NOW_NS, OTHER_KEY, a_sender, position, stamp
 
 from gcs import mavlink
 from signing.keys import Key
 from signing.link import LARGEST, MINUTE, REMEMBERED, SignedLink
 from signing.stamps import Stamps
 from sim_vehicles.mavlink import CRC_EXTRA
-from tests.signed_peer import EPOCH_NS, KEY, NOW, NOW_NS, OTHER_KEY, a_sender, position, stamp
 
 
 def a_link(*, stamps: Stamps | None = None, key: bytes = KEY, owner: int = 0) -> SignedLink:

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+from signed_peer import EPOCH_NS, KEY, OTHER_KEY, a_sender, stamp
 
 from gcs.guard import Guard
 from gcs.lockstep import START_NS, Sent, fly_lockstep
+from gcs.modes import Phase
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import TickArray
 from gcs.station import Datagram, Station
@@ -20,7 +22,6 @@ from signing.keys import Key
 from signing.stamps import Stamps
 from sim_vehicles.fleet import Fleet
 from sim_vehicles.guard import signed_links
-from tests.signed_peer import EPOCH_NS, KEY, OTHER_KEY, a_sender, stamp
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 
@@ -162,12 +163,32 @@ def test_a_restarted_station_refuses_what_was_recorded_before() -> None:
     attacked = Attacked(a_fleet(plan))
     flown(plan, attacked, a_guard(stamps=memory))
     recorded = [Datagram(data, ("virtual", system_id), START_NS) for system_id, data in attacked.up]
-    heard: Counter[str] = Counter()
+    station = Station(plan, start_ns=START_NS)
     again = a_guard(stamps=Stamps(memory.memory))
-    assert again.received(recorded, START_NS + 10**9, heard) == []
-    assert heard["replayed"] == len([d for d in recorded if d.data[2]]) - heard["wrong signature"]
-    forgetful: Counter[str] = Counter()
-    assert a_guard().received(recorded, START_NS + 10**9, forgetful)
+    assert again.received(recorded, START_NS + 10**9, station) == []
+    assert station.counters == {"replayed": len(recorded)}
+    assert a_guard().received(recorded, START_NS + 10**9, Station(plan, start_ns=START_NS))
+
+
+def test_a_copy_from_another_address_that_comes_first_does_not_make_the_frame_a_replay() -> None:
+    plan = a_plan("chain3", 2.0)
+    calm, _ = flown(plan, a_fleet(plan), a_guard())
+    station, guard, fleet = Station(plan, start_ns=START_NS), a_guard(), a_fleet(plan)
+    ticks: list[TickArray] = []
+    down: Sent = []
+    copies = 0
+    while station.phase is not Phase.ENDED:
+        now_ns = station.next_event_ns
+        arrived = [Datagram(data, ("virtual", k), at_ns) for k, data, at_ns in fleet.step(down, now_ns)]
+        first = [Datagram(d.data, ("stranger", 7), d.received_ns) for d in arrived] if now_ns > 2 * 10**9 else []
+        copies += len(first)
+        outgoing, tick = station.step(guard.received(first + arrived, now_ns, station), now_ns)
+        down = [(int(address[1]), data, now_ns) for data, address in guard.sent(outgoing, now_ns)]
+        if tick is not None:
+            ticks.append(station.complete(tick, now_ns))
+    for name in calm.dtype.names or ():
+        np.testing.assert_array_equal(np.concatenate(ticks)[name], calm[name], err_msg=name)
+    assert station.counters == {"known system id from another address": copies}
 
 
 def test_a_heartbeat_in_mavlink_1_is_an_exception_only_without_signing() -> None:
@@ -180,7 +201,7 @@ def test_a_heartbeat_in_mavlink_1_is_an_exception_only_without_signing() -> None
     open_station, guarded = Station(plan, start_ns=START_NS), Station(plan, start_ns=START_NS)
     open_station.step(datagram, START_NS)
     assert open_station.vehicles[0].address == ("127.0.0.1", 9)
-    guarded.step(a_guard().received(datagram, START_NS, guarded.counters), START_NS)
+    guarded.step(a_guard().received(datagram, START_NS, guarded), START_NS)
     assert guarded.vehicles[0].address is None
     assert guarded.counters == {"MAVLink 1": 1}
 
@@ -192,7 +213,7 @@ def test_what_is_logged_of_a_signed_flight_has_no_signatures() -> None:
     for _ in range(40):
         now_ns = station.next_event_ns
         arrived = [Datagram(data, ("virtual", k), at_ns) for k, data, at_ns in fleet.step(down, now_ns)]
-        outgoing, _ = station.step(guard.received(arrived, now_ns, station.counters), now_ns)
+        outgoing, _ = station.step(guard.received(arrived, now_ns, station), now_ns)
         signed = guard.sent(outgoing, now_ns)
         assert all(stamp(data) > 0 and data[2] == 1 for data, _ in signed)
         down = [(int(address[1]), data, now_ns) for data, address in signed]

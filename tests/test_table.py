@@ -169,3 +169,12 @@ def test_headroom_is_coloured_on_a_terminal_only(mode: Mode, headroom: float, se
             picture
         )
         assert all((sequence in output.getvalue()) == terminal for sequence in sequences)
+
+
+def test_what_was_refused_has_a_line_of_its_own_and_is_no_news() -> None:
+    state = flown(line(2))
+    event = {"time_s": 1.0, "kind": "refused", "system_id": None, "text": "3 unsigned", "counts": {"unsigned": 3}}
+    assert not any("refused" in text for text in drawn(state))
+    state.add(ticks_of(line(2), start_s=1.0, count=1), [event, {**event, "text": "5 unsigned, 1 replayed"}])
+    assert [text for text in drawn(state) if "refused" in text] == ["refused: 5 unsigned, 1 replayed"]
+    assert state.news == []

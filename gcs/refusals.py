@@ -1,0 +1,58 @@
+"""What does not get in at the station, by reason, for the log of a run: seldom enough that no attacker can fill it."""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+VEHICLES_FILE = "vehicles.json"
+"""What the simulated vehicles counted."""
+
+REFUSED = "refused"
+"""Kind of the events; each holds all counts so far."""
+_IGNORED = {"other component", "before a first heartbeat"}
+"""No strangers, though the station has no use for what they say."""
+_EVERY_NS = 2_000_000_000
+
+
+class Refusals:
+    """Remembers what has been told."""
+
+    def __init__(self) -> None:
+        self._told: dict[str, int] = {}
+        self._next_ns = 0
+
+    def news(self, counters: Counter[str], now_ns: int, *, last: bool = False) -> dict[str, int]:
+        """All counts by reason if there are new ones and the last news are two seconds old; nothing otherwise."""
+        if now_ns < self._next_ns and not last:
+            return {}
+        counts = {reason: count for reason, count in counters.items() if reason not in _IGNORED}
+        if counts == self._told:
+            return {}
+        self._told, self._next_ns = counts, now_ns + _EVERY_NS
+        return counts
+
+
+def in_words(counts: dict[str, int]) -> str:
+    """The counts in one line, the most frequent first."""
+    return ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items(), key=lambda each: -each[1]))
+
+
+def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
+    """What the vehicles of a run refused, by reason; None if they have not said."""
+    try:
+        counters = json.loads((folder / VEHICLES_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    prefix = "refused_"
+    return {
+        name.removeprefix(prefix).replace("_", " "): count
+        for name, count in counters.items()
+        if name.startswith(prefix)
+    }
+
+
+def counts_of(events: list[dict[str, Any]]) -> dict[str, int]:
+    """The newest counts in a run's events."""
+    told = [event["counts"] for event in events if event["kind"] == REFUSED]
+    return told[-1] if told else {}

@@ -1,0 +1,48 @@
+"""What did not get in is told with its reasons, seldom enough, and found again in a run."""
+
+from collections import Counter
+from pathlib import Path
+
+from gcs.record import RunTail, RunWriter
+from gcs.refusals import REFUSED, VEHICLES_FILE, Refusals, counts_of, in_words, refused_by_vehicles
+
+SECOND = 10**9
+
+
+def test_new_counts_are_told_at_once_then_every_two_seconds_and_at_the_end() -> None:
+    refusals, counters = Refusals(), Counter[str]()
+    assert refusals.news(counters, 0) == {}
+    told: list[tuple[int, dict[str, int]]] = []
+    for tenth in range(50):
+        counters["unsigned"] += 1
+        if counts := refusals.news(counters, tenth * SECOND // 10):
+            told.append((tenth, counts))
+    assert told == [(0, {"unsigned": 1}), (20, {"unsigned": 21}), (40, {"unsigned": 41})]
+    assert refusals.news(counters, 5 * SECOND, last=True) == {"unsigned": 50}
+    assert refusals.news(counters, 9 * SECOND, last=True) == {}
+
+
+def test_the_vehicles_own_cameras_and_first_frames_are_no_refusals() -> None:
+    counters = Counter({"other component": 3, "before a first heartbeat": 7})
+    assert Refusals().news(counters, 0, last=True) == {}
+
+
+def test_a_run_tells_its_newest_counts_the_most_frequent_first(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path)
+    for unsigned in (1, 5):
+        counts = {"replayed": 2, "unsigned": unsigned}
+        writer.event(time_s=1.0, kind=REFUSED, text=in_words(counts), counts=counts)
+    writer.event(time_s=2.0, kind="end", text="completed")
+    writer.close()
+    events = RunTail(tmp_path).events()
+    assert [event["text"] for event in events] == ["2 replayed, 1 unsigned", "5 unsigned, 2 replayed", "completed"]
+    assert counts_of(events) == {"replayed": 2, "unsigned": 5}
+    assert counts_of([]) == {}
+
+
+def test_what_vehicles_counted_is_read_if_it_is_there(tmp_path: Path) -> None:
+    assert refused_by_vehicles(tmp_path) is None
+    (tmp_path / VEHICLES_FILE).write_text('{"setpoints": 10, "refused_wrong_signature": 3, "ignored_message": 1}')
+    assert refused_by_vehicles(tmp_path) == {"wrong signature": 3}
+    (tmp_path / VEHICLES_FILE).write_text("half a fi")
+    assert refused_by_vehicles(tmp_path) is None
