@@ -28,10 +28,9 @@ from gains.delay import delay_margin
 from gains.delay_loci import factor_rank
 from gains.errors import BadModelError
 from gains.formation import FloatArray, FormationModel
-from gains.rightmost import rightmost_root
 from gains.sampled_crossings import block_delay_margin
 from gains.sampled_loop import HeldPlant, block_radius, matrix_exponentials
-from gains.structure import balanced, distinct_blocks
+from gains.structure import IntArray, balanced, distinct_blocks
 
 # an instant this close to a step (in steps) is that of the step
 _SAME_INSTANT = 1e-9
@@ -86,6 +85,11 @@ class OnboardLoop:
     late: FloatArray
     timing: OnboardTiming
 
+    def part(self, states: IntArray) -> "OnboardLoop":
+        """The loop of some of the states, those of vehicles that act on each other."""
+        at = np.ix_(states, states)
+        return OnboardLoop(self.A[at], self.sensed[at], self.known[at], self.late[at], self.timing)
+
     def continuous_margin_s(self) -> float:
         """The least delay tau at which (5.2) loses stability."""
         return delay_margin(self.A + self.sensed + self.known, self.late)
@@ -105,11 +109,9 @@ class OnboardLoop:
         radius = max(block_radius(plant, delay_s) for plant in self._plants())
         return float(np.log(radius)) / self.timing.control_s if radius > 0.0 else -inf
 
-    def growth_continuous_1_s(self, delay_s: float) -> float:
-        """Real part of the rightmost root of the continuous model; a hold counts as half its period of delay."""
-        step_s = self.timing.control_s / self.timing.steps
-        own, late_s = self.sensed + self.known, delay_s + self.timing.control_s / 2.0
-        return rightmost_root([(self.A, 0.0), (own, step_s / 2.0), (self.late, late_s)]).real
+    def continuous_at_once(self) -> list[tuple[FloatArray, float]]:
+        """What is not late in the continuous model, each term with its delay (s): a hold counts as half a step."""
+        return [(self.A, 0.0), (self.sensed + self.known, self.timing.control_s / self.timing.steps / 2.0)]
 
     def _plants(self) -> "list[LocalPlant]":
         plants: list[LocalPlant] = []

@@ -139,9 +139,11 @@ class VehicleControl(NamedTuple):
     spacing_error_m: tuple[float, float]
     velocity_error_m_s: tuple[float, float]
     command_m_s2: tuple[float, float]
+    used_ns: int
+    """Instant of the errors that the command was computed from: in the ground loop `sample_ns`."""
 
 
-_UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan, nan))
+_UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan, nan), 0)
 
 
 def formation_control(
@@ -171,9 +173,25 @@ def formation_control(
             spacing_error, command = _followed(history, own, newest, blend, nominal_velocity_m_s, opening)
         velocity_error = state[2] - nominal_velocity_m_s[0], state[3] - nominal_velocity_m_s[1]
         controls.append(
-            VehicleControl(sample_ns, state, spacing_error, velocity_error, _shortened(command, limit_m_s2))
+            VehicleControl(sample_ns, state, spacing_error, velocity_error, _shortened(command, limit_m_s2), sample_ns)
         )
     return controls
+
+
+def command_at(
+    history: StateHistory,
+    law: VehicleLaw,
+    row: int,
+    instant_ns: int,
+    blend: Blend,
+    nominal_velocity_m_s: tuple[float, float],
+    limit_m_s2: float,
+    opening: float,
+) -> tuple[float, float]:
+    """The command of one vehicle from the errors at an instant."""
+    state = history.at(row, instant_ns) or _UNKNOWN.state
+    _, command = _followed(history, law, (instant_ns, state), blend, nominal_velocity_m_s, opening)
+    return _shortened(command, limit_m_s2)
 
 
 def _followed(
@@ -184,7 +202,7 @@ def _followed(
     nominal_velocity_m_s: tuple[float, float],
     opening: float,
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Spacing error and command of one vehicle: the sum of G_ik (x_k - x*_k) at the instant of its newest state."""
+    """Spacing error and command of one vehicle: the sum of G_ik (x_k - x*_k) at the instant of its given state."""
     sample_ns, (north, east, _, _) = newest
     nominal_north, nominal_east = nominal_velocity_m_s
     command_north = command_east = 0.0

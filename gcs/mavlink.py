@@ -16,6 +16,9 @@ STATION_SYSTEM_ID = 255
 STATION_COMPONENT_ID = 190
 
 HEARTBEAT = 0
+PARAM_REQUEST_READ = 20
+PARAM_VALUE = 22
+PARAM_SET = 23
 LOCAL_POSITION_NED = 32
 GLOBAL_POSITION_INT = 33
 GPS_GLOBAL_ORIGIN = 49
@@ -221,6 +224,16 @@ def command_long(
     """Fields of COMMAND_LONG to the autopilot (component 1) of one vehicle; parameters left out are 0."""
     padded = (*parameters, *(0.0 for _ in range(7 - len(parameters))))
     return (*padded, command, target_system, 1, confirmation)
+
+
+def param_set(name: str, value: float, *, target_system: int) -> tuple[Any, ...]:
+    """Fields of PARAM_SET with a REAL32."""
+    return (value, target_system, 1, name.encode(), dialect.MAV_PARAM_TYPE_REAL32)
+
+
+def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
+    """Fields of PARAM_REQUEST_READ by name."""
+    return (-1, target_system, 1, name.encode())
 
 
 IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION = 0x0C07

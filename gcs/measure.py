@@ -28,6 +28,8 @@ AMPLITUDES = (1.0, 0.03, 0.001)
 _PILOT_S = 1.0
 _SETTLED_LOOP_DELAYS = 4.0
 """Modes other than the slowest are gone, or small enough to be fitted along, after this many loop delays."""
+_FLYING_LOOP_DELAYS = 1.0
+"""Until then the states used are those of vehicles on the launcher; enough where nothing is fed back late."""
 _BEGUN_LOOP_DELAYS = 2.0
 """Nothing that a vehicle did at the start is left to be acted on after this many."""
 _CALM_SHARE = 0.8
@@ -182,7 +184,8 @@ def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcom
         return outcome
     since_s = own["time_s"] - own["time_s"][0]
     delay_s = max(response.loop_delays_s(own, loop.system_ids).values())
-    start_s = _SETTLED_LOOP_DELAYS * delay_s + 2.0 * loop.period_s
+    settled = _SETTLED_LOOP_DELAYS if loop.has_late_terms else _FLYING_LOOP_DELAYS
+    start_s = settled * delay_s + 2.0 * loop.period_s
     modes = len(loop.A) // 2 + 2  # those of one axis, and two of what is late; the other axis has the same
     motion = motion_of(own, loop.system_ids, period_s=loop.period_s)
     if response.varying:

@@ -11,7 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.delay import delay_margin
 from gains.formation import FormationModel
+from gains.onboard import OnboardLoop, OnboardTiming, onboard_loop
 from gains.rightmost import rightmost_root
 from gains.sampled import growth_rate, sampled_delay_margin
 from gains.several_delays import late_by_vehicle
@@ -22,20 +24,38 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Vehicles that act on each other, with their part of e' = A e + B u, u = K e."""
+    """Vehicles that act on each other, with their part of e' = A e + B u, u = K e.
+
+    `onboard` is their part of the onboard loop; without it all feedback is late.
+    """
 
     system_ids: tuple[int, ...]
     A: FloatArray
     B: FloatArray
     K: FloatArray
     period_s: float
+    onboard: OnboardLoop | None = None
+
+    @property
+    def has_late_terms(self) -> bool:
+        """Whether anything in it is fed back late: not on board, in a loop of one vehicle."""
+        return self.onboard is None or bool(self.onboard.late.any())
 
     def margin_s(self) -> float:
         """The least loop delay at which the sampled and held loop loses stability."""
+        if self.onboard is not None:
+            return self.onboard.sampled_margin_s()
         return float(sampled_delay_margin(self.A, self.B, self.K, period_s=self.period_s))
+
+    def margin_continuous_s(self) -> float:
+        """The least loop delay at which the continuous model loses stability; the hold counts as half a period."""
+        whole_s = delay_margin(self.A, self.B @ self.K) if self.onboard is None else self.onboard.continuous_margin_s()
+        return whole_s - self.period_s / 2.0
 
     def growth_1_s(self, delay_s: float) -> float:
         """Growth rate of the sampled and held loop at a loop delay."""
+        if self.onboard is not None:
+            return self.onboard.growth_1_s(delay_s)
         return growth_rate(self.A, self.B, self.K, period_s=self.period_s, delay_s=delay_s)
 
     def growth_continuous_1_s(self, delay_s: float) -> float:
@@ -44,9 +64,11 @@ class Loop:
 
     def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
         """The same with a loop delay of its own for each vehicle's command, as in `gains.several_delays`."""
-        late = late_by_vehicle(self.B, self.K, [slice(2 * k, 2 * k + 2) for k in range(len(self.system_ids))])
+        late_gain = self.K if self.onboard is None else self.B.T @ self.onboard.late
+        at_once = [(self.A, 0.0)] if self.onboard is None else self.onboard.continuous_at_once()
+        late = late_by_vehicle(self.B, late_gain, [slice(2 * k, 2 * k + 2) for k in range(len(self.system_ids))])
         delays_s = [loop_delay_s[system_id] + self.period_s / 2.0 for system_id in self.system_ids]
-        return rightmost_root([(self.A, 0.0), *zip(late, delays_s, strict=True)]).real
+        return rightmost_root([*at_once, *zip(late, delays_s, strict=True)]).real
 
     def growth_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
         """Growth rate of the sampled loop with a loop delay of its own for each vehicle.
@@ -91,12 +113,21 @@ class Zero:
     inside: bool
 
 
-def loops_of(predecessors: Sequence[int], system_ids: Sequence[int], K: FloatArray, *, period_s: float) -> list[Loop]:
+def loops_of(
+    predecessors: Sequence[int],
+    system_ids: Sequence[int],
+    K: FloatArray,
+    *,
+    period_s: float,
+    onboard: OnboardTiming | None = None,
+) -> list[Loop]:
     """The loops of a formation flown with a gain matrix K, those ahead first.
 
-    `predecessors` and the order of K are those of `gains.formation.FormationModel`.
+    `predecessors` and the order of K are those of `gains.formation.FormationModel`. `onboard` is the timing of the
+    onboard loop; without it the station closes every loop.
     """
     model = FormationModel(tuple(predecessors))
+    whole = None if onboard is None else onboard_loop(model, K, onboard)
     states = [
         np.r_[model.spacing_slice(i), model.velocity_slice(i)] if i > 0 else np.r_[model.velocity_slice(0)]
         for i in range(model.vehicles)
@@ -116,6 +147,7 @@ def loops_of(predecessors: Sequence[int], system_ids: Sequence[int], K: FloatArr
                 B=B[np.ix_(own, inputs)],
                 K=K[np.ix_(inputs, own)],
                 period_s=period_s,
+                onboard=None if whole is None else whole.part(own),
             )
         )
     return loops

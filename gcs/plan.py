@@ -14,6 +14,7 @@ from gains.requirement import Requirement
 from gains.response import Response, continuous_margin, requirement_with, string_peak
 from gains.structure import strongly_connected_blocks
 from gcs.control import Formation
+from gcs.onboard import onboard_plan
 from gcs.responses import Responses, given_responses, margins_with
 from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
@@ -85,7 +86,7 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
     formation = plan_formation(scenario)
     model = FormationModel(tuple(formation.predecessor.tolist()))
     if scenario.control.method != "inclusion" or scenario.control.blocks:
-        return _graph_plan(scenario, formation, model)
+        return _flown_loop(*_graph_plan(scenario, formation, model))
     responses = given_responses(scenario)
     found = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
     schedule = _schedule(scenario, model, found)
@@ -97,7 +98,12 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
         slower=tuple((model.overlapping_gain(s.K1, s.K2, s.K3), s.delay_margin_s) for _, s in schedule),
     )
     whole = found.to_dict() | {"schedule": [_entry(1.0, found), *(_entry(*slower) for slower in schedule)]}
-    return _with_responses(whole, plan, responses)
+    return _flown_loop(*_with_responses(whole, plan, responses))
+
+
+def _flown_loop(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, Any], FlightPlan]:
+    """Design and plan of a ground loop, made those of the scenario's loop."""
+    return onboard_plan(design, plan) if plan.scenario.control.loop == "onboard" else (design, plan)
 
 
 def _with_responses(
@@ -201,7 +207,7 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
         delay_margin_s=found.delay_margin_s,
         slower=tuple((entry.K, entry.delay_margin_s) for entry in slower),
         separable=len(_loops(model, found.K)) == model.vehicles,
-        around_loss=_around_loss(model, found.delay_margin_s, scales, period_s),
+        around_loss=() if control.loop == "onboard" else _around_loss(model, found.delay_margin_s, scales, period_s),
     )
     names = ("alpha", "decay_rate_1_s", "delay_margin_s", "delay_margin_continuous_s")
     schedule = [

@@ -15,7 +15,7 @@ What would hide the loop is taken out:
 * Links that differ start the vehicles at different instants, and leave clocks that are wrong by different halves of the
   links' asymmetry, which the station sees as errors too. So all vehicles have the links of the one that is probed.
   Its loop is the same for that: what the station uses of the others is brought to the instant of its own state.
-* Changes of the nominal velocity.
+* Changes of the nominal velocity, and the noise of the vehicles' sensors.
 """
 
 import numpy as np
@@ -54,6 +54,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         "vehicles": tuple(vehicles),
         "nominal_velocity": scenario.nominal_velocity[:1],
         "duration_s": PROBE_S,
+        "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
     }
     return scenario.model_copy(update=update)
 

@@ -90,7 +90,7 @@ TICK = np.dtype(
         ("nearest_m", "<f8"),  # distance to the nearest other vehicle, at the tick's instant; NaN while unknown
         ("queue_s", "<f8"),  # from the kernel's receive stamp of the newest state to its use by a step
         ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
-        ("loop_delay_s", "<f8"),  # telemetry_age_s + down_delay_s
+        ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s; in the ground loop it is the newest one
         ("headroom", "<f8"),  # 1 - loop delay / margin
         ("rtt_s", "<f8"),  # the TIMESYNC round trip that ended since the tick before; NaN if none did
         ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock

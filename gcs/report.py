@@ -41,10 +41,16 @@ def print_design(design: dict[str, Any], console: Console | None = None) -> None
 
 
 def _print_margins(design: dict[str, Any], console: Console) -> None:
-    console.print(
-        f"margin   {_ms(design['delay_margin_s'])} of loop delay in the sampled loop, "
-        f"{_ms(design['delay_margin_continuous_s'])} in the continuous model"
-    )
+    sampled_s, continuous_s = design["delay_margin_s"], design["delay_margin_continuous_s"]
+    if design["loop"] == "onboard" and sampled_s is None:
+        console.print("margin   no limit: no delay of what the station streams makes this loop unstable")
+    else:
+        console.print(
+            f"margin   {_ms(sampled_s)} of loop delay in the sampled loop, {_ms(continuous_s)} in the continuous model"
+        )
+    if design["loop"] == "onboard":
+        ground_s = design["onboard"]["ground_delay_margin_s"]
+        console.print(f"         {_ms(ground_s)} if the station closed every loop with the same gains")
 
 
 def _print_graph_design(design: dict[str, Any], console: Console) -> None:

@@ -60,8 +60,9 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
         estimate = clock.estimate
         age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
         down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
+        used_s = (sent_ns - control.used_ns) * 1e-9 if control.used_ns > 0 else nan
         known = estimate.samples > 0
-        delays_s.append(age_s + down_s)
+        delays_s.append(used_s + down_s)
         packed.append(
             _ROW.pack(
                 tick.number, tick.time_s, tick.due_ns, sent_ns, tick.key_ms, vehicle.system_id,
@@ -70,7 +71,7 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
                 *control.state[:2], reported.down_m, *control.state[2:], reported.velocity_down_m_s,
                 *control.spacing_error_m, *control.velocity_error_m_s,
                 *(control.command_m_s2 if commanded else (nan, nan)),
-                nearest_m, reported.queue_s, down_s, age_s + down_s, headroom(age_s + down_s, margin_s), rtt_s,
+                nearest_m, reported.queue_s, down_s, used_s + down_s, headroom(used_s + down_s, margin_s), rtt_s,
                 estimate.offset_ns * 1e-9 if known else nan, estimate.bound_ns * 1e-9 if known else nan,
                 frames.received, frames.lost, frames.late, frames.duplicate,
             )

@@ -13,13 +13,7 @@ import numpy as np
 
 from gcs import mavlink
 from gcs.autopilots import Goal
-from gcs.control import (
-    LARGEST_COMMAND_M_S2,
-    VehicleControl,
-    distances_m,
-    feedback_law,
-    formation_control,
-)
+from gcs.control import LARGEST_COMMAND_M_S2, VehicleControl, distances_m, formation_control
 from gcs.copters import START_PATIENCE_S, Copters
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
@@ -27,6 +21,7 @@ from gcs.plan import FlightPlan
 from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
 from gcs.startup import Startup
+from gcs.stream import Stream, law_of, set_point, upload_of
 from gcs.telemetry import FloatArray, StateHistory
 from gcs.vehicle import SILENCE_S, Address, RemoteVehicle
 from scenarios.schema import NS_PER_S
@@ -84,13 +79,16 @@ class Station:
                 if autopilots
                 else None,
                 land=scenario.at_end == "land",
+                upload=upload_of(plan, system_id),
             )
             for system_id in plan.formation.system_ids
         ]
         n = len(self.vehicles)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
         self._history = StateHistory(n)
-        self._law = feedback_law(plan.formation, plan.gains, [False] * n)
+        self._law = law_of(plan, [False] * n)
+        self._stream = Stream(plan) if scenario.control.loop == "onboard" else None
+        self._control = formation_control if self._stream is None else self._stream.control
         self._period_ns = round(NS_PER_S / rates.control_hz)
         self._monitor = FormationMonitor(
             n,
@@ -214,6 +212,8 @@ class Station:
                     self._timesync_reply(row, vehicle, tc1_ns, ts1_ns, datagram.received_ns)
             case mavlink.HEARTBEAT:
                 vehicle.heartbeat(fields, datagram.received_ns)
+            case mavlink.PARAM_VALUE if vehicle.upload is not None:
+                vehicle.upload.take(fields)
             case mavlink.COMMAND_ACK:
                 vehicle.acknowledge(fields, datagram.received_ns)
             case mavlink.STATUSTEXT:
@@ -258,7 +258,7 @@ class Station:
             self._copters.locate(self._history)
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
-        controls = formation_control(
+        controls = self._control(
             self._history,
             self._law,
             self._monitor.blends(time_s),
@@ -303,8 +303,7 @@ class Station:
                 if gone != was:
                     self._report("vehicle", "is lost" if gone else "is heard again", vehicle.system_id)
             self._lost = lost
-            gains = self.plan.around_loss if any(lost) and self.plan.around_loss else self.plan.gains
-            self._law = feedback_law(self.plan.formation, gains, lost)
+            self._law = law_of(self.plan, lost)
         view = FleetView(
             time_s=self.scenario_time_s(due_ns),
             flying=flying,
@@ -370,6 +369,9 @@ class Station:
             reason = self._copters.impatience(due_ns, self._start_ns)
             if reason:
                 self.request_stop(reason)
+        elif any(vehicle.refused for vehicle in self.vehicles):
+            refusals = [f"vehicle {v.system_id}: {v.missing}" for v in self.vehicles if v.refused]
+            self.request_stop("refused: " + "; ".join(refusals))
         elif waited_s > CONNECT_PATIENCE_S:
             unready = "; ".join(f"vehicle {v.system_id} {v.missing}" for v in self.vehicles if not v.ready)
             self.request_stop(f"not ready: {unready}")
@@ -390,6 +392,9 @@ class Station:
             return self._copters.set_point(row, control, self.phase, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
         if not commanded:
             return None
+        if self._stream is not None:
+            velocity = self.plan.scenario.nominal_velocity_at(self.scenario_time_s(due_ns))
+            return set_point(self.vehicles[row], control, velocity, key_ms=key_ms)
         north, east = control.command_m_s2
         return mavlink.acceleration_set_point(
             key_ms=key_ms, target_system=self.vehicles[row].system_id, north_m_s2=north, east_m_s2=east

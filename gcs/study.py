@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from gains.delay import delay_margin
 from gcs.campaign import Run
 from gcs.onset import GrowthPoint, Loop, Zero, distinct, locate_zero
 from gcs.plan import FlightPlan
@@ -201,7 +200,7 @@ def _found(
         loop_delay_s=zero.loop_delay_s,
         error_s=zero.error_s,
         predicted_s=predicted_s,
-        predicted_continuous_s=float(delay_margin(loop.A, loop.B @ loop.K)) - loop.period_s / 2.0,
+        predicted_continuous_s=loop.margin_continuous_s(),
         difference=zero.loop_delay_s / predicted_s - 1.0,
         link_delay_s=link_s,
         waiting_s=waiting_s,

@@ -13,6 +13,7 @@ import numpy as np
 
 from gcs.flown import Flight, margins_of
 from gcs.growth import FloatArray
+from gcs.onboard import timing_of
 from gcs.onset import Loop, loops_of
 from gcs.plan import FlightPlan, plan_formation
 from gcs.record import TickArray
@@ -125,7 +126,8 @@ def plan_of(trial: Trial) -> FlightPlan:
 def plan_loops(plan: FlightPlan) -> list[Loop]:
     """The loops of a plan at its control period."""
     predecessors, system_ids = plan.formation.predecessor.tolist(), plan.formation.system_ids
-    return loops_of(predecessors, system_ids, plan.gain, period_s=1.0 / plan.scenario.rates.control_hz)
+    period_s = 1.0 / plan.scenario.rates.control_hz
+    return loops_of(predecessors, system_ids, plan.gain, period_s=period_s, onboard=timing_of(plan.scenario))
 
 
 def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:

@@ -19,6 +19,7 @@ from gcs.autopilots import (
 from gcs.clocks import LEAST_SAMPLES, VehicleClock
 from gcs.sequence import DUPLICATE, LATE, SequenceCounter
 from gcs.startup import Startup
+from gcs.upload import Upload
 
 Address = tuple[str, int]
 
@@ -47,7 +48,8 @@ class _Command:
 class RemoteVehicle:
     """What is known of one vehicle; `converse` brings it to the state the station wants.
 
-    A vehicle with an autopilot has a `startup`; `land` says how it is to end.
+    A vehicle with an autopilot has a `startup`; `land` says how it is to end. One with a loop of its own has an
+    `upload`, its parameters, without which it is not armed.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class RemoteVehicle:
         report: Callable[[str, str], None],
         startup: Startup | None = None,
         land: bool = False,
+        upload: Upload | None = None,
     ) -> None:
         self.system_id = system_id
         self.address: Address | None = None
@@ -71,6 +74,7 @@ class RemoteVehicle:
         self.goal: Goal | None = Goal.FLY
         """None: it is left to itself."""
         self.startup = startup
+        self.upload = upload
         self.first_heard_ns: int | None = None
         self.rates_set = False
         self._land = land
@@ -104,9 +108,7 @@ class RemoteVehicle:
 
     @property
     def ready(self) -> bool:
-        if self.startup is not None:
-            return not self._next(self.startup).missing
-        return self.guided and self.rates_set and self.clock.estimate.samples >= LEAST_SAMPLES
+        return not self.missing if self.startup is None else not self._next(self.startup).missing
 
     @property
     def missing(self) -> str:
@@ -115,13 +117,25 @@ class RemoteVehicle:
             return "not heard"
         if self.startup is not None:
             return self._next(self.startup).missing
-        if not self.rates_set:
-            return "does not accept the telemetry rate"
-        if self.clock.estimate.samples < LEAST_SAMPLES:
-            return "does not answer TIMESYNC"
-        if self.custom_mode != self.kind.guided_mode:
-            return "does not enter GUIDED"
-        return "" if self.armed else "does not arm"
+        if self.refused and self.upload is not None:
+            return self.upload.refusal
+        waits = (
+            ("does not accept the telemetry rate", not self.rates_set),
+            ("does not answer TIMESYNC", self.clock.estimate.samples < LEAST_SAMPLES),
+            ("" if self.upload is None else self.upload.missing, not self._uploaded),
+            ("does not enter GUIDED", self.custom_mode != self.kind.guided_mode),
+            ("does not arm", not self.armed),
+        )
+        return next((text for text, waiting in waits if waiting), "")
+
+    @property
+    def refused(self) -> bool:
+        """Whether it holds other parameters than it was told, and so is not to be flown."""
+        return self.upload is not None and self.upload.refusal != ""
+
+    @property
+    def _uploaded(self) -> bool:
+        return self.upload is None or self.upload.done
 
     def encode(self, msg_id: int, fields: tuple[Any, ...]) -> bytes:
         """A frame to this vehicle; each vehicle sees a sequence of its own, so it can count losses."""
@@ -200,13 +214,23 @@ class RemoteVehicle:
             self._acknowledged_ns = now_ns
 
     def converse(self, now_ns: int) -> bytes | None:
-        """The next frame that brings the vehicle to the wanted state, if one is due.
+        """The next frame that brings the vehicle to the wanted state, if one is due: a command, else a parameter.
 
         One command is in flight at a time (an ACK carries no request id); it is sent again, with the confirmation
         raised, when three round trips or 1 s have passed without an answer.
         """
         self._now_ns = now_ns
-        if self.address is None or now_ns < self._not_before_ns:
+        if self.address is None:
+            return None
+        frame = self._next_command(now_ns)
+        if frame is None and self.upload is not None and self.goal is Goal.FLY:
+            due = self.upload.next(now_ns, target_system=self.system_id, rtt_ns=self.clock.rtt_ns or 0)
+            return None if due is None else self.encode(*due)
+        return frame
+
+    def _next_command(self, now_ns: int) -> bytes | None:
+        """The next COMMAND_LONG, if one is due."""
+        if now_ns < self._not_before_ns:
             return None
         waiting = self._command
         if waiting is not None:
@@ -242,7 +266,7 @@ class RemoteVehicle:
             return SET_MESSAGE_INTERVAL, (float(mavlink.LOCAL_POSITION_NED), self._telemetry_interval_us)
         if self.custom_mode != self.kind.guided_mode:
             return mode_command(self.kind, self.kind.guided_mode)
-        return (ARM_DISARM, (1.0,)) if not self.armed else None
+        return (ARM_DISARM, (1.0,)) if self._uploaded and not self.armed else None
 
     def _next(self, startup: Startup) -> Step:
         return startup.next(
@@ -257,4 +281,6 @@ class RemoteVehicle:
         self.rates_set = False
         if self.startup is not None:
             self.startup.forget_rates()
+        if self.upload is not None:
+            self.upload.begin_anew()
         self._command = None

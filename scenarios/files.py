@@ -130,6 +130,7 @@ def _contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
     yield from _links_contradictions(scenario)
     yield from _control_contradictions(scenario)
     yield from _monitor_contradictions(scenario)
+    yield from _onboard_contradictions(scenario)
     yield from _autopilot_contradictions(scenario)
     limits = scenario.limits
     if limits.speed_max_m_s is not None and limits.speed_max_m_s <= limits.speed_min_m_s:
@@ -188,6 +189,19 @@ def _monitor_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, s
     scales = monitor.time_scales
     if scales[0] != 1 or any(slow <= fast for fast, slow in itertools.pairwise(scales)):
         yield "monitor.time_scales", list(scales), "1 first, then increasing factors"
+
+
+def _onboard_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+    if scenario.control.loop != "onboard":
+        return
+    own, control_hz = scenario.onboard, scenario.rates.control_hz
+    if scenario.dynamics == "autopilot":
+        wanted = "ground, with dynamics autopilot: no autopilot at hand has the other loop"
+        yield "control.loop", scenario.control.loop, wanted
+    if own.sensor_hz % control_hz:
+        yield "onboard.sensor_hz", own.sensor_hz, f"a whole multiple of rates.control_hz = {control_hz:g}"
+    if own.rate_hz % own.sensor_hz:
+        yield "onboard.rate_hz", own.rate_hz, f"a whole multiple of onboard.sensor_hz = {own.sensor_hz:g}"
 
 
 def _formation_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:

@@ -94,7 +94,10 @@ class Control(Part):
     method: Literal["inclusion", "graph-dk", "graph-lqr"] = "inclusion"
     """inclusion: every vehicle uses its own errors and the velocity error of the one in front. The graph methods use
     all errors of these two, and of those it hears."""
-    loop: Literal["ground"] = "ground"
+    loop: Literal["ground", "onboard"] = "ground"
+    """ground: the station closes every loop, and all feedback is late. onboard: every vehicle feeds back its own errors
+    by itself, and the station streams what depends on those of others (thesis eq. 5.1). What is required of a design is
+    required of its ground loop; the margins reported are those of the loop flown."""
     delay_margin_s: Positive | None = None
     """Least delay margin of the sampled loop."""
     alpha: Annotated[float, Field(gt=0, lt=1)] | None = None
@@ -106,6 +109,20 @@ class Control(Part):
     gains: FixedGains | None = None
     blocks: tuple[GainBlock, ...] = ()
     """In place of a design, the gain matrix block by block; blocks left out are zero."""
+
+
+class Onboard(Part):
+    """The loop on board of each vehicle, with control.loop onboard, and its sensor for the vehicle ahead."""
+
+    rate_hz: Rate = 100.0
+    """How often the vehicle computes its own part of the command; a whole multiple of sensor_hz."""
+    sensor_hz: Rate = 50.0
+    """How often the sensor sees the vehicle ahead; a whole multiple of rates.control_hz. In between the position is
+    carried on with the relative velocity."""
+    position_noise_m: NotNegative = 0.0
+    """Standard deviation of the sensor's relative position, in each axis; normal, independent from look to look."""
+    velocity_noise_m_s: NotNegative = 0.0
+    """The same of its relative velocity."""
 
 
 class Jitter(Part):
@@ -329,6 +346,7 @@ class Scenario(Part):
     limits: Limits = Limits()
     rates: Rates = Rates()
     control: Control = Control()
+    onboard: Onboard = Onboard()
     links: Links = Links()
     clocks: Clocks = Clocks()
     safety: Safety = Safety()

@@ -15,6 +15,7 @@ from signing.link import SignedLink
 from sim_vehicles.copter import Copter
 from sim_vehicles.dynamics import State
 from sim_vehicles.links import NEVER_NS, Link, LinkSet
+from sim_vehicles.onboard import OnboardLoop
 from sim_vehicles.truth import Record
 from sim_vehicles.vehicle import Change, Vehicle
 
@@ -33,7 +34,7 @@ class _Member:
     leaves_ns: int = NEVER_NS
     """The earliest instant at which a datagram of this vehicle can leave its up link."""
     acts_ns: int = NEVER_NS
-    """With channels only: the next instant at which the vehicle does something or a datagram reaches it."""
+    """In order of time only: the next instant at which the vehicle does something or a datagram reaches it."""
 
 
 class Fleet:
@@ -41,8 +42,9 @@ class Fleet:
 
     Vehicles do not meet each other here, so each is brought up to date only when a datagram of its own can leave,
     in order of that time and of system id; nothing is late for it, since everything it does has its exact instant.
-    Only where links have channels does what one vehicle sends delay the others: then all that happens is done in order
-    of time, and at one instant first what the station sends and then the vehicles by system id.
+    Only where links have channels does what one vehicle sends delay the others, and only sensors let one see another:
+    then all that happens is done in order of time, and at one instant first what the station sends and then the
+    vehicles by system id.
 
     Vehicles with an end of a signed link, by system id, sign what they send and are given what could be verified.
     """
@@ -62,13 +64,18 @@ class Fleet:
         """(leaves_ns, system id); entries that no longer agree with the member are stale and skipped."""
         self._links = LinkSet(scenario, start_ns, record=record)
         self._acts: list[tuple[int, int]] = []
-        """With channels only: (acts_ns, system id), stale entries likewise."""
+        """In order of time only: (acts_ns, system id), stale entries likewise."""
         self._entering: list[tuple[int, int, int, bytes]] = []
-        """With channels only: (time, system id, number, data) of what the station has sent, earliest first."""
+        """In order of time only: (time, system id, number, data) of what the station has sent, earliest first."""
         self._entered = 0
+        sensors = scenario.control.loop == "onboard"
+        self._in_order = sensors or self._links.have_channels
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
-            kind = Copter if scenario.dynamics == "autopilot" else Vehicle
-            vehicle = kind(scenario, own, start_ns, record=record)
+            if scenario.dynamics == "autopilot":
+                vehicle = Copter(scenario, own, start_ns, record=record)
+            else:
+                onboard = OnboardLoop(scenario, own.system_id, self._seen) if sensors else None
+                vehicle = Vehicle(scenario, own, start_ns, record=record, onboard=onboard)
             self._members[own.system_id] = _Member(
                 vehicle, *self._links.of(own.system_id), signed[own.system_id] if signed else None
             )
@@ -127,7 +134,7 @@ class Fleet:
             received = list(received)
             for _, data, time_ns in received:
                 self._links.hear(data, time_ns)
-        if self._links.have_channels:
+        if self._in_order:
             self._run_in_order(received, now_ns)
         else:
             for system_id, data, time_ns in received:
@@ -153,12 +160,17 @@ class Fleet:
 
     def state(self, system_id: int, now_ns: int) -> State:
         """The true state of a vehicle now, everything that has reached it by now included."""
-        if self._links.have_channels:
+        if self._in_order:
             self._run_in_order((), now_ns)
         member = self._members[system_id]
         self._live(member, now_ns)
         self._plan(member)
         return member.vehicle.state_at(now_ns)
+
+    def _seen(self, system_id: int, now_ns: int) -> State | None:
+        """What a sensor sees of a vehicle: its true state now; everything before is done. None if it is not there."""
+        member = self._members.get(system_id)
+        return None if member is None else member.vehicle.state_at(now_ns)
 
     def _run_in_order(self, received: Iterable[Datagram], now_ns: int) -> None:
         """Let everything enter its link in order of time, from the station and from the vehicles, until now."""
@@ -205,7 +217,7 @@ class Fleet:
         if leaves_ns != member.leaves_ns:
             member.leaves_ns = leaves_ns
             heapq.heappush(self._heap, (leaves_ns, member.vehicle.system_id))
-        if self._links.have_channels:
+        if self._in_order:
             self._plan_act(member, min(acts_ns, arrives_ns))
 
     def _plan_act(self, member: _Member, acts_ns: int) -> None:

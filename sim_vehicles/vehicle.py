@@ -17,11 +17,12 @@ from sim_vehicles.autopilot import MODE_NAMES, Autopilot
 from sim_vehicles.clock import BootClock
 from sim_vehicles.dynamics import COAST, VELOCITY_GAIN_1_S, Command, State, advance, bounds_of, rates, state_from
 from sim_vehicles.earth import ORIGIN_ALTITUDE_M, ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, degrees
+from sim_vehicles.onboard import STEP, OnboardLoop, formation_parameters
 from sim_vehicles.parameters import Parameters, of_vehicle
 from sim_vehicles.schedule import Schedule
 from sim_vehicles.service_messages import PARAMETER_VALUE, ParameterSet, Request, SetMode
 from sim_vehicles.services import EXTRA, Condition, Services, report, whole
-from sim_vehicles.setpoints import ACCELERATION, AXES, VELOCITY, fault, to_local
+from sim_vehicles.setpoints import ACCELERATION, AXES, VELOCITY, VELOCITY_ACCELERATION, fault, to_local
 from sim_vehicles.setup_parameters import of_ardupilot
 from sim_vehicles.truth import ACTED, SAMPLED, Record
 
@@ -58,7 +59,13 @@ class Vehicle:
     """
 
     def __init__(
-        self, scenario: schema.Scenario, own: schema.Vehicle, start_ns: int, *, record: Record | None = None
+        self,
+        scenario: schema.Scenario,
+        own: schema.Vehicle,
+        start_ns: int,
+        *,
+        record: Record | None = None,
+        onboard: OnboardLoop | None = None,
     ) -> None:
         self.system_id = own.system_id
         self.counters: Counter[str] = Counter()
@@ -68,7 +75,9 @@ class Vehicle:
         """When the last valid frame for this vehicle, or for all, arrived."""
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.autopilot = Autopilot(scenario.safety)
-        self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot()])
+        formation = [] if onboard is None else formation_parameters()
+        self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot(), *formation])
+        self._onboard = onboard
         self._record = record
         self._encoder = mavlink.Encoder(own.system_id)
         self._altitude_m = scenario.altitude_m
@@ -91,6 +100,8 @@ class Vehicle:
         self._services = Services(
             self._encoder, self._schedule, self.parameters, VERSION, DEFAULT_INTERVAL_US, start_ns
         )
+        if onboard is not None:
+            self._schedule.set_interval(STEP, onboard.interval_us, start_ns)
 
     @property
     def next_event_ns(self) -> int:
@@ -164,7 +175,12 @@ class Vehicle:
     def _take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
         time_ns = max(time_ns, self._state_ns)
         on_launcher = not self.autopilot.flying
-        reason = fault(setpoint) or self.autopilot.accept_setpoint(time_ns)
+        counts = setpoint.type_mask & AXES
+        onboard = self._onboard if self._onboard is not None and self._onboard.on else None
+        reason = fault(setpoint)
+        if onboard is not None and counts != VELOCITY_ACCELERATION:
+            reason = reason or "refused_mask"  # its own loop wants to know the formation's velocity
+        reason = reason or self.autopilot.accept_setpoint(time_ns)
         if reason:
             self.counters[reason] += 1
             return
@@ -176,8 +192,10 @@ class Vehicle:
         if setpoint.frame != mavlink.FRAME_LOCAL_NED:
             setpoint = to_local(setpoint, self._state.yaw_rad)
         north, east, _ = setpoint.acceleration_ned_m_s2
-        counts = setpoint.type_mask & AXES
-        if counts == ACCELERATION:
+        if onboard is not None:
+            onboard.stream(setpoint.velocity_ned_m_s[:2], (north, east))
+            self._command = onboard.command()
+        elif counts == ACCELERATION:
             self._command = Command(north, east)
         elif counts == VELOCITY:
             self._command = Command(0.0, 0.0, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
@@ -210,6 +228,8 @@ class Vehicle:
         if isinstance(request, ParameterSet):
             timeouts_s = self.parameters["GUID_TIMEOUT"], self.parameters["FS_GCS_TIMEOUT"]
             self.autopilot.set_timeouts(*timeouts_s, time_ns)
+            if self._onboard is not None:
+                self._onboard.set(self.parameters)
 
     # Commands
 
@@ -253,7 +273,7 @@ class Vehicle:
         result = self.autopilot.set_mode(mode, time_ns)
         if (self.autopilot.mode, self.autopilot.failsafe) != before:
             self._advance(time_ns)
-            self._command = COAST
+            self._command = self._alone()
             self._tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
         return result
 
@@ -261,13 +281,37 @@ class Vehicle:
 
     def _fail(self, time_ns: int) -> None:
         self._advance(time_ns)
-        self._command = COAST
         self.autopilot.fail()
+        self._command = self._alone()
         text = f"failsafe: {self.autopilot.failsafe} stopped"
         self._tell(time_ns, text)
         self._send(self._encoder.statustext(mavlink.SEVERITY_CRITICAL, text), time_ns)
 
+    def _alone(self) -> Command:
+        """What it does without set-points: its own loop, if it has one and is not told to hold, or fly straight on."""
+        onboard = self._onboard
+        if onboard is None:
+            return COAST
+        onboard.drop_stream()
+        return onboard.command() if self._own_loop_flies(onboard) else COAST
+
+    def _own_loop_flies(self, onboard: OnboardLoop) -> bool:
+        autopilot = self.autopilot
+        return onboard.on and autopilot.flying and (autopilot.mode == mavlink.MODE_GUIDED or autopilot.failsafe != "")
+
+    def _step_onboard(self, time_ns: int, boot_ms: int) -> None:
+        onboard = self._onboard
+        if onboard is None or not onboard.on:
+            return
+        self._advance(time_ns)
+        onboard.step(time_ns, boot_ms, self._state)
+        if self._own_loop_flies(onboard):
+            self._command = onboard.command()
+
     def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
+        if message_id == STEP:
+            self._step_onboard(time_ns, boot_ms)
+            return
         boot_ms &= 0xFFFFFFFF
         if message_id == mavlink.LOCAL_POSITION:
             self._advance(time_ns)
