@@ -10,7 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from gcs.stress import stress
-from gcs.watch_command import monitor
+from gcs.user_input import InputError, listening
+from gcs.watch_command import monitor, replay
 
 app = typer.Typer(
     add_completion=False,
@@ -34,10 +35,6 @@ class Method(Enum):
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
-
-
-class InputError(Exception):
-    """The user's input cannot be used: one line with what was read and what was wanted; exit code 2."""
 
 
 @app.callback(invoke_without_command=True)
@@ -65,7 +62,6 @@ def fly(
     as_json: AsJson = False,
 ) -> None:
     """Design the control, start the vehicles, fly, show, record."""
-    from gcs.addresses import listening
     from gcs.fly import FlyOptions, new_folder
     from gcs.fly import fly as fly_now
     from gcs.guard import open_guard
@@ -305,6 +301,7 @@ def key(file: Annotated[Path, typer.Argument(metavar="FILE", help="a new file")]
 
 app.command()(stress)
 app.command()(monitor)
+app.command()(replay)
 
 
 def main() -> None:

@@ -37,6 +37,7 @@ _HEADER = struct.Struct("<BBBBBBBHB")
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
 _OVERHEAD = 12
+_SET_POINT_ID = SET_POSITION_TARGET_LOCAL_NED.to_bytes(3, "little")
 
 
 class _Layout(NamedTuple):
@@ -234,6 +235,11 @@ def param_set(name: str, value: float, *, target_system: int) -> tuple[Any, ...]
 def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
     """Fields of PARAM_REQUEST_READ by name."""
     return (-1, target_system, 1, name.encode())
+
+
+def is_set_point(frame: bytes) -> bool:
+    """Whether a frame of MAVLink 2 is a SET_POSITION_TARGET_LOCAL_NED."""
+    return frame[7:10] == _SET_POINT_ID
 
 
 IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION = 0x0C07

@@ -85,19 +85,24 @@ def _matrix(columns: Sequence[Sequence[float]]) -> str:
 def print_summary(summary: dict[str, Any], folder: Path, console: Console | None = None) -> None:
     """The verdict with its figures, and where the files are."""
     console = console or Console(highlight=False, soft_wrap=True)
+    print_flight(summary, console)
+    console.print(f"files    {folder}: {', '.join(summary['files'])}")
+    if "flight.rrd" in summary["files"]:
+        console.print(f"look     gcs view {folder}")
+
+
+def print_flight(summary: dict[str, Any], console: Console) -> None:
+    """The verdict with its figures; `control` may be None, where a log does not show the ticks."""
     style = {"stable": "bold green", "unstable": "bold red"}.get(summary["verdict"], "bold yellow")
     console.print(f"verdict  [{style}]{summary['verdict']}[/]: {summary['reason']}")
-    delay = summary["loop_delay_s"]
-    console.print(
-        f"delay    loop {_ms(delay['p50'])} p50, {_ms(delay['p99'])} p99, {_ms(delay['max'])} max; "
-        f"margin {_ms(summary['delay_margin_s'])}; least headroom {_percent(summary['headroom_min'])}"
-    )
+    console.print(f"delay    {delay_text(summary)}")
     console.print(_response(summary.get("response")), end="")
     control = summary["control"]
-    console.print(
-        f"control  {control['ticks']} ticks at {control['rate_hz']:g} Hz, "
-        f"{control['deadline_misses']} deadline misses; settled {_after(summary['settling_time_s'])}"
-    )
+    if control is not None:
+        console.print(
+            f"control  {control['ticks']} ticks at {control['rate_hz']:g} Hz, "
+            f"{control['deadline_misses']} deadline misses; settled {_after(summary['settling_time_s'])}"
+        )
     for who, counts in (("station", summary.get("refused")), ("vehicles", summary.get("refused_by_vehicles"))):
         if counts:
             console.print(f"refused  by the {who}: {in_words(counts)}")
@@ -116,9 +121,15 @@ def print_summary(summary: dict[str, Any], folder: Path, console: Console | None
             _count(vehicle["late"]),
         )
     console.print(table)
-    console.print(f"files    {folder}: {', '.join(summary['files'])}")
-    if "flight.rrd" in summary["files"]:
-        console.print(f"look     gcs view {folder}")
+
+
+def delay_text(summary: dict[str, Any]) -> str:
+    """Loop delay against the margin."""
+    delay = summary["loop_delay_s"]
+    return (
+        f"loop {_ms(delay['p50'])} p50, {_ms(delay['p99'])} p99, {_ms(delay['max'])} max; "
+        f"margin {_ms(summary['delay_margin_s'])}; least headroom {_percent(summary['headroom_min'])}"
+    )
 
 
 def _response(response: dict[str, Any] | None) -> str:

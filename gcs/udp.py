@@ -14,6 +14,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from gcs import mavlink
 from gcs.guard import Guard
 from gcs.modes import Phase
 from gcs.plan import FlightPlan
@@ -140,7 +141,8 @@ def drive(
         link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
         sent_ns = clock_ns()
         log += station.frames
-        log += [(data, sent_ns) for data, _ in outgoing]
+        # A round trip counts from the step that asked, a set-point's age from when it was handed over.
+        log += [(data, sent_ns if mavlink.is_set_point(data) else now_ns) for data, _ in outgoing]
         station.frames.clear()
         if tick is None:
             continue

@@ -79,6 +79,11 @@ class WatchedVehicle:
             self._least_since_ns, self._least_ns = received_ns, (1 << 62, self._least_ns[0])
         self._least_ns = min(self._least_ns[0], received_ns - boot_ns), self._least_ns[1]
 
+    @property
+    def least_delay_ns(self) -> int:
+        """The least of reception minus boot time among the last frames: of the offset and the fastest frame's delay."""
+        return min(self._least_ns)
+
     def look(self, now_ns: int) -> None:
         """Note how old the newest state is, and how late a command computed from it would act."""
         clock = self.remote.clock
@@ -89,7 +94,7 @@ class WatchedVehicle:
             age_s = (now_ns - clock.estimate.to_station_ns(self.boot_ns)) * 1e-9
             down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
         elif self.states:
-            age_s, down_s = (now_ns - self.boot_ns - min(self._least_ns)) * 1e-9, 0.0
+            age_s, down_s = (now_ns - self.boot_ns - self.least_delay_ns) * 1e-9, 0.0
         self.age_s.append(age_s)
         self.loop_delay_s.append(age_s + down_s)
 

@@ -1,10 +1,16 @@
-"""`gcs monitor`: its options; the work is in `gcs.watch` (what frames say) and `gcs.watch_live` (the socket)."""
+"""The options of `gcs monitor` and `gcs replay`.
+
+The work is in `gcs.watch` (what frames say), `gcs.watch_live` (the socket), `gcs.tlog` and `gcs.replay` (logs).
+"""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from gcs.user_input import InputError, listening
 
 _FAILED, _INTERRUPTED = 1, 130
 _TIMESYNC_HZ = 10.0
@@ -38,9 +44,7 @@ def monitor(
     Exit code 1 if an expected vehicle, or any at all, was not heard, or if the loop delay (p99) was past the margin.
     """
     if margin is not None and design is not None:
-        raise typer.BadParameter("read --margin and --design, wanted one of them")
-    from gcs.addresses import listening
-
+        raise InputError("read --margin and --design, wanted one of them")
     with listening("--listen", listen) as link:
         scenario, margin_s, margin_of = _compared_with(scenario_file, margin, design)
         # After the socket: what comes while these load keeps its receive stamp.
@@ -68,6 +72,56 @@ def monitor(
     raise typer.Exit(_INTERRUPTED if interrupted else _exit_code(report))
 
 
+def replay(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN|FILE.tlog", help="a run's folder, or a telemetry log of any tool")
+    ],
+    scenario_file: Annotated[
+        Path | None, typer.Argument(metavar="[SCENARIO]", help="the formation flown, where it is not in the run")
+    ] = None,
+    margin: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="compare with this delay margin", min=0.0)
+    ] = None,
+    design: Annotated[
+        Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margins of this design")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
+) -> None:
+    """Rebuild latencies, errors and margins from a telemetry log alone.
+
+    Round trips come from the TIMESYNC exchanges in the log; in one without, delays are lower bounds, told against the
+    fastest frames. Errors need the formation, of the run's folder or of SCENARIO. What is damaged is left out and
+    counted.
+    """
+    if margin is not None and design is not None:
+        raise InputError("read --margin and --design, wanted one of them")
+    from gcs import replay_report
+    from gcs.tlog import TlogError, read_tlog
+
+    there = replay_report.found(run)
+    try:
+        log = read_tlog(there.log_file)
+    except TlogError as error:
+        raise InputError(str(error)) from None
+    if scenario_file is not None:
+        from scenarios.files import load
+
+        there = replace(there, scenario=load(scenario_file), design=None, recorded=None)
+    if margin is not None:
+        there = replace(there, design={"delay_margin_s": margin})
+    elif design is not None:
+        there = replace(there, design=_design(design))
+    elif there.design is None and there.scenario is not None:
+        from gcs.plan import flight_plan
+
+        there = replace(there, design=flight_plan(there.scenario)[0])
+    result = replay_report.replay(log, there)
+    if as_json:
+        typer.echo(json.dumps(result, indent=2, allow_nan=False))
+    else:
+        replay_report.print_replay(result)
+
+
 def _exit_code(report: dict[str, Any]) -> int:
     bad = {"not heard", "past the margin"} & {vehicle["status"] for vehicle in report["vehicles"]}
     return _FAILED if bad or not report["vehicles"] else 0
@@ -83,7 +137,7 @@ def _compared_with(scenario_file: Path | None, margin: float | None, design: Pat
     if margin is not None:
         return scenario, margin, "given"
     if design is not None:
-        return scenario, margin_of_design(design), f"of {design}"
+        return scenario, _design(design)["delay_margin_s"], f"of {design}"
     if scenario is not None:
         from gcs.plan import flight_plan
 
@@ -91,14 +145,17 @@ def _compared_with(scenario_file: Path | None, margin: float | None, design: Pat
     return None, None, ""
 
 
-def margin_of_design(file: Path) -> float | None:
-    """The delay margin that a design.json says; None if it is unbounded."""
+def _design(file: Path) -> dict[str, Any]:
+    """A design.json, of which every margin is a number above 0, or None where it is unbounded."""
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))["delay_margin_s"]
+        found = json.loads(file.read_text(encoding="utf-8"))
+        entries = [found, *found.get("schedule", [])]
+        margins_s = [entry["delay_margin_s"] for entry in entries]
     except (OSError, UnicodeDecodeError) as error:
-        raise typer.BadParameter(f"--design: {file}: {error}; wanted the design.json of a run") from None
-    except (json.JSONDecodeError, KeyError, TypeError):
-        raise typer.BadParameter(f"--design: {file}: no delay_margin_s, wanted the design.json of a run") from None
-    if found is not None and not (isinstance(found, int | float) and found > 0):
-        raise typer.BadParameter(f"--design: {file}: delay_margin_s: read {found!r}, wanted seconds above 0")
+        raise InputError(f"--design: {file}: {error}; wanted the design.json of a run") from None
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
+        raise InputError(f"--design: {file}: no delay_margin_s, wanted the design.json of a run") from None
+    for margin_s in margins_s:
+        if margin_s is not None and not (isinstance(margin_s, int | float) and margin_s > 0):
+            raise InputError(f"--design: {file}: delay_margin_s: read {margin_s!r}, wanted seconds above 0")
     return found

@@ -25,7 +25,7 @@ def render(report: dict[str, Any], *, width: int, height: int | None = None) -> 
         shown = sorted(worst, key=lambda figures: figures["system_id"])
     hidden = len(vehicles) - len(shown)
     more = [Text(f"  … {hidden} vehicles not shown, none of them worse", style="dim")] if hidden else []
-    table = _vehicles(shown, width) if shown else Text("no vehicle heard", "bold red")
+    table = links_table(shown, width) if shown else Text("no vehicle heard", "bold red")
     return Group(_headline(report), table, *more, _footer(report))
 
 
@@ -64,7 +64,8 @@ def _headline(report: dict[str, Any]) -> Text:
     return line
 
 
-def _vehicles(vehicles: list[Figures], width: int) -> Table:
+def links_table(vehicles: list[Figures], width: int) -> Table:
+    """One row for each vehicle; on a narrow terminal the columns that say least are left out."""
     wide = width >= _WIDE
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1 if wide else 0, 0, 0))
     columns = [("id", 3), *[("Hz", 5)] * wide, ("RTT p50\nms", 8), ("p99\nms", 7)]
