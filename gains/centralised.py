@@ -1,7 +1,7 @@
 """Centralised robust gains, every vehicle with the state of all: what decentralised ones are measured by.
 
 The robust LMI (3.25-3.29) of the whole formation with a full Lyapunov matrix. It grows with the number of vehicles,
-which is what the decentralised routes avoid. The centralised LQR is in `gains.structured_lqr`.
+which is what the decentralised routes avoid. The centralised LQR is in `gains.lqr`.
 
 Source: S. Boyd, L. El Ghaoui, E. Feron, V. Balakrishnan, "Linear Matrix Inequalities in System and Control Theory",
 SIAM 1994, section 7.2, for the change of variables L = K Y.

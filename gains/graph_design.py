@@ -222,7 +222,8 @@ def _narrowed(pattern: Pattern, single: FormationModel) -> Pattern:
 
 
 def _lqr_bases(plant: Plant, pattern: Pattern, single: FormationModel) -> Iterable[_Base]:
-    from gains.structured_lqr import Weights, structured_lqr
+    from gains.lqr import Weights
+    from gains.structured_lqr import structured_lqr
 
     for ratio in _WEIGHT_RATIOS:
         weight = np.ones(single.states)

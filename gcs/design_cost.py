@@ -11,9 +11,9 @@ from gains.centralised import centralised_lmi
 from gains.design import design
 from gains.dk_iteration import LARGEST_STATES
 from gains.formation import FormationModel
+from gains.lqr import Weights, centralised_lqr
 from gains.pattern import bidirectional, formation_plant, leader_follower
 from gains.requirement import Requirement
-from gains.structured_lqr import Weights, centralised_lqr
 
 RATIO = "times inclusion of 5"
 _REFERENCE = ("inclusion", 5)

@@ -7,9 +7,9 @@ from scipy import linalg
 from gains.centralised import centralised_lmi
 from gains.errors import BadModelError
 from gains.formation import FormationModel
+from gains.lqr import Weights, centralised_lqr
 from gains.pattern import Plant, formation_plant
 from gains.robust import disturbance_bound
-from gains.structured_lqr import Weights, centralised_lqr
 from gcs.design_cost import DesignCost, ratios
 
 CHAIN = formation_plant(FormationModel((-1, 0, 1), axes=1))

@@ -9,8 +9,9 @@ from gains.dk_iteration import dk_iteration
 from gains.errors import InfeasibleError
 from gains.fixed_modes import check_stabilisable, fixed_modes
 from gains.formation import FormationModel
+from gains.lqr import Weights, lqr_cost
 from gains.pattern import Pattern, all_to_all, bidirectional, formation_plant, leader_follower, without_links
-from gains.structured_lqr import Weights, lqr_cost, structured_lqr
+from gains.structured_lqr import structured_lqr
 
 CHAIN = FormationModel((-1, 0, 1))
 PLANT = formation_plant(CHAIN)
