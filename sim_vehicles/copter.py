@@ -14,6 +14,7 @@ import numpy as np
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles import mavlink
+from sim_vehicles.authority import Authority
 from sim_vehicles.clock import BootClock
 from sim_vehicles.copter_dynamics import Motion, Target, advance
 from sim_vehicles.copter_reports import Facts, intervals_us, report
@@ -63,6 +64,7 @@ class Copter:
         self.last_heard_ns = start_ns
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.parameters = parameters(self.rules, own.system_id)
+        self._authority = Authority(scenario.safety.heartbeat_timeout_s)
         self.mode = self.rules.first_mode
         self.armed = self.failsafe = False
         self.landed = True
@@ -172,10 +174,10 @@ class Copter:
     # What arrives
 
     def _receive(self, data: bytes, time_ns: int) -> None:
-        for message in mavlink.read_datagram(data, self.counters):
+        for source, message in mavlink.read_datagram(data, self.counters):
             self._speaks_version_1 = False
             if isinstance(message, mavlink.Heartbeat):
-                if message.vehicle_type == mavlink.TYPE_GCS:
+                if message.vehicle_type == mavlink.TYPE_GCS and self._authority.hears(source, time_ns):
                     self.counters["heartbeats"] += 1
                     self.last_heard_ns = time_ns
                 continue
@@ -187,6 +189,9 @@ class Copter:
                 mavlink.COMPONENT_AUTOPILOT,
             ):
                 self.counters["ignored_not_addressed"] += 1
+                continue
+            if not self._authority.obeys(source, message, time_ns):
+                self._refuse(source, time_ns)
                 continue
             self.last_heard_ns = time_ns
             at_ns = max(time_ns, self._motion_ns)
@@ -206,6 +211,12 @@ class Copter:
                 ack = self._encoder.command_ack(message.command, result, message.source)
                 self._out.insert(at, (ack, at_ns))
                 self._out += [(frame, at_ns) for frame in frames]
+
+    def _refuse(self, source: int, time_ns: int) -> None:
+        text = self._authority.refusal(source, self.counters)
+        if text:
+            self._tell(time_ns, text)
+            self._send(self._encoder.statustext(mavlink.SEVERITY_WARNING, text), time_ns)
 
     def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
         if message.target_system not in (0, self.system_id):

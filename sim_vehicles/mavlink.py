@@ -27,7 +27,7 @@ BASE_MODE_ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
 BASE_MODE_GUIDED = dialect.MAV_MODE_FLAG_GUIDED_ENABLED
 STATUS_STANDBY, STATUS_ACTIVE = dialect.MAV_STATE_STANDBY, dialect.MAV_STATE_ACTIVE
 STATUS_CRITICAL = dialect.MAV_STATE_CRITICAL
-SEVERITY_CRITICAL = dialect.MAV_SEVERITY_CRITICAL
+SEVERITY_CRITICAL, SEVERITY_WARNING = dialect.MAV_SEVERITY_CRITICAL, dialect.MAV_SEVERITY_WARNING
 FRAME_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
 
 COMMAND_MODE, COMMAND_ARM = dialect.MAV_CMD_DO_SET_MODE, dialect.MAV_CMD_COMPONENT_ARM_DISARM
@@ -118,14 +118,14 @@ class Timesync(NamedTuple):
 Message = Setpoint | Command | Heartbeat | Timesync | Request
 
 
-def read_datagram(data: bytes, counters: Counter[str]) -> list[Message]:
-    """The messages of a datagram that a vehicle may act on.
+def read_datagram(data: bytes, counters: Counter[str]) -> list[tuple[int, Message]]:
+    """The messages of a datagram that a vehicle may act on, each after the system id of its source.
 
     Everything else is counted: `refused_empty`, `refused_mavlink1`, `refused_garbage` (no frame begins where one
     should), `refused_truncated`, `refused_incompatible` (unknown flags), `refused_unknown` (message id not in the
     dialect), `refused_setup_signing`, `refused_crc`, and `ignored_message` (valid, but nothing for a vehicle).
     """
-    messages: list[Message] = []
+    messages: list[tuple[int, Message]] = []
     begin, end = 0, len(data)
     if not data:
         counters["refused_empty"] += 1
@@ -176,22 +176,22 @@ def _refusal(data: bytes, begin: int, checked: int) -> str:
     return ""
 
 
-def _append(messages: list[Message], frame: bytes, checked: int, counters: Counter[str]) -> None:
+def _append(messages: list[tuple[int, Message]], frame: bytes, checked: int, counters: Counter[str]) -> None:
     """Decode one frame whose checksum is right; `checked` is where its payload ends."""
     number = frame[7] | frame[8] << 8 | frame[9] << 16
     # Most of the traffic is of these two messages: no object of pymavlink's is made for them.
     if number == SETPOINT:
         values = _values(_SETPOINT.unpacker, frame, checked)
-        messages.append(Setpoint(values[0], values[4:7], values[7:10], *values[10:]))
+        messages.append((frame[5], Setpoint(values[0], values[4:7], values[7:10], *values[10:])))
     elif number == TIMESYNC:
         # The target is an extension field that this dialect does not know yet.
         target = frame[HEADER_BYTES + 16] if checked > HEADER_BYTES + 16 else 0
         tc1, ts1 = _values(_TIMESYNC.unpacker, frame, checked)
-        messages.append(Timesync(tc1, ts1, target))
+        messages.append((frame[5], Timesync(tc1, ts1, target)))
     elif number in (HEARTBEAT, COMMAND_LONG, COMMAND_INT):
-        messages.append(_decode(number, frame))
+        messages.append((frame[5], _decode(number, frame)))
     elif number in REQUESTS:
-        messages.append(request(number, (frame[5], frame[6]), frame[HEADER_BYTES:checked]))
+        messages.append((frame[5], request(number, (frame[5], frame[6]), frame[HEADER_BYTES:checked])))
     else:
         counters["ignored_message"] += 1
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles import mavlink
+from sim_vehicles.authority import Authority
 from sim_vehicles.autopilot import MODE_NAMES, Autopilot
 from sim_vehicles.clock import BootClock
 from sim_vehicles.dynamics import COAST, VELOCITY_GAIN_1_S, Command, State, advance, bounds_of, rates, state_from
@@ -75,6 +76,7 @@ class Vehicle:
         """When the last valid frame for this vehicle, or for all, arrived."""
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.autopilot = Autopilot(scenario.safety)
+        self._authority = Authority(scenario.safety.heartbeat_timeout_s)
         formation = [] if onboard is None else formation_parameters()
         self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot(), *formation])
         self._onboard = onboard
@@ -144,33 +146,48 @@ class Vehicle:
     # What arrives
 
     def _receive(self, data: bytes, time_ns: int) -> None:
-        for message in mavlink.read_datagram(data, self.counters):
-            if isinstance(message, mavlink.Setpoint):
-                if self._is_for_us(message.target_system, message.target_component):
-                    self.last_heard_ns = time_ns
-                    self._take_setpoint(message, time_ns)
-            elif isinstance(message, mavlink.Command):
-                if self._is_for_us(message.target_system, message.target_component):
-                    self.last_heard_ns = time_ns
-                    self._take_command(message, time_ns)
-            elif isinstance(message, mavlink.Timesync):
+        for source, message in mavlink.read_datagram(data, self.counters):
+            if isinstance(message, mavlink.Timesync):
                 self._take_timesync(message, time_ns)
-            elif not isinstance(message, mavlink.Heartbeat):
-                if self._is_for_us(message.target_system, message.target_component):
-                    self.last_heard_ns = time_ns
-                    self._take_request(message, max(time_ns, self._state_ns))
-            elif message.vehicle_type == mavlink.TYPE_GCS:
-                self.counters["heartbeats"] += 1
-                self.last_heard_ns = time_ns
-                self.autopilot.hear_heartbeat(max(time_ns, self._state_ns))
+                continue
+            if isinstance(message, mavlink.Heartbeat):
+                self._take_heartbeat(source, message, time_ns)
+                continue
+            if not self._is_for_us(message.target_system, message.target_component):
+                continue
+            if not self._authority.obeys(source, message, time_ns):
+                self._refuse(source, time_ns)
+                continue
+            self.last_heard_ns = time_ns
+            if isinstance(message, mavlink.Setpoint):
+                self._take_setpoint(message, time_ns)
+            elif isinstance(message, mavlink.Command):
+                self._take_command(message, time_ns)
             else:
-                self.counters["ignored_heartbeat"] += 1
+                self._take_request(message, max(time_ns, self._state_ns))
 
     def _is_for_us(self, target_system: int, target_component: int) -> bool:
         if target_system == self.system_id and target_component in (0, mavlink.COMPONENT_AUTOPILOT):
             return True
         self.counters["ignored_not_addressed"] += 1
         return False
+
+    def _refuse(self, source: int, time_ns: int) -> None:
+        """No COMMAND_ACK: the station has no way to tell it from the answer to an equal command of its own."""
+        text = self._authority.refusal(source, self.counters)
+        if text:
+            self._tell(time_ns, text)
+            self._send(self._encoder.statustext(mavlink.SEVERITY_WARNING, text), time_ns)
+
+    def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
+        if heartbeat.vehicle_type != mavlink.TYPE_GCS:
+            self.counters["ignored_heartbeat"] += 1
+        elif not self._authority.hears(source, time_ns):
+            self.counters["ignored_not_the_station"] += 1
+        else:
+            self.counters["heartbeats"] += 1
+            self.last_heard_ns = time_ns
+            self.autopilot.hear_heartbeat(max(time_ns, self._state_ns))
 
     def _take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
         time_ns = max(time_ns, self._state_ns)

@@ -202,6 +202,7 @@ def test_the_frames_read_are_those_pymavlink_reads(frames: list[bytes]) -> None:
     expected = dialect.MAVLink(None).parse_buffer(b"".join(frames)) or []
     read = read_datagram(b"".join(frames), counters)
     assert len(read) == len(expected)
-    for ours, theirs in zip(read, expected, strict=True):
+    for (source, ours), theirs in zip(read, expected, strict=True):
+        assert source == theirs.get_srcSystem()
         for field in set(ours._fields) & set(theirs.get_fieldnames()):
             assert getattr(ours, field) == getattr(theirs, field)
