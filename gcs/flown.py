@@ -21,13 +21,15 @@ class Flight:
     """A flight's log, whichever clock it was flown on.
 
     `truth` holds when states were sampled and set-points acted, as the vehicles know it; None if nobody asked for it.
-    `steal_share` is the part of the processor time that the host took away; in real time only.
+    `steal_share` and `busy_share` are the parts of the processor time that the host took away and that anyone used; in
+    real time only.
     """
 
     ticks: TickArray
     events: list[dict[str, Any]]
     truth: Truth | None = None
     steal_share: float | None = None
+    busy_share: float | None = None
 
 
 def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None) -> Flight:
@@ -36,8 +38,8 @@ def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None) -
         return fly_virtual(plan, folder)
     from gcs.trial_realtime import fly_real_time  # processes and sockets: not for flights in virtual time
 
-    ticks, events, steal_share = fly_real_time(plan, margins_of(plan), folder)
-    return Flight(ticks, events, steal_share=steal_share)
+    ticks, events, spent = fly_real_time(plan, margins_of(plan), folder)
+    return Flight(ticks, events, steal_share=spent.steal, busy_share=spent.busy)
 
 
 def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:

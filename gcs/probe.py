@@ -16,6 +16,8 @@ What would hide the loop is taken out:
   links' asymmetry, which the station sees as errors too. So all vehicles have the links of the one that is probed.
   Its loop is the same for that: what the station uses of the others is brought to the instant of its own state.
 * Changes of the nominal velocity, and the noise of the vehicles' sensors.
+* Changes of the nominal velocity.
+* The vehicles' failsafe, which lossy links would now and then call for: it opens the loop.
 """
 
 import numpy as np
@@ -30,6 +32,8 @@ PROBE_S = 20.0
 
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
     """The plan's scenario with every vehicle in place at its nominal velocity, but for an error of the given vehicles.
+
+    No vehicle goes to its failsafe.
 
     The error is in the position of a follower (m) and in the velocity of the leader (m/s), whose position is not
     controlled; north and east alike, and different for each vehicle.
@@ -55,6 +59,9 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         "nominal_velocity": scenario.nominal_velocity[:1],
         "duration_s": PROBE_S,
         "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
+        "safety": scenario.safety.model_copy(
+            update={"setpoint_timeout_s": 2.0 * PROBE_S, "heartbeat_timeout_s": 2.0 * PROBE_S}
+        ),
     }
     return scenario.model_copy(update=update)
 

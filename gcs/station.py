@@ -75,7 +75,7 @@ class Station:
                 system_id,
                 telemetry_hz=rates.telemetry_hz,
                 report=self._reporter(system_id),
-                startup=Startup(altitude_m=scenario.altitude_m, telemetry_interval_us=1e6 / rates.telemetry_hz)
+                startup=Startup(altitude_m=scenario.altitude_m, telemetry_interval_us=round(1e6 / rates.telemetry_hz))
                 if autopilots
                 else None,
                 land=scenario.at_end == "land",

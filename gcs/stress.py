@@ -1,7 +1,7 @@
 """`gcs stress`: fly the formation at many link delays, and see whether it breaks where the margin says.
 
 The command's options are here, light to import; the work is in `gcs.study` (what is flown), `gcs.campaign` (how it is
-flown and stored) and `gcs.stress_report` (what is shown).
+flown and stored), `gcs.stress_result` (what was found) and `gcs.stress_report` (what is shown).
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from gcs.campaign import Fly, Store
+    from gcs.campaign import Fly
     from gcs.study import Onset, Study
     from gcs.trial import Outcome
 
@@ -100,19 +100,18 @@ def stress(
     try:
         if trial:
             assert out is not None
-            _fly_again(options, out, trial, as_json=as_json)
-            return
+            raise typer.Exit(_fly_again(options, out, trial, as_json=as_json))
         result, folder = _campaign(options, out, shown=not as_json)
     except CampaignError as error:
         raise typer.BadParameter(str(error)) from None
     if junit is not None:
-        from gcs.stress_report import write_junit
+        from gcs.stress_print import write_junit
 
         write_junit(result, junit)
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     else:
-        from gcs.stress_report import print_result
+        from gcs.stress_print import print_result
 
         print_result(result, folder)
     raise typer.Exit(0 if result["passed"] else _FAILED)
@@ -141,6 +140,7 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
     """Fly what was asked for; the result as plain types, and the folder it is in."""
     from gcs.campaign import Store, run_campaign, write_parquet
     from gcs.stress_report import write_report
+    from gcs.stress_result import result_of
     from gcs.study import NoOnset, find_onset
     from scenarios.files import dump
 
@@ -171,8 +171,12 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
         except KeyboardInterrupt:
             typer.echo(f"{len(store.outcomes)} trials are stored; go on with --resume --out {folder}", err=True)
             raise
-        write_parquet(store.outcomes.values(), folder)
-        result = _result(options, study, design, sweep, onset, why_not, store)
+        outcomes = list(store.outcomes.values())
+        write_parquet(outcomes, folder)
+    allowed = options.assert_onset
+    result = result_of(
+        study, design, outcomes, axes=axes, sweep=sweep, onset=onset, why_no_onset=why_not, allowed=allowed
+    )
     (folder / RESULT_FILE).write_text(json.dumps(result, indent=2, allow_nan=False), encoding="utf-8")
     write_report(folder, result, study=study, axes=axes, sweep=sweep, onset=onset)
     return result, folder
@@ -215,7 +219,7 @@ def _workers(options: StressOptions) -> "Generator[Fly]":
     from gcs.campaign import dask_workers, local_workers
 
     # flights in real time disturb each other: one at a time unless the user knows better
-    count = options.workers or (1 if options.real_time else os.cpu_count() or 1)
+    count = options.workers or (1 if options.real_time else len(os.sched_getaffinity(0)))
     with dask_workers(options.dask) if options.dask else local_workers(count) as fly:
         yield fly
 
@@ -255,107 +259,19 @@ def _progress(shown: bool) -> Generator[Any]:
         yield begin
 
 
-def _result(
-    options: StressOptions,
-    study: "Study",
-    design: dict[str, Any],
-    sweep: "list[Outcome]",
-    onset: "Onset | None",
-    why_not: str,
-    store: "Store",
-) -> dict[str, Any]:
-    """Everything a machine wants to know, as plain types."""
-    from gcs.stress_provenance import provenance
-    from gcs.study import curve_error
-
-    outcomes = list(store.outcomes.values())
-    failed = [outcome for outcome in outcomes if outcome.error is not None]
-    allowed = options.assert_onset
-    agrees = onset is not None and (allowed is None or abs(onset.difference) <= allowed)
-    missed = allowed is not None and not agrees
-    if missed and onset is not None:
-        why_not = (
-            f"the onset is at {onset.loop_delay_s:.4f} s of loop delay, {onset.difference:+.1%} from the margin "
-            f"{onset.predicted_s:.4f} s; {allowed:.1%} is allowed"
-        )
-    near = [*sweep, *(onset.flights if onset else ())]
-    return {
-        "scenario": study.plan.scenario.name,
-        "delay_margin_s": design["delay_margin_s"],
-        "delay_margin_continuous_s": design["delay_margin_continuous_s"],
-        "period_s": design["period_s"],
-        "gains": {name: design[name] for name in ("K1_1_s", "K2_1_s", "K3_1_s2", "blocks") if name in design},
-        "real_time": options.real_time,
-        "axes": dict(options.axes),
-        "onset": None if onset is None else onset.to_dict(),
-        "onset_missing": why_not if onset is None and options.onset else "",
-        "curve_error": curve_error(near),
-        "assert_onset": allowed,
-        "failure": why_not if missed else "",
-        "passed": not missed and not failed,
-        "trials": len(outcomes),
-        "trials_failed": [
-            {"id": o.id, "seed": o.seed, "coordinates": o.coordinates, "error": o.error} for o in failed
-        ],
-        "flight_time_s": round(sum(outcome.elapsed_s for outcome in outcomes), 3),
-        "points": [
-            {
-                "id": o.id, "kind": o.kind, "seed": o.seed, "coordinates": o.coordinates, "verdict": o.verdict,
-                "loop_delay_s": o.loop_delay_s, "growth_1_s": o.growth_1_s, "growth_error_1_s": o.growth_error_1_s,
-                "predicted_growth_1_s": o.predicted_growth_1_s, "spacing_error_max_m": o.spacing_error_max_m,
-            }
-            for o in sweep
-        ],
-        "provenance": provenance(study.plan.scenario.seed),
-    }  # fmt: skip
-
-
-def _fly_again(options: StressOptions, folder: Path, wanted: str, *, as_json: bool) -> None:
-    """Fly a stored trial again and leave a run folder with a Rerun recording."""
-    from dataclasses import replace
-
-    from gcs.campaign import Store
-    from gcs.measure import fly_trial
-    from gcs.observer import record_run
-    from gcs.summary import finish
+def _fly_again(options: StressOptions, folder: Path, wanted: str, *, as_json: bool) -> int:
+    """Fly a stored trial again, say how it went, and give the exit code."""
+    from gcs.stress_print import print_replay
+    from gcs.stress_replay import replayed
 
     study, _ = _study(options)
-    with contextlib.closing(Store(folder)) as store:
-        found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
-    if len(found) != 1:
-        raise typer.BadParameter(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
-    stored = found[0]
-    was = replace(study, real_time=stored.real_time)
-    trial = was.trial(stored.kind, stored.coordinates, seed=stored.seed, probe=stored.probe)
-    if trial.id != stored.id:
-        raise typer.BadParameter(
-            f"--trial: {stored.id} was flown with another scenario than {options.scenario_file}; "
-            f"wanted {folder / SCENARIO_FILE}"
-        )
-    trial = replace(trial, real_time=trial.real_time or options.real_time)
-    run = _new_folder_in(folder / "flights", f"{stored.id}{'-real-time' if trial.real_time else ''}")
-    outcome = fly_trial(trial, run)
-    for flight in [run] if (run / SCENARIO_FILE).exists() else sorted(run.iterdir()):
-        finish(flight)
-        record_run(flight)
-        finish(flight)  # again: it lists the files
-        if not as_json:
-            typer.echo(f"look     gcs view {flight}")
+    replay = replayed(study, folder, wanted, real_time=options.real_time)
     if as_json:
-        typer.echo(outcome.to_json())
+        typer.echo(replay.outcome.to_json())
     else:
-        from gcs.stress_report import print_outcome
-
-        print_outcome(outcome)
-    raise typer.Exit(_FAILED if outcome.error is not None else 0)
+        print_replay(replay)
+    return _FAILED if replay.outcome.error is not None or replay.differs else 0
 
 
 def _new_folder(scenario_name: str) -> Path:
-    return _new_folder_in(Path("runs"), f"{scenario_name}-stress-{time.strftime('%Y%m%d-%H%M%S')}")
-
-
-def _new_folder_in(parent: Path, stem: str) -> Path:
-    """A name that is free; whoever fills it makes it."""
-    parent.mkdir(parents=True, exist_ok=True)
-    names = (stem if count == 1 else f"{stem}-{count}" for count in range(1, 1000))
-    return next(parent / name for name in names if not (parent / name).exists())
+    return Path("runs") / f"{scenario_name}-stress-{time.strftime('%Y%m%d-%H%M%S')}"

@@ -67,11 +67,16 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     With jitter of at most j each way and periods T of telemetry and control, the age of the state behind the command
     in action lies between d - 2 j and d + 2 j + 2 T. It is covered as a deviation from its middle
     (`gains.jitter.spread_bound`, a search on a grid of frequencies) or as any variation from 0 on
-    (`gains.varying_delay.varying_delay_bound`). None for other axes, and for jitter that has no largest value.
+    (`gains.varying_delay.varying_delay_bound`). None for other axes, for jitter that has no largest value, and for the
+    onboard loop, of which not all feedback is late.
     """
-    if [axis.name for axis in axes] != ["delay", "jitter"] or len(axes[0].values) < 2:
-        return None
     scenario = study.plan.scenario
+    if (
+        [axis.name for axis in axes] != ["delay", "jitter"]
+        or len(axes[0].values) < 2
+        or scenario.control.loop != "ground"
+    ):
+        return None
     links = at_coordinates(scenario, {"jitter": 1.0}).links
     every = [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link)]
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in every):
@@ -93,9 +98,9 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
 def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[FloatArray]:
     """The edge of stability over the link delays of two vehicles, from the continuous model of the whole formation.
 
-    Empty for other axes, and for vehicles whose loop has others in it: their delays matter too.
+    Empty for other axes, for the onboard loop, and for vehicles whose loop has others in it: their delays matter too.
     """
-    if not all(axis.name.startswith("delay_") for axis in axes):
+    if not all(axis.name.startswith("delay_") for axis in axes) or study.plan.scenario.control.loop != "ground":
         return []
     ids = [int(axis.name.removeprefix("delay_")) for axis in axes]
     plan = study.plan

@@ -60,6 +60,7 @@ class Outcome:
     the control tick it has. `loop_delay_s` is its median over the window of the fit, `loop_delay_spread_s` by how
     much the 90th percentile is above it; for an own trial its median in flight. `predicted_*` are the models' growth
     rates at that delay. The growth of an own trial is that of the envelope of all spacing errors, which is rough.
+    `ticks_sha256` is that of the tick log, in virtual time: the same trial has the same in any process.
     `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`. `error` holds a traceback if the
     trial itself failed.
     """
@@ -92,6 +93,8 @@ class Outcome:
     lateness_s_p50: float | None = None
     lateness_s_p99: float | None = None
     steal_share: float | None = None
+    busy_share: float | None = None
+    ticks_sha256: str | None = None
     trace_period_s: float = TRACE_PERIOD_S
     trace_m: list[float] = field(default_factory=list[float])
     elapsed_s: float = 0.0
@@ -143,6 +146,9 @@ def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
         spacing_error_final_m=max(final, default=None),
         lateness_s_p50=summary["control"]["lateness_s"]["p50"],
         lateness_s_p99=summary["control"]["lateness_s"]["p99"],
+        steal_share=flight.steal_share,
+        busy_share=flight.busy_share,
+        ticks_sha256=None if outcome.real_time else hashlib.sha256(flight.ticks.tobytes()).hexdigest(),
         trace_m=_trace(flight.ticks),
     )
 

@@ -3,7 +3,7 @@
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from gcs.fly import FlyOptions, fly
 from gcs.plan import FlightPlan
@@ -11,20 +11,27 @@ from gcs.record import RunTail, TickArray
 from gcs.summary import read_ticks
 from gcs.udp import StationSocket
 
-_STEAL = 7
-"""Place of the time that the host took away in the cpu line of /proc/stat."""
+_IDLE, _WAITING, _STEAL = 3, 4, 7
+"""Places in the cpu line of /proc/stat: time without work, also while a disk is waited for, and taken by the host."""
+
+
+class ProcessorShares(NamedTuple):
+    """Parts of the time of all processors: taken away by the host, and not idle (with the former)."""
+
+    steal: float
+    busy: float
 
 
 def fly_real_time(
     plan: FlightPlan, design: dict[str, Any], folder: Path | None
-) -> tuple[TickArray, list[dict[str, Any]], float]:
+) -> tuple[TickArray, list[dict[str, Any]], ProcessorShares]:
     """Fly a plan in real time.
 
     With a folder, which is made, the run is left there; without, it goes when it has been read.
 
     Returns
     -------
-    the ticks, the events, and the part of all processor time that the host took away during the flight
+    the ticks, the events, and where the processors' time went during the flight
     """
     kept = folder is not None
     folder = folder if folder is not None else Path(tempfile.mkdtemp(prefix="stress-"))
@@ -34,7 +41,9 @@ def fly_real_time(
         with StationSocket("127.0.0.1", 0) as link:
             fly(plan, design, link, FlyOptions(folder=folder, start_vehicles=True, show_table=False))
         spent = [after - former for after, former in zip(_processor_times(), before, strict=True)]
-        return read_ticks(folder), RunTail(folder).events(), spent[_STEAL] / max(1, sum(spent))
+        total = max(1, sum(spent))
+        shares = ProcessorShares(spent[_STEAL] / total, 1.0 - (spent[_IDLE] + spent[_WAITING]) / total)
+        return read_ticks(folder), RunTail(folder).events(), shares
     finally:
         if not kept:
             shutil.rmtree(folder, ignore_errors=True)

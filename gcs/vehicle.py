@@ -79,7 +79,7 @@ class RemoteVehicle:
         self.rates_set = False
         self._land = land
         self._now_ns = 0
-        self._telemetry_interval_us = 1e6 / telemetry_hz
+        self._telemetry_interval_us = round(1e6 / telemetry_hz)  # vehicles take whole numbers
         self._report = report
         self._sequence = 0
         self._command: _Command | None = None

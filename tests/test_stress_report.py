@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from gcs.campaign import TRIALS_FILE, Store, local_workers, run_campaign
 from gcs.plan import FlightPlan
 from gcs.stress import stress
-from gcs.stress_report import write_junit
+from gcs.stress_print import write_junit
 from gcs.study import Onset, Study, find_onset
 from gcs.summary import SUMMARY_FILE
 from scenarios.files import dump
@@ -105,18 +105,67 @@ def test_map_of_random_links_flies_probes_and_the_scenarios_own_states_with_each
     assert (out / "map.png").stat().st_size > 0
 
 
-def test_one_trial_is_flown_again_with_a_recording(tmp_path: Path) -> None:
+def printed_replay(output: str) -> list[str]:
+    """The arguments of the command that flies the worst trial again, as it is printed."""
+    [line] = [line for line in output.splitlines() if line.startswith("again")]
+    return line.split()[3:]
+
+
+def test_the_printed_command_flies_the_failing_trial_again_to_the_last_bit_with_a_recording(tmp_path: Path) -> None:
+    """At 0.5 s of link delay and with jitter: the tick log's hash is part of what is compared."""
     out = tmp_path / "out"
-    result = json.loads(run(tmp_path, "--delay", "0.1", "--out", str(out), "--json"))
-    stored = {point["kind"]: point for point in result["points"]}
-    for kind in ("own", "probe"):
-        again = json.loads(run(tmp_path, "--trial", stored[kind]["id"], "--out", str(out), "--json"))
-        assert {name: again[name] for name in ("id", "verdict", "growth_1_s")} == {
-            name: stored[kind][name] for name in ("id", "verdict", "growth_1_s")
-        }
-        [recording] = (out / "flights" / stored[kind]["id"]).rglob("flight.rrd")
-        assert recording.stat().st_size > 0
-        assert json.loads((recording.parent / SUMMARY_FILE).read_text(encoding="utf-8"))["scenario"] == "pair"
+    output = run(tmp_path, "--delay", "0.1,0.5", "--jitter", "0.01", "--out", str(out))
+    scenario, *options = printed_replay(output)
+    result = CliRunner().invoke(app, [scenario, *options])
+    assert result.exit_code == 0, result.output
+    assert "verdict  unstable" in result.output
+    assert "the same to the last bit" in result.output
+    [recording] = (out / "flights").rglob("flight.rrd")
+    assert recording.stat().st_size > 0
+    summary = json.loads((recording.parent / SUMMARY_FILE).read_text(encoding="utf-8"))
+    assert (summary["scenario"], summary["verdict"]) == ("pair", "unstable")
+
+
+def test_both_flights_of_a_probe_on_random_links_are_left_and_a_replay_that_differs_is_told(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = json.loads(run(tmp_path, "--delay", "0.1", "--loss", "0.1", "--out", str(out), "--json"))
+    [probe] = [point["id"] for point in result["points"] if point["kind"] == "probe"]
+    run(tmp_path, "--trial", probe, "--out", str(out))
+    assert len(list((out / "flights").rglob("flight.rrd"))) == 2
+    table = out / TRIALS_FILE
+    table.write_text(
+        re.sub(r'"ticks_sha256": "\w{8}', '"ticks_sha256": "00000000', table.read_text()), encoding="utf-8"
+    )
+    assert "not as it was flown first: ticks_sha256" in run(tmp_path, "--trial", probe, "--out", str(out), code=1)
+
+
+def test_a_sweep_over_two_vehicles_links_names_both_axes(tmp_path: Path) -> None:
+    options = ["--delay-of", "1=0.1:0.2:2", "--delay-of", "2=0.1,0.3", "--out", str(tmp_path / "out"), "--json"]
+    result = json.loads(run(tmp_path, *options))
+    assert result["axes"] == {"delay_1": [0.1, 0.2], "delay_2": [0.1, 0.3]}
+    assert result["noise"] is None
+
+
+def test_a_rate_whose_period_is_no_whole_number_of_microseconds_is_flown(tmp_path: Path) -> None:
+    result = json.loads(run(tmp_path, "--rate", "30", "--out", str(tmp_path / "out"), "--json"))
+    for point in result["points"]:
+        assert point["verdict"] == "stable"
+    [probe] = [point for point in result["points"] if point["kind"] == "probe"]
+    # telemetry is sampled on whole milliseconds, up to one later than its period says
+    assert probe["growth_1_s"] == pytest.approx(probe["predicted_growth_1_s"], rel=0.01)
+
+
+@pytest.mark.realtime
+def test_a_trial_in_real_time_has_the_noise_of_the_machine_on_record(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    options = ["--delay", "0.1", "--jitter", "0.005", "--real-time", "--out", str(out), "--json"]
+    result = json.loads(run(tmp_path, *options, duration_s=2.0))
+    assert [point["kind"] for point in result["points"]] == ["own"]
+    noise = result["noise"]
+    assert noise["flights"] == 1
+    assert 0.0 <= noise["lateness_s_p50"]["median"] <= noise["lateness_s_p99"]["max"]
+    assert 0.0 <= noise["steal_share"]["max"] <= noise["busy_share"]["max"] <= 1.0
+    assert "Noise of the machine" in (out / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
