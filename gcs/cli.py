@@ -141,13 +141,18 @@ def compare(
 
 @app.command()
 def margin(
-    model_file: Annotated[Path, typer.Argument(metavar="MODEL.json", help="matrices and delays of any linear loop")],
+    model_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="MODEL.json|SCENARIO.toml", help="matrices and delays of any linear loop, or a scenario"
+        ),
+    ],
     as_json: AsJson = False,
 ) -> None:
-    """How much delay any linear loop takes: stability windows, margin, crossings."""
-    from gcs.margin import margin_of_file, print_margin
+    """How much delay any linear loop takes, or that of a scenario: stability windows, margin, crossings."""
+    from gcs.margin import margin_of_file, margin_of_scenario, print_margin
 
-    result = margin_of_file(model_file)
+    result = margin_of_scenario(model_file) if model_file.suffix == ".toml" else margin_of_file(model_file)
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     else:

@@ -1,4 +1,4 @@
-"""`gcs margin`: how much delay any linear loop takes, from a JSON model to a verdict that was checked twice.
+"""`gcs margin`: how much delay any linear loop takes, from a JSON model or a scenario to a verdict checked twice.
 
 The exact analysis is confirmed by two others that share no algebra with it, a sweep along the unit circle and the
 rightmost root beside the ends of the windows, as far as they take a fraction of a second; `checked_by` in the result
@@ -14,7 +14,7 @@ import numpy as np
 
 from gains.delay import DelayAnalysis, analyse_delay
 from gains.errors import BadModelError, DisagreementError
-from gains.model_file import DelayModel, HeldModel, parse_model
+from gains.model_file import DelayModel, HeldModel, Term, parse_model
 from gains.structure import FloatArray, distinct_blocks, without_equilibria
 
 # multiples of the unknown up to this many times their common divisor
@@ -58,6 +58,35 @@ def margin_of_file(file: Path) -> dict[str, Any]:
         raise ModelFileError(f"{file}: read bytes that are not UTF-8, wanted a JSON model") from None
     except BadModelError as error:
         raise ModelFileError(f"{file}: {error}") from None
+
+
+def margin_of_scenario(file: Path) -> dict[str, Any]:
+    """The same for the loop that a scenario flies: the continuous model in full, and the margin as flown.
+
+    Raises
+    ------
+    ModelFileError, scenarios.files.ScenarioError, GainsError
+        One line with what was read and what was wanted.
+    """
+    from gains.onboard import own_part
+    from gcs.plan import flight_plan
+    from scenarios.files import load
+
+    scenario = load(file)
+    if scenario.dynamics == "autopilot":
+        wanted = "double_integrator: gcs design and gcs fly tell the margin with an autopilot's response"
+        raise ModelFileError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
+    design, plan = flight_plan(scenario)
+    model, onboard = plan.model, plan.scenario.control.loop == "onboard"
+    at_once = own_part(model, plan.gain) if onboard else np.zeros_like(plan.gain)
+    terms = Term(model.A + model.B @ at_once, 0.0, Fraction(0)), Term(model.B @ (plan.gain - at_once), 0.0, Fraction(1))
+    result = margin_of_model(DelayModel(terms, "tau"))
+    sampled_s = design["delay_margin_s"]
+    what = "own errors at once, those of others late" if onboard else "all feedback late"
+    flown = "no limit" if sampled_s is None else f"margin {sampled_s:.6g} s"
+    note = f"as flown, sampled and held every {design['period_s'] * 1e3:g} ms: {flown}"
+    notes = [f"loop {plan.scenario.control.loop}: {what}", note, *result["notes"]]
+    return result | {"loop": plan.scenario.control.loop, "delay_margin_sampled_s": sampled_s, "notes": notes}
 
 
 def margin_of_model(model: DelayModel | HeldModel) -> dict[str, Any]:

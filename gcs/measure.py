@@ -154,7 +154,8 @@ def _with_response(loop: Loop, respond: Callable[[float], FreeResponse], outcome
         outcome = _with_growth(loop, response, outcome)
         if outcome.growth_1_s is not None:
             outcome = replace(outcome, verdict="unstable" if outcome.growth_1_s > 0.0 else "stable")
-        if not _left_linear_range_too_soon(outcome) or response.until_s > _CALM_SHARE * response.calm_until_s:
+        # a flight that never left the linear range has infinity for both
+        if not _left_linear_range_too_soon(outcome) or response.until_s >= _CALM_SHARE * response.calm_until_s:
             break
     return outcome
 

@@ -13,9 +13,10 @@ import pytest
 
 from gains.errors import BadModelError, DisagreementError
 from gains.model_file import parse_model
-from gcs.margin import ModelFileError, margin_of_file, margin_of_model, print_margin
+from gcs.margin import ModelFileError, margin_of_file, margin_of_model, margin_of_scenario, print_margin
 
 CLASSIC = {"A0": [[-2.0, 0.0], [0.0, -0.9]], "A1": [[-1.0, 0.0], [-1.0, -1.0]]}
+SCENARIOS = Path(__file__).parent.parent / "scenarios"
 CLASSIC_MARGIN_S = acos(-0.9) / sqrt(1.0 - 0.81)
 
 
@@ -203,3 +204,24 @@ def test_table_says_the_verdict(model: object, lines: list[str], capsys: pytest.
     shown = capsys.readouterr().out
     for line in lines:
         assert line in shown
+
+
+@pytest.mark.parametrize(
+    ("name", "loop", "continuous_s", "sampled_s"),
+    [("thesis_delay", "onboard", 1.00796, 1.00216), ("thesis_gains", "ground", 0.077736, 0.068456)],
+)
+def test_a_scenario_has_the_margins_of_the_loop_it_flies(
+    name: str, loop: str, continuous_s: float, sampled_s: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = margin_of_scenario(SCENARIOS / f"{name}.toml")
+    assert result["loop"] == loop
+    assert result["delay_margin_s"] == pytest.approx(continuous_s, rel=1e-5)
+    assert result["delay_margin_sampled_s"] == pytest.approx(sampled_s, rel=1e-5)
+    assert result["checked_by"]
+    print_margin(result)
+    assert f"as flown, sampled and held every 20 ms: margin {sampled_s}" in capsys.readouterr().out
+
+
+def test_a_scenario_whose_vehicles_answer_late_is_refused() -> None:
+    with pytest.raises(ModelFileError, match="dynamics: read 'autopilot', wanted double_integrator"):
+        margin_of_scenario(SCENARIOS / "copters5.toml")

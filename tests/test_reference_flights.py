@@ -97,6 +97,14 @@ REFERENCES: dict[str, Reference] = {
             (29.85273, -243.9063, 92.46601, 0.38121),
         ),
     ),
+    "thesis_delay": Reference(
+        sha256="496a2b44830be26fa215f2db8fd1c2238f272b8013ec457e9fa089e69e93d9f0",
+        end=(
+            (276.64929, 0.16502, 91.80975, -0.38539),
+            (153.61879, 121.78094, 91.49078, -0.05023),
+            (33.06472, 243.28491, 91.05216, 0.4348),
+        ),
+    ),
 }
 
 
@@ -107,9 +115,11 @@ def scenario(name: str) -> Scenario:
         "chain3, above the margin": ("chain3", {"delay": 0.5}),
         "triangle5_scattered": ("triangle5_scattered", {}),
         "triangle5, jitter and loss": ("triangle5", {"delay": 0.1, "jitter": 0.01, "loss": 0.05}),
+        "thesis_delay": ("thesis_delay", {}),
     }[name]
-    gains = Control(gains=FixedGains(K1=-3.4, K2=0.6, K3=5.6))
-    loaded = load(SCENARIOS / f"{file}.toml").model_copy(update={"control": gains, "duration_s": DURATION_S})
+    loaded = load(SCENARIOS / f"{file}.toml").model_copy(update={"duration_s": DURATION_S})
+    if not loaded.control.blocks:
+        loaded = loaded.model_copy(update={"control": Control(gains=FixedGains(K1=-3.4, K2=0.6, K3=5.6))})
     return at_coordinates(loaded, changes)
 
 
