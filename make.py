@@ -29,6 +29,10 @@ JOBS: dict[str, tuple[str, list[str]]] = {
     "setup": ("make .venv with everything in requirements.lock", ["python --version"]),
     "fly": ("fly scenarios/triangle5.toml", ["gcs fly scenarios/triangle5.toml"]),
     "test": ("run the tests", ["python -m pytest -n auto"]),
+    "clients": (
+        "fly the vehicles under MAVProxy and MAVSDK's server, which it installs (1.2 GB)",
+        ["uv pip install --quiet --group clients", "python -m pytest -n 0 -rs tests/test_clients.py"],
+    ),
     "lint": (
         "check format, style, types and import contracts",
         ["ruff format --check .", "ruff check .", "pyright", "lint-imports"],

@@ -6,6 +6,7 @@ QGroundControl warns of a vehicle without them: it looks for a frame, calibrated
 from sim_vehicles.parameters import Parameter
 
 _ARDUPILOT: dict[str, float] = {
+    "ARMING_CHECK": 1,
     "FRAME_CLASS": 1,
     "FRAME_TYPE": 1,
     "BATT_MONITOR": 4,

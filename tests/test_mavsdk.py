@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time  # noqa: TID251 - MAVSDK has threads and a clock of its own
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -20,46 +20,10 @@ from mavsdk.plugins.telemetry import FlightMode, Telemetry
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios import files
-from scenarios.schema import Scenario
+from tests.flown_fleet import PATIENCE_S, SCENARIOS, copters, fleet, until
 from tests.sim_client import parse
 
-SCENARIOS = Path(__file__).parent.parent / "scenarios"
-PATIENCE_S = 20.0
-ARDUPILOT, PX4 = 2, 5
-
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
-
-
-def until(condition: Callable[[], Any], what: str) -> None:
-    """Wait for it: MAVSDK's threads work meanwhile."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end_s, f"{what}: not after {PATIENCE_S} s"
-        time.sleep(0.02)
-
-
-def copters() -> Scenario:
-    """Three ArduCopters and two PX4, soon ready to fly."""
-    loaded = files.load(SCENARIOS / "copters5.toml")
-    vehicles = (v.model_copy(update={"flavour": "px4" if v.system_id > 3 else None}) for v in loaded.vehicles)
-    autopilot = loaded.autopilot.model_copy(update={"telemetry_after_s": 0.1, "ready_after_s": 0.2})
-    return loaded.model_copy(update={"vehicles": tuple(vehicles), "autopilot": autopilot})
-
-
-@contextlib.contextmanager
-def fleet(scenario: Scenario, folder: Path) -> Generator[int]:
-    """The vehicles of a scenario in a process of their own, and the port they send to."""
-    file = folder / "scenario.toml"
-    file.write_text(files.dump(scenario), encoding="utf-8")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    command = [sys.executable, "-m", "sim_vehicles.cli", str(file), "--station", f"127.0.0.1:{port}"]
-    with subprocess.Popen([*command, "--duration", "90"], stdout=subprocess.DEVNULL) as process:
-        try:
-            yield port
-        finally:
-            process.terminate()
 
 
 class Client:
