@@ -79,12 +79,12 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]
     designed, plan = flight_plan(_without_solver(scenario, seconds))
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name) / "run"
-        _, _, steal_share = fly_real_time(plan, designed, folder)
+        _, _, spent = fly_real_time(plan, designed, folder)
         summary, graded = finish(folder), grade(folder)
     return {
         "control": summary["control"],
         "reason": summary["reason"],
-        "steal_share": steal_share,
+        "steal_share": spent.steal,
         "load_average": os.getloadavg()[0],
         **graded,
     }
@@ -92,9 +92,9 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]
 
 def _without_solver(scenario: Scenario, seconds: float) -> Scenario:
     gains = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
-    control = scenario.control.model_copy(
-        update={"gains": gains, "alpha": None, "delay_margin_s": None, "decay_rate_1_s": None}
-    )
+    requirement = dict.fromkeys(("alpha", "delay_margin_s", "decay_rate_1_s"))
+    given = {"method": "inclusion", "gains": gains, "blocks": ()}
+    control = scenario.control.model_copy(update=requirement | given)
     return scenario.model_copy(update={"duration_s": seconds, "control": control})
 
 

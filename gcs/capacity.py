@@ -16,6 +16,7 @@ from gcs.lockstep import START_NS, LinkLosses, Sent, Vehicles, fly_lockstep, veh
 from gcs.plan import flight_plan
 from gcs.report import number_text
 from gcs.station import Station
+from gcs.user_input import InputError
 from scenarios.schema import Scenario
 
 FloatArray = NDArray[np.float64]
@@ -88,7 +89,20 @@ def capacity(scenario: Scenario, *, rates_hz: list[float], most: int, seconds: f
     """The capacity of each rate, up to `most` vehicles: doubled until one fails, then halved in between.
 
     Near the margin errors go slowly, so that the flights of `seconds` are long.
+
+    Raises
+    ------
+    InputError
+        If the scenario's gains are of its own formation only, or its vehicles take off first.
     """
+    blocks = len(scenario.control.blocks)
+    if blocks:
+        raise InputError(
+            f"{scenario.name}: control.blocks: read {blocks} of them, wanted gains for any number of vehicles"
+        )
+    if scenario.dynamics != "double_integrator":
+        wanted = "double_integrator: gcs capacity does not fly vehicles that take off first"
+        raise InputError(f"{scenario.name}: dynamics: read {scenario.dynamics!r}, wanted {wanted}")
     scenario = scenario.model_copy(update={"duration_s": seconds})
     return [_capacity_of(scenario, rate_hz, most) for rate_hz in rates_hz]
 

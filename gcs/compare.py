@@ -224,6 +224,10 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
         texts = [
             str(v or UNKNOWN) if not form else number_text(None if v is None else factor * v, form) for v in values
         ]
+        if name.startswith("delay_margin"):  # of a route that was flown, none is no limit
+            texts = [
+                "no limit" if v is None and not r.failed else t for v, r, t in zip(values, routes, texts, strict=True)
+            ]
         table.append((title, texts))
     return table
 

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from gcs.capacity import capacity, fly_loaded
 from gcs.cli import app
+from gcs.user_input import InputError
 from scenarios.files import load
 from scenarios.schema import Scenario
 
@@ -66,3 +67,9 @@ def test_bad_rates_are_refused_in_one_line(rates: str) -> None:
     result = CliRunner().invoke(app, ["capacity", str(RADIO), "--rates", rates])
     assert result.exit_code == 2
     assert f"--rates: {rates}, wanted numbers from 0.1 to 1000" in result.output
+
+
+@pytest.mark.parametrize(("name", "read"), [("thesis_delay", "control.blocks: read 7"), ("copters5", "'autopilot'")])
+def test_what_it_cannot_fly_is_refused_in_one_line(name: str, read: str) -> None:
+    with pytest.raises(InputError, match=read):
+        capacity(load(RADIO.with_name(f"{name}.toml")), rates_hz=[10.0], most=2)
