@@ -21,9 +21,8 @@ from gcs.record import TickArray
 from gcs.stress_axes import has_constant_links
 from scenarios.schema import Scenario
 
-_SHARE_ALONE, _SHARE_PAIRED = 0.2, 0.8
-"""Parts of the nominal speed that an error may reach. The vehicles' own linearisation is exact until a limit is met;
-the larger part leaves room for what pushes both flights of a pair."""
+_LINEAR_SHARE = 0.8
+"""Part of the nominal speed that an error may reach: the vehicles' linearisation is exact, but not at speed zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +54,7 @@ def response_alone(
     probe = replace(plan, scenario=scenario)
     flight = fly_plan(probe, real_time=real_time, folder=folder)
     errors = _rows_of(flight.ticks, system_ids)
-    return FreeResponse(probe, flight, errors, linear_until_s(scenario, errors, share=_SHARE_ALONE))
+    return FreeResponse(probe, flight, errors, linear_until_s(scenario, errors, share=_LINEAR_SHARE))
 
 
 def fly_calm(plan: FlightPlan, folder: Path | None) -> Flight:
@@ -73,7 +72,7 @@ def response_paired(
     count = _alike(rows, calm_rows)
     rows, calm_rows = rows[:count], calm_rows[:count]
     until_s, calm_until_s = (
-        linear_until_s(disturbed.scenario, each, share=_SHARE_PAIRED) for each in (rows, calm_rows)
+        linear_until_s(disturbed.scenario, each, share=_LINEAR_SHARE) for each in (rows, calm_rows)
     )
     errors = rows.copy()
     for name in CHANNELS:

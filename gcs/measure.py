@@ -187,12 +187,13 @@ def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcom
     delay_s = max(response.loop_delays_s(own, loop.system_ids).values())
     settled = _SETTLED_LOOP_DELAYS if loop.has_late_terms else _FLYING_LOOP_DELAYS
     start_s = settled * delay_s + 2.0 * loop.period_s
-    modes = len(loop.A) // 2 + 2  # those of one axis, and two of what is late; the other axis has the same
+    # as many of one axis as its states, and as many again of what is late; the other axis has the same
+    modes = max(FOLLOWER_MODES, len(loop.A))
     motion = motion_of(own, loop.system_ids, period_s=loop.period_s)
     if response.varying:
         growth = norm_growth(motion, start_s=start_s, end_s=response.until_s)
     else:
-        growth = fit_growth(motion, start_s=start_s, end_s=response.until_s, modes=max(modes, FOLLOWER_MODES))
+        growth = fit_growth(motion, start_s=start_s, end_s=response.until_s, modes=modes)
     if growth is None:
         return replace(outcome, fit_start_s=round(start_s, 6), fit_end_s=round(min(response.until_s, since_s[-1]), 6))
     window = own[(since_s >= growth.start_s) & (since_s <= growth.end_s)]
