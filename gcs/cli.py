@@ -238,7 +238,7 @@ def _rates(text: str) -> list[float]:
     except ValueError:
         rates = []
     if not rates or not all(0.1 <= rate <= 1000.0 for rate in rates):
-        raise typer.BadParameter(f"--rates: {text}, wanted numbers from 0.1 to 1000 with commas, for example 2,5,10")
+        raise InputError(f"--rates: {text}, wanted numbers from 0.1 to 1000 with commas, for example 2,5,10")
     return rates
 
 
@@ -252,7 +252,7 @@ def grade(run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder")]
     try:
         result = graded(run)
     except RunError as error:
-        raise typer.BadParameter(str(error)) from None
+        raise InputError(str(error)) from None
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     else:

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from gcs.benchmark import benchmark, with_vehicles
 from gcs.cli import app
+from gcs.user_input import InputError
 from scenarios.files import load
 
 TRIANGLE = Path(__file__).parent.parent / "scenarios" / "triangle5.toml"
@@ -49,5 +50,5 @@ def test_in_real_time_latencies_are_graded_against_the_truth() -> None:
 
 def test_a_run_without_truth_is_refused_in_one_line(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["grade", str(tmp_path)])
-    assert result.exit_code == 2
-    assert "read no truth.bin" in result.output
+    assert isinstance(result.exception, InputError)
+    assert "read no truth.bin" in str(result.exception)
