@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from gcs.stress import stress
-from gcs.user_input import InputError, listening
+from gcs.user_input import InputError, KeyFile, listening, opened_guard, warn_if_open
 from gcs.watch_command import monitor, replay
 
 app = typer.Typer(
@@ -55,26 +55,23 @@ def fly(
     listen: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="listen here for the vehicles that this command starts")
     ] = "127.0.0.1:14550",
-    key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="sign, and take only what is signed with this key")
-    ] = None,
+    key: KeyFile = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="run folder; default runs/<scenario>-<time>")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Design the control, start the vehicles, fly, show, record."""
     from gcs.fly import FlyOptions, new_folder
     from gcs.fly import fly as fly_now
-    from gcs.guard import open_guard
     from gcs.plan import flight_plan
-    from gcs.udp import realtime_offset_ns
 
     scenario = _scenario(scenario_file)
     if link_delay is not None:
         if not 0 <= link_delay < 60:
             raise InputError(f"--link-delay: read {link_delay}, wanted seconds from 0 to 60")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
-    guard = None if key is None else open_guard(key, epoch_ns=realtime_offset_ns())
+    guard = opened_guard(key, role="station")
     with listening("--connect", connect) if connect else listening("--listen", listen) as link:
+        warn_if_open(link, signed=key is not None)
         design, plan = flight_plan(scenario)
         if not as_json:
             _print_design(design)

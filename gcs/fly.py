@@ -117,9 +117,10 @@ def _vehicles_heard(link: StationSocket, plan: FlightPlan, guard: Guard | None) 
     """System ids of the scenario that already send to our port, as after a station was killed in flight."""
     while (until_ns := link.bound_ns + round(_HEARTBEAT_PERIOD_S * _NS)) > clock_ns():
         time.sleep((until_ns - clock_ns()) * 1e-9)
-    received = link.receive()
-    data = [datagram.data for datagram in received] if guard is None else guard.heard(received, clock_ns())
-    frames = [frame for each in data for frame in mavlink.decode(each, Counter())]
+    datagrams = link.receive()
+    if guard is not None:
+        datagrams = guard.received(datagrams, clock_ns(), Counter())
+    frames = [frame for datagram in datagrams for frame in mavlink.decode(datagram.data, Counter())]
     return sorted({frame.system_id for frame in frames} & set(plan.formation.system_ids))
 
 

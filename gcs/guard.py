@@ -1,10 +1,11 @@
 """Signing at the station's socket: verified datagrams in, signed ones out. Stations know nothing of it."""
 
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 from gcs import mavlink
-from gcs.station import ANOTHER_ADDRESS, Datagram, Outgoing, Station
+from gcs.station import ANOTHER_ADDRESS, Datagram, Outgoing
 from signing.keys import Key, read_key
 from signing.link import SignedLink
 from signing.stamps import Stamps, open_stamps
@@ -19,30 +20,35 @@ class Guard:
     def __init__(self, key: Key, *, epoch_ns: int, stamps: Stamps) -> None:
         self._link = SignedLink(key, link_id=LINK_ID, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
 
-    def received(self, datagrams: list[Datagram], now_ns: int, station: Station) -> list[Datagram]:
-        """The datagrams with what could be verified of them; what is refused the station's counters count by reason."""
+    def received(
+        self,
+        datagrams: list[Datagram],
+        now_ns: int,
+        refused: Counter[str],
+        is_another: Callable[[int, Datagram], bool] | None = None,
+    ) -> list[Datagram]:
+        """The datagrams with what could be verified of them; what is refused is counted by reason.
+
+        `is_another` says of a system id whether a datagram is not from where that system speaks, see `Station`.
+        """
         verified: list[Datagram] = []
         for datagram in datagrams:
 
             def unwanted(system_id: int, datagram: Datagram = datagram) -> str:
-                return ANOTHER_ADDRESS if station.is_another(system_id, datagram) else ""
+                return ANOTHER_ADDRESS if is_another is not None and is_another(system_id, datagram) else ""
 
-            good = self._link.verify(datagram.data, now_ns, station.counters, unwanted)
+            good = self._link.verify(datagram.data, now_ns, refused, unwanted)
             if good:
                 verified.append(Datagram(good, *datagram[1:]))
         return verified
-
-    def heard(self, datagrams: list[Datagram], now_ns: int) -> list[bytes]:
-        """What could be verified of datagrams that came before there is a station."""
-        return [self._link.verify(datagram.data, now_ns, Counter()) for datagram in datagrams]
 
     def sent(self, outgoing: list[Outgoing], now_ns: int) -> list[Outgoing]:
         """The datagrams with their signatures."""
         return [Outgoing(self._link.sign(data, now_ns), address) for data, address in outgoing]
 
 
-def open_guard(key_file: Path, *, epoch_ns: int) -> Guard:
-    """The guard with the key in a file; the timestamps it has heard are kept beside it.
+def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:
+    """The guard with the key in a file; the timestamps it has heard are kept beside it, for each role apart.
 
     Raises
     ------
@@ -50,4 +56,4 @@ def open_guard(key_file: Path, *, epoch_ns: int) -> Guard:
         If one of the files cannot be used.
     """
     key = read_key(key_file)
-    return Guard(key, epoch_ns=epoch_ns, stamps=open_stamps(key_file.with_name(key_file.name + ".station")))
+    return Guard(key, epoch_ns=epoch_ns, stamps=open_stamps(key_file.with_name(f"{key_file.name}.{role}")))

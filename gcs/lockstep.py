@@ -82,7 +82,7 @@ def fly_lockstep(
         arrived = vehicles.step(to_vehicles, now_ns)
         datagrams = [Datagram(data, addresses[system_id], time_ns) for system_id, data, time_ns in arrived]
         if guard is not None:
-            datagrams = guard.received(datagrams, now_ns, station)
+            datagrams = guard.received(datagrams, now_ns, station.counters, station.is_another)
         outgoing, tick = station.step(datagrams, now_ns)
         if guard is not None:
             outgoing = guard.sent(outgoing, now_ns)

@@ -136,7 +136,7 @@ def drive(
         datagrams = link.receive()
         now_ns = clock_ns()
         if guard is not None:
-            datagrams = guard.received(datagrams, now_ns, station)
+            datagrams = guard.received(datagrams, now_ns, station.counters, station.is_another)
         outgoing, tick = station.step(datagrams, now_ns)
         link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
         sent_ns = clock_ns()

@@ -1,9 +1,18 @@
 """What a user gives to a command, and the one line that says what is wrong with it."""
 
-from typing import TYPE_CHECKING
+from ipaddress import ip_address
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 if TYPE_CHECKING:
+    from gcs.guard import Guard
     from gcs.udp import StationSocket
+
+KeyFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="sign, and take only what is signed with this key (see gcs key)")
+]
 
 
 class InputError(Exception):
@@ -27,3 +36,21 @@ def listening(option: str, text: str) -> "StationSocket":
         return StationSocket(host, port)
     except OSError as error:
         raise InputError(f"{host}:{port}: {error.strerror}; wanted a free UDP port") from None
+
+
+def warn_if_open(link: "StationSocket", *, signed: bool) -> None:
+    """One line where others than this machine can reach a socket without a key."""
+    host, port = link.address
+    if not signed and not ip_address(host).is_loopback:
+        text = "others can reach it and nothing is signed; gcs key FILE makes a key for --key"
+        typer.echo(f"warning: {host}:{port} is open: {text}", err=True)
+
+
+def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
+    """What signs and verifies with the key in a file, if one was given."""
+    if key is None:
+        return None
+    from gcs.guard import open_guard
+    from gcs.udp import realtime_offset_ns
+
+    return open_guard(key, epoch_ns=realtime_offset_ns(), role=role)

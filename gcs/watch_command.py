@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gcs.user_input import InputError, listening
+from gcs.user_input import InputError, KeyFile, listening, opened_guard
 
 _FAILED, _INTERRUPTED = 1, 130
 _TIMESYNC_HZ = 10.0
@@ -29,6 +29,7 @@ def monitor(
     design: Annotated[
         Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margin of a run's design.json")
     ] = None,
+    key: KeyFile = None,
     silent: Annotated[bool, typer.Option("--silent", help="send nothing: delays are lower bounds then")] = False,
     seconds: Annotated[
         float, typer.Option("--for", metavar="SECONDS", help="end by itself after this time", min=0.1)
@@ -45,6 +46,7 @@ def monitor(
     """
     if margin is not None and design is not None:
         raise InputError("read --margin and --design, wanted one of them")
+    guard = opened_guard(key, role="monitor")
     with listening("--listen", listen) as link:
         scenario, margin_s, margin_of = _compared_with(scenario_file, margin, design)
         # After the socket: what comes while these load keeps its receive stamp.
@@ -63,7 +65,7 @@ def monitor(
         )
         watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
         with stop_signals() as stop_reason:
-            report = monitor_links(link, watch, options, stop_reason)
+            report = monitor_links(link, watch, options, stop_reason, guard)
             interrupted = bool(stop_reason())
     if as_json:
         typer.echo(json.dumps(report, indent=2, allow_nan=False))

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.live import Live
 
 from gcs import mavlink
+from gcs.guard import Guard
 from gcs.udp import StationSocket, clock_ns
 from gcs.watch import Requests, Watch
 from gcs.watch_table import plain_line, render
@@ -38,7 +39,11 @@ class MonitorOptions:
 
 
 def monitor_links(
-    link: StationSocket, watch: Watch, options: MonitorOptions, stop_reason: Callable[[], str]
+    link: StationSocket,
+    watch: Watch,
+    options: MonitorOptions,
+    stop_reason: Callable[[], str],
+    guard: Guard | None = None,
 ) -> dict[str, Any]:
     """Watch until the time is over or a reason to stop is given; returns the figures of the whole time."""
     requests = Requests(options.timesync_hz)
@@ -68,12 +73,16 @@ def monitor_links(
         look_ns = start_ns
         while now_ns < end_ns and not stop_reason():
             link.wait(min(look_ns, end_ns, requests.next_ns))  # not long: a signal does not end the wait
-            for datagram in link.receive():
+            datagrams = link.receive()
+            if guard is not None:
+                datagrams = guard.received(datagrams, clock_ns(), watch.counters)
+            for datagram in datagrams:
                 for frame in mavlink.decode_either(datagram.data, watch.counters):
                     watch.take(frame, datagram.received_ns, datagram.address)
             now_ns = clock_ns()
             look_ns = watch.look(now_ns)
-            link.send(requests.due(watch, now_ns))
+            outgoing = requests.due(watch, now_ns)
+            link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
             if now_ns >= show_ns and live is not None:
                 show_ns = now_ns + _SHOW_NS
                 live.update(render(report(_WINDOW_LOOKS), width=console.width, height=console.height - 1), refresh=True)

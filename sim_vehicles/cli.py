@@ -10,6 +10,7 @@ import sys
 import time  # noqa: TID251 - the command starts the vehicles' clock
 from collections import Counter
 from collections.abc import Callable, Generator
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Never
 
@@ -95,6 +96,8 @@ def _fly(
     fleet = Fleet(scenario, start_ns, record=log.record if log else None, signed=signed)
     say = _Lines(start_ns)
     how = ", signed" if signed else ""
+    if not signed:
+        say.openness([options.station], "others may send from there and nothing is signed; see --key")
     say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
     fly(fleet, ports, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log, ports.sockets))
     say.changes(fleet.take_changes())
@@ -126,6 +129,7 @@ def _links_only(
     links = Relay(scenario, start_ns, record=log.record if log else None)
     say = _Lines(start_ns)
     ports = ", ".join(map(_shown, options.vehicle_port))
+    say.openness(options.vehicle_port, "links pass on what anybody sends; only stations and vehicles can sign")
     say.line(f"the links of {scenario.name}, from vehicles at {ports}, to {_shown(options.station)}")
     relay(links, peers, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log, peers.sockets))
     say.summary(links.counters + peers.sockets.counters, log)
@@ -165,6 +169,12 @@ class _Lines:
                 print(text, flush=True)
             except OSError:  # terminal or pipe was closed; the vehicles fly on
                 self._read = False
+
+    def openness(self, addresses: list[tuple[str, int]], why: str) -> None:
+        """A line on each address that is not this machine's alone."""
+        for host, port in addresses:
+            if not ip_address(host).is_loopback:
+                self.line(f"warning: {host}:{port} is open: {why}")
 
     def changes(self, changes: list["Change"]) -> None:
         for change in changes:

@@ -14,6 +14,7 @@ from sim_vehicles.links import NEVER_NS, Link, LinkSet
 from sim_vehicles.truth import LINK_DOWN, LINK_UP, Record
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD
+SETUP_SIGNING = (256).to_bytes(3, "little")
 
 
 class Passing(NamedTuple):
@@ -35,6 +36,16 @@ def sender(data: bytes) -> int | None:
     else:
         return None
     return system_id if 1 <= system_id <= 250 else None
+
+
+def holds_key(data: bytes) -> bool:
+    """Whether a frame of a datagram is SETUP_SIGNING, which is never passed on."""
+    at = 0
+    while at + 12 <= len(data) and data[at] == MAGIC_2:
+        if data[at + 7 : at + 10] == SETUP_SIGNING:
+            return True
+        at += 12 + data[at + 1] + 13 * (data[at + 2] & 1)
+    return False
 
 
 class Relay:

@@ -7,13 +7,16 @@ the station; what the station answers there goes through the down link to the ad
 import time  # noqa: TID251 - this is the real-time driver
 from collections.abc import Callable
 
-from sim_vehicles.relay import Passing, Relay, sender
+from scenarios.schema import NS_PER_S
+from sim_vehicles.relay import Passing, Relay, holds_key, sender
 from sim_vehicles.truth import LINK_DOWN, LINK_UP
 from sim_vehicles.udp import LONGEST_WAIT_NS, Received, Sockets, undisturbed
 from sim_vehicles.vehicle import Change
 
 MOST_PEERS = 1000
 """Addresses that vehicles speak from; each vehicle may be started again a few times."""
+SILENCE_NS = 3 * NS_PER_S // 2
+"""A vehicle that has not been heard for this long may have been started again, and speak from another address."""
 
 
 class Peers:
@@ -25,11 +28,14 @@ class Peers:
         If a vehicle port cannot be bound.
     """
 
-    def __init__(self, vehicle_ports: list[tuple[str, int]], station: tuple[str, int]) -> None:
+    def __init__(
+        self, vehicle_ports: list[tuple[str, int]], station: tuple[str, int], *, silence_ns: int = SILENCE_NS
+    ) -> None:
         self.sockets = Sockets()
         self.changes: list[Change] = []
         """Who was found; whoever reads may clear it."""
         self._station = station
+        self._silence_ns = silence_ns
         self._station_side: dict[int, int] = {}
         """System id to the file number of the socket that the station hears it from."""
         self._system_ids: dict[int, int] = {}
@@ -37,7 +43,9 @@ class Peers:
         self._peers: dict[tuple[int, tuple[str, int]], int] = {}
         """(File number of our port, the vehicle's address) to system id."""
         self._addresses: dict[int, tuple[int, tuple[str, int]]] = {}
-        """System id to where it was last heard from."""
+        """System id to where it was last heard from,"""
+        self._heard_ns: dict[int, int] = {}
+        """and when."""
         try:
             for address in vehicle_ports:
                 self.sockets.add(bind=address)
@@ -50,13 +58,14 @@ class Peers:
         """Everything that has arrived, from either side."""
         received: list[Passing] = []
         for datagram in self.sockets.receive():
+            if holds_key(datagram.data):
+                self.sockets.counters["refused_setup_signing"] += 1
+                continue
             system_id = self._system_ids.get(datagram.file_number)
             if system_id is not None:
                 received.append(Passing(datagram.time_ns, LINK_DOWN, system_id, datagram.data))
             elif (system_id := self._vehicle(datagram)) is not None:
                 received.append(Passing(datagram.time_ns, LINK_UP, system_id, datagram.data))
-            else:
-                self.sockets.counters["refused_peer"] += 1
         return received
 
     def send(self, passing: list[Passing]) -> None:
@@ -71,15 +80,22 @@ class Peers:
     def _vehicle(self, datagram: Received) -> int | None:
         """The vehicle that a datagram on one of our ports is from, or None if it does not say."""
         place = datagram.file_number, datagram.address
-        system_id = self._peers.get(place)
+        system_id = self._peers.get(place) or sender(datagram.data)
         if system_id is None:
-            system_id = sender(datagram.data)
-            if system_id is None or len(self._peers) >= MOST_PEERS or not self._admit(system_id):
+            self.sockets.counters["refused_peer"] += 1
+            return None
+        known = self._addresses.get(system_id, place)
+        if known != place and datagram.time_ns - self._heard_ns[system_id] < self._silence_ns:
+            self.sockets.counters["refused_second_source"] += 1
+            return None
+        if place not in self._peers:
+            if len(self._peers) >= MOST_PEERS or not self._admit(system_id):
+                self.sockets.counters["refused_peer"] += 1
                 return None
             self._peers[place] = system_id
             text = f"found at {datagram.address[0]}:{datagram.address[1]}"
             self.changes.append(Change(datagram.time_ns, system_id, text))
-        self._addresses[system_id] = place  # a vehicle that was started again has another port
+        self._addresses[system_id], self._heard_ns[system_id] = place, datagram.time_ns
         return system_id
 
     def _admit(self, system_id: int) -> bool:

@@ -106,6 +106,16 @@ def test_after_a_kill_a_new_station_with_the_key_takes_the_vehicles_back(tmp_pat
             os.kill(pid, signal.SIGTERM)
 
 
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_port_that_others_can_reach_is_warned_of_unless_it_is_signed(tmp_path: Path, signed: bool) -> None:
+    make_key(tmp_path / "key")
+    key = ["--key", tmp_path / "key"] if signed else []
+    process = fly(short(tmp_path, "chain3", 0.2), "--listen", "0.0.0.0:0", *key, "--out", tmp_path / "run", "--json")
+    _, err = process.communicate(timeout=PATIENCE_S)
+    warned = err.startswith("warning: 0.0.0.0:") and err.endswith("--key\n") and err.count("\n") == 1
+    assert (warned, err == "") == (not signed, signed)
+
+
 @contextmanager
 def signed_vehicles(tmp_path: Path, station_port: int) -> Generator[None]:
     key_file = tmp_path / "vehicles.key"
@@ -182,7 +192,9 @@ def test_our_station_flies_with_a_vehicle_of_pymavlinks_that_has_the_key_and_hea
                 own.send(packed(spoofer, heartbeat))
             link.wait(station.next_event_ns)
             now_ns = clock_ns()
-            outgoing, _ = station.step(guard.received(link.receive(), now_ns, station), now_ns)
+            outgoing, _ = station.step(
+                guard.received(link.receive(), now_ns, station.counters, station.is_another), now_ns
+            )
             link.send(guard.sent(outgoing, now_ns))
             while select.select([own], [], [], 0)[0]:
                 for message in vehicle.parse_buffer(own.recv(2048)) or []:
