@@ -9,28 +9,39 @@ so errors are those against the formation as designed. A tick's lateness is told
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import nan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gains.formation import FormationModel
 from gcs import mavlink
-from gcs.control import LARGEST_COMMAND_M_S2, Blend, distances_m, feedback_law, formation_control
+from gcs.control import (
+    LARGEST_COMMAND_M_S2,
+    Blend,
+    FeedbackLaw,
+    Formation,
+    distances_m,
+    feedback_law,
+    formation_control,
+)
 from gcs.copters import locate
 from gcs.monitor import VehicleState
-from gcs.plan import plan_formation
+from gcs.plan import flight_plan, plan_formation
 from gcs.record import CLOCK_JUMPED, GAIN_SET, TICK, Mode, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
 from gcs.startup import Startup
 from gcs.station import SILENCE_S
+from gcs.stream import Stream, law_of
 from gcs.telemetry import StateHistory
 from gcs.watch import Watch, WatchedVehicle
 from scenarios.schema import NS_PER_S, Scenario
 
 Frames = list[tuple[int, mavlink.Frame]]
+Laws = Callable[[Sequence[bool]], FeedbackLaw]
 Events = list[dict[str, object]]
 
 _TOLD = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
@@ -120,6 +131,16 @@ def _told(frame: mavlink.Frame) -> tuple[int, str] | None:
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 
+def _errors_of(scenario: Scenario, formation: Formation) -> tuple[Laws, Any]:
+    """The law around lost vehicles, and the function that forms the errors by it, as the station has them."""
+    if scenario.control.loop == "onboard":  # what is streamed, and so how old it is, depends on the gains
+        _, plan = flight_plan(scenario)
+        return partial(law_of, plan), Stream(plan).control
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    no_gains = (np.zeros((model.inputs, model.states)),)  # only the errors are wanted
+    return partial(feedback_law, formation, no_gains), formation_control
+
+
 class _Replay:
     """The station's picture of the vehicles, built up again."""
 
@@ -137,10 +158,9 @@ class _Replay:
             vehicle.remote.startup = startup
         self._frame_ned_m = [(0.0, 0.0, 0.0)] * len(ids)
         self._history = StateHistory(len(ids))
-        model = FormationModel(tuple(self._formation.predecessor.tolist()))
-        self._no_gains = (np.zeros((model.inputs, model.states)),)  # only the errors are wanted
+        self._laws, self._control = _errors_of(scenario, self._formation)
         self._lost = [False] * len(ids)
-        self._law = feedback_law(self._formation, self._no_gains, self._lost)
+        self._law = self._laws(self._lost)
         self._telemetry_ns = [0] * len(ids)
         self._reported = [Reported()] * len(ids)
         self._states = [VehicleState()] * len(ids)
@@ -258,8 +278,8 @@ class _Replay:
             locate(self._starts, self._frame_ned_m, self._history)
         lost = [flying and sent_ns - heard_ns > SILENCE_S * NS_PER_S for heard_ns in self._telemetry_ns]
         if lost != self._lost:
-            self._lost, self._law = lost, feedback_law(self._formation, self._no_gains, lost)
-        controls = formation_control(
+            self._lost, self._law = lost, self._laws(lost)
+        controls = self._control(
             self._history,
             self._law,
             [_NO_BLEND] * len(lost),

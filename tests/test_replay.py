@@ -27,6 +27,7 @@ FLIGHTS: dict[str, tuple[str, float, float | None]] = {
     "jitter and loss": ("wifi_bursts", 8.0, None),
     "gains change": ("triangle5", 40.0, None),
     "autopilots": ("copters5", 5.0, None),
+    "loops on board": ("chain3", 5.0, None),
 }
 """Scenario, duration in s, link delay in s."""
 MICROSECOND = 2e-6
@@ -38,6 +39,8 @@ def scenario_of(flight: str) -> Scenario:
     scenario = load(SCENARIOS / f"{name}.toml").model_copy(update={"duration_s": duration_s})
     if flight == "gains change":
         return scenario.model_copy(update={"links": ramp(0.44)})
+    if flight == "loops on board":
+        return scenario.model_copy(update={"control": scenario.control.model_copy(update={"loop": "onboard"})})
     return scenario if delay_s is None else scenario.with_link_delay(up_s=delay_s, down_s=delay_s)
 
 
