@@ -84,6 +84,7 @@ def _global_position(encoder: mavlink.Encoder, motion: Motion, boot_ms: int, *, 
         altitude_m=ORIGIN_ALTITUDE_M + motion.altitude_m,
         relative_altitude_m=motion.altitude_m,
         velocity_ne_m_s=motion[2:4],
+        velocity_down_m_s=-motion.climb_m_s,
         heading_deg=math.degrees(motion.yaw_rad) % 360.0,
     )
 

@@ -250,6 +250,7 @@ class Encoder:
         altitude_m: float,
         relative_altitude_m: float,
         velocity_ne_m_s: tuple[float, float],
+        velocity_down_m_s: float = 0.0,
         heading_deg: float,
     ) -> bytes:
         """GLOBAL_POSITION_INT; what does not fit a field is cut to its largest value."""
@@ -263,7 +264,7 @@ class Encoder:
                 _clipped(relative_altitude_m * 1e3, 2**31 - 1),
                 _clipped(north * 1e2, 2**15 - 1),
                 _clipped(east * 1e2, 2**15 - 1),
-                0,
+                _clipped(velocity_down_m_s * 1e2, 2**15 - 1),
                 round(heading_deg * 1e2) % 36000,
             )
         )

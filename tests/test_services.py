@@ -277,6 +277,22 @@ def hovering(kind: str) -> tuple[Copter, int]:
 
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_a_climb_shows_alike_in_all_reports(kind: str) -> None:
+    vehicle, now = hovering(kind)
+    for number in (30, 32, 33, 74):
+        vehicle.step([(command(511, number, 20_000), now)], now)
+    sent: list[tuple[Any, int]] = []
+    for k in range(1, 40):
+        at = now + k * 50 * MS
+        sent = parse_all(vehicle.step([(velocity_setpoint(1, 0xDC7, (0.0, 0.0, -1.5)), at)], at))
+    found = {m.get_type(): m for m, _ in sent}
+    assert found["LOCAL_POSITION_NED"].vz == pytest.approx(-1.5, abs=0.01)
+    assert found["GLOBAL_POSITION_INT"].vz == -150
+    assert found["VFR_HUD"].climb == pytest.approx(1.5, abs=0.01)
+    assert found["VFR_HUD"].alt == pytest.approx(found["GLOBAL_POSITION_INT"].alt * 1e-3, abs=0.05)
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
 def test_a_copter_turns_to_the_yaw_it_is_given_and_flies_forward_along_it(kind: str) -> None:
     vehicle, now = hovering(kind)
     for k in range(100):
