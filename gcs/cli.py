@@ -1,5 +1,6 @@
 """The `gcs` command. Slow imports (cvxpy, rerun) are made by the commands that need them, so that --help is quick."""
 
+import contextlib
 import json
 import os
 import sys
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from gcs.stress import stress
-from gcs.user_input import InputError, KeyFile, listening, opened_guard, warn_if_open
+from gcs.user_input import InputError, KeyFile, listening, mirroring, opened_guard, warn_if_open
 from gcs.watch_command import monitor, replay
 
 app = typer.Typer(
@@ -55,6 +56,12 @@ def fly(
     listen: Annotated[
         str, typer.Option(metavar="HOST:PORT", help="listen here for the vehicles that this command starts")
     ] = "127.0.0.1:14550",
+    mirror: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="forward all frames to another ground station, read-only")
+    ] = "",
+    mirror_commands: Annotated[
+        bool, typer.Option("--mirror-commands", help="let what that station sends through to the vehicles")
+    ] = False,
     key: KeyFile = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="run folder; default runs/<scenario>-<time>")] = None,
     as_json: AsJson = False,
@@ -70,14 +77,18 @@ def fly(
             raise InputError(f"--link-delay: read {link_delay}, wanted seconds from 0 to 60")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
     guard = opened_guard(key, role="station")
-    with listening("--connect", connect) if connect else listening("--listen", listen) as link:
+    if mirror_commands and not mirror:
+        raise InputError("read --mirror-commands without --mirror, wanted both")
+    with contextlib.ExitStack() as opened:
+        link = opened.enter_context(listening("--connect", connect) if connect else listening("--listen", listen))
         warn_if_open(link, signed=key is not None)
+        to = opened.enter_context(mirroring(mirror, commands=mirror_commands)) if mirror else None
         design, plan = flight_plan(scenario)
         if not as_json:
             _print_design(design)
         folder = _out_folder(out) if out is not None else new_folder(scenario.name)
         options = FlyOptions(folder=folder, start_vehicles=not connect, show_table=not as_json, key_file=key)
-        summary = fly_now(plan, design, link, options, guard)
+        summary = fly_now(plan, design, link, options, guard, to)
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:

@@ -15,6 +15,7 @@ from typing import Any
 
 from gcs import mavlink
 from gcs.guard import Guard
+from gcs.mirror import Mirror
 from gcs.plan import FlightPlan, described
 from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter
 from gcs.sitl import VehicleProcess
@@ -44,7 +45,12 @@ class FlyOptions:
 
 
 def fly(
-    plan: FlightPlan, design: dict[str, Any], link: StationSocket, options: FlyOptions, guard: Guard | None = None
+    plan: FlightPlan,
+    design: dict[str, Any],
+    link: StationSocket,
+    options: FlyOptions,
+    guard: Guard | None = None,
+    mirror: Mirror | None = None,
 ) -> dict[str, Any]:
     """Fly a designed scenario in real time and return the summary of the run left in the folder."""
     folder = options.folder
@@ -74,7 +80,7 @@ def fly(
             text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
             writer.event(time_s=station.scenario_time_s(clock_ns()), kind=NEW_DESIGN, text=text)
 
-        drive(station, link, writer, stop_reason, new_plan, guard)
+        drive(station, link, writer, stop_reason, new_plan, guard, mirror)
         writer.event(time_s=station.scenario_time_s(clock_ns()), kind="end", text=station.end_reason)
     return finish(folder)
 

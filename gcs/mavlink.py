@@ -80,6 +80,31 @@ def field_names(msg_id: int) -> list[str]:
     return list(messages[msg_id].ordered_fieldnames)
 
 
+def _target_places() -> dict[int, int]:
+    """Where among its fields a message says to which system it goes; those that do not are left out."""
+    messages: dict[int, Any] = dialect.mavlink_map
+    return {
+        msg_id: sum(message.lengths[: message.ordered_fieldnames.index("target_system")])
+        for msg_id, message in messages.items()
+        if "target_system" in message.ordered_fieldnames
+    }
+
+
+_TARGET_PLACES = _target_places()
+
+
+def target_system(frame: Frame) -> int:
+    """The system that a frame is for; 0 if for all."""
+    place = _TARGET_PLACES.get(frame.msg_id)
+    return 0 if place is None else frame.fields[place]
+
+
+def message_name(msg_id: int) -> str:
+    """The name of a message that can be decoded."""
+    messages: dict[int, Any] = dialect.mavlink_map
+    return messages[msg_id].msgname
+
+
 def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     """The valid frames of one datagram; what is refused is counted by reason and never raised.
 

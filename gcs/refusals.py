@@ -52,7 +52,7 @@ def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
     }
 
 
-def counts_of(events: list[dict[str, Any]]) -> dict[str, int]:
-    """The newest counts in a run's events."""
-    told = [event["counts"] for event in events if event["kind"] == REFUSED]
+def counts_of(events: list[dict[str, Any]], kind: str = REFUSED) -> dict[str, int]:
+    """The newest counts in a run's events of a kind."""
+    told = [event["counts"] for event in events if event["kind"] == kind]
     return told[-1] if told else {}

@@ -106,6 +106,8 @@ def print_flight(summary: dict[str, Any], console: Console) -> None:
     for who, counts in (("station", summary.get("refused")), ("vehicles", summary.get("refused_by_vehicles"))):
         if counts:
             console.print(f"refused  by the {who}: {in_words(counts)}")
+    if mirror := summary.get("mirror"):
+        console.print(f"mirror   {in_words(mirror)}")
     table = Table(box=box.SIMPLE_HEAD)
     for name in ("vehicle", "final error, m", "largest, m", "RTT p50, ms", "loop p50, ms", "p99, ms", "lost", "late"):
         table.add_column(name, justify="right")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gcs.mirror import MIRROR
 from gcs.record import (
     CLOCK_JUMPED,
     DESIGN_FILE,
@@ -129,6 +130,7 @@ def summarise(
         ],
         "control": _control(scenario, flown),
         "refused": counts_of(events),
+        "mirror": counts_of(events, MIRROR),
         "mode_changes": [e for e in events if e["kind"] == "mode" and e["time_s"] >= 0],
         "files": [],
     }

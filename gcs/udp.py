@@ -16,6 +16,7 @@ from typing import Self
 
 from gcs import mavlink
 from gcs.guard import Guard
+from gcs.mirror import MIRROR, Mirror
 from gcs.modes import Phase
 from gcs.plan import FlightPlan
 from gcs.record import RunWriter
@@ -115,11 +116,13 @@ def drive(
     stop_reason: Callable[[], str],
     new_plan: Callable[[FlightPlan], None],
     guard: Guard | None = None,
+    mirror: Mirror | None = None,
 ) -> None:
     """Run the station in real time until its flight has ended.
 
     `stop_reason` is asked at every tick; a text other than "" ends the flight for that reason. `new_plan` is told when
-    the station has found more out about what it flies. With a guard, what is sent and received is signed.
+    the station has found more out about what it flies. With a guard, what is sent and received is signed. A mirror
+    gets every frame taken in and sent, and may have some for the vehicles.
     """
     plan = station.plan
     log: list[tuple[bytes, int]] = []
@@ -140,6 +143,10 @@ def drive(
         outgoing, tick = station.step(datagrams, now_ns)
         link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
         sent_ns = clock_ns()
+        if mirror is not None:
+            mirror.forward([frame for frame, _ in station.frames] + [data for data, _ in outgoing])
+            passed_on = mirror.passed_on(station.vehicles)
+            link.send(passed_on if guard is None else guard.sent(passed_on, now_ns))
         log += station.frames
         # A round trip counts from the step that asked, a set-point's age from when it was handed over.
         log += [(data, sent_ns if mavlink.is_set_point(data) else now_ns) for data, _ in outgoing]
@@ -155,6 +162,9 @@ def drive(
         if reason := stop_reason():
             station.request_stop(reason)
     log_refusals(clock_ns(), last=True)
+    if mirror is not None:
+        time_s, counts = station.scenario_time_s(clock_ns()), dict(mirror.counters)
+        writer.event(time_s=time_s, kind=MIRROR, text=in_words(counts), counts=counts)
 
 
 def _log(station: Station, writer: RunWriter, frames: list[tuple[bytes, int]]) -> None:

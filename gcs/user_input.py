@@ -8,6 +8,7 @@ import typer
 
 if TYPE_CHECKING:
     from gcs.guard import Guard
+    from gcs.mirror import Mirror
     from gcs.udp import StationSocket
 
 KeyFile = Annotated[
@@ -54,3 +55,14 @@ def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
     from gcs.udp import realtime_offset_ns
 
     return open_guard(key, epoch_ns=realtime_offset_ns(), role=role)
+
+
+def mirroring(text: str, *, commands: bool) -> "Mirror":
+    """The mirror that --mirror HOST:PORT asks for."""
+    from gcs.mirror import Mirror
+
+    host, port = address("--mirror", text)
+    try:
+        return Mirror(host, port, commands=commands)
+    except OSError as error:
+        raise InputError(f"--mirror: {text}: {error.strerror}; wanted the address of a ground station") from None

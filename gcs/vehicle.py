@@ -185,9 +185,9 @@ class RemoteVehicle:
 
     def acknowledge(self, fields: tuple[Any, ...], now_ns: int) -> None:
         """Take in a COMMAND_ACK."""
-        command, result = fields[0], fields[1]
+        command, result, *_, target_system, _ = fields
         waiting = self._command
-        if waiting is None or waiting.command != command:
+        if waiting is None or waiting.command != command or target_system not in (0, mavlink.STATION_SYSTEM_ID):
             return
         if result == _IN_PROGRESS:
             waiting.sent_ns = now_ns

@@ -50,6 +50,9 @@ class WatchedVehicle:
         self.rtt_s = array("d")
         self.age_s = array("d")
         self.loop_delay_s = array("d")
+        """At each look; NaN where unknown, or where nothing came for so long that it is silence and no latency."""
+        self._judged = 0
+        """Looks up to the newest state: whether the later ones saw a latency is known when the next state comes."""
         self.states = 0
         """Position reports received."""
         self.first_state_ns = 0
@@ -72,6 +75,10 @@ class WatchedVehicle:
             return  # overtaken
         if boot_ns < self.boot_ns:
             self._least_ns = (1 << 62, 1 << 62)  # started anew
+        if self.states and received_ns - self.state_ns > SILENT_NS:
+            for looks in (self.age_s, self.loop_delay_s):
+                looks[self._judged :] = array("d", [nan]) * (len(looks) - self._judged)
+        self._judged = len(self.age_s)
         self.first_state_ns = self.first_state_ns if self.states else received_ns
         self.states += 1
         self.state_ns, self.boot_ns = received_ns, boot_ns
@@ -88,9 +95,7 @@ class WatchedVehicle:
         """Note how old the newest state is, and how late a command computed from it would act."""
         clock = self.remote.clock
         age_s = down_s = nan
-        if now_ns - self.state_ns > SILENT_NS:
-            pass  # that nothing comes is no latency
-        elif self.states and clock.estimate.samples:
+        if self.states and clock.estimate.samples:
             age_s = (now_ns - clock.estimate.to_station_ns(self.boot_ns)) * 1e-9
             down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
         elif self.states:
@@ -103,7 +108,8 @@ class WatchedVehicle:
         clock, frames = self.remote.clock, self.remote.frames
         estimate = clock.estimate
         measured = estimate.samples > 0
-        rtt_s, age_s, loop_s = (_spread(values, last) for values in (self.rtt_s, self.age_s, self.loop_delay_s))
+        rtt_s = _spread(self.rtt_s, last)
+        age_s, loop_s = (_spread(looks[: self._judged], last) for looks in (self.age_s, self.loop_delay_s))
         if not measured:
             age_s["status"] = loop_s["status"] = "lower bound" if self.states else "unknown"
         span_s = (self.state_ns - self.first_state_ns) * 1e-9

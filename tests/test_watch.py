@@ -149,7 +149,7 @@ def test_a_vehicle_that_falls_silent_says_so_and_its_delay_does_not_grow() -> No
         watched.watch.look(later_ns)
     after = watched.watch.figures(later_ns, None)[0]
     assert (before["status"], after["status"]) == ("measured", "silent")
-    assert after["loop_delay_s"]["max"] < 3.1
+    assert after["loop_delay_s"] == before["loop_delay_s"]
     assert after["headroom"] is None
 
 

@@ -1,0 +1,87 @@
+"""The stream of a flight for another ground station: what vehicles send and what the station sends, as raw MAVLink.
+
+It is read-only: what the other station sends is counted and left, unless it is asked for. Nothing waits for the other
+station; that nobody listens is counted.
+"""
+
+import contextlib
+import socket
+from collections import Counter
+from collections.abc import Iterable
+from types import TracebackType
+from typing import Self
+
+from gcs import mavlink
+from gcs.station import Outgoing
+from gcs.vehicle import RemoteVehicle
+
+MIRROR = "mirror"
+"""Kind of the event that holds what a mirror counted."""
+_LARGEST_DATAGRAM = 2048
+_DATAGRAMS_A_STEP = 64
+"""Of the other station; what is more waits, and is dropped by the kernel when its buffer is full."""
+
+
+class Mirror:
+    """A socket connected to another ground station; with `commands`, what that sends goes on to the vehicles.
+
+    Raises OSError if the address cannot be used.
+    """
+
+    def __init__(self, host: str, port: int, *, commands: bool) -> None:
+        self.counters: Counter[str] = Counter()
+        self._commands = commands
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.connect((host, port))
+        except OSError:
+            self._socket.close()
+            raise
+        self._socket.setblocking(False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._socket.close()
+
+    def forward(self, frames: Iterable[bytes]) -> None:
+        """Send frames on, each as it is."""
+        for frame in frames:
+            try:
+                self._socket.send(frame)
+                self.counters["forwarded"] += 1
+            except OSError:  # nobody listens there, which an earlier datagram told, or the buffer is full
+                self.counters["not forwarded"] += 1
+
+    def passed_on(self, vehicles: list[RemoteVehicle]) -> list[Outgoing]:
+        """What the other station has sent since and may go on: to the vehicle it is for, or to all.
+
+        Only to vehicles that are flown already: one that had not been commanded before would take the other station
+        for its own.
+        """
+        own = {vehicle.system_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
+        outgoing: list[Outgoing] = []
+        for frame in self._received():
+            name = mavlink.message_name(frame.msg_id)
+            target = mavlink.target_system(frame)
+            addresses = [address for system_id, address in own.items() if target in (0, system_id) and address]
+            if not self._commands:
+                self.counters[f"refused {name}"] += 1
+            elif frame.system_id in own or not addresses:
+                self.counters[f"refused {name} of or for a system that is not flown"] += 1
+            else:
+                self.counters[f"passed on {name}"] += 1
+                outgoing += [Outgoing(frame.data, address) for address in addresses]
+        return outgoing
+
+    def _received(self) -> list[mavlink.Frame]:
+        frames: list[mavlink.Frame] = []
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(_DATAGRAMS_A_STEP):
+                with contextlib.suppress(ConnectionError):  # the answer to something that was forwarded
+                    data = self._socket.recv(_LARGEST_DATAGRAM)
+                    refused: Counter[str] = Counter()
+                    frames += mavlink.decode_either(data, refused)
+                    self.counters.update({f"refused: {reason}": count for reason, count in refused.items()})
+        return frames
