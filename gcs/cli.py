@@ -307,7 +307,7 @@ def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a
 @app.command()
 def key(file: Annotated[Path, typer.Argument(metavar="FILE", help="a new file")]) -> None:
     """Make a key for signing (--key) that only you can read."""
-    from signing.keys import make_key
+    from scenarios.signing.keys import make_key
 
     make_key(file)
 
@@ -321,7 +321,7 @@ def main() -> None:
     """Entry point: bad input is one line and exit code 2."""
     from gains.errors import GainsError
     from scenarios.files import ScenarioError
-    from signing.keys import KeyFileError
+    from scenarios.signing.keys import KeyFileError
 
     try:
         code = app(standalone_mode=False)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from gcs import mavlink
 from gcs.station import ANOTHER_ADDRESS, Datagram, Outgoing
-from signing.keys import Key, read_key
-from signing.link import SignedLink
-from signing.stamps import Stamps, open_stamps
+from scenarios.signing.keys import Key, read_key
+from scenarios.signing.link import SignedLink
+from scenarios.signing.stamps import Stamps, open_stamps
 
 LINK_ID = 0
 """Of the one socket over which a station speaks to its vehicles."""

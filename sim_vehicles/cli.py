@@ -47,7 +47,7 @@ def run(arguments: list[str]) -> int:
     with _signals() as signals, contextlib.ExitStack() as opened:
         # After parsing, so that --help and a mistyped option answer at once.
         from scenarios.files import ScenarioError, load
-        from signing.keys import KeyFileError
+        from scenarios.signing.keys import KeyFileError
         from sim_vehicles.truth import TruthLog
 
         try:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 
 from scenarios import schema
-from signing.link import SignedLink
+from scenarios.signing.link import SignedLink
 from sim_vehicles.copter import Copter
 from sim_vehicles.dynamics import State
 from sim_vehicles.links import NEVER_NS, Link, LinkSet

@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 from pathlib import Path
 
-from signing.keys import Key, read_key
-from signing.link import SignedLink
-from signing.stamps import Stamps, open_stamps
+from scenarios.signing.keys import Key, read_key
+from scenarios.signing.link import SignedLink
+from scenarios.signing.stamps import Stamps, open_stamps
 from sim_vehicles.mavlink import CRC_EXTRA
 
 LINK_ID = 0

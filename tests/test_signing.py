@@ -10,9 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from signed_peer import EPOCH_NS, KEY, NOW, NOW_NS, OTHER_KEY, a_sender, position, stamp
 
 from gcs import mavlink
-from signing.keys import Key
-from signing.link import LARGEST, MINUTE, REMEMBERED, SignedLink
-from signing.stamps import Stamps
+from scenarios.signing.keys import Key
+from scenarios.signing.link import LARGEST, MINUTE, REMEMBERED, SignedLink
+from scenarios.signing.stamps import Stamps
 from sim_vehicles.mavlink import CRC_EXTRA
 
 

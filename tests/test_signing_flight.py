@@ -18,8 +18,8 @@ from gcs.record import TickArray
 from gcs.station import Datagram, Station
 from scenarios.files import load
 from scenarios.schema import FixedGains
-from signing.keys import Key
-from signing.stamps import Stamps
+from scenarios.signing.keys import Key
+from scenarios.signing.stamps import Stamps
 from sim_vehicles.fleet import Fleet
 from sim_vehicles.guard import signed_links
 

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from signing.keys import Key, KeyFileError, make_key, read_key
-from signing.stamps import Stamps, open_stamps
+from scenarios.signing.keys import Key, KeyFileError, make_key, read_key
+from scenarios.signing.stamps import Stamps, open_stamps
 
 SECRET = bytes(range(200, 232))
 
@@ -106,7 +106,7 @@ def test_a_key_does_not_show_itself() -> None:
 def test_timestamps_in_a_file_are_there_again_and_belong_to_one_process(tmp_path: Path) -> None:
     file = tmp_path / "stamps"
     program = (
-        "import os, sys; from pathlib import Path; from signing.stamps import open_stamps\n"
+        "import os, sys; from pathlib import Path; from scenarios.signing.stamps import open_stamps\n"
         "open_stamps(Path(sys.argv[1])).keep(77, 12345); os.kill(os.getpid(), 9)"
     )
     killed = subprocess.run([sys.executable, "-c", program, str(file)], check=False, timeout=60)

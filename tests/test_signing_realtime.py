@@ -24,8 +24,8 @@ from gcs.station import Station
 from gcs.udp import StationSocket, clock_ns, realtime_offset_ns
 from scenarios.files import load
 from scenarios.schema import FixedGains
-from signing.keys import Key, make_key, read_key
-from signing.stamps import Stamps
+from scenarios.signing.keys import Key, make_key, read_key
+from scenarios.signing.stamps import Stamps
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 

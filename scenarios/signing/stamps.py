@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 from struct import Struct
 
-from signing.keys import KeyFileError
+from scenarios.signing.keys import KeyFileError
 
 _MAGIC = b"MAVLink stamps 1"
 _ENTRY = Struct("<QQ")

@@ -21,8 +21,8 @@ from hmac import compare_digest
 
 from fastcrc.crc16 import mcrf4xx
 
-from signing.keys import Key
-from signing.stamps import Stamps
+from scenarios.signing.keys import Key
+from scenarios.signing.stamps import Stamps
 
 MAGIC_1, MAGIC = 0xFE, 0xFD
 SIGNED = 0x01
