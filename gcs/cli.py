@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gcs.loop_option import LoopOption, load_with_loop
 from gcs.stress import stress
 from gcs.user_input import InputError, KeyFile, listening, mirroring, opened_guard, warn_if_open
 from gcs.watch_command import monitor, replay
@@ -47,6 +48,7 @@ def help_without_command(context: typer.Context) -> None:
 @app.command()
 def fly(
     scenario_file: ScenarioFile,
+    loop: LoopOption = None,
     link_delay: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="emulate this constant delay each way, on every link")
     ] = None,
@@ -71,7 +73,7 @@ def fly(
     from gcs.fly import fly as fly_now
     from gcs.plan import flight_plan
 
-    scenario = _scenario(scenario_file)
+    scenario = load_with_loop(scenario_file, loop)
     if link_delay is not None:
         if not 0 <= link_delay < 60:
             raise InputError(f"--link-delay: read {link_delay}, wanted seconds from 0 to 60")
@@ -104,12 +106,13 @@ def design(
     method: Annotated[
         Method | None, typer.Option(help="in place of the scenario's: inclusion principle, or a graph method")
     ] = None,
+    loop: LoopOption = None,
     as_json: AsJson = False,
 ) -> None:
     """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
     from gcs.plan import flight_plan
 
-    scenario = _scenario(scenario_file)
+    scenario = load_with_loop(scenario_file, loop)
     if method is not None:
         control = scenario.control.model_copy(update={"method": method.value, "gains": None, "blocks": ()})
         scenario = scenario.model_copy(update={"control": control})

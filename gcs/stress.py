@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gcs.loop_option import Loop, LoopOption, load_with_loop
+
 if TYPE_CHECKING:
     from gcs.campaign import Fly
     from gcs.study import Onset, Study
@@ -30,6 +32,7 @@ class StressOptions:
     """What the user asked for, as `stress` documents it."""
 
     scenario_file: Path
+    loop: Loop | None
     axes: tuple[tuple[str, str], ...]
     onset: bool
     tolerance: float
@@ -60,6 +63,7 @@ def stress(
     rate: Annotated[
         str, typer.Option(metavar="FROM:TO:N", help="control rate in Hz, with the gains designed for the scenario's")
     ] = "",
+    loop: LoopOption = None,
     onset: Annotated[bool, typer.Option("--onset", help="find the delay at which it breaks")] = False,
     tolerance: Annotated[
         float, typer.Option(metavar="PART", help="half width of the last round of flights around the onset")
@@ -84,6 +88,7 @@ def stress(
     named += [("jitter", jitter), ("loss", loss), ("rate", rate)]
     options = StressOptions(
         scenario_file=scenario_file,
+        loop=loop,
         axes=tuple((name, text) for name, text in named if text),
         onset=onset or assert_onset is not None,
         tolerance=tolerance,
@@ -147,7 +152,7 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
     study, design = _study(options)
     axes = _axes(options, study)
     onset: Onset | None = None
-    why_not = ""
+    no_onset: NoOnset | None = None
     with contextlib.ExitStack() as stack:
         fly = stack.enter_context(_workers(options))
         folder = out if out is not None else _new_folder(study.plan.scenario.name)
@@ -167,16 +172,14 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
                         study, lambda trials: run_campaign(trials, store, fly, ended=ended), tolerance=options.tolerance
                     )
                 except NoOnset as reason:
-                    why_not = str(reason)
+                    no_onset = reason
         except KeyboardInterrupt:
             typer.echo(f"{len(store.outcomes)} trials are stored; go on with --resume --out {folder}", err=True)
             raise
         outcomes = list(store.outcomes.values())
         write_parquet(outcomes, folder)
     allowed = options.assert_onset
-    result = result_of(
-        study, design, outcomes, axes=axes, sweep=sweep, onset=onset, why_no_onset=why_not, allowed=allowed
-    )
+    result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, no_onset=no_onset, allowed=allowed)
     (folder / RESULT_FILE).write_text(json.dumps(result, indent=2, allow_nan=False), encoding="utf-8")
     write_report(folder, result, study=study, axes=axes, sweep=sweep, onset=onset)
     return result, folder
@@ -185,9 +188,8 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
 def _study(options: StressOptions) -> "tuple[Study, dict[str, Any]]":
     from gcs.plan import flight_plan
     from gcs.study import Study
-    from scenarios.files import load
 
-    scenario = load(options.scenario_file)
+    scenario = load_with_loop(options.scenario_file, options.loop)
     if scenario.dynamics == "autopilot":
         wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
         raise typer.BadParameter(f"{options.scenario_file}: dynamics: read 'autopilot', wanted {wanted}")

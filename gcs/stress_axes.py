@@ -85,8 +85,8 @@ def parse_vehicle_axis(text: str, system_ids: tuple[int, ...]) -> Axis:
 def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenario:
     """The scenario at one point of a campaign.
 
-    A rate is set for control, and for telemetry if both were the same. Jitter keeps the distribution of a link that
-    has one, and is uniform (mean 0, from minus to plus the value) where there is none.
+    A rate is set for control, for telemetry if both were the same, and on board in proportion. Jitter keeps the
+    distribution of a link that has one, and is uniform (mean 0, from minus to plus the value) where there is none.
     """
     if "rate" in coordinates:
         rates, hz = scenario.rates, coordinates["rate"]
@@ -94,6 +94,10 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
         telemetry_hz = hz if together else rates.telemetry_hz
         update = {"rates": rates.model_copy(update={"control_hz": hz, "telemetry_hz": telemetry_hz})}
         scenario = scenario.model_copy(update=update)
+        if scenario.control.loop == "onboard":
+            own, factor = scenario.onboard, hz / rates.control_hz
+            on_board = {"rate_hz": own.rate_hz * factor, "sensor_hz": own.sensor_hz * factor}
+            scenario = scenario.model_copy(update={"onboard": own.model_copy(update=on_board)})
     if "delay" in coordinates:
         up_s, down_s = split_delay(coordinates["delay"], 1.0 / scenario.rates.control_hz)
         scenario = scenario.with_link_delay(up_s=up_s, down_s=down_s)

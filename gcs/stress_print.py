@@ -37,7 +37,8 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
             f"{_ms(onset['waiting_s'])} for the control tick; breaks at {onset['frequency_rad_s']:.2f} rad/s"
         )
     if result["onset_missing"]:
-        console.print(f"onset    not found: {result['onset_missing']}")
+        found = "none, as predicted" if result["onset_missing_as_predicted"] else "not found"
+        console.print(f"onset    {found}: {result['onset_missing']}")
     if result["curve_error"] is not None:
         console.print(
             f"curve    measured and predicted growth differ by at most {result['curve_error']:.3%} of the range"

@@ -11,7 +11,7 @@ import numpy as np
 
 from gcs.stress_axes import Axis, at_coordinates, has_constant_links
 from gcs.stress_figures import worst_of
-from gcs.study import Onset, Study, curve_error
+from gcs.study import NoOnset, Onset, Study, curve_error
 from gcs.trial import Outcome
 
 _PACKAGES = ("formation-gcs", "numpy", "scipy", "clarabel", "cvxpy", "pymavlink")
@@ -25,18 +25,20 @@ def result_of(
     axes: Sequence[Axis],
     sweep: Sequence[Outcome],
     onset: Onset | None,
-    why_no_onset: str,
+    no_onset: NoOnset | None,
     allowed: float | None,
 ) -> dict[str, Any]:
     """The result of a campaign: `outcomes` are all of its trials, `sweep` those of its points.
 
-    With `allowed` it has not passed if the onset is farther than this part from the margin, or was not found.
-    `failure` then says why in one line.
+    With `allowed` it has not passed if the onset is farther than this part from the margin, or was not found though
+    there should be one. `failure` then says why in one line.
     """
     failed = [outcome for outcome in outcomes if outcome.error is not None]
     failure = ""
-    if allowed is not None:
-        failure = why_no_onset if onset is None else _parted(onset, allowed)
+    if allowed is not None and onset is not None:
+        failure = _parted(onset, allowed)
+    elif allowed is not None and no_onset is not None and not no_onset.as_predicted:
+        failure = str(no_onset)
     worst = worst_of(outcomes)
     return {
         "scenario": study.plan.scenario.name,
@@ -47,7 +49,8 @@ def result_of(
         "real_time": study.real_time,
         "axes": {axis.name: list(axis.values) for axis in axes},
         "onset": None if onset is None else onset.to_dict(),
-        "onset_missing": why_no_onset,
+        "onset_missing": str(no_onset or ""),
+        "onset_missing_as_predicted": no_onset is not None and no_onset.as_predicted,
         "curve_error": curve_error([*(sweep if exact(study, axes) else ()), *(onset.flights if onset else ())]),
         "assert_onset": allowed,
         "failure": failure,

@@ -15,6 +15,8 @@ from gcs.trial import CRITICAL, Kind, Outcome, Trial, plan_loops, sparse_gain
 
 _ROUNDS = 8
 _FLIGHTS_A_ROUND = 5
+_LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
+"""Link delays flown where no delay is to break the formation."""
 _FIRST_WIDTH = 3.0
 """Half width of the first round of an onset search, in tolerances."""
 
@@ -89,7 +91,14 @@ class Onset:
 
 
 class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
-    """There is no delay at which the formation begins to break, or it was not found: one line that says why."""
+    """There is no delay at which the formation begins to break, or it was not found: one line that says why.
+
+    `as_predicted` says that the margin has no limit and that flights bear it out.
+    """
+
+    def __init__(self, line: str, *, as_predicted: bool = False) -> None:
+        super().__init__(line)
+        self.as_predicted = as_predicted
 
 
 def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
@@ -104,8 +113,10 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         With the reason.
     """
     predicted_s = study.plan.delay_margin_s
-    if not 0.0 < predicted_s < np.inf:
-        raise NoOnset(f"the predicted margin is {predicted_s:g} s: there is no delay at which stability is lost")
+    if predicted_s == np.inf:
+        raise _no_limit(study, run, tolerance=tolerance)
+    if predicted_s <= 0.0:
+        raise NoOnset(f"the predicted margin is {predicted_s:g} s: there is no delay at which it is stable")
     seed, period_s = study.plan.scenario.seed, 1.0 / study.plan.scenario.rates.control_hz
     centre_s, width_s = predicted_s - period_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
     flights: dict[str, Outcome] = {}
@@ -132,6 +143,24 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
     raise NoOnset(
         f"growth did not pass zero in {len(flights)} flights with {min(links_of(flights.values())):.3f} to "
         f"{max(links_of(flights.values())):.3f} s of link delay ({failed} without a growth rate)"
+    )
+
+
+def _no_limit(study: Study, run: Run, *, tolerance: float) -> NoOnset:
+    """What flights show of a loop that no delay is to break."""
+    flown = run([study.trial("probe", {"delay": d}, seed=study.plan.scenario.seed) for d in _LIMITLESS_LINKS_S])
+    pairs = [(o.growth_1_s, o.predicted_growth_1_s) for o in flown]
+    known = [(measured, predicted) for measured, predicted in pairs if measured is not None and predicted is not None]
+    off = max((abs(measured - predicted) / abs(predicted) for measured, predicted in known), default=np.inf)
+    steady = len(known) == len(flown) and off <= tolerance and all(measured < 0.0 for measured, _ in known)
+    first_s, *_, last_s = _LIMITLESS_LINKS_S
+    said = f"the margin has no limit; in {len(flown)} flights with {first_s:g} to {last_s:g} s of link delay"
+    if not known:
+        return NoOnset(f"{said} no growth rate could be measured")
+    slowest, expected = max(known)
+    return NoOnset(
+        f"{said} errors decay at {-slowest:.5f} 1/s or faster, predicted {-expected:.5f} 1/s, at most {off:.3%} apart",
+        as_predicted=steady,
     )
 
 

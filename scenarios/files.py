@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
@@ -60,6 +60,21 @@ def parse(text: str, file: Path) -> Scenario:
     for key, read, wanted in _contradictions(scenario):
         raise ScenarioError(file, key, read, wanted)
     return _with_traces(scenario, file)
+
+
+def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path) -> Scenario:
+    """The scenario with its loop closed elsewhere; `file` is named in errors.
+
+    Raises
+    ------
+    ScenarioError
+        If it cannot be flown so.
+    """
+    control = scenario.control.model_copy(update={"loop": loop})
+    changed = scenario.model_copy(update={"control": control})
+    for key, read, wanted in _contradictions(changed):
+        raise ScenarioError(file, key, read, wanted)
+    return changed
 
 
 def dump(scenario: Scenario) -> str:

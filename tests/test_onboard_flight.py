@@ -1,6 +1,7 @@
 """The onboard loop flown over MAVLink in virtual time: gains uploaded, own terms at once, the station's late."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,10 +18,12 @@ from gcs.onboard import own_parameters
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import TickArray
 from gcs.station import Station
+from gcs.stress_axes import at_coordinates
+from gcs.study import NoOnset, Study, find_onset
 from gcs.summary import summarise
-from gcs.trial import CRITICAL, Trial, sparse_gain
+from gcs.trial import CRITICAL, Outcome, Trial, sparse_gain
 from gcs.upload import float32
-from scenarios.files import ScenarioError, load, parse
+from scenarios.files import ScenarioError, dump, load, parse, with_loop
 from scenarios.schema import Link, Scenario
 from sim_vehicles.fleet import Fleet
 from sim_vehicles.mavlink import STATUS_CRITICAL
@@ -49,9 +52,7 @@ def flown(scenario: Scenario) -> FlightPlan:
 
 def onboard(name: str, **update: Any) -> Scenario:
     """A scenario of the ground loop, flown on board."""
-    scenario = load(SCENARIOS / f"{name}.toml")
-    control = scenario.control.model_copy(update={"loop": "onboard"})
-    return scenario.model_copy(update={"control": control} | update)
+    return with_loop(load(SCENARIOS / f"{name}.toml"), "onboard", THESIS).model_copy(update=update)
 
 
 def vehicle(fleet: Fleet, system_id: int) -> Vehicle:
@@ -181,14 +182,29 @@ def test_growth_in_flight_is_that_of_the_sampled_model_on_both_sides_of_the_marg
         assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=2e-4)
 
 
-@pytest.mark.parametrize("link_delay_s", [0.04, 1.5])
-def test_no_delay_breaks_a_leader_follower_formation(link_delay_s: float) -> None:
+def test_no_delay_breaks_a_leader_follower_formation_and_the_search_for_one_says_so() -> None:
     design, plan = flight_plan(onboard("chain3"))
     assert design["delay_margin_s"] is None
-    outcome = probed(plan, link_delay_s)
-    assert outcome.error is None
-    assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, rel=5e-3)
-    assert outcome.growth_1_s < -1.0
+    with pytest.raises(NoOnset, match="the margin has no limit; in 5 flights with 0 to 2 s of link delay") as caught:
+        find_onset(Study(plan), lambda trials: [fly_trial(trial) for trial in trials], tolerance=1e-4)
+    assert caught.value.as_predicted  # growth rates within a part in ten thousand of those predicted
+
+
+def test_flights_that_contradict_a_margin_without_limit_are_told() -> None:
+    _, plan = flight_plan(onboard("chain3"))
+
+    def half_as_fast(trials: Sequence[Trial]) -> list[Outcome]:
+        return [replace(fly_trial(trial), growth_1_s=-0.86) for trial in trials[:1]]
+
+    with pytest.raises(NoOnset, match=r"decay at 0\.86000 1/s or faster, predicted 1\.71943") as caught:
+        find_onset(Study(plan), half_as_fast, tolerance=0.02)
+    assert not caught.value.as_predicted
+
+
+def test_control_rates_are_varied_together_with_those_on_board() -> None:
+    scenario = at_coordinates(load(THESIS), {"rate": 25.0})
+    assert (scenario.onboard.rate_hz, scenario.onboard.sensor_hz) == (50.0, 25.0)
+    assert parse(dump(scenario), THESIS) == scenario
 
 
 def test_ticks_of_the_formation_opened_by_the_station_keep_the_wider_spacing() -> None:
@@ -221,6 +237,5 @@ def test_what_the_onboard_loop_cannot_be_flown_with_is_refused_in_one_line(good:
 
 
 def test_vehicles_with_an_autopilot_have_no_such_loop() -> None:
-    text = (SCENARIOS / "copters5.toml").read_text().replace('loop = "ground"', 'loop = "onboard"')
     with pytest.raises(ScenarioError, match=r"control\.loop: read 'onboard', wanted ground, with dynamics autopilot"):
-        parse(text, Path("x.toml"))
+        onboard("copters5")
