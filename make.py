@@ -19,10 +19,11 @@ LOCK = ROOT / "requirements.lock"
 # name: (what it is for, the commands; further arguments go to the last one)
 # The hot path of a flight in virtual time, and of the station: these modules can be compiled.
 COMPILED = (
-    "gcs/clocks.py gcs/control.py gcs/lockstep.py gcs/mavlink.py gcs/modes.py gcs/monitor.py gcs/rows.py "
+    "gcs/clocks.py gcs/control.py gcs/guard.py gcs/lockstep.py gcs/mavlink.py gcs/modes.py gcs/monitor.py gcs/rows.py "
     "gcs/sequence.py gcs/station.py gcs/telemetry.py gcs/vehicle.py sim_vehicles/autopilot.py sim_vehicles/clock.py "
     "sim_vehicles/dynamics.py sim_vehicles/fleet.py sim_vehicles/link_channel.py sim_vehicles/links.py "
-    "sim_vehicles/mavlink.py sim_vehicles/schedule.py sim_vehicles/setpoints.py sim_vehicles/vehicle.py"
+    "sim_vehicles/mavlink.py sim_vehicles/schedule.py sim_vehicles/setpoints.py sim_vehicles/vehicle.py "
+    "scenarios/signing/link.py scenarios/signing/stamps.py"
 )
 
 JOBS: dict[str, tuple[str, list[str]]] = {
@@ -71,7 +72,9 @@ def install() -> None:
 
 def drop_stale() -> None:
     """Remove what was compiled from sources that have changed since: Python would run it in their place."""
-    compiled = [file for folder in (".", "gcs", "sim_vehicles") for file in (ROOT / folder).glob("*.so")]
+    compiled = [
+        file for folder in (".", "gcs", "sim_vehicles", "scenarios/signing") for file in (ROOT / folder).glob("*.so")
+    ]
     newest = max((ROOT / source).stat().st_mtime for source in COMPILED.split())
     if any(file.stat().st_mtime < newest for file in compiled):
         print("sources have changed: compiled modules removed", flush=True)

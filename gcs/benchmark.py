@@ -9,9 +9,10 @@ from statistics import median
 from typing import Any
 
 from gcs import station
-from gcs.lockstep import Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.lockstep import Sent, Vehicles, fly_lockstep, signed_ends, vehicles_of
 from gcs.plan import FlightPlan, flight_plan
 from scenarios.schema import FixedGains, Scenario, Vehicle
+from scenarios.signing.keys import KEY_BYTES, Key
 
 _COLUMN = 10
 """Vehicles behind one another in a large formation; the columns follow one leader."""
@@ -51,10 +52,18 @@ def with_vehicles(scenario: Scenario, count: int) -> Scenario:
     return scenario.model_copy(update={"vehicles": tuple(vehicles)})
 
 
-def benchmark(scenario: Scenario, *, seconds: float, repeat: int) -> dict[str, Any]:
-    """Fly `seconds` of a scenario `repeat` times in virtual time; figures of the fastest and of the median flight."""
+def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool = False) -> dict[str, Any]:
+    """Fly `seconds` of a scenario `repeat` times in virtual time; figures of the fastest and of the median flight.
+
+    With `signed` as many signed flights are flown in turn with the others, and `signed` says what they cost.
+    """
     _, plan = flight_plan(_without_solver(scenario, seconds))
-    flights = [_flight(plan) for _ in range(repeat)]
+    flights: list[dict[str, float]] = []
+    signed_flights: list[dict[str, float]] = []
+    for _ in range(repeat):
+        flights.append(_flight(plan))
+        if signed:
+            signed_flights.append(_flight(plan, key=Key(os.urandom(KEY_BYTES))))
     fastest = min(flights, key=lambda flight: flight["s_per_tick"])
     period_s = 1.0 / scenario.rates.control_hz
     return {
@@ -67,6 +76,17 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int) -> dict[str, A
         "station_share_of_period": fastest["station_s_per_tick"] / period_s,
         "ticks": fastest["ticks"],
         "flights": repeat,
+        "signed": _cost(signed_flights, flights) if signed else None,
+    }
+
+
+def _cost(signed: list[dict[str, float]], plain: list[dict[str, float]]) -> dict[str, float]:
+    """How many times as long a signed flight takes as one that is not, and its station: best and median."""
+    names = {"time_ratio": "s_per_tick", "station_time_ratio": "station_s_per_tick"}
+    return {
+        f"{ratio}{suffix}": pick(flight[name] for flight in signed) / pick(flight[name] for flight in plain)
+        for ratio, name in names.items()
+        for suffix, pick in (("", min), ("_p50", median))
     }
 
 
@@ -98,10 +118,11 @@ def _without_solver(scenario: Scenario, seconds: float) -> Scenario:
     return scenario.model_copy(update={"duration_s": seconds, "control": control})
 
 
-def _flight(plan: FlightPlan) -> dict[str, float]:
-    vehicles = _Timed(vehicles_of(plan))
+def _flight(plan: FlightPlan, key: Key | None = None) -> dict[str, float]:
+    ends, guard = (vehicles_of(plan), None) if key is None else signed_ends(plan, key)
+    vehicles = _Timed(ends)
     begun_s = time.perf_counter()
-    ticks = sum(1 for _ in fly_lockstep(plan, vehicles=vehicles))
+    ticks = sum(1 for _ in fly_lockstep(plan, vehicles=vehicles, guard=guard))
     taken_s = time.perf_counter() - begun_s
     return {
         "ticks": ticks,
@@ -121,6 +142,11 @@ def print_benchmark(result: dict[str, Any]) -> None:
         f"station alone   {1e6 * result['station_s_per_tick']:.0f} µs a tick, "
         f"{100 * result['station_share_of_period']:.1f} % of its period"
     )
+    if (cost := result["signed"]) is not None:
+        print(
+            f"signed          takes {cost['time_ratio']:.2f} times as long (median {cost['time_ratio_p50']:.2f}), "
+            f"the station {cost['station_time_ratio']:.2f} times (median {cost['station_time_ratio_p50']:.2f})"
+        )
 
 
 def print_real_time(result: dict[str, Any]) -> None:

@@ -204,6 +204,7 @@ def bench(
     real_time: Annotated[
         bool, typer.Option("--real-time", help="one flight over UDP instead: is it punctual, are its latencies true?")
     ] = False,
+    signed: Annotated[bool, typer.Option("--signed", help="also measure what signing costs")] = False,
     as_json: AsJson = False,
 ) -> None:
     """How much faster than real time flights are computed, and what the station takes of its control period."""
@@ -215,7 +216,7 @@ def bench(
     if real_time:
         result = benchmark.benchmark_real_time(scenario, seconds=seconds)
     else:
-        result = benchmark.benchmark(scenario, seconds=seconds, repeat=repeat)
+        result = benchmark.benchmark(scenario, seconds=seconds, repeat=repeat, signed=signed)
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     elif real_time:

@@ -13,11 +13,16 @@ from gcs.modes import Phase
 from gcs.plan import FlightPlan
 from gcs.record import TickArray
 from gcs.station import Datagram, Station
+from scenarios.signing.keys import Key
+from scenarios.signing.stamps import Stamps
 from sim_vehicles.fleet import Fleet
+from sim_vehicles.guard import signed_links
 from sim_vehicles.truth import DROPPED, LINK_DOWN, LINK_UP, Record, Row
 
 START_NS = 1_000_000_000
 """Virtual time at which vehicles and station start; not zero, so that a forgotten time shows."""
+EPOCH_NS = 1_800_000_000 * 1_000_000_000
+"""What a signed flight takes virtual time 0 to be, in ns since 1970."""
 _HOST = "virtual"
 
 Sent = list[tuple[int, bytes, int]]
@@ -58,6 +63,13 @@ class LinkLosses:
 def vehicles_of(plan: FlightPlan, *, record: Record | None = None) -> Vehicles:
     """The simulated vehicles of a plan with their links, at the start; `record` takes the truth of what they do."""
     return Fleet(plan.scenario, START_NS, record=record)
+
+
+def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
+    """The same vehicles, and the guard of their station, both with a key and no memory of earlier flights."""
+    links = signed_links(key, plan.formation.system_ids, epoch_ns=EPOCH_NS, stamps=Stamps())
+    vehicles = Fleet(plan.scenario, START_NS, signed=links)
+    return vehicles, Guard(key, epoch_ns=EPOCH_NS, stamps=Stamps())
 
 
 def fly_lockstep(

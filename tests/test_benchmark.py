@@ -22,6 +22,14 @@ def test_a_large_formation_is_flown_by_its_station() -> None:
     assert result["real_time_factor"] >= result["real_time_factor_p50"] > 0.0
 
 
+def test_what_signing_costs_is_measured_in_the_same_run() -> None:
+    result = benchmark(load(TRIANGLE), seconds=0.2, repeat=2, signed=True)
+    assert set(result["signed"]) == {
+        "time_ratio", "time_ratio_p50", "station_time_ratio", "station_time_ratio_p50"
+    }  # fmt: skip
+    assert min(result["signed"].values()) > 0.5  # a figure, whatever else this machine does
+
+
 def test_columns_keep_their_places_behind_one_leader() -> None:
     scenario = with_vehicles(load(TRIANGLE), 250)
     place = {vehicle.system_id: vehicle.position_ne_m for vehicle in scenario.vehicles}

@@ -1,9 +1,11 @@
 """What a signed link refuses, with real bytes. The frames are pymavlink's, so that signing is done twice."""
 
+import hashlib
 from collections import Counter
 from typing import Any
 
 import pytest
+from fastcrc.crc16 import mcrf4xx
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -40,6 +42,19 @@ def test_a_frame_that_pymavlink_signed_is_passed_on_as_the_frame_that_pymavlink_
     good = a_link().verify(position(a_sender()), NOW_NS, refused)
     assert good == position(a_sender(key=None))
     assert not refused
+
+
+def test_a_checksum_that_is_wrong_although_the_frame_is_genuine_stays_wrong() -> None:
+    """As of a sender to which the message is another one: its definition is part of the checksum."""
+    sender = a_sender()
+    frame = position(sender)
+    extra = bytes([mavlink.CRC_EXTRA[32][0] ^ 1])
+    signed = frame[:34] + mcrf4xx(frame[1:34] + extra).to_bytes(2, "little") + frame[36:43]
+    signed += hashlib.sha256(KEY + signed).digest()[:6]
+    refused: Counter[str] = Counter()
+    good = a_link().verify(signed, NOW_NS, refused)
+    assert mavlink.decode(good, refused) == []
+    assert refused == {"bad checksum": 1}
 
 
 def test_a_frame_that_is_signed_here_is_good_for_pymavlink() -> None:

@@ -41,6 +41,9 @@ UNKNOWN, CHECKSUM_WRONG, UNSIGNED, WRONG = "unknown message", "bad checksum", "u
 REPLAYED, OVERTAKEN, TOO_OLD, SETUP = "replayed", "overtaken", "too old", "SETUP_SIGNING"
 TOO_MANY = "too many signing streams"
 
+_FLAG_IN_CHECKSUM = tuple(mcrf4xx(b"\0\1" + bytes(8 + n)) ^ mcrf4xx(bytes(10 + n)) for n in range(256))
+"""By what the flag SIGNED changes the checksum of a frame with a payload of n bytes: the checksum is linear."""
+
 
 class SignedLink:
     """One system's end of one link.
@@ -82,7 +85,7 @@ class SignedLink:
         timestamp = min(LARGEST, max(self._timestamp + 1, (now_ns + self._offset_ns) // TICK_NS))
         self._timestamp = timestamp
         self._stamps.keep(self._own, timestamp)
-        signed = self._with_flags(frame, SIGNED) + self._link_id + timestamp.to_bytes(6, "little")
+        signed = _toggled(frame) + self._link_id + timestamp.to_bytes(6, "little")
         return signed + self._signature(signed)
 
     def verify(
@@ -111,34 +114,30 @@ class SignedLink:
                 refused[TRUNCATED] += 1
                 break
             frame = datagram[at:stop]
-            reason = self._malformed(frame) or self._forged(frame)
+            reason = self._fault(frame)
             if not reason and unwanted is not None:
                 reason = unwanted(frame[5])
-            reason = reason or self._stale(frame, now_ns)
+            if not reason:
+                reason = self._staleness(frame, now_ns)
             if reason:
                 refused[reason] += 1
             else:
-                good.append(self._with_flags(frame[:-SIGNATURE], 0))
+                good.append(_toggled(frame[:-SIGNATURE]))
             at = stop
         return b"".join(good)
 
-    def _malformed(self, frame: bytes) -> str:
+    def _fault(self, frame: bytes) -> str:
+        """Why a frame is not from a sender with the key. What its checksum says serves only to name that."""
         number = frame[7] | frame[8] << 8 | frame[9] << 16
-        if frame[2] & ~SIGNED:
-            return FLAGS
-        if number == SETUP_SIGNING:
-            return SETUP
-        return "" if number in self._crc_extra else UNKNOWN
-
-    def _forged(self, frame: bytes) -> str:
-        """Why a frame may be anybody's. What the checksum says counts only if the frame is not good: it names why."""
-        if not frame[2]:
-            return UNSIGNED if self._checksum_right(frame) else CHECKSUM_WRONG
-        if compare_digest(self._signature(frame[:-6]), frame[-6:]):
+        if frame[2] & ~SIGNED or number == SETUP_SIGNING or number not in self._crc_extra:
+            return FLAGS if frame[2] & ~SIGNED else SETUP if number == SETUP_SIGNING else UNKNOWN
+        if frame[2] and compare_digest(self._signature(frame[:-6]), frame[-6:]):
             return ""
-        return WRONG if self._checksum_right(frame[:-SIGNATURE]) else CHECKSUM_WRONG
+        if not self._checksum_right(frame[:-SIGNATURE] if frame[2] else frame):
+            return CHECKSUM_WRONG
+        return WRONG if frame[2] else UNSIGNED
 
-    def _stale(self, frame: bytes, now_ns: int) -> str:
+    def _staleness(self, frame: bytes, now_ns: int) -> str:
         """Why a verified frame is too old. One that is not is the newest of its stream from now on."""
         stream = self._streams | frame[5] << 16 | frame[6] << 8 | frame[-13]
         timestamp = int.from_bytes(frame[-12:-6], "little")
@@ -160,13 +159,14 @@ class SignedLink:
         return hashlib.sha256(self._key.secret + data).digest()[:6]
 
     def _checksum_right(self, frame: bytes) -> bool:
-        return self._with_flags(frame, frame[2]) == frame
-
-    def _with_flags(self, frame: bytes, flags: int) -> bytes:
-        """A frame without signature, with other incompatibility flags and the checksum for them."""
-        body = frame[1:2] + bytes([flags]) + frame[3:-CHECKSUM]
         extra = self._crc_extra[frame[7] | frame[8] << 8 | frame[9] << 16]
-        return b"\xfd" + body + mcrf4xx(body + extra).to_bytes(2, "little")
+        return mcrf4xx(frame[1:-CHECKSUM] + extra) == int.from_bytes(frame[-CHECKSUM:], "little")
+
+
+def _toggled(frame: bytes) -> bytes:
+    """A frame without signature, said to be signed if it was not and the other way round; its checksum is as right."""
+    checksum = int.from_bytes(frame[-CHECKSUM:], "little") ^ _FLAG_IN_CHECKSUM[frame[1]]
+    return frame[:2] + bytes([frame[2] ^ SIGNED]) + frame[3:-CHECKSUM] + checksum.to_bytes(2, "little")
 
 
 class _Recent:
