@@ -25,7 +25,7 @@ from sim_vehicles.copter_rules import (
     TEMPORARILY_REJECTED,
     commanded_mode,
     parameters,
-    setpoint_meaning,
+    setpoint_target,
 )
 from sim_vehicles.dynamics import State, state_from
 from sim_vehicles.earth import ORIGIN_ALTITUDE_M
@@ -33,7 +33,7 @@ from sim_vehicles.links import NEVER_NS
 from sim_vehicles.schedule import Schedule
 from sim_vehicles.service_messages import PARAMETER_VALUE, ParameterSet, Request, SetMode
 from sim_vehicles.services import Services
-from sim_vehicles.setpoints import ABSURD, YAW_IGNORED, YAW_RATE_IGNORED, to_local
+from sim_vehicles.setpoints import ABSURD
 from sim_vehicles.truth import ACTED, SAMPLED, Record
 from sim_vehicles.vehicle import (
     HEARTBEAT_INTERVAL_US,
@@ -230,15 +230,8 @@ class Copter:
             self.counters["timesync_replies" if known else "ignored_timesync_reply"] += 1
 
     def _take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
-        vectors = (
-            *setpoint.velocity_ned_m_s,
-            *setpoint.acceleration_ned_m_s2,
-            setpoint.yaw_rad,
-            setpoint.yaw_rate_rad_s,
-        )
-        reason, velocity, acceleration = setpoint_meaning(setpoint, self.rules)
-        if not math.hypot(*vectors) <= ABSURD:
-            reason = "refused_absurd"
+        gain = self.settings.velocity_gain_1_s
+        reason, target = setpoint_target(setpoint, self.rules, yaw_rad=self.motion.yaw_rad, velocity_gain_1_s=gain)
         guided = self.mode == self.rules.guided_mode
         if reason:
             self.counters[reason] += 1
@@ -253,14 +246,7 @@ class Copter:
         if self.landed:
             return
         self._takeoff_m = None  # a set-point ends a guided take-off where it is
-        setpoint = to_local(setpoint, self.motion.yaw_rad)
-        wanted = setpoint.acceleration_ned_m_s2 if acceleration else (0.0, 0.0, 0.0)
-        north, east, down = setpoint.velocity_ned_m_s if velocity else (0.0, 0.0, 0.0)
-        gain = self.settings.velocity_gain_1_s if velocity else 0.0
-        growth = 1.0 if velocity and self.rules.velocity_grows else 0.0
-        yaw = None if setpoint.type_mask & YAW_IGNORED else setpoint.yaw_rad
-        rate = 0.0 if setpoint.type_mask & YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
-        self._target = Target(wanted[0], wanted[1], north, east, gain, growth, -down, None, yaw, rate)
+        self._target = target
         if self._record is not None:
             self._record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
 

@@ -8,15 +8,20 @@ import math
 from dataclasses import dataclass
 
 from sim_vehicles import mavlink, setup_parameters
+from sim_vehicles.copter_dynamics import Target
 from sim_vehicles.mavlink import Command, Setpoint
 from sim_vehicles.parameters import Parameter, Parameters, fixed, timeout
 from sim_vehicles.setpoints import (
+    ABSURD,
     ACCELERATION_AXES,
     BODY_FRAMES,
     FORCE_SET,
     LOCAL_FRAMES,
     POSITION_AXES,
     VELOCITY_AXES,
+    YAW_IGNORED,
+    YAW_RATE_IGNORED,
+    to_local,
 )
 
 TEMPORARILY_REJECTED, FAILED = 1, 4
@@ -141,6 +146,32 @@ def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]
     if not mask & POSITION_AXES or not (velocity or acceleration):
         return "refused_mask", False, False  # flying to positions is not simulated
     return "", velocity, acceleration
+
+
+def setpoint_target(
+    setpoint: Setpoint, rules: Rules, *, yaw_rad: float, velocity_gain_1_s: float
+) -> tuple[str, Target]:
+    """Why a set-point is not flown, or "", and what it makes a vehicle with that yaw try.
+
+    Fields that are ignored may hold anything, also NaN, as some clients send.
+    """
+    reason, velocity_counts, acceleration_counts = setpoint_meaning(setpoint, rules)
+    setpoint = to_local(setpoint, yaw_rad)
+    acceleration = setpoint.acceleration_ned_m_s2 if acceleration_counts else (0.0, 0.0, 0.0)
+    velocity = setpoint.velocity_ned_m_s if velocity_counts else (0.0, 0.0, 0.0)
+    yaw = None if setpoint.type_mask & YAW_IGNORED else setpoint.yaw_rad
+    rate = 0.0 if setpoint.type_mask & YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
+    if not math.hypot(*acceleration, *velocity, yaw or 0.0, rate) <= ABSURD:
+        return "refused_absurd", Target()
+    return reason, Target(
+        *acceleration[:2],
+        *velocity[:2],
+        velocity_gain_1_s=velocity_gain_1_s if velocity_counts else 0.0,
+        growth=1.0 if velocity_counts and rules.velocity_grows else 0.0,
+        climb_m_s=-velocity[2],
+        yaw_rad=yaw,
+        yaw_rate_rad_s=rate,
+    )
 
 
 def commanded_mode(command: Command, rules: Rules) -> int | None:

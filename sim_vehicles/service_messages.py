@@ -44,6 +44,7 @@ GEOFENCE = dialect.MAV_SYS_STATUS_GEOFENCE
 # The value as its four bytes: an integer sent bytewise may look like a NaN, which a float need not carry exactly.
 _PARAMETER_VALUE = struct.Struct("<4sHH16sB")
 Message = dialect.MAVLink_message
+LARGEST = 2**31 - 1
 _LAYOUTS = {
     PARAMETER_LIST: dialect.MAVLink_param_request_list_message.unpacker,
     PARAMETER_READ: dialect.MAVLink_param_request_read_message.unpacker,
@@ -206,16 +207,25 @@ def battery_status() -> Message:
 def gps_raw(
     time_us: int, place_deg: tuple[float, float], altitude_m: float, speed_m_s: float, course_deg: float, *, fix: bool
 ) -> Message:
-    """GPS_RAW_INT; without a fix it has no place."""
+    """GPS_RAW_INT; without a fix it has no place. What does not fit a field is cut to its largest value."""
     if not fix:
         return dialect.MAVLink_gps_raw_int_message(
             time_us, dialect.GPS_FIX_TYPE_NO_FIX, 0, 0, 0, *(0xFFFF,) * 4, satellites_visible=0
         )
-    latitude, longitude = (round(angle * 1e7) for angle in place_deg)
+    wanted = place_deg[0] * 1e7, place_deg[1] * 1e7, altitude_m * 1e3
+    latitude, longitude, altitude = (max(-LARGEST, min(LARGEST, round(value))) for value in wanted)
     speed = min(0xFFFE, round(speed_m_s * 100.0))
-    place = latitude, longitude, round(altitude_m * 1000.0)
     return dialect.MAVLink_gps_raw_int_message(
-        time_us, dialect.GPS_FIX_TYPE_3D_FIX, *place, 80, 120, speed, round(course_deg * 100.0) % 36_000, 12
+        time_us,
+        dialect.GPS_FIX_TYPE_3D_FIX,
+        latitude,
+        longitude,
+        altitude,
+        80,
+        120,
+        speed,
+        round(course_deg * 100.0) % 36_000,
+        12,
     )
 
 

@@ -1,7 +1,7 @@
 """What a vehicle answers when a ground station asks for more than its telemetry; the same for every kind of vehicle.
 
-Our own station asks for none of it. Others greet a vehicle with a request for AUTOPILOT_VERSION: from then on it also
-reports, slowly, what they take for granted.
+Most ground stations greet a vehicle with a request for AUTOPILOT_VERSION: from then on it also reports, slowly, what
+they take for granted. Our own does not, and is sent nothing that it did not ask for.
 """
 
 import math
@@ -124,9 +124,10 @@ class Services:
         if isinstance(request, FileTransfer):
             return [self._encoder.pack(_file_answer(request))]
         if isinstance(request, DataStream):
+            interval_us = max(SHORTEST_INTERVAL_US, round(1e6 / request.rate_hz)) if request.rate_hz else 0
             for message_id in STREAMS.get(request.stream, ()):
                 if message_id in self._defaults_us:
-                    self._set(message_id, round(1e6 / request.rate_hz) if request.rate_hz else 0, time_ns)
+                    self._set(message_id, interval_us, time_ns)
             return []
         assert not isinstance(request, service_messages.SetMode)
         frames = self.parameters.answer(request, self._encoder, counters)

@@ -14,7 +14,20 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.copter import Copter
 from sim_vehicles.vehicle import Vehicle
-from tests.sim_client import MS, SECOND, START, a_vehicle, arm, command, heartbeat, mode, pack, parse_all, take_off
+from tests.sim_client import (
+    MS,
+    SECOND,
+    START,
+    a_vehicle,
+    arm,
+    command,
+    heartbeat,
+    mode,
+    pack,
+    parse_all,
+    setpoint,
+    take_off,
+)
 from tests.vehicle_kinds import VEHICLES, copter
 
 ACCEPTED, DENIED, UNSUPPORTED = (
@@ -167,6 +180,23 @@ def test_data_streams_begin_change_and_stop(kind: str) -> None:
     assert not [m for m in sent_after(vehicle, stream(77, 50), 9.0, 9.1) if m.get_type() == "COMMAND_ACK"]
 
 
+def test_a_stream_of_sixty_thousand_a_second_is_one_of_a_thousand() -> None:
+    assert len(named(sent_after(VEHICLES["plain"](), stream(10, 65_535), 5.0, 5.1), "ATTITUDE")) == 100
+
+
+def test_a_vehicle_at_the_end_of_the_world_still_reports() -> None:
+    vehicle = a_vehicle()
+    take_off(vehicle)
+    vehicle.step([(command(512, 148), START)], START)
+    for k in range(800):  # at 1000 g
+        at = START + k * 100 * MS
+        vehicle.step([(heartbeat(), at), (setpoint(9_000.0), at)], at)
+    sent = [m for m, _ in parse_all(vehicle.step([], START + 82 * SECOND))]
+    assert named(sent, "GPS_RAW_INT")[-1].lat == 2**31 - 1
+    assert named(sent, "GPS_RAW_INT")[-1].vel == 0xFFFE
+    assert named(sent, "VFR_HUD")[-1].groundspeed > 7e5
+
+
 @pytest.mark.parametrize("kind", VEHICLES)
 def test_intervals_are_set_told_and_reset(kind: str) -> None:
     vehicle = VEHICLES[kind]()
@@ -242,9 +272,19 @@ def test_a_take_off_command_launches_a_plain_vehicle_which_then_waits_for_set_po
     assert [m.text for m in named(silent, "STATUSTEXT")] == ["failsafe: station heartbeat stopped"]
 
 
-def velocity_setpoint(frame: int, mask: int, velocity: tuple[float, float, float], yaw: float = 0.0) -> bytes:
+def velocity_setpoint(
+    frame: int,
+    mask: int,
+    velocity: tuple[float, float, float],
+    yaw: float = 0.0,
+    yaw_rate: float = 0.0,
+    *,
+    other: float = 0.0,
+) -> bytes:
+    """With `other` in all fields of position and acceleration."""
+    x = other
     message = dialect.MAVLink_set_position_target_local_ned_message
-    return pack(message(0, 1, 1, frame, mask, 0, 0, 0, *velocity, 0, 0, 0, yaw, 0))
+    return pack(message(0, 1, 1, frame, mask, x, x, x, *velocity, x, x, x, yaw, yaw_rate))
 
 
 @pytest.mark.parametrize(("frame", "mask"), [(1, 0x9C7), (8, 0x5C7), (8, 0xFC7)], ids=["MAVSDK", "body", "MAVProxy"])
@@ -274,6 +314,21 @@ def hovering(kind: str) -> tuple[Copter, int]:
         vehicle.step([(command(176, 1, 6), now)], now)
     assert (vehicle.mode, vehicle.motion.altitude_m) == (FLYING[kind], pytest.approx(10.0, abs=0.5))
     return vehicle, now
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+def test_what_is_ignored_may_be_nan_and_what_counts_may_not(kind: str) -> None:
+    vehicle, now = hovering(kind)
+    nan, at = math.nan, now
+    for k in range(60):
+        at = now + k * 50 * MS
+        vehicle.step([(velocity_setpoint(1, 0xDC7, (2.0, 0.0, 0.0), nan, nan, other=nan), at)], at)
+    assert vehicle.motion.velocity_north_m_s == pytest.approx(2.0, abs=0.01)
+    assert vehicle.counters["refused_absurd"] == 0
+    bad = [((nan, 0.0, 0.0), 0.0, 0.0), ((2.0, 0.0, 0.0), nan, 0.0), ((2.0, 0.0, 0.0), 0.0, nan)]
+    for velocity, yaw, rate in bad:
+        vehicle.step([(velocity_setpoint(1, 0x1C7, velocity, yaw, rate), at)], at)
+    assert vehicle.counters["refused_absurd"] == 3
 
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
