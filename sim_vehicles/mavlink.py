@@ -332,9 +332,9 @@ class Encoder:
         """HOME_POSITION, on the globe and in the local frame."""
         return self.pack(
             dialect.MAVLink_home_position_message(
-                round(latitude_deg * 1e7),
-                round(longitude_deg * 1e7),
-                round(altitude_m * 1e3),
+                _clipped(latitude_deg * 1e7, 2**31 - 1),
+                _clipped(longitude_deg * 1e7, 2**31 - 1),
+                _clipped(altitude_m * 1e3, 2**31 - 1),
                 *local_ned_m,
                 (1.0, 0.0, 0.0, 0.0),
                 *(0.0, 0.0, 0.0),
@@ -358,7 +358,7 @@ class Encoder:
 
     def global_origin(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> bytes:
         """GPS_GLOBAL_ORIGIN: where this vehicle's local frame begins."""
-        degrees = round(latitude_deg * 1e7), round(longitude_deg * 1e7)
+        degrees = _clipped(latitude_deg * 1e7, 2**31 - 1), _clipped(longitude_deg * 1e7, 2**31 - 1)
         return self.pack(dialect.MAVLink_gps_global_origin_message(*degrees, round(altitude_m * 1e3)))
 
     def pack(self, message: dialect.MAVLink_message) -> bytes:
