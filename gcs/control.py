@@ -18,8 +18,9 @@ import numpy as np
 from gains.formation import FormationModel
 from gcs.telemetry import FloatArray, IntArray, Report, State, StateHistory
 
-LARGEST_COMMAND_M_S2 = 1e4
-"""Limit on what is sent when the scenario sets none; beyond it a command is a fault, not a manoeuvre."""
+LARGEST_COMMAND_M_S2 = 9_999.0
+"""Limit on what is sent when the scenario sets none; beyond it a command is a fault, not a manoeuvre. Vehicles refuse
+more than 1e4, and rounding to float32 must not lead there."""
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,12 @@ def response_paired(
 def effective_delays_s(
     plan: FlightPlan, rows: TickArray, flight: Flight, system_ids: tuple[int, ...]
 ) -> dict[int, float]:
-    """The constant loop delay that each vehicle's commands in these rows stand for."""
+    """The constant loop delay that each vehicle's commands in these rows stand for.
+
+    With loops on board it is the measured median: what is late there is not of the vehicle's own state.
+    """
+    if plan.scenario.control.loop == "onboard":
+        return median_delays_s(rows, system_ids)
     assert flight.truth is not None
     period_s = 1.0 / plan.scenario.rates.control_hz
     return {

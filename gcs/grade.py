@@ -93,17 +93,35 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
 
 
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
-    """The true loop delay of each row of ticks, in s; NaN where its set-point never acted or no state is known."""
+    """The true loop delay of each row of ticks, in s; NaN where its set-point never acted or no state is known.
+
+    `ticks` are whole: a row for every vehicle.
+    """
     sampled, acted = (instants(truth, kind) for kind in (SAMPLED, ACTED))
     out = np.full(len(ticks), np.nan)
+    used = _rows_used(ticks)
     for k in np.flatnonzero(ticks["commanded"]):
-        row = ticks[k]
-        system_id = int(row["system_id"])
-        since_ns = sampled.get((system_id, int(row["sample_boot_ms"])))
-        until_ns = acted.get((system_id, int(row["key_ms"])))
+        row, source = ticks[k], ticks[used[k]]
+        since_ns = sampled.get((int(source["system_id"]), int(source["sample_boot_ms"])))
+        until_ns = acted.get((int(row["system_id"]), int(row["key_ms"])))
         if since_ns is not None and until_ns is not None:
             out[k] = (until_ns - since_ns) * 1e-9
     return out
+
+
+def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
+    """For each row that of the same tick whose state its loop delay counts from.
+
+    In the ground loop its own; in the onboard loop that of the oldest state that was needed, known by its age.
+    """
+    vehicles = len(np.unique(ticks["system_id"]))
+    age_s = ticks["telemetry_age_s"].reshape(-1, vehicles)
+    used_s = (ticks["loop_delay_s"] - ticks["down_delay_s"]).reshape(-1, vehicles)
+    apart_s = np.abs(age_s[:, np.newaxis, :] - used_s[:, :, np.newaxis])
+    own = np.arange(vehicles)
+    apart_s[:, own, own] -= 1e-9  # its own, where another one is as old
+    nearest = np.argmin(np.where(np.isnan(apart_s), np.inf, apart_s), axis=2)
+    return (np.arange(len(age_s))[:, np.newaxis] * vehicles + nearest).ravel()
 
 
 def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:

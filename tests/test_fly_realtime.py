@@ -194,6 +194,31 @@ def test_killed_station_leaves_readable_logs_and_a_new_one_takes_the_vehicles_ba
             os.kill(pid, signal.SIGTERM)
 
 
+def test_vehicles_with_loops_of_their_own_keep_their_places_without_a_station_and_are_taken_back(
+    tmp_path: Path,
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    scenario, listen = short(tmp_path, "thesis_delay", 8.0), f"127.0.0.1:{free_port()}"
+    process = fly(scenario, "--listen", listen, "--out", first)
+    until(lambda: flying(first, 4.0))
+    process.kill()
+    process.communicate(timeout=PATIENCE_S)
+    try:
+        until(lambda: vehicles_log(first).count("failsafe") >= 3)
+        again = fly(scenario, "--listen", listen, "--out", second, "--json")
+        out, err = again.communicate(timeout=PATIENCE_S)
+        assert (again.returncode, err) == (0, "")
+        summary = json.loads(out)
+        assert (summary["verdict"], summary["loop"]) == ("stable", "onboard")
+        assert summary["settling_time_s"] == 0.0  # they had kept their places
+        # the links' 160 ms, and up to two periods until states of all vehicles are there
+        assert 0.16 < summary["loop_delay_s"]["p50"] < 0.2
+        assert summary["delay_margin_s"] == pytest.approx(1.00216, abs=1e-5)
+    finally:
+        for pid in children_named(str(first)):
+            os.kill(pid, signal.SIGTERM)
+
+
 def test_killed_vehicles_end_the_flight_with_the_station_saying_which(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     process = fly(short(tmp_path, "chain3", 60.0), "--listen", "127.0.0.1:0", "--out", folder)

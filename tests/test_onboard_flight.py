@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gcs.flown import fly_virtual
-from gcs.grade import instants
+from gcs.grade import instants, true_loop_delays_s
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.measure import fly_trial
 from gcs.onboard import own_parameters
@@ -154,17 +154,19 @@ def test_loop_delays_measured_are_those_of_the_truth(name: str) -> None:
     ticks = np.concatenate(list(fly_lockstep(plan, vehicles=Fleet(plan.scenario, START_NS, record=records.append))))
     truth = np.array([(*row, *(0,) * (8 - len(row))) for row in records], DTYPE)
     sampled, acted = instants(truth, SAMPLED), instants(truth, ACTED)
+    true_s = true_loop_delays_s(ticks, truth)
     # whose states are needed; with none, when its own v_d comes is all that is late
     needed = {1: (1, 2), 2: (1, 2, 3), 3: (1, 2)} if name == "thesis_delay" else {1: (1,), 2: (1,), 3: (2,)}
     graded = Counter[int]()
-    for row in ticks[ticks["commanded"] & (ticks["time_s"] > 1.0)]:
-        system_id, same = int(row["system_id"]), ticks[ticks["tick"] == row["tick"]]
-        newest = {int(other["system_id"]): int(other["sample_boot_ms"]) for other in same}
+    for k in np.flatnonzero(ticks["commanded"] & (ticks["time_s"] > 1.0)):
+        row, same = ticks[k], ticks[ticks["tick"] == ticks["tick"][k]]
+        system_id, newest = int(row["system_id"]), {int(o["system_id"]): int(o["sample_boot_ms"]) for o in same}
         since_ns = min(sampled[other, newest[other]] for other in needed[system_id])
         until_ns = acted.get((system_id, int(row["key_ms"])))
         if until_ns is not None:
             graded[system_id] += 1
             assert row["loop_delay_s"] == pytest.approx((until_ns - since_ns) * 1e-9, abs=1e-6)
+            assert true_s[k] == (until_ns - since_ns) * 1e-9  # the same as gcs grade finds it
     assert set(graded) == {1, 2, 3}
 
 
