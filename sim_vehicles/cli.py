@@ -25,7 +25,7 @@ NS_PER_S = 1_000_000_000
 
 DESCRIPTION = """\
 Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
-They stay on the launcher, or on the ground, until a ground station arms them and commands them: any that speaks MAVLink.
+They stay on the launcher, or on the ground, until a ground station arms and commands them: any that speaks MAVLink.
 
 With --links-only no vehicle is flown: any MAVLink vehicles that send to a --vehicle-port get the scenario's links, each
 those of its system id, and the station hears each from a port of its own."""
