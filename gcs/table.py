@@ -173,7 +173,7 @@ def render(state: FlightState, *, width: int, height: int) -> RenderableType:
         order = sorted(figures.worst_first()[: room - 1])
     table = _vehicles(state, figures, order, width)
     hidden = len(state.system_ids) - len(order)
-    more = [Text(f"  … {hidden} vehicles not shown, none of them worse", style="dim")] if hidden else []
+    more = [Text(f"  … {hidden} vehicles not shown, none of them worse", style="dim", no_wrap=True)] if hidden else []
     return Group(*head, table, *more, Text(), *foot)
 
 
@@ -195,36 +195,52 @@ def _progress(state: FlightState, width: int) -> RenderableType:
     return line
 
 
+_COLUMNS = (
+    ("id", 3, 0),
+    ("follows", 7, 101),
+    ("spacing\nerror m", 7, 0),
+    ("error\n%", 5, 76),
+    ("RTT\nms", 6, 76),
+    ("delay p50\nms", 9, 76),
+    ("delay p99\nms", 9, 0),
+    ("margin\nms", 6, 101),
+    ("headroom\n%", 8, 0),
+    ("", 10, 113),
+    ("lost", 5, 76),
+    ("late", 5, 76),
+    ("mode", 8, 0),
+)
+"""Heading, least width (so that columns stand still while their numbers change), and the terminal it needs."""
+
+
 def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
     """One row for each vehicle in `order`; on a narrow terminal the columns that say least are left out."""
-    wide, widest = width >= 101, width >= 113
-    gap = 1 if wide else 0
+    gap = 1 if width >= 101 else 0
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, gap, 0, 0))
-    # With a least width, so that the columns stand still while their numbers change.
-    columns = [("id", 3), *[("follows", 7)] * wide, ("spacing\nerror m", 7), ("error\n%", 5), ("RTT\nms", 6)]
-    columns += [("delay p50\nms", 9), ("delay p99\nms", 9), *[("margin\nms", 6)] * wide, ("headroom\n%", 8)]
-    columns += [*[("", 10)] * widest, ("lost", 5), ("late", 5), ("mode", 8)]
-    for name, least in columns:
-        table.add_column(name, justify="left" if name in ("", "mode") else "right", no_wrap=True, min_width=least)
+    for name, least, from_width in _COLUMNS:
+        if width >= from_width:
+            justify = "left" if name in ("", "mode") else "right"
+            table.add_column(name, justify=justify, no_wrap=True, min_width=least)
     for k in order:
         vehicle, error_m, mode = state.scenario.vehicles[k], figures.spacing_error_m[k], figures.modes[k]
         headroom = float(figures.headroom[k])
         cells = [
             str(vehicle.system_id),
-            *[UNKNOWN if vehicle.follows is None else str(vehicle.follows)] * wide,
+            UNKNOWN if vehicle.follows is None else str(vehicle.follows),
             _number(error_m, ".2f"),
             _number(100 * error_m / figures.spacing_m[k], ".1f"),
             _number(1e3 * figures.rtt_s[k], ".1f"),
             _number(1e3 * figures.loop_delay_s_p50[k], ".1f"),
             _number(1e3 * figures.loop_delay_s_p99[k], ".1f"),
-            *[_number(1e3 * state.margins_s[state.newest["gain_set"][k]], ".0f")] * wide,
+            _number(1e3 * state.margins_s[state.newest["gain_set"][k]], ".0f"),
             Text(_number(100 * headroom, ".0f"), headroom_style(headroom)),
-            *[Text(_bar(headroom), headroom_style(headroom))] * widest,
+            Text(_bar(headroom), headroom_style(headroom)),
             str(figures.lost[k]),
             str(figures.late[k]),
             Text(mode.name, MODE_STYLES[mode]),
         ]
-        table.add_row(*cells)
+        columns = zip(cells, _COLUMNS, strict=True)
+        table.add_row(*(cell for cell, (_, _, from_width) in columns if width >= from_width))
     return table
 
 

@@ -12,7 +12,8 @@ from gcs.watch import Figures
 
 STATUS_STYLES = {"measured": "green", "past the margin": "bold red", "silent": "bold red", "not heard": "bold red"}
 _LOWER_BOUND = "lower bound"
-_WIDE = 115
+_USUAL, _WIDE = 73, 140
+"""Widths of terminals that more columns have room on."""
 
 
 def render(report: dict[str, Any], *, width: int, height: int | None = None) -> RenderableType:
@@ -24,7 +25,7 @@ def render(report: dict[str, Any], *, width: int, height: int | None = None) -> 
         worst = sorted(vehicles, key=_badness)[: max(1, room - 1)]
         shown = sorted(worst, key=lambda figures: figures["system_id"])
     hidden = len(vehicles) - len(shown)
-    more = [Text(f"  … {hidden} vehicles not shown, none of them worse", style="dim")] if hidden else []
+    more = [Text(f"  … {hidden} vehicles not shown, none of them worse", style="dim", no_wrap=True)] if hidden else []
     table = links_table(shown, width) if shown else Text("no vehicle heard", "bold red")
     return Group(_headline(report), table, *more, _footer(report))
 
@@ -64,34 +65,52 @@ def _headline(report: dict[str, Any]) -> Text:
     return line
 
 
+_COLUMNS = (
+    ("id", 3, 0),
+    ("Hz", 5, _WIDE),
+    ("RTT p50\nms", 8, 0),
+    ("p99\nms", 7, _USUAL),
+    ("age p50\nms", 8, _WIDE),
+    ("p99\nms", 7, _WIDE),
+    ("loop p50\nms", 9, _USUAL),
+    ("p99\nms", 9, 0),
+    ("headroom\n%", 8, 0),
+    ("lost\n%", 6, _USUAL),
+    ("late", 4, _WIDE),
+    ("clock offset\ns", 13, _WIDE),
+    ("±\nms", 7, _WIDE),
+    ("", 15, 0),
+)
+"""Heading, least width, and the width of the terminal it needs."""
+
+
 def links_table(vehicles: list[Figures], width: int) -> Table:
     """One row for each vehicle; on a narrow terminal the columns that say least are left out."""
-    wide = width >= _WIDE
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1 if wide else 0, 0, 0))
-    columns = [("id", 3), *[("Hz", 5)] * wide, ("RTT p50\nms", 8), ("p99\nms", 7)]
-    columns += [("age p50\nms", 8), ("p99\nms", 7)] * wide + [("loop p50\nms", 9), ("p99\nms", 9), ("headroom\n%", 8)]
-    columns += [("lost\n%", 6), *[("late", 4), ("clock offset\ns", 13), ("±\nms", 7)] * wide, ("", 15)]
-    for name, least in columns:
-        table.add_column(name, justify="left" if name == "" else "right", no_wrap=True, min_width=least)
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1 if width >= _WIDE else 0, 0, 0))
+    for name, least, from_width in _COLUMNS:
+        if width >= from_width:
+            heading = f"loop {name}" if width < _USUAL and name == "p99\nms" else name
+            table.add_column(heading, justify="left" if name == "" else "right", no_wrap=True, min_width=least)
     for v in vehicles:
         bound = "≥ " if v["loop_delay_s"]["status"] == _LOWER_BOUND else ""
         at_most = "≤ " if bound and v["headroom"] is not None else ""
         expected = v["received"] + v["lost"]
-        clock, status = v["clock"], v["status"]
-        age = [_ms(v["telemetry_age_s"][p], bound) for p in ("p50", "p99")]
-        offset = _number(clock["offset_s"], ".6f"), _ms(clock["bound_s"])
-        left = v["headroom"]
-        table.add_row(
+        clock, status, left = v["clock"], v["status"], v["headroom"]
+        cells = [
             str(v["system_id"]),
-            *[_number(v["telemetry_hz"], ".1f")] * wide,
+            _number(v["telemetry_hz"], ".1f"),
             *(_ms(v["rtt_s"][p]) for p in ("p50", "p99")),
-            *age * wide,
+            *(_ms(v["telemetry_age_s"][p], bound) for p in ("p50", "p99")),
             *(_ms(v["loop_delay_s"][p], bound) for p in ("p50", "p99")),
             Text(at_most + _percent(left), "dim" if left is None else headroom_style(left)),
             _number(100 * v["lost"] / expected if expected else None, ".1f"),
-            *([str(v["late"]), *offset] if wide else []),
+            str(v["late"]),
+            _number(clock["offset_s"], ".6f"),
+            _ms(clock["bound_s"]),
             Text(f" {status}", STATUS_STYLES.get(status, "yellow")),
-        )
+        ]
+        columns = zip(cells, _COLUMNS, strict=True)
+        table.add_row(*(cell for cell, (_, _, from_width) in columns if width >= from_width))
     return table
 
 

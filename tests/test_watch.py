@@ -1,5 +1,6 @@
 """Links watched from aside: what is said of their delays against the truth, in virtual time, and what is not done."""
 
+import io
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 from sim_client import arm, guided, heartbeat, setpoint
 
 from gcs import mavlink
 from gcs.watch import SYSTEM_ID, Requests, Watch
+from gcs.watch_table import links_table
 from scenarios.files import load
 from scenarios.schema import Jitter, Link, Links, Scenario
 from sim_vehicles.fleet import Fleet
@@ -197,3 +200,18 @@ def test_whatever_a_stream_says_is_taken_and_figures_are_plain_numbers(
     assert figures["system_id"] == 1
     assert all(value is None or np.isfinite(value) for value in figures["rtt_s"].values() if not isinstance(value, str))
     assert figures["headroom"] is None or np.isfinite(figures["headroom"])
+
+
+@pytest.mark.parametrize("width", [50, 73, 80, 139, 140, 200])
+def test_the_table_of_links_fits_the_terminal_and_keeps_headroom_and_status(width: int) -> None:
+    watched = Watched(CHAIN, timesync_hz=10.0)
+    watched.run(1.5)
+    figures = watched.watch.figures(watched.now_ns, 0.3)
+    console = Console(file=io.StringIO(), width=width, color_system=None)
+    with console.capture() as capture:
+        console.print(links_table(figures, width))
+    lines = [line.rstrip() for line in capture.get().splitlines()]
+    assert max(map(len, lines)) <= width
+    assert sum(line.endswith(" measured") for line in lines) == 3
+    for line, vehicle in zip(lines[-3:], figures, strict=True):
+        assert f"{100 * vehicle['headroom']:.0f}" in line.split()
