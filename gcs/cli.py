@@ -84,7 +84,7 @@ def fly(
     with contextlib.ExitStack() as opened:
         link = opened.enter_context(listening("--connect", connect) if connect else listening("--listen", listen))
         warn_if_open(link, signed=key is not None)
-        to = opened.enter_context(mirroring(mirror, commands=mirror_commands)) if mirror else None
+        to = opened.enter_context(mirroring(mirror, commands=mirror_commands, guard=guard)) if mirror else None
         design, plan = flight_plan(scenario)
         if not as_json:
             _print_design(design)

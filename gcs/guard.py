@@ -10,15 +10,18 @@ from scenarios.signing.keys import Key, read_key
 from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps, open_stamps
 
-LINK_ID = 0
-"""Of the one socket over which a station speaks to its vehicles."""
+LINK_ID, MIRROR_LINK_ID = 0, 1
+"""Of the socket over which a station speaks to its vehicles, and of the one to another station."""
 
 
 class Guard:
     """What the station sends is signed; what it receives is verified, and unsigned when it is passed on."""
 
     def __init__(self, key: Key, *, epoch_ns: int, stamps: Stamps) -> None:
-        self._link = SignedLink(key, link_id=LINK_ID, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
+        self._link, self.mirror_link = (
+            SignedLink(key, link_id=link_id, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
+            for link_id in (LINK_ID, MIRROR_LINK_ID)
+        )
 
     def received(
         self,

@@ -14,6 +14,7 @@ from typing import Self
 from gcs import mavlink
 from gcs.station import Outgoing
 from gcs.vehicle import RemoteVehicle
+from scenarios.signing.link import SignedLink
 
 MIRROR = "mirror"
 """Kind of the event that holds what a mirror counted."""
@@ -25,12 +26,15 @@ _DATAGRAMS_A_STEP = 64
 class Mirror:
     """A socket connected to another ground station; with `commands`, what that sends goes on to the vehicles.
 
+    On a signed link what goes there is signed, and what comes from there is heard only if it is.
+
     Raises OSError if the address cannot be used.
     """
 
-    def __init__(self, host: str, port: int, *, commands: bool) -> None:
+    def __init__(self, host: str, port: int, *, commands: bool, signed: SignedLink | None = None) -> None:
         self.counters: Counter[str] = Counter()
         self._commands = commands
+        self._signed = signed
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.connect((host, port))
@@ -45,16 +49,17 @@ class Mirror:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._socket.close()
 
-    def forward(self, frames: Iterable[bytes]) -> None:
-        """Send frames on, each as it is."""
+    def forward(self, frames: Iterable[bytes], now_ns: int) -> None:
+        """Send frames on, each as it is, or signed again for this link."""
         for frame in frames:
             try:
-                self._socket.send(frame)
+                # What is signed is MAVLink 2.
+                self._socket.send(frame if self._signed is None else self._signed.sign(frame, now_ns))
                 self.counters["forwarded"] += 1
             except OSError:  # nobody listens there, which an earlier datagram told, or the buffer is full
                 self.counters["not forwarded"] += 1
 
-    def passed_on(self, vehicles: list[RemoteVehicle]) -> list[Outgoing]:
+    def passed_on(self, vehicles: list[RemoteVehicle], now_ns: int) -> list[Outgoing]:
         """What the other station has sent since and may go on: to the vehicle it is for, or to all.
 
         Only to vehicles that are flown already: one that had not been commanded before would take the other station
@@ -62,7 +67,7 @@ class Mirror:
         """
         own = {vehicle.system_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
         outgoing: list[Outgoing] = []
-        for frame in self._received():
+        for frame in self._received(now_ns):
             name = mavlink.message_name(frame.msg_id)
             target = mavlink.target_system(frame)
             addresses = [address for system_id, address in own.items() if target in (0, system_id) and address]
@@ -75,13 +80,15 @@ class Mirror:
                 outgoing += [Outgoing(frame.data, address) for address in addresses]
         return outgoing
 
-    def _received(self) -> list[mavlink.Frame]:
+    def _received(self, now_ns: int) -> list[mavlink.Frame]:
         frames: list[mavlink.Frame] = []
         with contextlib.suppress(BlockingIOError):
             for _ in range(_DATAGRAMS_A_STEP):
                 with contextlib.suppress(ConnectionError):  # the answer to something that was forwarded
                     data = self._socket.recv(_LARGEST_DATAGRAM)
                     refused: Counter[str] = Counter()
+                    if self._signed is not None:
+                        data = self._signed.verify(data, now_ns, refused)
                     frames += mavlink.decode_either(data, refused)
                     self.counters.update({f"refused: {reason}": count for reason, count in refused.items()})
         return frames

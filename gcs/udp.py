@@ -144,8 +144,8 @@ def drive(
         link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
         sent_ns = clock_ns()
         if mirror is not None:
-            mirror.forward([frame for frame, _ in station.frames] + [data for data, _ in outgoing])
-            passed_on = mirror.passed_on(station.vehicles)
+            mirror.forward([frame for frame, _ in station.frames] + [data for data, _ in outgoing], now_ns)
+            passed_on = mirror.passed_on(station.vehicles, now_ns)
             link.send(passed_on if guard is None else guard.sent(passed_on, now_ns))
         log += station.frames
         # A round trip counts from the step that asked, a set-point's age from when it was handed over.

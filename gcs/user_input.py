@@ -57,12 +57,12 @@ def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
     return open_guard(key, epoch_ns=realtime_offset_ns(), role=role)
 
 
-def mirroring(text: str, *, commands: bool) -> "Mirror":
+def mirroring(text: str, *, commands: bool, guard: "Guard | None") -> "Mirror":
     """The mirror that --mirror HOST:PORT asks for."""
     from gcs.mirror import Mirror
 
     host, port = address("--mirror", text)
     try:
-        return Mirror(host, port, commands=commands)
+        return Mirror(host, port, commands=commands, signed=guard and guard.mirror_link)
     except OSError as error:
         raise InputError(f"--mirror: {text}: {error.strerror}; wanted the address of a ground station") from None

@@ -15,10 +15,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs import mavlink
+from gcs.guard import Guard
 from gcs.mirror import Mirror
 from gcs.tlog import read_tlog
 from gcs.vehicle import RemoteVehicle
 from scenarios.files import dump, load
+from scenarios.signing.keys import Key
+from scenarios.signing.stamps import Stamps
+from tests.signed_peer import EPOCH_NS, KEY, NOW_NS, a_sender
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
@@ -141,7 +145,7 @@ def test_what_is_garbled_or_in_a_vehicles_name_is_not_passed_on() -> None:
     ):
         other.bind(("127.0.0.1", 0))
         with Mirror(*other.getsockname(), commands=True) as mirror:
-            mirror.forward([b"hello"])
+            mirror.forward([b"hello"], 0)
             _, address = other.recvfrom(2048)
             good = mavlink.encode(mavlink.COMMAND_LONG, mavlink.command_long(1, target_system=1), sequence=0)
             as_vehicle = mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=0, system_id=1)
@@ -149,12 +153,39 @@ def test_what_is_garbled_or_in_a_vehicles_name_is_not_passed_on() -> None:
             for data in (b"\xfdgarbage", as_vehicle, for_nobody, good):
                 other.sendto(data, address)
             stranger.sendto(good, address)  # the socket is connected: this never gets in
-            passed = mirror.passed_on([vehicle])
+            passed = mirror.passed_on([vehicle], 0)
     assert passed == [(good, ("127.0.0.1", 9))]
     assert mirror.counters["passed on COMMAND_LONG"] == 1
     assert mirror.counters["refused COMMAND_LONG of or for a system that is not flown"] == 1
     assert mirror.counters["refused HEARTBEAT of or for a system that is not flown"] == 1
     assert sum(count for name, count in mirror.counters.items() if name.startswith("refused: ")) == 1
+
+
+def test_on_a_signed_link_the_other_station_gets_signed_frames_and_is_heard_only_if_it_signs() -> None:
+    vehicle = RemoteVehicle(1, telemetry_hz=1.0, report=lambda _kind, _text: None)
+    vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
+    ours, theirs = Guard(Key(KEY), epoch_ns=EPOCH_NS, stamps=Stamps()), a_sender(system=255)
+    good = mavlink.encode(mavlink.COMMAND_LONG, mavlink.command_long(1, target_system=1), sequence=0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        with Mirror(*other.getsockname(), commands=True, signed=ours.mirror_link) as mirror:
+            mirror.forward([good], NOW_NS)
+            data, address = other.recvfrom(2048)
+            (heard,) = theirs.parse_buffer(data)
+            assert (heard.get_type(), heard.get_signed(), data[-13]) == ("COMMAND_LONG", True, 1)
+            theirs.srcComponent = 190
+            message = dialect.MAVLink_command_long_message(1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0)
+            signed = message.pack(theirs)
+            for sent in (good, signed, signed):
+                other.sendto(sent, address)
+            passed = mirror.passed_on([vehicle], NOW_NS)
+    assert passed == [(good, ("127.0.0.1", 9))]  # as a frame that the link to the vehicle signs
+    assert mirror.counters == {
+        "forwarded": 1,
+        "refused: unsigned": 1,
+        "refused: replayed": 1,
+        "passed on COMMAND_LONG": 1,
+    }
 
 
 @pytest.mark.parametrize(

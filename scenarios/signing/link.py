@@ -75,7 +75,7 @@ class SignedLink:
         self._stamps = stamps
         self._streams = 1 << 32 | owner << 24
         """With system, component and link id below: a stream that is heard."""
-        self._own = 1 << 33 | owner << 24
+        self._own = 1 << 33 | owner << 24 | link_id
         self._timestamp = stamps.known.get(self._own, 0)
         stamps.keep(self._own, self._timestamp)
         self._recent: dict[int, _Recent] = {}
