@@ -127,10 +127,11 @@ def print_flight(summary: dict[str, Any], console: Console) -> None:
 
 def delay_text(summary: dict[str, Any]) -> str:
     """Loop delay against the margin."""
-    delay = summary["loop_delay_s"]
+    delay, margin_s = summary["loop_delay_s"], summary["delay_margin_s"]
+    margin = "no limit" if summary["loop"] == "onboard" and margin_s is None else f"margin {_ms(margin_s)}"
     return (
         f"loop {_ms(delay['p50'])} p50, {_ms(delay['p99'])} p99, {_ms(delay['max'])} max; "
-        f"margin {_ms(summary['delay_margin_s'])}; least headroom {_percent(summary['headroom_min'])}"
+        f"{margin}; least headroom {_percent(summary['headroom_min'])}"
     )
 
 

@@ -16,7 +16,7 @@ from gcs.lockstep import START_NS, fly_lockstep
 from gcs.measure import fly_trial
 from gcs.onboard import own_parameters
 from gcs.plan import FlightPlan, flight_plan
-from gcs.record import TickArray
+from gcs.record import Mode, TickArray
 from gcs.station import Station
 from gcs.stress_axes import at_coordinates
 from gcs.study import NoOnset, Study, find_onset
@@ -24,7 +24,7 @@ from gcs.summary import summarise
 from gcs.trial import CRITICAL, Outcome, Trial, sparse_gain
 from gcs.upload import float32
 from scenarios.files import ScenarioError, dump, load, parse, with_loop
-from scenarios.schema import Link, Scenario
+from scenarios.schema import Link, Outage, Scenario, VehicleLinks
 from sim_vehicles.fleet import Fleet
 from sim_vehicles.mavlink import STATUS_CRITICAL
 from sim_vehicles.truth import ACTED, DTYPE, SAMPLED
@@ -142,6 +142,22 @@ def test_without_set_points_vehicles_keep_their_places_by_their_own_sensors_and_
         error = (own.north_m - ahead.north_m - offsets[k, 0], own.east_m - ahead.east_m - offsets[k, 1])
         assert np.hypot(*error) < 0.1  # noise of the sensor: 0.05 m, filtered
         assert vehicle(fleet, k + 1).autopilot.system_status == STATUS_CRITICAL
+
+
+@pytest.mark.parametrize("act", [False, True])
+def test_while_a_vehicle_is_lost_all_keep_their_places_by_their_own_loops(act: bool) -> None:
+    """Vehicle 2, which the others act on and which acts on them, is not heard and hears nothing for six seconds."""
+    gone = Link(delay_s=0.085, outages=(Outage(from_s=8.0, until_s=14.0),))
+    scenario = delayed(0.17, duration_s=25.0)
+    links = scenario.links.model_copy(update={"vehicles": (VehicleLinks(system_id=2, up=gone, down=gone),)})
+    monitor = scenario.monitor.model_copy(update={"act": act})
+    flight = fly_virtual(flown(scenario.model_copy(update={"links": links, "monitor": monitor})))
+    told = [event["text"] for event in flight.events if event["kind"] == "vehicle"]
+    assert told[3:] == ["is lost", "is heard again", "is in failsafe"]
+    later = flight.ticks[(flight.ticks["time_s"] > 7.0) & (flight.ticks["time_s"] < 25.0)]
+    # noise of the sensor: 0.05 m, filtered
+    assert np.nanmax(np.hypot(later["spacing_error_north_m"], later["spacing_error_east_m"])) < 0.1
+    assert set(later["mode"][later["time_s"] > 24.0]) == {Mode.NOMINAL}
 
 
 @pytest.mark.parametrize("name", ["thesis_delay", "chain3"])
