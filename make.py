@@ -43,6 +43,7 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         [f"mypyc {COMPILED}"],
     ),
     "format": ("format the code", ["ruff check --fix-only .", "ruff format ."]),
+    "pictures": ("make the pictures in README and docs anew, from flights and designs", ["python docs/pictures.py"]),
     "lock": (
         "write requirements.lock anew from pyproject.toml",
         [

@@ -1,0 +1,39 @@
+"""Make the pictures in README and docs anew, by the commands that a user has; some minutes, on an idle machine.
+
+    python3 make.py pictures
+
+The recording is drawn without a screen, by a software Vulkan driver (Debian and Ubuntu: apt install
+mesa-vulkan-drivers).
+"""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+SCENARIOS = DOCS.parent / "scenarios"
+
+
+def gcs(*arguments: str | Path) -> None:
+    """Run a command of the ground station; it has to succeed."""
+    print("gcs", *arguments, flush=True)
+    program = Path(sys.executable).with_name("gcs")
+    subprocess.run([program, *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+
+
+def main() -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        gcs("fly", SCENARIOS / "triangle5.toml", "--listen", "127.0.0.1:0", "--out", folder / "flight")
+        gcs("view", folder / "flight", "--picture", folder / "flight.png", "--at", "1.2")
+        gcs("stress", SCENARIOS / "chain3.toml", "--onset", "--out", folder / "onset")
+        gcs("thesis", "--out", folder / "thesis")
+        shutil.copy(folder / "flight.png", DOCS / "flight.png")
+        shutil.copy(folder / "onset" / "growth.png", DOCS / "onset.png")
+        shutil.copytree(folder / "thesis", DOCS / "thesis", dirs_exist_ok=True)
+
+
+if __name__ == "__main__":
+    main()

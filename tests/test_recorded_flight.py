@@ -1,0 +1,85 @@
+"""The recording of a flight as another program reads it: whole, with what was flown, and drawn without a complaint."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from test_recording import read_back
+
+from gcs.lockstep import START_NS, fly_lockstep
+from gcs.observer import record_run
+from gcs.plan import flight_plan
+from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.station import Station
+from gcs.summary import read_ticks
+from gcs.viewer import screenshot, vulkan_missing
+from scenarios.files import dump, load
+
+pytestmark = pytest.mark.xdist_group("recorded flight")
+
+SCENARIO = load(Path(__file__).parent.parent / "scenarios" / "triangle5.toml").model_copy(update={"duration_s": 4.0})
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a flight of four seconds, with its recording."""
+    folder = tmp_path_factory.mktemp("run")
+    design, plan = flight_plan(SCENARIO)
+    (folder / SCENARIO_FILE).write_text(dump(SCENARIO), encoding="utf-8")
+    (folder / DESIGN_FILE).write_text(json.dumps(design), encoding="utf-8")
+    writer, station = RunWriter(folder), Station(plan, start_ns=START_NS)
+    for rows in fly_lockstep(plan, station=station):
+        writer.tick(rows)
+    for event in station.events:
+        writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
+    writer.close()
+    record_run(folder)
+    return folder
+
+
+def rerun(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
+    program = Path(sys.executable).with_name("rerun")
+    return subprocess.run([program, *arguments], capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_reruns_own_check_finds_the_recording_whole(run: Path) -> None:
+    assert rerun("rrd", "verify", run / "flight.rrd").returncode == 0
+    cut = run / "cut.rrd"
+    cut.write_bytes(b"RRF2" + bytes(200))
+    assert rerun("rrd", "verify", cut).returncode != 0  # the check can fail
+
+
+def test_delays_headroom_and_errors_in_the_recording_are_those_of_the_ticks(run: Path) -> None:
+    ticks = read_ticks(run).reshape(-1, len(SCENARIO.vehicles))
+    column = {system_id: k for k, system_id in enumerate(ticks[0]["system_id"].tolist())}
+    flown = ticks[ticks["time_s"][:, 0] >= 0][:, [column[vehicle.system_id] for vehicle in SCENARIO.vehicles]]
+    errors_m = np.hypot(flown["spacing_error_north_m"], flown["spacing_error_east_m"])[:, 1:]
+    wanted: dict[str, Any] = {
+        "/delay/loop_ms": 1e3 * flown["loop_delay_s"],
+        "/headroom/percent": 100 * flown["headroom"],
+        "/spacing/error_m": errors_m,
+    }
+    for entity, values in wanted.items():
+        times_s, found = read_back(run / "flight.rrd", entity, "Scalars:scalars")
+        np.testing.assert_allclose(times_s, flown["time_s"][:, 0], atol=1e-9)
+        np.testing.assert_allclose(found, values, rtol=1e-12, atol=1e-9)
+    assert len(flown) > 200
+    assert np.nanmax(errors_m[0]) > 10 > np.nanmax(errors_m[-1])
+
+
+@pytest.mark.skipif(vulkan_missing(), reason="no Vulkan driver installed (Debian: mesa-vulkan-drivers)")
+def test_the_headless_viewer_opens_a_flight_and_no_view_reports_an_error(run: Path) -> None:
+    pictures: list[Any] = []
+    for time_s in (0.2, 3.5):
+        png = run / f"{time_s}.png"
+        assert screenshot(run, png, time_s=time_s, width=800, height=500) == []
+        pictures.append(imread(png))
+    assert [picture.shape[:2] for picture in pictures] == [(500, 800)] * 2
+    assert len(np.unique(pictures[0].reshape(-1, pictures[0].shape[2]), axis=0)) > 100  # lines, labels, vehicles
+    moved = np.abs(pictures[0] - pictures[1]).max(axis=2) > 0.1
+    assert 0.001 < moved.mean() < 0.9  # vehicles and the time cursor have moved on, the screen is the same
