@@ -99,7 +99,7 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]
     designed, plan = flight_plan(_without_solver(scenario, seconds))
     with tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name) / "run"
-        _, _, spent = fly_real_time(plan, designed, folder)
+        _, _, _, spent = fly_real_time(plan, designed, folder)
         summary, graded = finish(folder), grade(folder)
     return {
         "control": summary["control"],

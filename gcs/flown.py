@@ -20,7 +20,8 @@ from scenarios import files as scenario_files
 class Flight:
     """A flight's log, whichever clock it was flown on.
 
-    `truth` holds when states were sampled and set-points acted, as the vehicles know it; None if nobody asked for it.
+    `truth` holds when states were sampled and set-points acted, as the vehicles know it; None if in virtual time nobody
+    asked for it.
     `steal_share` and `busy_share` are the parts of the processor time that the host took away and that anyone used; in
     real time only.
     """
@@ -38,8 +39,8 @@ def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None) -
         return fly_virtual(plan, folder)
     from gcs.trial_realtime import fly_real_time  # processes and sockets: not for flights in virtual time
 
-    ticks, events, spent = fly_real_time(plan, margins_of(plan), folder)
-    return Flight(ticks, events, steal_share=spent.steal, busy_share=spent.busy)
+    ticks, events, truth, spent = fly_real_time(plan, margins_of(plan), folder)
+    return Flight(ticks, events, truth, steal_share=spent.steal, busy_share=spent.busy)
 
 
 def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:

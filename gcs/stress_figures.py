@@ -59,7 +59,7 @@ def growth_figure(
     below.axhline(0.0, color=LIMIT, linewidth=0.8)
     below.errorbar(delay_s, measured - predicted, yerr=error, **style)
     below.set_ylabel("flight − sampled\n[1/s]")
-    below.set_xlabel("loop delay, as measured in flight [s]")
+    below.set_xlabel("loop delay of the flight [s]")
     below.ticklabel_format(axis="y", scilimits=(-2, 2))
     above.sharex(below)
     return saved(figure, file)

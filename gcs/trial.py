@@ -57,9 +57,10 @@ class Outcome:
 
     `verdict` is that of the whole flight for an own trial, the sign of the growth rate for a probe. `probed` is the
     first vehicle of the loop that was measured; it stands for the loop of vehicle `critical`, whose `waiting_s` for
-    the control tick it has. `loop_delay_s` is its median over the window of the fit, `loop_delay_spread_s` by how
-    much the 90th percentile is above it; for an own trial its median in flight. `predicted_*` are the models' growth
-    rates at that delay. The growth of an own trial is that of the envelope of all spacing errors, which is rough.
+    the control tick it has. `loop_delay_s` is the effective one over the window of the fit (`gcs.effective_delay`; on
+    constant links each is it), for an own trial the median that was measured in flight. `loop_delay_spread_s` is by how
+    much the 90th percentile of the measured ones is above their median. `predicted_*` are the models' growth rates at
+    that delay. The growth of an own trial is that of the envelope of all spacing errors, which is rough.
     `ticks_sha256` is that of the tick log, in virtual time: the same trial has the same in any process.
     `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`. `error` holds a traceback if the
     trial itself failed.

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gcs.fly import FlyOptions, fly
+from gcs.grade import TRUTH_FILE, Truth, read_truth
 from gcs.plan import FlightPlan
 from gcs.record import RunTail, TickArray
 from gcs.summary import read_ticks
@@ -24,14 +25,14 @@ class ProcessorShares(NamedTuple):
 
 def fly_real_time(
     plan: FlightPlan, design: dict[str, Any], folder: Path | None
-) -> tuple[TickArray, list[dict[str, Any]], ProcessorShares]:
+) -> tuple[TickArray, list[dict[str, Any]], Truth, ProcessorShares]:
     """Fly a plan in real time.
 
     With a folder, which is made, the run is left there; without, it goes when it has been read.
 
     Returns
     -------
-    the ticks, the events, and where the processors' time went during the flight
+    the ticks, the events, the vehicles' truth, and where the processors' time went during the flight
     """
     kept = folder is not None
     folder = folder if folder is not None else Path(tempfile.mkdtemp(prefix="stress-"))
@@ -43,7 +44,7 @@ def fly_real_time(
         spent = [after - former for after, former in zip(_processor_times(), before, strict=True)]
         total = max(1, sum(spent))
         shares = ProcessorShares(spent[_STEAL] / total, 1.0 - (spent[_IDLE] + spent[_WAITING]) / total)
-        return read_ticks(folder), RunTail(folder).events(), shares
+        return read_ticks(folder), RunTail(folder).events(), read_truth(folder / TRUTH_FILE), shares
     finally:
         if not kept:
             shutil.rmtree(folder, ignore_errors=True)

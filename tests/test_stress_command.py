@@ -10,9 +10,12 @@ import pytest
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 
 
+def stress_command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-m", "gcs.cli", "stress", *map(str, arguments)]
+
+
 def stress(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "gcs.cli", "stress", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+    return subprocess.run(stress_command(*arguments), capture_output=True, text=True, timeout=110, check=False)
 
 
 def test_onset_of_instability_is_measured_at_the_sampled_margin(tmp_path: Path) -> None:
@@ -29,20 +32,20 @@ def test_onset_of_instability_is_measured_at_the_sampled_margin(tmp_path: Path) 
     assert "https://" not in page
 
 
-def test_a_campaign_is_resumed_without_flying_a_trial_again(tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_a_campaign_killed_in_the_middle_is_resumed_without_losing_or_repeating_a_flight(tmp_path: Path) -> None:
+    out, log = tmp_path / "out", tmp_path / "out" / "trials.jsonl"
     arguments = (SCENARIOS / "chain3.toml", "--delay", "0.1:0.3:3", "--out", out, "--workers", "2", "--json")
-    first = stress(*arguments)
-    assert first.returncode in (0, 1), first.stderr
-    log = out / "trials.jsonl"
-    lines = log.read_text().splitlines()
-    log.write_text("\n".join(lines[:-1]) + "\n" + lines[-1][:20])  # killed while the last trial was written
+    process = subprocess.Popen(stress_command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (log.exists() and log.read_bytes().count(b"\n") >= 2):
+        assert process.poll() is None
+    process.kill()
+    process.wait()
+    kept = log.read_bytes().rpartition(b"\n")[0] + b"\n"
     again = stress(*arguments, "--resume")
-    assert again.returncode == first.returncode, again.stderr
-    ids = [
-        json.loads(line)["id"] for line in log.read_text().splitlines() if line.startswith("{") and line.endswith("}")
-    ]
-    assert len(ids) == len(set(ids)) == len(lines)
+    assert again.returncode == 0, again.stderr
+    assert log.read_bytes().startswith(kept)
+    ids = [json.loads(line)["id"] for line in log.read_bytes().splitlines() if line.endswith(b"}")]
+    assert len(ids) == len(set(ids)) == json.loads(again.stdout)["trials"] == 6
 
 
 @pytest.mark.parametrize(
