@@ -54,7 +54,13 @@ class Copter:
     """A multicopter with its autopilot, boot clock and counters; the latter as those of `vehicle.Vehicle`."""
 
     def __init__(
-        self, scenario: schema.Scenario, own: schema.Vehicle, start_ns: int, *, record: Record | None = None
+        self,
+        scenario: schema.Scenario,
+        own: schema.Vehicle,
+        start_ns: int,
+        *,
+        record: Record | None = None,
+        signed: bool = False,
     ) -> None:
         self.system_id = own.system_id
         self.settings = scenario.autopilot
@@ -88,7 +94,7 @@ class Copter:
         self._jumps = deque(
             (start_ns + round(j.at_s * NS_PER_S), round(j.by_s * NS_PER_S)) for j in self.settings.clock_jumps
         )
-        self._speaks_version_1 = self.rules.version_1_first
+        self._speaks_version_1 = self.rules.version_1_first and not signed  # MAVLink 1 cannot be signed
         self._timesync_ts1 = -1
         self._out: list[tuple[bytes, int]] = []
         self._answers: dict[int, Callable[[mavlink.Command, int], int]] = {

@@ -72,7 +72,7 @@ class Fleet:
         self._in_order = sensors or self._links.have_channels
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
             if scenario.dynamics == "autopilot":
-                vehicle = Copter(scenario, own, start_ns, record=record)
+                vehicle = Copter(scenario, own, start_ns, record=record, signed=bool(signed))
             else:
                 onboard = OnboardLoop(scenario, own.system_id, self._seen) if sensors else None
                 vehicle = Vehicle(scenario, own, start_ns, record=record, onboard=onboard)

@@ -33,14 +33,14 @@ def copters() -> Scenario:
 
 
 @contextlib.contextmanager
-def fleet(scenario: Scenario, folder: Path) -> Generator[int]:
-    """The vehicles of a scenario, and the port they send to."""
+def fleet(scenario: Scenario, folder: Path, *options: str) -> Generator[int]:
+    """The vehicles of a scenario, with further options of their command, and the port they send to."""
     file = folder / "scenario.toml"
     file.write_text(files.dump(scenario), encoding="utf-8")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
-    command = [sys.executable, "-m", "sim_vehicles.cli", str(file), "--station", f"127.0.0.1:{port}"]
+    command = [sys.executable, "-m", "sim_vehicles.cli", str(file), "--station", f"127.0.0.1:{port}", *options]
     with subprocess.Popen([*command, "--duration", "90"], stdout=subprocess.DEVNULL) as process:
         try:
             yield port

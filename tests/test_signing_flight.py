@@ -17,7 +17,7 @@ from gcs.plan import FlightPlan, flight_plan
 from gcs.record import TickArray
 from gcs.station import Datagram, Station
 from scenarios.files import load
-from scenarios.schema import FixedGains
+from scenarios.schema import FixedGains, Flavour, Response
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.fleet import Fleet
@@ -106,6 +106,22 @@ def test_a_signed_flight_is_the_unsigned_flight_bit_by_bit() -> None:
         np.testing.assert_array_equal(signed[name], plain[name], err_msg=name)
     assert station.events == plain_station.events
     assert not station.counters
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_signed_copters_start_and_fly(flavour: Flavour) -> None:
+    """A PX4, which otherwise speaks MAVLink 1 until it is spoken to, is heard as well."""
+    scenario = load(SCENARIOS / "copters5.toml")
+    autopilot = scenario.autopilot.model_copy(update={"flavour": flavour})
+    response = Response(lag_s=0.15, velocity_gain_1_s=2.0)
+    update = {"autopilot": autopilot, "response": response, "duration_s": 5.0}
+    _, plan = flight_plan(scenario.model_copy(update=update))
+    fleet = a_fleet(plan)
+    ticks, station = flown(plan, fleet, a_guard())
+    assert station.end_reason == "completed: duration reached"
+    assert ticks["commanded"].sum() > 1000
+    assert not station.counters
+    assert not any(name.startswith("refused") for name in fleet.counters)
 
 
 def test_under_attack_at_both_ends_a_signed_flight_is_flown_as_without() -> None:

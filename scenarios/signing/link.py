@@ -82,6 +82,7 @@ class SignedLink:
 
     def sign(self, frame: bytes, now_ns: int) -> bytes:
         """An unsigned frame of ours as a signed one, newer than whatever this end has sent or heard."""
+        assert (frame[0], frame[2]) == (MAGIC, 0)
         timestamp = min(LARGEST, max(self._timestamp + 1, (now_ns + self._offset_ns) // TICK_NS))
         self._timestamp = timestamp
         self._stamps.keep(self._own, timestamp)
