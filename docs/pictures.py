@@ -28,10 +28,13 @@ def main() -> None:
         folder = Path(name)
         gcs("fly", SCENARIOS / "triangle5.toml", "--listen", "127.0.0.1:0", "--out", folder / "flight")
         gcs("view", folder / "flight", "--picture", folder / "flight.png", "--at", "1.2")
-        gcs("stress", SCENARIOS / "chain3.toml", "--onset", "--out", folder / "onset")
+        gcs("stress", SCENARIOS / "chain3.toml", "--onset", "--delay", "0:0.6:7", "--out", folder / "onset")
+        jitter = ["--delay", "0.15:0.375:10", "--jitter", "0:0.08:5", "--seeds", "3"]
+        gcs("stress", SCENARIOS / "chain3.toml", *jitter, "--out", folder / "map")
         gcs("thesis", "--out", folder / "thesis")
         shutil.copy(folder / "flight.png", DOCS / "flight.png")
         shutil.copy(folder / "onset" / "growth.png", DOCS / "onset.png")
+        shutil.copy(folder / "map" / "map.png", DOCS / "map.png")
         shutil.copytree(folder / "thesis", DOCS / "thesis", dirs_exist_ok=True)
 
 
