@@ -3,14 +3,26 @@
 from collections import Counter
 
 from scenarios.schema import NS_PER_S
-from sim_vehicles.mavlink import Command, Message, Setpoint
+from sim_vehicles.mavlink import (
+    COMMAND_CAPABILITIES,
+    COMMAND_GET_HOME,
+    COMMAND_GET_INTERVAL,
+    COMMAND_INTERVAL,
+    COMMAND_REQUEST,
+    Command,
+    Message,
+    Setpoint,
+)
 from sim_vehicles.service_messages import DataStream, ParameterSet, SetMode
+
+_QUESTIONS = frozenset((COMMAND_CAPABILITIES, COMMAND_GET_HOME, COMMAND_GET_INTERVAL, COMMAND_REQUEST))
 
 
 class Authority:
     """Remembers the system that commands a vehicle: the first to do so, until it has been silent for a time.
 
-    Who only asks, listens or sends heartbeats does not become the station, and is not kept from it.
+    Who only asks, listens or sends heartbeats does not become the station, and is not kept from it. A rate of reports
+    is set by the station, or by anybody while there is none, who does not become it: display programs do so at once.
     """
 
     def __init__(self, silence_s: float) -> None:
@@ -23,8 +35,13 @@ class Authority:
         """Whether a message to this vehicle may be acted upon; if it wants something, its sender is the station."""
         if not isinstance(message, Setpoint | Command | ParameterSet | SetMode | DataStream):
             return True
+        command = message.command if isinstance(message, Command) else None
+        if command in _QUESTIONS:
+            return True
         if not self.hears(source, time_ns):
             return False
+        if command == COMMAND_INTERVAL or isinstance(message, DataStream):
+            return True
         self.station, self._heard_ns = source, time_ns
         return True
 

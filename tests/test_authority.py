@@ -80,6 +80,23 @@ def test_another_station_may_ask() -> None:
     assert vehicle.counters["refused_not_the_station"] == 0
 
 
+@pytest.mark.parametrize("make", [a_vehicle, a_copter])
+def test_a_display_that_comes_first_does_not_keep_the_station_out(make: Callable[[], Vehicle | Copter]) -> None:
+    """What other people's ground stations send by themselves when they find a vehicle, before anybody flies it."""
+    vehicle = make()
+    shown = [command_from_another(512, 148), COMMANDS["stream"], COMMANDS["interval"], command_from_another(520, 1)]
+    vehicle.step([(frame, START + SECOND) for frame in shown], START + SECOND)
+    sent = vehicle.step([(guided(), START + 2 * SECOND)], START + 2 * SECOND)
+    assert "COMMAND_ACK" in {parse(data).get_type() for data, _ in sent}
+    # and once there is a station, questions are still answered while rates are its own
+    refused = vehicle.counters["refused_not_the_station"]
+    assert refused == 0
+    for frame, more in ((command_from_another(512, 148), 0), (COMMANDS["interval"], 1)):
+        vehicle.step([(frame, START + 3 * SECOND)], START + 3 * SECOND)
+        assert vehicle.counters["refused_not_the_station"] == refused + more
+        refused += more
+
+
 def test_heartbeats_of_another_station_do_not_keep_the_failsafe_away() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
