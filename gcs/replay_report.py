@@ -18,7 +18,7 @@ from gcs.watch_table import links_table
 from scenarios import files
 from scenarios.schema import Scenario
 
-_COMPARED = ("verdict", "delay_margin_s", "loop_delay_s", "headroom_min", "settling_time_s", "distance_min_m")
+_COMPARED = ("verdict", "loop", "delay_margin_s", "loop_delay_s", "headroom_min", "settling_time_s", "distance_min_m")
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,10 @@ def test_the_log_of_a_run_gives_its_summary_within_tenths_of_a_millisecond(tmp_p
         assert found["spacing_error_final_m"] == pytest.approx(was["spacing_error_final_m"] or 0.0, abs=0.1) or (
             was["spacing_error_final_m"] is None
         )
+    shown = gcs("replay", run)
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert "verdict  stable: completed" in shown.stdout
+    assert "recorded stable: loop" in shown.stdout
     cut = tmp_path / "cut.tlog"
     cut.write_bytes((run / "flight.tlog").read_bytes()[:-5])
     shown = gcs("replay", cut, tmp_path / "chain3.toml")
