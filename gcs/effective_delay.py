@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.grade import ACTED, SAMPLED, Truth, instants
+from gcs.grade import ACTED, SAMPLED, Truth, instants, true_loop_delays_s
 from gcs.record import TickArray
 
 _TRUTH = np.dtype([("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_ns", "<i8")])
@@ -23,6 +23,18 @@ def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.in
     keys = zip(rows["key_ms"].tolist(), rows["sample_boot_ms"].tolist(), strict=True)
     known = [((system_id, key), (system_id, boot)) for key, boot in keys]
     pairs = [(acted[key], sampled[boot]) for key, boot in known if key in acted and boot in sampled]
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+
+
+def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
+    """The same with loops on board: what was streamed, and when the oldest state that it needed was sampled.
+
+    `ticks` are whole: a row for every vehicle.
+    """
+    acted, delays_s = instants(truth, ACTED), true_loop_delays_s(ticks, truth)
+    own = (ticks["system_id"] == system_id) & np.isfinite(delays_s)
+    acted_ns = [acted[system_id, key] for key in ticks["key_ms"][own].tolist()]
+    pairs = [(at, at - round(1e9 * late_s)) for at, late_s in zip(acted_ns, delays_s[own].tolist(), strict=True)]
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 

@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs.effective_delay import commands_of, effective_delay_s
+from gcs.effective_delay import commands_of, commands_on_board, effective_delay_s
 from gcs.flown import Flight, fly_plan, fly_virtual, median_delays_s
 from gcs.growth import CHANNELS
 from gcs.plan import FlightPlan
 from gcs.probe import in_place, linear_until_s
 from gcs.record import TickArray
 from gcs.stress_axes import has_constant_links
+from gcs.telemetry import IntArray
 from scenarios.schema import Scenario
 
 _LINEAR_SHARE = 0.8
@@ -84,18 +85,16 @@ def response_paired(
 def effective_delays_s(
     plan: FlightPlan, rows: TickArray, flight: Flight, system_ids: tuple[int, ...]
 ) -> dict[int, float]:
-    """The constant loop delay that each vehicle's commands in these rows stand for.
+    """The constant loop delay that each vehicle's commands in these rows stand for."""
+    truth = flight.truth
+    assert truth is not None
+    whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
+    on_board, period_s = plan.scenario.control.loop == "onboard", 1.0 / plan.scenario.rates.control_hz
 
-    With loops on board it is the measured median: what is late there is not of the vehicle's own state.
-    """
-    if plan.scenario.control.loop == "onboard":
-        return median_delays_s(rows, system_ids)
-    assert flight.truth is not None
-    period_s = 1.0 / plan.scenario.rates.control_hz
-    return {
-        system_id: effective_delay_s(commands_of(rows, flight.truth, system_id), period_s=period_s)
-        for system_id in system_ids
-    }
+    def commands(system_id: int) -> IntArray:
+        return commands_on_board(whole, truth, system_id) if on_board else commands_of(rows, truth, system_id)
+
+    return {system_id: effective_delay_s(commands(system_id), period_s=period_s) for system_id in system_ids}
 
 
 def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
