@@ -1,14 +1,17 @@
 """The free response of one loop through random links, against its linear model through the same delays."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 from stress_pair import SCENARIO, pair_plan
 
 from gcs.effective_delay import commands_of, effective_delay_s
 from gcs.free_response import FreeResponse, fly_calm, response_paired
+from gcs.grade import ACTED, SAMPLED, instants
 from gcs.growth import CHANNELS, FloatArray
 from gcs.measure import fly_trial
 from gcs.onset import Loop
@@ -16,6 +19,7 @@ from gcs.plan import FlightPlan
 from gcs.stress_axes import at_coordinates
 from gcs.study import Study
 from gcs.trial import plan_loops
+from scenarios.schema import Link, VehicleLinks
 
 PERIOD_S = 0.02
 
@@ -71,6 +75,78 @@ def test_a_loop_on_random_links_is_its_linear_model_through_the_delays_drawn(coo
     assert flown[early] == pytest.approx(model[early], abs=2e-3)
     pushed = calm.ticks[(calm.ticks["system_id"] == 2) & calm.ticks["commanded"]]
     assert np.nanmax(np.abs(pushed["spacing_error_north_m"])) > 0.1
+
+
+class Reported:
+    """Reported states of one vehicle along one axis, as the station knows them at some time."""
+
+    def __init__(self) -> None:
+        self.time_s: list[float] = []
+        self.position_m: list[float] = []
+        self.velocity_m_s: list[float] = []
+
+    def at(self, time_s: float, newest_s: float) -> tuple[float, float]:
+        """Between two reports their cubic, after the newest one straight on."""
+        k = int(np.searchsorted(self.time_s, newest_s - 1e-9))
+        if time_s >= newest_s:
+            return self.position_m[k] + self.velocity_m_s[k] * (time_s - newest_s), self.velocity_m_s[k]
+        k = int(np.searchsorted(self.time_s, time_s, side="right"))
+        pair = slice(k - 1, k + 1)
+        cubic = CubicHermiteSpline(self.time_s[pair], self.position_m[pair], self.velocity_m_s[pair])
+        return float(cubic(time_s)), float(cubic(time_s, 1))
+
+
+def test_a_coupled_loop_on_links_that_differ_is_its_linear_model_with_the_stations_one_instant() -> None:
+    """The leader uses the follower's spacing, which it hears 60 ms later than itself: the station carries it forward.
+
+    In absolute positions along one axis, from the instants at which states were sampled and commands acted. A model of
+    one delay for each vehicle's command, which has all states at the instant of the vehicle's own, is not as near.
+    """
+    plan = pair_plan()
+    gain = plan.gain.copy()
+    gain[0, 2] = gain[1, 3] = -1.5
+    slow, fast = Link(delay_s=0.08), Link(delay_s=0.02)
+    own = (VehicleLinks(system_id=1, up=fast, down=fast), VehicleLinks(system_id=2, up=slow, down=slow))
+    links = SCENARIO.links.model_copy(update={"vehicles": own})
+    plan = replace(plan, gain=gain, scenario=SCENARIO.model_copy(update={"links": links}))
+    response = response_paired(plan, fly_calm(plan, None), (1, 2), amplitude=1.0, folder=None)
+    truth, rows = response.flight.truth, response.errors
+    assert truth is not None
+    sampled = {key: ns * 1e-9 for key, ns in instants(truth, SAMPLED).items()}
+    acted = {key: ns * 1e-9 for key, ns in instants(truth, ACTED).items()}
+    used_s = {
+        (int(row["tick"]), int(row["system_id"])): sampled[int(row["system_id"]), int(row["sample_boot_ms"])]
+        for row in rows
+    }
+    acts = [
+        (acted[int(row["system_id"]), int(row["key_ms"])], 1, row)
+        for row in rows
+        if (int(row["system_id"]), int(row["key_ms"])) in acted
+    ]
+    samples = [(time_s, 0, system_id) for (system_id, _), time_s in sampled.items()]
+    events: list[tuple[float, int, Any]] = sorted([*acts, *samples], key=lambda event: event[:2])
+    reports = {1: Reported(), 2: Reported()}
+    # the leader starts with 1 m/s too much, the follower 1.3 m behind its place
+    x, v, u, now_s = np.array([0.0, -1.3]), np.array([1.0, 0.0]), np.zeros(2), acts[0][0]
+    gain_axis, off = gain[::2, ::2], list[float]()
+    for time_s, kind, what in events:
+        step_s = max(0.0, time_s - now_s)
+        x, v, now_s = x + v * step_s + u * step_s**2 / 2.0, v + u * step_s, max(now_s, time_s)
+        if kind == 0:
+            one = reports[what]
+            one.time_s.append(time_s)
+            one.position_m.append(float(x[what - 1]))
+            one.velocity_m_s.append(float(v[what - 1]))
+            continue
+        tick, system_id = int(what["tick"]), int(what["system_id"])
+        at_s = used_s[tick, system_id]
+        (p1, v1), (p2, v2) = (reports[k].at(at_s, used_s[tick, k]) for k in (1, 2))
+        u[system_id - 1] = (gain_axis @ np.array([v1, p1 - p2, v2]))[system_id - 1]
+        off.append(what["velocity_error_north_m_s"] - (v1, v2)[system_id - 1])
+        if system_id == 2:
+            off.append(what["spacing_error_north_m"] - (p1 - p2))
+    assert np.abs(off).max() < 1e-3  # 0.06 m if nothing were carried forward
+    assert np.abs(rows["velocity_error_north_m_s"]).max() > 1.0
 
 
 def test_effective_delay_of_regular_commands_is_their_loop_delay() -> None:
