@@ -132,6 +132,18 @@ def signed_vehicles(tmp_path: Path, station_port: int) -> Generator[None]:
         process.wait(PATIENCE_S)
 
 
+def test_a_monitor_with_the_key_is_answered_and_one_without_hears_only(tmp_path: Path) -> None:
+    port = free_port()
+    with signed_vehicles(tmp_path, port):
+        watch = [sys.executable, "-m", "gcs.cli", "monitor", "--listen", f"127.0.0.1:{port}", "--for", "2", "--json"]
+        for key, status in ((["--key", str(tmp_path / "vehicles.key")], "measured"), ([], "no exchange")):
+            done = subprocess.run([*watch, *key], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+            assert (done.returncode, done.stderr) == (0, "")
+            report = json.loads(done.stdout)
+            assert [vehicle["status"] for vehicle in report["vehicles"]] == [status] * 3
+            assert report["refused"] == {}
+
+
 def answers(link: socket.socket, mav: Any, data: bytes, address: Any, wanted: str, patience_s: float) -> Any:
     """The first message of a type that comes from an address after data was sent there, None if none does."""
     link.sendto(data, address)
