@@ -117,7 +117,7 @@ class WatchedVehicle:
         left = None if margin_s is None or worst_s is None else headroom(worst_s, margin_s)
         return {
             "system_id": self.remote.system_id,
-            "status": self._status(now_ns, left),
+            "status": self._status(now_ns, worst_s, left),
             "telemetry_hz": round((self.states - 1) / span_s, 3) if self.states > 1 and span_s > 0 else None,
             "rtt_s": rtt_s,
             "telemetry_age_s": age_s,
@@ -137,7 +137,7 @@ class WatchedVehicle:
             },
         }
 
-    def _status(self, now_ns: int, left: float | None) -> str:
+    def _status(self, now_ns: int, loop_delay_s: float | None, left: float | None) -> str:
         if not self.remote.heard_ns:
             return "not heard"
         if now_ns - self.remote.heard_ns > SILENT_NS:
@@ -146,7 +146,7 @@ class WatchedVehicle:
             return "past the margin"
         if not self.remote.clock.estimate.samples:
             return "no exchange"
-        return "measured" if self.states else "no position"
+        return "no position" if loop_delay_s is None else "measured"
 
 
 class Watch:

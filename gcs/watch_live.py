@@ -7,7 +7,8 @@ is not a station's. No heartbeat: a vehicle whose station has gone has to notice
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 from rich.console import Console
 from rich.live import Live
@@ -38,6 +39,39 @@ class MonitorOptions:
     shown: bool
 
 
+class _Display:
+    """The figures of the last seconds on standard output: a table on a terminal, else a line now and then."""
+
+    def __init__(self, *, shown: bool, start_ns: int) -> None:
+        self._console = Console()
+        self._shown = shown
+        self._live: Live | None = None
+        if shown and self._console.is_terminal:
+            self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._period_ns = _SHOW_NS if self._live is not None else _PLAIN_NS
+        self._due_ns = start_ns + self._period_ns
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, report: Callable[[int], dict[str, Any]], now_ns: int) -> None:
+        """Show the report on the last so many looks, if that is due."""
+        if now_ns < self._due_ns or not self._shown:
+            return
+        self._due_ns = now_ns + self._period_ns
+        console, figures = self._console, report(_WINDOW_LOOKS)
+        if self._live is None:
+            print(plain_line(figures), flush=True)
+        else:  # the last line stays free for the cursor
+            self._live.update(render(figures, width=console.width, height=console.height - 1), refresh=True)
+
+
 def monitor_links(
     link: StationSocket,
     watch: Watch,
@@ -49,9 +83,6 @@ def monitor_links(
     requests = Requests(options.timesync_hz)
     start_ns = now_ns = clock_ns()
     end_ns = start_ns + round(options.seconds * NS_PER_S) if math.isfinite(options.seconds) else 1 << 62
-    console = Console()
-    live = Live(console=console, auto_refresh=False, transient=True) if options.shown and console.is_terminal else None
-    show_ns = start_ns + _SHOW_NS if live else start_ns + _PLAIN_NS
 
     def report(last: int = 0) -> dict[str, Any]:
         return {
@@ -67,9 +98,7 @@ def monitor_links(
             "vehicles": watch.figures(now_ns, options.margin_s, last),
         }
 
-    if live is not None:
-        live.start()
-    try:
+    with _Display(shown=options.shown, start_ns=start_ns) as display:
         look_ns = start_ns
         while now_ns < end_ns and not stop_reason():
             link.wait(min(look_ns, end_ns, requests.next_ns))  # not long: a signal does not end the wait
@@ -83,13 +112,5 @@ def monitor_links(
             look_ns = watch.look(now_ns)
             outgoing = requests.due(watch, now_ns)
             link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
-            if now_ns >= show_ns and live is not None:
-                show_ns = now_ns + _SHOW_NS
-                live.update(render(report(_WINDOW_LOOKS), width=console.width, height=console.height - 1), refresh=True)
-            elif now_ns >= show_ns and options.shown:
-                show_ns = now_ns + _PLAIN_NS
-                print(plain_line(report(_WINDOW_LOOKS)), flush=True)
-    finally:
-        if live is not None:
-            live.stop()
+            display.show(report, now_ns)
     return report()
