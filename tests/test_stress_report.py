@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import pytest
 import typer
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it comes with pymavlink, untyped
 from stress_pair import SCENARIO, pair_plan
 from typer.testing import CliRunner
 
@@ -33,6 +34,18 @@ def run(folder: Path, *options: str, code: int = 0, **changes: Any) -> str:
     return result.output
 
 
+def junit_counts(file: Path) -> dict[str, int]:
+    """The counts that a report claims; it has to be valid by the schema, and its cases have to be as many."""
+    schema = etree.XMLSchema(etree.parse(str(Path(__file__).parent / "junit.xsd")))
+    schema.assertValid(etree.parse(str(file)))
+    suite = ElementTree.parse(file).getroot()
+    found = {"tests": len(suite)}
+    for kind, plural in (("failure", "failures"), ("error", "errors"), ("skipped", "skipped")):
+        found[plural] = len(suite.findall(f"testcase/{kind}"))
+    assert {name: int(suite.get(name, -1)) for name in found} == found
+    return found
+
+
 def test_sweep_and_onset_agree_with_the_margin_and_leave_a_page_of_their_own(tmp_path: Path) -> None:
     out, junit = tmp_path / "out", tmp_path / "ci" / "junit.xml"
     options = ["--delay", "0,0.25", "--assert-onset", "0.005", "--junit", str(junit), "--out", str(out)]
@@ -48,8 +61,7 @@ def test_sweep_and_onset_agree_with_the_margin_and_leave_a_page_of_their_own(tmp
     assert page.count("data:image/png;base64,") == 2
     for name in ("stress.json", "trials.parquet", "growth.png", "worst.png", "scenario.toml"):
         assert (out / name).stat().st_size > 0
-    suite = ElementTree.parse(junit).getroot()
-    assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("1", "0", "0")
+    assert junit_counts(junit) == {"tests": 1, "failures": 0, "errors": 0, "skipped": 0}
     # taken up again it flies nothing, and says the same
     lines = (out / TRIALS_FILE).read_bytes()
     again = json.loads(run(tmp_path, *options, "--json", "--resume"))
@@ -88,6 +100,7 @@ def test_assert_onset_fails_where_the_margin_does_not_hold(tmp_path: Path) -> No
     options = ["--assert-onset", "0.005", "--junit", str(junit), "--out", str(out)]
     output = run(tmp_path, *options, code=1, rates=rates)
     assert "0.5% is allowed" in output
+    assert junit_counts(junit) == {"tests": 1, "failures": 1, "errors": 0, "skipped": 0}
     [case] = ElementTree.parse(junit).getroot().findall("testcase")
     assert case.find("failure") is not None
     assert "not met" in (out / "report.html").read_text(encoding="utf-8")
@@ -192,7 +205,7 @@ def test_failed_trials_are_errors_in_junit(tmp_path: Path) -> None:
     }  # fmt: skip
     write_junit(result, tmp_path / "junit.xml")
     suite = ElementTree.parse(tmp_path / "junit.xml").getroot()
-    assert (suite.get("tests"), suite.get("errors")) == ("2", "1")
+    assert junit_counts(tmp_path / "junit.xml") == {"tests": 2, "failures": 0, "errors": 1, "skipped": 1}
     error = suite.findall("testcase")[1].find("error")
     assert error is not None
     assert error.get("message") == "ValueError: no"
