@@ -6,22 +6,26 @@ import subprocess
 import sys
 import threading  # noqa: TID251 - stands for another process
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mavsdk import ComponentType, Configuration, Mavsdk
+from mavsdk.plugins.telemetry import Telemetry
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs import mavlink
 from gcs.guard import Guard
 from gcs.mirror import Mirror
+from gcs.summary import read_ticks
 from gcs.tlog import read_tlog
 from gcs.vehicle import RemoteVehicle
 from scenarios.files import dump, load
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
+from tests.flown_fleet import until
 from tests.signed_peer import EPOCH_NS, KEY, NOW_NS, a_sender
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
@@ -75,15 +79,17 @@ def listening(system_id: int = 245) -> Generator[Listener]:
         listener.socket.close()
 
 
-def fly(tmp_path: Path, *arguments: str) -> tuple[dict[str, Any], Path]:
+def fly(tmp_path: Path, *arguments: str, meanwhile: Callable[[], None] = lambda: None) -> tuple[dict[str, Any], Path]:
     """A flight of chain3 for three seconds: its summary and its folder."""
     scenario = load(ROOT / "scenarios" / "chain3.toml").model_copy(update={"duration_s": 3.0})
     file, run = tmp_path / "chain3.toml", tmp_path / "run"
     file.write_text(dump(scenario), encoding="utf-8")
     command = [*GCS, "fly", str(file), "--listen", "127.0.0.1:0", "--out", str(run), "--json", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    return json.loads(done.stdout), run
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        meanwhile()
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, err) == (0, "")
+    return json.loads(out), run
 
 
 def acknowledged(heard: list[bytes]) -> list[int]:
@@ -134,6 +140,29 @@ def test_a_mirror_where_nobody_listens_is_counted_and_the_flight_goes_on(tmp_pat
     assert summary["verdict"] == "stable"
     assert summary["mirror"]["not forwarded"] > 100
     assert summary["control"]["ticks"] > 140  # of 150; a busy machine may take one away
+
+
+def test_mavsdk_on_a_mirror_finds_all_vehicles_and_where_they_fly(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    other = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
+    other.add_any_connection(f"udpin://127.0.0.1:{port}")
+    telemetry: dict[int, Telemetry] = {}
+
+    def discover() -> None:
+        until(lambda: other.system_count() == 3, "three systems")
+        telemetry.update({system.get_system_id(): Telemetry(system) for system in other.get_systems()})
+
+    summary, run = fly(tmp_path, "--mirror", f"127.0.0.1:{port}", meanwhile=discover)
+    found = {system_id: told.position_velocity_ned() for system_id, told in telemetry.items()}
+    other.destroy()
+    ends_m = {int(row["system_id"]): float(row["north_m"]) for row in read_ticks(run)}
+    assert sorted(found) == [1, 2, 3]
+    for system_id, told in found.items():
+        assert told.position.north_m == pytest.approx(ends_m[system_id], abs=30.0)  # a third of a second at 91 m/s
+        assert told.velocity.north_m_s == pytest.approx(91.4, abs=3.0)  # some still close up
+    assert summary["mirror"]["refused HEARTBEAT"] >= 1
 
 
 def test_what_is_garbled_or_in_a_vehicles_name_is_not_passed_on() -> None:
