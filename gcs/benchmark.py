@@ -93,8 +93,8 @@ def _cost(signed: list[dict[str, float]], plain: list[dict[str, float]]) -> dict
 def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]:
     """Fly `seconds` of a scenario over UDP: how punctual the station was, and its latencies against the truth."""
     from gcs.grade import grade
+    from gcs.stress.trial_realtime import fly_real_time
     from gcs.summary import finish
-    from gcs.trial_realtime import fly_real_time
 
     designed, plan = flight_plan(_without_solver(scenario, seconds))
     with tempfile.TemporaryDirectory(prefix="bench-") as name:

@@ -14,7 +14,7 @@ from gains.errors import GainsError
 from gcs.benchmark import with_vehicles
 from gcs.lockstep import START_NS, LinkLosses, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan import flight_plan
-from gcs.report import number_text
+from gcs.show.report import number_text
 from gcs.station import Station
 from gcs.user_input import InputError
 from scenarios.schema import Scenario

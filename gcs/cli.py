@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import typer
 
 from gcs.loop_option import LoopOption, load_with_loop
-from gcs.stress import stress
+from gcs.stress.command import stress
 from gcs.user_input import InputError, KeyFile, listening, mirroring, opened_guard, warn_if_open
-from gcs.watch_command import monitor, replay
+from gcs.watch.command import monitor, replay
 
 app = typer.Typer(
     add_completion=False,
@@ -94,7 +94,7 @@ def fly(
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:
-        from gcs.report import print_summary
+        from gcs.show.report import print_summary
 
         print_summary(summary, folder)
     raise typer.Exit(_exit_code(summary))
@@ -133,8 +133,8 @@ def compare(
     """Design and fly a scenario by the inclusion principle and on the graph, side by side."""
     from dataclasses import asdict
 
-    from gcs import compare as comparing
-    from gcs.design_cost import design_costs
+    from gcs.compare import command as comparing
+    from gcs.compare.cost import design_costs
     from gcs.fly import new_folder
 
     scenario = _scenario(scenario_file)
@@ -178,8 +178,8 @@ def thesis(
     """Reproduce the figures and numbers of the source, published and computed side by side."""
     from dataclasses import asdict
 
-    from gcs import thesis as source
     from gcs.fly import new_folder
+    from gcs.thesis import command as source
 
     folder = _out_folder(out) if out is not None else new_folder("thesis")
     found = source.claims()
@@ -278,8 +278,8 @@ def view(
     at: Annotated[float, typer.Option(metavar="SECONDS", help="scenario time of the picture")] = 10.0,
 ) -> None:
     """Open a recording in the Rerun viewer."""
-    from gcs.viewer import ViewerError, screenshot
-    from gcs.viewer import view as open_viewer
+    from gcs.show.viewer import ViewerError, screenshot
+    from gcs.show.viewer import view as open_viewer
 
     try:
         if picture is None:
@@ -295,8 +295,8 @@ def view(
 @app.command()
 def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run that was killed")]) -> None:
     """Finish the files of a run whose processes were killed: ticks.parquet, summary.json, flight.rrd."""
-    from gcs.observer import record_run
-    from gcs.report import print_summary
+    from gcs.show.observer import record_run
+    from gcs.show.report import print_summary
     from gcs.summary import RunError, finish
 
     try:
@@ -365,7 +365,7 @@ def _out_folder(out: Path) -> Path:
 
 
 def _print_design(result: dict[str, Any]) -> None:
-    from gcs.report import print_design
+    from gcs.show.report import print_design
 
     print_design(result)
 

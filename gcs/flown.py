@@ -37,7 +37,7 @@ def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None) -
     """Fly a plan; with a folder, which is made, its files are left there but for the summary."""
     if not real_time:
         return fly_virtual(plan, folder)
-    from gcs.trial_realtime import fly_real_time  # processes and sockets: not for flights in virtual time
+    from gcs.stress.trial_realtime import fly_real_time  # processes and sockets: not for flights in virtual time
 
     ticks, events, truth, spent = fly_real_time(plan, margins_of(plan), folder)
     return Flight(ticks, events, truth, steal_share=spent.steal, busy_share=spent.busy)

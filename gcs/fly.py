@@ -133,7 +133,7 @@ def _vehicles_heard(link: StationSocket, plan: FlightPlan, guard: Guard | None) 
 @contextlib.contextmanager
 def _observer(folder: Path, *, show_table: bool) -> Generator["subprocess.Popen[bytes]"]:
     """The process that shows and records the flight; left, it has ended by itself or been told to."""
-    command = [sys.executable, "-m", "gcs.observer", str(folder), "--parent", str(os.getpid())]
+    command = [sys.executable, "-m", "gcs.show.observer", str(folder), "--parent", str(os.getpid())]
     process = subprocess.Popen(command + ([] if show_table else ["--no-table"]), stdin=subprocess.DEVNULL)
     try:
         yield process

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs.record import TickArray
-from gcs.report import UNKNOWN
+from gcs.show.report import UNKNOWN
 from gcs.sitl import TRUTH_FILE
 from gcs.summary import RunError, read_ticks
 from sim_vehicles.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth

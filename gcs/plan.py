@@ -13,9 +13,9 @@ from gains.pattern import Pattern, leader_follower, with_links, without_links
 from gains.requirement import Requirement
 from gains.response import Response, continuous_margin, requirement_with, string_peak
 from gains.structure import strongly_connected_blocks
+from gcs.autopilot.responses import Responses, given_responses, margins_with
 from gcs.control import Formation
 from gcs.onboard import onboard_plan
-from gcs.responses import Responses, given_responses, margins_with
 from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
 

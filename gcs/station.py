@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gcs import mavlink
-from gcs.autopilots import Goal
+from gcs.autopilot.copters import START_PATIENCE_S, Copters
+from gcs.autopilot.kinds import Goal
+from gcs.autopilot.startup import Startup
 from gcs.control import LARGEST_COMMAND_M_S2, VehicleControl, distances_m, formation_control
-from gcs.copters import START_PATIENCE_S, Copters
 from gcs.modes import Phase, next_phase
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
 from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
-from gcs.startup import Startup
 from gcs.stream import Stream, law_of, set_point, upload_of
 from gcs.telemetry import FloatArray, StateHistory
 from gcs.vehicle import SILENCE_S, Address, RemoteVehicle

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gcs import mavlink
-from gcs.autopilots import (
+from gcs.autopilot.kinds import (
     ARM_DISARM,
     LAUNCHED,
     SET_MESSAGE_INTERVAL,
@@ -16,9 +16,9 @@ from gcs.autopilots import (
     commanded_mode,
     mode_command,
 )
+from gcs.autopilot.startup import Startup
 from gcs.clocks import LEAST_SAMPLES, VehicleClock
 from gcs.sequence import DUPLICATE, LATE, SequenceCounter
-from gcs.startup import Startup
 from gcs.upload import Upload
 
 Address = tuple[str, int]

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from stress_pair import SCENARIO, pair_plan
 
-from gcs.campaign import (
+from gcs.stress.campaign import (
     TRIALS_FILE,
     CampaignError,
     Store,
@@ -22,9 +22,9 @@ from gcs.campaign import (
     run_campaign,
     write_parquet,
 )
-from gcs.measure import fly_trial
-from gcs.study import Study
-from gcs.trial import Outcome, Trial
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import Study
+from gcs.stress.trial import Outcome, Trial
 
 TESTS = Path(__file__).parent
 
@@ -132,7 +132,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_campaign import trials
-from gcs.campaign import Store, local_workers, run_campaign
+from gcs.stress.campaign import Store, local_workers, run_campaign
 if __name__ == "__main__":
     store = Store(Path(sys.argv[1]))
     with local_workers(2) as fly:

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from gains.design import design
 from gains.formation import FormationModel
 from gcs.cli import app
-from gcs.compare import METHODS, string_peak
+from gcs.compare.command import METHODS, string_peak
 
 SCENARIO = Path(__file__).parent.parent / "scenarios" / "chain3.toml"
 CHAIN = FormationModel((-1, 0, 1))

@@ -10,7 +10,7 @@ from gains.formation import FormationModel
 from gains.lqr import Weights, centralised_lqr
 from gains.pattern import Plant, formation_plant
 from gains.robust import disturbance_bound
-from gcs.design_cost import DesignCost, ratios
+from gcs.compare.cost import DesignCost, ratios
 
 CHAIN = formation_plant(FormationModel((-1, 0, 1), axes=1))
 

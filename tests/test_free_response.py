@@ -10,15 +10,15 @@ from scipy.linalg import expm
 from stress_pair import SCENARIO, pair_plan
 
 from gcs.effective_delay import commands_of, effective_delay_s
-from gcs.free_response import FreeResponse, fly_calm, response_paired
 from gcs.grade import ACTED, SAMPLED, instants
-from gcs.growth import CHANNELS, FloatArray
-from gcs.measure import fly_trial
-from gcs.onset import Loop
 from gcs.plan import FlightPlan
-from gcs.stress_axes import at_coordinates
-from gcs.study import Study
-from gcs.trial import plan_loops
+from gcs.stress.axes import at_coordinates
+from gcs.stress.free_response import FreeResponse, fly_calm, response_paired
+from gcs.stress.growth import CHANNELS, FloatArray
+from gcs.stress.measure import fly_trial
+from gcs.stress.onset import Loop
+from gcs.stress.study import Study
+from gcs.stress.trial import plan_loops
 from scenarios.schema import Link, VehicleLinks
 
 PERIOD_S = 0.02

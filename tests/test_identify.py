@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from gains.response import Response
-from gcs.identify import LONGEST_S, MISFIT_MAX, PROFILE, identify, manoeuvre_m_s2, step_velocity
+from gcs.autopilot.identify import LONGEST_S, MISFIT_MAX, PROFILE, identify, manoeuvre_m_s2, step_velocity
 from gcs.telemetry import FloatArray
 
 AMPLITUDE, DOWN_S = 1.5, 0.037

@@ -20,8 +20,8 @@ from gcs import mavlink
 from gcs.guard import Guard
 from gcs.mirror import Mirror
 from gcs.summary import read_ticks
-from gcs.tlog import read_tlog
 from gcs.vehicle import RemoteVehicle
+from gcs.watch.tlog import read_tlog
 from scenarios.files import dump, load
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from gcs.flown import fly_virtual, median_delays_s
-from gcs.free_response import fly_calm, response_paired
 from gcs.grade import instants, true_loop_delays_s
-from gcs.growth import fit_growth, motion_of
 from gcs.lockstep import START_NS, fly_lockstep
-from gcs.measure import fly_trial
 from gcs.onboard import own_parameters
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import Mode, TickArray
 from gcs.station import Station
-from gcs.stress_axes import at_coordinates
-from gcs.study import NoOnset, Study, find_onset
+from gcs.stress.axes import at_coordinates
+from gcs.stress.free_response import fly_calm, response_paired
+from gcs.stress.growth import fit_growth, motion_of
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import NoOnset, Study, find_onset
+from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
 from gcs.summary import summarise
-from gcs.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
 from gcs.upload import float32
 from scenarios.files import ScenarioError, dump, load, parse, with_loop
 from scenarios.schema import Link, Outage, Scenario, VehicleLinks

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gains.formation import FormationModel
-from gcs.onset import GrowthPoint, Loop, critical_loop, distinct, locate_zero, loops_of
+from gcs.stress.onset import GrowthPoint, Loop, critical_loop, distinct, locate_zero, loops_of
 
 TREE = (-1, 0, 1, 0, 3)
 K1, K2, K3 = -3.4, 0.6, 5.6

@@ -12,12 +12,12 @@ from matplotlib.image import imread
 from test_recording import read_back
 
 from gcs.lockstep import START_NS, fly_lockstep
-from gcs.observer import record_run
 from gcs.plan import flight_plan
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.show.observer import record_run
+from gcs.show.viewer import screenshot, vulkan_missing
 from gcs.station import Station
 from gcs.summary import read_ticks
-from gcs.viewer import screenshot, vulkan_missing
 from scenarios.files import dump, load
 
 pytestmark = pytest.mark.xdist_group("recorded flight")

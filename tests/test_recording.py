@@ -10,12 +10,12 @@ import pytest
 from flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
 from rerun.chunk import RrdReader
 
-from gcs.grid import WholeTicks
-from gcs.observer import record_run
 from gcs.record import PARQUET_FILE, RECORDING_FILE, TICK, TICKS_FILE, Mode, TickArray
-from gcs.recording import UNFINISHED_FILE, Recording
-from gcs.scene import vehicle_colors
-from gcs.viewer import ViewerError, find_recording, view
+from gcs.show.grid import WholeTicks
+from gcs.show.observer import record_run
+from gcs.show.recording import UNFINISHED_FILE, Recording
+from gcs.show.scene import vehicle_colors
+from gcs.show.viewer import ViewerError, find_recording, view
 
 FIVE = line(5)
 

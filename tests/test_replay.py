@@ -12,9 +12,9 @@ from test_flight_monitor import ramp
 
 from gcs import mavlink
 from gcs.record import TickArray
-from gcs.replay import rebuild
-from gcs.replay_report import Replayed, replay
-from gcs.tlog import parse_tlog
+from gcs.watch.replay import rebuild
+from gcs.watch.replay_report import Replayed, replay
+from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
 from scenarios.schema import Scenario
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stress_pair import SCENARIO
 
-from gcs.stress_axes import (
+from gcs.stress.axes import (
     AxisError,
     at_coordinates,
     has_constant_links,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from stress_pair import SCENARIO, pair_plan
 
-from gcs.measure import fly_trial
-from gcs.stress_axes import Axis, at_coordinates
-from gcs.stress_map import guaranteed_line, two_delays_lines
-from gcs.study import Study
-from gcs.trial import plan_loops
+from gcs.stress.axes import Axis, at_coordinates
+from gcs.stress.boundary import guaranteed_line, two_delays_lines
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import Study
+from gcs.stress.trial import plan_loops
 from scenarios.schema import Jitter, Link
 
 DELAY_JITTER = (Axis("delay", (0.02, 0.25)), Axis("jitter", (0.0, 0.05)))

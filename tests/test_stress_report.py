@@ -13,11 +13,11 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it comes
 from stress_pair import SCENARIO, pair_plan
 from typer.testing import CliRunner
 
-from gcs.campaign import TRIALS_FILE, Store, local_workers, run_campaign
 from gcs.plan import FlightPlan
-from gcs.stress import stress
-from gcs.stress_print import write_junit
-from gcs.study import Onset, Study, find_onset
+from gcs.stress.campaign import TRIALS_FILE, Store, local_workers, run_campaign
+from gcs.stress.command import stress
+from gcs.stress.study import Onset, Study, find_onset
+from gcs.stress.terminal import write_junit
 from gcs.summary import SUMMARY_FILE
 from scenarios.files import dump
 
@@ -88,7 +88,7 @@ def test_a_margin_that_is_not_that_of_the_gains_flown_is_found_out(tmp_path: Pat
 
 
 def margin_of(plan: FlightPlan) -> float:
-    from gcs.trial import plan_loops
+    from gcs.stress.trial import plan_loops
 
     return min(loop.margin_s() for loop in plan_loops(plan))
 

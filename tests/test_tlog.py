@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
 from gcs import mavlink
 from gcs.record import TLOG_FILE, RunWriter
-from gcs.tlog import TlogError, parse_tlog, read_tlog
+from gcs.watch.tlog import TlogError, parse_tlog, read_tlog
 
 START_US = 1_750_000_000_000_000
 ENTRIES = [

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from stress_pair import SCENARIO, pair_plan
 
 from gcs.flown import fly_virtual
-from gcs.measure import fly_trial
 from gcs.plan import flight_plan
-from gcs.probe import probe_scenario, with_waiting
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, TICKS_FILE
-from gcs.stress_axes import at_coordinates
-from gcs.study import Study
-from gcs.trial import Trial, plan_of
+from gcs.stress.axes import at_coordinates
+from gcs.stress.measure import fly_trial
+from gcs.stress.probe import probe_scenario, with_waiting
+from gcs.stress.study import Study
+from gcs.stress.trial import Trial, plan_of
 from scenarios.files import load
 from scenarios.schema import Clocks, Link, VehicleLinks
 

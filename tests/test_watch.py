@@ -13,8 +13,8 @@ from rich.console import Console
 from sim_client import arm, guided, heartbeat, setpoint
 
 from gcs import mavlink
-from gcs.watch import SYSTEM_ID, Requests, Watch
-from gcs.watch_table import links_table
+from gcs.watch.links import SYSTEM_ID, Requests, Watch
+from gcs.watch.table import links_table
 from scenarios.files import load
 from scenarios.schema import Jitter, Link, Links, Scenario
 from sim_vehicles.fleet import Fleet

@@ -1,0 +1,100 @@
+"""The identification manoeuvre of all vehicles at once, tick by tick, and what it makes of the flight plan."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from gains.response import Response, sampled_margin
+from gcs.autopilot.identify import (
+    LONGEST_S,
+    MISFIT_MAX,
+    PROFILE,
+    Identified,
+    amplitude_m_s2,
+    identify,
+    manoeuvre_m_s2,
+)
+from gcs.autopilot.responses import Responses
+from gcs.plan import FlightPlan
+from gcs.telemetry import StateHistory
+from gcs.vehicle import RemoteVehicle
+from scenarios.schema import NS_PER_S
+
+
+class Identification:
+    """Collects what the vehicles do in the manoeuvre, then works it out in small pieces, one a tick."""
+
+    def __init__(
+        self,
+        plan: FlightPlan,
+        vehicles: Sequence[RemoteVehicle],
+        report: Callable[[str, str, int], None],
+    ) -> None:
+        self._plan = plan
+        self._vehicles = vehicles
+        self._report = report
+        self._amplitude_m_s2 = amplitude_m_s2(plan.scenario.limits.acceleration_max_m_s2)
+        self._begin_ns: int | None = None
+        self._acted_ns: list[list[int]] = [[] for _ in vehicles]
+        """When each change of the acceleration acted."""
+        self._samples: list[list[tuple[int, float]]] = [[] for _ in vehicles]
+        """(instant, velocity north)"""
+        self._work = self._worked_out()
+
+    def command(self, due_ns: int) -> tuple[float, float]:
+        """The acceleration that all vehicles are told at a tick; notes when it changes."""
+        if self._begin_ns is None:
+            self._begin_ns = due_ns
+        since_s = (due_ns - self._begin_ns) / NS_PER_S
+        begun = sum(at_s <= since_s for at_s, _ in PROFILE)
+        for vehicle, acted in zip(self._vehicles, self._acted_ns, strict=True):
+            if len(acted) < begun:
+                acted.append(due_ns + (vehicle.clock.down_ns or 0))
+        return manoeuvre_m_s2(since_s, self._amplitude_m_s2)
+
+    def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
+        """The plan with the margins of what was found; why nothing was; or None while it takes longer."""
+        if self._begin_ns is None or due_ns - self._begin_ns < LONGEST_S * NS_PER_S:
+            self._observe(history)
+            return None
+        return next(self._work)
+
+    def _worked_out(self) -> Iterator[FlightPlan | str | None]:
+        """The result, after a None for each piece of work before it."""
+        found: dict[int, Response] = {}
+        period_s = 1.0 / self._plan.scenario.rates.control_hz
+        for row, vehicle in enumerate(self._vehicles):
+            seen = self._fit(row)
+            if seen is None:
+                yield f"not identified: vehicle {vehicle.system_id} sent too little telemetry in the manoeuvre"
+                return
+            if seen.misfit > MISFIT_MAX:
+                yield (
+                    f"not identified: vehicle {vehicle.system_id} does not answer with a lag, {seen.misfit:.0%} of its "
+                    "velocity is unexplained; [response] in the scenario leaves the manoeuvre out"
+                )
+                return
+            response = found[vehicle.system_id] = seen.response
+            answer = f"lag {response.lag_s:.3f} s, velocity gain {response.velocity_gain_1_s:.2f} 1/s"
+            self._report("response", f"{answer}, misfit {seen.misfit:.1%}", vehicle.system_id)
+            yield None
+        responses = Responses("identified", found)
+        of, margins_s = responses.in_order(self._plan.formation.system_ids), list[float]()
+        for K in self._plan.gains:
+            margins_s.append(sampled_margin(self._plan.model, K, of, period_s=period_s))
+            yield None
+        yield self._plan.with_margins(tuple(margins_s), responses)
+
+    def _observe(self, history: StateHistory) -> None:
+        for row, samples in enumerate(self._samples):
+            newest = history.newest(row)
+            if newest is not None and (not samples or newest[0] > samples[-1][0]):
+                samples.append((newest[0], newest[1][2]))
+
+    def _fit(self, row: int) -> Identified | None:
+        begin_ns = self._begin_ns or 0
+        acted_s = (np.array(self._acted_ns[row], dtype=np.int64) - begin_ns) / NS_PER_S
+        change = self._amplitude_m_s2 * np.array([size for _, size in PROFILE[: acted_s.size]])
+        samples = [(t, v) for t, v in self._samples[row] if t >= begin_ns]
+        sample_s = (np.array([t for t, _ in samples], dtype=np.int64) - begin_ns) / NS_PER_S
+        return identify(acted_s, change, sample_s, np.array([v for _, v in samples], dtype=np.float64))

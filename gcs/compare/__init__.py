@@ -1,0 +1,1 @@
+"""`gcs compare`: the design routes side by side."""

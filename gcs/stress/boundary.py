@@ -1,0 +1,163 @@
+"""The map of a campaign with two axes: where it breaks in flight, where it should, and where it cannot."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.errors import BadModelError
+from gains.jitter import spread_bound
+from gains.several_delays import boundary_of_two_delays, late_by_vehicle
+from gains.varying_delay import varying_delay_bound
+from gcs.stress.axes import Axis, at_coordinates
+from gcs.stress.figures import MEASURED, figure_of, saved
+from gcs.stress.growth import FloatArray
+from gcs.stress.onset import distinct
+from gcs.stress.study import Study
+from gcs.stress.trial import Outcome, plan_loops
+
+_PREDICTED, _GUARANTEED, _SEVERAL = "black", "#1b7837", "#7b3294"
+_POINTS = 60
+
+
+def map_figure(
+    file: Path, *, study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome], verdicts: Sequence[Outcome]
+) -> Path | None:
+    """Measured growth over two axes, mean of the seeds, with the boundary in flight and the predicted ones.
+
+    The marks are of the flights `verdicts`, of which the worst seed counts.
+    """
+    axes = [replace(axis, values=tuple(sorted(axis.values))) for axis in axes]
+    measured = _cells(axes, outcomes, "growth_1_s")
+    predicted = _cells(axes, outcomes, "predicted_growth_1_s")
+    if not np.isfinite(measured).any():
+        return None
+    across, up = (np.array(axis.values) for axis in axes)
+    figure, (plot,) = figure_of(1, (9.0, 6.2))
+    reach = max(1e-6, min(float(np.nanmax(np.abs(measured))), 1.0))
+    colors = plot.pcolormesh(across, up, measured.T, cmap="RdBu_r", vmin=-reach, vmax=reach, shading="nearest")
+    figure.colorbar(colors, ax=plot, label="growth rate in flight [1/s]: red grows", extend="both")
+    for values, color, dashes, label in (
+        (measured, MEASURED, "solid", "boundary in flight"),
+        (predicted, _PREDICTED, "dashed", "predicted: sampled model at the loop delay of each flight"),
+    ):
+        if np.nanmin(values) < 0.0 < np.nanmax(values) and min(values.shape) > 1:
+            plot.contour(across, up, values.T, levels=[0.0], colors=[color], linestyles=[dashes], linewidths=2.0)
+            plot.plot([], [], color=color, linestyle=dashes, linewidth=2.0, label=label)
+    for line in two_delays_lines(study, axes, outcomes):
+        plot.plot(*line.T, color=_SEVERAL, linestyle="dotted", linewidth=3.0, label="predicted: two delays, continuous")
+    line = guaranteed_line(study, axes)
+    if line is not None:
+        label = "guaranteed to the left, however the delay varies"
+        plot.plot(*line.T, color=_GUARANTEED, linestyle="dashdot", linewidth=2.0, label=label)
+    _mark(plot, axes, verdicts, np.abs(measured) > 0.6 * reach)
+    plot.set(xlabel=axes[0].label, ylabel=axes[1].label, xlim=_limits(across), ylim=_limits(up))
+    handles = dict(zip(*reversed(plot.get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside upper left", ncols=2, frameon=False, fontsize=9)
+    return saved(figure, file)
+
+
+def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
+    """(k, 2) link delays and the largest jitters below which the formation is proved stable however the delay varies.
+
+    With jitter of at most j each way and periods T of telemetry and control, the age of the state behind the command
+    in action lies between d - 2 j and d + 2 j + 2 T. It is covered as a deviation from its middle
+    (`gains.jitter.spread_bound`, a search on a grid of frequencies) or as any variation from 0 on
+    (`gains.varying_delay.varying_delay_bound`). None for other axes, for jitter that has no largest value, and for the
+    onboard loop, of which not all feedback is late.
+    """
+    scenario = study.plan.scenario
+    if (
+        [axis.name for axis in axes] != ["delay", "jitter"]
+        or len(axes[0].values) < 2
+        or scenario.control.loop != "ground"
+    ):
+        return None
+    links = at_coordinates(scenario, {"jitter": 1.0}).links
+    every = [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link)]
+    if any(link.jitter is None or link.jitter.distribution != "uniform" for link in every):
+        return None
+    period_s = max(1.0 / scenario.rates.control_hz, 1.0 / scenario.rates.telemetry_hz)
+    loops = [(loop.A, loop.B @ loop.K) for loop in distinct(plan_loops(study.plan))]
+    try:
+        any_s = min(varying_delay_bound(A0, A1, rate=inf) for A0, A1 in loops)
+    except BadModelError:  # the loop is too large for a proof
+        any_s = 0.0
+    delays_s = np.linspace(axes[0].values[0], axes[0].values[-1], _POINTS)
+    around_s = [min(spread_bound(A0, A1, mean_s=delay + period_s) for A0, A1 in loops) for delay in delays_s.tolist()]
+    jitter_s = np.maximum((np.array(around_s) - period_s) / 2.0, (any_s - 2.0 * period_s - delays_s) / 2.0)
+    # no delay is below zero
+    jitter_s = np.minimum(jitter_s, delays_s / 2.0)
+    return np.stack([delays_s, jitter_s], axis=1)[jitter_s >= 0.0]
+
+
+def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[FloatArray]:
+    """The edge of stability over the link delays of two vehicles, from the continuous model of the whole formation.
+
+    Empty for other axes, for the onboard loop, and for vehicles whose loop has others in it: their delays matter too.
+    """
+    if not all(axis.name.startswith("delay_") for axis in axes) or study.plan.scenario.control.loop != "ground":
+        return []
+    ids = [int(axis.name.removeprefix("delay_")) for axis in axes]
+    plan = study.plan
+    if any(system_id in loop.system_ids and len(loop.system_ids) > 1 for loop in plan_loops(plan) for system_id in ids):
+        return []
+    model, places = plan.model, [plan.formation.system_ids.index(system_id) for system_id in ids]
+    late = late_by_vehicle(model.B, plan.gain, [model.input_slice(k) for k in range(model.vehicles)])
+    others = sum((late[k] for k in range(model.vehicles) if k not in places), model.A)
+    # from the model's delay to that of the links: less the hold, and the waiting for the control tick
+    less_s = np.array([0.5 / plan.scenario.rates.control_hz + _waiting_s(outcomes, system_id) for system_id in ids])
+    longest_s = (axes[0].values[-1] + float(less_s[0]), axes[1].values[-1] + float(less_s[1]))
+    lines = boundary_of_two_delays(others, late[places[0]], late[places[1]], longest_s=longest_s)
+    return [line.delays_s - less_s for line in lines]
+
+
+def _waiting_s(outcomes: Sequence[Outcome], system_id: int) -> float:
+    waits = [o.waiting_s for o in outcomes if o.critical == system_id and o.waiting_s is not None]
+    return float(np.median(waits)) if waits else 0.0
+
+
+def _mark(plot: Any, axes: Sequence[Axis], verdicts: Sequence[Outcome], dark: NDArray[np.bool_]) -> None:
+    """The verdict of each cell's flights from the scenario's own initial states; light marks on dark cells."""
+    across, up = (np.array(axis.values) for axis in axes)
+    found = _verdicts(axes, verdicts)
+    for verdict, marker, size in (("unstable", "x", 22), ("stable", "o", 8)):
+        at = np.argwhere(found == verdict)
+        ink = np.where(dark[at[:, 0], at[:, 1]], "white", "#222222")
+        plot.scatter(across[at[:, 0]], up[at[:, 1]], marker=marker, s=size, c=ink, linewidths=0.9)
+        label = f"own initial states: {verdict}"
+        plot.scatter([], [], marker=marker, s=size, c="#222222", linewidths=0.9, label=label)
+
+
+def _limits(values: FloatArray) -> tuple[float, float]:
+    """The outer edges of the cells."""
+    if values.size < 2:
+        return float(values[0]) - 0.5, float(values[0]) + 0.5
+    ordered = np.sort(values)
+    return float(1.5 * ordered[0] - 0.5 * ordered[1]), float(1.5 * ordered[-1] - 0.5 * ordered[-2])
+
+
+def _cells(axes: Sequence[Axis], outcomes: Sequence[Outcome], field: str) -> FloatArray:
+    """A field as an array over two axes, mean of the seeds; NaN where no seed has it."""
+    values = np.full([len(axis.values) for axis in axes], np.nan)
+    for place in np.ndindex(*values.shape):
+        at = {axis.name: axis.values[k] for axis, k in zip(axes, place, strict=True)}
+        known = [getattr(o, field) for o in outcomes if o.coordinates == at]
+        known = [value for value in known if value is not None]
+        if known:
+            values[place] = float(np.mean(known))
+    return values
+
+
+def _verdicts(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> NDArray[np.str_]:
+    """The worst verdict of all seeds at each point, empty where nothing was flown."""
+    worst = np.full([len(axis.values) for axis in axes], "", dtype="U16")
+    for place in np.ndindex(*worst.shape):
+        at = {axis.name: axis.values[k] for axis, k in zip(axes, place, strict=True)}
+        found = {outcome.verdict for outcome in outcomes if outcome.coordinates == at}
+        worst[place] = next((verdict for verdict in ("unstable", "aborted", "stable") if verdict in found), "")
+    return worst

@@ -1,0 +1,173 @@
+"""Many trials, flown on all processors or on a cluster, each stored the moment it ends.
+
+The store is one file of JSON lines to which a finished trial is appended with one system call, so a killed campaign
+loses nothing that was finished, and a later one takes it up: what is stored under a trial's id is not flown again.
+"""
+
+import contextlib
+import ctypes
+import os
+import signal
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from gcs.stress.measure import fly_trial
+from gcs.stress.trial import Outcome, Trial
+
+TRIALS_FILE = "trials.jsonl"
+PARQUET_FILE = "trials.parquet"
+_PR_SET_PDEATHSIG = 1
+
+Fly = Callable[[Sequence[Trial]], Iterator[Outcome]]
+"""Flies trials and gives their outcomes as they end, in any order."""
+Run = Callable[[Sequence[Trial]], list[Outcome]]
+"""Gives the outcomes of trials in their order, flying those that are not stored."""
+
+
+class CampaignError(Exception):
+    """A campaign that cannot go on: one line."""
+
+
+class Store:
+    """The finished trials of a campaign's folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / TRIALS_FILE
+        self.outcomes: dict[str, Outcome] = {}
+        text = self.file.read_bytes() if self.file.exists() else b""
+        for line in text.splitlines():
+            with contextlib.suppress(ValueError, TypeError):  # a line cut short by a kill; its trial is flown again
+                outcome = Outcome.from_json(line.decode())
+                self.outcomes[outcome.id] = outcome
+        self._descriptor = os.open(self.file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        if text and not text.endswith(b"\n"):
+            os.write(self._descriptor, b"\n")
+
+    def add(self, outcome: Outcome) -> None:
+        """Store an outcome; it is in the file when this returns."""
+        self.outcomes[outcome.id] = outcome
+        os.write(self._descriptor, (outcome.to_json() + "\n").encode())
+
+    def close(self) -> None:
+        os.close(self._descriptor)
+
+
+def run_campaign(
+    trials: Sequence[Trial], store: Store, fly: Fly, *, ended: Callable[[Outcome, int], None] | None = None
+) -> list[Outcome]:
+    """The outcomes of trials in their order; those that are not stored are flown, each only once.
+
+    `ended` is called for each trial that has ended, with the number of those still to come.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Also if a flight in real time was ended by Ctrl-C; it does not count as flown.
+    """
+    missing = {trial.id: trial for trial in trials if trial.id not in store.outcomes}
+    left = len(missing)
+    for outcome in fly(list(missing.values())) if missing else ():
+        if (outcome.reason or "").startswith("interrupted"):
+            raise KeyboardInterrupt
+        store.add(outcome)
+        left -= 1
+        if ended is not None:
+            ended(outcome, left)
+    # the same trial may stand at another place of another sweep
+    return [replace(store.outcomes[trial.id], coordinates=dict(trial.coordinates)) for trial in trials]
+
+
+@contextlib.contextmanager
+def local_workers(count: int) -> Generator[Fly]:
+    """Fly trials in `count` processes; with one, in this process."""
+    if count == 1:
+        yield _here
+        return
+    with contextlib.ExitStack() as stack:
+        pools: list[ProcessPoolExecutor] = []
+
+        def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
+            if not pools:
+                pools.append(_pool(count))
+                stack.callback(pools[0].shutdown, cancel_futures=True)
+            try:
+                for future in as_completed([pools[0].submit(fly_trial, trial) for trial in trials]):
+                    yield future.result()
+            except BrokenProcessPool:
+                raise CampaignError(
+                    "a worker process was killed, perhaps for want of memory; try fewer --workers, with --resume"
+                ) from None
+
+        yield fly
+
+
+@contextlib.contextmanager
+def dask_workers(address: str) -> Generator[Fly]:
+    """Fly trials on the workers of a Dask cluster, which have this package installed.
+
+    Raises
+    ------
+    CampaignError
+        If `distributed` is not installed or there is no scheduler at the address.
+    """
+    try:
+        from distributed import Client
+        from distributed import as_completed as dask_as_completed
+    except ImportError:
+        raise CampaignError("--dask: the package distributed is not installed, wanted the extra [cluster]") from None
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        raise CampaignError(f"--dask: read {address!r} ({error}), wanted the address of a Dask scheduler") from None
+
+    def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
+        # the id as key: a scheduler that still has the result of an earlier client gives it without a flight
+        futures = [client.submit(fly_trial, trial, key=f"trial-{trial.id}", pure=True) for trial in trials]
+        for _, outcome in dask_as_completed(futures, with_results=True):
+            yield outcome
+
+    with client:
+        yield fly
+
+
+def write_parquet(outcomes: Iterable[Outcome], folder: Path) -> Path:
+    """All outcomes as one table: a column for each field, and `at_<axis>` for each axis of the campaign."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = [_row(outcome) for outcome in outcomes]
+    names = dict.fromkeys(name for row in rows for name in row)
+    table = pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
+    part = folder / (PARQUET_FILE + ".new")
+    pq.write_table(table, part, compression="zstd")
+    return part.replace(folder / PARQUET_FILE)
+
+
+def _row(outcome: Outcome) -> dict[str, Any]:
+    row = asdict(outcome)
+    coordinates = row.pop("coordinates")
+    return row | {f"at_{name}": value for name, value in coordinates.items()}
+
+
+def _here(trials: Sequence[Trial]) -> Iterator[Outcome]:
+    return map(fly_trial, trials)
+
+
+def _pool(count: int) -> ProcessPoolExecutor:
+    # spawn: a fork would copy the threads' locks of whatever the user's process has loaded
+    return ProcessPoolExecutor(
+        count, mp_context=get_context("spawn"), initializer=_prepare_worker, initargs=(os.getpid(),)
+    )
+
+
+def _prepare_worker(parent: int) -> None:
+    """Ctrl-C is the parent's to answer; and without a parent there is nobody to fly for."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:  # it died while this process was starting, before it could be told
+        os._exit(1)

@@ -1,0 +1,170 @@
+"""The figures of a campaign, as PNG files."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs.stress.axes import Axis
+from gcs.stress.onset import Loop, distinct
+from gcs.stress.study import Onset, Study
+from gcs.stress.trial import Outcome, plan_loops
+
+FloatArray = NDArray[np.float64]
+
+SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
+_DPI = 130
+_WORST = 6
+
+
+def growth_figure(
+    file: Path, *, study: Study, outcomes: Sequence[Outcome], own: Sequence[Outcome], onset: Onset | None
+) -> Path | None:
+    """Growth rate against loop delay: both models, the flights with their errors, and what is left between them.
+
+    `own`, the flights from the scenario's own initial states, are marks at the lower edge.
+    """
+    probes = [o for o in outcomes if o.growth_1_s is not None and o.loop_delay_s is not None]
+    if not probes:
+        return None
+    delay_s = np.array([o.loop_delay_s for o in probes], dtype=float)
+    measured = np.array([o.growth_1_s for o in probes], dtype=float)
+    predicted = np.array([o.predicted_growth_1_s for o in probes], dtype=float)
+    error = np.array([o.growth_error_1_s for o in probes], dtype=float)
+    figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
+    room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
+    grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 240)
+    sampled, continuous = _curves(distinct(plan_loops(study.plan)), grid_s)
+    above.axhline(0.0, color=LIMIT, linewidth=0.8)
+    above.plot(grid_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
+    above.plot(grid_s, sampled, color=SAMPLED, linewidth=1.4, label="sampled model, exact")
+    style: dict[str, Any] = {"fmt": "o", "color": MEASURED, "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0}
+    above.errorbar(delay_s, measured, yerr=error, label="flights", zorder=3, **style)
+    _mark_own(above, own)
+    margin_s = study.plan.delay_margin_s
+    if grid_s[0] <= margin_s <= grid_s[-1]:
+        above.axvline(margin_s, color=SAMPLED, linestyle="--", linewidth=1.0)
+        text = f" margin {margin_s:.4f} s"
+        above.annotate(text, (margin_s, float(measured.min())), color=SAMPLED, ha="left", va="bottom", fontsize=9)
+    if onset is not None:
+        above.plot([onset.loop_delay_s], [0.0], marker="D", color="none", markeredgecolor=MEASURED, markersize=11)
+        text = f"onset in flight {onset.loop_delay_s:.4f} s"
+        at = (onset.loop_delay_s, 0.0)
+        above.annotate(text, at, xytext=(12, -16), textcoords="offset points", color=MEASURED, ha="left", fontsize=9)
+        _link_delay_axis(above, onset)
+    above.set_ylabel("growth rate of errors [1/s]\n< 0 they die away, > 0 they grow")
+    figure.legend(loc="outside upper left", ncols=3, frameon=False, fontsize=9)
+    below.axhline(0.0, color=LIMIT, linewidth=0.8)
+    below.errorbar(delay_s, measured - predicted, yerr=error, **style)
+    below.set_ylabel("flight − sampled\n[1/s]")
+    below.set_xlabel("loop delay of the flight [s]")
+    below.ticklabel_format(axis="y", scilimits=(-2, 2))
+    above.sharex(below)
+    return saved(figure, file)
+
+
+def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path | None:
+    """Growth rate against any one axis: flights, and the sampled model at the loop delay that each had."""
+    probes = [o for o in outcomes if o.growth_1_s is not None]
+    if not probes:
+        return None
+    figure, (plot,) = figure_of(1, (9.0, 4.2))
+    at = [o.coordinates[axis.name] for o in probes]
+    plot.axhline(0.0, color=LIMIT, linewidth=0.8)
+    plot.plot(at, [o.predicted_growth_1_s for o in probes], "_", color=SAMPLED, markersize=14, label="sampled model")
+    plot.errorbar(
+        at,
+        [o.growth_1_s for o in probes],
+        yerr=[o.growth_error_1_s for o in probes],
+        fmt="o", color=MEASURED, markersize=4.0, capsize=2.0, label="flights",
+    )  # fmt: skip
+    plot.set_xlabel(axis.label)
+    plot.set_ylabel("growth rate of errors [1/s]")
+    plot.legend(frameon=False)
+    return saved(figure, file)
+
+
+def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
+    """The largest spacing error of the worst flights over time."""
+    worst = worst_of(outcomes)
+    if not worst:
+        return None
+    figure, (plot,) = figure_of(1, (9.0, 4.2))
+    for outcome in worst:
+        error_m = np.maximum(np.array(outcome.trace_m), 1e-6)
+        time_s = outcome.trace_period_s * (np.arange(error_m.size) + 0.5)
+        plot.semilogy(time_s, error_m, linewidth=1.3, label=f"{outcome.id}  {outcome.kind}, {_place(outcome)}")
+    plot.set_xlabel("scenario time [s]")
+    plot.set_ylabel("largest spacing error of all vehicles [m]")
+    plot.legend(frameon=False, fontsize=8)
+    return saved(figure, file)
+
+
+def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """The flights that broke soonest, or else came nearest to it: own initial states before probes."""
+    flown = [outcome for outcome in outcomes if outcome.trace_m]
+    own = [outcome for outcome in flown if outcome.kind == "own"]
+
+    def badness(outcome: Outcome) -> tuple[bool, float, float]:
+        broke = (outcome.reason or "").startswith("broken")
+        return broke, -float(len(outcome.trace_m)) if broke else 0.0, outcome.spacing_error_max_m or 0.0
+
+    return sorted(own or flown, key=badness, reverse=True)[:_WORST]
+
+
+def _place(outcome: Outcome) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in outcome.coordinates.items())
+
+
+def _curves(kinds: Sequence[Loop], delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Growth rates of the formation by the sampled and the continuous model: the largest of its loops'."""
+    sampled = np.array([[kind.growth_1_s(float(at)) for at in delay_s] for kind in kinds])
+    continuous = np.array([[kind.growth_continuous_1_s(float(at)) for at in delay_s] for kind in kinds])
+    return sampled.max(axis=0), continuous.max(axis=0)
+
+
+def figure_of(
+    rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
+) -> tuple[Any, Any]:
+    """A figure that needs no screen, and its plots: a list from the top, or rows of columns if there are several."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    plots = figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
+    for plot in plots.flat:
+        plot.grid(visible=True, color="#dddddd", linewidth=0.6)
+        plot.spines[["top", "right"]].set_visible(False)
+        plot.set_axisbelow(True)
+    return figure, plots if columns > 1 else plots[:, 0]
+
+
+def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
+    """Verdicts of flights with large errors, at the link delay's loop delay, along the lower edge."""
+    for verdict, marker, color in (("stable", "o", SAMPLED), ("unstable", "x", MEASURED)):
+        at = [o.loop_delay_s for o in own if o.verdict == verdict and o.loop_delay_s is not None]
+        if at:
+            label = f"own initial states: {verdict}"
+            edge = {"transform": plot.get_xaxis_transform(), "clip_on": False}
+            plot.plot(at, [0.02] * len(at), marker, color=color, markersize=5, fillstyle="none", label=label, **edge)
+
+
+def _link_delay_axis(plot: Any, onset: Onset) -> None:
+    """The same delays as link delays, at the top."""
+
+    def to_link_s(loop_delay_s: FloatArray) -> FloatArray:
+        return loop_delay_s - onset.waiting_s
+
+    def to_loop_s(link_delay_s: FloatArray) -> FloatArray:
+        return link_delay_s + onset.waiting_s
+
+    top = plot.secondary_xaxis("top", functions=(to_link_s, to_loop_s))
+    top.set_xlabel(f"link delay of vehicle {onset.critical}, up + down [s]: {1e3 * onset.waiting_s:.1f} ms less")
+
+
+def saved(figure: Any, file: Path) -> Path:
+    figure.savefig(file, dpi=_DPI)
+    return file

@@ -1,0 +1,234 @@
+"""A trial is flown and judged: the growth rate of the loop that breaks first, and the verdict of the whole flight.
+
+A *probe* measures the growth rate of one loop, see `gcs.stress.probe`; where links lose or delay at random, by the
+difference of two flights, see `gcs.stress.free_response`. An *own* trial flies the scenario's own initial states,
+large errors and all, and gives the verdict that `gcs fly` would give. In both the monitor only watches: the margin of
+the designed gains is on trial, not what is done before it is reached.
+"""
+
+import time  # noqa: TID251 - the time a trial takes is for the progress bar and the report; nothing flown depends on it
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gcs.flown import fly_plan, fly_virtual, median_delays_s
+from gcs.plan import FlightPlan
+from gcs.stress.axes import has_constant_links
+from gcs.stress.free_response import FreeResponse, effective_delays_s, fly_calm, response_alone, response_paired
+from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth
+from gcs.stress.onset import Loop, critical_loop
+from gcs.stress.probe import PROBE_S, probe_scenario
+from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_loops, plan_of, with_summary
+
+AMPLITUDES = (1.0, 0.03, 0.001)
+"""Initial error of a probe in m (the leader's in m/s); the next is for growth that leaves the linear range too soon."""
+_PILOT_S = 1.0
+_SETTLED_LOOP_DELAYS = 4.0
+"""Modes other than the slowest are gone, or small enough to be fitted along, after this many loop delays."""
+_FLYING_LOOP_DELAYS = 1.0
+"""Until then the states used are those of vehicles on the launcher; enough where nothing is fed back late."""
+_BEGUN_LOOP_DELAYS = 2.0
+"""Nothing that a vehicle did at the start is left to be acted on after this many."""
+_CALM_SHARE = 0.8
+"""A disturbed flight that stays in the linear range for this part of the time that the calm one does is long enough."""
+_WANTED_LOOP_DELAYS = 8.0
+_WANTED_SAMPLES = 60
+_WANTED_ERROR = 0.01
+"""Standard error of a growth rate as a share of it: with several vehicles in a loop other modes take long to go."""
+
+
+def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
+    """Fly a trial and judge it; never raises: what it meets is in the outcome's `error`.
+
+    With `folder` the files of its flight are left there as `gcs fly` leaves them, for a probe in one folder for each
+    size of the initial error that was flown. In real time they are written anyway, and go again without `folder`.
+    """
+    began_s = time.perf_counter()
+    outcome = Outcome(
+        id=trial.id,
+        kind=trial.kind,
+        seed=trial.scenario.seed,
+        coordinates=dict(trial.coordinates),
+        real_time=trial.real_time,
+        probe=trial.probe,
+    )
+    try:
+        measure = _own if trial.kind == "own" else _pair if _needs_pair(trial) else _probe
+        outcome = measure(trial, outcome, folder)
+    except Exception:  # noqa: BLE001 - a campaign of thousands goes on; what happened is recorded with its inputs
+        outcome = replace(outcome, error=traceback.format_exc())
+    return replace(outcome, elapsed_s=round(time.perf_counter() - began_s, 3))
+
+
+def _needs_pair(trial: Trial) -> bool:
+    """Whether one flight cannot show the free response of one loop, as `gcs.stress.probe` wants it; not in real time,
+    where no two flights have the same delays."""
+    links = {trial.scenario.link_of(vehicle.system_id) for vehicle in trial.scenario.vehicles}
+    coupled = any(len(loop.system_ids) > 1 for loop in plan_loops(plan_of(trial)))
+    return not trial.real_time and (not has_constant_links(trial.scenario) or (coupled and len(links) > 1))
+
+
+def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
+    plan = plan_of(trial)
+    flight = fly_plan(plan, real_time=trial.real_time, folder=folder)
+    outcome = with_summary(plan, flight, outcome)
+    flown = flight.ticks[flight.ticks["time_s"] >= 0.0]
+    delays_s = median_delays_s(flown, plan.formation.system_ids)
+    loop = critical_loop(plan_loops(plan), delays_s)
+    slowest = max(loop.system_ids, key=lambda system_id: delays_s[system_id])
+    up, down = plan.scenario.link_of(slowest)
+    outcome = replace(
+        outcome,
+        critical=loop.system_ids[0],
+        link_delay_s=up.delay_s + down.delay_s,
+        loop_delay_s=round(delays_s[slowest], 9),
+        predicted_growth_1_s=finite(loop.growth_at_1_s(delays_s)),
+        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(delays_s)),
+    )
+    start_s = _BEGUN_LOOP_DELAYS * delays_s[slowest]
+    growth = envelope_growth(np.array(outcome.trace_m), period_s=TRACE_PERIOD_S, start_s=start_s)
+    return outcome if growth is None else _with_fit(outcome, growth)
+
+
+def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
+    """One loop alone, on links that are all those of the loop that is the first to break."""
+    base = plan_of(trial)
+    pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": _PILOT_S})))
+    probed, critical, waiting_s = _choose(base, median_delays_s(pilot.ticks, base.formation.system_ids), trial.probe)
+    up, down = links = base.scenario.link_of(critical.system_ids[0])
+    outcome = replace(
+        outcome,
+        probed=probed.system_ids[0],
+        critical=critical.system_ids[0],
+        link_delay_s=up.delay_s + down.delay_s,
+        waiting_s=round(waiting_s, 9),
+    )
+
+    def respond(amplitude: float) -> FreeResponse:
+        scenario = probe_scenario(base, probed.system_ids, amplitude=amplitude, links=links, waiting_s=waiting_s)
+        run = _folder_of(folder, amplitude)
+        return response_alone(base, scenario, probed.system_ids, real_time=trial.real_time, folder=run)
+
+    return _with_response(probed, respond, outcome)
+
+
+def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
+    """The loop that is the first to break, on the scenario's own links, by the difference of two flights."""
+    base = plan_of(trial)
+    calm = fly_calm(base, _folder_of(folder, 0.0))
+    delays_s = effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
+    loops = plan_loops(base)
+    if trial.probe == CRITICAL:
+        probed = critical_loop(loops, delays_s)
+    else:
+        probed = next(loop for loop in loops if trial.probe in loop.system_ids)
+    slowest = max(probed.system_ids, key=lambda system_id: delays_s[system_id])
+    up, down = base.scenario.link_of(slowest)
+    outcome = replace(
+        outcome,
+        probed=probed.system_ids[0],
+        critical=probed.system_ids[0],
+        link_delay_s=up.delay_s + down.delay_s,
+        waiting_s=round(delays_s[slowest] - up.delay_s - down.delay_s, 9),
+    )
+
+    def respond(amplitude: float) -> FreeResponse:
+        run = _folder_of(folder, amplitude)
+        return response_paired(base, calm, probed.system_ids, amplitude=amplitude, folder=run)
+
+    return _with_response(probed, respond, outcome)
+
+
+def _folder_of(folder: Path | None, amplitude: float) -> Path | None:
+    return None if folder is None else folder / f"error-{amplitude:g}-m"
+
+
+def _with_response(loop: Loop, respond: Callable[[float], FreeResponse], outcome: Outcome) -> Outcome:
+    """The outcome with what the response to a metre of error shows, or to less where that grows too fast."""
+    for amplitude in AMPLITUDES:
+        response = respond(amplitude)
+        outcome = with_summary(response.plan, response.flight, replace(outcome, amplitude_m=amplitude))
+        outcome = _with_growth(loop, response, outcome)
+        if outcome.growth_1_s is not None:
+            outcome = replace(outcome, verdict="unstable" if outcome.growth_1_s > 0.0 else "stable")
+        # a flight that never left the linear range has infinity for both
+        if not _left_linear_range_too_soon(outcome) or response.until_s >= _CALM_SHARE * response.calm_until_s:
+            break
+    return outcome
+
+
+def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tuple[Loop, Loop, float]:
+    """The loop to be probed, the loop it stands for, and the waiting of the latter for the control tick.
+
+    The first to break may be far down the tree, where whatever moves ahead of it would drive it, so the same loop
+    nearest to the leader is probed for it, with its links and its waiting.
+    """
+    loops, links = plan_loops(plan), plan.scenario.links
+    if probe == CRITICAL:
+        critical = critical_loop(loops, loop_delay_s)
+        probed = next(loop for loop in loops if loop.same_as(critical))
+    else:
+        probed = critical = next(loop for loop in loops if probe in loop.system_ids)
+    slowest = max(critical.system_ids, key=lambda system_id: loop_delay_s[system_id])
+    up, down = links.of(slowest)
+    return probed, critical, (loop_delay_s[slowest] - up.delay_s - down.delay_s) % critical.period_s
+
+
+def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcome:
+    """The outcome with the growth rate of the probed loop, and the rates predicted at the loop delays it had."""
+    own = response.errors
+    outcome = replace(outcome, growth_1_s=None, growth_error_1_s=None, fit_samples=None)
+    if not own.size:
+        return outcome
+    since_s = own["time_s"] - own["time_s"][0]
+    delay_s = max(response.loop_delays_s(own, loop.system_ids).values())
+    settled = _SETTLED_LOOP_DELAYS if loop.has_late_terms else _FLYING_LOOP_DELAYS
+    start_s = settled * delay_s + 2.0 * loop.period_s
+    # as many of one axis as its states, and as many again of what is late; the other axis has the same
+    modes = max(FOLLOWER_MODES, len(loop.A))
+    motion = motion_of(own, loop.system_ids, period_s=loop.period_s)
+    if response.varying:
+        growth = norm_growth(motion, start_s=start_s, end_s=response.until_s)
+    else:
+        growth = fit_growth(motion, start_s=start_s, end_s=response.until_s, modes=modes)
+    if growth is None:
+        return replace(outcome, fit_start_s=round(start_s, 6), fit_end_s=round(min(response.until_s, since_s[-1]), 6))
+    window = own[(since_s >= growth.start_s) & (since_s <= growth.end_s)]
+    delays_s = response.loop_delays_s(window, loop.system_ids)
+    spread_s = float(np.nanpercentile(window["loop_delay_s"], 90) - np.nanmedian(window["loop_delay_s"]))
+    return replace(
+        _with_fit(outcome, growth),
+        loop_delay_s=round(max(delays_s.values()), 9),
+        loop_delay_spread_s=round(spread_s, 9),
+        predicted_growth_1_s=finite(loop.growth_at_1_s(delays_s)),
+        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(delays_s)),
+    )
+
+
+def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
+    return replace(
+        outcome,
+        growth_1_s=finite(growth.growth_1_s),
+        growth_error_1_s=finite(growth.error_1_s),
+        frequency_rad_s=finite(growth.frequency_rad_s),
+        fit_start_s=round(growth.start_s, 6),
+        fit_end_s=round(growth.end_s, 6),
+        fit_samples=growth.samples,
+    )
+
+
+def _left_linear_range_too_soon(outcome: Outcome) -> bool:
+    """Whether a smaller error would show more: the flight grew, and left too short a window."""
+    if outcome.fit_start_s is None or outcome.fit_end_s is None:
+        return False
+    if outcome.growth_1_s is None:
+        return outcome.fit_end_s < PROBE_S / 2.0
+    short = (outcome.fit_samples or 0) < _WANTED_SAMPLES
+    short |= outcome.fit_end_s - outcome.fit_start_s < _WANTED_LOOP_DELAYS * (outcome.loop_delay_s or 0.0)
+    short |= (
+        outcome.fit_end_s < PROBE_S / 2.0 and (outcome.growth_error_1_s or 0.0) > _WANTED_ERROR * outcome.growth_1_s
+    )
+    return short and outcome.growth_1_s > 0.0

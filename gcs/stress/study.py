@@ -1,0 +1,250 @@
+"""What a campaign asks: the growth rate over axes, and where it passes zero."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from gcs.plan import FlightPlan
+from gcs.stress.axes import Axis, at_coordinates, has_constant_links
+from gcs.stress.campaign import Run
+from gcs.stress.onset import GrowthPoint, Loop, Zero, distinct, locate_zero
+from gcs.stress.trial import CRITICAL, Kind, Outcome, Trial, plan_loops, sparse_gain
+
+_ROUNDS = 8
+_FLIGHTS_A_ROUND = 5
+_LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
+"""Link delays flown where no delay is to break the formation."""
+_FIRST_WIDTH = 3.0
+"""Half width of the first round of an onset search, in tolerances."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """The trials of a scenario: one plan whose gains are kept, whatever is varied."""
+
+    plan: FlightPlan
+    real_time: bool = False
+
+    def trial(self, kind: Kind, coordinates: dict[str, float], *, seed: int, probe: int = CRITICAL) -> Trial:
+        """The trial at one point. `seed` is the scenario's, which draws clocks, jitter and loss."""
+        scenario = at_coordinates(self.plan.scenario, coordinates).model_copy(update={"seed": seed})
+        return Trial(
+            scenario=scenario,
+            gain=sparse_gain(self.plan.gain),
+            delay_margin_s=self.plan.delay_margin_s,
+            kind=kind,
+            probe=probe,
+            real_time=self.real_time,
+            coordinates=tuple(coordinates.items()),
+        )
+
+    def sweep(self, axes: Sequence[Axis], *, seeds: int) -> list[Trial]:
+        """The trials of a sweep (one axis) or map (two), with the scenario's seed and those that follow it.
+
+        At every point a probe and the scenario's own flight. In real time links that lose or delay at random leave no
+        free response to probe, since no two flights have the same delays: then only the latter.
+        """
+        points = [dict(zip([a.name for a in axes], at, strict=True)) for at in product(*(a.values for a in axes))]
+        constant = all(has_constant_links(at_coordinates(self.plan.scenario, point)) for point in points)
+        kinds: tuple[Kind, ...] = ("own",) if self.real_time and not constant else ("probe", "own")
+        first = self.plan.scenario.seed
+        return [self.trial(kind, point, seed=first + k) for kind, point, k in product(kinds, points, range(seeds))]
+
+
+@dataclass(frozen=True)
+class Onset:
+    """Where the formation breaks, in flight and in the models.
+
+    All delays are loop delays of the vehicle that breaks first but `link_delay_s`, which is the total link delay, up
+    plus down, at which it has that loop delay: `waiting_s` less. `predicted_s` is the sampled margin that the design
+    claims, `difference` measured over predicted less one. `predicted_continuous_s` is the continuous model's margin
+    less half a period for the hold.
+    """
+
+    loop_delay_s: float
+    error_s: float
+    predicted_s: float
+    predicted_continuous_s: float
+    difference: float
+    link_delay_s: float
+    waiting_s: float
+    slope_1_s2: float
+    frequency_rad_s: float
+    probed: int
+    critical: int
+    rounds: int
+    flights: tuple[Outcome, ...]
+    checks: tuple[Outcome, ...]
+    """Probes of the other kinds of loops and of the last vehicle, at the onset."""
+    own: tuple[Outcome, ...]
+    """The scenario's own initial states, at nine tenths of the onset's link delay and at eleven."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types for JSON; of the flights only what identifies them."""
+        plain = asdict(self)
+        for name in ("flights", "checks", "own"):
+            plain[name] = [outcome.id for outcome in getattr(self, name)]
+        return plain
+
+
+class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
+    """There is no delay at which the formation begins to break, or it was not found: one line that says why.
+
+    `as_predicted` says that the margin has no limit and that flights bear it out.
+    """
+
+    def __init__(self, line: str, *, as_predicted: bool = False) -> None:
+        super().__init__(line)
+        self.as_predicted = as_predicted
+
+
+def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
+    """Fly probes around the predicted onset, closer and closer, until the zero of their growth rates is located.
+
+    A round is a few flights at once, spread evenly over three tolerances to either side at first, then over one. The
+    search follows the measured growth wherever it leads: the prediction only says where to begin.
+
+    Raises
+    ------
+    NoOnset
+        With the reason.
+    """
+    predicted_s = study.plan.delay_margin_s
+    if predicted_s == np.inf:
+        raise _no_limit(study, run, tolerance=tolerance)
+    if predicted_s <= 0.0:
+        raise NoOnset(f"the predicted margin is {predicted_s:g} s: there is no delay at which it is stable")
+    seed, period_s = study.plan.scenario.seed, 1.0 / study.plan.scenario.rates.control_hz
+    centre_s, width_s = predicted_s - period_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
+    flights: dict[str, Outcome] = {}
+    for round_number in range(1, _ROUNDS + 1):
+        spread = centre_s + width_s * np.linspace(-1.0, 1.0, _FLIGHTS_A_ROUND)
+        links_s = dict.fromkeys(round(float(delay_s), 6) for delay_s in np.maximum(spread, 0.0))
+        flown = run([study.trial("probe", {"delay": link_s}, seed=seed) for link_s in links_s])
+        flights |= {outcome.id: outcome for outcome in flown}
+        near = [o for o in flights.values() if abs((o.link_delay_s or 0.0) - centre_s) <= 1.001 * width_s]
+        zero = locate_zero(points_of(near))
+        if zero is None:
+            centre_s, width_s = centre_s + _downhill(near) * width_s, 2.0 * width_s
+            continue
+        waiting_s = _waiting_s(near)
+        ahead_s = max(0.0, zero.loop_delay_s - waiting_s) - centre_s
+        if zero.inside and width_s <= 1.001 * tolerance * predicted_s:
+            return _found(study, run, zero, near, tuple(flights.values()), rounds=round_number)
+        if centre_s <= 0.0 and ahead_s <= 0.0:
+            break
+        # no farther than twice the width at once: a far extrapolation is a guess
+        centre_s += float(np.clip(ahead_s, -2.0 * width_s, 2.0 * width_s))
+        width_s = tolerance * predicted_s if abs(ahead_s) < width_s else width_s
+    failed = sum(outcome.growth_1_s is None for outcome in flights.values())
+    raise NoOnset(
+        f"growth did not pass zero in {len(flights)} flights with {min(links_of(flights.values())):.3f} to "
+        f"{max(links_of(flights.values())):.3f} s of link delay ({failed} without a growth rate)"
+    )
+
+
+def _no_limit(study: Study, run: Run, *, tolerance: float) -> NoOnset:
+    """What flights show of a loop that no delay is to break."""
+    flown = run([study.trial("probe", {"delay": d}, seed=study.plan.scenario.seed) for d in _LIMITLESS_LINKS_S])
+    pairs = [(o.growth_1_s, o.predicted_growth_1_s) for o in flown]
+    known = [(measured, predicted) for measured, predicted in pairs if measured is not None and predicted is not None]
+    off = max((abs(measured - predicted) / abs(predicted) for measured, predicted in known), default=np.inf)
+    steady = len(known) == len(flown) and off <= tolerance and all(measured < 0.0 for measured, _ in known)
+    first_s, *_, last_s = _LIMITLESS_LINKS_S
+    said = f"the margin has no limit; in {len(flown)} flights with {first_s:g} to {last_s:g} s of link delay"
+    if not known:
+        return NoOnset(f"{said} no growth rate could be measured")
+    slowest, expected = max(known)
+    return NoOnset(
+        f"{said} errors decay at {-slowest:.5f} 1/s or faster, predicted {-expected:.5f} 1/s, at most {off:.3%} apart",
+        as_predicted=steady,
+    )
+
+
+def points_of(outcomes: Sequence[Outcome]) -> list[GrowthPoint]:
+    """The measured rates of those outcomes that have one."""
+    return [
+        GrowthPoint(o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
+        for o in outcomes
+        if o.growth_1_s is not None and o.loop_delay_s is not None
+    ]
+
+
+def links_of(outcomes: Any) -> list[float]:
+    """Link delays of outcomes, up plus down."""
+    return [outcome.link_delay_s or 0.0 for outcome in outcomes]
+
+
+def curve_error(outcomes: Sequence[Outcome]) -> float | None:
+    """Largest difference of measured and predicted growth rates, as a part of the range of the predicted ones."""
+    pairs = [
+        (o.growth_1_s, o.predicted_growth_1_s)
+        for o in outcomes
+        if o.kind == "probe" and o.growth_1_s is not None and o.predicted_growth_1_s is not None
+    ]
+    if len(pairs) < 2:
+        return None
+    measured, predicted = np.array(pairs, dtype=float).T
+    spread = float(np.ptp(predicted))
+    return float(np.abs(measured - predicted).max()) / spread if spread > 0.0 else None
+
+
+def _downhill(near: Sequence[Outcome]) -> float:
+    """+1 to look at longer delays, -1 at shorter ones."""
+    rates = [outcome.growth_1_s for outcome in near if outcome.growth_1_s is not None]
+    return -1.0 if rates and min(rates) > 0.0 else 1.0
+
+
+def _waiting_s(outcomes: Sequence[Outcome]) -> float:
+    waits = [o.loop_delay_s - o.link_delay_s for o in outcomes if o.loop_delay_s and o.link_delay_s is not None]
+    return float(np.median(waits)) if waits else 0.0
+
+
+def _found(
+    study: Study, run: Run, zero: Zero, near: Sequence[Outcome], flights: tuple[Outcome, ...], *, rounds: int
+) -> Onset:
+    """The onset with its predictions and the flights that check it."""
+    loops = plan_loops(study.plan)
+    nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.loop_delay_s))
+    assert nearest.probed is not None
+    assert nearest.critical is not None
+    loop = next(loop for loop in loops if nearest.probed in loop.system_ids)
+    margins_s = [kind.margin_s() for kind in distinct(loops)]
+    # of the loop of least margin the design's own figure is on trial, the one that the station flies by
+    predicted_s = study.plan.delay_margin_s if loop.margin_s() == min(margins_s) else loop.margin_s()
+    waiting_s = _waiting_s(near)
+    link_s = max(0.0, zero.loop_delay_s - waiting_s)
+    seed = study.plan.scenario.seed
+    checks = run(
+        [
+            study.trial("probe", {"delay": round(link_s, 6)}, seed=seed, probe=system_id)
+            for system_id in _to_check(loops, loop)
+        ]
+    )
+    own = run([study.trial("own", {"delay": round(part * link_s, 6)}, seed=seed) for part in (0.9, 1.1)])
+    return Onset(
+        loop_delay_s=zero.loop_delay_s,
+        error_s=zero.error_s,
+        predicted_s=predicted_s,
+        predicted_continuous_s=loop.margin_continuous_s(),
+        difference=zero.loop_delay_s / predicted_s - 1.0,
+        link_delay_s=link_s,
+        waiting_s=waiting_s,
+        slope_1_s2=zero.slope_1_s2,
+        frequency_rad_s=nearest.frequency_rad_s or 0.0,
+        probed=nearest.probed,
+        critical=nearest.critical,
+        rounds=rounds,
+        flights=tuple(sorted(flights, key=lambda outcome: outcome.link_delay_s or 0.0)),
+        checks=tuple(checks),
+        own=tuple(own),
+    )
+
+
+def _to_check(loops: Sequence[Loop], probed: Loop) -> list[int]:
+    """One vehicle of every other kind of loop, and the last vehicle."""
+    others = [kind.system_ids[0] for kind in distinct(loops) if not kind.same_as(probed)]
+    return list(dict.fromkeys([*others, loops[-1].system_ids[-1]]))

@@ -1,0 +1,172 @@
+"""One trial and its outcome: a formation flown once, and what that says of its stability. Both can be pickled.
+
+`gcs.stress.measure` flies it.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from typing import Literal, Self
+
+import numpy as np
+
+from gcs.flown import Flight, margins_of
+from gcs.onboard import timing_of
+from gcs.plan import FlightPlan, plan_formation
+from gcs.record import TickArray
+from gcs.stress.growth import FloatArray
+from gcs.stress.onset import Loop, loops_of
+from gcs.summary import summarise
+from scenarios.schema import Scenario
+
+Kind = Literal["probe", "own"]
+CRITICAL = 0
+"""In place of a system id: probe the loop that is predicted to be the first to break."""
+
+TRACE_PERIOD_S = 0.25
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Everything a trial depends on. `coordinates` say where it stands in a campaign, and have no effect on it.
+
+    `gain` holds the entries (row, column, value) of K that are not zero, `probe` the system id of a vehicle of the loop
+    to be probed, or `CRITICAL`.
+    """
+
+    scenario: Scenario
+    gain: tuple[tuple[int, int, float], ...]
+    delay_margin_s: float
+    kind: Kind
+    probe: int = CRITICAL
+    real_time: bool = False
+    coordinates: tuple[tuple[str, float], ...] = ()
+
+    @cached_property
+    def id(self) -> str:
+        """A hash of the inputs: the same trial has the same id anywhere."""
+        inputs = [self.scenario.model_dump(mode="json"), self.gain, self.delay_margin_s, self.kind, self.probe]
+        text = json.dumps([*inputs, self.real_time], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came out of a trial: one row of the campaign's table. None where it is unknown or does not apply.
+
+    `verdict` is that of the whole flight for an own trial, the sign of the growth rate for a probe. `probed` is the
+    first vehicle of the loop that was measured; it stands for the loop of vehicle `critical`, whose `waiting_s` for
+    the control tick it has. `loop_delay_s` is the effective one over the window of the fit (`gcs.effective_delay`; on
+    constant links each is it), for an own trial the median that was measured in flight. `loop_delay_spread_s` is by how
+    much the 90th percentile of the measured ones is above their median. `predicted_*` are the models' growth rates at
+    that delay. The growth of an own trial is that of the envelope of all spacing errors, which is rough.
+    `ticks_sha256` is that of the tick log, in virtual time: the same trial has the same in any process.
+    `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`. `error` holds a traceback if the
+    trial itself failed.
+    """
+
+    id: str
+    kind: Kind
+    seed: int
+    coordinates: dict[str, float]
+    real_time: bool
+    probe: int = CRITICAL
+    probed: int | None = None
+    critical: int | None = None
+    verdict: str | None = None
+    reason: str | None = None
+    growth_1_s: float | None = None
+    growth_error_1_s: float | None = None
+    frequency_rad_s: float | None = None
+    predicted_growth_1_s: float | None = None
+    predicted_growth_continuous_1_s: float | None = None
+    loop_delay_s: float | None = None
+    loop_delay_spread_s: float | None = None
+    link_delay_s: float | None = None
+    waiting_s: float | None = None
+    fit_start_s: float | None = None
+    fit_end_s: float | None = None
+    fit_samples: int | None = None
+    amplitude_m: float | None = None
+    spacing_error_max_m: float | None = None
+    spacing_error_final_m: float | None = None
+    lateness_s_p50: float | None = None
+    lateness_s_p99: float | None = None
+    steal_share: float | None = None
+    busy_share: float | None = None
+    ticks_sha256: str | None = None
+    trace_period_s: float = TRACE_PERIOD_S
+    trace_m: list[float] = field(default_factory=list[float])
+    elapsed_s: float = 0.0
+    error: str | None = None
+
+    def to_json(self) -> str:
+        """One line."""
+        return json.dumps(asdict(self), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, line: str) -> Self:
+        return cls(**json.loads(line))
+
+
+def sparse_gain(K: FloatArray) -> tuple[tuple[int, int, float], ...]:
+    """The entries of K that are not zero, as `Trial.gain` wants them."""
+    return tuple((int(i), int(j), float(K[i, j])) for i, j in np.argwhere(K != 0.0))
+
+
+def plan_of(trial: Trial) -> FlightPlan:
+    """The plan of a trial as given, without the changes that a probe makes."""
+    formation = plan_formation(trial.scenario)
+    n = len(formation.system_ids)
+    K = np.zeros((2 * n, 4 * n - 2))
+    for row, column, value in trial.gain:
+        K[row, column] = value
+    calm = trial.scenario.monitor.model_copy(update={"act": False})
+    scenario = trial.scenario.model_copy(update={"monitor": calm})
+    return FlightPlan(scenario, formation, K, trial.delay_margin_s)
+
+
+def plan_loops(plan: FlightPlan) -> list[Loop]:
+    """The loops of a plan at its control period."""
+    predecessors, system_ids = plan.formation.predecessor.tolist(), plan.formation.system_ids
+    period_s = 1.0 / plan.scenario.rates.control_hz
+    return loops_of(predecessors, system_ids, plan.gain, period_s=period_s, onboard=timing_of(plan.scenario))
+
+
+def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
+    """The outcome with the verdict of the flight, its spacing errors and the driver's lateness."""
+    summary = summarise(plan.scenario, margins_of(plan), flight.ticks, flight.events)
+    largest = [v["spacing_error_max_m"] for v in summary["vehicles"] if v["spacing_error_max_m"] is not None]
+    final = [v["spacing_error_final_m"] for v in summary["vehicles"] if v["spacing_error_final_m"] is not None]
+    return replace(
+        outcome,
+        verdict=summary["verdict"],
+        reason=summary["reason"],
+        spacing_error_max_m=max(largest, default=None),
+        spacing_error_final_m=max(final, default=None),
+        lateness_s_p50=summary["control"]["lateness_s"]["p50"],
+        lateness_s_p99=summary["control"]["lateness_s"]["p99"],
+        steal_share=flight.steal_share,
+        busy_share=flight.busy_share,
+        ticks_sha256=None if outcome.real_time else hashlib.sha256(flight.ticks.tobytes()).hexdigest(),
+        trace_m=_trace(flight.ticks),
+    )
+
+
+def _trace(ticks: TickArray) -> list[float]:
+    """The largest spacing error of all vehicles in each stretch of `TRACE_PERIOD_S` of the flight, to four digits."""
+    rows = ticks[(ticks["time_s"] >= 0.0) & (ticks["tick"] <= ticks["tick"][ticks["commanded"]].max(initial=-1))]
+    error = np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
+    rows, error = rows[np.isfinite(error)], error[np.isfinite(error)]
+    if not error.size:
+        return []
+    stretch = (rows["time_s"] / TRACE_PERIOD_S).astype(np.int64)
+    largest = np.zeros(int(stretch.max()) + 1)
+    np.maximum.at(largest, stretch, error)
+    return [float(f"{value:.4g}") for value in largest]
+
+
+def finite(value: float) -> float | None:
+    """Rounded to nine places; None if it is not finite."""
+    return round(float(value), 9) if np.isfinite(value) else None

@@ -1,0 +1,1 @@
+"""`gcs thesis`: the source's figures and numbers, published and computed."""

@@ -1,0 +1,163 @@
+"""The options of `gcs monitor` and `gcs replay`.
+
+The work is in `links` (what frames say), `live` (the socket), `tlog` and `replay` (logs), all of this package.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gcs.user_input import InputError, KeyFile, listening, opened_guard
+
+_FAILED, _INTERRUPTED = 1, 130
+_TIMESYNC_HZ = 10.0
+
+
+def monitor(
+    scenario_file: Annotated[
+        Path | None, typer.Argument(metavar="[SCENARIO]", help="the vehicles expected, and the margin of their gains")
+    ] = None,
+    listen: Annotated[
+        str, typer.Option("--listen", "--connect", metavar="HOST:PORT", help="where vehicles or a mirror send to")
+    ] = "127.0.0.1:14550",
+    margin: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="compare with this delay margin", min=0.0)
+    ] = None,
+    design: Annotated[
+        Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margin of a run's design.json")
+    ] = None,
+    key: KeyFile = None,
+    silent: Annotated[bool, typer.Option("--silent", help="send nothing: delays are lower bounds then")] = False,
+    seconds: Annotated[
+        float, typer.Option("--for", metavar="SECONDS", help="end by itself after this time", min=0.1)
+    ] = float("inf"),
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
+) -> None:
+    """Watch the latencies of vehicles against a margin, without commanding anything.
+
+    All that is sent are TIMESYNC requests (10 a second to each address), which vehicles answer with their clock. No
+    heartbeat is sent. With --silent nothing is sent: exchanges of a station on the same stream are used if there are
+    any; otherwise delays are told against the fastest frames, and are lower bounds.
+
+    Exit code 1 if an expected vehicle, or any at all, was not heard, or if the loop delay (p99) was past the margin.
+    """
+    if margin is not None and design is not None:
+        raise InputError("read --margin and --design, wanted one of them")
+    guard = opened_guard(key, role="monitor")
+    with listening("--listen", listen) as link:
+        scenario, margin_s, margin_of = _compared_with(scenario_file, margin, design)
+        # After the socket: what comes while these load keeps its receive stamp.
+        from gcs.fly import stop_signals
+        from gcs.watch.links import Watch
+        from gcs.watch.live import MonitorOptions, monitor_links
+        from gcs.watch.table import print_report
+
+        asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
+        options = MonitorOptions(
+            margin_s=margin_s,
+            margin_of=margin_of,
+            timesync_hz=0.0 if silent else asked_hz,
+            seconds=seconds,
+            shown=not as_json,
+        )
+        watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
+        with stop_signals() as stop_reason:
+            report = monitor_links(link, watch, options, stop_reason, guard)
+            interrupted = bool(stop_reason())
+    if as_json:
+        typer.echo(json.dumps(report, indent=2, allow_nan=False))
+    else:
+        print_report(report)
+    raise typer.Exit(_INTERRUPTED if interrupted else _exit_code(report))
+
+
+def replay(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN|FILE.tlog", help="a run's folder, or a telemetry log of any tool")
+    ],
+    scenario_file: Annotated[
+        Path | None, typer.Argument(metavar="[SCENARIO]", help="the formation flown, where it is not in the run")
+    ] = None,
+    margin: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="compare with this delay margin", min=0.0)
+    ] = None,
+    design: Annotated[
+        Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margins of this design")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
+) -> None:
+    """Rebuild latencies, errors and margins from a telemetry log alone.
+
+    Round trips come from the TIMESYNC exchanges in the log; in one without, delays are lower bounds, told against the
+    fastest frames. Errors need the formation, of the run's folder or of SCENARIO. What is damaged is left out and
+    counted.
+    """
+    if margin is not None and design is not None:
+        raise InputError("read --margin and --design, wanted one of them")
+    from gcs.watch import replay_report
+    from gcs.watch.tlog import TlogError, read_tlog
+
+    there = replay_report.found(run)
+    try:
+        log = read_tlog(there.log_file)
+    except TlogError as error:
+        raise InputError(str(error)) from None
+    if scenario_file is not None:
+        from scenarios.files import load
+
+        there = replace(there, scenario=load(scenario_file), design=None, recorded=None)
+    if margin is not None:
+        there = replace(there, design={"delay_margin_s": margin})
+    elif design is not None:
+        there = replace(there, design=_design(design))
+    elif there.design is None and there.scenario is not None:
+        from gcs.plan import flight_plan
+
+        there = replace(there, design=flight_plan(there.scenario)[0])
+    result = replay_report.replay(log, there)
+    if as_json:
+        typer.echo(json.dumps(result, indent=2, allow_nan=False))
+    else:
+        replay_report.print_replay(result)
+
+
+def _exit_code(report: dict[str, Any]) -> int:
+    bad = {"not heard", "past the margin"} & {vehicle["status"] for vehicle in report["vehicles"]}
+    return _FAILED if bad or not report["vehicles"] else 0
+
+
+def _compared_with(scenario_file: Path | None, margin: float | None, design: Path | None) -> tuple[Any, Any, str]:
+    """The scenario, the margin in s (None: none is known) and in words where it is from."""
+    scenario = None
+    if scenario_file is not None:
+        from scenarios.files import load
+
+        scenario = load(scenario_file)
+    if margin is not None:
+        return scenario, margin, "given"
+    if design is not None:
+        return scenario, _design(design)["delay_margin_s"], f"of {design}"
+    if scenario is not None:
+        from gcs.plan import flight_plan
+
+        return scenario, flight_plan(scenario)[0]["delay_margin_s"], f"of {scenario.name}'s gains"
+    return None, None, ""
+
+
+def _design(file: Path) -> dict[str, Any]:
+    """A design.json, of which every margin is a number above 0, or None where it is unbounded."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        entries = [found, *found.get("schedule", [])]
+        margins_s = [entry["delay_margin_s"] for entry in entries]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"--design: {file}: {error}; wanted the design.json of a run") from None
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
+        raise InputError(f"--design: {file}: no delay_margin_s, wanted the design.json of a run") from None
+    for margin_s in margins_s:
+        if margin_s is not None and not (isinstance(margin_s, int | float) and margin_s > 0):
+            raise InputError(f"--design: {file}: delay_margin_s: read {margin_s!r}, wanted seconds above 0")
+    return found
