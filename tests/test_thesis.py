@@ -10,7 +10,8 @@ from gains.delay import delay_margin
 from gains.pattern import bidirectional
 from gains.rightmost import rightmost_root
 from gcs.cli import app
-from gcs.thesis.command import CHAIN, late_neighbours, nonlinear_response, printed_gains
+from gcs.thesis.command import late_neighbours
+from gcs.thesis.flights import CHAIN, nonlinear_response, printed_gains
 
 
 def test_printed_gains_take_a_second_of_their_neighbours_delay_and_not_the_published_0_19() -> None:

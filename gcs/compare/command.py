@@ -184,7 +184,7 @@ def write_comparison(
         "sizes": [asdict(size) for size in grown],
     }
     (folder / RESULT_FILE).write_text(json.dumps(result, indent=2), encoding="utf-8")
-    figures = {"Spacing errors and commands in flight": errors_figure(folder / "flights.png", flights)}
+    figures = {"Spacing errors and commands in flight": errors_figure(folder / "flights.png", flights.items())}
     if grown:
         figures["Cost of a design against the number of vehicles"] = sizes_figure(folder / "sizes.png", grown)
     page = rendered(

@@ -1,11 +1,12 @@
 """The figures of `gcs compare`, as PNG files."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
-from gcs.compare.command import Flights
 from gcs.compare.cost import DesignCost
+from gcs.record import TickArray
 from gcs.stress.figures import figure_of, saved
 
 _COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#777777", "#b8860b")
@@ -13,10 +14,10 @@ _FLOOR_M = 1e-3
 """Less than this is rounding of the telemetry."""
 
 
-def errors_figure(file: Path, flights: Flights) -> Path:
+def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
     """The largest spacing error, and the largest command, of all vehicles over time."""
     figure, (above, below) = figure_of(2, (9.0, 6.0), heights=(1.4, 1.0))
-    for (method, ticks), colour in zip(flights.items(), _COLOURS, strict=False):
+    for (method, ticks), colour in zip(flights, _COLOURS, strict=False):
         flown = ticks[(ticks["time_s"] >= 0.0) & ticks["commanded"]]
         time_s, place = np.unique(flown["time_s"], return_inverse=True)
         error, command = np.zeros(time_s.size), np.zeros(time_s.size)

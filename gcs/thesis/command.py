@@ -6,14 +6,12 @@ thesis, NIT Rourkela, 2012. Numbers that contradict it are found by two methods 
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-import scenarios
 from gains.bipartite import expanded_gain, partition_by_input, verify_expansion
 from gains.delay import delay_margin
 from gains.delay_opinions import checked_delay_margin
@@ -27,21 +25,11 @@ from gains.pattern import Pattern, bidirectional, formation_plant, leader_follow
 from gains.requirement import Requirement
 from gains.rightmost import rightmost_root
 from gains.robust import robust_lmi
-from gcs.flown import fly_virtual
-from gcs.plan import flight_plan
-from gcs.record import TickArray
-from gcs.summary import summarise
-from gcs.thesis.flight import fly_with_late_neighbours
-from scenarios.files import load
-from scenarios.schema import Scenario
+from gcs.thesis.flights import ALPHA, CHAIN, DELAYS_S, PERIOD_S, SPEED_M_S, flown, nonlinear_response, printed_gains
+from gcs.thesis.nonlinear import fly_with_late_neighbours
 
 FloatArray = NDArray[np.float64]
 PAGE_FILE = "thesis.md"
-PERIOD_S = 0.02
-ALPHA = 0.93
-SPEED_M_S = 91.44  # 300 ft/s
-DELAYS_S = (0.17, 0.9, 1.1)
-CHAIN = FormationModel((-1, 0, 1))
 SINGLE = FormationModel((-1, 0, 1), axes=1)
 
 
@@ -56,16 +44,6 @@ class Claim:
     second: str
     verdict: str
     """"agrees", "erratum", "holds with conditions", or "not checkable": nothing was printed to compare with."""
-
-
-@cache
-def printed_gains() -> FloatArray:
-    """K of section 5.2.2, with the slip "0.5003" mended, from scenarios/thesis_gains.toml."""
-    return flight_plan(_scenario("thesis_gains"))[1].gain
-
-
-def _scenario(name: str) -> Scenario:
-    return load(Path(scenarios.__file__).parent / f"{name}.toml")
 
 
 def claims() -> list[Claim]:
@@ -266,46 +244,6 @@ def _splits(K: FloatArray) -> Iterator[tuple[str, float]]:
             late[mask & take] = K[mask & take]
         names = [name for name, take in zip(kinds, chosen, strict=True) if take]
         yield ", ".join(names), delay_margin(CHAIN.A + CHAIN.B @ (K - late), CHAIN.B @ late)
-
-
-@cache
-def late_flight(delay_s: float) -> tuple[FloatArray, FloatArray]:
-    """Times and errors of the nonlinear flight with the printed gains; 20 s, with initial errors of our own choice."""
-    start = np.zeros(CHAIN.states)
-    start[CHAIN.velocity_slice(0)] = (2.0, -1.0)
-    start[CHAIN.spacing_slice(1)], start[CHAIN.spacing_slice(2)] = (10.0, 5.0), (-6.0, 8.0)
-    return fly_with_late_neighbours(
-        CHAIN, printed_gains(), start, delay_s=delay_s, speed_m_s=SPEED_M_S, duration_s=20.0
-    )
-
-
-def nonlinear_response(delay_s: float) -> tuple[float, float]:
-    """Growth rate (1/s) of the errors' envelope in the second half, and when they stay within 2 % of their largest."""
-    time_s, errors = late_flight(delay_s)
-    size = np.linalg.norm(errors, axis=1)
-    outside = np.flatnonzero(size > 0.02 * size.max())
-    settled_s = float(time_s[min(outside[-1] + 1, len(time_s) - 1)])
-    # largest of each second, while it is above rounding
-    whole = int(time_s[-1])
-    envelope = size[: whole * 1000].reshape(whole, 1000).max(axis=1)
-    kept = (envelope > 1e-9 * envelope.max()) & (np.arange(whole) >= whole // 4)
-    slope = np.polyfit(np.arange(whole)[kept] + 0.5, np.log(envelope[kept]), 1)[0]
-    return float(slope), settled_s
-
-
-def flown(name: str, method: str) -> tuple[TickArray, float | None]:
-    """A flight of one of the triangle's scenarios without link delay, by inclusion at α = 0.93 or by the D-K iteration
-    at the delay margin that this has; with its settling time."""
-    scenario = _scenario(name)
-    control = scenario.control.model_copy(update={"delay_margin_s": None, "alpha": ALPHA})
-    if method != "inclusion":
-        margin_s = design(CHAIN, Requirement(alpha=ALPHA), period_s=PERIOD_S).delay_margin_s
-        control = control.model_copy(update={"alpha": None, "delay_margin_s": margin_s, "method": method})
-    calm = scenario.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
-    scenario = scenario.with_link_delay(up_s=0.0, down_s=0.0)
-    designed, plan = flight_plan(scenario.model_copy(update={"control": control, "monitor": calm}))
-    flight = fly_virtual(replace(plan))
-    return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events)["settling_time_s"]
 
 
 def _comparison() -> Iterator[Claim]:
