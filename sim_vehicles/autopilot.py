@@ -1,10 +1,12 @@
 """Whom the vehicle obeys and when: arming, modes, the beginning of the flight, the failsafe. No bytes, no motion.
 
-on the launcher ──first set-point or take-off, armed, GUIDED──► flying (GUIDED) ◄──commanded──► flying (LOITER)
+on the launcher ──first set-point or take-off, armed, GUIDED──► flying (GUIDED) ◄──commanded──► flying (LOITER, BRAKE)
                                                                       │                             │
                                    set-points or station's heartbeat stop             station's heartbeat stops
                                                                       ▼                             ▼
                                           failsafe: LOITER, CRITICAL, until GUIDED or LOITER is commanded
+
+LOITER and BRAKE are the same here: it holds its course. Stations say either when they mean hold.
 """
 
 from scenarios.schema import NS_PER_S, Safety
@@ -15,6 +17,7 @@ from sim_vehicles.mavlink import (
     BASE_MODE_CUSTOM,
     BASE_MODE_GUIDED,
     DENIED,
+    MODE_BRAKE,
     MODE_GUIDED,
     MODE_LOITER,
     MODE_STABILIZE,
@@ -23,7 +26,7 @@ from sim_vehicles.mavlink import (
     STATUS_STANDBY,
 )
 
-MODE_NAMES = {MODE_STABILIZE: "STABILIZE", MODE_GUIDED: "GUIDED", MODE_LOITER: "LOITER"}
+MODE_NAMES = {MODE_STABILIZE: "STABILIZE", MODE_GUIDED: "GUIDED", MODE_LOITER: "LOITER", MODE_BRAKE: "BRAKE"}
 
 
 class Autopilot:

@@ -93,6 +93,8 @@ class Vehicle:
             mavlink.COMMAND_ARM: self._arm,
             mavlink.COMMAND_MODE: self._set_mode,
             mavlink.COMMAND_TAKEOFF: self._take_off,
+            mavlink.COMMAND_LAND: lambda _, time_ns: self._cannot_land(time_ns),
+            mavlink.COMMAND_RETURN: lambda _, time_ns: self._cannot_land(time_ns),
         }
         self._schedule = Schedule(self.clock)
         self._schedule.add_once(mavlink.HEARTBEAT, start_ns)  # found at once, not after up to a second
@@ -286,6 +288,8 @@ class Vehicle:
     def _change_mode(self, base_mode: int | None, mode: int | None, time_ns: int) -> int:
         if base_mode is None or mode is None or not base_mode & mavlink.BASE_MODE_CUSTOM:
             return mavlink.DENIED
+        if mode in (mavlink.MODE_LAND, mavlink.MODE_RETURN):
+            return self._cannot_land(time_ns)
         before = (self.autopilot.mode, self.autopilot.failsafe)
         result = self.autopilot.set_mode(mode, time_ns)
         if (self.autopilot.mode, self.autopilot.failsafe) != before:
@@ -293,6 +297,12 @@ class Vehicle:
             self._command = self._alone()
             self._tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
         return result
+
+    def _cannot_land(self, time_ns: int) -> int:
+        """Said in words as well: a person who asks for this may not see the result."""
+        text = "cannot land or return, LOITER holds the course"
+        self._send(self._encoder.statustext(mavlink.SEVERITY_WARNING, text), time_ns)
+        return mavlink.DENIED
 
     # What happens by itself
 

@@ -151,7 +151,10 @@ def test_its_velocities_are_flown_in_both_frames_then_it_holds_and_returns(clien
 def take_over_and_say_so(port: int) -> None:
     """What the process does that is killed: take a plain vehicle in flight under control."""
     client = Client(port)
-    Action(client.systems[2]).arm()
+    action = Action(client.systems[2])
+    action.arm()
+    action.hold()
+    until(lambda: client.mode(2) == FlightMode.HOLD, "hold")
     control = Offboard(client.systems[2])
     for _ in range(10):
         with contextlib.suppress(OffboardError):

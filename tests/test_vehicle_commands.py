@@ -77,23 +77,34 @@ def test_on_the_launcher_it_can_be_disarmed_but_in_flight_it_cannot() -> None:
     assert vehicle.autopilot.armed
 
 
-def test_a_commanded_hold_flies_straight_on_and_is_no_failsafe() -> None:
+@pytest.mark.parametrize("hold", [5, 17], ids=["LOITER", "BRAKE"])
+def test_a_commanded_hold_flies_straight_on_and_is_no_failsafe(hold: int) -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     vehicle.step([(setpoint(2.0, 1.0), START)], START)
-    assert result(vehicle, mode(5), START + SECOND // 2) == dialect.MAV_RESULT_ACCEPTED
+    assert result(vehicle, mode(hold), START + SECOND // 2) == dialect.MAV_RESULT_ACCEPTED
     vehicle.step([(setpoint(9.0), START + SECOND // 2)], START + SECOND // 2)
     assert vehicle.counters["ignored_not_guided"] == 1
     heartbeat = last_heartbeat(vehicle, START + SECOND)
-    assert (heartbeat.custom_mode, heartbeat.system_status) == (5, dialect.MAV_STATE_ACTIVE)
+    assert (heartbeat.custom_mode, heartbeat.system_status) == (hold, dialect.MAV_STATE_ACTIVE)
     assert vehicle.state_at(START + 2 * SECOND).velocity_ne_m_s() == pytest.approx((41.0, 9.5))
+
+
+@pytest.mark.parametrize("wish", [command(21), command(20), mode(9), mode(6)], ids=["21", "20", "LAND", "RTL"])
+def test_landing_and_return_are_refused_with_a_word_to_who_asks(wish: bytes) -> None:
+    vehicle = a_vehicle()
+    take_off(vehicle)
+    told, ack = answers(vehicle, wish, START + SECOND // 2)
+    assert (ack.get_type(), ack.result) == ("COMMAND_ACK", dialect.MAV_RESULT_DENIED)
+    assert (told.severity, told.text.split(",")[0]) == (dialect.MAV_SEVERITY_WARNING, "cannot land or return")
+    assert vehicle.autopilot.mode == 4
 
 
 DENIED, UNSUPPORTED = dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_UNSUPPORTED
 IMPOSSIBLE = {
     "neither arm nor disarm": (command(400, 2), DENIED),
     "arm with NaN": (command(400, math.nan), DENIED),
-    "unknown mode": (mode(17), DENIED),
+    "unknown mode": (mode(16), DENIED),
     "mode without the flag for custom modes": (command(176, 0, 4), DENIED),
     "mode with infinity and NaN": (command(176, math.inf, math.nan), DENIED),
     "interval NaN": (command(511, 32, math.nan), DENIED),
@@ -103,7 +114,6 @@ IMPOSSIBLE = {
     "request of a message it has not": (command(512, 27), DENIED),
     "request of message infinity": (command(512, math.inf), DENIED),
     "take-off before it is armed": (command(22, 0, 0, 0, 0, 0, 0, 10), DENIED),
-    "landing": (command(21), UNSUPPORTED),
     "no command at all": (command(65535), UNSUPPORTED),
 }
 
