@@ -230,13 +230,14 @@ def capacity(
     scenario_file: ScenarioFile,
     rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
     most: Annotated[int, typer.Option(metavar="N", min=2, max=250, help="largest formation tried")] = 100,
+    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights of each formation; it is carried in all")] = 3,
     as_json: AsJson = False,
 ) -> None:
     """How many vehicles, at which rate, the scenario's links carry before the delay margin is gone."""
     from gcs import capacity as carrying
 
     scenario = _scenario(scenario_file)
-    found = carrying.capacity(scenario, rates_hz=_rates(rates), most=most)
+    found = carrying.capacity(scenario, rates_hz=_rates(rates), most=most, seeds=seeds)
     if as_json:
         typer.echo(json.dumps(carrying.to_dict(found), indent=2))
     else:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from gcs.capacity import capacity, fly_loaded
+from gcs.capacity import capacity, fly_loaded, worst_load
 from gcs.cli import app
 from gcs.user_input import InputError
 from scenarios.files import load
@@ -37,13 +37,22 @@ def test_traffic_is_that_of_the_messages_and_what_is_too_much_is_lost(short: Sce
 
 
 def test_the_largest_formation_holds_and_the_next_does_not(short: Scenario) -> None:
-    [found] = capacity(short, rates_hz=[20.0], most=6, seconds=40.0)
+    [found] = capacity(short, rates_hz=[20.0], most=6, seeds=1, seconds=40.0)
     assert found.most is not None
     assert found.next is not None
     assert found.most.holds
     assert not found.next.holds
     assert found.next.vehicles == found.most.vehicles + 1
     assert fly_loaded(short, 20.0, found.most.vehicles) == found.most
+
+
+def test_a_formation_is_as_good_as_its_worst_draw_of_losses(short: Scenario) -> None:
+    alone = [fly_loaded(short.model_copy(update={"seed": short.seed + k}), 10.0, 3) for k in range(3)]
+    assert all(load.holds for load in alone)
+    assert len({load.lost_down for load in alone}) == 3
+    assert worst_load(short, 10.0, 3, seeds=3) == min(alone, key=lambda load: load.headroom_p01 or 0.0)
+    heavy = worst_load(short, 10.0, 8, seeds=3)
+    assert heavy == fly_loaded(short, 10.0, 8), "the first that does not hold is enough"
 
 
 def test_a_rate_without_gains_says_why(short: Scenario) -> None:
