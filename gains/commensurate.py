@@ -23,7 +23,7 @@ from gains.delay_crossings import AxisCrossing, axis_crossings, crossings_of_loc
 from gains.delay_loci import ComplexArray, Loci, unit_crossings
 from gains.delay_sweep import near_unit_extrema
 from gains.errors import BadModelError
-from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
+from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
 # the pencil's companion matrix takes 3 s at this size; larger ones leave the frequencies to the sweep
 _LARGEST_PENCIL = 1200
@@ -147,7 +147,6 @@ def highest_frequency(terms: Sequence[FloatArray]) -> float:
 
 def has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
     """Whether an eigenvalue on the imaginary axis of sum A_k (all of them: `roots`) is a root at every delay."""
-    n = terms[0].shape[0]
     scale = float(sum(np.linalg.norm(matrix) for matrix in terms))
     if scale == 0.0:
         return True
@@ -155,7 +154,7 @@ def has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
         omega = abs(float(root.imag))
         if omega < 1e-6 * scale:
             # a defective root at zero is known to sqrt(eps) only: the singular value decides, not the eigenvalue
-            if _least_singular(terms, 0.0, 0.0) < n * 1e-15 * scale:
+            if is_singular_for_any_delay(terms):
                 return True
         # a determinant that vanishes at more points of the circle than its degree vanishes identically; 3 unlike
         # angles stand for them, the tolerance being far above rounding

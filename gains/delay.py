@@ -21,7 +21,7 @@ from gains.delay_crossings import AxisCrossing, axis_crossings
 from gains.delay_loci import ComplexArray
 from gains.delay_sweep import frequency_sweep_margin
 from gains.errors import BadModelError, DisagreementError
-from gains.structure import Block, FloatArray, balanced, distinct_blocks, square_matrices
+from gains.structure import Block, FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
 __all__ = [
     "Crossing",
@@ -182,7 +182,6 @@ def _marginal(A0: FloatArray, A1: FloatArray) -> float:
 
 def _has_fixed_root(A0: FloatArray, A1: FloatArray, roots: ComplexArray) -> bool:
     """Whether some j omega is a root at every delay: at omega = 0, or of the pencil for every e^{-j theta}."""
-    n = A0.shape[0]
     scale = float(np.linalg.norm(A0) + np.linalg.norm(A1))
     if scale == 0.0:
         return True
@@ -190,7 +189,7 @@ def _has_fixed_root(A0: FloatArray, A1: FloatArray, roots: ComplexArray) -> bool
     for root in roots[np.abs(roots.real) < 1e-6 * scale]:
         omega = abs(root.imag)
         if omega < 1e-6 * scale:
-            if np.linalg.svd(A0 + A1, compute_uv=False)[-1] < n * 1e-15 * scale:
+            if is_singular_for_any_delay((A0, A1)):
                 return True
         elif all(_least_singular(A0 + z * A1, omega) < 1e-12 * scale for z in (1.0, 1j, -1.0)):
             return True

@@ -19,7 +19,7 @@ from gains.delay import Crossing, DelayAnalysis, check_horizon, stability_window
 from gains.delay_loci import ComplexArray, Loci, unit_crossings, without_limits_at_zero
 from gains.delay_sweep import near_unit_extrema
 from gains.errors import BadModelError, DisagreementError
-from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
+from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
 # rad by which e^{-j omega d} turns between neighbouring frequencies
 _TURN = 0.1
@@ -84,7 +84,7 @@ def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None)
     unstable, on_axis = 0, False
     for block in distinct_blocks(*matrices):
         parts = _Parts(np.array(balanced(*block.matrices)), known_s, np.array(multiples))
-        if parts.is_singular_at_zero():
+        if is_singular_for_any_delay(parts.matrices):
             on_axis = True
             continue
         crossings += [
@@ -123,11 +123,6 @@ class _Parts:
         """Bound (rad/s) of every root on the imaginary axis."""
         at_once = (self.known_s == 0.0) & (self.multiples == 0)
         return highest_frequency([self.matrices[at_once].sum(axis=0), *self.matrices[~at_once]])
-
-    def is_singular_at_zero(self) -> bool:
-        # s = 0 is then a root whatever the delays
-        singular = np.linalg.svd(self.matrices.sum(axis=0), compute_uv=False)
-        return bool(singular[-1] <= 1e-14 * self.size * np.linalg.norm(self.matrices))
 
     def frequencies(self, highest: float) -> FloatArray:
         turning = np.linspace(0.0, highest, int(highest * float(self.known_s.max()) / _TURN) + 200)

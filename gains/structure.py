@@ -165,7 +165,7 @@ def project_out_equilibria(*matrices: ArrayLike) -> tuple[FloatArray, ...]:
     >>> difference.round(6).tolist()
     [[-2.0]]
     """
-    left = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
+    left = list(balanced(*square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})))
     while True:
         basis = _complement_of_common_kernel(left)
         if basis.shape[1] == left[0].shape[0]:
@@ -174,7 +174,7 @@ def project_out_equilibria(*matrices: ArrayLike) -> tuple[FloatArray, ...]:
             return tuple(left)
         if basis.shape[1] == 0:
             raise BadModelError("the matrices have nothing but equilibria; at least one moving state is wanted")
-        left = [basis.T @ matrix @ basis for matrix in left]
+        left = [_projected(matrix, basis) for matrix in left]
 
 
 def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], int]:
@@ -203,7 +203,7 @@ def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], in
     filled = 0
     for indices in strongly_connected_blocks(*checked):
         block = [matrix[np.ix_(indices, indices)] for matrix in checked]
-        if any(matrix.any() for matrix in block) and _is_singular(sum(block, np.zeros_like(block[0]))):
+        if any(matrix.any() for matrix in block):
             block = _moving_part(block)
         place = slice(filled, filled + block[0].shape[0])
         for target, matrix in zip(kept, block, strict=True):
@@ -245,17 +245,43 @@ def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
     return tuple(matrix * scale / scale[:, np.newaxis] for matrix in matrices)
 
 
+def is_singular_for_any_delay(matrices: Iterable[FloatArray]) -> bool:
+    """Whether the sum of the matrices is singular to rounding: s = 0 is then a root however late each one acts.
+
+    Each row is judged in its own unit: a motion that is slow beside others is none that stands still.
+
+    Examples
+    --------
+    x'(t) = -x(t) + x(t - tau) stays where it is; a slow decay beside a fast one does not:
+
+    >>> import numpy as np
+    >>> from gains.structure import is_singular_for_any_delay
+    >>> is_singular_for_any_delay([np.array([[-1]]), np.array([[1]])])
+    True
+    >>> is_singular_for_any_delay([np.diag([-1e9, -1e-9])])
+    False
+    """
+    stacked = np.array(list(matrices))
+    size = np.linalg.norm(stacked, axis=(0, 2))
+    total = stacked.sum(axis=0) / np.where(size > 0.0, size, 1.0)[:, np.newaxis]
+    return bool(np.linalg.svd(total, compute_uv=False)[-1] < 2e-15 * len(size))
+
+
 def _complement_of_common_kernel(matrices: list[FloatArray]) -> FloatArray:
     """Orthonormal basis (n, n - k) of the complement of the k-dimensional common kernel of the matrices."""
-    _, singular, rows = np.linalg.svd(np.vstack(matrices))
-    # relative to the largest singular value; a kernel known to rounding shows at a few eps
+    stacked = np.vstack(matrices)
+    size = np.linalg.norm(stacked, axis=1, keepdims=True)
+    # each row in its own unit, as above
+    _, singular, rows = np.linalg.svd(stacked / np.where(size > 0.0, size, 1.0))
+    # a kernel known to rounding shows at a few eps
     rank = int(np.count_nonzero(singular > 1e-12 * singular[0]))
     return rows[:rank].T
 
 
-def _is_singular(matrix: FloatArray) -> bool:
-    singular = np.linalg.svd(matrix, compute_uv=False)
-    return bool(singular[-1] <= 1e-12 * singular[0])
+def _projected(matrix: FloatArray, basis: FloatArray) -> FloatArray:
+    """The matrix in the coordinates of an orthonormal basis, with what rounding leaves of zeros set to zero."""
+    projected = basis.T @ matrix @ basis
+    return np.where(np.abs(projected) > 1e-14 * np.abs(matrix).max(), projected, 0.0)
 
 
 def _moving_part(block: list[FloatArray]) -> list[FloatArray]:

@@ -325,7 +325,7 @@ app.command()(replay)
 def main() -> None:
     """Entry point: bad input is one line and exit code 2."""
     from gains.errors import GainsError
-    from scenarios.files import ScenarioError
+    from scenarios.errors import ScenarioError
     from scenarios.signing.keys import KeyFileError
 
     try:

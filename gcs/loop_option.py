@@ -28,7 +28,7 @@ def load_with_loop(file: Path, loop: Loop | None) -> "Scenario":
 
     Raises
     ------
-    scenarios.files.ScenarioError
+    scenarios.errors.ScenarioError
         If the file cannot be used, or not with this loop.
     """
     from scenarios.files import load, with_loop

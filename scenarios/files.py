@@ -1,6 +1,6 @@
 """Read a scenario file strictly, and write one.
 
-ScenarioError(Exception)    the one error: file, key, what was read, what was wanted, in one line
+The one error is ScenarioError: file, key, what was read, what was wanted, in one line.
 """
 
 import csv
@@ -15,20 +15,12 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
+from scenarios.errors import ScenarioError
 from scenarios.schema import Jitter, Link, Links, Outage, Scenario
 
 TRACE_DELAYS = 100_000
 """Most delays of a trace."""
 TRACE_COLUMN = "delay_s"
-
-
-class ScenarioError(Exception):
-    """A scenario that cannot be flown."""
-
-    def __init__(self, file: Path, key: str, read: object, wanted: str) -> None:
-        shown = " ".join(repr(read).split())
-        shown = shown if len(shown) <= 80 else shown[:77] + "..."
-        super().__init__(f"{file}: {key}: read {shown}, wanted {wanted}")
 
 
 def load(path: Path) -> Scenario:

@@ -46,7 +46,8 @@ def run(arguments: list[str]) -> int:
         parser.error("read --key with --links-only, wanted one of them: links pass signed frames on as they are")
     with _signals() as signals, contextlib.ExitStack() as opened:
         # After parsing, so that --help and a mistyped option answer at once.
-        from scenarios.files import ScenarioError, load
+        from scenarios.errors import ScenarioError
+        from scenarios.files import load
         from scenarios.signing.keys import KeyFileError
         from sim_vehicles.truth import TruthLog
 

@@ -16,7 +16,8 @@ from gains.pattern import Pattern, bidirectional, formation_plant, leader_follow
 from gains.requirement import Requirement
 from gains.sampled import spectral_radius
 from gcs.plan import flight_plan
-from scenarios.files import ScenarioError, load, parse
+from scenarios.errors import ScenarioError
+from scenarios.files import load, parse
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 PERIOD_S = 0.02

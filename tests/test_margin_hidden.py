@@ -120,6 +120,28 @@ def test_consensus_has_the_margin_of_the_motion_that_decays(size: int) -> None:
     assert result["roots_fixed_at_zero"] == 1
 
 
+@pytest.mark.parametrize("decades", [6, 10])
+def test_unlike_units_are_no_equilibrium(decades: int) -> None:
+    # states in units that differ by up to twice as many decades: states were once taken out as standing still
+    rng = np.random.default_rng(8)
+    A0, A1 = rng.normal(size=(12, 12)), rng.normal(size=(12, 12))
+    A0 -= (np.linalg.eigvals(A0 + A1).real.max() + 0.3) * np.eye(12)
+    unit = 10.0 ** rng.uniform(-decades, decades, 12)
+    result = result_of(A0 * unit[:, None] / unit, A1 * unit[:, None] / unit)
+    assert result["roots_fixed_at_zero"] == 0
+    # the similarity itself rounds each entry
+    assert result["delay_margin_s"] == pytest.approx(delay_margin(A0, A1), rel=1e-10)
+
+
+@pytest.mark.parametrize("slow", [1e-6, 1e-9, 1e-14])
+def test_slow_motion_within_the_block_of_a_fast_one(slow: float) -> None:
+    # s (s + 1e3) + slow e^{-s tau} (s + 1e3) - slow / 2: to first order in slow s = slow (5e-4 - e^{-s tau})
+    result = result_of([[-1e3, 0.5], [slow, 0.0]], [[0.0, 0.0], [0.0, -slow]])
+    expected = scalar_margin_s(5e-4 * slow, -slow)
+    assert (result["roots_fixed_at_zero"], result["notes"]) == (0, [])
+    assert result["delay_margin_s"] == pytest.approx(expected, rel=3.0 * slow + 1e-12)
+
+
 def test_formation_at_constant_velocity_has_two_roots_at_zero() -> None:
     # x'' = -L (x + x') all late: per eigenvalue the follower's closed form with k1 = k3 = lambda
     size = 5

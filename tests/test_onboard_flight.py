@@ -25,7 +25,8 @@ from gcs.stress.study import NoOnset, Study, find_onset
 from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
 from gcs.summary import summarise
 from gcs.upload import float32
-from scenarios.files import ScenarioError, dump, load, parse, with_loop
+from scenarios.errors import ScenarioError
+from scenarios.files import dump, load, parse, with_loop
 from scenarios.schema import Link, Outage, Scenario, VehicleLinks
 from sim_vehicles.fleet import Fleet
 from sim_vehicles.mavlink import STATUS_CRITICAL

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.files import ScenarioError, dump, load, parse
+from scenarios.errors import ScenarioError
+from scenarios.files import dump, load, parse
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 TRIANGLE = (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
