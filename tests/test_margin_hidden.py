@@ -124,8 +124,8 @@ def test_consensus_has_the_margin_of_the_motion_that_decays(size: int) -> None:
 def test_unlike_units_are_no_equilibrium(decades: int) -> None:
     # states in units that differ by up to twice as many decades: states were once taken out as standing still
     rng = np.random.default_rng(8)
-    A0, A1 = rng.normal(size=(12, 12)), rng.normal(size=(12, 12))
-    A0 -= (np.linalg.eigvals(A0 + A1).real.max() + 0.3) * np.eye(12)
+    free, A1 = rng.normal(size=(12, 12)), rng.normal(size=(12, 12))
+    A0 = free - (np.linalg.eigvals(free + A1).real.max() + 0.3) * np.eye(12)
     unit = 10.0 ** rng.uniform(-decades, decades, 12)
     result = result_of(A0 * unit[:, None] / unit, A1 * unit[:, None] / unit)
     assert result["roots_fixed_at_zero"] == 0
