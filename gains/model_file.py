@@ -28,8 +28,12 @@ _MULTIPLE = re.compile(
     rf"(?:\s*\*\s*(?P<after>{_NUMBER}))?(?:\s*/\s*(?P<divisor>{_NUMBER}))?"
 )
 _PLAIN = re.compile(_NUMBER)
+# not that of an exponent
+_PLUS = re.compile(r"(?<![0-9.][eE])\+")
 _FORMS = (("A0", "A1"), ("terms",), ("A", "B", "K", "hold"))
 _DELAY_WANTED = 'a number of seconds >= 0 or a multiple of the unknown, as "tau" or "2*tau"'
+# products and squares of the matrices stay far from the largest number that there is
+_LARGEST = 1e30
 # a text longer than this in a message is cut
 _SHOWN = 60
 
@@ -99,8 +103,8 @@ def _parsed(text: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=pairs)
     except json.JSONDecodeError as error:
-        line = text.splitlines()[error.lineno - 1] if text.strip() else ""
-        read = f"read {_shown(line)}" if line else "read nothing"
+        line = text.split("\n")[error.lineno - 1].strip()
+        read = f"read {_shown(line)}" if line else "read nothing more" if text.strip() else "read nothing"
         raise BadModelError(f"line {error.lineno}: {read}, wanted JSON ({error.msg})") from None
     except RecursionError:
         raise BadModelError("read lists within lists too deep to follow, wanted a model") from None
@@ -195,6 +199,8 @@ def _finite(key: str, value: Any, wanted: str) -> float:
         # Python reads NaN and Infinity, which are no JSON, and takes 1e999 for the latter
         read = "NaN" if isnan(number) else "a number beyond 1e308"
         raise BadModelError(f"{key}: read {read}, wanted {wanted}")
+    if abs(number) > _LARGEST:
+        _bad(key, value, f"{wanted}, up to {_LARGEST:g}")
     return number
 
 
@@ -206,7 +212,7 @@ def _delay(key: str, value: Any) -> tuple[float, Fraction, str]:
             _bad(key, value, _DELAY_WANTED)
         return number, Fraction(0), ""
     fixed_s, multiple, unknown = 0.0, Fraction(0), ""
-    for part in (piece.strip() for piece in value.split("+")):
+    for part in (piece.strip() for piece in _PLUS.split(value)):
         match = _MULTIPLE.fullmatch(part)
         if match is None:
             if not _PLAIN.fullmatch(part) or part == value.strip():

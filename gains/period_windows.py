@@ -16,7 +16,7 @@ from gains.delay_loci import ComplexArray, bracketed_roots, factor_rank
 from gains.errors import GainsError
 from gains.sampled import checked_loop, sampling_period_limit
 from gains.sampled_loop import HeldPlant
-from gains.sampled_period import next_periods, with_peaks
+from gains.sampled_period import longest_period, next_periods, with_peaks
 from gains.structure import FloatArray, balanced, distinct_blocks
 
 # windows are listed up to this many times the first limit, or of the slowest time constant without one
@@ -110,7 +110,9 @@ def _horizon(A: FloatArray, BK: FloatArray, limit_s: float) -> tuple[float, bool
     rate = float(np.linalg.norm(A) + np.linalg.norm(BK))
     horizon_s = _HORIZON * (limit_s if 0.0 < limit_s < inf else 10.0 / rate if rate > 0.0 else 1.0)
     slowest = float(np.linalg.eigvals(A).real.max())
-    return (max(horizon_s, 40.0 / -slowest), True) if slowest < 0.0 else (horizon_s, False)
+    if slowest < 0.0:
+        return max(horizon_s, 40.0 / -slowest), True
+    return min(horizon_s, longest_period(slowest)), False
 
 
 def _is_stable(blocks: list[tuple[FloatArray, ...]], window: tuple[float, float], last_s: float) -> bool:
@@ -155,7 +157,7 @@ def _block_crossings(block: tuple[FloatArray, ...], horizon_s: float) -> tuple[l
     start_s, looked_at = 1e-5 / rate if rate > 0.0 else horizon_s, 0
     found: list[PeriodCrossing] = []
     while start_s < horizon_s and looked_at < _MOST_PERIODS:
-        periods_s = next_periods(start_s, fastest)
+        periods_s = next_periods(start_s, fastest, horizon_s)
         looked_at += periods_s.size
         start_s = float(periods_s[-1])
         periods_s, logs = with_peaks(log_radius, periods_s, log_radius(periods_s))

@@ -15,6 +15,8 @@ _CHUNK, _CHUNKS = 256, 200
 # growth of the period from one look to the next, and its largest step in periods of the fastest oscillation
 _RATIO, _STEP = 1.03, 0.02
 _GOLDEN = (3.0 - 5.0**0.5) / 2.0
+# a plant that grows by e to this in a period, 1 / eps, leaves nothing of the loop but rounding
+_MOST_GROWTH = 36.0
 
 
 def block_period_limit(A: FloatArray, BK: FloatArray) -> float:
@@ -39,7 +41,7 @@ def block_period_limit(A: FloatArray, BK: FloatArray) -> float:
     start_s = 1e-3 * float((-loop_roots.real).min()) / (float(np.linalg.norm(A) + np.linalg.norm(BK)) ** 2)
     slowest = float(plant_roots.real.max())
     for _ in range(_CHUNKS):
-        periods_s = next_periods(start_s, fastest)
+        periods_s = next_periods(start_s, fastest, longest_period(slowest))
         logs = log_radius(periods_s)
         periods_s, logs = with_peaks(log_radius, periods_s, logs)
         above = np.flatnonzero(logs >= 0.0)
@@ -57,12 +59,18 @@ def block_period_limit(A: FloatArray, BK: FloatArray) -> float:
     )
 
 
-def next_periods(start_s: float, fastest: float) -> FloatArray:
-    """Ascending periods from `start_s`, geometric until the steps would skip an oscillation of the plant."""
+def longest_period(slowest_1_s: float) -> float:
+    """The period (s) up to which the map of a loop can be computed, whose plant grows with this rate at most."""
+    return _MOST_GROWTH / slowest_1_s if slowest_1_s > 0.0 else inf
+
+
+def next_periods(start_s: float, fastest: float, until_s: float) -> FloatArray:
+    """Ascending periods from `start_s` to `until_s` or before it, so that no step skips an oscillation of the plant."""
     largest_step_s = 2.0 * np.pi * _STEP / fastest if fastest > 0.0 else inf
     periods_s = [start_s]
-    for _ in range(_CHUNK):
-        periods_s.append(periods_s[-1] + min((_RATIO - 1.0) * periods_s[-1], largest_step_s))
+    while len(periods_s) <= _CHUNK and periods_s[-1] < until_s:
+        step_s = min((_RATIO - 1.0) * periods_s[-1], largest_step_s)
+        periods_s.append(min(periods_s[-1] + step_s, until_s))
     return np.array(periods_s)
 
 

@@ -12,7 +12,17 @@ import typer
 
 from gcs.loop_option import LoopOption, load_with_loop
 from gcs.stress.command import stress
-from gcs.user_input import InputError, KeyFile, listening, mirroring, opened_guard, warn_if_open
+from gcs.user_input import (
+    InputError,
+    KeyFile,
+    listening,
+    mirroring,
+    opened_guard,
+    out_file,
+    out_folder,
+    warn_if_open,
+    within,
+)
 from gcs.watch.command import monitor, replay
 
 app = typer.Typer(
@@ -75,8 +85,7 @@ def fly(
 
     scenario = load_with_loop(scenario_file, loop)
     if link_delay is not None:
-        if not 0 <= link_delay < 60:
-            raise InputError(f"--link-delay: read {link_delay}, wanted seconds from 0 to 60")
+        within("--link-delay", link_delay, 0, 60, "seconds")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
     guard = opened_guard(key, role="station")
     if mirror_commands and not mirror:
@@ -88,7 +97,7 @@ def fly(
         design, plan = flight_plan(scenario)
         if not as_json:
             _print_design(design)
-        folder = _out_folder(out) if out is not None else new_folder(scenario.name)
+        folder = out_folder(out) if out is not None else new_folder(scenario.name)
         options = FlyOptions(folder=folder, start_vehicles=not connect, show_table=not as_json, key_file=key)
         summary = fly_now(plan, design, link, options, guard, to)
     if as_json:
@@ -138,7 +147,7 @@ def compare(
     from gcs.fly import new_folder
 
     scenario = _scenario(scenario_file)
-    folder = _out_folder(out) if out is not None else new_folder(f"{scenario.name}-compare")
+    folder = out_folder(out) if out is not None else new_folder(f"{scenario.name}-compare")
     routes, flights = comparing.compare(scenario)
     grown = design_costs() if sizes else []
     comparing.write_comparison(folder, scenario, routes, flights, grown)
@@ -181,7 +190,7 @@ def thesis(
     from gcs.fly import new_folder
     from gcs.thesis import command as source
 
-    folder = _out_folder(out) if out is not None else new_folder("thesis")
+    folder = out_folder(out) if out is not None else new_folder("thesis")
     found = source.claims()
     page = source.write_page(folder, found)
     if as_json:
@@ -282,6 +291,9 @@ def view(
     from gcs.show.viewer import ViewerError, screenshot
     from gcs.show.viewer import view as open_viewer
 
+    within("--at", at, -1e6, 1e6, "seconds")
+    if picture is not None:
+        out_file("--picture", picture)
     try:
         if picture is None:
             raise typer.Exit(open_viewer(run))
@@ -352,17 +364,6 @@ def _scenario(file: Path) -> Any:
     from scenarios.files import load
 
     return load(file)
-
-
-def _out_folder(out: Path) -> Path:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        used = any(out.iterdir())
-    except OSError as error:
-        raise InputError(f"--out: {out}: {error.strerror}, wanted a folder that can be written") from None
-    if used:
-        raise InputError(f"--out: {out} is not empty, wanted a new or empty folder")
-    return out
 
 
 def _print_design(result: dict[str, Any]) -> None:

@@ -20,6 +20,36 @@ class InputError(Exception):
     """The user's input cannot be used: one line with what was read and what was wanted; exit code 2."""
 
 
+def within(option: str, value: float, least: float, most: float, unit: str = "") -> None:
+    """Refuse a number that is not in a range, NaN among them."""
+    if not least <= value <= most:
+        raise InputError(f"{option}: read {value:g}, wanted {unit or 'a number'} from {least:g} to {most:g}")
+
+
+def out_folder(out: Path, wanted: str = "a new or empty folder") -> Path:
+    """The new or empty folder that --out names, made if need be."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        used = any(out.iterdir())
+    except OSError as error:
+        raise InputError(f"--out: {out}: {error.strerror}, wanted a folder that can be written") from None
+    if used:
+        raise InputError(f"--out: {out} is not empty, wanted {wanted}")
+    return out
+
+
+def out_file(option: str, file: Path) -> None:
+    """Refuse a file that cannot be written, before the work whose result goes there; its folder is made."""
+    try:
+        new = not file.exists()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.open("ab").close()
+        if new:
+            file.unlink()
+    except OSError as error:
+        raise InputError(f"{option}: {file}: {error.strerror}, wanted a file that can be written") from None
+
+
 def address(option: str, text: str) -> tuple[str, int]:
     """HOST:PORT as given to an option."""
     host, _, port = text.rpartition(":")

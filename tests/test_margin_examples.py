@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from math import pi
+from math import log, pi
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,10 @@ KNOWN: dict[str, tuple[dict[str, Any], list[list[float | None]]]] = {
         {"A": [[0, 1], [0, -0.1]], "B": [[0], [0.1]], "K": [[-3.75, -11.5]], "hold": True},
         [[0.0, 1.7294142794798775]],
     ),
+    "an unstable plant, held: e^2T - 1.5 (e^2T - 1) = -1": (
+        {"A": [[2]], "B": [[1]], "K": [[-3]], "hold": True},
+        [[0.0, log(5) / 2]],
+    ),
 }
 
 
@@ -50,6 +54,14 @@ def test_known_margins(tmp_path: Path, model: dict[str, Any], intervals: list[li
     assert result["delay_margin_s"] == (first[1] if first[0] == 0.0 and first[1] is None else pytest.approx(
         first[1] if first[0] == 0.0 else 0.0, rel=1e-8
     ))  # fmt: skip
+
+
+@pytest.mark.parametrize("gain", [0, -1])
+def test_an_unstable_plant_with_too_little_gain_is_stable_at_no_period(tmp_path: Path, gain: int) -> None:
+    done = run(tmp_path, json.dumps({"A": [[2]], "B": [[1]], "K": [[gain]], "hold": True}), "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    result = json.loads(done.stdout)
+    assert (result["stable_intervals_s"], result["unstable_roots_at_zero_delay"]) == ([], 1)
 
 
 def test_fixed_delays_give_the_rightmost_root(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from gcs.lockstep import START_NS, fly_lockstep
 from gcs.plan import flight_plan
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
 from gcs.show.observer import record_run
-from gcs.show.viewer import screenshot, vulkan_missing
+from gcs.show.viewer import ViewerError, screenshot, vulkan_missing
 from gcs.station import Station
 from gcs.summary import read_ticks
 from scenarios.files import dump, load
@@ -83,3 +83,11 @@ def test_the_headless_viewer_opens_a_flight_and_no_view_reports_an_error(run: Pa
     assert len(np.unique(pictures[0].reshape(-1, pictures[0].shape[2]), axis=0)) > 100  # lines, labels, vehicles
     moved = np.abs(pictures[0] - pictures[1]).max(axis=2) > 0.1
     assert 0.001 < moved.mean() < 0.9  # vehicles and the time cursor have moved on, the screen is the same
+
+
+@pytest.mark.skipif(vulkan_missing(), reason="no Vulkan driver installed (Debian: mesa-vulkan-drivers)")
+def test_a_recording_cut_off_before_its_first_tick_is_told_in_one_line(run: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.rrd"
+    cut.write_bytes((run / "flight.rrd").read_bytes()[:2000])
+    with pytest.raises(ViewerError, match=r"cut\.rrd: the viewer reads no flight in it; wanted a recording of a run"):
+        screenshot(cut, tmp_path / "cut.png", time_s=0.0, width=800, height=500)

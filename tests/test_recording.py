@@ -129,7 +129,7 @@ def test_what_a_tick_says_of_several_vehicles_is_one_entry(tmp_path: Path) -> No
 
 
 def test_without_a_screen_the_viewer_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / RECORDING_FILE).touch()
+    (tmp_path / RECORDING_FILE).write_bytes(b"RRF2")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
@@ -193,8 +193,11 @@ def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path: Path) -> N
     (tmp_path / UNFINISHED_FILE).touch()
     with pytest.raises(ViewerError, match=r"the recording is not finished"):
         find_recording(tmp_path)
-    (tmp_path / RECORDING_FILE).touch()
+    (tmp_path / RECORDING_FILE).write_bytes(b"RRF2")
     assert find_recording(tmp_path) == find_recording(tmp_path / RECORDING_FILE) == tmp_path / RECORDING_FILE
+    (tmp_path / RECORDING_FILE).write_bytes(b"")
+    with pytest.raises(ViewerError, match=r"flight\.rrd: read a file of another kind; wanted a recording of a run"):
+        find_recording(tmp_path)
 
 
 def test_a_half_written_row_is_left_out_of_a_recovered_recording(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from gcs.stress.command import stress
 from gcs.stress.study import Onset, Study, find_onset
 from gcs.stress.terminal import write_junit
 from gcs.summary import SUMMARY_FILE
+from gcs.user_input import InputError
 from scenarios.files import dump
 
 app = typer.Typer()
@@ -193,8 +194,11 @@ def test_a_trial_in_real_time_has_the_noise_of_the_machine_on_record(tmp_path: P
         (["--onset", "--dask", "no address"], "wanted the address of a Dask scheduler"),
     ],
 )
-def test_input_that_cannot_be_used_is_one_line_and_code_2(tmp_path: Path, options: list[str], wanted: str) -> None:
-    assert wanted in " ".join(run(tmp_path, *options, code=2).replace("│", " ").split())
+def test_input_that_cannot_be_used_is_told_and_leaves_nothing(tmp_path: Path, options: list[str], wanted: str) -> None:
+    (tmp_path / "pair.toml").write_text(dump(SCENARIO), encoding="utf-8")
+    result = CliRunner().invoke(app, [str(tmp_path / "pair.toml"), *options])
+    assert isinstance(result.exception, InputError)
+    assert wanted in str(result.exception)
     assert [file.name for file in tmp_path.iterdir()] == ["pair.toml"]
 
 

@@ -20,6 +20,9 @@ from gcs.show.recording import TIMELINE, UNFINISHED_FILE, viewer_client
 
 START_S = 20.0
 SETTLE_S = 20.0
+_MAGIC = b"RRF"
+"""How every .rrd file begins."""
+_WANTED = "wanted a recording of a run (.rrd)"
 
 
 class ViewerError(Exception):
@@ -45,27 +48,37 @@ def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 16
     recording = find_recording(folder_or_rrd)
     with _headless(width, height) as viewer:
         viewer.open(str(recording.resolve()))
-        viewer.set_time(TIMELINE, duration=time_s, play_state="paused")
+        try:
+            viewer.set_time(TIMELINE, duration=time_s, play_state="paused")
+        except ConnectionError:  # it has loaded nothing with times
+            raise ViewerError(f"{recording}: the viewer reads no flight in it; {_WANTED}") from None
         viewer.run_command("ui.toggle_top_panel")  # it has nothing to say on a picture
         png.write_bytes(_settled_picture(viewer))
         state = viewer.get_state()
     if not state.views:
-        raise ViewerError(f"{recording}: the viewer shows nothing of it; wanted a recording of a run")
+        raise ViewerError(f"{recording}: the viewer shows nothing of it; {_WANTED}")
     return [f"{shown.name}: {report}" for shown in state.views for report in shown.reports]
 
 
 def find_recording(folder_or_rrd: Path) -> Path:
     """The finished recording of a run folder, or the file itself."""
     if folder_or_rrd.is_file():
-        return folder_or_rrd
+        return _begun_as_recording(folder_or_rrd)
     recording = folder_or_rrd / RECORDING_FILE
     if recording.is_file():
-        return recording
+        return _begun_as_recording(recording)
     if not folder_or_rrd.is_dir():
         raise ViewerError(f"{folder_or_rrd}: no such run folder or recording")
     if (folder_or_rrd / UNFINISHED_FILE).exists():
         raise ViewerError(f"{folder_or_rrd}: the recording is not finished; the run still flies, or it was killed")
     raise ViewerError(f"{folder_or_rrd}: no {RECORDING_FILE} here; wanted a run folder or an .rrd file")
+
+
+def _begun_as_recording(file: Path) -> Path:
+    with file.open("rb") as opened:
+        if opened.read(len(_MAGIC)) != _MAGIC:
+            raise ViewerError(f"{file}: read a file of another kind; {_WANTED}")
+    return file
 
 
 def vulkan_missing() -> bool:

@@ -7,7 +7,6 @@ stored), `result` (what was found) and `report` (what is shown), all of this pac
 import contextlib
 import json
 import os
-import time  # noqa: TID251 - names the campaign's folder; the flights have clocks of their own
 from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from gcs.loop_option import Loop, LoopOption, load_with_loop
+from gcs.user_input import InputError, out_file, out_folder
 
 if TYPE_CHECKING:
     from gcs.stress.campaign import Fly
@@ -100,6 +100,8 @@ def stress(
         assert_onset=assert_onset,
     )
     _check(options, out, trial)
+    if junit is not None:
+        out_file("--junit", junit)
     from gcs.stress.campaign import CampaignError
 
     try:
@@ -108,7 +110,7 @@ def stress(
             raise typer.Exit(_fly_again(options, out, trial, as_json=as_json))
         result, folder = _campaign(options, out, shown=not as_json)
     except CampaignError as error:
-        raise typer.BadParameter(str(error)) from None
+        raise InputError(str(error)) from None
     if junit is not None:
         from gcs.stress.terminal import write_junit
 
@@ -124,25 +126,23 @@ def stress(
 
 def _check(options: StressOptions, out: Path | None, trial: str) -> None:
     """What no single option can show."""
-    if trial or options.resume:
-        if out is None or not out.is_dir():
-            flag = "--trial" if trial else "--resume"
-            raise typer.BadParameter(f"--out: read {out}, wanted the folder of a campaign, as {flag} is given")
-    elif out is not None and out.is_dir() and any(out.iterdir()):
-        raise typer.BadParameter(f"--out: {out} is not empty, wanted a new or empty folder, or --resume")
+    if (trial or options.resume) and (out is None or not out.is_dir()):
+        flag = "--trial" if trial else "--resume"
+        raise InputError(f"--out: read {out}, wanted the folder of a campaign, as {flag} is given")
     if not (trial or options.onset or options.axes):
-        raise typer.BadParameter("nothing to fly; wanted --onset, or an axis as --delay 0:0.6:13")
+        raise InputError("nothing to fly; wanted --onset, or an axis as --delay 0:0.6:13")
     if len(options.axes) > 2:
-        raise typer.BadParameter(f"read {len(options.axes)} axes, wanted one (a sweep) or two (a map)")
+        raise InputError(f"read {len(options.axes)} axes, wanted one (a sweep) or two (a map)")
     if options.seeds < 1 or options.workers < 0:
-        raise typer.BadParameter("--seeds and --workers: wanted whole numbers from 1")
+        raise InputError("--seeds and --workers: wanted whole numbers from 1")
     for name, value in (("--tolerance", options.tolerance), ("--assert-onset", options.assert_onset)):
         if value is not None and not 0.0 < value < 1.0:
-            raise typer.BadParameter(f"{name}: read {value:g}, wanted a part between 0 and 1, as 0.02")
+            raise InputError(f"{name}: read {value:g}, wanted a part between 0 and 1, as 0.02")
 
 
 def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple[dict[str, Any], Path]:
     """Fly what was asked for; the result as plain types, and the folder it is in."""
+    from gcs.fly import new_folder
     from gcs.stress.campaign import Store, run_campaign, write_parquet
     from gcs.stress.report import write_report
     from gcs.stress.result import result_of
@@ -155,8 +155,10 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
     no_onset: NoOnset | None = None
     with contextlib.ExitStack() as stack:
         fly = stack.enter_context(_workers(options))
-        folder = out if out is not None else _new_folder(study.plan.scenario.name)
-        folder.mkdir(parents=True, exist_ok=True)
+        if out is None:
+            folder = new_folder(f"{study.plan.scenario.name}-stress")
+        else:
+            folder = out if options.resume else out_folder(out, "a new or empty folder, or --resume")
         (folder / SCENARIO_FILE).write_text(dump(study.plan.scenario), encoding="utf-8")
         store = stack.enter_context(contextlib.closing(Store(folder)))
         progress = stack.enter_context(_progress(shown))
@@ -192,7 +194,7 @@ def _study(options: StressOptions) -> "tuple[Study, dict[str, Any]]":
     scenario = load_with_loop(options.scenario_file, options.loop)
     if scenario.dynamics == "autopilot":
         wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
-        raise typer.BadParameter(f"{options.scenario_file}: dynamics: read 'autopilot', wanted {wanted}")
+        raise InputError(f"{options.scenario_file}: dynamics: read 'autopilot', wanted {wanted}")
     # the slower gains of the schedule are not flown here, and need not be designed
     scheduled = scenario.model_copy(
         update={"monitor": scenario.monitor.model_copy(update={"time_scales": (1.0,), "act": False})}
@@ -212,7 +214,7 @@ def _axes(options: StressOptions, study: "Study") -> "list[Any]":
                 parse_vehicle_axis(text, study.plan.formation.system_ids) if of_vehicle else parse_axis(name, text)
             )
         except AxisError as error:
-            raise typer.BadParameter(f"--{name.replace('_', '-')}: {error}") from None
+            raise InputError(f"--{name.replace('_', '-')}: {error}") from None
     return axes
 
 
@@ -273,7 +275,3 @@ def _fly_again(options: StressOptions, folder: Path, wanted: str, *, as_json: bo
     else:
         print_replay(replay)
     return _FAILED if replay.outcome.error is not None or replay.differs else 0
-
-
-def _new_folder(scenario_name: str) -> Path:
-    return Path("runs") / f"{scenario_name}-stress-{time.strftime('%Y%m%d-%H%M%S')}"

@@ -133,5 +133,4 @@ def write_junit(result: dict[str, Any], file: Path) -> None:
         case = ElementTree.SubElement(suite, "testcase", classname=name, name=f"trial {trial_id}")
         error = ElementTree.SubElement(case, "error", message=entry["error"].strip().splitlines()[-1])
         error.text = entry["error"]
-    file.parent.mkdir(parents=True, exist_ok=True)
     ElementTree.ElementTree(suite).write(file, encoding="utf-8", xml_declaration=True)
