@@ -37,6 +37,7 @@ GREETED_US = {
     **dict.fromkeys(EXTRA, 1_000_000),
     mavlink.LOCAL_POSITION: 250_000,
     mavlink.GLOBAL_POSITION: 250_000,
+    mavlink.HOME_POSITION: 2_000_000,
 }
 """What it reports once it has been greeted, unless it does already."""
 STREAMS: dict[int, tuple[int, ...]] = {

@@ -87,6 +87,7 @@ def test_whoever_asks_for_the_version_is_reported_all_that_health_is_read_from(k
     for name in ("SYS_STATUS", "EXTENDED_SYS_STATE", "GPS_RAW_INT", "ATTITUDE", "BATTERY_STATUS", "VFR_HUD"):
         assert 4 <= len(named(sent, name)) <= 6, name
     assert len(named(sent, "GLOBAL_POSITION_INT")) >= 4
+    assert len(named(sent, "HOME_POSITION")) >= 2  # QGroundControl asks ArduPilot for it; PX4 sends it by itself
     status, gps = named(sent, "SYS_STATUS")[-1], named(sent, "GPS_RAW_INT")[-1]
     wanted = (
         dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
