@@ -57,15 +57,16 @@ def fly(
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
     (folder / DESIGN_FILE).write_text(json.dumps(design, indent=2), encoding="utf-8")
     with contextlib.ExitStack() as stack:
-        stop_reason = stack.enter_context(stop_signals())
+        asked_to_stop = stack.enter_context(stop_signals())
         heard = _vehicles_heard(link, plan, guard)
         # Left in the reverse order: the log is closed, the vehicles end, the observer has finished the recording.
+        vehicles: VehicleProcess | None = None
         observer = stack.enter_context(_observer(folder, show_table=options.show_table))
         if options.start_vehicles and not heard:
-            start = VehicleProcess(
+            vehicles = VehicleProcess(
                 folder / SCENARIO_FILE, station=link.address, folder=folder, key_file=options.key_file
             )
-            stack.enter_context(start)
+            stack.enter_context(vehicles)
         writer = RunWriter(folder)
         stack.callback(writer.close)
         _wait_until_ready(observer, folder)
@@ -80,7 +81,10 @@ def fly(
             text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
             writer.event(time_s=station.scenario_time_s(clock_ns()), kind=NEW_DESIGN, text=text)
 
-        drive(station, link, writer, stop_reason, new_plan, guard, mirror)
+        def stop() -> str:
+            return asked_to_stop() or ("" if vehicles is None else vehicles.complaint())
+
+        drive(station, link, writer, stop, new_plan, guard, mirror)
         writer.event(time_s=station.scenario_time_s(clock_ns()), kind="end", text=station.end_reason)
     return finish(folder)
 

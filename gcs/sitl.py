@@ -24,7 +24,8 @@ class VehicleProcess:
 
     def __init__(self, scenario_file: Path, *, station: Address, folder: Path, key_file: Path | None = None) -> None:
         host, port = station
-        with (folder / VEHICLES_LOG).open("wb") as log:
+        self._log = folder / VEHICLES_LOG
+        with self._log.open("wb") as log:
             self._process = subprocess.Popen(
                 [
                     sys.executable, "-m", "sim_vehicles.cli", str(scenario_file), "--station", f"{host}:{port}",
@@ -39,6 +40,13 @@ class VehicleProcess:
     @property
     def pid(self) -> int:
         return self._process.pid
+
+    def complaint(self) -> str:
+        """Why they ended by themselves, as they said it last; empty while they live, or if somebody killed them."""
+        if (self._process.poll() or 0) <= 0:
+            return ""
+        lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")
+        return f"vehicles ended: {next((line for line in reversed(lines) if line), 'they did not say why')}"
 
     def __enter__(self) -> Self:
         return self

@@ -25,7 +25,7 @@ from gcs.udp import StationSocket, clock_ns, realtime_offset_ns
 from scenarios.files import load
 from scenarios.schema import FixedGains
 from scenarios.signing.keys import Key, make_key, read_key
-from scenarios.signing.stamps import Stamps
+from scenarios.signing.stamps import Stamps, open_stamps
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
@@ -104,6 +104,20 @@ def test_after_a_kill_a_new_station_with_the_key_takes_the_vehicles_back(tmp_pat
     finally:
         for pid in children_named(str(first)):
             os.kill(pid, signal.SIGTERM)
+
+
+def test_vehicles_that_cannot_start_as_others_have_their_timestamps_end_the_flight_with_what_they_said(
+    tmp_path: Path,
+) -> None:
+    key_file = tmp_path / "key"
+    make_key(key_file)
+    held = open_stamps(tmp_path / "key.vehicles")  # as by vehicles at another port
+    options = ("--listen", f"127.0.0.1:{free_port()}", "--key", key_file, "--out", tmp_path / "run", "--json")
+    out, _ = fly(short(tmp_path, "chain3", 1.0), *options).communicate(timeout=PATIENCE_S)
+    summary = json.loads(out)
+    said = f"{tmp_path}/key.vehicles: another process uses it, wanted a key of one's own for each"
+    assert (summary["verdict"], summary["reason"]) == ("aborted", f"vehicles ended: sim-vehicles: {said}")
+    assert len(held.known) == 0
 
 
 @pytest.mark.parametrize("signed", [False, True])
