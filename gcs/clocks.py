@@ -112,10 +112,12 @@ class VehicleClock:
         t = (self._sent_ns[:n] - now_ns).astype(float)
         base = int(self._offset_ns[(self._count - 1) % WINDOW])
         y = (self._offset_ns[:n] - base).astype(float)
-        t_mean, y_mean = weight @ t, weight @ y
-        spread = weight @ (t - t_mean) ** 2
+        # Sums of products, not `@`: BLAS adds in an order of each processor's own, and flights are the same on all.
+        t_mean, y_mean = (weight * t).sum(), (weight * y).sum()
+        t -= t_mean
+        spread = (weight * t * t).sum()
         # A slope from a short stretch would be noise: below 0.3 s (rms) of history the clock is taken as drift-free.
-        skew = float(weight @ ((t - t_mean) * (y - y_mean)) / spread) if spread > 0.09e18 else 0.0
+        skew = float((weight * t * (y - y_mean)).sum() / spread) if spread > 0.09e18 else 0.0
         offset = base + round(y_mean - skew * t_mean)
         return ClockEstimate(
             samples=n, offset_ns=offset, skew=skew, bound_ns=least // 2 + 1, reference_ns=now_ns
