@@ -84,6 +84,19 @@ def test_the_error_of_the_zero_is_that_of_the_rates_over_the_slope() -> None:
     assert 0.7 < float(np.std(off)) < 1.4
 
 
+def test_flights_over_a_kink_are_said_to_lie_on_no_parabola_and_the_error_says_so() -> None:
+    """As the sampled loop has at whole numbers of periods: slopes of 18 and 14 1/s², seen of a graph-dk design."""
+    for half_width_s, smooth in ((0.004, False), (0.0002, False), (0.004, True)):
+        delays = 0.2 + half_width_s * np.linspace(-1.0, 0.8, 5)
+        rates = [(18.0 if d < 0.2 and not smooth else 14.0) * (float(d) - 0.2) for d in delays]
+        zero = locate_zero([GrowthPoint(float(d), rate, 1e-6) for d, rate in zip(delays, rates, strict=True)])
+        assert zero is not None
+        assert (zero.misfit < 1e-3) is smooth
+        assert (zero.misfit > 5.0) is not smooth
+        assert abs(zero.loop_delay_s - 0.2) < 3.0 * zero.error_s + 1e-12
+        assert abs(zero.loop_delay_s - 0.2) < 0.06 * half_width_s
+
+
 def test_zero_outside_the_flights_is_marked_and_points_the_way() -> None:
     zero = locate_zero([GrowthPoint(d, curve(d), 1e-5) for d in (0.2, 0.22, 0.24)])
     assert zero is not None

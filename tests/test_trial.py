@@ -20,7 +20,7 @@ from gcs.stress.probe import probe_scenario, with_waiting
 from gcs.stress.study import Study
 from gcs.stress.trial import Trial, plan_of
 from scenarios.files import load
-from scenarios.schema import Clocks, Link, VehicleLinks
+from scenarios.schema import Clocks, Control, GainBlock, Link, VehicleLinks
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 
@@ -50,6 +50,15 @@ def test_flown_growth_is_that_of_the_sampled_model(name: str, delay_s: float) ->
     # the half period that the continuous model takes for the hold is good to a part in a thousand
     assert outcome.predicted_growth_continuous_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=2e-3)
     assert outcome.verdict == ("unstable" if outcome.growth_1_s > 0.0 else "stable")
+
+
+def test_a_follower_whose_gains_differ_north_and_east_is_measured_as_well() -> None:
+    """Four states of its own and not twice two: with half the modes the fit is off by 6e-2."""
+    own = GainBlock(vehicle=2, of=2, gain=((7.6, 0.3, -4.7, 0.0), (-0.2, 6.1, 0.0, -4.7)))
+    ahead = GainBlock(vehicle=1, of=1, gain=((-4.7, 0.0), (0.0, -6.1)))
+    _, plan = flight_plan(SCENARIO.model_copy(update={"control": Control(blocks=(ahead, own))}))
+    outcome = fly_trial(Study(plan).trial("probe", {"delay": 0.2}, seed=4, probe=2))
+    assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=2e-3)
 
 
 def test_the_leaders_loop_can_be_probed_too() -> None:

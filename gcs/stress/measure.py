@@ -187,8 +187,8 @@ def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcom
     delay_s = max(response.loop_delays_s(own, loop.system_ids).values())
     settled = _SETTLED_LOOP_DELAYS if loop.has_late_terms else _FLYING_LOOP_DELAYS
     start_s = settled * delay_s + 2.0 * loop.period_s
-    # as many of one axis as its states, and as many again of what is late; the other axis has the same
-    modes = max(FOLLOWER_MODES, len(loop.A))
+    # as many as its states, and as many again of what is late; given gains may differ north and east, or couple them
+    modes = 2 * max(FOLLOWER_MODES, len(loop.A))
     motion = motion_of(own, loop.system_ids, period_s=loop.period_s)
     if response.varying:
         growth = norm_growth(motion, start_s=start_s, end_s=response.until_s)

@@ -104,13 +104,16 @@ class GrowthPoint:
 class Zero:
     """Where growth passes from below to above zero; `error_s` is the standard error, `slope_1_s2` dg/dtau there.
 
-    `inside` says that there are flights on both sides: otherwise it is extrapolated.
+    `inside` says that there are flights on both sides: otherwise it is extrapolated. `misfit` is how far the flights
+    lie off the curve, in their errors: well above one where no parabola fits, as over a kink. The sampled loop's growth
+    has one where the delay is a whole number of periods.
     """
 
     loop_delay_s: float
     error_s: float
     slope_1_s2: float
     inside: bool
+    misfit: float
 
 
 def loops_of(
@@ -197,11 +200,14 @@ def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
             row = at ** np.arange(degree, -1, -1.0)
             slope = float(np.polyval(np.polyder(coefficients), at))
             variance = float(row @ np.linalg.pinv(weighted.T @ weighted) @ row)
+            off, free = weighted @ coefficients - growth / error, len(points) - degree - 1
+            misfit = float(np.linalg.norm(off)) / free**0.5 if free else 0.0
             return Zero(
                 loop_delay_s=middle + half * at,
-                error_s=half * variance**0.5 / slope,
+                error_s=half * variance**0.5 / slope * max(1.0, misfit),
                 slope_1_s2=slope / half,
                 inside=bool((growth < 0.0).any() and (growth > 0.0).any()),
+                misfit=misfit,
             )
     return None
 

@@ -16,7 +16,6 @@ What would hide the loop is taken out:
   links' asymmetry, which the station sees as errors too. So all vehicles have the links of the one that is probed.
   Its loop is the same for that: what the station uses of the others is brought to the instant of its own state.
 * Changes of the nominal velocity, and the noise of the vehicles' sensors.
-* Changes of the nominal velocity.
 * The vehicles' failsafe, which lossy links would now and then call for: it opens the loop.
 """
 

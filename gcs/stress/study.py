@@ -17,8 +17,10 @@ _ROUNDS = 8
 _FLIGHTS_A_ROUND = 5
 _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 """Link delays flown where no delay is to break the formation."""
-_FIRST_WIDTH = 3.0
-"""Half width of the first round of an onset search, in tolerances."""
+_FIRST_WIDTH, _FINEST_WIDTH = 3.0, 0.1
+"""Half widths of the first and of the closest round of an onset search, in tolerances."""
+_SMOOTH_MISFIT = 3.0
+"""Flights farther than this off a parabola, root mean square in standard errors, do not lie on one."""
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,9 @@ class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a f
 def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
     """Fly probes around the predicted onset, closer and closer, until the zero of their growth rates is located.
 
-    A round is a few flights at once, spread evenly over three tolerances to either side at first, then over one. The
-    search follows the measured growth wherever it leads: the prediction only says where to begin.
+    A round is a few flights at once, spread evenly over three tolerances to either side at first, then over one, and
+    over a part of one where no smooth curve goes through the flights. The search follows the measured growth wherever
+    it leads: the prediction only says where to begin.
 
     Raises
     ------
@@ -132,13 +135,16 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
             continue
         waiting_s = _waiting_s(near)
         ahead_s = max(0.0, zero.loop_delay_s - waiting_s) - centre_s
-        if zero.inside and width_s <= 1.001 * tolerance * predicted_s:
+        wanted_s = tolerance * predicted_s
+        smooth = zero.misfit <= _SMOOTH_MISFIT or width_s <= 1.001 * _FINEST_WIDTH * wanted_s
+        if zero.inside and smooth and width_s <= 1.001 * wanted_s:
             return _found(study, run, zero, near, tuple(flights.values()), rounds=round_number)
         if centre_s <= 0.0 and ahead_s <= 0.0:
             break
         # no farther than twice the width at once: a far extrapolation is a guess
         centre_s += float(np.clip(ahead_s, -2.0 * width_s, 2.0 * width_s))
-        width_s = tolerance * predicted_s if abs(ahead_s) < width_s else width_s
+        if abs(ahead_s) < width_s:
+            width_s = wanted_s if width_s > 1.001 * wanted_s else _FINEST_WIDTH * wanted_s
     failed = sum(outcome.growth_1_s is None for outcome in flights.values())
     raise NoOnset(
         f"growth did not pass zero in {len(flights)} flights with {min(links_of(flights.values())):.3f} to "
