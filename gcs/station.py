@@ -300,7 +300,7 @@ class Station:
         lost = silent if flying else [False] * len(silent)
         if lost != self._lost:
             for vehicle, gone, was in zip(self.vehicles, lost, self._lost, strict=True):
-                if gone != was:
+                if gone != was and flying:
                     self._report("vehicle", "is lost" if gone else "is heard again", vehicle.system_id)
             self._lost = lost
             self._law = law_of(self.plan, lost)

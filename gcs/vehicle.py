@@ -35,6 +35,10 @@ SILENCE_S = 1.5
 which nothing has come may be found at another address."""
 
 
+_SILENT_NS = 3 * _NS
+"""A vehicle is not ready to begin when nothing has come for this long, heartbeats neither."""
+
+
 @dataclass
 class _Command:
     """A COMMAND_LONG that waits for its COMMAND_ACK."""
@@ -108,13 +112,20 @@ class RemoteVehicle:
 
     @property
     def ready(self) -> bool:
-        return not self.missing if self.startup is None else not self._next(self.startup).missing
+        return not self.missing
+
+    @property
+    def silent(self) -> bool:
+        """Whether it was heard, but nothing of it for some seconds."""
+        return self.address is not None and self._now_ns - self.heard_ns > _SILENT_NS
 
     @property
     def missing(self) -> str:
         """What keeps it from being ready, in words."""
         if self.address is None:
             return "not heard"
+        if self.silent:
+            return "is silent"
         if self.startup is not None:
             return self._next(self.startup).missing
         if self.refused and self.upload is not None:

@@ -210,6 +210,18 @@ def test_vehicles_already_in_the_air_are_held_when_another_never_starts() -> Non
         assert flight.copter(system_id).mode == flight.copter(system_id).rules.hold_mode
 
 
+def test_no_flight_begins_without_a_vehicle_that_has_fallen_silent_while_it_climbed() -> None:
+    gone = Link(delay_s=0.02, outages=(Outage(from_s=6.0, until_s=1e6),))
+    vehicles = (VehicleLinks(system_id=3, up=gone, down=gone),)
+    scenario = three().model_copy(update={"response": TRUTH})
+    links = scenario.links.model_copy(update={"vehicles": vehicles, "times_from": "start"})
+    flight = fly(plan_for(scenario.model_copy(update={"links": links})))
+    assert flight.station.end_reason == "not ready: vehicle 3 is silent"
+    assert not flight.ticks["commanded"].any()
+    assert "is silent" in flight.texts("start")
+    assert "is heard again" not in flight.texts("vehicle")
+
+
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("by_s", [-0.2, 0.2, 5.0])
 def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str, by_s: float) -> None:

@@ -15,7 +15,7 @@ from gcs.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S
 
 PATIENCE_S = 120.0
-"""How long a vehicle may take from its first heartbeat until it is in the air and takes set-points."""
+"""How long a vehicle may take from its first heartbeat until it is in the air and takes set-points, or be silent."""
 START_PATIENCE_S = 360.0
 """How long all of them may take, whenever each was first heard."""
 _SILENT_S = 3.0
@@ -48,7 +48,8 @@ class Copters:
         out_of_time = due_ns - start_ns > START_PATIENCE_S * NS_PER_S
 
         def late(vehicle: RemoteVehicle) -> bool:
-            heard_ns = start_ns if vehicle.first_heard_ns is None else vehicle.first_heard_ns
+            first_ns = start_ns if vehicle.first_heard_ns is None else vehicle.first_heard_ns
+            heard_ns = vehicle.heard_ns if vehicle.silent else first_ns
             return not vehicle.ready and (out_of_time or due_ns - heard_ns > PATIENCE_S * NS_PER_S)
 
         unready = [f"vehicle {v.system_id} {v.missing}" for v in self._vehicles if late(v)]
