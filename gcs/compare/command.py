@@ -17,7 +17,7 @@ from gains.dk_iteration import LARGEST_STATES, abscissa
 from gains.errors import GainsError
 from gains.formation import FormationModel
 from gains.robust import disturbance_bound
-from gcs.compare.cost import RATIO, DesignCost, ratios
+from gcs.compare.cost import RATIO, DesignCost, left_out, ratios
 from gcs.flown import fly_virtual
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import TickArray
@@ -194,6 +194,7 @@ def write_comparison(
         methods=[route.method for route in routes],
         failed=[route for route in routes if route.failed],
         sizes=list(zip(grown, ratios(grown), strict=True)),
+        left_out=left_out(grown),
         ratio=RATIO,
         figures={title: data_uri(file) for title, file in figures.items()},
     )
@@ -239,7 +240,8 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Design
     from rich.table import Table
 
     console = Console(highlight=False, soft_wrap=True)
-    table = Table(box=box.SIMPLE_HEAD, title=scenario.name, title_justify="left", title_style="")
+    title = f"{scenario.name}: designed for what it asks for, flown over its links"
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="")
     for heading in ("", *(route.method for route in routes)):
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     for title, texts in rows(routes):
@@ -255,3 +257,5 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Design
         for size, ratio in zip(grown, ratios(grown), strict=True):
             table.add_row(size.method, str(size.vehicles), str(size.free_gains), f"{size.design_s:.3f}", f"{ratio:.2f}")
         console.print(table)
+        for line in left_out(grown):
+            console.print(line)

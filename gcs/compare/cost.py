@@ -20,6 +20,7 @@ _REFERENCE = ("inclusion", 5)
 _SIZES = (3, 5, 10, 20, 40, 80, 200)
 _LONGEST_S = 10.0
 """A method that would take longer, should its time grow with the cube of the size, is not tried on more vehicles."""
+_DK_STATES = LARGEST_STATES // 2
 _REPEATED_BELOW_S = 1.0
 _REPEATS = 5
 _PERIOD_S = 0.02
@@ -56,7 +57,7 @@ def design_costs() -> list[DesignCost]:
     }
     for label, method in methods.items():
         for vehicles, following in zip(_SIZES, (*_SIZES[1:], _SIZES[-1]), strict=True):
-            if label == "graph-dk" and 2 * vehicles - 1 > LARGEST_STATES // 2:
+            if _too_large(label, vehicles):
                 break
             taken_s, free = _timed(method, vehicles)
             found.append(DesignCost(label, vehicles, taken_s, free))
@@ -69,6 +70,22 @@ def ratios(costs: list[DesignCost]) -> list[float]:
     """Time of each design over that of five vehicles by inclusion, in the same run; empty for no designs."""
     reference_s = [cost.design_s for cost in costs if (cost.method, cost.vehicles) == _REFERENCE]
     return [cost.design_s / reference_s[0] for cost in costs]
+
+
+def left_out(costs: list[DesignCost]) -> list[str]:
+    """For each method that was not tried on all sizes, one line that says from where on, and why."""
+    largest = {cost.method: cost.vehicles for cost in costs}
+    tried = {method: _SIZES.index(vehicles) + 1 for method, vehicles in largest.items()}
+    return [
+        f"{method}: not tried on {_SIZES[count]} vehicles and more; "
+        + (f"more than {_DK_STATES} states an axis" if _too_large(method, _SIZES[count]) else f"over {_LONGEST_S:g} s")
+        for method, count in tried.items()
+        if count < len(_SIZES)
+    ]
+
+
+def _too_large(method: str, vehicles: int) -> bool:
+    return method == "graph-dk" and 2 * vehicles - 1 > _DK_STATES
 
 
 def _timed(method: Callable[[int], int], vehicles: int) -> tuple[float, int]:
