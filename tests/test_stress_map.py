@@ -7,7 +7,7 @@ import pytest
 from stress_pair import SCENARIO, pair_plan
 
 from gcs.stress.axes import Axis, at_coordinates
-from gcs.stress.boundary import guaranteed_line, two_delays_lines
+from gcs.stress.boundary import cell_edges, guaranteed_line, two_delays_lines
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
@@ -62,3 +62,17 @@ def test_loops_of_several_vehicles_have_no_such_rectangle() -> None:
     gain[0, 2] = 0.5  # the leader uses the follower's spacing: one loop of two
     study = Study(replace(plan, gain=gain, scenario=at_coordinates(SCENARIO, {"delay": 0.02})))
     assert two_delays_lines(study, (Axis("delay_1", (0.1, 0.5)), Axis("delay_2", (0.1, 0.5))), []) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "edges"),
+    [
+        ([0.2, 0.25, 0.4], [0.175, 0.225, 0.325, 0.475]),
+        ([0.2], [0.18, 0.22]),
+        ([0.0], [-0.01, 0.01]),
+    ],
+)
+def test_each_value_of_an_axis_lies_in_a_cell_that_ends_halfway_to_the_next(
+    values: list[float], edges: list[float]
+) -> None:
+    assert cell_edges(np.array(values)) == pytest.approx(edges)

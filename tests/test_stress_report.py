@@ -70,6 +70,26 @@ def test_sweep_and_onset_agree_with_the_margin_and_leave_a_page_of_their_own(tmp
     assert again["onset"] == onset
 
 
+def test_a_campaign_is_taken_up_with_its_own_scenario_only(tmp_path: Path) -> None:
+    out, run_folder = tmp_path / "out", tmp_path / "run"
+    run(tmp_path, "--delay", "0", "--out", str(out))
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    run_folder.mkdir()
+    (run_folder / "scenario.toml").write_text(dump(SCENARIO), encoding="utf-8")
+    (tmp_path / "pair.toml").write_text(dump(SCENARIO.model_copy(update={"seed": 99})), encoding="utf-8")
+    for folder, option, wanted in (
+        (out, ("--resume",), "is another scenario"),
+        (run_folder, ("--resume",), "read no trials.jsonl"),
+        (run_folder, ("--trial", "abc"), "read no trials.jsonl"),
+    ):
+        arguments = [str(tmp_path / "pair.toml"), "--delay", "0", "--out", str(folder), *option]
+        result = CliRunner().invoke(app, arguments)
+        assert isinstance(result.exception, InputError), result.output
+        assert wanted in str(result.exception)
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+    assert [file.name for file in run_folder.iterdir()] == ["scenario.toml"]
+
+
 def found_with(plan: FlightPlan, folder: Path) -> Onset:
     store = Store(folder)
     with local_workers(1) as fly:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gcs.record import SCENARIO_FILE
 from gcs.show.observer import record_run
-from gcs.stress.campaign import CampaignError, Store
+from gcs.stress.campaign import CampaignError, Store, check_campaign
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, Trial
@@ -46,6 +46,7 @@ def replayed(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Rep
 
 
 def _stored(folder: Path, wanted: str) -> Outcome:
+    check_campaign(folder, "--trial")
     with contextlib.closing(Store(folder)) as store:
         found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
     if len(found) != 1:

@@ -20,8 +20,9 @@ from gcs.stress.onset import distinct
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, plan_loops
 
-_PREDICTED, _GUARANTEED, _SEVERAL = "black", "#1b7837", "#7b3294"
+_PREDICTED, _GUARANTEED, _SEVERAL, _BLANK = "black", "#1b7837", "#7b3294", "#c8c8c8"
 _POINTS = 60
+_MOST_TICKS = 12
 
 
 def map_figure(
@@ -39,7 +40,9 @@ def map_figure(
     across, up = (np.array(axis.values) for axis in axes)
     figure, (plot,) = figure_of(1, (9.0, 6.2))
     reach = max(1e-6, min(float(np.nanmax(np.abs(measured))), 1.0))
-    colors = plot.pcolormesh(across, up, measured.T, cmap="RdBu_r", vmin=-reach, vmax=reach, shading="nearest")
+    plot.set_facecolor(_BLANK)
+    plot.grid(visible=False)
+    colors = plot.pcolormesh(cell_edges(across), cell_edges(up), measured.T, cmap="RdBu_r", vmin=-reach, vmax=reach)
     figure.colorbar(colors, ax=plot, label="growth rate in flight [1/s]: red grows", extend="both")
     for values, color, dashes, label in (
         (measured, MEASURED, "solid", "boundary in flight"),
@@ -55,7 +58,12 @@ def map_figure(
         label = "guaranteed to the left, however the delay varies"
         plot.plot(*line.T, color=_GUARANTEED, linestyle="dashdot", linewidth=2.0, label=label)
     _mark(plot, axes, verdicts, np.abs(measured) > 0.6 * reach)
-    plot.set(xlabel=axes[0].label, ylabel=axes[1].label, xlim=_limits(across), ylim=_limits(up))
+    if np.isnan(measured).any():
+        plot.plot([], [], "s", color=_BLANK, markersize=9, label="no growth rate could be measured")
+    plot.set(xlabel=axes[0].label, ylabel=axes[1].label, xlim=cell_edges(across)[[0, -1]], ylim=cell_edges(up)[[0, -1]])
+    for axis, values in ((plot.xaxis, across), (plot.yaxis, up)):
+        flown = values[:: 1 + (values.size - 1) // _MOST_TICKS].tolist()
+        axis.set_ticks(flown, [f"{value:g}" for value in flown])
     handles = dict(zip(*reversed(plot.get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside upper left", ncols=2, frameon=False, fontsize=9)
     return saved(figure, file)
@@ -125,20 +133,23 @@ def _mark(plot: Any, axes: Sequence[Axis], verdicts: Sequence[Outcome], dark: ND
     """The verdict of each cell's flights from the scenario's own initial states; light marks on dark cells."""
     across, up = (np.array(axis.values) for axis in axes)
     found = _verdicts(axes, verdicts)
-    for verdict, marker, size in (("unstable", "x", 22), ("stable", "o", 8)):
+    for verdict, marker, size in (("unstable", "x", 22), ("stable", "o", 8), ("aborted", "+", 22)):
         at = np.argwhere(found == verdict)
+        if not at.size:
+            continue
         ink = np.where(dark[at[:, 0], at[:, 1]], "white", "#222222")
         plot.scatter(across[at[:, 0]], up[at[:, 1]], marker=marker, s=size, c=ink, linewidths=0.9)
         label = f"own initial states: {verdict}"
         plot.scatter([], [], marker=marker, s=size, c="#222222", linewidths=0.9, label=label)
 
 
-def _limits(values: FloatArray) -> tuple[float, float]:
-    """The outer edges of the cells."""
+def cell_edges(values: FloatArray) -> FloatArray:
+    """The edges of cells around rising values: halfway between them, and as far beyond the outer ones."""
     if values.size < 2:
-        return float(values[0]) - 0.5, float(values[0]) + 0.5
-    ordered = np.sort(values)
-    return float(1.5 * ordered[0] - 0.5 * ordered[1]), float(1.5 * ordered[-1] - 0.5 * ordered[-2])
+        half = 0.1 * abs(float(values[0])) or 0.01
+        return np.array([values[0] - half, values[0] + half])
+    between = (values[:-1] + values[1:]) / 2.0
+    return np.r_[2.0 * values[0] - between[0], between, 2.0 * values[-1] - between[-1]]
 
 
 def _cells(axes: Sequence[Axis], outcomes: Sequence[Outcome], field: str) -> FloatArray:

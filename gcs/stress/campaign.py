@@ -16,6 +16,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from gcs.record import SCENARIO_FILE
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
 
@@ -55,6 +56,22 @@ class Store:
 
     def close(self) -> None:
         os.close(self._descriptor)
+
+
+def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None:
+    """Refuse, for an option, a folder that is no campaign, or one of another scenario than this, as TOML.
+
+    Raises
+    ------
+    CampaignError
+        With what was read and what was wanted.
+    """
+    for name in (SCENARIO_FILE, TRIALS_FILE):
+        if not (folder / name).is_file():
+            raise CampaignError(f"{flag}: read no {name} in {folder}, wanted the folder of a campaign")
+    file = folder / SCENARIO_FILE
+    if scenario is not None and file.read_text(encoding="utf-8") != scenario:
+        raise CampaignError(f"{flag}: {file} is another scenario or loop than was given, wanted that of the campaign")
 
 
 def run_campaign(

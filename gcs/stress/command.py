@@ -143,13 +143,17 @@ def _check(options: StressOptions, out: Path | None, trial: str) -> None:
 def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple[dict[str, Any], Path]:
     """Fly what was asked for; the result as plain types, and the folder it is in."""
     from gcs.fly import new_folder
-    from gcs.stress.campaign import Store, run_campaign, write_parquet
+    from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
     from gcs.stress.report import write_report
     from gcs.stress.result import result_of
     from gcs.stress.study import NoOnset, find_onset
     from scenarios.files import dump
 
     study, design = _study(options)
+    scenario = dump(study.plan.scenario)
+    if options.resume:
+        assert out is not None
+        check_campaign(out, "--resume", scenario)
     axes = _axes(options, study)
     onset: Onset | None = None
     no_onset: NoOnset | None = None
@@ -159,7 +163,7 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
             folder = new_folder(f"{study.plan.scenario.name}-stress")
         else:
             folder = out if options.resume else out_folder(out, "a new or empty folder, or --resume")
-        (folder / SCENARIO_FILE).write_text(dump(study.plan.scenario), encoding="utf-8")
+        (folder / SCENARIO_FILE).write_text(scenario, encoding="utf-8")
         store = stack.enter_context(contextlib.closing(Store(folder)))
         progress = stack.enter_context(_progress(shown))
         try:

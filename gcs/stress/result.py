@@ -2,6 +2,7 @@
 
 import platform
 import subprocess
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -56,6 +57,7 @@ def result_of(
         "failure": failure,
         "passed": not failure and not failed,
         "trials": len(outcomes),
+        "trials_of_kind": dict(Counter(outcome.kind for outcome in outcomes)),
         "trials_failed": [{"id": o.id, "seed": o.seed, "coordinates": o.coordinates, "error": o.error} for o in failed],
         "worst": [o.id for o in worst],
         "flight_time_s": round(sum(outcome.elapsed_s for outcome in outcomes), 3),

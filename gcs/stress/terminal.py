@@ -25,12 +25,13 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
     if not console.is_terminal:
         console.width = _FILE_WIDTH
     onset = result["onset"]
-    console.print(f"margin   {_ms(result['delay_margin_s'])} of loop delay, sampled; {result['trials']} trials flown")
+    console.print(f"margin   {_ms(result['delay_margin_s'])} of loop delay, sampled")
+    console.print(f"trials   {result['trials']}: {_kinds(result['trials_of_kind'])}")
     if onset is not None:
         console.print(
             f"onset    {_ms(onset['loop_delay_s'])} ± {1e3 * onset['error_s']:.2f} ms in flight, "
             f"[bold]{onset['difference']:+.3%}[/] from the sampled margin of this loop, {_ms(onset['predicted_s'])}; "
-            f"continuous {_ms(onset['predicted_continuous_s'])}"
+            f"the continuous model's less half a period for the hold, {_ms(onset['predicted_continuous_s'])}"
         )
         console.print(
             f"         {_ms(onset['link_delay_s'])} of link delay, up + down: vehicle {onset['critical']} waits "
@@ -55,6 +56,12 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
         console.print(f"again    {replay_command(folder, result['worst'][0])}")
     if result["failure"]:
         console.print(f"[bold red]failed[/]   {result['failure']}")
+
+
+def _kinds(trials_of_kind: dict[str, int]) -> str:
+    """How many trials of each kind."""
+    words = {"probe": "probes with small errors", "own": "flights from the scenario's initial states"}
+    return ", ".join(f"{trials_of_kind[kind]} {text}" for kind, text in words.items() if kind in trials_of_kind)
 
 
 def _print_noise(console: Console, noise: dict[str, Any] | None) -> None:
