@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.bracketing import bracketed_roots
 from gains.structure import FloatArray
 
 ComplexArray = NDArray[np.complex128]
@@ -155,45 +156,3 @@ def _read_loci(loci: Loci, omega: FloatArray, outward: NDArray[np.int_]) -> list
 def _log(values: ComplexArray) -> FloatArray:
     """Natural logarithms of the moduli, zero and infinity as large numbers."""
     return np.log(np.clip(np.abs(values), 1e-300, 1e300))
-
-
-def bracketed_roots(
-    function: Callable[[FloatArray], FloatArray], a: FloatArray, b: FloatArray, fa: FloatArray, fb: FloatArray
-) -> FloatArray:
-    """Roots of many scalar functions at once, each within its bracket [a, b], to rounding.
-
-    Chandrupatla's method: inverse quadratic interpolation where it is safe, bisection elsewhere. `function` takes all
-    abscissae (k,) and returns all values (k,); `fa` and `fb` differ in sign.
-    """
-    a, b, fa, fb = a.copy(), b.copy(), fa.copy(), fb.copy()
-    c, fc = a.copy(), fa.copy()
-    fraction = np.full(a.size, 0.5)
-    # 100 halvings exhaust any bracket of doubles; interpolation needs about 6
-    for _ in range(100):
-        x = a + fraction * (b - a)
-        fx = function(x)
-        same = np.sign(fx) == np.sign(fa)
-        c, fc = np.where(same, a, b), np.where(same, fa, fb)
-        b, fb = np.where(same, b, a), np.where(same, fb, fa)
-        a, fa = x, fx
-        best = np.where(np.abs(fa) < np.abs(fb), a, b)
-        width = np.abs(b - a)
-        tolerance = 2.0 * _EPS * np.abs(best)
-        if bool(np.all((width <= 2.0 * tolerance) | (fa == 0.0))):
-            break
-        fraction = _next_fraction(a, b, c, fa, fb, fc)
-        least = np.minimum(tolerance / np.maximum(width, tolerance), 0.5)
-        fraction = np.clip(fraction, least, 1.0 - least)
-        fraction = np.where(fa == 0.0, 0.0, fraction)
-    return np.where(np.abs(fa) <= np.abs(fb), a, b)
-
-
-def _next_fraction(
-    a: FloatArray, b: FloatArray, c: FloatArray, fa: FloatArray, fb: FloatArray, fc: FloatArray
-) -> FloatArray:
-    """Chandrupatla's choice of the next abscissa, as a fraction of the way from a to b."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
-        interpolate = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
-        quadratic = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-        return np.where(interpolate & np.isfinite(quadratic), quadratic, 0.5)

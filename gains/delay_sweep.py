@@ -11,6 +11,7 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.bracketing import may_reach_zero, peaks
 from gains.delay_loci import Loci, delay_loci, log_moduli, unit_crossings, without_limits_at_zero
 from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
 
@@ -19,7 +20,6 @@ _POINTS_PER_DECADE = 60
 _DECADES = 9
 # a modulus peak is searched when its sampled height is this close to one (log): sampled peaks are flat by far less
 _NEAR_UNIT = 1.0
-_GOLDEN = (3.0 - 5.0**0.5) / 2.0
 
 
 def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
@@ -85,19 +85,13 @@ def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT
     Extrema whose sampled log modulus is `near` or more away from zero are taken not to reach it.
     """
     logs = log_moduli(loci(omega))
-    inner, left, right = logs[1:-1], logs[:-2], logs[2:]
-    peak = (inner >= left) & (inner >= right) & (inner <= 0.0)
-    valley = (inner <= left) & (inner <= right) & (inner >= 0.0)
-    row, rank = np.nonzero((peak | valley) & (np.abs(inner) < near))
+    peak, valley = may_reach_zero(omega, logs), may_reach_zero(omega, -logs)
+    row, rank = np.nonzero((peak | valley) & (np.abs(logs[1:-1]) < near))
     if row.size == 0:
         return np.empty(0)
     sign = np.where(peak[row, rank], 1.0, -1.0)
-    a, b = omega[row], omega[row + 2]
-    # golden section, all extrema at once; 45 steps shrink a bracket to 1e-9, the accuracy of an extremum
-    for _ in range(45):
-        c, d = a + _GOLDEN * (b - a), b - _GOLDEN * (b - a)
-        at_c = log_moduli(loci(c))[np.arange(c.size), rank]
-        at_d = log_moduli(loci(d))[np.arange(d.size), rank]
-        to_left = sign * at_c > sign * at_d
-        a, b = np.where(to_left, a, c), np.where(to_left, d, b)
-    return (a + b) / 2.0
+
+    def height(at: FloatArray) -> FloatArray:
+        return sign * log_moduli(loci(at))[np.arange(at.size), rank]
+
+    return peaks(height, omega[row], omega[row + 2])

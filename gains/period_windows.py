@@ -12,11 +12,12 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.delay_loci import ComplexArray, bracketed_roots, factor_rank
+from gains.bracketing import bracketed_roots
+from gains.delay_loci import ComplexArray, factor_rank
 from gains.errors import GainsError
 from gains.sampled import checked_loop, sampling_period_limit
 from gains.sampled_loop import HeldPlant
-from gains.sampled_period import longest_period, next_periods, with_peaks
+from gains.sampled_period import last_period, next_periods, with_peaks
 from gains.structure import FloatArray, balanced, distinct_blocks
 
 # windows are listed up to this many times the first limit, or of the slowest time constant without one
@@ -29,7 +30,8 @@ _MOST_PERIODS = 40_000
 class PeriodCrossing:
     """At the period `period_s` eigenvalues e^{+-j omega T} of the one-period map are on the unit circle.
 
-    `direction` is +1 when they leave the unit circle as the period grows, -1 when they enter it.
+    `direction` is +1 when they leave the unit circle as the period grows, -1 when they enter it, 0 when they touch it
+    and return, as at a period in which an undamped plant turns once and no sample sees it move.
     """
 
     omega_rad_s: float
@@ -95,7 +97,7 @@ def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
     # once e^{A T} has died out nothing depends on the period any more
     end_s = inf if forgets and reached_s == wanted_s else reached_s
     edges_s = [0.0, *(crossing.period_s for crossing in crossings), end_s]
-    windows = _merged([window for window in pairwise(edges_s) if _is_stable(blocks, window, reached_s)])
+    windows = tuple(window for window in pairwise(edges_s) if _is_stable(blocks, window, reached_s))
     return PeriodAnalysis(
         stable_intervals_s=windows,
         limit_s=next((end_s for start_s, end_s in windows if start_s == 0.0), 0.0),
@@ -109,27 +111,14 @@ def _horizon(A: FloatArray, BK: FloatArray, limit_s: float) -> tuple[float, bool
     """How far (s) to look, and whether e^{A T} has died out there."""
     rate = float(np.linalg.norm(A) + np.linalg.norm(BK))
     horizon_s = _HORIZON * (limit_s if 0.0 < limit_s < inf else 10.0 / rate if rate > 0.0 else 1.0)
-    slowest = float(np.linalg.eigvals(A).real.max())
-    if slowest < 0.0:
-        return max(horizon_s, 40.0 / -slowest), True
-    return min(horizon_s, longest_period(slowest)), False
+    last_s, decays = last_period(A)
+    return (max(horizon_s, last_s), True) if decays else (min(horizon_s, last_s), False)
 
 
 def _is_stable(blocks: list[tuple[FloatArray, ...]], window: tuple[float, float], last_s: float) -> bool:
     start_s, end_s = window[0], min(window[1], last_s)
     middle_s = (start_s + end_s) / 2.0
     return end_s > start_s * (1.0 + 1e-12) and all(_radius(A, BK, middle_s) < 1.0 for A, BK in blocks)
-
-
-def _merged(windows: list[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Neighbouring windows joined: a root that crosses in a block that another one does not limit."""
-    merged: list[tuple[float, float]] = []
-    for start_s, end_s in windows:
-        if merged and merged[-1][1] == start_s:
-            merged[-1] = (merged[-1][0], end_s)
-        else:
-            merged.append((start_s, end_s))
-    return tuple(merged)
 
 
 def _eigenvalues(A: FloatArray, BK: FloatArray, periods_s: FloatArray) -> ComplexArray:
@@ -152,23 +141,29 @@ def _block_crossings(block: tuple[FloatArray, ...], horizon_s: float) -> tuple[l
     def minus_log_radius(periods_s: FloatArray) -> FloatArray:
         return -log_radius(periods_s)
 
-    fastest = float(np.abs(np.linalg.eigvals(A).imag).max())
     rate = float(np.linalg.norm(A) + np.linalg.norm(BK))
     start_s, looked_at = 1e-5 / rate if rate > 0.0 else horizon_s, 0
     found: list[PeriodCrossing] = []
     while start_s < horizon_s and looked_at < _MOST_PERIODS:
-        periods_s = next_periods(start_s, fastest, horizon_s)
+        periods_s = next_periods(start_s, horizon_s, A)
         looked_at += periods_s.size
         start_s = float(periods_s[-1])
         periods_s, logs = with_peaks(log_radius, periods_s, log_radius(periods_s))
         # dips into stability between two looks
         periods_s, negative = with_peaks(minus_log_radius, periods_s, -logs)
         logs = -negative
+        touches_s = periods_s[logs == 0.0].tolist()
+        found += [PeriodCrossing(_angle(A, BK, touch_s) / touch_s, touch_s, 0) for touch_s in touches_s]
+        periods_s, logs = periods_s[logs != 0.0], logs[logs != 0.0]
         at = np.flatnonzero(np.sign(logs[1:]) != np.sign(logs[:-1]))
         if at.size > 0:
             roots_s = bracketed_roots(log_radius, periods_s[at], periods_s[at + 1], logs[at], logs[at + 1])
             for root_s, after in zip(roots_s.tolist(), logs[at + 1].tolist(), strict=True):
-                eigenvalues = _eigenvalues(A, BK, np.array([root_s]))[0]
-                angle = abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))])))
-                found.append(PeriodCrossing(angle / root_s, root_s, 1 if after > 0.0 else -1))
+                found.append(PeriodCrossing(_angle(A, BK, root_s) / root_s, root_s, 1 if after > 0.0 else -1))
     return found, min(start_s, horizon_s)
+
+
+def _angle(A: FloatArray, BK: FloatArray, period_s: float) -> float:
+    """Angle (rad, 0 to pi) of the largest eigenvalue of the one-period map."""
+    eigenvalues = _eigenvalues(A, BK, np.array([period_s]))[0]
+    return abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))])))

@@ -15,8 +15,9 @@ from math import ceil, floor, inf, pi
 
 import numpy as np
 
+from gains.bracketing import bracketed_roots
 from gains.delay_crossings import separating_points
-from gains.delay_loci import ComplexArray, Loci, bracketed_roots, delay_loci, unit_crossings
+from gains.delay_loci import ComplexArray, Loci, delay_loci, unit_crossings
 from gains.delay_sweep import near_unit_extrema, sweep_frequencies
 from gains.errors import DisagreementError
 from gains.sampled_loop import SampledPlant, block_radius, split_delay

@@ -18,6 +18,7 @@ from math import inf, isfinite
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.bracketing import peaks
 from gains.delay import delay_margin
 from gains.errors import BadModelError
 from gains.structure import FloatArray
@@ -25,9 +26,8 @@ from gains.structure import FloatArray
 ComplexArray = NDArray[np.complex128]
 Response = Callable[[FloatArray], ComplexArray]
 
-# the sweep of a peak: frequencies in each of its decades, and halvings of the bracket of a maximum
+# the sweep of a peak: frequencies in each of its decades
 _POINTS_PER_DECADE, _DECADES_BELOW, _DECADES_ABOVE = 300, 4, 2
-_GOLDEN, _GOLDEN_STEPS = (3.0 - 5.0**0.5) / 2.0, 60
 # |Gamma| this little above one is rounding
 _ROUNDING = 1e-9
 # the limit at zero is extrapolated from these shares of the natural frequency: rounding 1e-16 / 1e-6 and the fourth
@@ -269,11 +269,6 @@ def _largest(value: Callable[[FloatArray], FloatArray], omega: FloatArray) -> tu
     best = int(np.argmax(values))
     found = [(float(values[best]), float(omega[best]))]
     if inner.size > 0:
-        a, b = omega[inner - 1], omega[inner + 1]
-        for _ in range(_GOLDEN_STEPS):
-            c, d = a + _GOLDEN * (b - a), b - _GOLDEN * (b - a)
-            to_left = value(c) > value(d)
-            a, b = np.where(to_left, a, c), np.where(to_left, d, b)
-        middle = (a + b) / 2.0
-        found += zip(value(middle).tolist(), middle.tolist(), strict=True)
+        at = peaks(value, omega[inner - 1], omega[inner + 1])
+        found += zip(value(at).tolist(), at.tolist(), strict=True)
     return max(found, default=(-inf, 0.0))

@@ -17,6 +17,7 @@ MODULES = sorted(path.stem for path in Path(gains.__path__[0]).glob("*.py") if p
 # What other modules of `gains` alone call: whole modules, and functions of the others. A new function is not among
 # them and so needs an example.
 INTERNAL_MODULES = {
+    "bracketing",
     "delay_crossings",
     "delay_curves",
     "delay_loci",

@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from math import acos, pi, sqrt
+from math import acos, atan, log, pi, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -143,17 +143,42 @@ def test_held_loop_gives_the_published_period() -> None:
 
 
 def test_held_loop_may_need_a_long_period() -> None:
-    # x'' = -x + k x(sample): undamped at T = 0; a period maps by [[cos, sin], [-sin, cos]] + k [1 - cos; sin] [1, 0]
-    k = -0.5
-    result = result_of({"A": [[0, 1], [-1, 0]], "B": [[0], [1]], "K": [[k, 0]], "hold": True})
+    # x'' = -x + k x'(sample) with k > 0: a push in the direction of motion. A period maps by
+    # [[cos, sin], [-sin, cos]] + k [1 - cos; sin] [0, 1], and held for most of a turn the push is a brake.
+    k = 0.2
+    result = result_of({"A": [[0, 1], [-1, 0]], "B": [[0], [1]], "K": [[0, k]], "hold": True})
+    edges = [edge for window in result["stable_intervals_s"] for edge in window]
     assert result["delay_margin_s"] == 0.0
+    # the determinant 1 + k sin T is below one from half a turn on, an eigenvalue passes -1 where tan(T / 2) = -1 / k
+    assert edges[:2] == pytest.approx([2.0 * (pi - atan(1.0 / k)), 2.0 * pi], rel=1e-12)
     for period_s in np.linspace(0.03, 12.0, 200).tolist():
         c, s = np.cos(period_s), np.sin(period_s)
-        radius = np.abs(np.linalg.eigvals([[c + k * (1.0 - c), s], [-s + k * s, c]])).max()
-        edges = [edge for window in result["stable_intervals_s"] for edge in window]
-        if period_s < result["complete_to_s"] and min(abs(period_s - edge) for edge in edges) > 1e-6:
+        radius = np.abs(np.linalg.eigvals([[c, s + k * (1.0 - c)], [-s, c + k * s]])).max()
+        if min(abs(period_s - edge) for edge in edges) > 1e-6:
             inside = any(start < period_s < end for start, end in result["stable_intervals_s"])
             assert inside == (radius < 1.0)
+
+
+def test_held_loop_that_is_never_stable_has_no_window() -> None:
+    # x'' = -x - x(sample) / 2: the radius touches one at whole turns, of which rounding once made windows
+    result = result_of({"A": [[0, 1], [-1, 0]], "B": [[0], [1]], "K": [[-0.5, 0]], "hold": True})
+    assert result["stable_intervals_s"] == []
+
+
+def test_held_loop_touches_the_circle_where_samples_see_no_motion() -> None:
+    # x'' = -x + x(sample) / 5: at half turns the map has the eigenvalue -1, at whole turns it is the identity
+    result = result_of({"A": [[0, 1], [-1, 0]], "B": [[0], [1]], "K": [[0.2, 0]], "hold": True})
+    first = result["stable_intervals_s"][:4]
+    # a double eigenvalue is known to sqrt(eps)
+    assert np.array(first) == pytest.approx(pi * np.array([[0, 1], [1, 2], [2, 3], [3, 4]]), rel=1e-7)
+    assert {crossing["direction"] for crossing in result["crossings"][:4]} == {0}
+
+
+@pytest.mark.parametrize("pole", [2.0, 300.0])
+def test_held_loop_of_an_unstable_plant(pole: float) -> None:
+    # x' = p x + u, u = -2 p x: e^{pT} - 2 (e^{pT} - 1) reaches -1 at e^{pT} = 3; e^{AT} once grew until it overflowed
+    result = result_of({"A": [[pole]], "B": [[1]], "K": [[-2.0 * pole]], "hold": True})
+    assert result["stable_intervals_s"] == [[0.0, pytest.approx(log(3.0) / pole, rel=1e-12)]]
 
 
 def test_held_loop_stable_at_every_period_is_unbounded() -> None:
