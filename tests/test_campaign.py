@@ -82,6 +82,14 @@ def test_the_same_trial_at_two_places_is_flown_once_and_stands_at_both(tmp_path:
     assert [outcome.coordinates for outcome in outcomes] == [{"delay": 0.0}, {"x": 1.0}]
 
 
+def test_two_campaigns_do_not_fly_in_one_folder(tmp_path: Path) -> None:
+    first = Store(tmp_path)
+    with pytest.raises(CampaignError, match="another gcs stress"):
+        Store(tmp_path)
+    first.close()
+    Store(tmp_path).close()
+
+
 def test_a_line_cut_short_costs_its_own_trial_only(tmp_path: Path) -> None:
     wanted, store = trials(3), Store(tmp_path)
     run_campaign(wanted, store, Here())

@@ -46,6 +46,10 @@ def test_a_campaign_killed_in_the_middle_is_resumed_without_losing_or_repeating_
     assert log.read_bytes().startswith(kept)
     ids = [json.loads(line)["id"] for line in log.read_bytes().splitlines() if line.endswith(b"}")]
     assert len(ids) == len(set(ids)) == json.loads(again.stdout)["trials"] == 6
+    other = stress(SCENARIOS / "triangle5.toml", *arguments[1:], "--resume")
+    assert (other.returncode, other.stderr.count("\n")) == (2, 1)
+    assert "another scenario" in other.stderr
+    assert log.read_bytes().count(b"\n") <= 7
 
 
 @pytest.mark.parametrize(
@@ -55,6 +59,8 @@ def test_a_campaign_killed_in_the_middle_is_resumed_without_losing_or_repeating_
         (("--delay", "0:0.6:0"), "--delay"),
         (("--delay", "nonsense"), "--delay"),
         (("--onset", "--resume"), "--resume"),
+        (("--onset", "--resume", "--out", SCENARIOS), "wanted the folder of a campaign"),
+        (("--trial", "1234", "--out", SCENARIOS), "wanted the folder of a campaign"),
     ],
 )
 def test_bad_options_are_one_line_and_exit_code_2(arguments: tuple[str, ...], wanted: str) -> None:

@@ -6,6 +6,7 @@ loses nothing that was finished, and a later one takes it up: what is stored und
 
 import contextlib
 import ctypes
+import fcntl
 import os
 import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -35,17 +36,28 @@ class CampaignError(Exception):
 
 
 class Store:
-    """The finished trials of a campaign's folder."""
+    """The finished trials of a campaign's folder.
+
+    Raises
+    ------
+    CampaignError
+        If another campaign has it open: both would fly the same trials.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.file = folder / TRIALS_FILE
         self.outcomes: dict[str, Outcome] = {}
-        text = self.file.read_bytes() if self.file.exists() else b""
+        self._descriptor = os.open(self.file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(self._descriptor)
+            raise CampaignError(f"{folder}: another gcs stress works there; wanted a folder of its own") from None
+        text = self.file.read_bytes()
         for line in text.splitlines():
             with contextlib.suppress(ValueError, TypeError):  # a line cut short by a kill; its trial is flown again
                 outcome = Outcome.from_json(line.decode())
                 self.outcomes[outcome.id] = outcome
-        self._descriptor = os.open(self.file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         if text and not text.endswith(b"\n"):
             os.write(self._descriptor, b"\n")
 
