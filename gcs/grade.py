@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs.record import TickArray
+from gcs.run_files import read_ticks
 from gcs.show.report import UNKNOWN
 from gcs.sitl import TRUTH_FILE
-from gcs.summary import RunError, read_ticks
+from gcs.user_input import InputError
 from sim_vehicles.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
 
 FloatArray = NDArray[np.float64]
@@ -29,15 +30,16 @@ def grade(folder: Path) -> dict[str, Any]:
 
     Raises
     ------
-    RunError
+    InputError
         If the folder is not a run, or has no truth log.
     """
     try:
         truth = read_truth(folder / TRUTH_FILE)
-    except (OSError, ValueError):
-        raise RunError(
-            f"{folder}: read no {TRUTH_FILE}, wanted the folder of a run whose vehicles the station started"
-        ) from None
+    except FileNotFoundError:
+        wanted = "the folder of a run whose vehicles the station started"
+        raise InputError(f"{folder}: read no {TRUTH_FILE}, wanted {wanted}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{error}, wanted the truth log of a run's vehicles") from None
     ticks = read_ticks(folder)
     flown = ticks[ticks["time_s"] >= 0.0]
     system_ids = np.unique(ticks["system_id"]).tolist()

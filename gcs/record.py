@@ -138,34 +138,3 @@ class RunWriter:
     def close(self) -> None:
         for descriptor in (self._ticks, self._events, self._tlog):
             os.close(descriptor)
-
-
-class RunTail:
-    """Reads what has been added to a run's ticks and events since the last call; the run may still be growing."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._ticks_read = 0
-        self._events_read = 0
-
-    def ticks(self) -> TickArray:
-        """New rows, in the order they were written; a half-written one is left for the next call."""
-        data, count = self._new(TICKS_FILE, self._ticks_read, TICK.itemsize)
-        self._ticks_read += count
-        return np.frombuffer(data[:count], dtype=TICK)
-
-    def events(self) -> list[dict[str, Any]]:
-        """New events: time_s, kind, system_id (or None), text."""
-        data, _ = self._new(EVENTS_FILE, self._events_read, 1)
-        whole = data[: data.rfind(b"\n") + 1]
-        self._events_read += len(whole)
-        return [json.loads(line) for line in whole.splitlines()]
-
-    def _new(self, name: str, start: int, unit: int) -> tuple[bytes, int]:
-        try:
-            with (self._folder / name).open("rb") as file:
-                file.seek(start)
-                data = file.read()
-        except FileNotFoundError:
-            return b"", 0
-        return data, len(data) - len(data) % unit

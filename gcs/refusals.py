@@ -1,9 +1,10 @@
 """What does not get in at the station, by reason, for the log of a run: seldom enough that no attacker can fill it."""
 
-import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
+
+from pydantic import TypeAdapter
 
 VEHICLES_FILE = "vehicles.json"
 """What the simulated vehicles counted."""
@@ -12,6 +13,7 @@ REFUSED = "refused"
 """Kind of the events; each holds all counts so far."""
 _IGNORED = {"other component", "before a first heartbeat"}
 """No strangers, though the station has no use for what they say."""
+_COUNTERS = TypeAdapter(dict[str, int])
 _EVERY_NS = 2_000_000_000
 
 
@@ -41,7 +43,7 @@ def in_words(counts: dict[str, int]) -> str:
 def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
     """What the vehicles of a run refused, by reason; None if they have not said."""
     try:
-        counters = json.loads((folder / VEHICLES_FILE).read_text(encoding="utf-8"))
+        counters = _COUNTERS.validate_json((folder / VEHICLES_FILE).read_bytes())
     except (OSError, ValueError):
         return None
     prefix = "refused_"

@@ -21,11 +21,11 @@ from gcs.record import (
     TICK,
     TICKS_FILE,
     Mode,
-    RunTail,
     TickArray,
 )
 from gcs.refusals import counts_of, refused_by_vehicles
-from scenarios import files as scenario_files
+from gcs.run_files import RunTail, read_design, read_scenario, read_ticks
+from gcs.user_input import InputError
 from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0
@@ -33,25 +33,22 @@ _SKEW_SPAN_S = 1.0
 SILENT_END = "interrupted: the station ended without a word"
 
 
-class RunError(Exception):
-    """A run folder that cannot be read: one line, what was read and what was wanted."""
-
-
 def finish(folder: Path) -> dict[str, Any]:
     """Write ticks.parquet and summary.json of a run that has ended, and return the summary.
 
     Raises
     ------
-    RunError
-        If the folder is not a run.
+    InputError
+        If the folder is not a run, or a file of it is damaged.
     """
-    if not (folder / SCENARIO_FILE).exists():
-        raise RunError(f"{folder}: read no {SCENARIO_FILE}, wanted the folder of a run")
-    scenario = scenario_files.load(folder / SCENARIO_FILE)
-    design = json.loads((folder / DESIGN_FILE).read_text())
-    tail = RunTail(folder)
+    scenario = read_scenario(folder)
+    design = read_design(folder / DESIGN_FILE)
     ticks = read_ticks(folder)
-    summary = summarise(scenario, design, ticks, tail.events())
+    if strangers := set(ticks["system_id"].tolist()) - {vehicle.system_id for vehicle in scenario.vehicles}:
+        raise InputError(
+            f"{folder}: read ticks of vehicles {sorted(strangers)}, wanted those of its {SCENARIO_FILE} only"
+        )
+    summary = summarise(scenario, design, ticks, RunTail(folder).events())
     _write_parquet(folder, ticks)
     summary["refused_by_vehicles"] = refused_by_vehicles(folder)
     summary["files"] = sorted(file.name for file in folder.iterdir() if not file.name.startswith("."))
@@ -59,21 +56,6 @@ def finish(folder: Path) -> dict[str, Any]:
         summary["files"] = sorted([*summary["files"], SUMMARY_FILE])
     _write_whole(folder / SUMMARY_FILE, json.dumps(summary, indent=2, allow_nan=False).encode())
     return summary
-
-
-def read_ticks(folder: Path) -> TickArray:
-    """All tick rows of a run, finished or not."""
-    if (folder / TICKS_FILE).exists():
-        return RunTail(folder).ticks()
-    if not (folder / PARQUET_FILE).exists():
-        raise RunError(f"{folder}: read neither {TICKS_FILE} nor {PARQUET_FILE}, wanted the folder of a run")
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(folder / PARQUET_FILE)
-    ticks = np.empty(table.num_rows, TICK)
-    for name in TICK.names or ():
-        ticks[name] = table[name].to_numpy()
-    return ticks
 
 
 def _write_parquet(folder: Path, ticks: TickArray) -> None:

@@ -113,10 +113,13 @@ def read_truth(path: Path) -> npt.NDArray[np.void]:
     Raises
     ------
     ValueError
-        If the file is not a truth log.
+        If the file is not a truth log, or holds a record of an unknown kind.
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):
         raise ValueError(f"{path} is not a truth log")
     count = (len(data) - len(_MAGIC)) // DTYPE.itemsize
-    return np.frombuffer(data, DTYPE, count, len(_MAGIC))
+    records = np.frombuffer(data, DTYPE, count, len(_MAGIC))
+    if (unknown := np.flatnonzero(~np.isin(records["kind"], list(KINDS)))).size:
+        raise ValueError(f"{path}: record {unknown[0] + 1} of {count} is of no known kind")
+    return records

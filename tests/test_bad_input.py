@@ -1,5 +1,6 @@
 """Input that a command cannot use, as `main` meets it: one line with what was read and what was wanted, exit code 2."""
 
+import itertools
 import sys
 from pathlib import Path
 
@@ -7,6 +8,9 @@ import pytest
 from flown_run import line, ticks_of, write_run
 
 from gcs.cli import main
+from gcs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE
+from gcs.sitl import TRUTH_FILE
+from gcs.summary import finish
 
 CHAIN = "scenarios/chain3.toml"
 ROOT = Path(__file__).parent.parent
@@ -60,3 +64,71 @@ def test_what_cannot_be_used_is_refused_before_the_work(
     said = complaint(capsys, monkeypatch, *arguments.format(run=run).split())
     assert wanted in said
     assert "Invalid value" not in said
+
+
+DAMAGED = {
+    "half a JSON file": b'{"delay_margin_s": 0.3,',
+    "another JSON": b"[1, 2]",
+    "a word for a number": b'{"delay_margin_s": "x", "delay_margin_continuous_s": 1.0}\n',
+    "bytes": bytes(range(256)) * 40,
+    "nothing": b"",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        *itertools.product([DESIGN_FILE, PARQUET_FILE, SCENARIO_FILE], DAMAGED),
+        # in a growing file less than a line or a row is nothing yet
+        *itertools.product([EVENTS_FILE], ["a word for a number", "bytes"]),
+        (TICKS_FILE, "bytes"),
+    ],
+)
+def test_a_damaged_file_of_a_run_is_named_by_recover(
+    name: str, what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish(run)
+    (run / name).write_bytes(DAMAGED[what])
+    assert f"run/{name}: " in complaint(capsys, monkeypatch, "recover", str(run))
+    (run / name).unlink()
+    (run / name).mkdir()
+    assert f"run/{name}: " in complaint(capsys, monkeypatch, "recover", str(run))
+
+
+@pytest.mark.parametrize("what", DAMAGED)
+@pytest.mark.parametrize("name", [DESIGN_FILE, SUMMARY_FILE])
+def test_a_damaged_file_of_a_run_is_named_by_replay(
+    name: str, what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish(run)
+    (run / name).write_bytes(DAMAGED[what])
+    assert f"run/{name}: " in complaint(capsys, monkeypatch, "replay", str(run))
+
+
+@pytest.mark.parametrize("what", DAMAGED)
+def test_a_design_that_is_none_is_named_by_replay_and_monitor(
+    what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    design = run / "other.json"
+    design.write_bytes(DAMAGED[what])
+    for command in (("replay", str(run)), ("monitor", "--listen", "127.0.0.1:0")):
+        assert "run/other.json: " in complaint(capsys, monkeypatch, *command, "--design", str(design))
+
+
+@pytest.mark.parametrize("what", ["bytes", "nothing", "another JSON", "of no kind", "a folder", "not there"])
+def test_a_truth_log_that_is_none_is_named_by_grade(
+    what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if what == "a folder":
+        (run / TRUTH_FILE).mkdir()
+    elif what != "not there":
+        (run / TRUTH_FILE).write_bytes(b"UAVTRUE2" + bytes(400) if what == "of no kind" else DAMAGED[what])
+    assert TRUTH_FILE in complaint(capsys, monkeypatch, "grade", str(run))
+
+
+def test_ticks_of_vehicles_that_are_not_in_the_scenario_are_refused(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (run / SCENARIO_FILE).read_text(encoding="utf-8")
+    (run / SCENARIO_FILE).write_text(text.replace("system_id = 1\n", "system_id = 9\n"), encoding="utf-8")
+    assert "read ticks of vehicles [1]" in complaint(capsys, monkeypatch, "recover", str(run))

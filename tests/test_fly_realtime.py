@@ -17,8 +17,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.record import TICK, TickArray
+from gcs.run_files import read_ticks
 from gcs.sitl import TRUTH_FILE
-from gcs.summary import read_ticks
 from scenarios.files import dump, load
 from sim_vehicles.truth import ACTED, SAMPLED, read_truth
 

@@ -19,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from gcs import mavlink
 from gcs.guard import Guard
 from gcs.mirror import Mirror
-from gcs.summary import read_ticks
+from gcs.run_files import read_ticks
 from gcs.vehicle import RemoteVehicle
 from gcs.watch.tlog import read_tlog
 from scenarios.files import dump, load

@@ -109,7 +109,10 @@ def test_nobody_heard_is_a_failure_and_is_said() -> None:
         (["--listen", "here"], "--listen: read 'here', wanted HOST:PORT"),
         (["--margin", "1", "--design", "x.json"], "read --margin and --design, wanted one of them"),
         (["--margin", "-1"], "--margin"),
-        (["--design", "README.md"], "README.md: no delay_margin_s, wanted the design.json of a run"),
+        (
+            ["--design", "README.md"],
+            "README.md: Invalid JSON: expected value at line 1 column 1; wanted the design.json of a run",
+        ),
         (["--design", "nowhere.json"], "wanted the design.json of a run"),
     ],
 )

@@ -14,10 +14,10 @@ from test_recording import read_back
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.plan import flight_plan
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.run_files import read_ticks
 from gcs.show.observer import record_run
 from gcs.show.viewer import ViewerError, screenshot, vulkan_missing
 from gcs.station import Station
-from gcs.summary import read_ticks
 from scenarios.files import dump, load
 
 pytestmark = pytest.mark.xdist_group("recorded flight")

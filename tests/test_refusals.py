@@ -3,8 +3,9 @@
 from collections import Counter
 from pathlib import Path
 
-from gcs.record import RunTail, RunWriter
+from gcs.record import RunWriter
 from gcs.refusals import REFUSED, VEHICLES_FILE, Refusals, counts_of, in_words, refused_by_vehicles
+from gcs.run_files import RunTail
 
 SECOND = 10**9
 
@@ -44,5 +45,6 @@ def test_what_vehicles_counted_is_read_if_it_is_there(tmp_path: Path) -> None:
     assert refused_by_vehicles(tmp_path) is None
     (tmp_path / VEHICLES_FILE).write_text('{"setpoints": 10, "refused_wrong_signature": 3, "ignored_message": 1}')
     assert refused_by_vehicles(tmp_path) == {"wrong signature": 3}
-    (tmp_path / VEHICLES_FILE).write_text("half a fi")
-    assert refused_by_vehicles(tmp_path) is None
+    for damaged in ("half a fi", "[1, 2]", '{"refused_unsigned": "many"}'):
+        (tmp_path / VEHICLES_FILE).write_text(damaged)
+        assert refused_by_vehicles(tmp_path) is None

@@ -10,7 +10,6 @@ each case the recording is whole. SIGINT and SIGHUP are left to the parent, whic
 """
 
 import argparse
-import json
 import os
 import signal
 import sys
@@ -21,12 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE, SCENARIO_FILE, RunTail
+from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE
+from gcs.run_files import RunTail, read_design, read_scenario, read_ticks
 from gcs.show.grid import WholeTicks
 from gcs.show.recording import Recording
 from gcs.show.table import Display, FlightState
-from gcs.summary import finish, read_ticks
-from scenarios import files
+from gcs.summary import finish
+from gcs.user_input import InputError
 from scenarios.schema import Scenario
 
 POLL_S = 0.1
@@ -94,7 +94,7 @@ def observe(folder: Path, scenario: Scenario, design: dict[str, Any], *, parent:
             if ended:
                 ticks = np.concatenate([ticks, whole.rest()])
             if any(event["kind"] == NEW_DESIGN for event in events):
-                design = json.loads((folder / DESIGN_FILE).read_text(encoding="utf-8"))
+                design = read_design(folder / DESIGN_FILE)
                 state.redesigned(design)
                 recording.redesigned(design)
             state.add(ticks, events)
@@ -115,8 +115,7 @@ def observe(folder: Path, scenario: Scenario, design: dict[str, Any], *, parent:
 
 def record_run(folder: Path) -> Path:
     """Make flight.rrd anew from the other files of a run that has ended, and return its path."""
-    scenario = files.load(folder / SCENARIO_FILE)
-    design = json.loads((folder / DESIGN_FILE).read_text(encoding="utf-8"))
+    scenario, design = read_scenario(folder), read_design(folder / DESIGN_FILE)
     rows = read_ticks(folder)
     whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])
     with Recording(folder, scenario, design) as recording:
@@ -132,13 +131,13 @@ def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, dict[str, Any]] | N
     """The run's scenario and design once both are written; None if the parent goes before that."""
     while True:
         try:
-            design = json.loads((folder / DESIGN_FILE).read_text(encoding="utf-8"))
-        except (FileNotFoundError, json.JSONDecodeError):  # not yet written, or half of it
+            design = read_design(folder / DESIGN_FILE)
+        except InputError:  # not yet written, or half of it
             if parent.stop or parent.gone():
                 return None
             time.sleep(POLL_S)
         else:
-            return files.load(folder / SCENARIO_FILE), design
+            return read_scenario(folder), design
 
 
 if __name__ == "__main__":

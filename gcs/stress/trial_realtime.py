@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 from gcs.fly import FlyOptions, fly
 from gcs.grade import TRUTH_FILE, Truth, read_truth
 from gcs.plan import FlightPlan
-from gcs.record import RunTail, TickArray
-from gcs.summary import read_ticks
+from gcs.record import TickArray
+from gcs.run_files import RunTail, read_ticks
 from gcs.udp import StationSocket
 
 _IDLE, _WAITING, _STEAL = 3, 4, 7

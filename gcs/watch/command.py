@@ -97,10 +97,12 @@ def replay(
     """
     if margin is not None and design is not None:
         raise InputError("read --margin and --design, wanted one of them")
+    from gcs.run_files import read_design
     from gcs.watch import replay_report
     from gcs.watch.tlog import TlogError, read_tlog
 
     there = replay_report.found(run)
+    given = None if design is None else read_design(design)
     try:
         log = read_tlog(there.log_file)
     except TlogError as error:
@@ -111,8 +113,8 @@ def replay(
         there = replace(there, scenario=load(scenario_file), design=None, recorded=None)
     if margin is not None:
         there = replace(there, design={"delay_margin_s": margin})
-    elif design is not None:
-        there = replace(there, design=_design(design))
+    elif given is not None:
+        there = replace(there, design=given)
     elif there.design is None and there.scenario is not None:
         from gcs.plan import flight_plan
 
@@ -139,25 +141,11 @@ def _compared_with(scenario_file: Path | None, margin: float | None, design: Pat
     if margin is not None:
         return scenario, margin, "given"
     if design is not None:
-        return scenario, _design(design)["delay_margin_s"], f"of {design}"
+        from gcs.run_files import read_design
+
+        return scenario, read_design(design)["delay_margin_s"], f"of {design}"
     if scenario is not None:
         from gcs.plan import flight_plan
 
         return scenario, flight_plan(scenario)[0]["delay_margin_s"], f"of {scenario.name}'s gains"
     return None, None, ""
-
-
-def _design(file: Path) -> dict[str, Any]:
-    """A design.json, of which every margin is a number above 0, or None where it is unbounded."""
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-        entries = [found, *found.get("schedule", [])]
-        margins_s = [entry["delay_margin_s"] for entry in entries]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"--design: {file}: {error}; wanted the design.json of a run") from None
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError):
-        raise InputError(f"--design: {file}: no delay_margin_s, wanted the design.json of a run") from None
-    for margin_s in margins_s:
-        if margin_s is not None and not (isinstance(margin_s, int | float) and margin_s > 0):
-            raise InputError(f"--design: {file}: delay_margin_s: read {margin_s!r}, wanted seconds above 0")
-    return found

@@ -1,6 +1,5 @@
 """`gcs replay`: what is asked of a log, and the summary made of it."""
 
-import json
 from dataclasses import dataclass
 from math import hypot, inf
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE, TickArray
+from gcs.run_files import read_design, read_summary
 from gcs.show.report import delay_text, print_flight
 from gcs.summary import summarise
 from gcs.watch.replay import Rebuilt, rebuild, watched
@@ -39,10 +39,8 @@ def found(run_or_file: Path) -> Replayed:
     own = log_file.name == TLOG_FILE
     scenario_file, design_file, summary_file = (folder / name for name in (SCENARIO_FILE, DESIGN_FILE, SUMMARY_FILE))
     scenario = files.load(scenario_file) if own and scenario_file.exists() else None
-    design, recorded = (
-        json.loads(file.read_text(encoding="utf-8")) if own and file.exists() else None
-        for file in (design_file, summary_file)
-    )
+    design = read_design(design_file) if own and design_file.exists() else None
+    recorded = read_summary(summary_file) if own and summary_file.exists() else None
     return Replayed(log_file, scenario, design, recorded)
 
 
