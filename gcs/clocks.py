@@ -5,11 +5,20 @@ half of what the way up was slower than the way down, at most RTT / 2. Exchanges
 the estimate is a straight line through the window's offsets, weighted by 1 / (RTT - least RTT + 0.2 ms)^2: it works at
 any RTT and follows the drift of the vehicle's clock.
 
+The bound owes nothing to that line. The vehicle's clock was read after the request left and before the reply came, so
+t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits go apart by DRIFT_BOUND; the line is
+kept between them, and the bound is the distance to the farther one. It holds for any delays, losses and asymmetry, as
+long as the clock keeps to DRIFT_BOUND and has not jumped since the newest exchange.
+
+Limits that contradict each other show that the clock has jumped. A jump of less than a round trip need not: it shows
+in exchanges that differ from the line by more than their round trips, and all others before them, can explain. The
+first of these makes the limits its own alone, the third is taken for a jump.
+
 For a loop closed over the ground an error of the offset cancels: it makes the telemetry look older by what it makes the
 command look younger.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,21 +30,39 @@ LEAST_SAMPLES = 5
 REQUEST_LIFETIME_NS = 20_000_000_000
 DRIFT_BOUND = 1e-3
 """Rate difference of two clocks beyond which a change of offset is a jump, not drift."""
+DOUBTS = 3
+"""Exchanges without one to the contrary that make a jump of what is possible without."""
+_UNUSUAL = 1.5
+"""Farther off the line than this times the farthest in the window is what jitter does not explain."""
+_READING_NS = 1000
+"""What stamps may be wrong by; those of a telemetry log are whole microseconds."""
+_DOUBTFUL_NS = 10_000
+"""Smaller differences from the line are not worth a doubt."""
 _WEIGHT_FLOOR_NS = 200_000.0
 _EVERY_SAMPLE = 32
 _ESTIMATE_EVERY = 4
 """Past the first samples the line is drawn anew only at each fourth: in between it is followed, which costs nothing."""
 
 
-@dataclass(frozen=True)
-class ClockEstimate:
-    """Offset of one vehicle's boot clock against the station's, at `reference_ns` of the station's clock."""
+class ClockEstimate(NamedTuple):
+    """Offset of one vehicle's boot clock against the station's, at `reference_ns` of the station's clock.
+
+    `bound_ns` is the most by which the offset can be wrong there; `bound_at_ns` tells it of other times.
+    """
 
     samples: int
     offset_ns: int
     skew: float
     bound_ns: int
     reference_ns: int
+
+    def offset_at_ns(self, time_ns: int) -> int:
+        """The offset at a time of the station's clock."""
+        return self.offset_ns + round(self.skew * (time_ns - self.reference_ns))
+
+    def bound_at_ns(self, time_ns: int) -> int:
+        """Most by which the offset, or an instant that `to_station_ns` gives, can be wrong near a station time."""
+        return self.bound_ns + round((DRIFT_BOUND + abs(self.skew)) * abs(time_ns - self.reference_ns))
 
     def to_station_ns(self, boot_ns: int) -> int:
         """The station's time at an instant of the vehicle's boot clock."""
@@ -55,13 +82,24 @@ class VehicleClock:
         self.rtt_ns: int | None = None
         """Round trip of the newest exchange."""
         self.down_ns: int | None = None
-        """One-way delay station to vehicle of the newest exchange, by the estimated offset."""
+        """One-way delay station to vehicle of the newest exchange, by the estimated offset,"""
+        self.down_bound_ns = 0
+        """and the most by which it can be wrong."""
         self.unmatched = 0
         self._pending: dict[int, None] = {}
         self._count = 0
         self._sent_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
         self._rtt_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
         self._offset_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
+        self._least_ns = self._unusual_ns = 0
+        """Of the window when the line was last drawn: its least round trip, and the farthest off the line."""
+        self._low_ns = self._low_at_ns = self._high_ns = self._high_at_ns = 0
+        """Limits of the offset, each at its time."""
+        self._since_ns = -1
+        """When the first exchange with the clock as it is now was asked for."""
+        self._doubts = 0
+        self._doubted_ns = 0
+        """By how much the first doubtful exchange was off the line."""
 
     def request(self, now_ns: int) -> int:
         """Note a request sent now; returns its ts1, which is unique among those waiting."""
@@ -79,29 +117,88 @@ class VehicleClock:
             self.unmatched += 1
             return None
         del self._pending[ts1_ns]
-        rtt = received_ns - ts1_ns
+        rtt = self.rtt_ns = received_ns - ts1_ns
+        if ts1_ns < self._since_ns:
+            return rtt  # overtaken by one with a clock that has jumped since
         middle = ts1_ns + rtt // 2
         offset = tc1_ns - middle
-        if self._contradicts(offset, rtt, middle):
-            self.jumps += 1
-            self._count = 0
+        low, high = tc1_ns - received_ns - _READING_NS, tc1_ns - ts1_ns + _READING_NS
+        if self._contradicts(low, received_ns, high, ts1_ns):
+            self._jumped(ts1_ns, keep=0)
+        doubtful = self._is_doubtful(offset, rtt, middle)
+        if self._count == 0 or doubtful:
+            self._low_ns, self._low_at_ns, self._high_ns, self._high_at_ns = low, received_ns, high, ts1_ns
+        else:
+            self._narrow(low, received_ns, high, ts1_ns)
         slot = self._count % WINDOW
         self._sent_ns[slot], self._rtt_ns[slot], self._offset_ns[slot] = middle, rtt, offset
         self._count += 1
-        if self._count <= _EVERY_SAMPLE or self._count % _ESTIMATE_EVERY == 0:
+        if self._doubts == DOUBTS:
+            self._jumped(ts1_ns, keep=DOUBTS)
+        if self._doubts == 0 and (self._count <= _EVERY_SAMPLE or self._count % _ESTIMATE_EVERY == 0):
             self.estimate = self._estimated(middle)
-        self.rtt_ns = rtt
-        self.down_ns = self.estimate.to_station_ns(tc1_ns) - ts1_ns
+        self.estimate = self._within_limits(middle)
+        self.down_ns = min(rtt, max(0, self.estimate.to_station_ns(tc1_ns) - ts1_ns))
+        self.down_bound_ns = self.estimate.bound_at_ns(ts1_ns + self.down_ns)
         return rtt
 
-    def _contradicts(self, offset_ns: int, rtt_ns: int, at_ns: int) -> bool:
-        """Whether the offset differs from the estimate by more than both errors and drift can explain."""
-        known = self.estimate
-        if self._count < LEAST_SAMPLES:
+    def _contradicts(self, low_ns: int, low_at_ns: int, high_ns: int, high_at_ns: int) -> bool:
+        """Whether limits exclude those known already, whatever the clock has drifted in between."""
+        if self._count == 0:
             return False
-        passed = at_ns - known.reference_ns
-        expected = known.offset_ns + known.skew * passed
-        return abs(offset_ns - expected) > rtt_ns / 2 + known.bound_ns + DRIFT_BOUND * abs(passed)
+        return (
+            low_ns - self._high_ns > DRIFT_BOUND * abs(low_at_ns - self._high_at_ns)
+            or self._low_ns - high_ns > DRIFT_BOUND * abs(high_at_ns - self._low_at_ns)
+        )  # fmt: skip
+
+    def _narrow(self, low_ns: int, low_at_ns: int, high_ns: int, high_at_ns: int) -> None:
+        """Take limits in: of old and new ones the nearer at the newer time."""
+        at_ns = max(low_at_ns, self._low_at_ns)
+        mine, new = self._low_ns - _drift(at_ns - self._low_at_ns), low_ns - _drift(at_ns - low_at_ns)
+        self._low_ns, self._low_at_ns = max(mine, new), at_ns
+        at_ns = max(high_at_ns, self._high_at_ns)
+        mine, new = self._high_ns + _drift(at_ns - self._high_at_ns), high_ns + _drift(at_ns - high_at_ns)
+        self._high_ns, self._high_at_ns = min(mine, new), at_ns
+
+    def _is_doubtful(self, offset_ns: int, rtt_ns: int, at_ns: int) -> bool:
+        """Whether an exchange is off the line by more than jitter explains; counts those without one to the contrary.
+
+        Where one way alone has become slower by x, the round trip has too, and the offset is off by x / 2.
+        """
+        if self._count < 2 * LEAST_SAMPLES:
+            return False
+        known = self.estimate
+        off_ns = abs(offset_ns - known.offset_at_ns(at_ns))
+        explained_ns = (
+            abs(rtt_ns - self._least_ns) / 2
+            + _UNUSUAL * self._unusual_ns
+            + DRIFT_BOUND * abs(at_ns - known.reference_ns)
+            + _DOUBTFUL_NS
+        )
+        if off_ns > explained_ns:
+            self._doubts += 1
+            self._doubted_ns = off_ns if self._doubts == 1 else self._doubted_ns
+            return True
+        if explained_ns < self._doubted_ns:
+            self._doubts = self._doubted_ns = 0
+        return False
+
+    def _jumped(self, ts1_ns: int, *, keep: int) -> None:
+        """Begin anew, with the newest exchanges."""
+        newest = [k % WINDOW for k in range(self._count - keep, self._count)]
+        for kept in (self._sent_ns, self._rtt_ns, self._offset_ns):
+            kept[:keep] = kept[newest]
+        self.jumps += 1
+        self._count, self._doubts, self._doubted_ns, self._since_ns = keep, 0, 0, ts1_ns
+
+    def _within_limits(self, at_ns: int) -> ClockEstimate:
+        """The line, brought between the limits at a time."""
+        known = self.estimate
+        low_ns = self._low_ns - _drift(abs(at_ns - self._low_at_ns))
+        high_ns = self._high_ns + _drift(abs(at_ns - self._high_at_ns))
+        offset_ns = min(max(known.offset_at_ns(at_ns), low_ns), high_ns)
+        bound_ns = max(high_ns - offset_ns, offset_ns - low_ns)
+        return ClockEstimate(min(self._count, WINDOW), offset_ns, known.skew, bound_ns, at_ns)
 
     def _estimated(self, now_ns: int) -> ClockEstimate:
         n = min(self._count, WINDOW)
@@ -115,10 +212,17 @@ class VehicleClock:
         # Sums of products, not `@`: BLAS adds in an order of each processor's own, and flights are the same on all.
         t_mean, y_mean = (weight * t).sum(), (weight * y).sum()
         t -= t_mean
+        y -= y_mean
         spread = (weight * t * t).sum()
-        # A slope from a short stretch would be noise: below 0.3 s (rms) of history the clock is taken as drift-free.
-        skew = float((weight * t * (y - y_mean)).sum() / spread) if spread > 0.09e18 else 0.0
+        # A slope from a short stretch would be noise: below 0.3 s (rms) of history the rate is the one known before,
+        # at first none.
+        skew = float((weight * t * y).sum() / spread) if spread > 0.09e18 else self.estimate.skew
+        skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, skew))
+        self._least_ns, self._unusual_ns = least, round(float(np.abs(y - skew * t).max()))
         offset = base + round(y_mean - skew * t_mean)
-        return ClockEstimate(
-            samples=n, offset_ns=offset, skew=skew, bound_ns=least // 2 + 1, reference_ns=now_ns
-        )  # fmt: skip
+        return ClockEstimate(samples=n, offset_ns=offset, skew=skew, bound_ns=0, reference_ns=now_ns)
+
+
+def _drift(time_ns: int) -> int:
+    """Most that a clock drifts in a time."""
+    return round(DRIFT_BOUND * time_ns)

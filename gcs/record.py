@@ -89,12 +89,15 @@ TICK = np.dtype(
         ("command_east_m_s2", "<f8"),
         ("nearest_m", "<f8"),  # distance to the nearest other vehicle, at the tick's instant; NaN while unknown
         ("queue_s", "<f8"),  # from the kernel's receive stamp of the newest state to its use by a step
+        ("up_delay_s", "<f8"),  # one-way delay of the newest state: from sample_ns to the kernel's receive stamp
+        ("sample_bound_s", "<f8"),  # most that sample_ns, telemetry_age_s and up_delay_s can be wrong (gcs/clocks.py)
         ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
+        ("down_bound_s", "<f8"),  # most that it can be wrong
         ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s; in the ground loop it is the newest one
         ("headroom", "<f8"),  # 1 - loop delay / margin
         ("rtt_s", "<f8"),  # the TIMESYNC round trip that ended since the tick before; NaN if none did
-        ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock
-        ("clock_offset_bound_s", "<f8"),
+        ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock, at sent_ns
+        ("clock_offset_bound_s", "<f8"),  # most that it can be wrong
         ("received", "<u4"),  # frames from this vehicle so far, and those lost, late, twice
         ("lost", "<u4"),
         ("late", "<u4"),

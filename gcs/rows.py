@@ -22,6 +22,10 @@ class Reported(NamedTuple):
     down_m: float = nan
     velocity_down_m_s: float = nan
     queue_s: float = nan
+    received_ns: int = 0
+    """The kernel's stamp."""
+    bound_s: float = nan
+    """Most that the instant at which it was sampled can be wrong."""
 
 
 class VehicleTick(NamedTuple):
@@ -59,9 +63,14 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
         clock, frames = vehicle.clock, vehicle.frames
         estimate = clock.estimate
         age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
-        down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
+        up_s = (reported.received_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
+        down_s = down_bound_s = nan
+        if clock.down_ns is not None:
+            down_s, down_bound_s = clock.down_ns * 1e-9, clock.down_bound_ns * 1e-9
         used_s = (sent_ns - control.used_ns) * 1e-9 if control.used_ns > 0 else nan
-        known = estimate.samples > 0
+        offset_s = bound_s = nan
+        if estimate.samples > 0:
+            offset_s, bound_s = estimate.offset_at_ns(sent_ns) * 1e-9, estimate.bound_at_ns(sent_ns) * 1e-9
         delays_s.append(used_s + down_s)
         packed.append(
             _ROW.pack(
@@ -71,8 +80,9 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
                 *control.state[:2], reported.down_m, *control.state[2:], reported.velocity_down_m_s,
                 *control.spacing_error_m, *control.velocity_error_m_s,
                 *(control.command_m_s2 if commanded else (nan, nan)),
-                nearest_m, reported.queue_s, down_s, used_s + down_s, headroom(used_s + down_s, margin_s), rtt_s,
-                estimate.offset_ns * 1e-9 if known else nan, estimate.bound_ns * 1e-9 if known else nan,
+                nearest_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
+                used_s + down_s, headroom(used_s + down_s, margin_s), rtt_s,
+                offset_s, bound_s,
                 frames.received, frames.lost, frames.late, frames.duplicate,
             )
         )  # fmt: skip

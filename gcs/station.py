@@ -235,7 +235,9 @@ class Station:
         if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             return
         self._telemetry_ns[row] = datagram.received_ns  # only what is new: a replay does not make up for silence
-        self._reported[row] = Reported(boot_ms, down + origin_down, v_down, datagram.queued_ns * 1e-9)
+        bound_s = clock.bound_at_ns(sample_ns) * 1e-9
+        queue_s, received_ns = datagram.queued_ns * 1e-9, datagram.received_ns
+        self._reported[row] = Reported(boot_ms, down + origin_down, v_down, queue_s, received_ns, bound_s)
 
     def _timesync_reply(self, row: int, vehicle: RemoteVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
         jumps = vehicle.clock.jumps

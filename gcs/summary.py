@@ -169,7 +169,8 @@ def _vehicle(
         "spacing_error_max_m": None if error_m is None else _number(error_m.max()),
         "rtt_s": spread_with_status(rtt),
         "loop_delay_s": spread_with_status(own["loop_delay_s"][own["commanded"]]),
-        "down_delay_s": spread_with_status(own["down_delay_s"][own["commanded"]]),
+        "up_delay_s": _one_way(own["up_delay_s"], own["sample_bound_s"], own["commanded"]),
+        "down_delay_s": _one_way(own["down_delay_s"], own["down_bound_s"], own["commanded"]),
         "telemetry_age_s": spread_with_status(own["telemetry_age_s"][own["commanded"]]),
         "station_queue_s": spread_with_status(own["queue_s"][own["commanded"]]),
         "clock": _clock(own, int(np.isfinite(rtt).sum()), jumps_s) | {"jumps": len(jumps_s)},
@@ -182,6 +183,14 @@ def spread_with_status(values: NDArray[np.float64]) -> dict[str, Any]:
     """The spread of an estimate with its status and the number of its samples."""
     samples = int(np.isfinite(values).sum())
     return _spread(values) | {"samples": samples, "status": "measured" if samples else "unknown"}
+
+
+def _one_way(
+    delay_s: NDArray[np.float64], bound_s: NDArray[np.float64], commanded: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """The spread of a one-way delay, and the largest bound of the error that the vehicle's clock brings into it."""
+    known = commanded & np.isfinite(delay_s) & np.isfinite(bound_s)
+    return spread_with_status(delay_s[commanded]) | {"bound_s": _number(bound_s[known].max()) if known.any() else None}
 
 
 def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gcs.clocks import LEAST_SAMPLES, VehicleClock
 
@@ -27,6 +29,9 @@ class Exchange:
 
     def error_ns(self, time_ns: int) -> int:
         return self.clock.estimate.to_station_ns(self.boot_ns(time_ns)) - time_ns
+
+    def bounded(self, time_ns: int) -> bool:
+        return abs(self.error_ns(time_ns)) <= self.clock.estimate.bound_at_ns(time_ns)
 
 
 @pytest.mark.parametrize("one_way_ms", [0, 1, 20, 400, 2500])
@@ -94,3 +99,67 @@ def test_reply_to_nothing_asked_is_refused() -> None:
     assert clock.reply(tc1_ns=5, ts1_ns=ts1, received_ns=300) is None  # the same reply again
     assert clock.unmatched == 2
     assert clock.estimate.samples == 1 < LEAST_SAMPLES
+
+
+LINKS = st.tuples(
+    st.sampled_from([0.0001, 0.002, 0.04, 0.4, 2.5]),  # way down and way up, s
+    st.sampled_from([0.0001, 0.002, 0.04, 0.4, 2.5]),
+    st.sampled_from([0.0, 0.005, 0.05, 0.5]),  # mean of exponential jitter, s
+    st.sampled_from([0.0, 0.3]),  # loss each way
+    st.floats(-3e-4, 3e-4),  # drift
+)
+
+
+@given(LINKS, st.integers(0, 2**32))
+def test_the_bound_is_never_violated_whatever_the_links_do(link: tuple[float, ...], seed: int) -> None:
+    down_s, up_s, jitter_s, loss, drift = link
+    rng = np.random.default_rng(seed)
+    truth = Exchange(offset_ns=int(rng.uniform(-1e12, 1e12)), drift=drift)
+    for k in range(150):
+        now = k * S // 10
+        down_ns, up_ns = (round(1e9 * (way_s + rng.exponential(jitter_s or 1e-12))) for way_s in (down_s, up_s))
+        if rng.random() < (1 - loss) ** 2:
+            truth.at(now, down_ns=down_ns, up_ns=up_ns)
+            assert truth.clock.down_ns is not None
+            assert abs(truth.clock.down_ns - down_ns) <= truth.clock.down_bound_ns
+            assert truth.bounded(now + down_ns + up_ns)
+        if truth.clock.estimate.samples:
+            assert truth.bounded(now)
+    assert truth.clock.jumps == 0
+
+
+@pytest.mark.parametrize("rtt_ms", [2, 40, 400, 5000])
+@pytest.mark.parametrize("by_ms", [-900.0, -20.0, -0.7, 0.7, 20.0, 900.0])
+def test_a_jump_of_less_than_a_round_trip_is_seen_and_keeps_the_bound(rtt_ms: int, by_ms: float) -> None:
+    truth = Exchange(offset_ns=0, drift=50e-6)
+    down_ns, up_ns = rtt_ms * MS // 10, rtt_ms * MS * 9 // 10  # so that half of all jumps leave the old limits
+    for k in range(100):
+        truth.at(k * S // 10, down_ns=down_ns, up_ns=up_ns)
+    truth.offset_ns += round(by_ms * MS)
+    for k in range(100, 110):
+        truth.at(k * S // 10, down_ns=down_ns, up_ns=up_ns)
+        assert truth.bounded(k * S // 10)
+    assert truth.clock.jumps == 1
+    assert truth.error_ns(11 * S) == pytest.approx((up_ns - down_ns) / 2, abs=20_000)
+
+
+def test_a_reply_from_before_a_jump_that_comes_after_it_is_no_second_jump() -> None:
+    truth = Exchange(offset_ns=0, drift=0.0)
+    for k in range(20):
+        truth.at(k * S // 10, down_ns=20 * MS, up_ns=20 * MS)
+    asked, read = truth.clock.request(2 * S), truth.boot_ns(2 * S + 20 * MS)
+    truth.offset_ns = -5 * S
+    truth.at(2 * S + 100 * MS, down_ns=20 * MS, up_ns=20 * MS)
+    assert truth.clock.reply(tc1_ns=read, ts1_ns=asked, received_ns=2 * S + 300 * MS) == 300 * MS
+    assert truth.clock.jumps == 1
+    assert abs(truth.error_ns(3 * S)) < 1000
+
+
+def test_no_way_of_slowing_down_is_taken_for_a_jump() -> None:
+    truth = Exchange(offset_ns=0, drift=20e-6)
+    for k in range(400):
+        slow = 300 * MS if 100 <= k < 200 else 20 * MS
+        ramp = 20 * MS + (k - 200) * 4 * MS if 200 <= k < 300 else 20 * MS
+        truth.at(k * S // 10, down_ns=slow, up_ns=ramp)
+        assert truth.bounded(k * S // 10)
+    assert truth.clock.jumps == 0

@@ -14,6 +14,7 @@ from gcs.station import Station
 from gcs.summary import summarise
 from scenarios.files import load
 from scenarios.schema import Clocks, FixedGains, Jitter, Link, Links, Monitor, Safety
+from sim_vehicles.clock import BootClock
 from sim_vehicles.fleet import Fleet
 from sim_vehicles.truth import DTYPE, LINK_UP, SAMPLED, Row
 
@@ -87,15 +88,32 @@ def test_with_jitter_loop_delay_is_off_by_no_more_than_set_points_and_exchanges_
 
 
 @pytest.mark.parametrize("name", GRID)
-def test_the_clock_offset_is_never_outside_its_bound(name: str) -> None:
+def test_instants_and_one_way_delays_are_never_outside_their_bounds(name: str) -> None:
     ticks, truth = flown(name)
-    known = np.isfinite(ticks["clock_offset_s"]) & (ticks["sample_ns"] > 0)
-    sampled = truth[truth["kind"] == 1]
+    sampled, ups = truth[truth["kind"] == SAMPLED], truth[(truth["kind"] == LINK_UP) & (truth["key"] == 32)]
     when = {(s, k): t for s, k, t in zip(*(sampled[n].tolist() for n in ("system_id", "key", "time_ns")), strict=True)}
-    rows = ticks[known & ticks["commanded"]]
-    error_s = [(int(row["sample_ns"]) - when[int(row["system_id"]), int(row["sample_boot_ms"])]) * 1e-9 for row in rows]
-    assert len(error_s) > 700
-    assert (np.abs(error_s) <= rows["clock_offset_bound_s"]).all()
+    rows = ticks[np.isfinite(ticks["sample_bound_s"]) & (ticks["sample_ns"] > 0)]
+    true_ns = np.array([when[int(row["system_id"]), int(row["sample_boot_ms"])] for row in rows])
+    assert rows.size > 700
+    assert (np.abs(rows["sample_ns"] - true_ns) * 1e-9 <= rows["sample_bound_s"]).all()
+    # A state enters its link when it is sampled, so that its way up ends when the link says.
+    ups_s = {
+        (s, entered): (due - entered) * 1e-9
+        for s, entered, due in sorted(ups[["system_id", "entered_ns", "due_ns"]].tolist(), reverse=True)
+    }
+    real_s = np.array([ups_s[int(s), int(t)] for s, t in zip(rows["system_id"], true_ns, strict=True)])
+    assert (np.abs(rows["up_delay_s"] - real_s) <= rows["sample_bound_s"] + 1e-9).all()
+
+
+@pytest.mark.parametrize("name", GRID)
+def test_clock_offsets_are_never_outside_their_bounds(name: str) -> None:
+    ticks, _ = flown(name)
+    for system_id in (1, 2, 3):
+        clock = BootClock.draw(Clocks(drift_max_ppm=GRID[name][2]), CHAIN.seed, system_id, START_NS)
+        rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["clock_offset_s"])]
+        true_s = np.array([(clock.boot_ns(sent) - sent) * 1e-9 for sent in rows["sent_ns"].tolist()])
+        assert rows.size > 200
+        assert (np.abs(rows["clock_offset_s"] - true_s) <= rows["clock_offset_bound_s"]).all()
 
 
 @pytest.mark.parametrize("name", ["drift 300 ppm", "asymmetric"])

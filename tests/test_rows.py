@@ -19,8 +19,8 @@ def ignored(kind: str, text: str) -> None:
 
 def test_every_column_holds_what_its_name_says() -> None:
     vehicle = RemoteVehicle(7, telemetry_hz=50.0, report=ignored)
-    vehicle.clock.estimate = ClockEstimate(samples=9, offset_ns=3 * S, skew=0.0, bound_ns=5000, reference_ns=0)
-    vehicle.clock.down_ns = 30_000_000
+    vehicle.clock.estimate = ClockEstimate(samples=9, offset_ns=3 * S, skew=0.0, bound_ns=5000, reference_ns=10 * S)
+    vehicle.clock.down_ns, vehicle.clock.down_bound_ns = 30_000_000, 4000
     for sequence in (1, 2, 5, 4, 4):
         vehicle.frames.add(sequence)
     control = VehicleControl(
@@ -32,7 +32,7 @@ def test_every_column_holds_what_its_name_says() -> None:
         used_ns=10 * S - 10_000_000,
     )
     monitored = VehicleState(mode=Mode.CAUTION, gain_set=1)
-    reported = Reported(boot_ms=13_000, down_m=-100.0, velocity_down_m_s=0.5, queue_s=0.001)
+    reported = Reported(13_000, -100.0, 0.5, queue_s=0.001, received_ns=10 * S + 25_000_000, bound_s=3e-6)
     seen = VehicleTick(vehicle, monitored, control, reported, 0.07, 121.5, True, 0.4)
     tick = Tick(number=11, time_s=0.22, due_ns=10 * S + 40_000_000, key_ms=220, vehicles=[seen, seen])
     rows, delays_s = tick_rows(tick, 10 * S + 50_000_000)
@@ -45,8 +45,9 @@ def test_every_column_holds_what_its_name_says() -> None:
         "spacing_error_north_m": 5.0, "spacing_error_east_m": 6.0,
         "velocity_error_north_m_s": 7.0, "velocity_error_east_m_s": 8.0,
         "command_north_m_s2": 9.0, "command_east_m_s2": 10.0,
-        "nearest_m": 121.5, "queue_s": 0.001, "down_delay_s": 0.03, "loop_delay_s": 0.09, "headroom": 0.775,
-        "rtt_s": 0.07, "clock_offset_s": 3.0, "clock_offset_bound_s": 5e-6,
+        "nearest_m": 121.5, "queue_s": 0.001, "up_delay_s": 0.025, "sample_bound_s": 3e-6, "down_delay_s": 0.03,
+        "down_bound_s": 4e-6, "loop_delay_s": 0.09, "headroom": 0.775,
+        "rtt_s": 0.07, "clock_offset_s": 3.0, "clock_offset_bound_s": 55e-6,  # 5 µs, and 0.1 % of 50 ms
         "received": 5, "lost": 1, "late": 1, "duplicate": 1,
     }  # fmt: skip
     assert list(expected) == list(TICK.names or ())

@@ -13,6 +13,7 @@ def test_each_estimate_bears_its_status_and_samples_and_an_unknown_is_none() -> 
     ticks["commanded"] = True
     ticks["queue_s"] = 0.0002
     ticks["clock_offset_s"], ticks["clock_offset_bound_s"] = 3.0, 0.02
+    ticks["down_bound_s"] = 0.004
     blind = ticks["system_id"] == 1
     for name in ("rtt_s", "down_delay_s", "telemetry_age_s", "loop_delay_s", "clock_offset_s"):
         ticks[name][blind] = np.nan
@@ -27,6 +28,8 @@ def test_each_estimate_bears_its_status_and_samples_and_an_unknown_is_none() -> 
     assert (clock["offset_s"], clock["bound_s"]) == (3.0, 0.02)
     assert of[2]["station_queue_s"]["p50"] == 0.0002
     nothing = {"p50": None, "p95": None, "p99": None, "max": None, "samples": 0, "status": "unknown"}
-    for name in ("rtt_s", "down_delay_s", "telemetry_age_s", "loop_delay_s"):
+    for name in ("rtt_s", "telemetry_age_s", "loop_delay_s"):
         assert of[1][name] == nothing
+    assert of[1]["down_delay_s"] == nothing | {"bound_s": None}
+    assert of[2]["down_delay_s"]["bound_s"] == 0.004
     assert of[1]["clock"]["offset_s"] is None

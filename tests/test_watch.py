@@ -85,7 +85,8 @@ def test_round_trips_and_loop_delays_are_those_of_the_links_to_the_microsecond()
     np.testing.assert_allclose(late_s[known], -0.02, atol=1e-5)
     np.testing.assert_allclose((np.array(vehicle.loop_delay_s) - watched.true_ages_s)[known], 0.03, atol=1e-5)
     figures = watched.watch.figures(watched.now_ns, 0.5)[0]
-    assert figures["clock"]["bound_s"] == pytest.approx(0.05, abs=1e-6)
+    # Half a round trip, and what a clock may drift since the newest reply was read, by then 0.05 to 0.2 s ago.
+    assert 0.05 < figures["clock"]["bound_s"] < 0.05 + 1e-3 * 0.25
     assert figures["headroom"] == pytest.approx(1 - figures["loop_delay_s"]["p99"] / 0.5)
     assert figures["status"] == "measured"
 

@@ -130,8 +130,8 @@ class WatchedVehicle:
             "clock": {
                 "status": "measured" if measured else "unknown",
                 "samples": len(self.rtt_s),
-                "offset_s": estimate.offset_ns * 1e-9 if measured else None,
-                "bound_s": estimate.bound_ns * 1e-9 if measured else None,
+                "offset_s": estimate.offset_at_ns(now_ns) * 1e-9 if measured else None,
+                "bound_s": estimate.bound_at_ns(now_ns) * 1e-9 if measured else None,
                 "skew_ppm": round(estimate.skew * 1e6, 3) if measured else None,
                 "jumps": clock.jumps,
             },

@@ -258,8 +258,10 @@ class _Replay:
         if frame.msg_id != mavlink.LOCAL_POSITION_NED:
             return
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
+        bound_s = nan
         if clock.estimate.samples:
             sample_ns = clock.estimate.to_station_ns(boot_ms * 1_000_000)
+            bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
         elif self._outline.exchanges:
             self._telemetry_ns[row] = time_ns
             return
@@ -268,7 +270,9 @@ class _Replay:
         origin_north, origin_east, origin_down = self._frame_ned_m[row]
         if self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             self._telemetry_ns[row] = time_ns
-            self._reported[row] = Reported(boot_ms, down + origin_down, v_down)
+            self._reported[row] = Reported(
+                boot_ms, down + origin_down, v_down, received_ns=time_ns, bound_s=bound_s
+            )  # fmt: skip
 
     def _tick(self, due_ns: int, sent_ns: int, commands: dict[int, tuple[float, float]], key_ms: int) -> None:
         """The rows of one tick, from what the station knew when it sent these set-points."""
