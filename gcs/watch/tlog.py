@@ -66,7 +66,7 @@ def parse_tlog(data: bytes) -> TelemetryLog:
         if found:
             stamps_us.append(_STAMP.unpack_from(data, at)[0])
             frames.append(found[0])
-        elif unusable and mavlink.is_magic(data, stop + _STAMP.size):
+        elif unusable and mavlink.is_magic(data, stop + _STAMP.size) and not _good_within(data, start + 1, stop):
             counters.update(refused)
         else:
             following = _MAGIC.search(data, start + 1)
@@ -83,6 +83,15 @@ def parse_tlog(data: bytes) -> TelemetryLog:
     counters["wrong time stamps"] += len(good) - sum(good)
     kept = [(us * 1000, frame) for us, frame, ok in zip(stamps_us, frames, good, strict=True) if ok]
     return TelemetryLog(kept, +counters)
+
+
+def _good_within(data: bytes, start: int, stop: int) -> bool:
+    """Whether a good frame begins in a stretch: then what seemed to be a frame all over it was a damaged length."""
+    for magic in _MAGIC.finditer(data, start, stop):
+        end = mavlink.frame_end(data, magic.start())
+        if end and mavlink.decode_either(data[magic.start() : end], Counter()):
+            return True
+    return False
 
 
 def _plausible(stamps_us: list[int]) -> list[bool]:
