@@ -5,6 +5,7 @@ import tempfile
 import time  # noqa: TID251 - the time it takes is what is measured; nothing flown depends on it
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import which
 from statistics import median
 from typing import Any
 
@@ -132,7 +133,7 @@ def _flight(plan: FlightPlan, key: Key | None = None) -> dict[str, float]:
 
 
 def print_benchmark(result: dict[str, Any]) -> None:
-    how = "compiled" if result["compiled"] else "interpreted (python3 make.py compile makes it faster)"
+    how = "compiled" if result["compiled"] else "interpreted"
     print(f"{result['vehicles']} vehicles at {result['control_hz']:g} Hz, one core, hot path {how}")
     print(
         f"virtual time    {result['real_time_factor']:.3g} times real time "
@@ -147,6 +148,9 @@ def print_benchmark(result: dict[str, Any]) -> None:
             f"signed          takes {cost['time_ratio']:.2f} times as long (median {cost['time_ratio_p50']:.2f}), "
             f"the station {cost['station_time_ratio']:.2f} times (median {cost['station_time_ratio_p50']:.2f})"
         )
+    if not result["compiled"]:
+        first = "" if which(os.environ.get("CC", "cc")) else "install a C compiler, then "
+        print(f"twice as fast:  {first}python3 make.py compile")
 
 
 def print_real_time(result: dict[str, Any]) -> None:
