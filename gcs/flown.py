@@ -33,10 +33,11 @@ class Flight:
     busy_share: float | None = None
 
 
-def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None) -> Flight:
-    """Fly a plan; with a folder, which is made, its files are left there but for the summary."""
+def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, with_truth: bool = False) -> Flight:
+    """Fly a plan; with a folder, which is made, its files are left there but for the summary. In real time the truth is
+    always known."""
     if not real_time:
-        return fly_virtual(plan, folder)
+        return fly_virtual(plan, folder, with_truth=with_truth)
     from gcs.stress.trial_realtime import fly_real_time  # processes and sockets: not for flights in virtual time
 
     ticks, events, truth, spent = fly_real_time(plan, margins_of(plan), folder)
@@ -84,3 +85,9 @@ def median_delays_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, 
         known = own[np.isfinite(own)]
         delays[system_id] = float(np.median(known)) if known.size else 0.0
     return delays
+
+
+def first_uses(ticks: TickArray) -> TickArray:
+    """The rows in which a state of a vehicle was used for the first time: all, unless telemetry is slower or lost."""
+    _, first = np.unique(ticks[["system_id", "sample_boot_ms"]], return_index=True)
+    return ticks[np.sort(first)]

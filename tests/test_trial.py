@@ -61,6 +61,17 @@ def test_a_follower_whose_gains_differ_north_and_east_is_measured_as_well() -> N
     assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=2e-3)
 
 
+@pytest.mark.parametrize("telemetry_hz", [25.0, 100.0])
+def test_growth_with_telemetry_at_another_rate_is_that_of_the_model_at_the_effective_delay(telemetry_hz: float) -> None:
+    """A state used at two ticks is late by two delays; the model at their median is off by 0.09."""
+    study = study_of("chain3")
+    rates = study.plan.scenario.rates.model_copy(update={"telemetry_hz": telemetry_hz})
+    study = replace(study, plan=replace(study.plan, scenario=study.plan.scenario.model_copy(update={"rates": rates})))
+    for delay_s in (0.281, 0.29):
+        outcome = fly_trial(study.trial("probe", {"delay": delay_s}, seed=4))
+        assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=2e-3)
+
+
 def test_the_leaders_loop_can_be_probed_too() -> None:
     """Its margin is larger, so it decays where the followers are at their edge."""
     outcome = fly_trial(study_of("chain3").trial("probe", {"delay": 0.285}, seed=4, probe=1))

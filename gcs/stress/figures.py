@@ -111,7 +111,12 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
         broke = (outcome.reason or "").startswith("broken")
         return broke, -float(len(outcome.trace_m)) if broke else 0.0, outcome.spacing_error_max_m or 0.0
 
-    return sorted(own or flown, key=badness, reverse=True)[:_WORST]
+    ordered = sorted(own or flown, key=badness, reverse=True)
+    # what is varied may have no part in what breaks: of flights that went alike the first stands for all
+    apart: dict[tuple[float, ...], Outcome] = {}
+    for outcome in ordered:
+        apart.setdefault(tuple(outcome.trace_m), outcome)
+    return list(apart.values())[:_WORST]
 
 
 def _place(outcome: Outcome) -> str:

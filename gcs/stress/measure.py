@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs.flown import fly_plan, fly_virtual, median_delays_s
+from gcs.flown import first_uses, fly_plan, fly_virtual, median_delays_s
 from gcs.plan import FlightPlan
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import FreeResponse, effective_delays_s, fly_calm, response_alone, response_paired
@@ -97,7 +97,8 @@ def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     """One loop alone, on links that are all those of the loop that is the first to break."""
     base = plan_of(trial)
     pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": _PILOT_S})))
-    probed, critical, waiting_s = _choose(base, median_delays_s(pilot.ticks, base.formation.system_ids), trial.probe)
+    fresh = first_uses(pilot.ticks)
+    probed, critical, waiting_s = _choose(base, median_delays_s(fresh, base.formation.system_ids), trial.probe)
     up, down = links = base.scenario.link_of(critical.system_ids[0])
     outcome = replace(
         outcome,
