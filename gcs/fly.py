@@ -19,7 +19,7 @@ from gcs.mirror import Mirror
 from gcs.plan import FlightPlan, described
 from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter
 from gcs.sitl import VehicleProcess
-from gcs.station import CONNECT_PATIENCE_S, Station
+from gcs.station import Station
 from gcs.summary import finish
 from gcs.udp import StationSocket, clock_ns, drive, prepare_real_time
 from scenarios import files as scenario_files
@@ -70,11 +70,11 @@ def fly(
         writer = RunWriter(folder)
         stack.callback(writer.close)
         _wait_until_ready(observer, folder)
-        if heard:
-            text = f"vehicles {heard} are flying already: none are started"
-            writer.event(time_s=-CONNECT_PATIENCE_S, kind="vehicle", text=text)
         prepare_real_time()
         station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS)
+        if heard:
+            text = f"vehicles {' '.join(map(str, heard))} are there already: none are started"
+            writer.event(time_s=station.scenario_time_s(clock_ns()), kind="vehicle", text=text)
 
         def new_plan(found: FlightPlan) -> None:
             _write_whole(folder / DESIGN_FILE, described(design, found))

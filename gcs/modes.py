@@ -35,5 +35,14 @@ def next_phase(
             return phase
 
 
+CONNECT_PATIENCE_S, START_PATIENCE_S = 20.0, 360.0
+"""How long it may take until all vehicles are ready: those that are simulated, and those with an autopilot."""
+
+
+def patience_s(dynamics: str) -> float:
+    """How long a flight may take to begin. Until then scenario time is that since the station's start less this."""
+    return START_PATIENCE_S if dynamics == "autopilot" else CONNECT_PATIENCE_S
+
+
 END_PATIENCE_S = 6.0
 """How long the station waits to see that the vehicles hold: their time-outs, a heartbeat and a slow link fit in."""

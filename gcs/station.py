@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gcs import mavlink
-from gcs.autopilot.copters import START_PATIENCE_S, Copters
+from gcs.autopilot.copters import Copters
 from gcs.autopilot.kinds import Goal
 from gcs.autopilot.startup import Startup
 from gcs.control import LARGEST_COMMAND_M_S2, VehicleControl, distances_m, formation_control
-from gcs.modes import Phase, next_phase
+from gcs.modes import CONNECT_PATIENCE_S, Phase, next_phase, patience_s
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
 from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
@@ -26,7 +26,6 @@ from gcs.telemetry import FloatArray, StateHistory
 from gcs.vehicle import SILENCE_S, Address, RemoteVehicle
 from scenarios.schema import NS_PER_S
 
-CONNECT_PATIENCE_S = 20.0
 AUTOPILOT_COMPONENT = 1
 """A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
 ANOTHER_ADDRESS = "known system id from another address"
@@ -98,7 +97,7 @@ class Station:
             period_s=self._period_ns / NS_PER_S,
         )
         self._copters = Copters(plan, self.vehicles, self._report) if autopilots else None
-        self.patience_s = START_PATIENCE_S if autopilots else CONNECT_PATIENCE_S
+        self.patience_s = patience_s(scenario.dynamics)
         self._timesync_ns = round(NS_PER_S / rates.timesync_hz)
         self._start_ns = start_ns
         self._phase_since_ns = start_ns

@@ -174,9 +174,15 @@ def _vehicle(
         "telemetry_age_s": spread_with_status(own["telemetry_age_s"][own["commanded"]]),
         "station_queue_s": spread_with_status(own["queue_s"][own["commanded"]]),
         "clock": _clock(own, int(np.isfinite(rtt).sum()), jumps_s) | {"jumps": len(jumps_s)},
-        "mode_final": None if not rows.size else Mode(int(rows["mode"][-1])).name,
+        "mode_final": _mode_final(rows),
         **counted,
     }
+
+
+def _mode_final(rows: TickArray) -> str | None:
+    """The last mode that was not WAITING, in which every vehicle is once it is told to hold at the end."""
+    flown = rows[rows["mode"] != Mode.WAITING]
+    return Mode(int((flown if flown.size else rows)["mode"][-1])).name if rows.size else None
 
 
 def spread_with_status(values: NDArray[np.float64]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Whole flights in virtual time: vehicles, links and station with real MAVLink bytes on one clock."""
 
+import io
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from gains.sampled import growth_rate
 from gcs import mavlink
@@ -14,6 +16,7 @@ from gcs.lockstep import START_NS, Sent, fly_lockstep
 from gcs.modes import Phase
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import Mode, TickArray
+from gcs.show.report import print_flight
 from gcs.station import Station
 from gcs.summary import summarise
 from scenarios.files import load
@@ -69,6 +72,19 @@ def test_formation_settles_below_one_percent_of_the_spacing(name: str) -> None:
         assert vehicle["spacing_error_final_m"] < 0.01 * spacing[vehicle["system_id"]]
     assert summary["settling_time_s"] < plan.scenario.duration_s / 2
     assert summary["control"]["deadline_misses"] == 0
+    assert {vehicle["mode_final"] for vehicle in summary["vehicles"]} == {"NOMINAL"}
+
+
+def test_a_flight_too_short_to_settle_says_what_is_left_of_its_errors() -> None:
+    plan, design = planned("triangle5", duration_s=1.0)
+    _, summary = flown(plan, design)
+    assert (summary["verdict"], summary["reason"]) == ("unstable", "completed: duration reached")
+    output = io.StringIO()
+    print_flight(summary, Console(file=output, width=200))
+    [verdict] = [line for line in output.getvalue().splitlines() if line.startswith("verdict")]
+    most_m = max(vehicle["spacing_error_max_m"] for vehicle in summary["vehicles"][1:])
+    left_m = max(vehicle["spacing_error_final_m"] for vehicle in summary["vehicles"][1:])
+    assert verdict == f"verdict  unstable: not settled in 1.0 s; {left_m:.2f} m left of errors of up to {most_m:.2f} m"
 
 
 def test_formation_follows_the_turns() -> None:

@@ -108,7 +108,7 @@ def test_the_recording_starts_with_the_flight_and_earlier_events_stand_at_its_st
     events = [chunk.to_record_batch() for chunk in RrdReader(file).stream().filter(content="/events")]
     texts = [text for batch in events for [text] in batch.column("TextLog:text").to_pylist()]
     assert [text.split() for text in texts] == [
-        ["-1.00", "s", "phase", "connecting"],
+        ["start", "+19.00", "s", "phase", "connecting"],  # 1 s before the 20 s after which it is given up
         ["0.98", "s", "end", "duration", "reached"],
     ]
 

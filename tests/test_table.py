@@ -149,6 +149,15 @@ def test_a_plain_line_has_the_worst_of_the_formation() -> None:
     ]
 
 
+def test_before_the_flight_times_count_from_the_stations_start() -> None:
+    state = FlightState(line(2), DESIGN)
+    found = {"time_s": -19.5, "kind": "vehicle", "system_id": 2, "text": "found"}
+    state.add(ticks_of(line(2), start_s=-20.0, count=51), [found])
+    assert plain_line(state).startswith("start +1.00 s  spacing")
+    assert state.news == ["start +0.50 s  vehicle 2: found"]
+    assert "start +1.00 s" in drawn(state)[0]
+
+
 def test_a_plain_line_before_anything_is_known_says_so() -> None:
     text = plain_line(FlightState(line(2), DESIGN))
     assert "spacing error max – m" in text

@@ -8,7 +8,7 @@ from gcs.autopilot.manoeuvre import Identification
 from gcs.autopilot.pilots import Pilots
 from gcs.autopilot.startup import Startup, between
 from gcs.control import VehicleControl
-from gcs.modes import Phase
+from gcs.modes import START_PATIENCE_S, Phase
 from gcs.plan import FlightPlan
 from gcs.telemetry import StateHistory
 from gcs.vehicle import RemoteVehicle
@@ -16,8 +16,6 @@ from scenarios.schema import NS_PER_S
 
 PATIENCE_S = 120.0
 """How long a vehicle may take from its first heartbeat until it is in the air and takes set-points, or be silent."""
-START_PATIENCE_S = 360.0
-"""How long all of them may take, whenever each was first heard."""
 _SILENT_S = 3.0
 _FRAME_RESOLUTION_M = 0.005
 """Half of the last digit of a latitude: smaller changes of an origin are none."""

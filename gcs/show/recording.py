@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from gcs.modes import patience_s
 from gcs.record import RECORDING_FILE, Mode, TickArray
 from gcs.show.scene import (
     PICTURE_S,
@@ -85,6 +86,7 @@ class Recording:
         self._tree = tree_of(scenario)
         self._labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
         self._levels = _levels(scenario, design)
+        self._before_s = patience_s(scenario.dynamics)
         self._ticks: list[TickArray] = []
         self._events: list[dict[str, Any]] = []
         self._newest_m = Newest(count, 3)
@@ -237,7 +239,7 @@ class Recording:
             group = list(same)
             entries.append((group[0], [event["system_id"] for event in group if event["system_id"] is not None]))
         times_s = np.array([max(float(event["time_s"]), 0.0) for event, _ in entries])
-        texts = [event_text(event, system_ids) for event, system_ids in entries]
+        texts = [event_text(event, system_ids, self._before_s) for event, system_ids in entries]
         levels = [_event_level(event) for event, _ in entries]
         self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
 

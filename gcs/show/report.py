@@ -94,7 +94,7 @@ def print_summary(summary: dict[str, Any], folder: Path, console: Console | None
 def print_flight(summary: dict[str, Any], console: Console) -> None:
     """The verdict with its figures; `control` may be None, where a log does not show the ticks."""
     style = {"stable": "bold green", "unstable": "bold red"}.get(summary["verdict"], "bold yellow")
-    console.print(f"verdict  [{style}]{summary['verdict']}[/]: {summary['reason']}")
+    console.print(f"verdict  [{style}]{summary['verdict']}[/]: {_reason(summary)}")
     console.print(f"delay    {delay_text(summary)}")
     console.print(_response(summary.get("response")), end="")
     control = summary["control"]
@@ -123,6 +123,16 @@ def print_flight(summary: dict[str, Any], console: Console) -> None:
             _count(vehicle["late"]),
         )
     console.print(table)
+
+
+def _reason(summary: dict[str, Any]) -> str:
+    """How the flight ended; of one that was flown to its end unsettled, what was left of the errors."""
+    errors = [(v["spacing_error_final_m"], v["spacing_error_max_m"]) for v in summary["vehicles"]]
+    known = [(final_m, most_m) for final_m, most_m in errors if final_m is not None and most_m is not None]
+    if summary["verdict"] != "unstable" or not summary["reason"].startswith("completed") or not known:
+        return summary["reason"]
+    final_m, most_m = (max(column) for column in zip(*known, strict=True))
+    return f"not settled in {summary['duration_s']:.1f} s; {final_m:.2f} m left of errors of up to {most_m:.2f} m"
 
 
 def delay_text(summary: dict[str, Any]) -> str:

@@ -19,6 +19,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from gcs.modes import patience_s
 from gcs.record import TICK, Mode, TickArray
 from gcs.refusals import REFUSED
 from gcs.show.grid import unknown
@@ -70,6 +71,8 @@ class FlightState:
         self.refused = ""
         """What did not get in, in words."""
         self.time_s = np.nan
+        self.before_s = patience_s(scenario.dynamics)
+        """What scenario time lacks to the time since the station's start, until the flight begins at 0."""
         self.skipped = 0
         """Ticks that were left out."""
         self.news: list[str] = []
@@ -110,11 +113,11 @@ class FlightState:
         same = (event["kind"], event["text"], event["time_s"] // TOGETHER_S)
         if event["system_id"] is not None and self._named and same == self._last_event:
             self._named.append(event["system_id"])
-            self.news[-1] = event_text(event, self._named)
+            self.news[-1] = event_text(event, self._named, self.before_s)
         else:
             self._named = [] if event["system_id"] is None else [event["system_id"]]
             self._last_event = same
-            self.news = [*self.news, event_text(event, self._named)][-EVENTS_SHOWN:]
+            self.news = [*self.news, event_text(event, self._named, self.before_s)][-EVENTS_SHOWN:]
 
     def figures(self) -> "Figures":
         """The figures to be shown, one value for each vehicle; NaN where unknown."""
@@ -178,7 +181,7 @@ def render(state: FlightState, *, width: int, height: int) -> RenderableType:
 
 
 def _headline(state: FlightState) -> Text:
-    time = UNKNOWN if np.isnan(state.time_s) else f"{state.time_s:.1f} s"
+    time = UNKNOWN if np.isnan(state.time_s) else time_text(state.time_s, state.before_s, ".1f")
     line = Text.assemble((state.scenario.name, "bold"), "  ", (state.phase, "bold cyan"), f"  {time}")
     loop = state.scenario.control.loop
     line.append(f"   delay margin {_number(1e3 * state.margins_s[0], '.0f')} ms (sampled, {loop} loop)", style="dim")
@@ -261,21 +264,27 @@ def plain_line(state: FlightState) -> str:
         f"{mode.name} {' '.join(str(state.system_ids[k]) for k in indices)}"
         for mode, indices in figures.not_nominal().items()
     ]
+    time = time_text(state.time_s, state.before_s)
     return (
-        f"{_number(state.time_s, '8.2f')} s  spacing error max {_number(_worst(figures.spacing_error_m), '.2f')} m"
+        f"{time}  spacing error max {_number(_worst(figures.spacing_error_m), '.2f')} m"
         f"  loop delay p99 max {_number(1e3 * _worst(figures.loop_delay_s_p99), '.1f')} ms"
         f"  headroom min {_worst_headroom(state, figures)}  {', '.join(modes) or 'all NOMINAL'}"
     )
 
 
-def event_text(event: dict[str, Any], system_ids: list[int]) -> str:
-    """An event in one line of text, for the vehicles it says the same of."""
+def time_text(time_s: float, before_s: float, form: str = "8.2f") -> str:
+    """Time of the flight; before it, time since the station's start, which scenario time is `before_s` short of."""
+    return f"start {time_s + before_s:+.2f} s" if time_s < 0.0 else f"{_number(time_s, form)} s"
+
+
+def event_text(event: dict[str, Any], system_ids: list[int], before_s: float) -> str:
+    """An event in one line of text, for the vehicles it says the same of; `before_s` as in `time_text`."""
     named = " ".join(str(system_id) for system_id in system_ids[:NAMED_MAX])
     if len(system_ids) > NAMED_MAX:
         named += f" and {len(system_ids) - NAMED_MAX} more"
     who = f"vehicle{'s' * (len(system_ids) > 1)} {named}: " if system_ids else ""
     kind = "" if event["kind"] == "vehicle" else f"{event['kind']}  "  # else the word would stand there twice
-    return f"{event['time_s']:8.2f} s  {kind}{who}{event['text']}"
+    return f"{time_text(event['time_s'], before_s)}  {kind}{who}{event['text']}"
 
 
 class Display:
@@ -301,7 +310,8 @@ class Display:
         """Say each event once, where there is no terminal to keep a table on."""
         if self._live is None:
             for event in events:
-                self._say(event_text(event, [] if event["system_id"] is None else [event["system_id"]]))
+                system_ids = [] if event["system_id"] is None else [event["system_id"]]
+                self._say(event_text(event, system_ids, self._state.before_s))
 
     def show(self, *, last: bool = False) -> None:
         """Show the flight as it is now."""
