@@ -78,7 +78,10 @@ def fly(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="run folder; default runs/<scenario>-<time>")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Design the control, start the vehicles, fly, show, record."""
+    """Design the control, start the vehicles, fly, show, record.
+
+    Exit code 1 if the flight is not stable.
+    """
     from gcs.fly import FlyOptions, new_folder
     from gcs.fly import fly as fly_now
     from gcs.plan import flight_plan
@@ -135,11 +138,14 @@ def design(
 @app.command()
 def compare(
     scenario_file: ScenarioFile,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="where page, figures and JSON go")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/<scenario>-compare-<time>")] = None,
     sizes: Annotated[bool, typer.Option(help="also time designs of growing chains")] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Design and fly a scenario by the inclusion principle and on the graph, side by side."""
+    """Design and fly a scenario by the inclusion principle and on the graph, side by side: figures, a page, JSON.
+
+    Exit code 1 if no route could be designed.
+    """
     from dataclasses import asdict
 
     from gcs.compare import command as comparing
@@ -181,7 +187,7 @@ def margin(
 
 @app.command()
 def thesis(
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="where page and figures go")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/thesis-<time>")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Reproduce the figures and numbers of the source, published and computed side by side."""
@@ -283,17 +289,22 @@ def view(
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="write a picture; open no window")] = None,
     at: Annotated[float, typer.Option(metavar="SECONDS", help="scenario time of the picture")] = 10.0,
 ) -> None:
-    """Open a recording in the Rerun viewer."""
-    from gcs.show.viewer import ViewerError, screenshot
+    """Open a recording in the Rerun viewer, or write a picture of it, which needs no screen.
+
+    Exit code 1 if a view of the picture reports a fault.
+    """
+    from gcs.show.viewer import ViewerError, find_recording, screenshot
     from gcs.show.viewer import view as open_viewer
 
     within("--at", at, -1e6, 1e6, "seconds")
     if picture is not None:
         out_file("--picture", picture)
     try:
+        recording = find_recording(run)
         if picture is None:
-            raise typer.Exit(open_viewer(run))
-        complaints = screenshot(run, picture, time_s=at)
+            raise typer.Exit(open_viewer(recording))
+        complaints = screenshot(recording, picture, time_s=at)
+        typer.echo(f"picture  {picture}: {recording} at {at:g} s")
     except ViewerError as error:
         raise InputError(str(error)) from None
     for complaint in complaints:
@@ -320,6 +331,7 @@ def key(file: Annotated[Path, typer.Argument(metavar="FILE", help="a new file")]
     from scenarios.signing.keys import make_key
 
     make_key(file)
+    typer.echo(f"key      {file}: for --key, at both ends of a link; keep it secret")
 
 
 app.command()(stress)

@@ -34,6 +34,7 @@ def view(folder_or_rrd: Path) -> int:
     recording = find_recording(folder_or_rrd)
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError("no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; a picture can be made without")
+    print(f"viewer   {recording}: until its window is closed", flush=True)
     return subprocess.run([_program(), str(recording)], check=False).returncode
 
 

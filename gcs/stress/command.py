@@ -70,7 +70,9 @@ def stress(
         float, typer.Option(metavar="PART", help="half width of the last round of flights around the onset")
     ] = 0.02,
     seeds: Annotated[int, typer.Option(metavar="N", help="flights at each point, each with a seed of its own")] = 1,
-    workers: Annotated[int, typer.Option(metavar="N", help="processes; default all processors, 1 in real time")] = 0,
+    workers: Annotated[
+        int, typer.Option(metavar="N", show_default=False, help="processes; default all processors, 1 in real time")
+    ] = 0,
     dask: Annotated[str, typer.Option(metavar="ADDRESS", help="fly on the workers of this Dask scheduler")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="go on with the campaign in --out")] = False,
     trial: Annotated[
@@ -84,7 +86,13 @@ def stress(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/<scenario>-stress-<time>")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
 ) -> None:
-    """Turn the link delay up until the formation breaks, and compare with the margin."""
+    """Turn the link delay up until the formation breaks, and compare with the margin.
+
+    An axis (--delay, --delay-of, --jitter, --loss, --rate) is FROM:TO:N, N values with the ends, or a list as
+    0.1,0.2,0.4. One axis is a sweep, two make a map.
+
+    Exit code 1 if --assert-onset is missed, a trial failed, or one flown again is not the same.
+    """
     named = [("delay", delay), *(("delay_of", text) for text in delay_of or ())]
     named += [("jitter", jitter), ("loss", loss), ("rate", rate)]
     options = StressOptions(
