@@ -331,7 +331,6 @@ def key(file: Annotated[Path, typer.Argument(metavar="FILE", help="a new file")]
     from scenarios.signing.keys import make_key
 
     make_key(file)
-    typer.echo(f"key      {file}: for --key, at both ends of a link; keep it secret")
 
 
 app.command()(stress)
