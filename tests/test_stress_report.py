@@ -78,7 +78,7 @@ def test_a_campaign_is_taken_up_with_its_own_scenario_only(tmp_path: Path) -> No
     (run_folder / "scenario.toml").write_text(dump(SCENARIO), encoding="utf-8")
     (tmp_path / "pair.toml").write_text(dump(SCENARIO.model_copy(update={"seed": 99})), encoding="utf-8")
     for folder, option, wanted in (
-        (out, ("--resume",), "is another scenario"),
+        (out, ("--resume",), "holds a campaign of another scenario"),
         (run_folder, ("--resume",), "read no trials.jsonl"),
         (run_folder, ("--trial", "abc"), "read no trials.jsonl"),
     ):

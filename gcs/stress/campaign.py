@@ -83,7 +83,7 @@ def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None
             raise CampaignError(f"{flag}: read no {name} in {folder}, wanted the folder of a campaign")
     file = folder / SCENARIO_FILE
     if scenario is not None and file.read_text(encoding="utf-8") != scenario:
-        raise CampaignError(f"{flag}: {file} is another scenario or loop than was given, wanted that of the campaign")
+        raise CampaignError(f"{flag}: {folder} holds a campaign of another scenario or loop, wanted {file}")
 
 
 def run_campaign(
