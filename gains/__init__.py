@@ -13,7 +13,8 @@ Delays that vary
 Formations and patterns
     `formation`, `pattern`, `fixed_modes`, `string_stability`, `behaviour`, `structure` (blocks that really interact)
 Designs
-    `design` (one call for both routes), `requirement`; by the inclusion principle: `inclusion`, `robust`, `search`;
+    `design` (one call for both routes), `requirement`; by the inclusion principle: `inclusion`,
+    `robust`, `required`, `search`, `scalar_gains`;
     by graphs: `graph_design`, `bipartite`, `lqr`, `structured_lqr`, `dk_iteration`; to compare with: `centralised`
 Inside
     `lmi` (inequalities with a proof that is checked); crossings and loci of the loops in the modules not named here

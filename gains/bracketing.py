@@ -1,7 +1,7 @@
-"""Roots and peaks of many scalar functions at once, each within its own bracket.
+"""Roots and peaks of scalar functions, within brackets.
 
-A function here takes all abscissae (k,) and returns all values (k,): one batch of eigenvalue problems a step, which is
-what the time goes to.
+Most functions here take all abscissae (k,) and return all values (k,): one batch of eigenvalue problems a step, which
+is what the time goes to.
 """
 
 from collections.abc import Callable
@@ -19,6 +19,8 @@ _GOLDEN = (3.0 - 5.0**0.5) / 2.0
 _GOLDEN_STEPS = 60
 # a peak between samples is higher than the highest of them by less than this many times what they differ
 _REACH = 4.0
+# Steps of false position at most, where the function is too rough for its resolution
+_FALSE_POSITIONS = 30
 
 
 def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -89,3 +91,29 @@ def _next_fraction(
         interpolate = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
         quadratic = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
         return np.where(interpolate & np.isfinite(quadratic), quadratic, 0.5)
+
+
+def met_end(
+    excess: Callable[[float], float], met: tuple[float, float], missed: tuple[float, float], *, resolution: float
+) -> float:
+    """An abscissa where an expensive, slightly rough function is between 0 and `resolution`: false position.
+
+    `met` and `missed` are abscissae with their excess, >= 0 and < 0. When one end moves twice in a row the value at the
+    other is halved, so that both close in (the Illinois rule); about six steps.
+    """
+    (x, value), (outside, f_outside) = met, missed
+    f_inside, moved = value, 0
+    for _ in range(_FALSE_POSITIONS):
+        if value <= resolution or f_outside >= 0.0:
+            break
+        middle = x + (outside - x) * min(max(f_inside / (f_inside - f_outside), 0.01), 0.99)
+        f_middle = excess(middle)
+        if f_middle >= 0.0:
+            x, value, f_inside = middle, f_middle, f_middle
+            f_outside = f_outside / 2.0 if moved > 0 else f_outside
+            moved = 1
+        else:
+            outside, f_outside = middle, f_middle
+            f_inside = f_inside / 2.0 if moved < 0 else f_inside
+            moved = -1
+    return x

@@ -18,22 +18,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from gains.behaviour import Behaviour, BlockMargin, Gains, behaviour, block_margin, follower_block, leader_block
 from gains.delay import delay_margin
-from gains.errors import BadModelError, DisagreementError, InfeasibleError
+from gains.errors import BadModelError, DisagreementError
 from gains.formation import FormationModel, checked_gain
 from gains.graph_design import GraphDesign, GraphMethod, graph_design
 from gains.pattern import Pattern, leader_follower
-from gains.requirement import ALPHA_MIN, DELAY_MARGIN_MAX_S, Requirement, plain
+from gains.required import required_gains
+from gains.requirement import ALPHA_MIN, Requirement, plain
 from gains.robust import Certificate, SolverFacts, certify, robustness
 from gains.sampled import sampled_delay_margin
-from gains.search import ScalarGains, largest_alpha, largest_margin
+from gains.search import largest_alpha
 
 FloatArray = NDArray[np.float64]
 
 PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
 # The certificate proves this share of α: at α itself the proof is on the edge of existence.
 _CERTIFIED_SHARE = 1 - 1e-4
-# The search aims this much above a margin asked for, so that rounding cannot leave it below.
-_MARGIN_AIM_S = 2e-10
+# A decay rate that is asked for is met to this share of itself: a double root is known to the root of the rounding.
+_DECAY_ROUNDING = 1e-6
 _TRADE_OFF_MARGINS_S = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 
 
@@ -194,7 +195,7 @@ def design(
         return graph_design(formation, links, requirement, method=method, period_s=period_s)
     wanted = Requirement() if requirement is None else requirement
     _check_period(period_s)
-    gains = _best_gains(wanted, period_s)
+    gains = required_gains(wanted, period_s)
     identity = np.eye(formation.axes)
     result = _assess(
         formation,
@@ -205,10 +206,12 @@ def design(
     )
     short_of_margin = wanted.delay_margin_s is not None and result.delay_margin_s < wanted.delay_margin_s
     short_of_alpha = wanted.alpha is not None and result.alpha < wanted.alpha
-    if short_of_margin or short_of_alpha:
+    decay = result.behaviour.decay_rate_1_s
+    short_of_decay = decay < (1.0 - _DECAY_ROUNDING) * (wanted.decay_rate_1_s or 0.0)
+    if short_of_margin or short_of_alpha or short_of_decay:
         raise DisagreementError(
             f"the search found gains for {wanted}, but the exact analysis gives them delay_margin_s = "
-            f"{result.delay_margin_s!r} and alpha = {result.alpha!r}"
+            f"{result.delay_margin_s!r}, alpha = {result.alpha!r} and decay_rate_1_s = {decay!r}"
         )
     return result
 
@@ -240,84 +243,6 @@ def evaluate_gains(
         checked_gain(name, gain, formation.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
     )
     return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None, method="given")
-
-
-def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains:
-    """Gains that meet the requirement, or InfeasibleError with what can be reached."""
-    limit = wanted.string_peak_max
-    if wanted.decay_rate_1_s is not None:
-        return _fast_gains(wanted, period_s)
-    if wanted.delay_margin_s is None:
-        assert wanted.alpha is not None
-        found = largest_margin(wanted.alpha, period_s, limit)
-        if found is None:
-            raise InfeasibleError(f"alpha = {wanted.alpha} cannot be reached: {_alpha_limit(period_s, limit)}")
-        return found[1]
-    gains = largest_alpha(wanted.delay_margin_s + _MARGIN_AIM_S, period_s, limit)
-    if gains is None:
-        raise InfeasibleError(
-            f"no gains have a sampled delay margin of {wanted.delay_margin_s} s with period_s = {period_s} "
-            f"and string_peak_max = {limit}; raise string_peak_max or lower period_s"
-        )
-    if wanted.alpha is not None and gains.alpha < wanted.alpha:
-        found = largest_margin(wanted.alpha, period_s, limit)
-        at_alpha = (
-            f"the largest margin at alpha = {wanted.alpha} is {found[0]:.4f} s"
-            if found
-            else f"alpha = {wanted.alpha} cannot be reached at any margin: {_alpha_limit(period_s, limit)}"
-        )
-        raise InfeasibleError(
-            f"delay_margin_s = {wanted.delay_margin_s} and alpha = {wanted.alpha} exclude each other: the largest "
-            f"alpha at that margin is {gains.alpha:.4f}, and {at_alpha}"
-        )
-    return gains
-
-
-def _fast_gains(wanted: Requirement, period_s: float) -> ScalarGains:
-    """The most robust gains of the wanted margin if they decay fast enough, or of the largest margin at which they do.
-
-    Along the curve of the most robust gains both α and the decay rate fall as the margin grows.
-    """
-    limit, decay, alpha = wanted.string_peak_max, wanted.decay_rate_1_s or 0.0, wanted.alpha or 0.0
-
-    def gains_at(margin_s: float) -> ScalarGains | None:
-        found = largest_alpha(margin_s, period_s, limit)
-        return found if found is not None and _decay_rate(found) >= decay and found.alpha >= alpha else None
-
-    if wanted.delay_margin_s is not None:
-        gains = gains_at(wanted.delay_margin_s + _MARGIN_AIM_S)
-        if gains is None:
-            best = largest_alpha(wanted.delay_margin_s, period_s, limit)
-            reached = "nothing" if best is None else f"{_decay_rate(best):.4f} 1/s with alpha = {best.alpha:.4f}"
-            raise InfeasibleError(
-                f"decay_rate_1_s = {decay} (with alpha = {wanted.alpha}) and delay_margin_s = {wanted.delay_margin_s} "
-                f"exclude each other: the most robust gains of that margin reach {reached}; lower delay_margin_s"
-            )
-        return gains
-    low, high = period_s / 10.0, DELAY_MARGIN_MAX_S
-    gains = gains_at(low)
-    if gains is None:
-        raise InfeasibleError(
-            f"decay_rate_1_s = {decay} (with alpha = {wanted.alpha}) leaves no delay margin with period_s = "
-            f"{period_s}; lower it, or period_s"
-        )
-    while high > low * (1.0 + 1e-6):
-        middle = (low * high) ** 0.5
-        found = gains_at(middle)
-        low, high, gains = (middle, high, found) if found is not None else (low, middle, gains)
-    return gains
-
-
-def _decay_rate(gains: ScalarGains) -> float:
-    """Decay rate (1/s) without delay: the slower of leader, s + k1, and follower, s² + k1 s + k3."""
-    return min(gains.k1, -float(np.roots([1.0, gains.k1, gains.k3]).real.max()))
-
-
-def _alpha_limit(period_s: float, string_peak_max: float | None) -> str:
-    gains = largest_alpha(0.0, period_s, string_peak_max)
-    return (
-        f"with period_s = {period_s} alpha is below {gains.alpha if gains else 0.0:.4f} even with no delay margin left"
-    )
 
 
 def _assess(

@@ -20,7 +20,6 @@ station; B. D. O. Anderson and D. J. Clements, "Algebraic characterization of fi
 Automatica 17 (1981), 703-712, for (1).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,9 +28,9 @@ from numpy.typing import NDArray
 from gains.errors import DisagreementError, InfeasibleError
 from gains.pattern import FloatArray, Link, Pattern, Plant, check_fits
 from gains.structure import distinct_blocks, strongly_connected_blocks
+from gains.submodular import least_exhaustive, least_submodular
 
 ComplexArray = NDArray[np.complex128]
-SetFunction = Callable[[frozenset[int]], int]
 
 # up to this many inputs in one component all subsets are tried (256 ranks); above, the submodular minimum is computed
 LARGEST_EXHAUSTIVE = 8
@@ -40,7 +39,6 @@ _RANK_TOLERANCE = 1e-10
 # eigenvalues of A closer than this share of its norm are one defective eigenvalue; their mean is exact to rounding
 _SAME_EIGENVALUE = 1e-5
 _RANDOM_GAINS = 3
-_MINIMUM_NORM_ROUNDS = 1000
 
 
 @dataclass(frozen=True)
@@ -163,71 +161,6 @@ def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tupl
     return modes
 
 
-def least_rank_exhaustive(rank: SetFunction, size: int) -> tuple[int, frozenset[int]]:
-    """The least value of a function of subsets of range(size), and a set that has it, by trying all 2^size."""
-    subsets = [frozenset(k for k in range(size) if code >> k & 1) for code in range(2**size)]
-    return min(((rank(subset), subset) for subset in subsets), key=lambda item: item[0])
-
-
-def least_rank_submodular(rank: SetFunction, size: int) -> tuple[int, frozenset[int]]:
-    """The least value of an integer submodular function of subsets of range(size), and a set that has it.
-
-    Wolfe's algorithm approaches the point x of least norm in the base polytope of f − f(∅). Every such x proves the
-    lower bound f(∅) + Σ min(x_k, 0), and every set met on the way is an upper bound; for integers a gap below one is
-    none. (S. Fujishige, Submodular Functions and Optimization, 2nd ed. 2005, section 7.1.)
-
-    Raises
-    ------
-    DisagreementError
-        If the gap does not close: the function is not submodular, as a rank decided by rounding need not be.
-    """
-    empty = rank(frozenset())
-    best = (empty, frozenset[int]())
-
-    def vertex(x: FloatArray) -> FloatArray:
-        """Vertex of the base polytope that is least in the direction x (Edmonds' greedy algorithm)."""
-        nonlocal best
-        point, subset, value = np.zeros(size), frozenset[int](), empty
-        for k in np.argsort(x, kind="stable").tolist():
-            subset |= {k}
-            next_value = rank(subset)
-            point[k], value = next_value - value, next_value
-            best = min(best, (value, subset), key=lambda item: item[0])
-        return point
-
-    points = vertex(np.zeros(size))[np.newaxis]
-    weights = np.ones(1)
-    for _ in range(_MINIMUM_NORM_ROUNDS):
-        x = weights @ points
-        if empty + np.minimum(x, 0.0).sum() > best[0] - 1 + 1e-6:
-            return best
-        points, weights = _nearest_to_origin(np.vstack([points, vertex(x)]), np.append(weights, 0.0))
-    raise DisagreementError(
-        f"the least rank is between {empty + np.minimum(weights @ points, 0.0).sum():.3f} and {best[0]}; the ranks are "
-        "decided by rounding: scale the plant so that its entries are of like size"
-    )
-
-
-def _nearest_to_origin(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Wolfe's minor cycle: the point of least norm in the hull of some of the points, which are kept."""
-    while True:
-        count = len(points)
-        # least norm in the affine hull: Lagrange's conditions, by least squares because points may be dependent
-        system = np.block([[points @ points.T, np.ones((count, 1))], [np.ones((1, count)), np.zeros((1, 1))]])
-        affine = np.linalg.lstsq(system, np.append(np.zeros(count), 1.0), rcond=None)[0][:count]
-        if affine.min() > -1e-10:
-            kept = affine > 1e-10
-            return points[kept], affine[kept] / affine[kept].sum()
-        outward = affine < weights - 1e-14
-        outward &= affine < 1e-10
-        step = float((weights[outward] / (weights[outward] - affine[outward])).min()) if outward.any() else 0.0
-        weights = weights + min(step, 1.0) * (affine - weights)
-        kept = weights > 1e-12
-        if kept.all():
-            kept[np.argmin(weights)] = False
-        points, weights = points[kept], weights[kept] / weights[kept].sum()
-
-
 def _components(plant: Plant, pattern: Pattern) -> list[_Component]:
     feedback = (plant.B != 0.0).astype(float) @ pattern.mask.astype(float) @ (plant.C != 0.0).astype(float)
     found: list[_Component] = []
@@ -300,7 +233,7 @@ def _least_rank(component: _Component, mode: complex) -> tuple[int, frozenset[in
         return kept + _rank(np.vstack([above, below]), _size(shifted))
 
     size = len(component.inputs)
-    return least_rank_exhaustive(rank, size) if size <= LARGEST_EXHAUSTIVE else least_rank_submodular(rank, size)
+    return least_exhaustive(rank, size) if size <= LARGEST_EXHAUSTIVE else least_submodular(rank, size)
 
 
 def _candidates(A: FloatArray) -> list[complex]:

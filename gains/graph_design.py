@@ -157,7 +157,7 @@ def graph_design(
     if wanted.delay_margin_s is not None:
         base, scale = _at_margin(single, bases, wanted, period_s)
     else:
-        base, scale = _slowest(single, bases, wanted)
+        base, scale = _slowest(single, bases, wanted, period_s)
     gain = time_scaled(single, base.K, scale)
     return _assess(
         formation, narrow, gain, period_s=period_s, requirement=wanted, method=method, loss=base.cost_loss,
@@ -258,8 +258,8 @@ def _at_margin(
     if not fitting:
         alpha, decay = max(entry[0] for entry in reached), max(entry[1] for entry in reached)
         raise InfeasibleError(
-            f"with delay_margin_s = {margin_s} this pattern reaches alpha = {alpha:.4f} or decay_rate_1_s = "
-            f"{decay:.4f} 1/s at most, not {_asked(wanted)}; lower that, or delay_margin_s"
+            f"with delay_margin_s = {margin_s} this pattern does not reach {_asked(wanted)}: "
+            f"{_reached(alpha, decay, wanted)} at most; lower that, or delay_margin_s"
         )
     _, _, base, scale = max(fitting, key=lambda entry: entry[0])
     for _ in range(_SCALING_STEPS):
@@ -273,7 +273,9 @@ def _at_margin(
     )
 
 
-def _slowest(single: FormationModel, bases: Sequence[_Base], wanted: Requirement) -> tuple[_Base, float]:
+def _slowest(
+    single: FormationModel, bases: Sequence[_Base], wanted: Requirement, period_s: float
+) -> tuple[_Base, float]:
     """The base and time scale of largest margin that reach the wanted robustness and decay rate."""
 
     def good(base: _Base, scale: float) -> bool:
@@ -288,13 +290,19 @@ def _slowest(single: FormationModel, bases: Sequence[_Base], wanted: Requirement
         scale = _last_good(lambda s, base=base: good(base, s), low, low * float(_SCALES[1] / _SCALES[0]))
         if best is None or base.margin_s * scale > best[0]:
             best = base.margin_s * scale, base, scale
-    if best is None:
-        alpha = max(_alpha(single, base, float(scale)) for base in bases for scale in _SCALES)
+    if best is None or sampled_delay_margin(single.A, single.B, _scaled(single, best), period_s=period_s) == 0.0:
+        flown = [(base, float(scale)) for base in bases for scale in _SCALES if base.margin_s * scale > period_s / 2.0]
+        alpha = max(_alpha(single, base, scale) for base, scale in flown)
+        decay = max(base.decay_rate_1_s / scale for base, scale in flown)
         raise InfeasibleError(
-            f"this pattern reaches alpha = {alpha:.4f} at most, however small the delay margin, and {_asked(wanted)} "
-            "cannot be reached: lower it, or add links"
+            f"this pattern does not reach {_asked(wanted)} with period_s = {period_s}, however small the delay margin: "
+            f"{_reached(alpha, decay, wanted)} at most; lower that, or period_s, or add links"
         )
     return best[1], best[2]
+
+
+def _scaled(single: FormationModel, best: tuple[float, _Base, float]) -> FloatArray:
+    return time_scaled(single, best[1].K, best[2])
 
 
 def _last_good(good: Callable[[float], bool], low: float, high: float) -> float:
@@ -312,6 +320,13 @@ def _meets(alpha: float, decay_rate_1_s: float, wanted: Requirement) -> bool:
 def _asked(wanted: Requirement) -> str:
     asked = {"alpha": wanted.alpha, "decay_rate_1_s": wanted.decay_rate_1_s}
     return " and ".join(f"{name} = {value}" for name, value in asked.items() if value is not None)
+
+
+def _reached(alpha: float, decay_rate_1_s: float, wanted: Requirement) -> str:
+    """The most that was reached of each thing asked for."""
+    reached = [f"alpha = {alpha:.4f}"] if wanted.alpha is not None else []
+    reached += [f"decay_rate_1_s = {decay_rate_1_s:.4f}"] if wanted.decay_rate_1_s is not None else []
+    return " or ".join(reached)
 
 
 def _alpha(single: FormationModel, base: _Base, scale: float) -> float:

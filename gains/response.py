@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gains.behaviour import Gains
+from gains.bracketing import met_end
 from gains.delay import delay_margin
 from gains.errors import BadModelError, InfeasibleError
 from gains.formation import FormationModel
@@ -24,7 +25,6 @@ from gains.search import largest_alpha
 from gains.structure import FloatArray
 
 _MARGIN_MAX_S = 30.0
-_BISECTIONS = 40
 _MARGIN_RESOLUTION = 1e-9
 
 
@@ -178,8 +178,8 @@ def string_peak(gains: Gains, response: Response, *, delay_s: float) -> float:
 def requirement_with(requirement: Requirement, response: Response, *, period_s: float) -> Requirement:
     """The requirement on vehicles that answer at once whose design has the wanted margin with this response.
 
-    The margin with the response grows with the one without it: found by bisection. A requirement without a margin stays
-    as it is.
+    The margin with the response grows with the one without it: found by false position. A requirement without a margin
+    stays as it is.
 
     Raises
     ------
@@ -202,23 +202,24 @@ def requirement_with(requirement: Requirement, response: Response, *, period_s: 
     pair = FormationModel((-1, 0), axes=1)  # a leader-follower tree has the roots of these two, whatever its size
 
     def excess(without_s: float) -> float:
-        found = largest_alpha(without_s, period_s, requirement.string_peak_max)
+        found = largest_alpha(without_s, period_s, requirement.string_peak_max, requirement.decay_rate_1_s or 0.0)
         if found is None:
-            return -np.inf
+            return -wanted_s
         K = pair.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
         return sampled_margin(pair, K, [response] * 2, period_s=period_s) - wanted_s
 
-    low, high = 0.0, wanted_s
-    while excess(high) < 0.0:
-        low, high = high, 2.0 * high
-        if high > _MARGIN_MAX_S:
-            raise InfeasibleError(
-                f"no gains have a sampled delay margin of {wanted_s} s with lag_s = {response.lag_s} and "
-                f"velocity_gain_1_s = {response.velocity_gain_1_s}; ask for less"
-            )
-    for _ in range(_BISECTIONS):
-        if high - low < _MARGIN_RESOLUTION * high:
-            break
-        middle = (low + high) / 2.0
-        low, high = (low, middle) if excess(middle) >= 0.0 else (middle, high)
-    return replace(requirement, delay_margin_s=high)
+    # the response takes about its lag of the margin
+    low, high = wanted_s, wanted_s + response.lag_s
+    f_low, f_high = excess(low), excess(high)
+    while f_high < 0.0 and high < _MARGIN_MAX_S:
+        low, f_low, high = high, f_high, min(high + wanted_s + response.lag_s, _MARGIN_MAX_S)
+        f_high = excess(high)
+    if f_high < 0.0 or high > _MARGIN_MAX_S:
+        raise InfeasibleError(
+            f"no gains have a sampled delay margin of {wanted_s} s with lag_s = {response.lag_s} and "
+            f"velocity_gain_1_s = {response.velocity_gain_1_s}; ask for less"
+        )
+    if f_low >= 0.0:
+        return requirement
+    found_s = met_end(excess, (high, f_high), (low, f_low), resolution=_MARGIN_RESOLUTION * wanted_s)
+    return replace(requirement, delay_margin_s=found_s)

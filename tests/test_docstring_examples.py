@@ -24,6 +24,7 @@ INTERNAL_MODULES = {
     "sampled_crossings",
     "sampled_loop",
     "sampled_period",
+    "submodular",
 }
 INTERNAL_FUNCTIONS = {
     "commensurate.block_crossings",
@@ -35,8 +36,6 @@ INTERNAL_FUNCTIONS = {
     "delay.stability_windows",
     "delay_sweep.near_unit_extrema",
     "delay_sweep.sweep_frequencies",
-    "fixed_modes.least_rank_exhaustive",
-    "fixed_modes.least_rank_submodular",
     "formation.checked_gain",
     "pattern.check_fits",
     "pattern.checked_pattern_gain",

@@ -91,10 +91,16 @@ def test_time_scale_multiplies_the_margin_and_divides_the_decay_rate() -> None:
 def test_what_cannot_be_had_together_is_named() -> None:
     with pytest.raises(InfeasibleError, match=r"lower that, or delay_margin_s"):
         design(CHAIN, Requirement(delay_margin_s=0.5, alpha=0.9), method="graph-lqr", period_s=PERIOD_S)
-    with pytest.raises(InfeasibleError, match=r"reaches alpha = 0\.\d+ at most.*lower it, or add links"):
+    with pytest.raises(InfeasibleError, match=r"alpha = 1\.5 .*: alpha = 0\.\d+ at most; lower that, .*or add links"):
         design(CHAIN, Requirement(alpha=1.5), method="graph-lqr", period_s=PERIOD_S)
     with pytest.raises(InfeasibleError, match="exclude each other"):
         design(CHAIN, Requirement(delay_margin_s=1.0, decay_rate_1_s=3.0), period_s=PERIOD_S)
+
+
+def test_a_decay_that_the_sampled_loop_cannot_have_is_refused() -> None:
+    # a gain that decays like e^-500t at once, sampled 50 times a second: once handed out, with a margin of 0
+    with pytest.raises(InfeasibleError, match=r"decay_rate_1_s = 500\.0 with period_s = 0\.02.*: decay_rate_1_s = \d+"):
+        design(CHAIN, Requirement(decay_rate_1_s=500.0), method="graph-lqr", period_s=0.02)
 
 
 def test_missing_link_is_named_before_anything_is_designed() -> None:

@@ -11,7 +11,8 @@ from gains.delay import delay_margin
 from gains.formation import FormationModel
 from gains.robust import robustness
 from gains.sampled import sampled_delay_margin
-from gains.search import alpha_of, front_gain_limit, gains_of_margin, largest_alpha, largest_margin
+from gains.scalar_gains import alpha_of, front_gain_limit, gains_of_margin
+from gains.search import largest_alpha, largest_margin
 
 FOLLOWER = FormationModel((-1, 0), axes=1)
 
