@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gcs import mavlink
+from gcs.absence import absences, end_reason, told
 from gcs.autopilot.copters import Copters
 from gcs.autopilot.kinds import Goal
 from gcs.autopilot.startup import Startup
@@ -115,7 +116,7 @@ class Station:
         self._telemetry_ns = [0] * n
         self._fresh_rtt_s = [nan] * n
         self._loop_delay_s = [nan] * n
-        self._lost = [False] * n
+        self._absent = [""] * n
 
     @property
     def next_event_ns(self) -> int:
@@ -298,13 +299,13 @@ class Station:
         flying = self.phase is Phase.FLYING
         silence_ns = SILENCE_S * NS_PER_S
         silent = [self._now_ns - heard_ns > silence_ns for heard_ns in self._telemetry_ns]
-        lost = silent if flying else [False] * len(silent)
-        if lost != self._lost:
-            for vehicle, gone, was in zip(self.vehicles, lost, self._lost, strict=True):
-                if gone != was and flying:
-                    self._report("vehicle", "is lost" if gone else "is heard again", vehicle.system_id)
-            self._lost = lost
-            self._law = law_of(self.plan, lost)
+        absent = absences(self.vehicles, silent) if flying else [""] * len(silent)
+        if absent != self._absent:
+            for vehicle, now, was in zip(self.vehicles, absent, self._absent, strict=True):
+                if now != was and flying:
+                    self._report("vehicle", told(was, now), vehicle.system_id)
+            self._absent = absent
+            self._law = law_of(self.plan, [why != "" for why in absent])
         view = FleetView(
             time_s=self.scenario_time_s(due_ns),
             flying=flying,
@@ -335,12 +336,8 @@ class Station:
             self._lose_patience(due_ns, waited_s)
         if self.phase is Phase.IDENTIFYING:
             self._identify(due_ns)
-        if self.phase is Phase.FLYING:
-            if waited_s >= self.plan.scenario.duration_s:
-                lost = ", ".join(str(v.system_id) for v, gone in zip(self.vehicles, self._lost, strict=True) if gone)
-                self.request_stop(f"lost: vehicles {lost}" if lost else "completed: duration reached")
-            elif all(self._lost):
-                self.request_stop("lost: all vehicles")
+        if self.phase is Phase.FLYING and (waited_s >= self.plan.scenario.duration_s or all(self._absent)):
+            self.request_stop(end_reason(self.vehicles, self._absent))
         phase = next_phase(
             self.phase,
             all_ready=self.phase is Phase.CONNECTING

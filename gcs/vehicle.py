@@ -77,6 +77,9 @@ class RemoteVehicle:
         self.critical = False
         self.goal: Goal | None = Goal.FLY
         """None: it is left to itself."""
+        self.taken_over = False
+        """Whether a vehicle with an autopilot has left its guided mode, by its pilot or for a reason of its own: until
+        it is guided again it is told nothing."""
         self.startup = startup
         self.upload = upload
         self.first_heard_ns: int | None = None
@@ -101,10 +104,10 @@ class RemoteVehicle:
 
     @property
     def ended(self) -> bool:
-        """Whether it is seen to hold or land, or never took off: what was not flown is told nothing."""
+        """Whether it is seen to hold or land, or is told nothing: it never took off, or is somebody else's."""
         if self.startup is not None and (self.startup.kind is None or not self.armed):
             return True
-        return self.custom_mode == self.end_mode
+        return self.taken_over or self.custom_mode == self.end_mode
 
     @property
     def guided(self) -> bool:
@@ -126,6 +129,8 @@ class RemoteVehicle:
             return "not heard"
         if self.silent:
             return "is silent"
+        if self.taken_over:
+            return f"left {self.kind.guided_name}, by its pilot or by itself"
         if self.startup is not None:
             return self._next(self.startup).missing
         if self.refused and self.upload is not None:
@@ -185,6 +190,7 @@ class RemoteVehicle:
         custom_mode, vehicle_type, autopilot, base_mode, system_status, _ = fields
         if self.startup is not None:
             self.startup.heartbeat(autopilot, vehicle_type)
+        self._see_takeover(custom_mode, critical=system_status == STATE_CRITICAL)
         was_guided = self.guided
         self.custom_mode, self.armed = custom_mode, bool(base_mode & ARMED)
         critical = system_status == STATE_CRITICAL
@@ -193,6 +199,14 @@ class RemoteVehicle:
         elif was_guided and not self.guided and not critical:
             self._report("vehicle", f"left {self.kind.guided_name}")
         self.critical = critical
+
+    def _see_takeover(self, mode: int, *, critical: bool) -> None:
+        """Notice that an autopilot has left its guided mode and nothing of ours made it, by the mode it reports."""
+        kind = self.kind
+        if mode == kind.guided_mode:
+            self.taken_over = False
+        elif self.startup is not None and self.goal is not Goal.END and self.custom_mode == kind.guided_mode:
+            self.taken_over = kind.stays_guided or not critical
 
     def acknowledge(self, fields: tuple[Any, ...], now_ns: int) -> None:
         """Take in a COMMAND_ACK."""
@@ -267,7 +281,7 @@ class RemoteVehicle:
         )
 
     def _wanted(self) -> tuple[int, tuple[float, ...]] | None:
-        if self.goal is None:
+        if self.goal is None or self.taken_over:
             return None
         if self.goal is Goal.END:
             return None if self.ended else mode_command(self.kind, self.end_mode)
@@ -289,7 +303,7 @@ class RemoteVehicle:
 
     def forget_rates(self) -> None:
         """The vehicle seems to have started anew: its rates have to be set again."""
-        self.rates_set = False
+        self.rates_set = self.taken_over = False
         if self.startup is not None:
             self.startup.forget_rates()
         if self.upload is not None:

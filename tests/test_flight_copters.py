@@ -1,5 +1,6 @@
 """Flights of vehicles with autopilots in virtual time, from boot to hold, and what the start-up has to cope with."""
 
+from collections import deque
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from gcs.absence import TAKEN_OVER
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.plan import FlightPlan, described, flight_plan
 from gcs.record import TickArray
@@ -17,7 +19,9 @@ from gcs.summary import verdict
 from scenarios.files import load
 from scenarios.schema import ClockJump, Link, Links, Outage, Response, Scenario, VehicleLinks
 from sim_vehicles.copter import Copter
+from sim_vehicles.copter_rules import RULES
 from sim_vehicles.fleet import Fleet
+from tests.sim_client import command
 from tests.test_station import HOME, Peer, messages
 
 COPTERS5 = load(Path(__file__).parent.parent / "scenarios" / "copters5.toml")
@@ -253,6 +257,42 @@ def test_after_an_outage_longer_than_the_time_outs_the_vehicle_is_called_back(fl
     assert "is lost" in flight.texts("vehicle")
     assert flight.error_m(3)[-1] < 0.17
     assert flight.copter(3).counters["setpoints"] > 1000
+
+
+@pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 6), ("px4", 4 << 16 | 5 << 24)])
+def test_a_vehicle_whose_pilot_sends_it_home_is_left_alone_and_flown_around(flavour: str, mode: int) -> None:
+    flight = fly_with_a_pilot(flavour, {5.0: mode})
+    assert flight.station.end_reason == "taken over: vehicles 3"
+    flight.fleet.step([], int(flight.ticks["due_ns"][-1]) + 60_000_000_000)
+    assert flight.copter(3).landed  # the return was not stopped in flight, nor at the end
+    rules = flight.copter(2).rules
+    assert [flight.copter(k).mode for k in (1, 2)] == [rules.hold_mode] * 2
+    assert flight.error_m(2)[-1] < 0.17
+    assert flight.texts("vehicle")[-2:] == [f"left {flight.station.vehicles[2].kind.guided_name}", TAKEN_OVER]
+
+
+@pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 5), ("px4", 3 << 16)])
+def test_a_vehicle_that_its_pilot_gives_back_flies_in_the_formation_again(flavour: str, mode: int) -> None:
+    flight = fly_with_a_pilot(flavour, {5.0: mode, 8.0: RULES[flavour].guided_mode})
+    assert flight.station.end_reason == "completed: duration reached"
+    assert flight.texts("vehicle")[-1] == "is given back"
+    assert flight.error_m(3)[-1] < 0.17
+
+
+def fly_with_a_pilot(flavour: str, modes: dict[float, int]) -> Flight:
+    """A flight in which the pilot of vehicle 3 changes its mode at these times."""
+    scenario = three(flavour=flavour, duration_s=20.0)
+    station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    wanted, ticks = deque(sorted(modes.items())), list[TickArray]()
+    for tick in fly_lockstep(station.plan, station=station, vehicles=fleet):
+        ticks.append(tick)
+        if wanted and tick["time_s"][0] > wanted[0][0]:
+            # what a switch of its remote control does is the command, without a link
+            vehicle, (_, mode) = fleet.vehicle(3), wanted.popleft()
+            assert isinstance(vehicle, Copter)
+            packed = (mode >> 16 & 0xFF, mode >> 24) if flavour == "px4" else (mode, 0)
+            vehicle.step([(command(176, 1, *packed, system=3), int(tick["due_ns"][0]))], int(tick["due_ns"][0]))
+    return Flight(station, fleet, np.concatenate(ticks), station.events)
 
 
 def test_a_second_station_takes_over_vehicles_that_are_in_the_air() -> None:

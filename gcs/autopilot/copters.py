@@ -90,7 +90,8 @@ class Copters:
         """Fields of the set-point that a vehicle is sent at this tick, if any: to hover, to be identified, to fly."""
         vehicle, command = self._vehicles[row], control.command_m_s2
         airborne = vehicle.startup is not None and vehicle.startup.airborne
-        if phase is Phase.CONNECTING and airborne:
+        others = vehicle.taken_over and phase in (Phase.IDENTIFYING, Phase.FLYING)
+        if (phase is Phase.CONNECTING and airborne) or others:  # PX4 is given back only while set-points come
             return self._pilots.hover(row, vehicle, key_ms=key_ms)
         if phase is Phase.IDENTIFYING and self._identification is not None:
             command, commanded = self._identification.command(due_ns), True

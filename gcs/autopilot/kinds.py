@@ -52,6 +52,9 @@ class Kind:
     """Guided on the ground, before it is armed; otherwise only in the air, while set-points come."""
     altitude_above_sea: bool = False
     """The altitude of a take-off command is above sea level, not above home."""
+    stays_guided: bool = False
+    """Without set-points it stays guided, and stops: if it leaves, that is somebody's will, or its own for another
+    reason."""
     velocity_grows: bool = False
     """Its velocity target grows with the acceleration between two set-points."""
     packed_modes: bool = False
@@ -70,6 +73,7 @@ ARDUCOPTER = Kind(
     hold_mode=17,  # BRAKE: LOITER would ask the pilot's sticks
     land_mode=9,
     estimator_message=mavlink.EKF_STATUS_REPORT,
+    stays_guided=True,
     velocity_grows=True,
 )
 PX4_COPTER = Kind(
