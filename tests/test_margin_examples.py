@@ -56,6 +56,23 @@ def test_known_margins(tmp_path: Path, model: dict[str, Any], intervals: list[li
     ))  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("name", "interval"),
+    [
+        ("two_matrices", [0.10016826845243451, 1.7178581782970905]),
+        # the delay of the coupling has no part in it: each state is a loop of its own, the second with 2 tau
+        ("terms", [0.0, 6.172581371221286 / 2]),
+        ("held", [0.0, 1.7294142794798775]),
+    ],
+)
+def test_the_model_files_in_docs_have_the_margins_that_are_known_of_them(
+    tmp_path: Path, name: str, interval: list[float]
+) -> None:
+    text = (Path(__file__).parent.parent / "docs" / "models" / f"{name}.json").read_text(encoding="utf-8")
+    [found] = json.loads(run(tmp_path, text, "--json").stdout)["stable_intervals_s"]
+    assert found == pytest.approx(interval, rel=1e-8)
+
+
 @pytest.mark.parametrize("gain", [0, -1])
 def test_an_unstable_plant_with_too_little_gain_is_stable_at_no_period(tmp_path: Path, gain: int) -> None:
     done = run(tmp_path, json.dumps({"A": [[2]], "B": [[1]], "K": [[gain]], "hold": True}), "--json")
