@@ -42,6 +42,8 @@ _WEIGHT_FLOOR_NS = 200_000.0
 _EVERY_SAMPLE = 32
 _ESTIMATE_EVERY = 4
 """Past the first samples the line is drawn anew only at each fourth: in between it is followed, which costs nothing."""
+_sum = np.add.reduce
+"""As np.sum, at half the cost for so few."""
 
 
 class ClockEstimate(NamedTuple):
@@ -205,18 +207,19 @@ class VehicleClock:
         rtt = self._rtt_ns[:n]
         least = int(rtt.min())
         weight = 1.0 / (rtt - least + _WEIGHT_FLOOR_NS) ** 2
-        weight /= weight.sum()
+        weight /= _sum(weight)
         t = (self._sent_ns[:n] - now_ns).astype(float)
         base = int(self._offset_ns[(self._count - 1) % WINDOW])
         y = (self._offset_ns[:n] - base).astype(float)
         # Sums of products, not `@`: BLAS adds in an order of each processor's own, and flights are the same on all.
-        t_mean, y_mean = (weight * t).sum(), (weight * y).sum()
+        t_mean, y_mean = _sum(weight * t), _sum(weight * y)
         t -= t_mean
         y -= y_mean
-        spread = (weight * t * t).sum()
+        weighted = weight * t
+        spread = _sum(weighted * t)
         # A slope from a short stretch would be noise: below 0.3 s (rms) of history the rate is the one known before,
         # at first none.
-        skew = float((weight * t * y).sum() / spread) if spread > 0.09e18 else self.estimate.skew
+        skew = float(_sum(weighted * y) / spread) if spread > 0.09e18 else self.estimate.skew
         skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, skew))
         self._least_ns, self._unusual_ns = least, round(float(np.abs(y - skew * t).max()))
         offset = base + round(y_mean - skew * t_mean)

@@ -238,13 +238,13 @@ def distances_m(controls: Sequence[VehicleControl], now_ns: int) -> FloatArray:
 
     Positions are brought to `now_ns` along the reported velocities.
     """
-    positions: list[tuple[float, float]] = []
+    positions: list[complex] = []
     for sample_ns, (north, east, v_north, v_east), *_ in controls:
         age_s = (now_ns - sample_ns) * 1e-9
-        positions.append((north + v_north * age_s, east + v_east * age_s))
-    position = np.array(positions).T
-    away = position[:, :, None] - position[:, None]
-    # not abs of complex numbers, which rounds as each processor can
-    distance = np.sqrt((away * away).sum(axis=0))
+        positions.append(complex(north + v_north * age_s, east + v_east * age_s))
+    position = np.array(positions)
+    away = position[:, None] - position
+    north, east = np.real(away), np.imag(away)
+    distance = np.sqrt(north * north + east * east)  # not abs(away), which rounds as each processor can
     distance.flat[:: len(positions) + 1] = nan  # to itself
     return distance

@@ -205,6 +205,7 @@ class FormationMonitor:
         self._delays_s = np.full((max(1, round(policy.window_s / period_s)), vehicles), np.nan)
         self._judged = 0
         """Ticks of this flight so far."""
+        self._settled = [Blend(gain_set, gain_set, 1.0) for gain_set in range(len(margins_s))]
 
     def update(self, view: FleetView) -> list[tuple[int, VehicleState, VehicleState]]:
         """Judge a tick; returns the vehicles whose mode, gain set or release changed, with both states."""
@@ -237,7 +238,7 @@ class FormationMonitor:
         return [
             Blend(s.gain_set, s.former_set, min(1.0, max(0.0, (time_s - s.changed_s) / blend_s)))
             if time_s - s.changed_s < blend_s
-            else Blend(s.gain_set, s.gain_set, 1.0)
+            else self._settled[s.gain_set]
             for s in self.states
         ]
 

@@ -6,7 +6,7 @@ or in virtual time, with the same bytes.
 
 from collections import Counter
 from collections.abc import Callable
-from math import hypot, isfinite, nan
+from math import hypot, isfinite, isnan, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -271,7 +271,7 @@ class Station:
         distance_m = distances_m(controls, due_ns)
         nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
         if flying:
-            self._watch(controls, distance_m)
+            self._watch(controls, distance_m, nearest_m)
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
         seen: list[VehicleTick] = []
         for row, (vehicle, control, monitored, nearest) in enumerate(
@@ -398,10 +398,10 @@ class Station:
             key_ms=key_ms, target_system=self.vehicles[row].system_id, north_m_s2=north, east_m_s2=east
         )
 
-    def _watch(self, controls: list[VehicleControl], distance_m: FloatArray) -> None:
+    def _watch(self, controls: list[VehicleControl], distance_m: FloatArray, nearest_m: list[float]) -> None:
         """End the flight on a collision or a spacing error past the limit."""
         safety = self.plan.scenario.safety
-        closest_m = float(np.fmin.reduce(distance_m, axis=None))
+        closest_m = min((distance for distance in nearest_m if not isnan(distance)), default=nan)
         if closest_m < safety.collision_distance_m:
             one, two = (self.vehicles[row].system_id for row in divmod(int(np.nanargmin(distance_m)), len(controls)))
             self.request_stop(f"broken: vehicles {one} and {two} have collided, {closest_m:.1f} m apart")
