@@ -244,7 +244,6 @@ def distances_m(controls: Sequence[VehicleControl], now_ns: int) -> FloatArray:
         positions.append(complex(north + v_north * age_s, east + v_east * age_s))
     position = np.array(positions)
     away = position[:, None] - position
-    north, east = np.real(away), np.imag(away)
-    distance = np.sqrt(north * north + east * east)  # not abs(away), which rounds as each processor can
+    distance = np.sqrt(np.real(away) ** 2 + np.imag(away) ** 2)  # not abs(away), which rounds as each processor can
     distance.flat[:: len(positions) + 1] = nan  # to itself
     return distance

@@ -113,8 +113,8 @@ def _parted(onset: Onset, allowed: float) -> str:
     if abs(onset.difference) <= allowed:
         return ""
     return (
-        f"the onset is at {onset.loop_delay_s:.4f} s of loop delay, {onset.difference:+.1%} from the margin "
-        f"{onset.predicted_s:.4f} s; {allowed:.1%} is allowed"
+        f"the onset is at {onset.loop_delay_s:.5f} s of loop delay, {onset.difference:+.3%} from the margin "
+        f"{onset.predicted_s:.5f} s; {100.0 * allowed:.3g}% is allowed"
     )
 
 
