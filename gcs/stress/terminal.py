@@ -25,7 +25,8 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
     if not console.is_terminal:
         console.width = _FILE_WIDTH
     onset = result["onset"]
-    console.print(f"margin   {_ms(result['delay_margin_s'])} of loop delay, sampled")
+    margin_s = result["delay_margin_s"]
+    console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
     console.print(f"trials   {result['trials']}: {_kinds(result['trials_of_kind'])}")
     if onset is not None:
         console.print(
