@@ -146,7 +146,8 @@ class Cost:
         L = equations.reached(weights.X0)
         gradient = 2.0 * (weights.R @ F + plant.B.T @ P) @ L @ plant.C.T
         cost = float(np.sum(P * weights.X0))
-        if not np.isfinite(cost):
+        # a loop so near its limit of stability that rounding decides: covariances are not negative
+        if not (np.isfinite(cost) and np.trace(L) > 0.0 and np.diag(L).min() > -1e-9 * np.trace(L)):
             return None
         return CostPoint(K, cost, np.where(self.mask, gradient, 0.0), plant.C @ L @ plant.C.T)
 
@@ -159,9 +160,10 @@ class Cost:
         direction = np.zeros_like(gradient)
         for rows, columns in self._row_groups:
             covariance = point.covariance[np.ix_(columns, columns)]
-            # outputs that never move leave the covariance singular
-            covariance = covariance + 1e-13 * max(float(np.trace(covariance)), 1e-300) * np.eye(columns.size)
-            solved = linalg.solve(covariance, gradient[np.ix_(rows, columns)].T, assume_a="pos").T
+            # outputs that never move, or hardly beside others, leave the covariance singular to rounding
+            values, vectors = np.linalg.eigh(covariance)
+            values = values.clip(min=1e-13 * max(float(np.trace(covariance)), 1e-300))
+            solved = gradient[np.ix_(rows, columns)] @ vectors / values @ vectors.T
             direction[np.ix_(rows, columns)] = solved / (2.0 * self.weights.R[rows, rows][:, np.newaxis])
         return direction
 

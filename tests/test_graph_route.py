@@ -11,7 +11,7 @@ from gains.fixed_modes import check_stabilisable, fixed_modes
 from gains.formation import FormationModel
 from gains.lqr import Weights, lqr_cost
 from gains.pattern import Pattern, all_to_all, bidirectional, formation_plant, leader_follower, without_links
-from gains.structured_lqr import structured_lqr
+from gains.structured_lqr import stabilising_gain, structured_lqr
 
 CHAIN = FormationModel((-1, 0, 1))
 PLANT = formation_plant(CHAIN)
@@ -51,6 +51,37 @@ def test_structured_optimum_is_stationary_stable_in_the_pattern_and_costs_more(p
     assert up > result.cost
     assert down > result.cost
     assert abs(up - down) < 1e-3 * (up + down - 2 * result.cost) + 1e-9 * result.cost  # flat to first order
+
+
+@pytest.mark.parametrize(
+    ("predecessors", "blocks"),
+    [
+        ((-1, 0, 1), [[0, 0, 1], [0, 1, 0], [1, 0, 0]]),
+        ((-1, 0, 1), [[1, 1, 0], [0, 0, 1], [1, 0, 0]]),
+        ((-1, 0, 0), [[1, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    ],
+)
+def test_vehicles_that_steer_each_other_only_are_stabilised(
+    predecessors: tuple[int, ...], blocks: list[list[int]]
+) -> None:
+    # three of the 1022 patterns of three vehicles; the gains grew until covariances overflowed
+    formation = FormationModel(predecessors, axes=1)
+    tree = leader_follower(formation)
+    pattern = Pattern(np.array(blocks, dtype=bool), tree.input_sizes, tree.output_sizes)
+    plant = formation_plant(formation)
+    gain = stabilising_gain(plant, pattern, Weights(np.eye(plant.states), np.eye(3)))
+    assert not gain[~pattern.mask].any()
+    assert np.linalg.eigvals(plant.A + plant.B @ gain).real.max() < -1e-4
+
+
+def test_a_loop_whose_eigenvalues_add_up_to_zero_is_refused() -> None:
+    # no vehicle sees its own output: the trace of A + B K is 0 for every K, though no mode is fixed
+    formation = FormationModel((-1, 0, 1), axes=1)
+    pattern = without_links(all_to_all(formation), [(0, 0), (1, 1), (2, 2)])
+    plant = formation_plant(formation)
+    assert check_stabilisable(plant, pattern) == ()
+    with pytest.raises(InfeasibleError, match="no static gain"):
+        stabilising_gain(plant, pattern, Weights(np.eye(plant.states), np.eye(3)))
 
 
 def test_dk_iteration_falls_at_each_iterate_and_ends_stable_in_the_pattern() -> None:
