@@ -239,6 +239,18 @@ def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str,
     assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
 
 
+@pytest.mark.parametrize("by_s", [-0.2, 5.0])
+def test_a_clock_that_jumps_in_the_manoeuvre_leaves_the_same_response(by_s: float) -> None:
+    flight = fly(plan_for(three(duration_s=1.0, clock_jumps=(ClockJump(at_s=13.0, by_s=by_s),))))
+    times = [event.time_s for event in flight.events if event.text in ("identifying", "its clock jumped")]
+    assert 0.5 < times[-1] - times[0] < 4.0  # while the vehicles were being moved
+    responses = flight.station.plan.responses
+    assert responses is not None
+    for found in responses.of.values():
+        assert found.lag_s == pytest.approx(TRUTH.lag_s, rel=0.02)
+        assert found.velocity_gain_1_s == pytest.approx(TRUTH.velocity_gain_1_s, rel=0.02)
+
+
 def test_clocks_that_drift_by_500_ppm_change_nothing() -> None:
     drifting = COPTERS5.clocks.model_copy(update={"drift_max_ppm": 500.0})
     flight = fly(plan_for(three().model_copy(update={"clocks": drifting})))

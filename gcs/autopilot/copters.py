@@ -93,9 +93,11 @@ class Copters:
         others = vehicle.taken_over and phase in (Phase.IDENTIFYING, Phase.FLYING)
         if (phase is Phase.CONNECTING and airborne) or others:  # PX4 is given back only while set-points come
             return self._pilots.hover(row, vehicle, key_ms=key_ms)
+        known = control.sample_ns > 0
         if phase is Phase.IDENTIFYING and self._identification is not None:
             command, commanded = self._identification.command(due_ns), True
-        if not commanded or control.sample_ns <= 0:
+            known = known or self._pilots.steers(row)  # the manoeuvre goes on while a clock that jumped is found again
+        if not commanded or not known:
             self._pilots.rest(row)
             return None
         if not vehicle.guided:

@@ -1,6 +1,7 @@
 """The identification manoeuvre of all vehicles at once, tick by tick, and what it makes of the flight plan."""
 
 from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +21,15 @@ from gcs.telemetry import StateHistory
 from gcs.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S
 
+_UNNOTICED_NS = NS_PER_S
+"""A clock jump is noticed within this: what was sampled since has a wrong instant."""
+
+
+class _Sample(NamedTuple):
+    sampled_ns: int
+    seen_ns: int
+    velocity_north_m_s: float
+
 
 class Identification:
     """Collects what the vehicles do in the manoeuvre, then works it out in small pieces, one a tick."""
@@ -37,8 +47,8 @@ class Identification:
         self._begin_ns: int | None = None
         self._acted_ns: list[list[int]] = [[] for _ in vehicles]
         """When each change of the acceleration acted."""
-        self._samples: list[list[tuple[int, float]]] = [[] for _ in vehicles]
-        """(instant, velocity north)"""
+        self._samples: list[list[_Sample]] = [[] for _ in vehicles]
+        self._jumps = [vehicle.clock.jumps for vehicle in vehicles]
         self._work = self._worked_out()
 
     def command(self, due_ns: int) -> tuple[float, float]:
@@ -55,7 +65,7 @@ class Identification:
     def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
         """The plan with the margins of what was found; why nothing was; or None while it takes longer."""
         if self._begin_ns is None or due_ns - self._begin_ns < LONGEST_S * NS_PER_S:
-            self._observe(history)
+            self._observe(due_ns, history)
             return None
         return next(self._work)
 
@@ -85,16 +95,19 @@ class Identification:
             yield None
         yield self._plan.with_margins(tuple(margins_s), responses)
 
-    def _observe(self, history: StateHistory) -> None:
-        for row, samples in enumerate(self._samples):
-            newest = history.newest(row)
-            if newest is not None and (not samples or newest[0] > samples[-1][0]):
-                samples.append((newest[0], newest[1][2]))
+    def _observe(self, due_ns: int, history: StateHistory) -> None:
+        for row, vehicle in enumerate(self._vehicles):
+            if vehicle.clock.jumps != self._jumps[row]:
+                self._jumps[row] = vehicle.clock.jumps
+                self._samples[row] = [s for s in self._samples[row] if s.seen_ns < due_ns - _UNNOTICED_NS]
+            samples, newest = self._samples[row], history.newest(row)
+            if newest is not None and (not samples or newest[0] > samples[-1].sampled_ns):
+                samples.append(_Sample(newest[0], due_ns, newest[1][2]))
 
     def _fit(self, row: int) -> Identified | None:
         begin_ns = self._begin_ns or 0
         acted_s = (np.array(self._acted_ns[row], dtype=np.int64) - begin_ns) / NS_PER_S
         change = self._amplitude_m_s2 * np.array([size for _, size in PROFILE[: acted_s.size]])
-        samples = [(t, v) for t, v in self._samples[row] if t >= begin_ns]
-        sample_s = (np.array([t for t, _ in samples], dtype=np.int64) - begin_ns) / NS_PER_S
-        return identify(acted_s, change, sample_s, np.array([v for _, v in samples], dtype=np.float64))
+        samples = [s for s in self._samples[row] if s.sampled_ns >= begin_ns]
+        sample_s = (np.array([s.sampled_ns for s in samples], dtype=np.int64) - begin_ns) / NS_PER_S
+        return identify(acted_s, change, sample_s, np.array([s.velocity_north_m_s for s in samples], dtype=np.float64))

@@ -40,6 +40,10 @@ class Pilots:
         """No set-point is sent: the next one begins at the vehicle's velocity."""
         self._targets[row] = None
 
+    def steers(self, row: int) -> bool:
+        """Whether a vehicle has a velocity target to go on from."""
+        return self._targets[row] is not None
+
     def accelerate(
         self,
         row: int,
@@ -50,7 +54,10 @@ class Pilots:
         key_ms: int,
         now_ns: int,
     ) -> tuple[Any, ...]:
-        """The set-point of a wanted acceleration; `velocity_m_s` is the vehicle's newest."""
+        """The set-point of a wanted acceleration.
+
+        `velocity_m_s` is the vehicle's newest; it may be NaN if the vehicle is steered already.
+        """
         target = self._targets[row]
         if target is None:
             north, east = velocity_m_s
