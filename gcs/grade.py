@@ -5,6 +5,8 @@ loop delay is the time from the sampling of the newest state used to the instant
 acts; both are in the truth by the time_boot_ms that the messages bear.
 """
 
+import itertools
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -73,25 +75,44 @@ def _ms(value_s: float | None) -> str:
 
 
 def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:
-    """Each measured round trip against that of the newest reply which had left before the tick that logs it."""
+    """Each measured round trip against that of the nearest reply which had left before the tick that logs it.
+
+    Both are in order of time, and each reply is one round trip at most; of several that came between two ticks the
+    later ones are in the ticks after.
+    """
     rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
     due_ns, trip_s = true_round_trips(truth, system_id)
-    newest = np.searchsorted(due_ns, rows["sent_ns"]) - 1
-    known = newest >= 0
-    return rows["rtt_s"][known] - trip_s[newest[known]]
+    left = np.searchsorted(due_ns, rows["sent_ns"])
+    errors_s: list[float] = []
+    taken = 0
+    for measured_s, end in zip(rows["rtt_s"].tolist(), left.tolist(), strict=True):
+        if taken < end:
+            off_s = measured_s - trip_s[taken:end]
+            nearest = int(np.abs(off_s).argmin())
+            errors_s.append(float(off_s[nearest]))
+            taken += nearest + 1
+    return np.array(errors_s)
 
 
 def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], FloatArray]:
     """TIMESYNC requests that the vehicle answered at once: when each reply was due (ns), and its round trip (s)."""
     own = truth[(truth["system_id"] == system_id) & (truth["key"] == _TIMESYNC) & (truth["fate"] & DROPPED == 0)]
     asked, answered = own[own["kind"] == LINK_DOWN], own[own["kind"] == LINK_UP]
-    sent_ns = dict(zip(asked["due_ns"].tolist(), asked["entered_ns"].tolist(), strict=True))
-    replies = sorted(
-        (due_ns, (due_ns - sent_ns[entered_ns]) * 1e-9)
-        for entered_ns, due_ns in zip(answered["entered_ns"].tolist(), answered["due_ns"].tolist(), strict=True)
-        if entered_ns in sent_ns
-    )
-    return np.array([due for due, _ in replies], dtype=np.int64), np.array([trip for _, trip in replies])
+    # Where none may overtake, several come at one instant and are answered in their order. Not all are requests: where
+    # the station's answer to the vehicle is among them, it is not known which is which.
+    sent_ns: dict[int, list[int]] = defaultdict(list)
+    left_ns: dict[int, list[int]] = defaultdict(list)
+    for entered_ns, due_ns in sorted(asked[["entered_ns", "due_ns"]].tolist()):
+        sent_ns[due_ns].append(entered_ns)
+    for entered_ns, due_ns in sorted(answered[["entered_ns", "due_ns"]].tolist()):
+        left_ns[entered_ns].append(due_ns)
+    replies: list[tuple[int, int]] = []
+    for at_ns, dues_ns in left_ns.items():
+        if len(sent_ns[at_ns]) in (1, len(dues_ns)):  # of one request there may be two replies, the second a copy
+            replies += zip(dues_ns, itertools.cycle(sent_ns[at_ns]), strict=False)
+    replies.sort()
+    due = np.array([due_ns for due_ns, _ in replies], dtype=np.int64)
+    return due, np.array([(due_ns - asked_ns) * 1e-9 for due_ns, asked_ns in replies])
 
 
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:

@@ -95,7 +95,7 @@ TICK = np.dtype(
         ("down_bound_s", "<f8"),  # most that it can be wrong
         ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s; in the ground loop it is the newest one
         ("headroom", "<f8"),  # 1 - loop delay / margin
-        ("rtt_s", "<f8"),  # the TIMESYNC round trip that ended since the tick before; NaN if none did
+        ("rtt_s", "<f8"),  # a TIMESYNC round trip that has ended and is in no earlier row; NaN if there is none
         ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock, at sent_ns
         ("clock_offset_bound_s", "<f8"),  # most that it can be wrong
         ("received", "<u4"),  # frames from this vehicle so far, and those lost, late, twice

@@ -36,7 +36,7 @@ class VehicleTick(NamedTuple):
     control: VehicleControl
     reported: Reported
     rtt_s: float
-    """The round trip that ended since the tick before; NaN if none did."""
+    """The oldest round trip that has ended and is in no earlier tick; NaN if there is none."""
     nearest_m: float
     """NaN while unknown."""
     commanded: bool

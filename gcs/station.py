@@ -4,7 +4,7 @@ One loop: receive, decide, command, record. No socket, clock or file is touched 
 or in virtual time, with the same bytes.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from math import hypot, isfinite, isnan, nan
 from typing import Any, NamedTuple
@@ -99,7 +99,7 @@ class Station:
         )
         self._copters = Copters(plan, self.vehicles, self._report) if autopilots else None
         self.patience_s = patience_s(scenario.dynamics)
-        self._timesync_ns = round(NS_PER_S / rates.timesync_hz)
+        self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._start_ns = start_ns
         self._phase_since_ns = start_ns
         self._flight_start_ns: int | None = None
@@ -114,7 +114,7 @@ class Station:
         self._now_ns = start_ns
         self._reported = [Reported()] * n
         self._telemetry_ns = [0] * n
-        self._fresh_rtt_s = [nan] * n
+        self._fresh_rtt_s = [deque[float]() for _ in range(n)]
         self._loop_delay_s = [nan] * n
         self._absent = [""] * n
 
@@ -243,7 +243,7 @@ class Station:
         jumps = vehicle.clock.jumps
         rtt_ns = vehicle.clock.reply(tc1_ns=tc1_ns, ts1_ns=ts1_ns, received_ns=received_ns)
         if rtt_ns is not None:
-            self._fresh_rtt_s[row] = rtt_ns * 1e-9
+            self._fresh_rtt_s[row].append(rtt_ns * 1e-9)
         if vehicle.clock.jumps != jumps:
             self._history.forget(row)
             vehicle.forget_rates()
@@ -283,13 +283,13 @@ class Station:
             if fields is not None:
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
             margin_s = self.plan.margins_s[monitored.gain_set]
-            reported, rtt_s = self._reported[row], self._fresh_rtt_s[row]
+            fresh_s = self._fresh_rtt_s[row]
+            reported, rtt_s = self._reported[row], fresh_s.popleft() if fresh_s else nan
             seen.append(VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, margin_s))
         for vehicle in self.vehicles:
             frame = vehicle.converse(self._now_ns)
             if frame is not None and vehicle.address is not None:
                 outgoing.append(Outgoing(frame, vehicle.address))
-        self._fresh_rtt_s = [nan] * len(self.vehicles)
         tick = Tick(self._tick_count, time_s, due_ns, key_ms, seen)
         self._tick_count += 1 + behind
         return tick

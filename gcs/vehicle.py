@@ -174,7 +174,7 @@ class RemoteVehicle:
         A vehicle that was started anew numbers its frames anew: after some time without a good heartbeat any is taken.
         """
         heartbeat = frame.msg_id == mavlink.HEARTBEAT
-        order = self.frames.add(frame.sequence)
+        order = self.frames.add(frame.sequence, now_ns)
         replayed = order == DUPLICATE or (heartbeat and order == LATE)
         if replayed and heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
             self.frames.restart()

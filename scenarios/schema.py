@@ -62,6 +62,7 @@ class Rates(Part):
     control_hz: Rate = 50.0
     telemetry_hz: Rate = 50.0
     timesync_hz: Annotated[float, Field(gt=0, le=50)] = 10.0
+    """Of each vehicle; at most control_hz, as each control tick logs one round trip."""
 
 
 class FixedGains(Part):

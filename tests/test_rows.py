@@ -22,7 +22,7 @@ def test_every_column_holds_what_its_name_says() -> None:
     vehicle.clock.estimate = ClockEstimate(samples=9, offset_ns=3 * S, skew=0.0, bound_ns=5000, reference_ns=10 * S)
     vehicle.clock.down_ns, vehicle.clock.down_bound_ns = 30_000_000, 4000
     for sequence in (1, 2, 5, 4, 4):
-        vehicle.frames.add(sequence)
+        vehicle.frames.add(sequence, 0)
     control = VehicleControl(
         sample_ns=10 * S,
         state=(1.0, 2.0, 3.0, 4.0),

@@ -1,4 +1,7 @@
-"""Loss, late and duplicate counts survive reordering."""
+"""Loss, late and duplicate counts survive reordering and outages."""
+
+import itertools
+from collections.abc import Iterable
 
 import numpy as np
 from hypothesis import given
@@ -6,11 +9,14 @@ from hypothesis import strategies as st
 
 from gcs.sequence import SequenceCounter
 
+MS = 1_000_000
 
-def counted(numbers: list[int]) -> SequenceCounter:
+
+def counted(numbers: list[int], times_ms: Iterable[float] | None = None) -> SequenceCounter:
+    """Frames that were received at these times, or each 20 ms after the one before it."""
     counter = SequenceCounter()
-    for number in numbers:
-        counter.add(number & 0xFF)
+    for number, time_ms in zip(numbers, times_ms or itertools.count(0, 20), strict=times_ms is not None):
+        counter.add(number & 0xFF, round(time_ms * MS))
     return counter
 
 
@@ -36,9 +42,40 @@ def test_duplicates_are_counted_apart() -> None:
 def test_random_losses_are_counted_exactly(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     kept = [n for n in range(500) if n in (0, 499) or rng.random() >= share]
-    gaps = np.diff(kept)
-    if gaps.max() < 128:  # more in a row than the number can hold
-        assert counts(counted(kept)) == (len(kept), 500 - len(kept), 0, 0)
+    assert np.diff(kept).max() < 128
+    assert counts(counted(kept, [20.0 * n for n in kept])) == (len(kept), 500 - len(kept), 0, 0)
+
+
+@given(st.integers(0, 2**32), st.floats(20.0, 300.0), st.floats(0.0, 60.0), st.floats(0.0, 0.3))
+def test_what_is_lost_in_an_outage_of_up_to_a_minute_is_counted_whole(
+    seed: int, rate_hz: float, outage_s: float, share: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    count = round((outage_s + 10.0) * rate_hz)
+    sent_s = np.arange(count) / rate_hz
+    came = (rng.random(count) >= share) & ((sent_s < 5.0) | (sent_s >= 5.0 + outage_s))
+    came[0] = came[-1] = True
+    kept = np.flatnonzero(came)
+    delay_s = rng.uniform(0.02, 0.03, kept.size)
+    order = np.argsort(sent_s[kept] + delay_s)
+    order = np.concatenate(([0], order[order != 0]))
+    counter = counted(kept[order].tolist(), (1e3 * (sent_s[kept] + delay_s)[order]).tolist())
+    # Of the last frames, one that has overtaken others leaves these out.
+    assert abs(counter.lost - (count - kept.size)) <= 0.01 * rate_hz + 1
+    assert counter.duplicate == 0
+
+
+def test_frames_overtaken_by_up_to_two_hundred_are_late_and_not_lost_or_doubled() -> None:
+    """50 frames a second, each up to 3 s late: the signed difference of two numbers would be wrong by 256."""
+    rng = np.random.default_rng(4)
+    arrival_ms = 20.0 * np.arange(4000) + rng.uniform(0.0, 3000.0, 4000)
+    arrival_ms[0] = 0.0
+    order = np.argsort(arrival_ms)
+    counter = counted(order.tolist(), arrival_ms[order].tolist())
+    newest = np.maximum.accumulate(order)
+    assert counter.late == int((order < newest).sum())
+    assert counter.lost <= 150  # what is still under way behind the last
+    assert counter.duplicate == 0
 
 
 @given(st.integers(0, 2**32))

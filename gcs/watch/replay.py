@@ -314,10 +314,12 @@ class _Replay:
         self._rows.append(rows)
 
     def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:
-        """The round trip that ended since the tick before, NaN if none did."""
-        fresh = len(vehicle.rtt_s) > self._exchanges[row]
-        self._exchanges[row] = len(vehicle.rtt_s)
-        return vehicle.rtt_s[-1] if fresh else nan
+        """The oldest round trip that is in no earlier tick, NaN if there is none."""
+        taken = self._exchanges[row]
+        if taken == len(vehicle.rtt_s):
+            return nan
+        self._exchanges[row] = taken + 1
+        return vehicle.rtt_s[taken]
 
     def _event(self, time_ns: int, kind: str, text: str, system_id: int | None = None) -> None:
         time_s = round((time_ns - self._start_ns) / NS_PER_S, 6)
