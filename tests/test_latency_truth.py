@@ -84,8 +84,8 @@ def test_every_round_trip_is_in_the_ticks(name: str) -> None:
         measured = ticks["rtt_s"][(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
         due_ns, real = true_round_trips(truth, system_id)
         real = real[due_ns <= ticks["sent_ns"][-1]]
-        found = (np.abs(measured[:, None] - real) < 1e-6).any(axis=0)
-        assert found[:-3].all()
+        off_s = np.abs(measured[:, None] - real).min(axis=0)
+        assert (off_s[:-3] < 1e-6).all()
         assert measured.size >= real.size - 3
 
 
