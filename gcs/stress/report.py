@@ -1,5 +1,6 @@
 """The report of a campaign: figures as PNG, and one HTML page that needs nothing else."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ def write_report(
 
 def replay_command(folder: Path, trial_id: str) -> str:
     """What flies a trial of a campaign again."""
-    return f"gcs stress {folder / 'scenario.toml'} --out {folder} --trial {trial_id}"
+    return shlex.join(["gcs", "stress", str(folder / "scenario.toml"), "--out", str(folder), "--trial", trial_id])
 
 
 def _along_delay(axes: Sequence[Axis]) -> bool:
