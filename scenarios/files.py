@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 
 from scenarios.errors import ScenarioError
-from scenarios.schema import Jitter, Link, Links, Outage, Scenario
+from scenarios.schema import MOST, Jitter, Link, Links, Outage, Scenario
 
 TRACE_DELAYS = 100_000
 """Most delays of a trace."""
@@ -373,8 +373,8 @@ def _read_trace(path: Path, file: Path, key: str) -> tuple[float, ...]:
             delay_s = float(row[column]) if first or len(row) == 1 else math.nan
         except (ValueError, IndexError):
             delay_s = math.nan
-        if not 0 <= delay_s < math.inf:
-            wanted = f"a delay of 0 s or more on each line, or CSV with a column {TRACE_COLUMN}"
+        if not 0 <= delay_s <= MOST:
+            wanted = f"a delay from 0 to {MOST:g} s on each line, or CSV with a column {TRACE_COLUMN}"
             raise ScenarioError(file, key, f"{path.name} line {number}: {','.join(row)}", wanted)
         delays.append(delay_s)
     if not 1 <= len(delays) <= TRACE_DELAYS:

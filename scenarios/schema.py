@@ -2,16 +2,24 @@
 
 Units are part of each key's name. Positions and velocities are in the horizontal plane of one local NED frame,
 as pairs (north, east). All vehicles fly at one altitude: the formation control is planar.
+
+Numbers are bounded where the messages (single precision) and the clocks (nanoseconds) can still tell them apart.
 """
 
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Pair = tuple[float, float]
+MOST = 1e6
+Number = Annotated[float, Field(ge=-MOST, le=MOST)]
+Position = tuple[Number, Number]
+Speed = Annotated[float, Field(ge=-1e4, le=1e4)]
+Velocity = tuple[Speed, Speed]
 SystemId = Annotated[int, Field(ge=1, le=250)]
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0, le=MOST)]
+NotNegative = Annotated[float, Field(ge=0, le=MOST)]
+Factor = Annotated[float, Field(ge=1, le=1000)]
+Headroom = Annotated[float, Field(ge=-1000, lt=1)]
 Rate = Annotated[float, Field(ge=1, le=500)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Flavour = Literal["ardupilot", "px4"]
@@ -30,12 +38,12 @@ class Vehicle(Part):
     system_id: SystemId
     follows: SystemId | None = None
     """System id of the vehicle in front; the one vehicle without it is the leader."""
-    offset_ne_m: Pair | None = None
+    offset_ne_m: Position | None = None
     """Wanted position relative to the vehicle in front (minus the spacing d of thesis eq. 2.10)."""
     hears: tuple[SystemId, ...] = ()
     """Vehicles besides the one in front whose errors its command may use; with a graph method only."""
-    position_ne_m: Pair
-    velocity_ne_m_s: Pair
+    position_ne_m: Position
+    velocity_ne_m_s: Velocity
     flavour: Flavour | None = None
     """Whose autopilot it is, if not that of the others; only with dynamics autopilot."""
 
@@ -44,7 +52,7 @@ class NominalVelocity(Part):
     """The formation's velocity v_d from a scenario time on, until the next entry."""
 
     from_s: NotNegative
-    velocity_ne_m_s: Pair
+    velocity_ne_m_s: Velocity
 
 
 class Limits(Part):
@@ -61,16 +69,16 @@ class Rates(Part):
 
     control_hz: Rate = 50.0
     telemetry_hz: Rate = 50.0
-    timesync_hz: Annotated[float, Field(gt=0, le=50)] = 10.0
+    timesync_hz: Annotated[float, Field(ge=0.01, le=50)] = 10.0
     """Of each vehicle; at most control_hz, as each control tick logs one round trip."""
 
 
 class FixedGains(Part):
     """Gains to be flown as they are, per axis: u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p."""
 
-    K1: float
-    K2: float
-    K3: float
+    K1: Number
+    K2: Number
+    K3: Number
 
 
 class GainBlock(Part):
@@ -80,7 +88,7 @@ class GainBlock(Part):
     """Whose command."""
     of: SystemId
     """Whose errors."""
-    gain: tuple[tuple[float, ...], tuple[float, ...]]
+    gain: tuple[tuple[Number, ...], tuple[Number, ...]]
     """Rows for north and east; columns for the spacing error (north, east) and the velocity error (north, east). The
     leader has a velocity error only."""
 
@@ -105,7 +113,7 @@ class Control(Part):
     """Least robustness bound (thesis eq. 3.29)."""
     decay_rate_1_s: Positive | None = None
     """Least decay rate of the continuous loop without delay."""
-    string_peak_max: Annotated[float, Field(ge=1)] = 1.0
+    string_peak_max: Factor = 1.0
     """Most that spacing errors may grow from one vehicle to the next, whatever their frequency: with 1 not at all."""
     gains: FixedGains | None = None
     blocks: tuple[GainBlock, ...] = ()
@@ -267,10 +275,10 @@ class Monitor(Part):
 
     act: bool = True
     """Off: the modes are shown, and nothing is done."""
-    caution_headroom: Annotated[float, Field(lt=1)] = 0.3
-    critical_headroom: Annotated[float, Field(lt=1)] = 0.15
+    caution_headroom: Headroom = 0.3
+    critical_headroom: Headroom = 0.15
     hysteresis: NotNegative = 0.05
-    window_s: Positive = 1.0
+    window_s: Annotated[float, Field(gt=0, le=60)] = 1.0
     """The loop delay judged is the one that nine tenths of the flight's ticks in this window stay below."""
     hold_s: NotNegative = 0.3
     """How long a condition holds before the slower side is taken,"""
@@ -278,13 +286,13 @@ class Monitor(Part):
     """and before the faster one is taken back."""
     blend_s: Positive = 1.0
     """How long a change of gains takes."""
-    time_scales: Annotated[tuple[Annotated[float, Field(ge=1)], ...], Field(min_length=1, max_length=8)] = (
+    time_scales: Annotated[tuple[Factor, ...], Field(min_length=1, max_length=8)] = (
         1.0,
         2.0,
         4.0,
     )
     """The gain schedule: the design slowed down by these factors, which multiplies its delay margin by them."""
-    open_factor: Annotated[float, Field(ge=1)] = 1.5
+    open_factor: Factor = 1.5
     """The formation's spacing is opened by this factor when the slowest gains have too little headroom,"""
     open_s: Positive = 10.0
     """over this time."""
@@ -295,7 +303,7 @@ class ClockJump(Part):
 
     at_s: Positive
     """Time since the vehicles were started."""
-    by_s: float
+    by_s: Number
 
 
 class Autopilot(Part):
@@ -317,7 +325,7 @@ class Autopilot(Part):
     """Until then it sends heartbeats only,"""
     ready_after_s: NotNegative = 2.0
     """and until then its estimator has no position and it refuses to arm."""
-    arming_refusals: Annotated[int, Field(ge=0)] = 0
+    arming_refusals: Annotated[int, Field(ge=0, le=1000)] = 0
     """How often it then still refuses to arm."""
     origin_spread_m: NotNegative = 20.0
     """The origin of each vehicle's local frame is drawn within this of the common one, north and east."""
@@ -374,7 +382,7 @@ class Scenario(Part):
         """The (up, down) links of one vehicle."""
         return self.links.of(system_id)
 
-    def nominal_velocity_at(self, time_s: float) -> Pair:
+    def nominal_velocity_at(self, time_s: float) -> Velocity:
         """v_d at a scenario time; before time zero it is the first entry's."""
         current = self.nominal_velocity[0]
         for entry in self.nominal_velocity:

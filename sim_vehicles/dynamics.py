@@ -18,6 +18,8 @@ from scenarios import schema
 LONGEST_STEP_S = 0.02
 VELOCITY_GAIN_1_S = 2.0
 """Gain of the velocity feedback when a set-point carries velocity as well as acceleration: time constant 0.5 s."""
+LARGEST_M_S2 = 20_000.0
+"""Acceleration of a vehicle without a limit of its own: what it reports stays a number, however unstable its loop."""
 
 
 class State(NamedTuple):
@@ -48,7 +50,7 @@ COAST = Command()
 
 
 class Bounds(NamedTuple):
-    """The limits as numbers; one that is off is infinite."""
+    """The limits as numbers; a speed or turn rate that has none is infinite."""
 
     speed_min_m_s: float
     speed_max_m_s: float
@@ -61,7 +63,7 @@ def bounds_of(limits: schema.Limits) -> Bounds:
     return Bounds(
         limits.speed_min_m_s,
         limits.speed_max_m_s or math.inf,
-        limits.acceleration_max_m_s2 or math.inf,
+        limits.acceleration_max_m_s2 or LARGEST_M_S2,
         limits.turn_rate_max_rad_s or math.inf,
     )
 
