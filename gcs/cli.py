@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from gcs.interrupts import EXIT_INTERRUPTED
 from gcs.loop_option import LoopOption, load_with_loop
 from gcs.stress.command import stress
 from gcs.user_input import (
@@ -46,7 +47,6 @@ class Method(Enum):
 
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
 
 
 @app.callback(invoke_without_command=True)

@@ -15,6 +15,7 @@ from typing import Any
 
 from gcs import mavlink
 from gcs.guard import Guard
+from gcs.interrupts import held_back
 from gcs.mirror import Mirror
 from gcs.plan import FlightPlan, described
 from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter
@@ -138,7 +139,8 @@ def _vehicles_heard(link: StationSocket, plan: FlightPlan, guard: Guard | None) 
 def _observer(folder: Path, *, show_table: bool) -> Generator["subprocess.Popen[bytes]"]:
     """The process that shows and records the flight; left, it has ended by itself or been told to."""
     command = [sys.executable, "-m", "gcs.show.observer", str(folder), "--parent", str(os.getpid())]
-    process = subprocess.Popen(command + ([] if show_table else ["--no-table"]), stdin=subprocess.DEVNULL)
+    with held_back():  # while it starts; then it ignores Ctrl-C by itself
+        process = subprocess.Popen(command + ([] if show_table else ["--no-table"]), stdin=subprocess.DEVNULL)
     try:
         yield process
         process.wait(_OBSERVER_PATIENCE_S)

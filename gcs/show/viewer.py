@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from gcs.interrupts import raised
 from gcs.record import RECORDING_FILE
 from gcs.show.recording import TIMELINE, UNFINISHED_FILE, viewer_client
 
@@ -94,7 +95,7 @@ def _headless(width: int, height: int) -> Generator[Any]:
     if vulkan_missing():
         raise ViewerError("no Vulkan driver to draw with; on Debian and Ubuntu: apt install mesa-vulkan-drivers")
     command = [_program(), "--headless", "--bind", "127.0.0.1", "--port", "0", "--window-size", f"{width}x{height}"]
-    with tempfile.TemporaryFile() as log:
+    with raised(), tempfile.TemporaryFile() as log:
         environment = os.environ | {"RERUN_APP_ONLY": "true"}  # what the package sets when it starts a viewer itself
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
         try:

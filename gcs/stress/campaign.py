@@ -17,6 +17,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from gcs.interrupts import held_back
 from gcs.record import SCENARIO_FILE
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
@@ -125,7 +126,9 @@ def local_workers(count: int) -> Generator[Fly]:
                 pools.append(_pool(count))
                 stack.callback(pools[0].shutdown, cancel_futures=True)
             try:
-                for future in as_completed([pools[0].submit(fly_trial, trial) for trial in trials]):
+                with held_back():  # workers that are just starting leave Ctrl-C to this process
+                    futures = [pools[0].submit(fly_trial, trial) for trial in trials]
+                for future in as_completed(futures):
                     yield future.result()
             except BrokenProcessPool:
                 raise CampaignError(
@@ -197,6 +200,7 @@ def _pool(count: int) -> ProcessPoolExecutor:
 def _prepare_worker(parent: int) -> None:
     """Ctrl-C is the parent's to answer; and without a parent there is nobody to fly for."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # it died while this process was starting, before it could be told
         os._exit(1)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gcs.interrupts import raised
 from gcs.loop_option import Loop, LoopOption, load_with_loop
 from gcs.user_input import InputError, out_file, out_folder
 
@@ -165,7 +166,7 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
     axes = _axes(options, study)
     onset: Onset | None = None
     no_onset: NoOnset | None = None
-    with contextlib.ExitStack() as stack:
+    with raised(), contextlib.ExitStack() as stack:
         fly = stack.enter_context(_workers(options))
         if out is None:
             folder = new_folder(f"{study.plan.scenario.name}-stress")

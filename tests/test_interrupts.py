@@ -1,0 +1,49 @@
+"""Ctrl-C at any moment, as a terminal sends it to all processes of a command: no traceback, exit code 130."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+
+ROOT = Path(__file__).parent.parent
+STRESS = ["stress", "scenarios/chain3.toml", "--delay", "0.1:0.3:3", "--workers", "2", "--out"]
+FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module", "times"),
+    [
+        (STRESS, "typer", 1),
+        (STRESS, "numpy", 1),
+        (STRESS, "site", 3),  # a worker starts: this process and the tracker of resources have
+        (STRESS, "numpy", 2),
+        (FLY, "numpy", 1),
+        (FLY, "site", 2),  # the observer starts
+    ],
+)
+def test_ctrl_c_while_a_command_or_its_workers_import_is_no_traceback(
+    arguments: list[str], module: str, times: int, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "gcs", *arguments, str(tmp_path / "out")]
+    environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1"}  # each process tells what it has imported
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT, env=environment,
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        seen = 0
+        for line in process.stderr:
+            seen += line.split("|")[-1].strip() == module
+            if seen == times:
+                break
+        os.killpg(process.pid, signal.SIGINT)
+        told = process.stderr.read()
+        code = process.wait(60)
+    assert (seen, code) == (times, 130)
+    assert "Traceback" not in told
+    assert "KeyboardInterrupt" not in told
