@@ -11,6 +11,7 @@ from gains.design import design
 from gains.formation import FormationModel
 from gcs.cli import app
 from gcs.compare.command import METHODS, string_peak
+from gcs.compare.cost import DesignCost, left_out
 
 SCENARIO = Path(__file__).parent.parent / "scenarios" / "chain3.toml"
 CHAIN = FormationModel((-1, 0, 1))
@@ -46,3 +47,13 @@ def test_routes_are_flown_and_shown_side_by_side(tmp_path: Path) -> None:
     assert "data:image/png" in page
     assert "http" not in page
     assert f"{routes['graph-dk']['settling_time_s']:.2f}" in page
+
+
+def test_sizes_that_were_not_tried_are_named_with_the_reason() -> None:
+    costs = [DesignCost("inclusion", size, 0.2, 3) for size in (3, 5, 10, 20, 40, 80, 200)]
+    costs += [DesignCost("graph-dk", size, 0.2, 8) for size in (3, 5, 10)]
+    costs += [DesignCost("centralised LMI", size, 20.0, 45) for size in (3, 5)]
+    assert left_out(costs) == [
+        "graph-dk: not tried on 20 vehicles and more; more than 20 states an axis",
+        "centralised LMI: not tried on 10 vehicles and more; it may take over 10 s",
+    ]

@@ -78,7 +78,11 @@ def left_out(costs: list[DesignCost]) -> list[str]:
     tried = {method: _SIZES.index(vehicles) + 1 for method, vehicles in largest.items()}
     return [
         f"{method}: not tried on {_SIZES[count]} vehicles and more; "
-        + (f"more than {_DK_STATES} states an axis" if _too_large(method, _SIZES[count]) else f"over {_LONGEST_S:g} s")
+        + (
+            f"more than {_DK_STATES} states an axis"
+            if _too_large(method, _SIZES[count])
+            else f"it may take over {_LONGEST_S:g} s"
+        )
         for method, count in tried.items()
         if count < len(_SIZES)
     ]
