@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.absence import TAKEN_OVER
 from gcs.lockstep import START_NS, fly_lockstep
+from gcs.modes import START_PATIENCE_S
 from gcs.plan import FlightPlan, described, flight_plan
 from gcs.record import TickArray
 from gcs.station import Datagram, Event, Station
@@ -237,6 +238,14 @@ def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str,
     time_s = flight.flown["time_s"]
     assert time_s[0] + 2.0 < 25.0 - (flight.flown["due_ns"][0] - START_NS) * 1e-9 < time_s[-1]  # it was in flight
     assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
+
+
+@pytest.mark.parametrize(("flavour", "mode", "left"), [("ardupilot", 5, "GUIDED"), ("px4", 3 << 16, "OFFBOARD")])
+def test_a_pilot_who_takes_over_in_the_manoeuvre_ends_it(flavour: str, mode: int, left: str) -> None:
+    flight = fly_with_a_pilot(flavour, {13.0 - START_PATIENCE_S: mode})
+    assert flight.station.end_reason == f"not identified: vehicle 3 left {left}, by its pilot or by itself"
+    modes = [flight.copter(k).mode for k in (1, 2, 3)]
+    assert modes == [RULES[flavour].hold_mode] * 2 + [mode]
 
 
 @pytest.mark.parametrize("by_s", [-0.2, 5.0])

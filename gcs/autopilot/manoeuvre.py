@@ -64,6 +64,9 @@ class Identification:
 
     def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
         """The plan with the margins of what was found; why nothing was; or None while it takes longer."""
+        gone = next((v for v in self._vehicles if v.silent or v.taken_over), None)
+        if gone is not None:
+            return f"not identified: vehicle {gone.system_id} {gone.missing}"
         if self._begin_ns is None or due_ns - self._begin_ns < LONGEST_S * NS_PER_S:
             self._observe(due_ns, history)
             return None
