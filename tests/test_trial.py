@@ -52,11 +52,19 @@ def test_flown_growth_is_that_of_the_sampled_model(name: str, delay_s: float) ->
     assert outcome.verdict == ("unstable" if outcome.growth_1_s > 0.0 else "stable")
 
 
-def test_a_follower_whose_gains_differ_north_and_east_is_measured_as_well() -> None:
-    """Four states of its own and not twice two: with half the modes the fit is off by 6e-2."""
-    own = GainBlock(vehicle=2, of=2, gain=((7.6, 0.3, -4.7, 0.0), (-0.2, 6.1, 0.0, -4.7)))
-    ahead = GainBlock(vehicle=1, of=1, gain=((-4.7, 0.0), (0.0, -6.1)))
-    _, plan = flight_plan(SCENARIO.model_copy(update={"control": Control(blocks=(ahead, own))}))
+@pytest.mark.parametrize(
+    "own",
+    [
+        ((7.6, 0.3, -4.7, 0.0), (-0.2, 6.1, 0.0, -4.7)),  # the fit wants four modes and as many of what is late
+        ((6.5, 1.2, -4.0, -0.7), (1.2, 6.5, -0.7, -4.0)),  # the slow mode is along one diagonal, and has to be moved
+    ],
+)
+def test_a_follower_whose_gains_couple_north_and_east_is_measured_as_well(
+    own: tuple[tuple[float, ...], tuple[float, ...]],
+) -> None:
+    """With half the modes the fit is off by 6e-2; an error along the other diagonal shows a mode that is 0.7 off."""
+    blocks = GainBlock(vehicle=1, of=1, gain=((-4.7, 0.0), (0.0, -6.1))), GainBlock(vehicle=2, of=2, gain=own)
+    _, plan = flight_plan(SCENARIO.model_copy(update={"control": Control(blocks=blocks)}))
     outcome = fly_trial(Study(plan).trial("probe", {"delay": 0.2}, seed=4, probe=2))
     assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=2e-3)
 

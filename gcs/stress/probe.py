@@ -27,6 +27,8 @@ from gcs.record import TickArray
 from scenarios.schema import Link, Scenario, Vehicle
 
 PROBE_S = 20.0
+_DIRECTION_NE = np.array([1.0, -0.4])
+"""Of a probe's error: no axis and no diagonal, as gains that couple north and east have modes in just these."""
 
 
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
@@ -35,7 +37,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     No vehicle goes to its failsafe.
 
     The error is in the position of a follower (m) and in the velocity of the leader (m/s), whose position is not
-    controlled; north and east alike, and different for each vehicle.
+    controlled; in `_DIRECTION_NE`, and different for each vehicle.
     """
     scenario, place = plan.scenario, plan.formation.place_ne_m()
     row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
@@ -46,7 +48,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         velocity = np.array(scenario.nominal_velocity[0].velocity_ne_m_s)
         if vehicle.system_id in system_ids:
             k = system_ids.index(vehicle.system_id)
-            error = amplitude * (1.0 + 0.3 * k) * (-1.0) ** k * np.array([1.0, -1.0])
+            error = amplitude * (1.0 + 0.3 * k) * (-1.0) ** k * _DIRECTION_NE
             if vehicle is leader:
                 velocity += error
             else:
