@@ -50,8 +50,10 @@ class StateHistory:
     def at(self, vehicle: int, time_ns: int) -> State | None:
         """The state of a vehicle at an instant, None if it has reported nothing.
 
-        Between two reports: the cubic through both positions and velocities, which is exact for a constant
-        acceleration. After the newest one and before the oldest: straight on with that report's velocity.
+        Between two reports: position by the cubic through both positions and velocities, velocity along a line; both
+        are exact for a constant acceleration. The cubic's slope would turn an error of the reports' instants, as when
+        the estimate of a clock moves, or the rounding of their positions into a velocity. After the newest report and
+        before the oldest: straight on with that report's velocity.
         """
         reports = self._reports[vehicle]
         if not reports:
@@ -69,7 +71,7 @@ class StateHistory:
 
 
 def _between(a: Report, b: Report, time_ns: int) -> State:
-    """Cubic Hermite interpolation of position and velocity between two reports."""
+    """Cubic Hermite interpolation of position, linear of velocity."""
     (a_ns, (north, east, v_north, v_east)), (b_ns, (north_b, east_b, v_north_b, v_east_b)) = a, b
     span_s = (b_ns - a_ns) * 1e-9
     x = (time_ns - a_ns) * 1e-9 / span_s
@@ -80,6 +82,6 @@ def _between(a: Report, b: Report, time_ns: int) -> State:
     return (
         north + x * (v0 + x * (c2 + x * c3)),
         east + x * (w0 + x * (d2 + x * d3)),
-        (v0 + x * (2.0 * c2 + 3.0 * x * c3)) / span_s,
-        (w0 + x * (2.0 * d2 + 3.0 * x * d3)) / span_s,
+        v_north + x * (v_north_b - v_north),
+        v_east + x * (v_east_b - v_east),
     )

@@ -173,6 +173,17 @@ def test_a_report_older_than_the_newest_changes_nothing() -> None:
     assert history.newest(0) == (100, (1.0, 2.0, 3.0, 4.0))
 
 
+def test_a_clock_that_is_set_right_between_two_reports_makes_no_velocity_of_it() -> None:
+    """0.2 ms at 91 m/s are 18 mm between reports 20 ms apart, which as a slope would be 1.4 m/s."""
+    history = StateHistory(1)
+    history.add(0, 0, (0.0, 0.0, 91.0, 0.1))
+    history.add(0, 20 * MS + MS // 5, (91.0 * 0.02, 0.002, 91.2, 0.1))
+    for time_ns in range(0, 20 * MS, MS):
+        _, _, v_north, v_east = history.at(0, time_ns) or (np.nan,) * 4
+        assert 91.0 <= v_north <= 91.2
+        assert v_east == pytest.approx(0.1)
+
+
 def test_before_the_first_report_the_first_one_is_used() -> None:
     history = StateHistory(1)
     history.add(0, 1000 * MS, (10.0, 0.0, 2.0, 0.0))

@@ -86,14 +86,14 @@ class Reported:
         self.velocity_m_s: list[float] = []
 
     def at(self, time_s: float, newest_s: float) -> tuple[float, float]:
-        """Between two reports their cubic, after the newest one straight on."""
+        """Between two reports their cubic, and a line for the velocity; after the newest one straight on."""
         k = int(np.searchsorted(self.time_s, newest_s - 1e-9))
         if time_s >= newest_s:
             return self.position_m[k] + self.velocity_m_s[k] * (time_s - newest_s), self.velocity_m_s[k]
         k = int(np.searchsorted(self.time_s, time_s, side="right"))
         pair = slice(k - 1, k + 1)
         cubic = CubicHermiteSpline(self.time_s[pair], self.position_m[pair], self.velocity_m_s[pair])
-        return float(cubic(time_s)), float(cubic(time_s, 1))
+        return float(cubic(time_s)), float(np.interp(time_s, self.time_s[pair], self.velocity_m_s[pair]))
 
 
 def test_a_coupled_loop_on_links_that_differ_is_its_linear_model_with_the_stations_one_instant() -> None:
