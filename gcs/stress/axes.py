@@ -7,7 +7,7 @@ With any other split the waiting would jump by a period as the up link grows pas
 steps; with this one it grows as the link delay does.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,6 +117,11 @@ def has_constant_links(scenario: Scenario) -> bool:
     links = scenario.links
     every = [links.up, links.down, *(link for v in links.vehicles for link in (v.up, v.down) if link is not None)]
     return all(link == Link(delay_s=link.delay_s) for link in every)
+
+
+def place_text(coordinates: Mapping[str, float]) -> str:
+    """A point of a campaign in words."""
+    return ", ".join(f"{name.replace('_', ' of ')} {value:g}" for name, value in coordinates.items())
 
 
 def split_delay(total_s: float, period_s: float) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.stress.axes import Axis
+from gcs.stress.axes import Axis, place_text
 from gcs.stress.onset import Loop, distinct
 from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, plan_loops
@@ -95,7 +95,9 @@ def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
     for outcome in worst:
         error_m = np.maximum(np.array(outcome.trace_m), 1e-6)
         time_s = outcome.trace_period_s * (np.arange(error_m.size) + 0.5)
-        plot.semilogy(time_s, error_m, linewidth=1.3, label=f"{outcome.id}  {outcome.kind}, {_place(outcome)}")
+        plot.semilogy(
+            time_s, error_m, linewidth=1.3, label=f"{outcome.id}  {outcome.kind}, {place_text(outcome.coordinates)}"
+        )
     plot.set_xlabel("scenario time [s]")
     plot.set_ylabel("largest spacing error of all vehicles [m]")
     plot.legend(frameon=False, fontsize=8)
@@ -117,10 +119,6 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
     for outcome in ordered:
         apart.setdefault(tuple(outcome.trace_m), outcome)
     return list(apart.values())[:_WORST]
-
-
-def _place(outcome: Outcome) -> str:
-    return ", ".join(f"{name} {value:g}" for name, value in outcome.coordinates.items())
 
 
 def _curves(kinds: Sequence[Loop], delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:

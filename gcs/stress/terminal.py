@@ -12,6 +12,7 @@ from gcs.show.page import milliseconds_text as _ms
 from gcs.show.report import UNKNOWN
 from gcs.show.report import number_text as _number
 from gcs.stress.again import Replay
+from gcs.stress.axes import place_text
 from gcs.stress.report import MOST_ROWS, REPORT_FILE, replay_command
 
 _FILE_WIDTH = 120
@@ -51,7 +52,9 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
         console.print(_table(points))
     for failed in result["trials_failed"]:
         last = failed["error"].strip().splitlines()[-1]
-        console.print(f"failed   {failed['id']}, seed {failed['seed']}, {failed['coordinates']}: {last}", markup=False)
+        console.print(
+            f"failed   {failed['id']}, seed {failed['seed']}, {place_text(failed['coordinates'])}: {last}", markup=False
+        )
     console.print(f"files    {folder}: {REPORT_FILE}, stress.json, trials.jsonl, trials.parquet")
     if result["worst"]:
         console.print(f"again    {replay_command(folder, result['worst'][0])}")
@@ -98,7 +101,7 @@ def _table(points: list[dict[str, Any]]) -> Table:
 def print_replay(replay: Replay) -> None:
     """One trial that was flown again."""
     console, outcome = Console(highlight=False, soft_wrap=True, markup=False), replay.outcome
-    console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {outcome.coordinates}")
+    console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {place_text(outcome.coordinates)}")
     console.print(f"verdict  {outcome.verdict}: {outcome.reason}")
     if outcome.growth_1_s is not None:
         of = f" of vehicle {outcome.probed}" if outcome.probed is not None else ""
