@@ -1,6 +1,7 @@
 """The `gcs` command. Slow imports (cvxpy, rerun) are made by the commands that need them, so that --help is quick."""
 
 import contextlib
+import errno
 import json
 import os
 import sys
@@ -45,6 +46,7 @@ class Method(Enum):
     GRAPH_LQR = "graph-lqr"
 
 
+LISTEN = "127.0.0.1:14550"
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
 
@@ -63,14 +65,15 @@ def fly(
         float | None, typer.Option(metavar="SECONDS", help="emulate this constant delay each way, on every link")
     ] = None,
     connect: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="listen here, and fly only vehicles that are already there")
-    ] = "",
+        str | None, typer.Option(metavar="HOST:PORT", help="listen here, and fly only vehicles that are already there")
+    ] = None,
     listen: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="listen here for the vehicles that this command starts")
-    ] = "127.0.0.1:14550",
+        str | None,
+        typer.Option(metavar="HOST:PORT", help=f"listen here for the vehicles that this command starts; {LISTEN}"),
+    ] = None,
     mirror: Annotated[
-        str, typer.Option(metavar="HOST:PORT", help="forward all frames to another ground station, read-only")
-    ] = "",
+        str | None, typer.Option(metavar="HOST:PORT", help="forward all frames to another ground station, read-only")
+    ] = None,
     mirror_commands: Annotated[
         bool, typer.Option("--mirror-commands", help="let what that station sends through to the vehicles")
     ] = False,
@@ -91,17 +94,20 @@ def fly(
         within("--link-delay", link_delay, 0, 60, "seconds")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
     guard = opened_guard(key, role="station")
-    if mirror_commands and not mirror:
+    if mirror_commands and mirror is None:
         raise InputError("read --mirror-commands without --mirror, wanted both")
+    if connect is not None and listen is not None:
+        raise InputError("read --connect and --listen, wanted one of them")
     with contextlib.ExitStack() as opened:
-        link = opened.enter_context(listening("--connect", connect) if connect else listening("--listen", listen))
+        at = ("--connect", connect) if connect is not None else ("--listen", LISTEN if listen is None else listen)
+        link = opened.enter_context(listening(*at))
         warn_if_open(link, signed=key is not None)
-        to = opened.enter_context(mirroring(mirror, commands=mirror_commands, guard=guard)) if mirror else None
+        to = None if mirror is None else opened.enter_context(mirroring(mirror, link, guard, commands=mirror_commands))
         design, plan = flight_plan(scenario)
         if not as_json:
             _print_design(design)
         folder = out_folder(out) if out is not None else new_folder(scenario.name)
-        options = FlyOptions(folder=folder, start_vehicles=not connect, show_table=not as_json, key_file=key)
+        options = FlyOptions(folder=folder, start_vehicles=connect is None, show_table=not as_json, key_file=key)
         summary = fly_now(plan, design, link, options, guard, to)
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
@@ -356,6 +362,10 @@ def main() -> None:
     except BrokenPipeError:  # whoever read our output, as `head`, has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = EXIT_FAILED
+    except OSError as error:
+        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise  # no file of the user's
+        code = _fail(f"{error.filename or 'write'}: {error.strerror}, wanted a file or folder that can be used")
     sys.exit(code if isinstance(code, int) else 0)
 
 

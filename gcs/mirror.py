@@ -13,7 +13,7 @@ from typing import Self
 
 from gcs import mavlink
 from gcs.station import Outgoing
-from gcs.vehicle import RemoteVehicle
+from gcs.vehicle import Address, RemoteVehicle
 from scenarios.signing.link import SignedLink
 
 MIRROR = "mirror"
@@ -41,12 +41,17 @@ class Mirror:
         except OSError:
             self._socket.close()
             raise
+        self.address: Address = (self._socket.getpeername()[0], port)
         self._socket.setblocking(False)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Send nothing more."""
         self._socket.close()
 
     def forward(self, frames: Iterable[bytes], now_ns: int) -> None:

@@ -53,7 +53,11 @@ def out_file(option: str, file: Path) -> None:
 def address(option: str, text: str) -> tuple[str, int]:
     """HOST:PORT as given to an option."""
     host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or not 0 <= int(port) < 65536:
+    try:
+        known = bool(host.encode("idna")) and port.isdecimal() and len(port) <= 5 and int(port) <= 65535
+    except UnicodeError:
+        known = False
+    if not known:
         raise InputError(f"{option}: read {text!r}, wanted HOST:PORT, as 127.0.0.1:14550")
     return host, int(port)
 
@@ -66,7 +70,7 @@ def listening(option: str, text: str) -> "StationSocket":
     try:
         return StationSocket(host, port)
     except OSError as error:
-        raise InputError(f"{host}:{port}: {error.strerror}; wanted a free UDP port") from None
+        raise InputError(f"{option}: {text}: {error.strerror}; wanted a free UDP port of this machine") from None
 
 
 def warn_if_open(link: "StationSocket", *, signed: bool) -> None:
@@ -87,12 +91,20 @@ def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
     return open_guard(key, epoch_ns=realtime_offset_ns(), role=role)
 
 
-def mirroring(text: str, *, commands: bool, guard: "Guard | None") -> "Mirror":
-    """The mirror that --mirror HOST:PORT asks for."""
+def mirroring(text: str, link: "StationSocket", guard: "Guard | None", *, commands: bool) -> "Mirror":
+    """The mirror that --mirror HOST:PORT asks for; `link` is where this station itself listens."""
     from gcs.mirror import Mirror
 
     host, port = address("--mirror", text)
+    if port == 0:
+        raise InputError(f"--mirror: read {text}, wanted the port of a ground station")
     try:
-        return Mirror(host, port, commands=commands, signed=guard and guard.mirror_link)
+        mirror = Mirror(host, port, commands=commands, signed=guard and guard.mirror_link)
     except OSError as error:
         raise InputError(f"--mirror: {text}: {error.strerror}; wanted the address of a ground station") from None
+    (to_host, to_port), (own_host, own_port) = mirror.address, link.address
+    here = to_host == own_host or (ip_address(own_host).is_unspecified and ip_address(to_host).is_loopback)
+    if here and to_port == own_port:
+        mirror.close()
+        raise InputError(f"--mirror: read {text}, which is this station's own, wanted that of another ground station")
+    return mirror

@@ -60,8 +60,13 @@ def run(arguments: list[str]) -> int:
             try:
                 log = TruthLog(options.truth)
             except (OSError, ValueError) as error:
-                return _complain(f"--truth: {error}")
+                return _complain(f"--truth: {error}, wanted a new file, or a truth log to go on with")
             opened.callback(log.close)
+        if options.counters:
+            try:
+                options.counters.open("ab").close()
+            except OSError as error:
+                return _complain(f"--counters: {options.counters}: {error.strerror}, wanted a file that can be written")
         try:
             run_it = _links_only if options.links_only else _fly
             run_it(scenario, log, signals, options, opened)

@@ -11,6 +11,7 @@ from gcs.cli import main
 from gcs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE
 from gcs.sitl import TRUTH_FILE
 from gcs.summary import finish
+from gcs.user_input import InputError, listening, mirroring
 
 CHAIN = "scenarios/chain3.toml"
 ROOT = Path(__file__).parent.parent
@@ -132,3 +133,21 @@ def test_ticks_of_vehicles_that_are_not_in_the_scenario_are_refused(
     text = (run / SCENARIO_FILE).read_text(encoding="utf-8")
     (run / SCENARIO_FILE).write_text(text.replace("system_id = 1\n", "system_id = 9\n"), encoding="utf-8")
     assert "read ticks of vehicles [1]" in complaint(capsys, monkeypatch, "recover", str(run))
+
+
+@pytest.mark.parametrize(("listens", "mirror"), [("127.0.0.1", "localhost"), ("0.0.0.0", "127.0.0.1")])
+def test_a_mirror_to_the_stations_own_port_is_refused(listens: str, mirror: str) -> None:
+    with listening("--listen", f"{listens}:0") as link, pytest.raises(InputError, match="which is this station's own"):
+        mirroring(f"{mirror}:{link.address[1]}", link, None, commands=False)
+
+
+def test_an_empty_connect_is_no_leave_to_start_vehicles(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "--connect: read '', wanted HOST:PORT" in complaint(capsys, monkeypatch, "fly", CHAIN, "--connect", "")
+
+
+def test_a_name_too_long_for_a_file_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "File name too long, wanted" in complaint(capsys, monkeypatch, "view", "a" * 300)

@@ -170,6 +170,8 @@ def test_it_flies_on_when_whoever_reads_its_lines_is_gone(client: Client, scenar
         ([str(SCENARIOS / "triangle5.toml"), "--station", "no.such.host.invalid:14550"], "no.such.host.invalid"),
         ([str(SCENARIOS / "triangle5.toml"), "--station", "255.255.255.255:14550"], "255.255.255.255:14550"),
         ([str(SCENARIOS / "triangle5.toml"), "--truth", "/no/such/folder/truth"], "/no/such/folder/truth"),
+        ([str(SCENARIOS / "triangle5.toml"), "--truth", str(SCENARIOS / "schema.py")], "is not a truth log, wanted"),
+        ([str(SCENARIOS / "triangle5.toml"), "--counters", "/no/such/folder/file"], "--counters: /no/such/folder/file"),
         ([str(SCENARIOS / "triangle5.toml"), "--duration", "-1"], "'-1'"),
         ([str(SCENARIOS / "triangle5.toml"), "--duration", "nan"], "'nan'"),
         ([str(SCENARIOS / "triangle5.toml"), "--stop-after-silence", "soon"], "'soon'"),
