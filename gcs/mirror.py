@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Self
 
 from gcs import mavlink
+from gcs.autopilot.kinds import SET_MESSAGE_INTERVAL
 from gcs.station import Outgoing
 from gcs.vehicle import Address, RemoteVehicle
 from scenarios.signing.link import SignedLink
@@ -19,6 +20,8 @@ from scenarios.signing.link import SignedLink
 MIRROR = "mirror"
 """Kind of the event that holds what a mirror counted."""
 _LARGEST_DATAGRAM = 2048
+_STREAMS_WITH_POSITION = (0, 6)
+"""MAV_DATA_STREAM: all, position."""
 _DATAGRAMS_A_STEP = 64
 """Of the other station; what is more waits, and is dropped by the kernel when its buffer is full."""
 
@@ -68,7 +71,8 @@ class Mirror:
         """What the other station has sent since and may go on: to the vehicle it is for, or to all.
 
         Only to vehicles that are flown already: one that had not been commanded before would take the other station
-        for its own.
+        for its own. Not what would make the telemetry slower that the formation is flown with: displays ask for a few
+        positions a second when they connect.
         """
         own = {vehicle.system_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
         outgoing: list[Outgoing] = []
@@ -80,6 +84,8 @@ class Mirror:
                 self.counters[f"refused {name}"] += 1
             elif frame.system_id in own or not addresses:
                 self.counters[f"refused {name} of or for a system that is not flown"] += 1
+            elif _sets_our_rate(frame):
+                self.counters[f"refused {name} about the rate of the telemetry that is flown with"] += 1
             else:
                 self.counters[f"passed on {name}"] += 1
                 outgoing += [Outgoing(frame.data, address) for address in addresses]
@@ -97,3 +103,14 @@ class Mirror:
                     frames += mavlink.decode_either(data, refused)
                     self.counters.update({f"refused: {reason}": count for reason, count in refused.items()})
         return frames
+
+
+def _sets_our_rate(frame: mavlink.Frame) -> bool:
+    """Whether a frame asks for LOCAL_POSITION_NED at a rate, alone or with a stream of messages."""
+    name = mavlink.message_name(frame.msg_id)
+    if name not in ("REQUEST_DATA_STREAM", "COMMAND_LONG", "COMMAND_INT"):
+        return False
+    fields = dict(zip(mavlink.field_names(frame.msg_id), frame.fields, strict=True))
+    if name == "REQUEST_DATA_STREAM":
+        return fields["req_stream_id"] in _STREAMS_WITH_POSITION
+    return fields["command"] == SET_MESSAGE_INTERVAL and fields["param1"] == mavlink.LOCAL_POSITION_NED

@@ -190,6 +190,30 @@ def test_what_is_garbled_or_in_a_vehicles_name_is_not_passed_on() -> None:
     assert sum(count for name, count in mirror.counters.items() if name.startswith("refused: ")) == 1
 
 
+def test_a_display_that_connects_in_flight_does_not_slow_the_telemetry_that_is_flown_with() -> None:
+    vehicle = RemoteVehicle(1, telemetry_hz=1.0, report=lambda _kind, _text: None)
+    vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
+    mav = dialect.MAVLink(None, srcSystem=255)
+    stream, long = dialect.MAVLink_request_data_stream_message, dialect.MAVLink_command_long_message
+    whole = dialect.MAVLink_command_int_message(1, 1, 0, 511, 0, 0, 32, 250_000, 0, 0, 0, 0, 0)
+    slowing = [stream(1, 1, 0, 3, 1), stream(1, 1, 6, 3, 1), long(1, 1, 511, 0, 32, 250_000, 0, 0, 0, 0, 0), whole]
+    files = dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, [0] * 251)
+    other_wishes = [stream(1, 1, 10, 10, 1), long(1, 1, 511, 0, 242, 1_000_000, 0, 0, 0, 0, 0), files]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        with Mirror(*other.getsockname(), commands=True) as mirror:
+            mirror.forward([b"hello"], 0)
+            _, address = other.recvfrom(2048)
+            sent = [message.pack(mav) for message in slowing + other_wishes]
+            for data in sent:
+                other.sendto(data, address)
+            passed = mirror.passed_on([vehicle], 0)
+    assert [data for data, _ in passed] == sent[len(slowing) :]
+    refused = "refused {} about the rate of the telemetry that is flown with"
+    assert mirror.counters[refused.format("REQUEST_DATA_STREAM")] == 2
+    assert mirror.counters[refused.format("COMMAND_LONG")] == mirror.counters[refused.format("COMMAND_INT")] == 1
+
+
 def test_on_a_signed_link_the_other_station_gets_signed_frames_and_is_heard_only_if_it_signs() -> None:
     vehicle = RemoteVehicle(1, telemetry_hz=1.0, report=lambda _kind, _text: None)
     vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
