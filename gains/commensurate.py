@@ -5,8 +5,8 @@ many lambda with det(j omega I - sum_k A_k lambda^{-k}) = 0: the eigenvalues of 
 as those of one delay (`gains.delay_loci`): a root is on the imaginary axis where a modulus is one, and it goes right
 where that modulus falls with the frequency, whatever the delay. Everything else is as with one delay.
 
-The frequencies come from a pencil, see `_pencil_angles`. A sweep along the unit circle, which shares no algebra
-with it, is the second opinion.
+The frequencies come from a pencil and from Newton's method along the unit circle, see `gains.circle_angles`. A sweep of
+the circle is the second opinion.
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, for the same problem as a
 polynomial eigenvalue problem.
@@ -16,27 +16,28 @@ from collections.abc import Callable, Sequence
 from math import inf, pi
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from gains.circle_angles import PAST_HALF, at_angle, candidate_angles, circle_loci, circle_points, norm_of
 from gains.delay import Crossing, DelayAnalysis, check_horizon, stability_windows
-from gains.delay_crossings import AxisCrossing, axis_crossings, crossings_of_loci, polish
-from gains.delay_loci import ComplexArray, Loci, unit_crossings
-from gains.delay_sweep import near_unit_extrema
+from gains.delay_crossings import (
+    AxisCrossing,
+    axis_crossings,
+    crossings_of_loci,
+    hidden_crossings,
+    polish,
+    separating_points,
+)
+from gains.delay_loci import ComplexArray, Loci, UnitCrossing, unit_crossings
 from gains.errors import BadModelError
 from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
-# the pencil's companion matrix takes 3 s at this size; larger ones leave the frequencies to the sweep
-_LARGEST_PENCIL = 1200
-# a locus is an eigenvalue of a companion matrix of this size at most
-_LARGEST_COMPANION = 200
-# where the polynomial in cos(theta) is expanded: off [-1, 1], and no special angle
-_EXPANSION = 1.3717
+# a locus is an eigenvalue of a companion matrix, of which many are wanted; beyond this size angles are followed instead
+_LARGEST_LOCI = 30
+# states times the largest multiple: a sweep takes some seconds there
+_LARGEST_PRODUCT = 3000
 # a candidate is kept when it is this close to the imaginary axis, relative to the norm; a false one costs little
 _CANDIDATE_TOLERANCE = 1e-3
-# angles of the sweep along the upper half of the unit circle
-_ANGLES = 400
-# a local extremum of a real part is refined when its sample is this close to the axis, relative to the norm
-_NEAR_AXIS = 0.1
 # and is on the axis when it is this close to it
 _ON_AXIS = 1e-9
 # below this share of the highest frequency a crossing may be that of a root that passes zero, seen so far beside it
@@ -130,6 +131,8 @@ def block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
         ]
     used = tuple(terms[: present[-1] + 1])
     highest = highest_frequency(used)
+    if (len(used) - 1) * column_space(used[1:]).shape[1] > _LARGEST_LOCI:
+        return _crossings_by_angle(used)
 
     def terms_at(omega: FloatArray) -> ComplexArray:
         return np.broadcast_to(np.array(used, dtype=np.complex128), (omega.size, len(used), *used[0].shape))
@@ -137,6 +140,28 @@ def block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
     loci = companion_loci(terms_at, column_space(used[1:]))
     found = crossings_of_loci(loci, _candidates(used, highest), highest)
     return sorted((polish(used, crossing) for crossing in found), key=lambda crossing: crossing.omega)
+
+
+def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
+    """The same from the eigenvalues s of A(theta), of which there are n however many the delays.
+
+    With theta = omega tau a root j omega goes right with growing tau where omega d(Re s) / d theta > 0, whatever tau.
+    """
+    scale = highest_frequency(terms)
+    loci, candidates = circle_loci(terms), candidate_angles(terms)
+    counted = unit_crossings(loci, np.union1d(circle_points(terms), separating_points(candidates, PAST_HALF)))
+    crossings: list[AxisCrossing] = []
+    # opposite ones at one angle are usual: all roots are on the axis at a quarter turn if all multiples are odd
+    for crossing in (*counted, *hidden_crossings(loci, candidates, counted)):
+        theta, omega = crossing.omega, float(np.angle(crossing.locus)) * norm_of(terms)
+        if abs(omega) < _SLOW * scale and _passes_zero(terms, theta, abs(omega)):
+            continue
+        # the angles beyond pi and the frequencies below zero are these, mirrored; outward is falling, to the left
+        turn, way = (theta, -1) if omega > 0.0 else (2.0 * pi - theta, 1)
+        if theta <= pi:
+            locus = UnitCrossing(abs(omega), complex(np.exp(1j * turn)), way * crossing.outward)
+            crossings.append(polish(terms, locus))
+    return sorted(crossings, key=lambda crossing: crossing.omega)
 
 
 def highest_frequency(terms: Sequence[FloatArray]) -> float:
@@ -168,10 +193,10 @@ def _checked(matrices: Sequence[ArrayLike]) -> list[FloatArray]:
         raise BadModelError("matrices is empty; at least A_0 is wanted")
     checked = square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)})
     size = checked[0].shape[0] * (len(checked) - 1)
-    if len(checked) > 2 and size > _LARGEST_COMPANION:
+    if len(checked) > 2 and size > _LARGEST_PRODUCT:
         raise BadModelError(
             f"the longest delay is {len(checked) - 1} times their common divisor, with {checked[0].shape[0]} states; "
-            f"a product of at most {_LARGEST_COMPANION} is wanted"
+            f"a product of at most {_LARGEST_PRODUCT} is wanted"
         )
     return checked
 
@@ -185,14 +210,8 @@ def _unstable_roots(roots: ComplexArray, crossings: Sequence[AxisCrossing]) -> i
     return int(np.count_nonzero(roots.real > 0.0))
 
 
-def _at_angle(terms: Sequence[FloatArray], theta: FloatArray) -> ComplexArray:
-    """sum_k A_k e^{-j k theta}, shape (angles, n, n)."""
-    turns = np.exp(-1j * theta[:, np.newaxis] * np.arange(len(terms)))
-    return np.tensordot(turns, np.array(terms), axes=1)
-
-
 def _least_singular(terms: Sequence[FloatArray], omega: float, theta: float) -> float:
-    matrix = 1j * omega * np.eye(terms[0].shape[0]) - _at_angle(terms, np.array([theta]))[0]
+    matrix = 1j * omega * np.eye(terms[0].shape[0]) - at_angle(terms, np.array([theta]))[0]
     return float(np.linalg.svd(matrix, compute_uv=False)[-1])
 
 
@@ -240,96 +259,19 @@ def column_space(late: Sequence[FloatArray]) -> FloatArray:
 
 def _candidates(terms: Sequence[FloatArray], highest: float) -> FloatArray:
     """Frequencies that come near every crossing, ascending."""
-    if len(terms) * terms[0].shape[0] ** 2 <= _LARGEST_PENCIL:
-        theta = _pencil_angles(terms)
-    else:
-        theta = np.array([angle for angle, _ in _circle_crossings(terms)])
+    theta = candidate_angles(terms)
     if theta.size == 0:
         return np.empty(0)
-    roots = np.linalg.eigvals(_at_angle(terms, theta))
+    roots = np.linalg.eigvals(at_angle(terms, theta))
     near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
     omega = np.unique(np.abs(roots.imag[near_axis]))
     return omega[(omega > 0.0) & (omega < 1.1 * highest)]
 
 
-def _pencil_angles(terms: Sequence[FloatArray]) -> FloatArray:
-    """Angles theta in [0, pi] at which the spectrum of A(theta) = sum_k A_k e^{-j k theta} may touch the axis.
-
-    A(theta) v = j omega v makes X = v v* a solution of A X + X A* = 0. With A = C - j sin(theta) D, C = sum A_k
-    cos(k theta) and D = sum A_k sin(k theta) / sin(theta) polynomials in c = cos(theta), and X = R + j S, the real
-    part and sin(theta) times the imaginary part are, with S' = S sin(theta),
-
-        C R + R C' + D S' - S' D' = 0,    C S' + S' C' - (1 - c^2) (D R - R D') = 0:
-
-    a polynomial eigenvalue problem in c with n^2 unknowns (R symmetric, S' skew) and real matrices, of degree m + 1.
-    """
-    n, degree = terms[0].shape[0], len(terms)
-    # values at Chebyshev nodes give the polynomial in powers of c - _EXPANSION
-    nodes = np.cos(pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
-    values = np.array([_pencil_at(terms, c) for c in nodes.tolist()])
-    powers = np.vander(nodes - _EXPANSION, increasing=True)
-    coefficients = np.linalg.solve(powers, values.reshape(degree + 1, -1)).reshape(values.shape)
-    size = n * n
-    try:
-        scaled = np.linalg.solve(coefficients[0], coefficients[1:].swapaxes(0, 1).reshape(size, degree * size))
-    except np.linalg.LinAlgError:
-        return np.empty(0)
-    # in 1 / (c - _EXPANSION) the matrix polynomial is monic
-    companion = np.zeros((degree * size, degree * size))
-    companion[:size] = -scaled
-    companion[size:, :-size] = np.eye((degree - 1) * size)
-    inverse = np.linalg.eigvals(companion).astype(np.complex128)
-    inverse = inverse[np.abs(inverse) > 1e-3]
-    c = _EXPANSION + 1.0 / inverse
-    # an eigenvalue of multiplicity q is known to eps^(1/q)
-    near = (np.abs(c.imag) < 1e-3) & (np.abs(c.real) < 1.0 + 1e-3)
-    return np.arccos(np.clip(c.real[near], -1.0, 1.0))
-
-
-def _pencil_at(terms: Sequence[FloatArray], c: float) -> FloatArray:
-    """The linear map (R, S') -> both equations of `_pencil_angles` at one c, in coordinates of R and S' (n^2, n^2)."""
-    n = terms[0].shape[0]
-    theta = float(np.arccos(c))
-    k = np.arange(len(terms))
-    C = np.tensordot(np.cos(k * theta), np.array(terms), axes=1)
-    D = np.tensordot(np.sin(k * theta) / np.sin(theta), np.array(terms), axes=1)
-    upper, strict = np.triu_indices(n), np.triu_indices(n, 1)
-    symmetric, skew = _unit_matrices(n, upper, 1.0), _unit_matrices(n, strict, -1.0)
-    columns = [_plus(C, symmetric), -(1.0 - c * c) * _minus(D, symmetric), _minus(D, skew), _plus(C, skew)]
-    top = np.vstack([columns[0][:, upper[0], upper[1]], columns[2][:, upper[0], upper[1]]]).T
-    bottom = np.vstack([columns[1][:, strict[0], strict[1]], columns[3][:, strict[0], strict[1]]]).T
-    return np.vstack([top, bottom])
-
-
-def _unit_matrices(n: int, at: tuple[NDArray[np.intp], NDArray[np.intp]], sign: float) -> FloatArray:
-    """A basis of symmetric (sign 1) or skew (-1) matrices, one for each place above the diagonal."""
-    count = np.arange(at[0].size)
-    basis = np.zeros((at[0].size, n, n))
-    basis[count, at[1], at[0]] = sign
-    basis[count, at[0], at[1]] = 1.0
-    return basis
-
-
-def _plus(matrix: FloatArray, X: FloatArray) -> FloatArray:
-    return matrix @ X + X @ matrix.T
-
-
-def _minus(matrix: FloatArray, X: FloatArray) -> FloatArray:
-    return matrix @ X - X @ matrix.T
-
-
 def _circle_crossings(terms: Sequence[FloatArray]) -> list[tuple[float, float]]:
     """Angles theta in [0, pi] and frequencies omega (either sign) with j omega an eigenvalue of A(theta)."""
-    scale = sum(float(np.linalg.norm(matrix)) for matrix in terms)
-
-    def loci(theta: FloatArray) -> ComplexArray:
-        # e^{s / scale}: of modulus one on the axis, and |s| / scale <= 1 leaves the frequency in the angle
-        return np.exp(np.linalg.eigvals(_at_angle(terms, theta)) / scale).astype(np.complex128)
-
-    # a little beyond pi, so that a crossing at pi itself is inside
-    theta = np.linspace(1e-9, 1.01 * pi, _ANGLES)
-    theta = np.union1d(theta, near_unit_extrema(loci, theta, near=_NEAR_AXIS))
-    angles = np.array([crossing.omega for crossing in unit_crossings(loci, theta)])
+    scale, loci = norm_of(terms), circle_loci(terms)
+    angles = np.array([crossing.omega for crossing in unit_crossings(loci, circle_points(terms))])
     # several roots may cross at nearly one angle (all of them, if nothing acts at once): take all that are on the axis
     roots = np.log(loci(angles)) * scale if angles.size > 0 else np.empty((0, 0))
     return [
@@ -344,7 +286,7 @@ def _passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> boo
 
     The motions of a slow part of the loop are slow at the angles beside it too.
     """
-    beside = np.abs(np.linalg.eigvals(_at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
+    beside = np.abs(np.linalg.eigvals(at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
     return bool(beside.min() > 1e3 * omega)
 
 

@@ -64,7 +64,7 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
 def crossings_of_loci(loci: Loci, candidates: FloatArray, highest: float) -> list[UnitCrossing]:
     """All crossings of the unit circle, mere touches included, given frequencies that come near each of them."""
     crossings = unit_crossings(loci, separating_points(candidates, highest))
-    return without_limits_at_zero(loci, crossings + _hidden_crossings(loci, candidates, crossings), highest)
+    return without_limits_at_zero(loci, crossings + hidden_crossings(loci, candidates, crossings), highest)
 
 
 def highest_frequency(A0: FloatArray, A1: FloatArray) -> float:
@@ -112,7 +112,7 @@ def separating_points(candidates: FloatArray, highest: float) -> FloatArray:
     return np.unique(points[(points >= lowest) & (points <= 1.1 * highest)])
 
 
-def _hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossing]) -> list[UnitCrossing]:
+def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossing]) -> list[UnitCrossing]:
     """Crossings that leave the count unchanged: two in opposite directions at one frequency, or a mere touch."""
     if candidates.size == 0:
         return []

@@ -19,10 +19,10 @@ from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_f
 
 # multiples of the unknown up to this many times their common divisor
 _MOST_STEPS = 200
-# a sweep of blocks of n states costs some n^3: these are 0.1 s
-_SWEEP_BUDGET = 1000
-# states times points of a discretised spectrum: 10 ms
-_SPECTRUM_BUDGET = 110
+# a sweep of blocks of n states costs some n^3: these are 0.2 s, and 0.08 s one of 12 states
+_SWEEP_BUDGET = 14_000
+# states times points of a discretised spectrum: 30 ms
+_SPECTRUM_BUDGET = 200
 # the rightmost root is looked at this far inside and outside a window, relative to its end
 _BESIDE = 1e-4
 # a near-tangent pair of crossings is known to sqrt(eps) only; a missed crossing is off by far more

@@ -126,7 +126,11 @@ def test_root_at_zero_for_every_delay_is_never_stable() -> None:
 
 @pytest.mark.parametrize(
     ("matrices", "message"),
-    [([], "matrices is empty"), ([[[1.0]]] * 300, "a product of at most 200"), ([[[1.0]], np.eye(2)], "1x1 is wanted")],
+    [
+        ([], "matrices is empty"),
+        ([[[1.0]]] * 4000, "a product of at most 3000"),
+        ([[[1.0]], np.eye(2)], "1x1 is wanted"),
+    ],
 )
 def test_wrong_terms_are_named(matrices: list[Matrix], message: str) -> None:
     with pytest.raises(BadModelError, match=message):
@@ -183,3 +187,64 @@ def test_horizon_must_be_positive(horizon_s: float) -> None:
         analyse_mixed([MixedTerm([[-1.0]], 0.1, 1)], horizon_s=horizon_s)
     with pytest.raises(BadModelError, match="horizon_s is"):
         analyse_commensurate([[[0.0]], [[-1.0]]], horizon_s=horizon_s)
+
+
+def unstable_roots(terms: list[tuple[Matrix, float]]) -> int:
+    """By the argument principle for det(sI - sum A e^{-s tau}) along the axis, sampled until it turns little."""
+    n, bound = len(terms[0][0]), sum(float(np.linalg.norm(matrix)) for matrix, _ in terms)
+
+    def value(omega: Matrix) -> np.ndarray[tuple[int], np.dtype[np.complex128]]:
+        matrix = 1j * omega[:, None, None] * np.eye(n)
+        for A, delay_s in terms:
+            matrix = matrix - np.exp(-1j * omega * delay_s)[:, None, None] * A
+        return np.linalg.slogdet(matrix)[0] * np.exp(-1j * n * np.angle(1j * omega + bound))
+
+    longest_s = max(delay_s for _, delay_s in terms)
+    near = np.linspace(0.0, bound, int(200 + 20 * bound * longest_s))
+    omega = np.unique(np.concatenate([near, bound * np.logspace(-9.0, 6.0, 900)]))
+    values = value(omega)
+    for _ in range(50):
+        coarse = np.flatnonzero(np.abs(np.angle(values[1:] / values[:-1])) > 0.3)
+        if coarse.size == 0:
+            break
+        between = (omega[coarse] + omega[coarse + 1]) / 2.0
+        omega, values = np.insert(omega, coarse + 1, between), np.insert(values, coarse + 1, value(between))
+    return round(float(np.angle(values[-1]) - np.angle(values[1:] / values[:-1]).sum()) / np.pi)
+
+
+@pytest.mark.parametrize(
+    ("states", "multiples", "acts_at_once"),
+    [
+        # the pencil of many multiples is ill-conditioned: margins of scalar loops were once too long, or contradicted
+        (1, (4, 38), True),
+        (1, (23, 45), True),
+        # odd multiples, nothing at once: at a quarter turn all roots are on the axis, in opposite directions
+        (3, (5, 11), False),
+        (4, (1, 3), False),
+        # too large for the companion matrix of each frequency
+        (6, (3, 8), True),
+        (12, (3, 5), True),
+    ],
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_roots_of_many_multiples_are_counted(
+    states: int, multiples: tuple[int, int], acts_at_once: bool, seed: int
+) -> None:
+    rng = np.random.default_rng([seed, states, *multiples])
+    late = [rng.normal(size=(states, states)) / np.sqrt(states) for _ in multiples]
+    # -1 is in the middle of stable and unstable loops
+    now = (rng.normal(size=(states, states)) / np.sqrt(states) - np.eye(states)) * acts_at_once
+    terms = [now, *(np.zeros_like(now) for _ in range(max(multiples)))]
+    for multiple, matrix in zip(multiples, late, strict=True):
+        terms[multiple] = matrix
+    found = analyse_commensurate(terms, horizon_s=1e-3)
+    for tau_s in (0.11, 0.37, 0.83, 1.31):
+        entered = sum(
+            crossing.direction
+            * crossing.roots
+            * (1 + int((tau_s - crossing.delay_s) * crossing.omega_rad_s / 2 / np.pi))
+            for crossing in found.crossings
+            if crossing.delay_s < tau_s
+        )
+        delayed = [(matrix, multiple * tau_s) for matrix, multiple in zip(late, multiples, strict=True)]
+        assert found.unstable_roots_at_zero_delay + entered == unstable_roots([(now, 0.0), *delayed])

@@ -18,6 +18,7 @@ MODULES = sorted(path.stem for path in Path(gains.__path__[0]).glob("*.py") if p
 # them and so needs an example.
 INTERNAL_MODULES = {
     "bracketing",
+    "circle_angles",
     "delay_crossings",
     "delay_curves",
     "delay_loci",
