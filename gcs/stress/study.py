@@ -123,6 +123,9 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
     seed, period_s = study.plan.scenario.seed, 1.0 / study.plan.scenario.rates.control_hz
     centre_s, width_s = predicted_s - period_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
     flights: dict[str, Outcome] = {}
+    noisy = study.real_time or not has_constant_links(
+        study.plan.scenario
+    )  # from closer by noise is all there is to see
     for round_number in range(1, _ROUNDS + 1):
         spread = centre_s + width_s * np.linspace(-1.0, 1.0, _FLIGHTS_A_ROUND)
         links_s = dict.fromkeys(round(float(delay_s), 6) for delay_s in np.maximum(spread, 0.0))
@@ -136,8 +139,8 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         waiting_s = _waiting_s(near)
         ahead_s = max(0.0, zero.loop_delay_s - waiting_s) - centre_s
         wanted_s = tolerance * predicted_s
-        smooth = zero.misfit <= _SMOOTH_MISFIT or width_s <= 1.001 * _FINEST_WIDTH * wanted_s
-        if zero.inside and smooth and width_s <= 1.001 * wanted_s:
+        close = noisy or zero.misfit <= _SMOOTH_MISFIT or width_s <= 1.001 * _FINEST_WIDTH * wanted_s
+        if zero.inside and close and width_s <= 1.001 * wanted_s:
             return _found(study, run, zero, near, tuple(flights.values()), rounds=round_number)
         if centre_s <= 0.0 and ahead_s <= 0.0:
             break
