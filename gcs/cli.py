@@ -220,7 +220,7 @@ def bench(
     vehicles: Annotated[
         int, typer.Option(metavar="N", min=0, max=250, help="as many vehicles instead, in columns behind a leader")
     ] = 0,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="flight time of each flight")] = 8.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, max=86400, help="flight time of each flight")] = 8.0,
     repeat: Annotated[int, typer.Option(metavar="N", min=1, help="flights; the fastest counts")] = 10,
     real_time: Annotated[
         bool, typer.Option("--real-time", help="one flight over UDP instead: is it punctual, are its latencies true?")

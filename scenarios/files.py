@@ -42,7 +42,9 @@ def parse(text: str, file: Path) -> Scenario:
     """The scenario in a TOML text; `file` is named in errors."""
     try:
         data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise ScenarioError(file, "file", "lists within lists too deep to follow", "valid TOML") from None
+    except ValueError as error:  # a TOMLDecodeError, or a number of thousands of digits
         raise ScenarioError(file, "file", str(error), "valid TOML") from None
     try:
         # TOML arrays become Python lists; strict validation from JSON text takes them as tuples.

@@ -92,6 +92,8 @@ BAD = {
         "control.gains",
         "either",
     ),
+    "lists without end": ("seed = 1", "seed = " + "[" * 20000, "file", "valid TOML"),
+    "thousands of digits": ("seed = 1", "seed = " + "9" * 5000, "file", "valid TOML"),
     "no TOML": ("seed = 1", "seed = = 1", "file", "valid TOML"),
 }
 

@@ -40,6 +40,8 @@ _LABELS = {
     "loss": "loss of datagrams, each way",
     "rate": "control and telemetry rate [Hz]",
 }
+_MOST = 10_000
+"""Values of an axis."""
 _RANGES = {"delay": (0.0, 60.0), "jitter": (0.0, 10.0), "loss": (0.0, 1.0), "rate": (1.0, 500.0)}
 
 
@@ -55,8 +57,8 @@ def parse_axis(name: str, text: str) -> Axis:
     try:
         if ":" in text:
             first, last, count = text.split(":")
-            ends = float(first), float(last)
-            values = np.linspace(*ends, int(count)).tolist() if np.isfinite(ends).all() else []
+            ends, points = (float(first), float(last)), int(count)
+            values = np.linspace(*ends, points).tolist() if np.isfinite(ends).all() and points <= _MOST else []
         else:
             values = [float(word) for word in text.split(",")]
     except ValueError:
@@ -64,7 +66,8 @@ def parse_axis(name: str, text: str) -> Axis:
     # the same number that a user would write, so that ids do not depend on how a range was cut
     values = [round(value, 9) for value in values]
     if not values or not all(low <= value <= high for value in values):
-        raise AxisError(f"read {text!r}, wanted FROM:TO:COUNT or values as 0.1,0.2, from {low:g} to {high:g}")
+        wanted = f"FROM:TO:COUNT or values as 0.1,0.2, from {low:g} to {high:g}, at most {_MOST}"
+        raise AxisError(f"read {text!r}, wanted {wanted}")
     return Axis(name, tuple(dict.fromkeys(values)))
 
 
