@@ -70,7 +70,7 @@ def test_a_loop_on_random_links_is_its_linear_model_through_the_delays_drawn(coo
     response = response_paired(plan, calm, (2,), amplitude=1.0, folder=None)
     flown = np.stack([response.errors[name] for name in CHANNELS], axis=1)
     early = response.errors["time_s"] < 5.0
-    model = modelled(follower, response, before=np.array([-1.0, 0.4, 0.0, 0.0]))
+    model = modelled(follower, response, before=np.array([-1.0, 0.8, 0.0, 0.0]))
     assert np.abs(flown).max() > 1.0
     assert flown[early] == pytest.approx(model[early], abs=2e-3)
     pushed = calm.ticks[(calm.ticks["system_id"] == 2) & calm.ticks["commanded"]]

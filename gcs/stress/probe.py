@@ -27,8 +27,9 @@ from gcs.record import TickArray
 from scenarios.schema import Link, Scenario, Vehicle
 
 PROBE_S = 20.0
-_DIRECTION_NE = np.array([1.0, -0.4])
-"""Of a probe's error: no axis and no diagonal, as gains that couple north and east have modes in just these."""
+_DIRECTION_NE = np.array([1.0, -0.8])
+"""Of a probe's error: no diagonal, as gains that couple north and east have modes in just these; and near one, as two
+modes that are nearly the same are told apart badly where both are large."""
 
 
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
