@@ -2,6 +2,8 @@
 
 from enum import StrEnum
 
+from scenarios.schema import Link, Scenario
+
 
 class Phase(StrEnum):
     """Where the flight stands."""
@@ -37,11 +39,19 @@ def next_phase(
 
 CONNECT_PATIENCE_S, START_PATIENCE_S = 20.0, 360.0
 """How long it may take until all vehicles are ready: those that are simulated, and those with an autopilot."""
+_ROUND_TRIPS = 40.0
+"""Or so many round trips: commands are answered one after the other, and sent again after three without an answer."""
 
 
-def patience_s(dynamics: str) -> float:
+def patience_s(scenario: Scenario) -> float:
     """How long a flight may take to begin. Until then scenario time is that since the station's start less this."""
-    return START_PATIENCE_S if dynamics == "autopilot" else CONNECT_PATIENCE_S
+    least_s = START_PATIENCE_S if scenario.dynamics == "autopilot" else CONNECT_PATIENCE_S
+    links = (scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles)
+    return max(least_s, _ROUND_TRIPS * max(_longest_s(up) + _longest_s(down) for up, down in links))
+
+
+def _longest_s(link: Link) -> float:
+    return max([link.delay_s, *(point.delay_s for point in link.delay_points)])
 
 
 END_PATIENCE_S = 6.0

@@ -17,7 +17,7 @@ from gcs.autopilot.copters import Copters
 from gcs.autopilot.kinds import Goal
 from gcs.autopilot.startup import Startup
 from gcs.control import LARGEST_COMMAND_M_S2, VehicleControl, distances_m, formation_control
-from gcs.modes import CONNECT_PATIENCE_S, Phase, next_phase, patience_s
+from gcs.modes import Phase, next_phase, patience_s
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
 from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
@@ -98,7 +98,7 @@ class Station:
             period_s=self._period_ns / NS_PER_S,
         )
         self._copters = Copters(plan, self.vehicles, self._report) if autopilots else None
-        self.patience_s = patience_s(scenario.dynamics)
+        self.patience_s = patience_s(scenario)
         self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._start_ns = start_ns
         self._phase_since_ns = start_ns
@@ -370,7 +370,7 @@ class Station:
         elif any(vehicle.refused for vehicle in self.vehicles):
             refusals = [f"vehicle {v.system_id}: {v.missing}" for v in self.vehicles if v.refused]
             self.request_stop("refused: " + "; ".join(refusals))
-        elif waited_s > CONNECT_PATIENCE_S:
+        elif waited_s > self.patience_s:
             unready = "; ".join(f"vehicle {v.system_id} {v.missing}" for v in self.vehicles if not v.ready)
             self.request_stop(f"not ready: {unready}")
 

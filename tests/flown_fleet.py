@@ -13,7 +13,7 @@ from scenarios import files
 from scenarios.schema import Scenario
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 def until(condition: Callable[[], Any], what: str) -> None:

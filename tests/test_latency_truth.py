@@ -27,6 +27,7 @@ GRID = {
     "40 ms": (Link(delay_s=0.02), Link(delay_s=0.02), 20.0),
     "asymmetric": (Link(delay_s=0.09), Link(delay_s=0.01), 20.0),
     "5 s": (Link(delay_s=2.5), Link(delay_s=2.5), 20.0),
+    "5 s, 30 % loss": (Link(delay_s=2.5, loss_probability=0.3), Link(delay_s=2.5, loss_probability=0.3), 20.0),
     "30 % loss": (Link(delay_s=0.05, loss_probability=0.3), Link(delay_s=0.05, loss_probability=0.3), 20.0),
     "drift 300 ppm": (Link(delay_s=0.05), Link(delay_s=0.02), 300.0),
     "bunches": (
@@ -50,7 +51,7 @@ def flown(name: str) -> tuple[TickArray, Truth]:
     up, down, drift_ppm = GRID[name]
     scenario = CHAIN.model_copy(
         update={
-            "duration_s": 20.0 if name == "5 s" else 8.0,
+            "duration_s": 20.0 if name.startswith("5 s") else 8.0,
             "control": CHAIN.control.model_copy(update={"gains": WEAK}),
             "links": Links(up=up, down=down),
             "clocks": Clocks(drift_max_ppm=drift_ppm),

@@ -146,17 +146,16 @@ def test_mavsdk_on_a_mirror_finds_all_vehicles_and_where_they_fly(tmp_path: Path
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    other = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
-    other.add_any_connection(f"udpin://127.0.0.1:{port}")
     telemetry: dict[int, Telemetry] = {}
+    with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as other:
+        other.add_any_connection(f"udpin://127.0.0.1:{port}")
 
-    def discover() -> None:
-        until(lambda: other.system_count() == 3, "three systems")
-        telemetry.update({system.get_system_id(): Telemetry(system) for system in other.get_systems()})
+        def discover() -> None:
+            until(lambda: other.system_count() == 3, "three systems")
+            telemetry.update({system.get_system_id(): Telemetry(system) for system in other.get_systems()})
 
-    summary, run = fly(tmp_path, "--mirror", f"127.0.0.1:{port}", meanwhile=discover)
-    found = {system_id: told.position_velocity_ned() for system_id, told in telemetry.items()}
-    other.destroy()
+        summary, run = fly(tmp_path, "--mirror", f"127.0.0.1:{port}", meanwhile=discover)
+        found = {system_id: told.position_velocity_ned() for system_id, told in telemetry.items()}
     ends_m = {int(row["system_id"]): float(row["north_m"]) for row in read_ticks(run)}
     assert sorted(found) == [1, 2, 3]
     for system_id, told in found.items():

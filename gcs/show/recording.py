@@ -86,7 +86,7 @@ class Recording:
         self._tree = tree_of(scenario)
         self._labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
         self._levels = _levels(scenario, design)
-        self._before_s = patience_s(scenario.dynamics)
+        self._before_s = patience_s(scenario)
         self._ticks: list[TickArray] = []
         self._events: list[dict[str, Any]] = []
         self._newest_m = Newest(count, 3)

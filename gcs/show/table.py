@@ -71,7 +71,7 @@ class FlightState:
         self.refused = ""
         """What did not get in, in words."""
         self.time_s = np.nan
-        self.before_s = patience_s(scenario.dynamics)
+        self.before_s = patience_s(scenario)
         """What scenario time lacks to the time since the station's start, until the flight begins at 0."""
         self.skipped = 0
         """Ticks that were left out."""
