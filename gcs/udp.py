@@ -38,8 +38,13 @@ def clock_ns() -> int:
 
 
 def realtime_offset_ns() -> int:
-    """What to add to the station's clock to get ns since 1970."""
-    return time.time_ns() - time.monotonic_ns()
+    """What to add to the station's clock to get ns since 1970: from the quickest of three readings of both clocks, as
+    the processor can be taken away between them."""
+    readings: list[tuple[int, int]] = []
+    for _ in range(3):
+        before_ns, real_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        readings.append((after_ns - before_ns, real_ns - (before_ns + after_ns) // 2))
+    return min(readings)[1]
 
 
 class StationSocket:
@@ -58,7 +63,7 @@ class StationSocket:
             self._socket.close()
             raise
         self._socket.setblocking(False)
-        self.bound_ns = clock_ns()
+        self.bound_ns = self._emptied_ns = clock_ns()
         self.send_errors = 0
 
     def __enter__(self) -> Self:
@@ -80,18 +85,23 @@ class StationSocket:
     def receive(self) -> list[Datagram]:
         """All datagrams that wait, oldest first, with their arrival on the station's clock."""
         datagrams: list[Datagram] = []
-        to_monotonic_ns = -realtime_offset_ns()
+        begin_ns, to_monotonic_ns = clock_ns(), -realtime_offset_ns()
+        oldest_ns = self._emptied_ns
         for _ in range(_DATAGRAMS_A_STEP):
             try:
                 data, ancillary, _, address = self._socket.recvmsg(_LARGEST_DATAGRAM, _ANCILLARY_BYTES)
             except BlockingIOError:
+                self._emptied_ns = begin_ns
                 break
             except ConnectionError:  # an earlier datagram met a closed port: the vehicle will count as silent
                 self.send_errors += 1
                 continue
             seconds, nanoseconds = _TIMESPEC.unpack(ancillary[0][2])
+            read_ns = clock_ns()
+            # If the wall clock is set, stamps jump; but nothing came before the socket was last empty.
             received_ns = seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns
-            datagrams.append(Datagram(data, address, received_ns, max(0, clock_ns() - received_ns)))
+            received_ns = min(max(received_ns, oldest_ns), read_ns)
+            datagrams.append(Datagram(data, address, received_ns, read_ns - received_ns))
         return datagrams
 
     def send(self, outgoing: list[Outgoing]) -> None:

@@ -1,0 +1,33 @@
+"""The station's socket: when datagrams came is the kernel's word, on the station's clock."""
+
+import socket
+
+import pytest
+
+from gcs.station import Datagram
+from gcs.udp import StationSocket, clock_ns
+
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+
+
+def test_a_datagram_came_after_it_was_sent_and_before_it_was_read_and_waited_in_between() -> None:
+    with StationSocket("127.0.0.1", 0) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        for wait_ns in (0, 5_000_000):
+            sent_ns: list[int] = []
+            for number in range(50):
+                sent_ns.append(clock_ns())
+                peer.sendto(bytes([number]), link.address)
+            until_ns = clock_ns() + wait_ns
+            while clock_ns() < until_ns:
+                pass
+            came: list[Datagram] = []
+            while len(came) < 50:
+                came += link.receive()
+            read_ns = clock_ns()
+            assert [datagram.data[0] for datagram in came] == list(range(50))
+            for before_ns, datagram in zip(sent_ns, came, strict=True):
+                # two clocks are compared, to some microseconds
+                assert before_ns - 50_000 <= datagram.received_ns <= read_ns
+                assert datagram.queued_ns <= read_ns - before_ns + 50_000
+            waited_ns = sorted(datagram.queued_ns for datagram in came)
+            assert waited_ns[25] >= wait_ns - 50_000  # the kernel may hand single ones over late
