@@ -62,9 +62,9 @@ class ClockEstimate(NamedTuple):
         """The offset at a time of the station's clock."""
         return self.offset_ns + round(self.skew * (time_ns - self.reference_ns))
 
-    def bound_at_ns(self, time_ns: int) -> int:
+    def bound_at_ns(self, time_ns: int) -> float:
         """Most by which the offset, or an instant that `to_station_ns` gives, can be wrong near a station time."""
-        return self.bound_ns + round((DRIFT_BOUND + abs(self.skew)) * abs(time_ns - self.reference_ns))
+        return self.bound_ns + (DRIFT_BOUND + abs(self.skew)) * abs(time_ns - self.reference_ns)
 
     def to_station_ns(self, boot_ns: int) -> int:
         """The station's time at an instant of the vehicle's boot clock."""
@@ -85,7 +85,7 @@ class VehicleClock:
         """Round trip of the newest exchange."""
         self.down_ns: int | None = None
         """One-way delay station to vehicle of the newest exchange, by the estimated offset,"""
-        self.down_bound_ns = 0
+        self.down_bound_ns = 0.0
         """and the most by which it can be wrong."""
         self.unmatched = 0
         self._pending: dict[int, None] = {}

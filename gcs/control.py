@@ -14,6 +14,7 @@ from math import hypot, nan
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gains.formation import FormationModel
 from gcs.telemetry import FloatArray, IntArray, Report, State, StateHistory
@@ -242,8 +243,9 @@ def distances_m(controls: Sequence[VehicleControl], now_ns: int) -> FloatArray:
     for sample_ns, (north, east, v_north, v_east), *_ in controls:
         age_s = (now_ns - sample_ns) * 1e-9
         positions.append(complex(north + v_north * age_s, east + v_east * age_s))
-    position = np.array(positions)
+    position: NDArray[np.complex128] = np.array(positions)
     away = position[:, None] - position
-    distance = np.sqrt(np.real(away) ** 2 + np.imag(away) ** 2)  # not abs(away), which rounds as each processor can
+    to_north, to_east = away.real, away.imag
+    distance = np.sqrt(to_north * to_north + to_east * to_east)  # not abs(away), which rounds as each processor can
     distance.flat[:: len(positions) + 1] = nan  # to itself
     return distance

@@ -2,8 +2,11 @@
 
 _KEPT = 128
 """Numbers behind the newest of which it is known whether they have come."""
+_SEEN = (1 << _KEPT) - 1
 NEW, LATE, DUPLICATE = 0, 1, 2
 _NS_PER_S = 1_000_000_000
+_NO_DOUBT = 100.0 * _NS_PER_S
+"""With fewer frames expected than 100, the next number is the next frame."""
 _STEADY_NS = _NS_PER_S // 2
 """A longer pause says nothing of the rate,"""
 _RATE_NS = _NS_PER_S
@@ -55,7 +58,18 @@ class SequenceCounter:
             self._rate_count, self._rate_ns = sequence, time_ns
             self._seen = 1
             return NEW
-        passed = int(self._rate_hz * (time_ns - self._newest_ns)) // _NS_PER_S
+        since_ns = time_ns - self._newest_ns
+        expected = self._rate_hz * since_ns
+        if step == 1 and (sequence - self._newest) & 0xFF == 1 and self._run == 0 and expected < _NO_DOUBT:
+            # the next one: what follows would come to the same, and most frames end here
+            self._lag *= 1.0 - _FORGET
+            self._seen = (self._seen << 1 | 1) & _SEEN
+            self._newest += 1
+            if since_ns >= _STEADY_NS or time_ns - self._rate_ns >= _RATE_NS:
+                self._note_rate(time_ns)
+            self._newest_ns = time_ns
+            return NEW
+        passed = int(expected) // _NS_PER_S
         most = passed + max(_LEAST_AHEAD, _AHEAD - int(self._lag))
         ahead = most - ((most - sequence + self._newest) & 0xFF)
         if ahead <= 0 and 0 < step <= _RUN_STEP:
@@ -68,7 +82,7 @@ class SequenceCounter:
         self._lag = max(self._lag * (1.0 - _FORGET), -ahead)
         if ahead > 0:
             self.lost += ahead - 1
-            self._seen = (self._seen << min(ahead, _KEPT) | 1) & ((1 << _KEPT) - 1)
+            self._seen = (self._seen << min(ahead, _KEPT) | 1) & _SEEN
             self._newest += ahead
             self._note_rate(time_ns)
             self._newest_ns = time_ns
