@@ -10,7 +10,7 @@ from gains.errors import InfeasibleError
 from gains.fixed_modes import check_stabilisable, fixed_modes
 from gains.formation import FormationModel
 from gains.lqr import Weights, lqr_cost
-from gains.pattern import Pattern, all_to_all, bidirectional, formation_plant, leader_follower, without_links
+from gains.pattern import Pattern, Plant, all_to_all, bidirectional, formation_plant, leader_follower, without_links
 from gains.structured_lqr import stabilising_gain, structured_lqr
 
 CHAIN = FormationModel((-1, 0, 1))
@@ -51,6 +51,25 @@ def test_structured_optimum_is_stationary_stable_in_the_pattern_and_costs_more(p
     assert up > result.cost
     assert down > result.cost
     assert abs(up - down) < 1e-3 * (up + down - 2 * result.cost) + 1e-9 * result.cost  # flat to first order
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_gradient_of_the_cost_is_its_slope_away_from_the_optimum_with_outputs_that_are_not_the_states(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(5, 5)) - 6.0 * np.eye(5)
+    plant = Plant(A, rng.normal(size=(5, 3)), rng.normal(size=(4, 5)))
+    pattern = Pattern(np.array([[1, 0], [1, 1]], dtype=bool), (1, 2), (2, 2))
+    weights = Weights(np.eye(5) + np.diag(rng.uniform(size=5)), np.diag(rng.uniform(1.0, 2.0, size=3)))
+    K = 0.1 * rng.normal(size=(3, 4)) * pattern.mask
+    _, gradient = lqr_cost(plant, pattern, weights, K)
+    assert not gradient[~pattern.mask].any()
+    for row, column in np.argwhere(pattern.mask):
+        step = np.zeros_like(K)
+        step[row, column] = 1e-5
+        up, down = (lqr_cost(plant, pattern, weights, K + s * step)[0] for s in (1, -1))
+        assert gradient[row, column] == pytest.approx((up - down) / 2e-5, rel=1e-5, abs=1e-7)
 
 
 @pytest.mark.parametrize(
