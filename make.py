@@ -77,7 +77,8 @@ def drop_stale() -> None:
         file for folder in (".", "gcs", "sim_vehicles", "scenarios/signing") for file in (ROOT / folder).glob("*.so")
     ]
     newest = max((ROOT / source).stat().st_mtime for source in COMPILED.split())
-    if any(file.stat().st_mtime < newest for file in compiled):
+    # the newest of them is the library that all share; the others are written when they change
+    if compiled and max(file.stat().st_mtime for file in compiled) < newest:
         print("sources have changed: compiled modules removed", flush=True)
         for file in compiled:
             file.unlink()
