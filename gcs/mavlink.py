@@ -121,18 +121,14 @@ def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
         if datagram[at] != MAGIC:
             refused["not MAVLink 2"] += 1
             break
-        if end - at < _OVERHEAD:
+        stop = frame_end(datagram, at)
+        if not stop:
             refused["truncated"] += 1
             break
-        length, incompatible = datagram[at + 1], datagram[at + 2]
-        stop = at + _OVERHEAD + length + (_SIGNATURE_LENGTH if incompatible & _SIGNED else 0)
-        if stop > end:
-            refused["truncated"] += 1
-            break
-        if incompatible & ~_SIGNED:
+        if datagram[at + 2] & ~_SIGNED:
             refused["unknown flags"] += 1
         else:
-            frame = _checked(datagram[at:stop], length, refused)
+            frame = _checked(datagram[at:stop], datagram[at + 1], refused)
             if frame is not None:
                 frames.append(frame)
         at = stop
@@ -145,7 +141,10 @@ def is_magic(data: bytes, at: int) -> bool:
 
 
 def frame_end(data: bytes, at: int) -> int:
-    """Where the frame that may begin there ends; 0 if none does, or not all of it is there."""
+    """Where the frame that may begin there ends; 0 if none does, or not all of it is there.
+
+    Nothing else says how long a frame is: a decoder reads no byte behind the magic before it has asked here.
+    """
     if at + _OVERHEAD_1 > len(data) or data[at] not in (MAGIC, MAGIC_1):
         return 0
     signature = _SIGNATURE_LENGTH if data[at] == MAGIC and data[at + 2] & _SIGNED else 0
@@ -166,13 +165,14 @@ def first_heartbeats(datagram: bytes) -> list[Frame]:
 def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     """The valid MAVLink 1 frames of one datagram; what is refused is counted by reason."""
     frames: list[Frame] = []
-    at, end = 0, len(datagram)
-    while at < end:
-        if datagram[at] != MAGIC_1 or end - at < _OVERHEAD_1 + datagram[at + 1]:
+    at = 0
+    while at < len(datagram):
+        stop = frame_end(datagram, at) if datagram[at] == MAGIC_1 else 0
+        if not stop:
             refused["not MAVLink 1" if datagram[at] != MAGIC_1 else "truncated"] += 1
             break
-        data = datagram[at : at + _OVERHEAD_1 + datagram[at + 1]]
-        at += len(data)
+        data = datagram[at:stop]
+        at = stop
         layout = _LAYOUTS.get(data[5])
         if layout is None:
             refused["unknown message"] += 1
