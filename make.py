@@ -22,7 +22,8 @@ COMPILED = (
     "gcs/clocks.py gcs/control.py gcs/guard.py gcs/lockstep.py gcs/mavlink.py gcs/modes.py gcs/monitor.py gcs/rows.py "
     "gcs/sequence.py gcs/station.py gcs/telemetry.py gcs/vehicle.py sim_vehicles/autopilot.py sim_vehicles/clock.py "
     "sim_vehicles/dynamics.py sim_vehicles/fleet.py sim_vehicles/link_channel.py sim_vehicles/links.py "
-    "sim_vehicles/mavlink.py sim_vehicles/schedule.py sim_vehicles/setpoints.py sim_vehicles/vehicle.py "
+    "sim_vehicles/mavlink.py sim_vehicles/schedule.py sim_vehicles/setpoints.py sim_vehicles/shell.py "
+    "sim_vehicles/vehicle.py "
     "scenarios/signing/link.py scenarios/signing/stamps.py"
 )
 

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Never
 
 if TYPE_CHECKING:
     from scenarios.schema import Scenario
+    from sim_vehicles.shell import Change
     from sim_vehicles.truth import TruthLog
     from sim_vehicles.udp import Sockets
-    from sim_vehicles.vehicle import Change
 
 SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
 NS_PER_S = 1_000_000_000

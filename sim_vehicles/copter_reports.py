@@ -6,8 +6,7 @@ from typing import NamedTuple
 from sim_vehicles import mavlink, services
 from sim_vehicles.copter_dynamics import Motion
 from sim_vehicles.copter_rules import Rules
-from sim_vehicles.earth import ORIGIN_ALTITUDE_M, degrees
-from sim_vehicles.vehicle import GRAVITY_M_S2, HEARTBEAT_INTERVAL_US
+from sim_vehicles.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 
 READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
 """Estimator flags with all that is wanted; and attitude only, constant position mode, uninitialised."""
@@ -28,16 +27,15 @@ class Facts(NamedTuple):
     """It has a position. Without one it sends a global position of zeros and no local one, as ArduPilot does."""
 
 
-def intervals_us(rules: Rules) -> dict[int, int]:
-    """The messages that can be asked for, with the intervals they have unasked, 0 for none."""
-    silent = (
+def reported(rules: Rules) -> tuple[int, ...]:
+    """The messages that it sends if asked for them, besides those of every vehicle."""
+    return (
         mavlink.LOCAL_POSITION,
         mavlink.GLOBAL_POSITION,
         mavlink.GLOBAL_ORIGIN,
         mavlink.HOME_POSITION,
         rules.estimator_message,
     )
-    return {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, **dict.fromkeys(silent, 0)}
 
 
 def report(message_id: int, encoder: mavlink.Encoder, rules: Rules, facts: Facts, boot_ms: int) -> bytes | None:
@@ -48,9 +46,7 @@ def report(message_id: int, encoder: mavlink.Encoder, rules: Rules, facts: Facts
         frame = encoder.heartbeat(_base_mode(facts), facts.mode, _status(facts), rules.autopilot)
     elif message_id == rules.estimator_message:
         frame = encoder.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if facts.ready else NOT_READY_FLAGS)
-    elif message_id == mavlink.GLOBAL_POSITION:
-        frame = _global_position(encoder, motion, boot_ms, known=facts.ready)
-    elif message_id in services.EXTRA:
+    elif message_id == mavlink.GLOBAL_POSITION or message_id in services.EXTRA:
         frame = services.report(message_id, encoder, _condition(facts, boot_ms))
     elif message_id == mavlink.LOCAL_POSITION and facts.ready:
         north, east = motion.north_m - origin_north_m, motion.east_m - origin_east_m
@@ -73,20 +69,6 @@ def _status(facts: Facts) -> int:
     if facts.failsafe:
         return mavlink.STATUS_CRITICAL
     return mavlink.STATUS_STANDBY if facts.landed else mavlink.STATUS_ACTIVE
-
-
-def _global_position(encoder: mavlink.Encoder, motion: Motion, boot_ms: int, *, known: bool) -> bytes:
-    latitude, longitude = degrees(motion.north_m, motion.east_m) if known else (0.0, 0.0)
-    return encoder.global_position(
-        time_boot_ms=boot_ms,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        altitude_m=ORIGIN_ALTITUDE_M + motion.altitude_m,
-        relative_altitude_m=motion.altitude_m,
-        velocity_ne_m_s=motion[2:4],
-        velocity_down_m_s=-motion.climb_m_s,
-        heading_deg=math.degrees(motion.yaw_rad) % 360.0,
-    )
 
 
 def _condition(facts: Facts, boot_ms: int) -> services.Condition:

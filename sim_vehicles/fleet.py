@@ -12,12 +12,13 @@ from operator import itemgetter
 
 from scenarios import schema
 from scenarios.signing.link import SignedLink
-from sim_vehicles.copter import Copter
+from sim_vehicles.copter import Copter, multicopter
 from sim_vehicles.dynamics import State
 from sim_vehicles.links import NEVER_NS, Link, LinkSet
 from sim_vehicles.onboard import OnboardLoop
+from sim_vehicles.shell import Change, Shell
 from sim_vehicles.truth import Record
-from sim_vehicles.vehicle import Change, Vehicle
+from sim_vehicles.vehicle import Vehicle, launched
 
 Datagram = tuple[int, bytes, int]
 """(system id of the vehicle, bytes, host time in ns)"""
@@ -27,7 +28,7 @@ _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 @dataclass(slots=True)
 class _Member:
-    vehicle: Vehicle | Copter
+    vehicle: Shell[Vehicle] | Shell[Copter]
     up: Link
     down: Link
     signed: SignedLink | None = None
@@ -72,10 +73,10 @@ class Fleet:
         self._in_order = sensors or self._links.have_channels
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
             if scenario.dynamics == "autopilot":
-                vehicle = Copter(scenario, own, start_ns, record=record, signed=bool(signed))
+                vehicle = multicopter(scenario, own, start_ns, record=record, signed=bool(signed))
             else:
                 onboard = OnboardLoop(scenario, own.system_id, self._seen) if sensors else None
-                vehicle = Vehicle(scenario, own, start_ns, record=record, onboard=onboard)
+                vehicle = launched(scenario, own, start_ns, record=record, onboard=onboard)
             self._members[own.system_id] = _Member(
                 vehicle, *self._links.of(own.system_id), signed[own.system_id] if signed else None
             )
@@ -109,7 +110,7 @@ class Fleet:
             total.update(member.vehicle.counters)
         return total
 
-    def vehicle(self, system_id: int) -> Vehicle | Copter:
+    def vehicle(self, system_id: int) -> Shell[Vehicle] | Shell[Copter]:
         """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
         return self._members[system_id].vehicle
 
@@ -165,12 +166,12 @@ class Fleet:
         member = self._members[system_id]
         self._live(member, now_ns)
         self._plan(member)
-        return member.vehicle.state_at(now_ns)
+        return member.vehicle.craft.state_at(now_ns)
 
     def _seen(self, system_id: int, now_ns: int) -> State | None:
         """What a sensor sees of a vehicle: its true state now; everything before is done. None if it is not there."""
         member = self._members.get(system_id)
-        return None if member is None else member.vehicle.state_at(now_ns)
+        return None if member is None else member.vehicle.craft.state_at(now_ns)
 
     def _run_in_order(self, received: Iterable[Datagram], now_ns: int) -> None:
         """Let everything enter its link in order of time, from the station and from the vehicles, until now."""

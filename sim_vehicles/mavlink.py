@@ -20,6 +20,9 @@ HEADER_BYTES, CHECKSUM_BYTES, SIGNATURE_BYTES = dialect.HEADER_LEN_V2, 2, dialec
 SIGNED = dialect.MAVLINK_IFLAG_SIGNED
 
 COMPONENT_AUTOPILOT = dialect.MAV_COMP_ID_AUTOPILOT1
+OUR_COMPONENTS = (0, COMPONENT_AUTOPILOT)
+"""That a message to a vehicle is addressed to: all, or the autopilot."""
+UINT32 = 0xFFFFFFFF
 TYPE_GCS = dialect.MAV_TYPE_GCS
 MODE_STABILIZE, MODE_GUIDED, MODE_LOITER, MODE_BRAKE = 0, 4, 5, 17
 MODE_RETURN, MODE_LAND = 6, 9
@@ -116,7 +119,9 @@ class Timesync(NamedTuple):
     target_system: int
 
 
-Message = Setpoint | Command | Heartbeat | Timesync | Request
+Asked = Setpoint | Command | Request
+"""What is addressed to one vehicle and wants something of it."""
+Message = Heartbeat | Timesync | Asked
 
 
 def read_datagram(data: bytes, counters: Counter[str]) -> list[tuple[int, Message]]:
@@ -307,20 +312,14 @@ class Encoder:
         assert len(encoded) <= 50
         return self.pack(dialect.MAVLink_statustext_message(severity, encoded))
 
-    def message_interval(self, number: int, interval_us: int) -> bytes:
-        """MESSAGE_INTERVAL."""
-        return self.pack(dialect.MAVLink_message_interval_message(number, interval_us))
-
-    def autopilot_version(self, version: tuple[int, int, int], *, parameters_bytewise: bool) -> bytes:
+    def autopilot_version(self, version: tuple[int, int, int], *, parameters_bytewise: bool) -> dialect.MAVLink_message:
         """AUTOPILOT_VERSION: capabilities, the version as one under development, zeros for what is not there."""
         major, minor, patch = version
         encoding = _BYTEWISE if parameters_bytewise else _C_CAST
         none: Sequence[int] = (0,) * 8
         uid = self._pymavlink.srcSystem
-        return self.pack(
-            dialect.MAVLink_autopilot_version_message(
-                _CAPABILITIES | encoding, major << 24 | minor << 16 | patch << 8, 0, 0, 0, none, none, none, 0, 0, uid
-            )
+        return dialect.MAVLink_autopilot_version_message(
+            _CAPABILITIES | encoding, major << 24 | minor << 16 | patch << 8, 0, 0, 0, none, none, none, 0, 0, uid
         )
 
     def home_position(

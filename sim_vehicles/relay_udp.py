@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 from scenarios.schema import NS_PER_S
 from sim_vehicles.relay import Passing, Relay, holds_key, sender
+from sim_vehicles.shell import Change
 from sim_vehicles.truth import LINK_DOWN, LINK_UP
 from sim_vehicles.udp import LONGEST_WAIT_NS, Received, Sockets, undisturbed
-from sim_vehicles.vehicle import Change
 
 MOST_PEERS = 1000
 """Addresses that vehicles speak from; each vehicle may be started again a few times."""

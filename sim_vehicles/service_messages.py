@@ -170,6 +170,11 @@ def parameter_error(message: ParameterRead | ParameterSet, error: int) -> Messag
     return dialect.MAVLink_param_error_message(0, 0, message.name.encode("ascii", "replace")[:16], index, error)
 
 
+def message_interval(number: int, interval_us: int) -> Message:
+    """MESSAGE_INTERVAL."""
+    return dialect.MAVLink_message_interval_message(number, interval_us)
+
+
 def mission_count(message: Mission) -> Message:
     """MISSION_COUNT of a list without items."""
     return dialect.MAVLink_mission_count_message(*message.source, 0, message.kind)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from sim_vehicles import mavlink, service_messages
+from sim_vehicles.earth import ORIGIN_ALTITUDE_M
 from sim_vehicles.mavlink import ACCEPTED, DENIED, UNSUPPORTED, Command, Encoder
 from sim_vehicles.parameters import LIST_INTERVAL_US, Parameters
 from sim_vehicles.schedule import US_PER_MS, Schedule
@@ -57,7 +58,7 @@ FTP_FILE_NOT_FOUND, FTP_UNKNOWN_COMMAND = 10, 7
 
 
 class Condition(NamedTuple):
-    """What a vehicle knows of itself at one instant, for the messages of EXTRA."""
+    """What a vehicle knows of itself at one instant, for GLOBAL_POSITION_INT and the messages of EXTRA."""
 
     time_boot_ms: int
     place_deg: tuple[float, float]
@@ -72,9 +73,22 @@ class Condition(NamedTuple):
 
 
 def report(message_id: int, encoder: Encoder, condition: Condition) -> bytes:
-    """The frame of one of EXTRA."""
+    """The frame of GLOBAL_POSITION_INT or one of EXTRA."""
     north, east, down = condition.velocity_ned_m_s
     speed_m_s, heading_deg = math.hypot(north, east), math.degrees(condition.attitude_rad[2]) % 360.0
+    if message_id == mavlink.GLOBAL_POSITION:
+        # Without a position it says zeros, as ArduPilot does.
+        latitude_deg, longitude_deg = condition.place_deg if condition.has_position else (0.0, 0.0)
+        return encoder.global_position(
+            time_boot_ms=condition.time_boot_ms,
+            latitude_deg=latitude_deg,
+            longitude_deg=longitude_deg,
+            altitude_m=condition.altitude_m,
+            relative_altitude_m=condition.altitude_m - ORIGIN_ALTITUDE_M,
+            velocity_ne_m_s=(north, east),
+            velocity_down_m_s=down,
+            heading_deg=heading_deg,
+        )
     if message_id == SYS_STATUS:
         message = service_messages.sys_status(has_position=condition.has_position)
     elif message_id == EXTENDED_SYS_STATE:
@@ -143,8 +157,8 @@ class Services:
             self._set(PARAMETER_VALUE, 0, time_ns)
         return frame
 
-    def command(self, command: Command, time_ns: int) -> tuple[int, list[bytes]]:
-        """The MAV_RESULT of a command about messages, and what is sent at once; a report comes in its turn."""
+    def command(self, command: Command, time_ns: int) -> tuple[int, list[service_messages.Message]]:
+        """The MAV_RESULT of a command about messages, and what is sent after it; a report comes in its turn."""
         number, message_id, second = command.command, whole(command.param1), whole(command.param2)
         wants_message = number == mavlink.COMMAND_REQUEST
         if number == mavlink.COMMAND_INTERVAL:
@@ -181,17 +195,18 @@ class Services:
         self._schedule.add_once(message_id, time_ns)
         return ACCEPTED
 
-    def _greet(self, time_ns: int) -> tuple[int, list[bytes]]:
+    def _greet(self, time_ns: int) -> tuple[int, list[service_messages.Message]]:
         """AUTOPILOT_VERSION, and the beginning of what whoever asks for it takes for granted."""
         for message_id, interval_us in GREETED_US.items():
             if not self._schedule.interval_us(message_id):
                 self._set(message_id, interval_us, time_ns)
         return ACCEPTED, [self._encoder.autopilot_version(self._version, parameters_bytewise=self.parameters.bytewise)]
 
-    def _interval(self, message_id: int | None) -> tuple[int, list[bytes]]:
+    def _interval(self, message_id: int | None) -> tuple[int, list[service_messages.Message]]:
         if message_id not in self._defaults_us:
             return DENIED, []
-        return ACCEPTED, [self._encoder.message_interval(message_id, self._schedule.interval_us(message_id) or -1)]
+        interval_us = self._schedule.interval_us(message_id) or -1
+        return ACCEPTED, [service_messages.message_interval(message_id, interval_us)]
 
     def _set(self, message_id: int, interval_us: int, time_ns: int) -> None:
         if message_id != mavlink.HEARTBEAT:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from scenarios.schema import NS_PER_S
 from sim_vehicles.fleet import Datagram, Fleet
-from sim_vehicles.vehicle import Change
+from sim_vehicles.shell import Change
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
 """Before a due time the loop stops sleeping and looks at the clock this long: with few vehicles, waking from sleep is

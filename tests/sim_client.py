@@ -5,7 +5,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.schema import Clocks, Limits, Link, Links, NominalVelocity, Safety, Scenario, Vehicle
+from sim_vehicles.shell import Shell
 from sim_vehicles.vehicle import Vehicle as SimulatedVehicle
+from sim_vehicles.vehicle import launched
 
 SECOND = 1_000_000_000
 MS = 1_000_000
@@ -49,10 +51,10 @@ def scenario(
     )
 
 
-def a_vehicle(**settings: Any) -> SimulatedVehicle:
+def a_vehicle(**settings: Any) -> Shell[SimulatedVehicle]:
     """The first vehicle of such a scenario, on the launcher at START."""
     flown = scenario(**settings)
-    return SimulatedVehicle(flown, flown.vehicles[0], START)
+    return launched(flown, flown.vehicles[0], START)
 
 
 def pack(message: dialect.MAVLink_message) -> bytes:
@@ -116,8 +118,8 @@ def setpoint(
     )
 
 
-def take_off(vehicle: SimulatedVehicle, time_ns: int = START) -> None:
+def take_off(vehicle: Shell[SimulatedVehicle], time_ns: int = START) -> None:
     """Arm, GUIDED, and a first set-point that wants no acceleration, all at one instant."""
     system = vehicle.system_id
     vehicle.step([(frame, time_ns) for frame in (arm(system), guided(system), setpoint(system=system))], time_ns)
-    assert vehicle.autopilot.flying
+    assert vehicle.craft.autopilot.flying

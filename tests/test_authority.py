@@ -14,9 +14,9 @@ from gcs.plan import flight_plan
 from gcs.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains
-from sim_vehicles.copter import Copter
+from sim_vehicles.copter import Copter, multicopter
 from sim_vehicles.fleet import Fleet
-from sim_vehicles.vehicle import Vehicle
+from sim_vehicles.shell import Craft, Shell
 
 OTHER = 245
 
@@ -30,9 +30,9 @@ def command_from_another(number: int, *parameters: float) -> bytes:
     return from_another(dialect.MAVLink_command_long_message(1, 1, number, 0, *padded))
 
 
-def a_copter() -> Copter:
+def a_copter() -> Shell[Copter]:
     flown = scenario()
-    return Copter(flown, flown.vehicles[0], START)
+    return multicopter(flown, flown.vehicles[0], START)
 
 
 COMMANDS = {
@@ -51,7 +51,7 @@ COMMANDS = {
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("make", [a_vehicle, a_copter])
 def test_what_another_system_wants_is_refused_and_counted_and_changes_nothing(
-    make: Callable[[], Vehicle | Copter], name: str
+    make: Callable[[], Shell[Craft]], name: str
 ) -> None:
     hit, calm = make(), make()
     for vehicle in (hit, calm):
@@ -63,7 +63,7 @@ def test_what_another_system_wants_is_refused_and_counted_and_changes_nothing(
     texts = [message.text for data, _ in told if (message := parse(data)).get_type() == "STATUSTEXT"]
     assert texts == ["refused: system 245, obeys system 255"]
     assert "COMMAND_ACK" not in {parse(data).get_type() for data, _ in told}
-    assert hit.state_at(START + 3 * SECOND) == calm.state_at(START + 3 * SECOND)
+    assert hit.craft.state_at(START + 3 * SECOND) == calm.craft.state_at(START + 3 * SECOND)
     later = [
         [(parse(data).get_type(), time_ns) for data, time_ns in vehicle.step([], START + 4 * SECOND)]
         for vehicle in (hit, calm)
@@ -81,7 +81,7 @@ def test_another_station_may_ask() -> None:
 
 
 @pytest.mark.parametrize("make", [a_vehicle, a_copter])
-def test_a_display_that_comes_first_does_not_keep_the_station_out(make: Callable[[], Vehicle | Copter]) -> None:
+def test_a_display_that_comes_first_does_not_keep_the_station_out(make: Callable[[], Shell[Craft]]) -> None:
     """What other people's ground stations send by themselves when they find a vehicle, before anybody flies it."""
     vehicle = make()
     shown = [command_from_another(512, 148), COMMANDS["stream"], COMMANDS["interval"], command_from_another(520, 1)]
@@ -106,7 +106,7 @@ def test_heartbeats_of_another_station_do_not_keep_the_failsafe_away() -> None:
         time_ns = START + tenth * SECOND // 10
         own = [(heartbeat(), time_ns)] if tenth <= 10 else []
         vehicle.step([(other, time_ns), *own], time_ns)
-    assert vehicle.autopilot.failsafe
+    assert vehicle.craft.autopilot.failsafe
     assert vehicle.counters["heartbeats"] < 30
 
 

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from scenarios.schema import Autopilot, ClockJump, Flavour, Scenario
-from sim_vehicles.copter import Copter
+from sim_vehicles.copter import Copter, multicopter
+from sim_vehicles.shell import Shell
 from tests.sim_client import MS, SECOND, START, arm, command, mode, parse_all, scenario, setpoint
 
 VELOCITY_ACCELERATION, VELOCITY, ACCELERATION = 0x0C07, 0x0DC7, 0x0C3F
@@ -26,19 +27,19 @@ def of_copters(flavour: Flavour = "ardupilot", **settings: Any) -> Scenario:
     )
 
 
-def copter(flavour: Flavour = "ardupilot", **settings: Any) -> Copter:
+def copter(flavour: Flavour = "ardupilot", **settings: Any) -> Shell[Copter]:
     flown = of_copters(flavour, **settings)
-    return Copter(flown, flown.vehicles[0], START)
+    return multicopter(flown, flown.vehicles[0], START)
 
 
-def tell(vehicle: Copter, data: bytes, at_s: float, kind: str = "COMMAND_ACK") -> list[Any]:
+def tell(vehicle: Shell[Copter], data: bytes, at_s: float, kind: str = "COMMAND_ACK") -> list[Any]:
     """Messages of a kind that the vehicle sends at once when told something `at_s` after its start."""
     time_ns = START + round(at_s * SECOND)
     vehicle.step([], time_ns - 1)
     return [message for message, _ in parse_all(vehicle.step([(data, time_ns)], time_ns), kind)]
 
 
-def result(vehicle: Copter, data: bytes, at_s: float) -> int:
+def result(vehicle: Shell[Copter], data: bytes, at_s: float) -> int:
     (ack,) = tell(vehicle, data, at_s)
     return ack.result
 
@@ -51,7 +52,7 @@ def take_off_px4(altitude_m: float, place: float = math.nan) -> bytes:
     return command(22, 0, 0, 0, math.nan, place, place, GROUND_M + altitude_m)
 
 
-def airborne(flavour: Flavour = "ardupilot", **settings: Any) -> tuple[Copter, float]:
+def airborne(flavour: Flavour = "ardupilot", **settings: Any) -> tuple[Shell[Copter], float]:
     """A vehicle that hovers at 20 m, under velocity control and at rest, and the time in s since its start."""
     vehicle = copter(flavour, **settings)
     if flavour == "ardupilot":
@@ -60,7 +61,7 @@ def airborne(flavour: Flavour = "ardupilot", **settings: Any) -> tuple[Copter, f
         told = [arm(), take_off_px4(20.0)]
     assert [result(vehicle, data, 5.0 + 0.1 * k) for k, data in enumerate(told)] == [0] * len(told)
     tell(vehicle, setpoint(mask=VELOCITY_ACCELERATION), 30.0)
-    assert vehicle.motion.altitude_m == pytest.approx(20.0, abs=0.5)
+    assert vehicle.craft.motion.altitude_m == pytest.approx(20.0, abs=0.5)
     if flavour == "px4":
         assert result(vehicle, px4_mode(6), 30.1) == 0
     return vehicle, 30.2
@@ -119,11 +120,11 @@ def test_px4_takes_off_to_an_altitude_above_sea_level_and_then_holds() -> None:
     assert result(vehicle, take_off_px4(20.0 - GROUND_M), 5.0) == 1  # below the ground
     assert result(vehicle, take_off_px4(20.0, 0.0), 5.05) == 2  # at latitude and longitude 0
     assert result(vehicle, take_off_px4(20.0), 5.1) == 0
-    assert vehicle.mode == PX4_TAKEOFF
+    assert vehicle.craft.mode == PX4_TAKEOFF
     assert result(vehicle, arm(), 5.2) == 0
     vehicle.step([], START + 30 * SECOND)
-    assert vehicle.mode == PX4_HOLD
-    assert vehicle.motion.altitude_m == pytest.approx(20.0, abs=0.5)
+    assert vehicle.craft.mode == PX4_HOLD
+    assert vehicle.craft.motion.altitude_m == pytest.approx(20.0, abs=0.5)
 
 
 def test_offboard_is_entered_only_while_set_points_come() -> None:
@@ -133,26 +134,26 @@ def test_offboard_is_entered_only_while_set_points_come() -> None:
     assert result(vehicle, px4_mode(6), 7.5) == 1
     tell(vehicle, setpoint(mask=VELOCITY_ACCELERATION), 8.0)
     assert result(vehicle, px4_mode(6), 8.9) == 0
-    assert vehicle.mode == PX4_OFFBOARD
+    assert vehicle.craft.mode == PX4_OFFBOARD
 
 
 def test_px4_leaves_offboard_a_second_after_the_last_set_point() -> None:
     vehicle, at_s = airborne("px4")
     tell(vehicle, setpoint(mask=VELOCITY_ACCELERATION, velocity=(3.0, 0.0)), at_s)
     vehicle.step([], START + round((at_s + 0.99) * SECOND))
-    assert vehicle.mode == PX4_OFFBOARD
+    assert vehicle.craft.mode == PX4_OFFBOARD
     vehicle.step([], START + round((at_s + 1.01) * SECOND))
-    assert (vehicle.mode, vehicle.failsafe) == (PX4_HOLD, True)
+    assert (vehicle.craft.mode, vehicle.craft.failsafe) == (PX4_HOLD, True)
 
 
 def test_ardupilot_stops_three_seconds_after_the_last_set_point_and_stays_guided() -> None:
     vehicle, at_s = airborne()
     tell(vehicle, setpoint(mask=VELOCITY_ACCELERATION, velocity=(3.0, 0.0)), at_s)
     vehicle.step([], START + round((at_s + 3.0) * SECOND))
-    assert vehicle.motion.velocity_north_m_s == pytest.approx(3.0, abs=0.05)
+    assert vehicle.craft.motion.velocity_north_m_s == pytest.approx(3.0, abs=0.05)
     vehicle.step([], START + round((at_s + 9.0) * SECOND))
-    assert vehicle.motion.velocity_north_m_s == pytest.approx(0.0, abs=0.01)
-    assert vehicle.mode == 4
+    assert vehicle.craft.motion.velocity_north_m_s == pytest.approx(0.0, abs=0.01)
+    assert vehicle.craft.mode == 4
 
 
 def test_a_set_point_ends_a_guided_take_off_where_it_is() -> None:
@@ -161,7 +162,7 @@ def test_a_set_point_ends_a_guided_take_off_where_it_is() -> None:
         assert result(vehicle, data, 5.0 + 0.1 * k) == 0
     for k in range(100):
         tell(vehicle, setpoint(mask=VELOCITY_ACCELERATION), 8.0 + 0.2 * k)
-    assert 2.0 < vehicle.motion.altitude_m < 15.0
+    assert 2.0 < vehicle.craft.motion.altitude_m < 15.0
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
@@ -169,9 +170,9 @@ def test_one_that_does_not_take_off_disarms_after_ten_seconds(flavour: Flavour) 
     vehicle = copter(flavour)
     assert result(vehicle, arm(), 5.0) == 0
     vehicle.step([], START + 14 * SECOND)
-    assert vehicle.armed
+    assert vehicle.craft.armed
     vehicle.step([], START + 16 * SECOND)
-    assert not vehicle.armed
+    assert not vehicle.craft.armed
 
 
 @pytest.mark.parametrize(
@@ -191,8 +192,8 @@ def test_masks_mean_what_arducopter_makes_of_them(mask: int, reason: str) -> Non
     assert vehicle.counters[reason] == before + 1
     vehicle.step([], START + round((at_s + 2.0) * SECOND))
     moves = reason == "setpoints"
-    assert (abs(vehicle.motion.velocity_north_m_s) > 0.5) == (moves and not mask & 8)
-    assert (vehicle.motion.velocity_east_m_s > 0.5) == (moves and not mask & 64)
+    assert (abs(vehicle.craft.motion.velocity_north_m_s) > 0.5) == (moves and not mask & 8)
+    assert (vehicle.craft.motion.velocity_east_m_s > 0.5) == (moves and not mask & 64)
 
 
 def integrated(
@@ -212,11 +213,12 @@ def integrated(
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_the_response_to_a_set_point_is_the_lag_of_the_scenario(flavour: Flavour) -> None:
     vehicle, at_s = airborne(flavour, lag_s=0.3, velocity_gain_1_s=1.5)
-    start_m = vehicle.motion.north_m
+    start_m = vehicle.craft.motion.north_m
     tell(vehicle, setpoint(0.7, 0.0, velocity=(1.2, 0.0), mask=VELOCITY_ACCELERATION), at_s)
     tell(vehicle, command(0), at_s + 0.9)  # whatever it is told, it is brought up to date
-    expected = integrated(flavour, vehicle.settings, (1.2, 0.7), 0.9)
-    found = vehicle.motion.north_m - start_m, vehicle.motion.velocity_north_m_s, vehicle.motion.acceleration_north_m_s2
+    expected = integrated(flavour, vehicle.craft.settings, (1.2, 0.7), 0.9)
+    motion = vehicle.craft.motion
+    found = motion.north_m - start_m, motion.velocity_north_m_s, motion.acceleration_north_m_s2
     assert found == pytest.approx(expected.tolist(), abs=1e-6)  # RK4 with steps of 10 ms against a lag of 300 ms
 
 
@@ -226,8 +228,8 @@ def test_acceleration_and_speed_keep_to_their_limits_whichever_way_they_point() 
     speeds: list[float] = []
     for k in range(200):
         tell(vehicle, setpoint(30.0, -40.0, mask=ACCELERATION), at_s + 0.05 * k)
-        accelerations.append(math.hypot(*vehicle.motion[4:6]))
-        speeds.append(math.hypot(*vehicle.motion[2:4]))
+        accelerations.append(math.hypot(*vehicle.craft.motion[4:6]))
+        speeds.append(math.hypot(*vehicle.craft.motion[2:4]))
     assert max(accelerations) == pytest.approx(2.0, abs=1e-6)
     assert max(speeds) == pytest.approx(6.0, abs=1e-6)
 
@@ -235,7 +237,7 @@ def test_acceleration_and_speed_keep_to_their_limits_whichever_way_they_point() 
 def test_each_vehicle_counts_from_an_origin_of_its_own_and_says_where_it_is() -> None:
     flown = of_copters()
     for own in flown.vehicles:
-        vehicle = Copter(flown, own, START)
+        vehicle = multicopter(flown, own, START)
         for number in (32, 49):
             vehicle.step(
                 [(command(511, number, 1_000_000, system=own.system_id), START + 3 * SECOND)], START + 3 * SECOND
@@ -253,7 +255,7 @@ def test_it_lands_where_it_is_told_to_and_disarms(flavour: Flavour) -> None:
     vehicle, at_s = airborne(flavour)
     assert result(vehicle, mode(9) if flavour == "ardupilot" else px4_mode(4, 6), at_s) == 0
     vehicle.step([], START + round((at_s + 40.0) * SECOND))
-    assert (vehicle.landed, vehicle.armed) == (True, False)
+    assert (vehicle.craft.landed, vehicle.craft.armed) == (True, False)
 
 
 def test_a_clock_jump_shows_in_every_stamp_from_then_on() -> None:

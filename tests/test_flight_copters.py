@@ -61,9 +61,9 @@ class Flight:
         return [event.text for event in self.events if event.kind == kind]
 
     def copter(self, system_id: int) -> Copter:
-        vehicle = self.fleet.vehicle(system_id)
-        assert isinstance(vehicle, Copter)
-        return vehicle
+        craft = self.fleet.vehicle(system_id).craft
+        assert isinstance(craft, Copter)
+        return craft
 
 
 def fly(plan: FlightPlan, fleet: Fleet | None = None, start_ns: int = START_NS) -> Flight:
@@ -234,7 +234,7 @@ def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str,
     flight = fly(plan_for(scenario))
     assert flight.station.end_reason == "completed: duration reached"
     assert flight.texts("vehicle").count("its clock jumped") == 3
-    assert all(flight.copter(k).counters["timesync_replies"] >= 2 for k in (1, 2, 3))  # to requests of their own
+    assert all(flight.fleet.vehicle(k).counters["timesync_replies"] >= 2 for k in (1, 2, 3))  # to requests of their own
     time_s = flight.flown["time_s"]
     assert time_s[0] + 2.0 < 25.0 - (flight.flown["due_ns"][0] - START_NS) * 1e-9 < time_s[-1]  # it was in flight
     assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
@@ -277,7 +277,7 @@ def test_after_an_outage_longer_than_the_time_outs_the_vehicle_is_called_back(fl
     assert flight.station.end_reason == "completed: duration reached"
     assert "is lost" in flight.texts("vehicle")
     assert flight.error_m(3)[-1] < 0.17
-    assert flight.copter(3).counters["setpoints"] > 1000
+    assert flight.fleet.vehicle(3).counters["setpoints"] > 1000
 
 
 @pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 6), ("px4", 4 << 16 | 5 << 24)])
@@ -310,7 +310,6 @@ def fly_with_a_pilot(flavour: str, modes: dict[float, int]) -> Flight:
         if wanted and tick["time_s"][0] > wanted[0][0]:
             # what a switch of its remote control does is the command, without a link
             vehicle, (_, mode) = fleet.vehicle(3), wanted.popleft()
-            assert isinstance(vehicle, Copter)
             packed = (mode >> 16 & 0xFF, mode >> 24) if flavour == "px4" else (mode, 0)
             vehicle.step([(command(176, 1, *packed, system=3), int(tick["due_ns"][0]))], int(tick["due_ns"][0]))
     return Flight(station, fleet, np.concatenate(ticks), station.events)

@@ -59,7 +59,7 @@ def onboard(name: str, **update: Any) -> Scenario:
 
 
 def vehicle(fleet: Fleet, system_id: int) -> Vehicle:
-    found = fleet.vehicle(system_id)
+    found = fleet.vehicle(system_id).craft
     assert isinstance(found, Vehicle)
     return found
 
@@ -115,7 +115,7 @@ def test_a_gain_that_a_vehicle_does_not_take_ends_the_start_in_one_line_and_noth
     assert list(fly_lockstep(station.plan, station=station, vehicles=fleet))
     assert station.end_reason.startswith("refused: vehicle 2: parameter FORM_KP_NN reads 0 after 20000")
     assert not vehicle(fleet, 2).autopilot.armed
-    assert vehicle(fleet, 2).counters["refused_parameter_value"] > 0
+    assert fleet.vehicle(2).counters["refused_parameter_value"] > 0
 
 
 def test_flights_are_the_same_to_the_last_bit_and_the_seed_moves_the_sensors() -> None:

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sim_client import SECOND, START, a_vehicle, arm, heartbeat, mode, pack, parse_all, setpoint, take_off
 
-from sim_vehicles.copter import Copter
-from sim_vehicles.vehicle import Vehicle
+from sim_vehicles.shell import Craft, Shell
 from tests.vehicle_kinds import VEHICLES, copter
 
 REAL32, INT32 = dialect.MAV_PARAM_TYPE_REAL32, dialect.MAV_PARAM_TYPE_INT32
@@ -33,7 +32,7 @@ def put(name: str, value: float, kind: int = REAL32) -> bytes:
     return pack(dialect.MAVLink_param_set_message(1, 1, name.encode(), value, kind))
 
 
-def told(vehicle: Vehicle | Copter, data: bytes, at_s: float = 5.0) -> list[Any]:
+def told(vehicle: Shell[Craft], data: bytes, at_s: float = 5.0) -> list[Any]:
     """PARAM_VALUE and PARAM_ERROR that a vehicle sends at once when it is told something."""
     time_ns = START + round(at_s * SECOND)
     vehicle.step([], time_ns - 1)
@@ -41,7 +40,7 @@ def told(vehicle: Vehicle | Copter, data: bytes, at_s: float = 5.0) -> list[Any]
     return [m for m, _ in sent if m.get_type() in ("PARAM_VALUE", "PARAM_ERROR")]
 
 
-def listed(vehicle: Vehicle | Copter, at_s: float = 5.0) -> list[tuple[Any, int]]:
+def listed(vehicle: Shell[Craft], at_s: float = 5.0) -> list[tuple[Any, int]]:
     told(vehicle, ask_list(), at_s)
     return parse_all(vehicle.step([], START + round((at_s + 5.0) * SECOND)), "PARAM_VALUE")
 

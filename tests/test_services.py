@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.copter import Copter
-from sim_vehicles.vehicle import Vehicle
+from sim_vehicles.shell import Craft, Shell
 from tests.sim_client import (
     MS,
     SECOND,
@@ -39,7 +39,7 @@ STATION = (255, 190)
 FLYING = {"plain": 0, "ardupilot": 4, "px4": 6 << 16}
 
 
-def sent_after(vehicle: Vehicle | Copter, data: bytes, at_s: float, until_s: float) -> list[Any]:
+def sent_after(vehicle: Shell[Craft], data: bytes, at_s: float, until_s: float) -> list[Any]:
     """What a vehicle sends from the instant it is told something to a later one, in s since its start."""
     begin_ns = START + round(at_s * SECOND)
     vehicle.step([], begin_ns - 1)
@@ -268,7 +268,7 @@ def test_a_take_off_command_launches_a_plain_vehicle_which_then_waits_for_set_po
     beats = [(heartbeat(), START + k * SECOND) for k in range(2, 11)]
     sent = [m for m, _ in parse_all(vehicle.step(beats, START + 11 * SECOND))]
     assert not named(sent, "STATUSTEXT")
-    assert vehicle.state_at(START + 11 * SECOND).north_m == pytest.approx(40.0 * 10.0)
+    assert vehicle.craft.state_at(START + 11 * SECOND).north_m == pytest.approx(40.0 * 10.0)
     silent = [m for m, _ in parse_all(vehicle.step([], START + 14 * SECOND))]
     assert [m.text for m in named(silent, "STATUSTEXT")] == ["failsafe: station heartbeat stopped"]
 
@@ -296,12 +296,12 @@ def test_a_plain_vehicle_takes_the_velocity_that_clients_send(frame: int, mask: 
     for k in range(200):
         at = START + k * 50 * MS
         vehicle.step([(heartbeat(), at), (velocity_setpoint(frame, mask, (30.0, 0.0, 0.0)), at)], at)
-    found = vehicle.state_at(START + 10 * SECOND).velocity_ne_m_s()
+    found = vehicle.craft.state_at(START + 10 * SECOND).velocity_ne_m_s()
     wanted = (30.0, 0.0) if frame == 1 else (30.0 * math.cos(course), 30.0 * math.sin(course))
     assert found == pytest.approx(wanted, abs=1e-3)
 
 
-def hovering(kind: str) -> tuple[Copter, int]:
+def hovering(kind: str) -> tuple[Shell[Copter], int]:
     """A copter at 10 m under velocity control."""
     vehicle = copter("px4" if kind == "px4" else "ardupilot")
     told = [arm(), command(22, 0, 0, 0, math.nan, math.nan, math.nan, 594.0)]
@@ -313,7 +313,7 @@ def hovering(kind: str) -> tuple[Copter, int]:
     vehicle.step([(velocity_setpoint(1, 0xDC7, (0.0, 0.0, 0.0)), now)], now)
     if kind == "px4":
         vehicle.step([(command(176, 1, 6), now)], now)
-    assert (vehicle.mode, vehicle.motion.altitude_m) == (FLYING[kind], pytest.approx(10.0, abs=0.5))
+    assert (vehicle.craft.mode, vehicle.craft.motion.altitude_m) == (FLYING[kind], pytest.approx(10.0, abs=0.5))
     return vehicle, now
 
 
@@ -324,7 +324,7 @@ def test_what_is_ignored_may_be_nan_and_what_counts_may_not(kind: str) -> None:
     for k in range(60):
         at = now + k * 50 * MS
         vehicle.step([(velocity_setpoint(1, 0xDC7, (2.0, 0.0, 0.0), nan, nan, other=nan), at)], at)
-    assert vehicle.motion.velocity_north_m_s == pytest.approx(2.0, abs=0.01)
+    assert vehicle.craft.motion.velocity_north_m_s == pytest.approx(2.0, abs=0.01)
     assert vehicle.counters["refused_absurd"] == 0
     bad = [((nan, 0.0, 0.0), 0.0, 0.0), ((2.0, 0.0, 0.0), nan, 0.0), ((2.0, 0.0, 0.0), 0.0, nan)]
     for velocity, yaw, rate in bad:
@@ -354,13 +354,13 @@ def test_a_copter_turns_to_the_yaw_it_is_given_and_flies_forward_along_it(kind: 
     for k in range(100):
         at = now + k * 50 * MS
         vehicle.step([(velocity_setpoint(1, 0x9C7, (0.0, 0.0, 0.0), math.radians(-120.0)), at)], at)
-    assert math.degrees(vehicle.motion.yaw_rad) == pytest.approx(-120.0, abs=1e-4)  # a float32
+    assert math.degrees(vehicle.craft.motion.yaw_rad) == pytest.approx(-120.0, abs=1e-4)  # a float32
     for k in range(100, 200):
         at = now + k * 50 * MS
         vehicle.step([(velocity_setpoint(8, 0xDC7, (2.0, 1.0, 0.0)), at)], at)
     forward, right = math.radians(-120.0), math.radians(-30.0)
     wanted = (2.0 * math.cos(forward) + math.cos(right), 2.0 * math.sin(forward) + math.sin(right))
-    assert vehicle.motion[2:4] == pytest.approx(wanted, abs=1e-2)
+    assert vehicle.craft.motion[2:4] == pytest.approx(wanted, abs=1e-2)
 
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
@@ -369,11 +369,11 @@ def test_a_copter_flies_home_when_it_is_told_to_and_lands_there(kind: str) -> No
     for k in range(50):
         at = now + k * 50 * MS
         vehicle.step([(velocity_setpoint(1, 0xDC7, (5.0, -5.0, 0.0)), at)], at)
-    assert math.dist(vehicle.motion[:2], vehicle.home_ne_m) > 10.0
+    assert math.dist(vehicle.craft.motion[:2], vehicle.craft.home_ne_m) > 10.0
     assert acknowledged(sent_after(vehicle, command(20), 27.5, 27.5), 20) == ACCEPTED
     vehicle.step([], START + 90 * SECOND)
-    assert (vehicle.landed, vehicle.armed) == (True, False)
-    assert math.dist(vehicle.motion[:2], vehicle.home_ne_m) < 1.0
+    assert (vehicle.craft.landed, vehicle.craft.armed) == (True, False)
+    assert math.dist(vehicle.craft.motion[:2], vehicle.craft.home_ne_m) < 1.0
 
 
 @pytest.mark.parametrize("kind", VEHICLES)

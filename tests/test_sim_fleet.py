@@ -95,7 +95,7 @@ def test_a_round_trip_takes_exactly_both_delays() -> None:
     replies = {k: (parse(data), due) for k, data, due in out if parse(data).get_type() == "TIMESYNC"}
     assert {k: due - sent_ns for k, (_, due) in replies.items()} == {1: 80 * MS, 2: 250 * MS, 3: 30 * MS}
     for k, arrival_ns in ((1, sent_ns + 50 * MS), (2, sent_ns + 50 * MS), (3, sent_ns)):
-        assert replies[k][0].tc1 == fleet.vehicle(k).clock.boot_ns(arrival_ns)
+        assert replies[k][0].tc1 == fleet.vehicle(k).radio.clock.boot_ns(arrival_ns)
 
 
 def test_the_true_state_is_known_at_any_time() -> None:

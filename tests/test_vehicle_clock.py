@@ -9,7 +9,7 @@ from sim_client import MS, SECOND, START, a_vehicle, command, guided, parse_all,
 
 from scenarios.schema import Clocks
 from sim_vehicles.clock import BootClock
-from sim_vehicles.vehicle import Vehicle
+from sim_vehicles.vehicle import launched
 
 times = st.integers(0, 10**15)
 clocks = st.builds(BootClock, times, times, st.integers(-(10**7), 10**7))
@@ -41,7 +41,7 @@ def test_a_drifting_clock_gains_its_drift() -> None:
 def test_positions_are_sampled_exactly_on_the_millisecond_they_name() -> None:
     vehicle = a_vehicle(seed=3, drift_max_ppm=10_000.0)
     take_off(vehicle)
-    start = vehicle.state_at(START)
+    start = vehicle.craft.state_at(START)
     vehicle.step([(command(511, 32, 20_000), START)], START)
     sent: list[tuple[bytes, int]] = []
     now = START
@@ -51,7 +51,7 @@ def test_positions_are_sampled_exactly_on_the_millisecond_they_name() -> None:
     positions = parse_all(sent, "LOCAL_POSITION_NED")
     assert len(positions) in (24, 25)  # 0.5 s at 50 Hz of a clock that is up to 1 % off
     for message, time_ns in positions:
-        assert 0 <= vehicle.clock.boot_ns(time_ns) - message.time_boot_ms * MS <= 1
+        assert 0 <= vehicle.radio.clock.boot_ns(time_ns) - message.time_boot_ms * MS <= 1
         flown_s = (time_ns - START) / SECOND
         assert message.x == pytest.approx(start.north_m + 40.0 * flown_s, abs=1e-5)  # float32 of some 20 m
         assert message.vy == pytest.approx(9.0, abs=1e-6)
@@ -80,9 +80,9 @@ def test_asking_for_the_same_rate_again_moves_no_sample() -> None:
 
 def test_two_vehicles_do_not_share_a_clock() -> None:
     flown = scenario(2)
-    first, second = (Vehicle(flown, own, START) for own in flown.vehicles)
-    assert first.clock.boot_ns(START) != second.clock.boot_ns(START)
-    assert first.clock.drift_ppb != second.clock.drift_ppb
+    first, second = (launched(flown, own, START) for own in flown.vehicles)
+    assert first.radio.clock.boot_ns(START) != second.radio.clock.boot_ns(START)
+    assert first.radio.clock.drift_ppb != second.radio.clock.drift_ppb
 
 
 def test_unasked_it_sends_a_heartbeat_at_once_and_then_slowly() -> None:

@@ -7,15 +7,16 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sim_client import MS, SECOND, START, a_vehicle, arm, command, guided, mode, pack, parse_all, setpoint, take_off
 
+from sim_vehicles.shell import Shell
 from sim_vehicles.vehicle import Vehicle
 
 
-def answers(vehicle: Vehicle, request: bytes, time_ns: int = START) -> list[Any]:
+def answers(vehicle: Shell[Vehicle], request: bytes, time_ns: int = START) -> list[Any]:
     """What is sent at the instant of a request, because of it."""
     return [m for m, t in parse_all(vehicle.step([(request, time_ns)], time_ns)) if t == time_ns]
 
 
-def result(vehicle: Vehicle, request: bytes, time_ns: int = START) -> int:
+def result(vehicle: Shell[Vehicle], request: bytes, time_ns: int = START) -> int:
     """The result of a command, acknowledged to who asked."""
     (ack,) = [m for m in answers(vehicle, request, time_ns) if m.get_type() == "COMMAND_ACK"]
     assert (ack.target_system, ack.target_component) == (255, 190)
@@ -23,7 +24,7 @@ def result(vehicle: Vehicle, request: bytes, time_ns: int = START) -> int:
     return ack.result
 
 
-def last_heartbeat(vehicle: Vehicle, now_ns: int) -> Any:
+def last_heartbeat(vehicle: Shell[Vehicle], now_ns: int) -> Any:
     return parse_all(vehicle.step([], now_ns + SECOND), "HEARTBEAT")[-1][0]
 
 
@@ -51,18 +52,18 @@ def test_arming_and_guided_show_in_the_heartbeat_and_flight_as_active() -> None:
 
 def test_it_stays_on_the_launcher_until_armed_guided_and_given_a_set_point() -> None:
     vehicle = a_vehicle()
-    start = vehicle.state_at(START)
+    start = vehicle.craft.state_at(START)
     vehicle.step([(setpoint(1.0), START)], START)
     vehicle.step([(arm(), START), (setpoint(1.0), START)], START)
     assert vehicle.counters["ignored_not_armed"] == 1
     assert vehicle.counters["ignored_not_guided"] == 1
     sent = vehicle.step([(guided(), START)], START + 10 * SECOND)
-    assert vehicle.state_at(START + 10 * SECOND) == start
+    assert vehicle.craft.state_at(START + 10 * SECOND) == start
     position = parse_all(sent, "LOCAL_POSITION_NED")[-1][0]
     assert (position.x, position.y) == (0.0, 10.0)
     assert (position.vx, position.vy) == pytest.approx((40.0, 9.0))
     vehicle.step([(setpoint(2.0), START + 10 * SECOND)], START + 10 * SECOND)
-    state = vehicle.state_at(START + 11 * SECOND)
+    state = vehicle.craft.state_at(START + 11 * SECOND)
     assert state[:2] == pytest.approx((41.0, 19.0))
 
 
@@ -70,11 +71,11 @@ def test_on_the_launcher_it_can_be_disarmed_but_in_flight_it_cannot() -> None:
     vehicle = a_vehicle()
     assert result(vehicle, arm()) == dialect.MAV_RESULT_ACCEPTED
     assert result(vehicle, command(400, 0)) == dialect.MAV_RESULT_ACCEPTED
-    assert not vehicle.autopilot.armed
+    assert not vehicle.craft.autopilot.armed
     take_off(vehicle)
     assert result(vehicle, command(400, 0)) == dialect.MAV_RESULT_DENIED
     assert result(vehicle, command(400, 0, 21196)) == dialect.MAV_RESULT_DENIED  # forced
-    assert vehicle.autopilot.armed
+    assert vehicle.craft.autopilot.armed
 
 
 @pytest.mark.parametrize("hold", [5, 17], ids=["LOITER", "BRAKE"])
@@ -87,17 +88,17 @@ def test_a_commanded_hold_flies_straight_on_and_is_no_failsafe(hold: int) -> Non
     assert vehicle.counters["ignored_not_guided"] == 1
     heartbeat = last_heartbeat(vehicle, START + SECOND)
     assert (heartbeat.custom_mode, heartbeat.system_status) == (hold, dialect.MAV_STATE_ACTIVE)
-    assert vehicle.state_at(START + 2 * SECOND).velocity_ne_m_s() == pytest.approx((41.0, 9.5))
+    assert vehicle.craft.state_at(START + 2 * SECOND).velocity_ne_m_s() == pytest.approx((41.0, 9.5))
 
 
 @pytest.mark.parametrize("wish", [command(21), command(20), mode(9), mode(6)], ids=["21", "20", "LAND", "RTL"])
 def test_landing_and_return_are_refused_with_a_word_to_who_asks(wish: bytes) -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
-    told, ack = answers(vehicle, wish, START + SECOND // 2)
+    ack, told = answers(vehicle, wish, START + SECOND // 2)
     assert (ack.get_type(), ack.result) == ("COMMAND_ACK", dialect.MAV_RESULT_DENIED)
-    assert (told.severity, told.text.split(",")[0]) == (dialect.MAV_SEVERITY_WARNING, "cannot land or return")
-    assert vehicle.autopilot.mode == 4
+    assert (told.severity, told.text.split(",")[0]) == (dialect.MAV_SEVERITY_CRITICAL, "cannot land or return")
+    assert vehicle.craft.autopilot.mode == 4
 
 
 DENIED, UNSUPPORTED = dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_UNSUPPORTED
@@ -153,7 +154,7 @@ def test_single_messages_come_on_request() -> None:
     vehicle.step([(command(511, 32, -1), START), (command(511, 33, -1), START)], START)
     sent = vehicle.step([(command(512, 32), START), (command(512, 33), START)], START + 100 * MS)
     ((local, time_ns),) = parse_all(sent, "LOCAL_POSITION_NED")
-    assert 0 <= vehicle.clock.boot_ns(time_ns) - local.time_boot_ms * MS <= 1
+    assert 0 <= vehicle.radio.clock.boot_ns(time_ns) - local.time_boot_ms * MS <= 1
     ((earth, _),) = parse_all(sent, "GLOBAL_POSITION_INT")
     assert earth.lat == -353632620
     assert earth.lon == 1491652370 + round(math.degrees(10.0 / (6378137.0 * math.cos(math.radians(35.363262)))) * 1e7)
@@ -165,7 +166,7 @@ def test_command_int_is_answered_like_command_long() -> None:
     vehicle = a_vehicle()
     request = pack(dialect.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, 1, 0, 0, 0, 0, 0, 0))
     assert result(vehicle, request) == dialect.MAV_RESULT_ACCEPTED
-    assert vehicle.autopilot.armed
+    assert vehicle.craft.autopilot.armed
 
 
 def test_a_timesync_request_is_answered_with_the_clock_at_its_arrival() -> None:
@@ -175,14 +176,14 @@ def test_a_timesync_request_is_answered_with_the_clock_at_its_arrival() -> None:
     ((reply, sent_ns),) = [
         (m, t) for m, t in parse_all(vehicle.step([(request, arrival)], START + SECOND)) if m.get_type() == "TIMESYNC"
     ]
-    assert (reply.tc1, reply.ts1) == (vehicle.clock.boot_ns(arrival), -987654321)
+    assert (reply.tc1, reply.ts1) == (vehicle.radio.clock.boot_ns(arrival), -987654321)
     assert sent_ns == arrival
 
 
 def test_its_own_timesync_request_is_matched_by_the_exact_stamp() -> None:
     vehicle = a_vehicle()
     ((request, sent_ns),) = parse_all(vehicle.step([], START + 10 * SECOND), "TIMESYNC")
-    assert (request.tc1, request.ts1) == (0, vehicle.clock.boot_ns(sent_ns))
+    assert (request.tc1, request.ts1) == (0, vehicle.radio.clock.boot_ns(sent_ns))
     replies = [pack(dialect.MAVLink_timesync_message(42, request.ts1 + error)) for error in (1, 0)]
     assert parse_all(vehicle.step([(r, START + 10 * SECOND) for r in replies], START + 10 * SECOND), "TIMESYNC") == []
     assert vehicle.counters["timesync_replies"] == 1
@@ -193,7 +194,7 @@ def test_a_set_point_acts_from_the_instant_it_arrives() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     vehicle.step([(setpoint(2.0), START + 100 * MS), (setpoint(0.0, -1.0), START + 250 * MS)], START + SECOND // 2)
-    state = vehicle.state_at(START + SECOND // 2)
+    state = vehicle.craft.state_at(START + SECOND // 2)
     assert state.velocity_ne_m_s() == pytest.approx((40.0 + 2.0 * 0.15, 9.0 - 1.0 * 0.25))
     assert state.north_m == pytest.approx(40.0 * 0.5 + 0.5 * 2.0 * 0.15**2 + 0.3 * 0.25)
 
@@ -204,7 +205,7 @@ def test_velocity_and_acceleration_together_are_feed_forward_and_feedback() -> N
     vehicle.step([(setpoint(1.0, 0.0, velocity=(45.0, 9.0), mask=0x0C07), START)], START)
     # v' = 1 + 2 (45 - v): settles at 45.5 with a time constant of 0.5 s
     expected = 45.5 - 5.5 * math.exp(-2.0 * 0.5)
-    assert vehicle.state_at(START + SECOND // 2).velocity_ne_m_s() == pytest.approx((expected, 9.0), abs=1e-6)
+    assert vehicle.craft.state_at(START + SECOND // 2).velocity_ne_m_s() == pytest.approx((expected, 9.0), abs=1e-6)
 
 
 def test_a_set_point_that_is_late_acts_at_once_and_does_not_change_the_past() -> None:
@@ -214,7 +215,7 @@ def test_a_set_point_that_is_late_acts_at_once_and_does_not_change_the_past() ->
     vehicle.step([(command(511, 32, 20_000), START)], START)
     position, sampled_ns = parse_all(vehicle.step([], START + 200 * MS), "LOCAL_POSITION_NED")[-1]
     vehicle.step([(setpoint(3.0), sampled_ns - 50 * MS)], START + 200 * MS)
-    at_sample, later = vehicle.state_at(sampled_ns), vehicle.state_at(sampled_ns + 100 * MS)
+    at_sample, later = vehicle.craft.state_at(sampled_ns), vehicle.craft.state_at(sampled_ns + 100 * MS)
     assert at_sample.north_m == pytest.approx(position.x, abs=1e-5)
     assert at_sample.velocity_ne_m_s()[0] == pytest.approx(40.0)
     assert later.velocity_ne_m_s()[0] == pytest.approx(40.3)
@@ -224,4 +225,4 @@ def test_it_cannot_be_put_back_on_the_launcher_in_flight() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     assert result(vehicle, mode(0)) == dialect.MAV_RESULT_DENIED
-    assert vehicle.autopilot.mode == 4
+    assert vehicle.craft.autopilot.mode == 4

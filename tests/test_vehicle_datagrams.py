@@ -23,20 +23,21 @@ from sim_client import (
 )
 
 from sim_vehicles.mavlink import read_datagram
+from sim_vehicles.shell import Shell
 from sim_vehicles.vehicle import Vehicle
 
 NAN, INFINITY = float("nan"), float("inf")
 VALID = [setpoint(3.0, -2.0), arm(), guided(), heartbeat(), command(511, 32, 20_000), mode(5)]
 
 
-def in_flight() -> Vehicle:
+def in_flight() -> Shell[Vehicle]:
     vehicle = a_vehicle()
     vehicle.step([(heartbeat(), START)], START)
     take_off(vehicle)
     return vehicle
 
 
-def future(vehicle: Vehicle) -> list[tuple[bytes, int]]:
+def future(vehicle: Shell[Vehicle]) -> list[tuple[bytes, int]]:
     return vehicle.step([], START + 5 * SECOND)
 
 
@@ -109,7 +110,7 @@ def test_nan_in_fields_that_the_mask_ignores_does_no_harm() -> None:
     vehicle = in_flight()
     vehicle.step([(setpoint(2.0, velocity=(NAN, INFINITY)), START)], START)
     assert vehicle.counters["setpoints"] == 2
-    assert vehicle.state_at(START + SECOND).velocity_ne_m_s()[0] == pytest.approx(42.0)
+    assert vehicle.craft.state_at(START + SECOND).velocity_ne_m_s()[0] == pytest.approx(42.0)
 
 
 def test_component_zero_means_every_component_of_the_addressed_system() -> None:
@@ -132,7 +133,7 @@ def test_a_timesync_request_for_another_vehicle_is_not_answered() -> None:
 def test_several_frames_in_one_datagram_are_all_obeyed() -> None:
     vehicle = a_vehicle()
     vehicle.step([(heartbeat() + arm() + guided() + setpoint(1.0), START)], START)
-    assert vehicle.autopilot.flying
+    assert vehicle.craft.autopilot.flying
     assert vehicle.counters == {"heartbeats": 1, "commands": 2, "setpoints": 1}
 
 
@@ -146,7 +147,7 @@ def test_good_frames_before_a_broken_tail_are_obeyed_and_the_next_datagram_is_no
     vehicle.step([(setpoint(1.0) + tail, START), (setpoint(2.0), START)], START)
     assert vehicle.counters["setpoints"] == 3
     assert sum(n for reason, n in vehicle.counters.items() if reason.startswith("refused")) == 1
-    assert vehicle.state_at(START + SECOND).velocity_ne_m_s()[0] == pytest.approx(42.0)
+    assert vehicle.craft.state_at(START + SECOND).velocity_ne_m_s()[0] == pytest.approx(42.0)
 
 
 def test_a_signed_frame_is_taken_by_a_vehicle_without_a_key() -> None:
@@ -155,7 +156,7 @@ def test_a_signed_frame_is_taken_by_a_vehicle_without_a_key() -> None:
     frame = dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0).pack(signing)
     vehicle = a_vehicle()
     vehicle.step([(frame, START)], START)
-    assert vehicle.autopilot.armed
+    assert vehicle.craft.autopilot.armed
     assert_only_counted(frame[:-1])
 
 

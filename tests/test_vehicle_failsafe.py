@@ -17,6 +17,7 @@ from sim_client import (
     take_off,
 )
 
+from sim_vehicles.shell import Shell
 from sim_vehicles.vehicle import Vehicle
 
 
@@ -30,7 +31,7 @@ def shown(sent: list[tuple[bytes, int]]) -> Any:
     return last.custom_mode, last.system_status
 
 
-def stream_setpoints(vehicle: Vehicle, begin_ns: int, end_ns: int) -> list[tuple[bytes, int]]:
+def stream_setpoints(vehicle: Shell[Vehicle], begin_ns: int, end_ns: int) -> list[tuple[bytes, int]]:
     """Set-points at 10 Hz without any heartbeat."""
     frames = [(setpoint(), t) for t in range(begin_ns, end_ns, 100 * MS)]
     return vehicle.step(frames, end_ns)
@@ -46,7 +47,7 @@ def test_set_points_stop_and_it_holds_at_the_exact_instant_however_late_it_is_st
     assert vehicle.next_event_ns <= deadline
     sent = vehicle.step([], deadline + late_ns)
     assert texts(sent) == [("failsafe: set-points stopped", deadline)]
-    state = vehicle.state_at(deadline + SECOND)
+    state = vehicle.craft.state_at(deadline + SECOND)
     assert state.velocity_ne_m_s() == pytest.approx((42.0, 10.0))
     assert shown(vehicle.step([], deadline + 2 * SECOND)) == (5, dialect.MAV_STATE_CRITICAL)
 
@@ -57,7 +58,7 @@ def test_a_set_point_on_the_deadline_is_in_time_and_one_after_it_is_not() -> Non
         take_off(vehicle)
         arrival = START + SECOND + late_ns
         vehicle.step([(setpoint(), arrival)], arrival)
-        assert bool(vehicle.autopilot.failsafe) is in_failsafe
+        assert bool(vehicle.craft.autopilot.failsafe) is in_failsafe
         assert vehicle.counters["ignored_in_failsafe"] == int(in_failsafe)
 
 
@@ -107,13 +108,13 @@ def test_in_failsafe_it_ignores_set_points_until_guided_is_commanded_again() -> 
     now = START + 2 * SECOND
     vehicle.step([(heartbeat(), now), (setpoint(5.0), now)], now)
     assert vehicle.counters["ignored_in_failsafe"] == 1
-    assert vehicle.state_at(now + SECOND).velocity_ne_m_s() == pytest.approx((40.0, 9.0))
+    assert vehicle.craft.state_at(now + SECOND).velocity_ne_m_s() == pytest.approx((40.0, 9.0))
     vehicle.step([(guided(), now)], now)
     vehicle.step([(setpoint(5.0), now + 900 * MS)], now + 900 * MS)
     assert vehicle.counters["ignored_in_failsafe"] == 1
     sent = vehicle.step([], now + 1890 * MS)
     assert shown(sent) == (4, dialect.MAV_STATE_ACTIVE)
-    assert vehicle.state_at(now + 1890 * MS).velocity_ne_m_s() == pytest.approx((40.0 + 5.0 * 0.99, 9.0))
+    assert vehicle.craft.state_at(now + 1890 * MS).velocity_ne_m_s() == pytest.approx((40.0 + 5.0 * 0.99, 9.0))
     assert [change.text for change in vehicle.changes][-2:] == ["failsafe: set-points stopped", "GUIDED, failsafe over"]
 
 
