@@ -1,4 +1,4 @@
-"""What does not get in at the station, by reason, for the log of a run: seldom enough that no attacker can fill it."""
+"""What does not get in at the station, by reason, for the log of a run: each once, so that no attacker can fill it."""
 
 from collections import Counter
 from pathlib import Path
@@ -10,11 +10,10 @@ VEHICLES_FILE = "vehicles.json"
 """What the simulated vehicles counted."""
 
 REFUSED = "refused"
-"""Kind of the events; each holds all counts so far."""
+"""Kind of the events: one when a reason is first met, and one at the end with how often each was."""
 _IGNORED = {"other component", "before a first heartbeat"}
 """No strangers, though the station has no use for what they say."""
 _COUNTERS = TypeAdapter(dict[str, int])
-_EVERY_NS = 2_000_000_000
 
 
 class Refusals:
@@ -22,16 +21,15 @@ class Refusals:
 
     def __init__(self) -> None:
         self._told: dict[str, int] = {}
-        self._next_ns = 0
 
-    def news(self, counters: Counter[str], now_ns: int, *, last: bool = False) -> dict[str, int]:
-        """All counts by reason if there are new ones and the last news are two seconds old; nothing otherwise."""
-        if now_ns < self._next_ns and not last:
+    def news(self, counters: Counter[str], *, last: bool = False) -> dict[str, int]:
+        """All counts by reason if there is a new reason, or at the end if any has changed; nothing otherwise."""
+        if not last and counters.keys() <= self._told.keys() | _IGNORED:
             return {}
         counts = {reason: count for reason, count in counters.items() if reason not in _IGNORED}
         if counts == self._told:
             return {}
-        self._told, self._next_ns = counts, now_ns + _EVERY_NS
+        self._told = counts
         return counts
 
 

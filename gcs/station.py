@@ -192,7 +192,6 @@ class Station:
                 self.counters["other component"] += 1
                 continue
             if vehicle.is_replay(frame, datagram.received_ns):
-                self.counters["replayed or overtaken"] += 1
                 continue
             self._handle(row, vehicle, frame, datagram, outgoing)
 

@@ -140,9 +140,9 @@ def drive(
     refusals = Refusals()
 
     def log_refusals(now_ns: int, *, last: bool = False) -> None:
-        if counts := refusals.news(station.counters, now_ns, last=last):
-            time_s = station.scenario_time_s(now_ns)
-            writer.event(time_s=time_s, kind=REFUSED, text=in_words(counts), counts=counts)
+        if counts := refusals.news(station.counters, last=last):
+            text = in_words(counts) if last else ", ".join(counts)
+            writer.event(time_s=station.scenario_time_s(now_ns), kind=REFUSED, text=text, counts=counts)
 
     while station.phase is not Phase.ENDED:
         link.wait(station.next_event_ns)

@@ -18,7 +18,7 @@ from gcs.autopilot.kinds import (
 )
 from gcs.autopilot.startup import Startup
 from gcs.clocks import LEAST_SAMPLES, VehicleClock
-from gcs.sequence import DUPLICATE, LATE, SequenceCounter
+from gcs.sequence import DUPLICATE, LATE, NEW, SequenceCounter
 from gcs.upload import Upload
 
 Address = tuple[str, int]
@@ -26,6 +26,7 @@ Address = tuple[str, int]
 ARMED = 0x80
 STATE_CRITICAL = 5
 
+_TOLD = {LATE: "its frames arrive out of order", DUPLICATE: "frames of it arrive more than once"}
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 _ACCEPTED, _IN_PROGRESS = 0, 5
 _NS = 1_000_000_000
@@ -92,6 +93,8 @@ class RemoteVehicle:
         self._command: _Command | None = None
         self._not_before_ns = 0
         self._acknowledged_ns = 0
+        self._told = {NEW}
+        """What has been told of the order of its frames."""
 
     @property
     def kind(self) -> Kind:
@@ -171,10 +174,14 @@ class RemoteVehicle:
     def is_replay(self, frame: mavlink.Frame, now_ns: int) -> bool:
         """Whether a frame has been heard before, or is a heartbeat that a newer frame has overtaken.
 
+        Links that reorder and repeat do that all the time: it is counted in `frames`, and told once of each.
         A vehicle that was started anew numbers its frames anew: after some time without a good heartbeat any is taken.
         """
         heartbeat = frame.msg_id == mavlink.HEARTBEAT
         order = self.frames.add(frame.sequence, now_ns)
+        if order not in self._told:
+            self._told.add(order)
+            self._report("link", _TOLD[order])
         replayed = order == DUPLICATE or (heartbeat and order == LATE)
         if replayed and heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
             self.frames.restart()

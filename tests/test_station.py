@@ -100,7 +100,19 @@ def test_a_heartbeat_that_is_replayed_or_overtaken_undoes_nothing() -> None:
     old, overtaken, new = (peer.heartbeat(S, base_mode=mode, custom_mode=4) for mode in (1, 1, 129))
     station.step([old, new, old, overtaken], S + 5 * MS)
     assert vehicle.armed
-    assert station.counters["replayed or overtaken"] == 2
+    assert (vehicle.frames.duplicate, vehicle.frames.late) == (1, 1)
+
+
+def test_what_a_link_reorders_or_repeats_is_no_refusal_and_is_told_once_of_each_vehicle() -> None:
+    station, peers = Station(PLAN, start_ns=S), [Peer(2), Peer(3)]
+    for second in range(1, 5):
+        for peer in peers:
+            first, second_one, third = (peer.heartbeat(second * S) for _ in range(3))
+            station.step([first, third, second_one, third], second * S)
+    assert not station.counters
+    told = [(event.system_id, event.text) for event in station.events if event.kind == "link"]
+    texts = "its frames arrive out of order", "frames of it arrive more than once"
+    assert told == [(system_id, text) for system_id in (2, 3) for text in texts]
 
 
 def test_a_vehicle_that_begins_anew_to_count_its_frames_is_heard() -> None:
