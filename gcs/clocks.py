@@ -27,6 +27,8 @@ WINDOW = 128
 """Exchanges kept for each vehicle: 13 s at 10 Hz, over which a drifting clock is straight to a few µs."""
 LEAST_SAMPLES = 5
 """Exchanges wanted before a clock counts as known."""
+LATEST_NS = 1 << 62
+"""No clock shows more, 146 years since 1970 or since boot: differences of two times fit 64 bits."""
 REQUEST_LIFETIME_NS = 20_000_000_000
 DRIFT_BOUND = 1e-3
 """Rate difference of two clocks beyond which a change of offset is a jump, not drift."""
@@ -114,8 +116,9 @@ class VehicleClock:
         return now_ns
 
     def reply(self, *, tc1_ns: int, ts1_ns: int, received_ns: int) -> int | None:
-        """Take a reply in; returns the round trip in ns, or None if it answers nothing that was asked."""
-        if ts1_ns not in self._pending or received_ns < ts1_ns:
+        """Take a reply in; returns the round trip in ns, or None if it answers nothing that was asked, or no clock
+        shows such a time."""
+        if ts1_ns not in self._pending or received_ns < ts1_ns or not 0 <= tc1_ns < LATEST_NS:
             self.unmatched += 1
             return None
         del self._pending[ts1_ns]

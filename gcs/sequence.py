@@ -14,6 +14,8 @@ _RATE_NS = _NS_PER_S
 _AHEAD, _LEAST_AHEAD = 127, 32
 """A frame may be newer by so many than time lets expect, as the newest may have come late itself. The more frames have
 been overtaken by, the fewer, but not less than the second figure."""
+_MOST = 0xFFFFFFFF
+"""What the tick record holds; a log whose clock jumps by centuries seems to have lost more."""
 _FORGET = 1.0 / 512
 _RUN, _RUN_STEP = 8, 4
 """Late frames in a row, each newer by no more than that than the one before, that show that they are not late."""
@@ -58,7 +60,7 @@ class SequenceCounter:
             self._rate_count, self._rate_ns = sequence, time_ns
             self._seen = 1
             return NEW
-        since_ns = time_ns - self._newest_ns
+        since_ns = max(0, time_ns - self._newest_ns)  # in a log the clock may have been set back
         expected = self._rate_hz * since_ns
         if step == 1 and (sequence - self._newest) & 0xFF == 1 and self._run == 0 and expected < _NO_DOUBT:
             # the next one: what follows would come to the same, and most frames end here
@@ -81,7 +83,7 @@ class SequenceCounter:
             self._run = 0
         self._lag = max(self._lag * (1.0 - _FORGET), -ahead)
         if ahead > 0:
-            self.lost += ahead - 1
+            self.lost = min(self.lost + ahead - 1, _MOST)
             self._seen = (self._seen << min(ahead, _KEPT) | 1) & _SEEN
             self._newest += ahead
             self._note_rate(time_ns)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gcs import mavlink
+from gcs.clocks import LATEST_NS
 
 _STAMP = struct.Struct(">Q")
 _MAGIC = re.compile(b"[\xfd\xfe]")
@@ -95,10 +96,11 @@ def _good_within(data: bytes, start: int, stop: int) -> bool:
 
 
 def _plausible(stamps_us: list[int]) -> list[bool]:
-    """Which stamps are not far from the middle one of themselves and their two neighbours."""
+    """Which stamps are times at all, and not far from the middle one of themselves and their two neighbours."""
+    possible = [us < LATEST_NS // 1000 for us in stamps_us]
     if len(stamps_us) < 3:
-        return [True] * len(stamps_us)
+        return possible
     t = np.array(stamps_us, dtype=np.uint64).astype(np.float64)
     around = np.stack([np.concatenate([t[2:3], t[:-1]]), t, np.concatenate([t[1:], t[-3:-2]])])
-    good: list[bool] = (np.abs(t - np.median(around, axis=0)) < _WRONG_STAMP_US).tolist()
-    return good
+    near: list[bool] = (np.abs(t - np.median(around, axis=0)) < _WRONG_STAMP_US).tolist()
+    return [one and other for one, other in zip(possible, near, strict=True)]
