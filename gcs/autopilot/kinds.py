@@ -45,6 +45,8 @@ class Kind:
     hold_mode: int
     """and in which it stays where it is, without a pilot."""
     land_mode: int
+    take_off_mode: int = -1
+    """In which it takes off, if that is not the guided one; it then holds."""
     guided_name: str = "GUIDED"
     estimator_message: int = 0
     """Tells whether it has a position."""
@@ -81,6 +83,7 @@ PX4_COPTER = Kind(
     guided_mode=_packed(6),
     hold_mode=_packed(4, 3),
     land_mode=_packed(4, 6),
+    take_off_mode=_packed(4, 2),
     guided_name="OFFBOARD",
     estimator_message=mavlink.ESTIMATOR_STATUS,
     guided_first=False,
