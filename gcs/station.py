@@ -202,7 +202,7 @@ class Station:
         fields = frame.fields
         match frame.msg_id:
             case mavlink.LOCAL_POSITION_NED:
-                self._position(row, vehicle, frame, datagram)
+                self._position(row, vehicle, frame, datagram, outgoing)
             case mavlink.TIMESYNC:
                 tc1_ns, ts1_ns = fields
                 if tc1_ns == 0:
@@ -224,18 +224,28 @@ class Station:
         if vehicle.startup is not None:
             vehicle.startup.take(frame.msg_id, fields)
 
-    def _position(self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram) -> None:
+    def _position(
+        self,
+        row: int,
+        vehicle: RemoteVehicle,
+        frame: mavlink.Frame,
+        datagram: Datagram,
+        outgoing: list[Outgoing],
+    ) -> None:
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
-        clock = vehicle.clock.estimate
-        if clock.samples == 0:
-            self._telemetry_ns[row] = datagram.received_ns
+        clock = vehicle.clock
+        sample_ns = clock.sampled_ns(boot_ms, datagram.received_ns, newest=vehicle.newest)
+        if sample_ns is None:
+            if not clock.exchange_due:
+                self._telemetry_ns[row] = datagram.received_ns  # it is heard, before the first exchange
+            elif self._now_ns - clock.asked_ns >= self._period_ns:
+                self._exchange(vehicle, outgoing)
             return
-        sample_ns = clock.to_station_ns(boot_ms * 1_000_000)
         origin_north, origin_east, origin_down = self._copters.frame_ned_m[row] if self._copters else (0.0, 0.0, 0.0)
         if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             return
         self._telemetry_ns[row] = datagram.received_ns  # only what is new: a replay does not make up for silence
-        bound_s = clock.bound_at_ns(sample_ns) * 1e-9
+        bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
         queue_s, received_ns = datagram.queued_ns * 1e-9, datagram.received_ns
         self._reported[row] = Reported(boot_ms, down + origin_down, v_down, queue_s, received_ns, bound_s)
 
@@ -418,8 +428,11 @@ class Station:
         self._timesync_row = (self._timesync_row + 1) % len(self.vehicles)
         self._next_timesync_ns += self._timesync_spacing_ns
         if vehicle.address is not None:
-            ts1_ns = vehicle.clock.request(self._now_ns)
-            self._send(vehicle, mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=ts1_ns), outgoing)
+            self._exchange(vehicle, outgoing)
+
+    def _exchange(self, vehicle: RemoteVehicle, outgoing: list[Outgoing]) -> None:
+        ts1_ns = vehicle.clock.request(self._now_ns)
+        self._send(vehicle, mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=ts1_ns), outgoing)
 
     def _send(self, vehicle: RemoteVehicle, msg_id: int, fields: tuple[object, ...], outgoing: list[Outgoing]) -> None:
         if vehicle.address is not None:

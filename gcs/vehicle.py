@@ -15,11 +15,12 @@ from gcs.autopilot.kinds import (
     Kind,
     Step,
     commanded_mode,
+    kind_of,
     mode_command,
 )
 from gcs.autopilot.startup import Startup
 from gcs.clocks import LEAST_SAMPLES, VehicleClock
-from gcs.sequence import DUPLICATE, LATE, SequenceCounter
+from gcs.sequence import DUPLICATE, LATE, NEW, SequenceCounter
 from gcs.upload import Upload
 
 Address = tuple[str, int]
@@ -72,6 +73,8 @@ class RemoteVehicle:
         self.heard_ns = 0  # newest valid frame
         self.heartbeat_ns = 0  # newest heartbeat
         self.frames = SequenceCounter()
+        self.newest = True
+        """Whether the frame last taken in was sent after all before it."""
         self.clock = VehicleClock()
         self.armed = False
         self.custom_mode = -1
@@ -84,7 +87,7 @@ class RemoteVehicle:
         self.startup = startup
         self.upload = upload
         self.first_heard_ns: int | None = None
-        self._has_been_guided = False
+        self._has_been_guided = self._take_off_told = False
         self._doubtful_ns = 0
         """When the first heartbeat came after a long silence. Its number does not show whether it is an old one."""
         self.rates_set = False
@@ -136,8 +139,9 @@ class RemoteVehicle:
         if self.silent:
             return "is silent"
         if self.taken_over:
-            left = "left" if self._has_been_guided else "is armed, and not in"
-            return f"{left} {self.kind.guided_name}, by its pilot or by itself"
+            if not self._has_been_guided:
+                return f"is armed and not in {self.kind.guided_name}: flown by its pilot or by itself"
+            return f"left {self.kind.guided_name}, by its pilot or by itself"
         if self.startup is not None:
             return self._next(self.startup).missing
         if self.refused and self.upload is not None:
@@ -182,6 +186,7 @@ class RemoteVehicle:
         """
         heartbeat = frame.msg_id == mavlink.HEARTBEAT
         order = self.frames.add(frame.sequence, now_ns)
+        self.newest = order == NEW
         if heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
             self._doubtful_ns = now_ns
         replayed = order == DUPLICATE or (heartbeat and order == LATE)
@@ -200,6 +205,8 @@ class RemoteVehicle:
         self._outdated = [before for before in self._outdated if before[0] > recent_ns]
         if any((custom_mode, armed) == before for _, *before in self._outdated):
             return
+        found = kind_of(autopilot, vehicle_type)
+        self.clock.backdated_ns = found.timesync_backdated_ns if isinstance(found, Kind) else 0
         was_guided = self.guided
         if self.startup is not None:
             self.startup.heartbeat(autopilot, vehicle_type)
@@ -238,8 +245,7 @@ class RemoteVehicle:
         if startup is None or kind.guided_first or self._has_been_guided:
             return False
         if mode == kind.take_off_mode:
-            told = self._command is not None and self._command.command == TAKE_OFF
-            return told or startup.took_off
+            return self._take_off_told
         return mode == kind.hold_mode and self.custom_mode == kind.take_off_mode and startup.is_half_way_up
 
     def acknowledge(self, fields: tuple[Any, ...], now_ns: int) -> None:
@@ -304,6 +310,7 @@ class RemoteVehicle:
             if wanted is None:
                 return None
             waiting = self._command = _Command(*wanted, sent_ns=now_ns)
+            self._take_off_told = self._take_off_told or waiting.command == TAKE_OFF
         return self.encode(
             mavlink.COMMAND_LONG,
             mavlink.command_long(

@@ -230,7 +230,7 @@ class Copter:
         elif message.tc1 == 0:
             self.counters["timesync_requests"] += 1
             self.last_heard_ns = time_ns
-            self._send(self._encoder.timesync(max(1, self.clock.boot_ns(time_ns)), message.ts1), time_ns)
+            self._send(self._encoder.timesync(self.clock.boot_ns(time_ns) or 1, message.ts1), time_ns)
         else:
             known = message.ts1 == self._timesync_ts1
             self.counters["timesync_replies" if known else "ignored_timesync_reply"] += 1

@@ -59,6 +59,8 @@ class Kind:
     reason."""
     velocity_grows: bool = False
     """Its velocity target grows with the acceleration between two set-points."""
+    timesync_backdated_ns: int = 0
+    """Most by which it dates its TIMESYNC replies back."""
     packed_modes: bool = False
     """Modes have a main and a sub number, which DO_SET_MODE takes apart and HEARTBEAT packed."""
 
@@ -77,6 +79,7 @@ ARDUCOPTER = Kind(
     estimator_message=mavlink.EKF_STATUS_REPORT,
     stays_guided=True,
     velocity_grows=True,
+    timesync_backdated_ns=5_000_000,  # by what the bytes would take on a serial port: 3.5 ms at its 57600 baud
 )
 PX4_COPTER = Kind(
     "PX4 multicopter",

@@ -115,11 +115,6 @@ class Startup:
             self._took_off_ns = now_ns
 
     @property
-    def took_off(self) -> bool:
-        """Whether a take-off has been accepted."""
-        return self._took_off_ns is not None
-
-    @property
     def is_half_way_up(self) -> bool:
         """Whether it has reached half of the altitude it takes off to, at least."""
         return (self.relative_altitude_m or 0.0) >= 0.5 * self.altitude_m

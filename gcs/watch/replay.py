@@ -259,11 +259,12 @@ class _Replay:
             return
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
         bound_s = nan
-        if clock.estimate.samples:
-            sample_ns = clock.estimate.to_station_ns(boot_ms * 1_000_000)
+        sample_ns = clock.sampled_ns(boot_ms, time_ns, newest=vehicle.remote.newest)
+        if sample_ns is not None:
             bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
         elif self._outline.exchanges:
-            self._telemetry_ns[row] = time_ns
+            if not clock.exchange_due:
+                self._telemetry_ns[row] = time_ns
             return
         else:
             sample_ns = boot_ms * 1_000_000 + vehicle.least_delay_ns
