@@ -16,7 +16,8 @@ from gcs.absence import absences, end_reason, told
 from gcs.autopilot.copters import Copters
 from gcs.autopilot.kinds import Goal
 from gcs.autopilot.startup import Startup
-from gcs.control import LARGEST_COMMAND_M_S2, VehicleControl, distances_m, formation_control
+from gcs.control import VehicleControl, distances_m, formation_control
+from gcs.limits import SetPointLimits
 from gcs.modes import Phase, next_phase, patience_s
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
@@ -88,6 +89,7 @@ class Station:
         self._history = StateHistory(n)
         self._law = law_of(plan, [False] * n)
         self._stream = Stream(plan) if scenario.control.loop == "onboard" else None
+        self._limits = SetPointLimits.of(scenario.limits)
         self._control = formation_control if self._stream is None else self._stream.control
         self._period_ns = round(NS_PER_S / rates.control_hz)
         self._monitor = FormationMonitor(
@@ -275,9 +277,9 @@ class Station:
             self._law,
             self._monitor.blends(time_s),
             nominal_velocity_m_s=self.plan.scenario.nominal_velocity_at(time_s),
-            limit_m_s2=self.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2,
             opening=self._monitor.opening,
         )
+        controls = [c._replace(command_m_s2=self._limits.command(c.command_m_s2)) for c in controls]
         distance_m = distances_m(controls, due_ns)
         nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
         if flying:
@@ -291,6 +293,7 @@ class Station:
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
             fields = self._set_point(row, control, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
             if fields is not None:
+                fields = self._limits.set_point(fields)  # the last thing done to anything that leaves
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
             margin_s = self.plan.margins_s[monitored.gain_set]
             fresh_s = self._fresh_rtt_s[row]

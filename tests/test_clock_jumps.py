@@ -112,7 +112,10 @@ def ticks_of(scenario: Scenario, vehicles: BackdatedReplies, station: Station) -
 def test_replies_that_are_dated_back_are_not_taken_for_jumps() -> None:
     """ArduCopter dates them back by up to 3.5 ms; on direct links up to half of the exchanges contradict the rest."""
     direct = column(clock_jumps=()).model_copy(update={"links": Links(up=Link(delay_s=1e-4), down=Link(delay_s=1e-4))})
-    station, vehicles = Station(replace(PLAN, scenario=direct), start_ns=START_NS), BackdatedReplies(Fleet(direct, START_NS))
+    station, vehicles = (
+        Station(replace(PLAN, scenario=direct), start_ns=START_NS),
+        BackdatedReplies(Fleet(direct, START_NS)),
+    )
     rows = np.concatenate(list(ticks_of(direct, vehicles, station)))
     assert vehicles.backdated > 100
     assert station.end_reason == "completed: duration reached"

@@ -183,9 +183,7 @@ def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("after_the_end_s", [-1.5, 0.5, 2.0])
-def test_a_pilot_who_takes_over_while_the_flight_ends_is_not_told_to_hold(
-    flavour: str, after_the_end_s: float
-) -> None:
+def test_a_pilot_who_takes_over_while_the_flight_ends_is_not_told_to_hold(flavour: str, after_the_end_s: float) -> None:
     began_s = flight_s(flavour)
     mode, end_s = PILOTS_MODE[flavour], began_s + 20.0
     lossy = VehicleLinks(system_id=2, up=Link(delay_s=0.02, outages=(Outage(from_s=end_s - 1.0, until_s=1e6),)))

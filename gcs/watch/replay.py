@@ -22,7 +22,6 @@ from gcs import mavlink
 from gcs.autopilot.copters import locate
 from gcs.autopilot.startup import Startup
 from gcs.control import (
-    LARGEST_COMMAND_M_S2,
     Blend,
     FeedbackLaw,
     Formation,
@@ -289,7 +288,6 @@ class _Replay:
             self._law,
             [_NO_BLEND] * len(lost),
             nominal_velocity_m_s=self._scenario.nominal_velocity_at(time_s),
-            limit_m_s2=LARGEST_COMMAND_M_S2,
         )
         nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns), axis=1).tolist()
         seen: list[VehicleTick] = []
