@@ -14,6 +14,9 @@ Limits that contradict each other show that the clock has jumped. A jump of less
 in exchanges that differ from the line by more than their round trips, and all others before them, can explain. The
 first of these makes the limits its own alone, the third is taken for a jump.
 
+What else the vehicle stamps with its clock shows a jump sooner: a state cannot have been sampled after it was received,
+nor before the one that was sent before it. Such a state is refused and an exchange is due at once, which tells.
+
 For a loop closed over the ground an error of the offset cancels: it makes the telemetry look older by what it makes the
 command look younger.
 """
@@ -23,6 +26,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scenarios.schema import DRIFT_MAX_PPM
+
 WINDOW = 128
 """Exchanges kept for each vehicle: 13 s at 10 Hz, over which a drifting clock is straight to a few µs."""
 LEAST_SAMPLES = 5
@@ -30,7 +35,8 @@ LEAST_SAMPLES = 5
 LATEST_NS = 1 << 62
 """No clock shows more, 146 years since 1970 or since boot: differences of two times fit 64 bits."""
 REQUEST_LIFETIME_NS = 20_000_000_000
-DRIFT_BOUND = 1e-3
+_LONG_AGO_NS = -(1 << 62)
+DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
 """Rate difference of two clocks beyond which a change of offset is a jump, not drift."""
 DOUBTS = 3
 """Exchanges without one to the contrary that make a jump of what is possible without."""
@@ -38,6 +44,9 @@ _UNUSUAL = 1.5
 """Farther off the line than this times the farthest in the window is what jitter does not explain."""
 _READING_NS = 1000
 """What stamps may be wrong by; those of a telemetry log are whole microseconds."""
+_BOOT_MS_NS = 1_000_000
+_WRAP_NS = _BOOT_MS_NS << 32
+"""time_boot_ms begins anew after this: 49.7 days, or what lies before the boot of a clock that was set back."""
 _DOUBTFUL_NS = 10_000
 """Smaller differences from the line are not worth a doubt."""
 _WEIGHT_FLOOR_NS = 200_000.0
@@ -90,6 +99,15 @@ class VehicleClock:
         self.down_bound_ns = 0.0
         """and the most by which it can be wrong."""
         self.unmatched = 0
+        self.backdated_ns = 0
+        """Most by which the vehicle dates its replies back."""
+        self.lost = False
+        """Whether it is known to have jumped, and not yet to what."""
+        self.asked_ns = 0
+        """When an exchange was last asked for."""
+        self._doubtful_state = False
+        self._newest_boot_ns = _LONG_AGO_NS
+        """Of the states whose instant was believed, on the vehicle's clock as it is now."""
         self._pending: dict[int, None] = {}
         self._count = 0
         self._sent_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
@@ -107,6 +125,7 @@ class VehicleClock:
 
     def request(self, now_ns: int) -> int:
         """Note a request sent now; returns its ts1, which is unique among those waiting."""
+        self.asked_ns = now_ns
         while now_ns in self._pending:
             now_ns += 1
         self._pending[now_ns] = None
@@ -114,6 +133,46 @@ class VehicleClock:
         if now_ns - oldest > REQUEST_LIFETIME_NS:
             del self._pending[oldest]
         return now_ns
+
+    @property
+    def exchange_due(self) -> bool:
+        """Whether a state was refused since the newest exchange, so that the next one should not wait."""
+        return self.lost or self._doubtful_state
+
+    def boot_ns(self, boot_ms: int, near_ns: int) -> int:
+        """The instant on the vehicle's clock that a time_boot_ms means which came near a station time."""
+        boot_ns = boot_ms * _BOOT_MS_NS
+        if self.estimate.samples == 0:
+            return boot_ns
+        turns = (self.estimate.offset_at_ns(near_ns) + near_ns - boot_ns + _WRAP_NS // 2) // _WRAP_NS
+        return boot_ns + turns * _WRAP_NS
+
+    def sampled_ns(self, boot_ms: int, received_ns: int, *, newest: bool) -> int | None:
+        """The station's time at which a state was sampled; None if that is unknown, or cannot be.
+
+        Parameters
+        ----------
+        boot_ms
+            The state's time_boot_ms.
+        received_ns
+            When it was received, on the station's clock.
+        newest
+            Whether it was sent after all states before, as its sequence number tells.
+        """
+        known = self.estimate
+        if known.samples == 0:
+            return None
+        boot_ns = self.boot_ns(boot_ms, received_ns)
+        sample_ns = known.to_station_ns(boot_ns)
+        if sample_ns - received_ns > known.bound_at_ns(sample_ns) + _BOOT_MS_NS:
+            self.lost, self._since_ns, self._count = True, received_ns, 0
+            self.estimate = UNKNOWN._replace(skew=known.skew)
+            return None
+        if newest and boot_ns < self._newest_boot_ns:
+            self._doubtful_state = True  # or a replay older than sequence numbers can tell: the exchange decides
+            return None
+        self._newest_boot_ns = max(boot_ns, self._newest_boot_ns)
+        return sample_ns
 
     def reply(self, *, tc1_ns: int, ts1_ns: int, received_ns: int) -> int | None:
         """Take a reply in; returns the round trip in ns, or None if it answers nothing that was asked, or no clock
@@ -125,10 +184,11 @@ class VehicleClock:
         rtt = self.rtt_ns = received_ns - ts1_ns
         if ts1_ns < self._since_ns:
             return rtt  # overtaken by one with a clock that has jumped since
+        self._doubtful_state = False
         middle = ts1_ns + rtt // 2
         offset = tc1_ns - middle
-        low, high = tc1_ns - received_ns - _READING_NS, tc1_ns - ts1_ns + _READING_NS
-        if self._contradicts(low, received_ns, high, ts1_ns):
+        low, high = tc1_ns - received_ns - _READING_NS, tc1_ns - ts1_ns + _READING_NS + self.backdated_ns
+        if self.lost or self._contradicts(low, received_ns, high, ts1_ns):
             self._jumped(ts1_ns, keep=0)
         doubtful = self._is_doubtful(offset, rtt, middle)
         if self._count == 0 or doubtful:
@@ -179,6 +239,7 @@ class VehicleClock:
             + _UNUSUAL * self._unusual_ns
             + DRIFT_BOUND * abs(at_ns - known.reference_ns)
             + _DOUBTFUL_NS
+            + self.backdated_ns
         )
         if off_ns > explained_ns:
             self._doubts += 1
@@ -194,6 +255,7 @@ class VehicleClock:
         for kept in (self._sent_ns, self._rtt_ns, self._offset_ns):
             kept[:keep] = kept[newest]
         self.jumps += 1
+        self.lost, self._newest_boot_ns = False, _LONG_AGO_NS
         self._count, self._doubts, self._doubted_ns, self._since_ns = keep, 0, 0, ts1_ns
 
     def _within_limits(self, at_ns: int) -> ClockEstimate:

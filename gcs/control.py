@@ -10,7 +10,7 @@ its margin.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import hypot, nan
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
@@ -18,10 +18,6 @@ from numpy.typing import NDArray
 
 from gains.formation import FormationModel
 from gcs.telemetry import FloatArray, IntArray, Report, State, StateHistory
-
-LARGEST_COMMAND_M_S2 = 9_999.0
-"""Limit on what is sent when the scenario sets none; beyond it a command is a fault, not a manoeuvre. Vehicles refuse
-more than 1e4, and rounding to float32 must not lead there."""
 
 
 @dataclass(frozen=True)
@@ -154,14 +150,12 @@ def formation_control(
     blends: Sequence[Blend],
     *,
     nominal_velocity_m_s: tuple[float, float],
-    limit_m_s2: float,
     opening: float = 1.0,
 ) -> list[VehicleControl]:
     """Errors and commands of every vehicle from the newest reported states.
 
     `blends` says with which gains each vehicle is flown. `opening` is a factor on the formation's spacing. A vehicle
-    whose law uses an unknown state has a NaN command; nothing is to be sent for it. A command longer than `limit_m_s2`
-    is shortened to it.
+    whose law uses an unknown state has a NaN command; nothing is to be sent for it. No limit is applied here.
     """
     controls: list[VehicleControl] = []
     for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
@@ -174,9 +168,7 @@ def formation_control(
         if own is not None:
             spacing_error, command = _followed(history, own, newest, blend, nominal_velocity_m_s, opening)
         velocity_error = state[2] - nominal_velocity_m_s[0], state[3] - nominal_velocity_m_s[1]
-        controls.append(
-            VehicleControl(sample_ns, state, spacing_error, velocity_error, _shortened(command, limit_m_s2), sample_ns)
-        )
+        controls.append(VehicleControl(sample_ns, state, spacing_error, velocity_error, command, sample_ns))
     return controls
 
 
@@ -187,13 +179,12 @@ def command_at(
     instant_ns: int,
     blend: Blend,
     nominal_velocity_m_s: tuple[float, float],
-    limit_m_s2: float,
     opening: float,
 ) -> tuple[float, float]:
     """The command of one vehicle from the errors at an instant."""
     state = history.at(row, instant_ns) or _UNKNOWN.state
     _, command = _followed(history, law, (instant_ns, state), blend, nominal_velocity_m_s, opening)
-    return _shortened(command, limit_m_s2)
+    return command
 
 
 def _followed(
@@ -226,12 +217,6 @@ def _followed(
 def _blended(new: Gain, old: Gain, share: float) -> Gain:
     a, b, c, d, e, f, g, h = (share * one + (1.0 - share) * other for one, other in zip(new, old, strict=True))
     return a, b, c, d, e, f, g, h
-
-
-def _shortened(command: tuple[float, float], limit: float) -> tuple[float, float]:
-    north, east = command
-    size = hypot(north, east)
-    return (north * limit / size, east * limit / size) if size > limit else command
 
 
 def distances_m(controls: Sequence[VehicleControl], now_ns: int) -> FloatArray:

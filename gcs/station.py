@@ -16,7 +16,8 @@ from gcs.absence import absences, end_reason, told
 from gcs.autopilot.copters import Copters
 from gcs.autopilot.kinds import Goal
 from gcs.autopilot.startup import Startup
-from gcs.control import LARGEST_COMMAND_M_S2, VehicleControl, distances_m, formation_control
+from gcs.control import VehicleControl, distances_m, formation_control
+from gcs.limits import SetPointLimits
 from gcs.modes import Phase, next_phase, patience_s
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
@@ -88,6 +89,7 @@ class Station:
         self._history = StateHistory(n)
         self._law = law_of(plan, [False] * n)
         self._stream = Stream(plan) if scenario.control.loop == "onboard" else None
+        self._limits = SetPointLimits.of(scenario.limits)
         self._control = formation_control if self._stream is None else self._stream.control
         self._period_ns = round(NS_PER_S / rates.control_hz)
         self._monitor = FormationMonitor(
@@ -201,7 +203,7 @@ class Station:
         fields = frame.fields
         match frame.msg_id:
             case mavlink.LOCAL_POSITION_NED:
-                self._position(row, vehicle, frame, datagram)
+                self._position(row, vehicle, frame, datagram, outgoing)
             case mavlink.TIMESYNC:
                 tc1_ns, ts1_ns = fields
                 if tc1_ns == 0:
@@ -223,18 +225,28 @@ class Station:
         if vehicle.startup is not None:
             vehicle.startup.take(frame.msg_id, fields)
 
-    def _position(self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram) -> None:
+    def _position(
+        self,
+        row: int,
+        vehicle: RemoteVehicle,
+        frame: mavlink.Frame,
+        datagram: Datagram,
+        outgoing: list[Outgoing],
+    ) -> None:
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
-        clock = vehicle.clock.estimate
-        if clock.samples == 0:
-            self._telemetry_ns[row] = datagram.received_ns
+        clock = vehicle.clock
+        sample_ns = clock.sampled_ns(boot_ms, datagram.received_ns, newest=vehicle.newest)
+        if sample_ns is None:
+            if not clock.exchange_due:
+                self._telemetry_ns[row] = datagram.received_ns  # it is heard, before the first exchange
+            elif self._now_ns - clock.asked_ns >= self._period_ns:
+                self._exchange(vehicle, outgoing)
             return
-        sample_ns = clock.to_station_ns(boot_ms * 1_000_000)
         origin_north, origin_east, origin_down = self._copters.frame_ned_m[row] if self._copters else (0.0, 0.0, 0.0)
         if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             return
         self._telemetry_ns[row] = datagram.received_ns  # only what is new: a replay does not make up for silence
-        bound_s = clock.bound_at_ns(sample_ns) * 1e-9
+        bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
         queue_s, received_ns = datagram.queued_ns * 1e-9, datagram.received_ns
         self._reported[row] = Reported(boot_ms, down + origin_down, v_down, queue_s, received_ns, bound_s)
 
@@ -264,9 +276,9 @@ class Station:
             self._law,
             self._monitor.blends(time_s),
             nominal_velocity_m_s=self.plan.scenario.nominal_velocity_at(time_s),
-            limit_m_s2=self.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2,
             opening=self._monitor.opening,
         )
+        controls = [c._replace(command_m_s2=self._limits.command(c.command_m_s2)) for c in controls]
         distance_m = distances_m(controls, due_ns)
         nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
         if flying:
@@ -280,6 +292,7 @@ class Station:
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
             fields = self._set_point(row, control, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
             if fields is not None:
+                fields = self._limits.set_point(fields)  # the last thing done to anything that leaves
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
             margin_s = self.plan.margins_s[monitored.gain_set]
             fresh_s = self._fresh_rtt_s[row]
@@ -417,8 +430,11 @@ class Station:
         self._timesync_row = (self._timesync_row + 1) % len(self.vehicles)
         self._next_timesync_ns += self._timesync_spacing_ns
         if vehicle.address is not None:
-            ts1_ns = vehicle.clock.request(self._now_ns)
-            self._send(vehicle, mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=ts1_ns), outgoing)
+            self._exchange(vehicle, outgoing)
+
+    def _exchange(self, vehicle: RemoteVehicle, outgoing: list[Outgoing]) -> None:
+        ts1_ns = vehicle.clock.request(self._now_ns)
+        self._send(vehicle, mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=ts1_ns), outgoing)
 
     def _send(self, vehicle: RemoteVehicle, msg_id: int, fields: tuple[object, ...], outgoing: list[Outgoing]) -> None:
         if vehicle.address is not None:

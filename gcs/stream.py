@@ -51,7 +51,6 @@ class Stream:
         blends: Sequence[Blend],
         *,
         nominal_velocity_m_s: tuple[float, float],
-        limit_m_s2: float,
         opening: float = 1.0,
     ) -> list[VehicleControl]:
         """Errors of every vehicle, and what is streamed to it. As `gcs.control.formation_control`, with the law of
@@ -62,7 +61,6 @@ class Stream:
             law,
             blends,
             nominal_velocity_m_s=nominal_velocity_m_s,
-            limit_m_s2=limit_m_s2,
             opening=opening,
         )
         for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
@@ -70,7 +68,7 @@ class Stream:
             used_ns = _oldest_needed(history, own)
             if own is not None and used_ns not in (0, control.sample_ns):
                 velocity = nominal_velocity_m_s
-                command = command_at(history, own, row, used_ns, blend, velocity, limit_m_s2, opening)
+                command = command_at(history, own, row, used_ns, blend, velocity, opening)
                 control = control._replace(command_m_s2=command, used_ns=used_ns)
             north, east = control.command_m_s2
             more_north, more_east = self._opened_m_s2[row]

@@ -10,10 +10,12 @@ from gcs.autopilot.kinds import (
     LAUNCHED,
     SET_MESSAGE_INTERVAL,
     SET_MODE,
+    TAKE_OFF,
     Goal,
     Kind,
     Step,
     commanded_mode,
+    kind_of,
     mode_command,
 )
 from gcs.autopilot.startup import Startup
@@ -72,6 +74,8 @@ class RemoteVehicle:
         self.heard_ns = 0  # newest valid frame
         self.heartbeat_ns = 0  # newest heartbeat
         self.frames = SequenceCounter()
+        self.newest = True
+        """Whether the frame last taken in was sent after all before it."""
         self.clock = VehicleClock()
         self.armed = False
         self.custom_mode = -1
@@ -79,11 +83,14 @@ class RemoteVehicle:
         self.goal: Goal | None = Goal.FLY
         """None: it is left to itself."""
         self.taken_over = False
-        """Whether a vehicle with an autopilot has left its guided mode, by its pilot or for a reason of its own: until
-        it is guided again it is told nothing."""
+        """Whether a vehicle with an autopilot is flown by its pilot, or by itself for a reason of its own. Only its own
+        report that it is guided ends that; until then it is asked for telemetry, and commanded nothing."""
         self.startup = startup
         self.upload = upload
         self.first_heard_ns: int | None = None
+        self._has_been_guided = self._take_off_told = False
+        self._doubtful_ns = 0
+        """When the first heartbeat came after a long silence. Its number does not show whether it is an old one."""
         self.rates_set = False
         self._land = land
         self._now_ns = 0
@@ -92,9 +99,11 @@ class RemoteVehicle:
         self._sequence = 0
         self._command: _Command | None = None
         self._not_before_ns = 0
-        self._acknowledged_ns = 0
         self._told = {NEW}
         """What has been told of the order of its frames."""
+        self._outdated: list[tuple[int, int, bool]] = []
+        """Mode and arming before each of the last commands that changed them, and when the ACK came: what a heartbeat
+        may still report that was made before the command was carried out."""
 
     @property
     def kind(self) -> Kind:
@@ -114,7 +123,7 @@ class RemoteVehicle:
 
     @property
     def guided(self) -> bool:
-        return self.armed and self.custom_mode == self.kind.guided_mode
+        return self.armed and self.custom_mode == self.kind.guided_mode and not self.taken_over
 
     @property
     def ready(self) -> bool:
@@ -133,6 +142,8 @@ class RemoteVehicle:
         if self.silent:
             return "is silent"
         if self.taken_over:
+            if not self._has_been_guided:
+                return f"is armed and not in {self.kind.guided_name}: flown by its pilot or by itself"
             return f"left {self.kind.guided_name}, by its pilot or by itself"
         if self.startup is not None:
             return self._next(self.startup).missing
@@ -182,6 +193,9 @@ class RemoteVehicle:
         if order not in self._told:
             self._told.add(order)
             self._report("link", _TOLD[order])
+        self.newest = order == NEW
+        if heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
+            self._doubtful_ns = now_ns
         replayed = order == DUPLICATE or (heartbeat and order == LATE)
         if replayed and heartbeat and now_ns - self.heartbeat_ns > _FORGET_NUMBERS_NS:
             self.frames.restart()
@@ -191,29 +205,55 @@ class RemoteVehicle:
         return replayed
 
     def heartbeat(self, fields: tuple[Any, ...], now_ns: int) -> None:
-        """Take in a HEARTBEAT. One sent before the vehicle took a command in does not undo what its ACK said."""
-        if now_ns - self._acknowledged_ns < _NS + 2 * (self.clock.rtt_ns or 0):
-            return
+        """Take in a HEARTBEAT. One made before the vehicle carried a command out does not undo what its ACK said."""
         custom_mode, vehicle_type, autopilot, base_mode, system_status, _ = fields
+        armed, critical = bool(base_mode & ARMED), system_status == STATE_CRITICAL
+        recent_ns = now_ns - _NS - 2 * (self.clock.rtt_ns or 0)
+        self._outdated = [before for before in self._outdated if before[0] > recent_ns]
+        if any((custom_mode, armed) == before for _, *before in self._outdated):
+            return
+        found = kind_of(autopilot, vehicle_type)
+        self.clock.backdated_ns = found.timesync_backdated_ns if isinstance(found, Kind) else 0
+        was_guided = self.guided
         if self.startup is not None:
             self.startup.heartbeat(autopilot, vehicle_type)
-        self._see_takeover(custom_mode, critical=system_status == STATE_CRITICAL)
-        was_guided = self.guided
-        self.custom_mode, self.armed = custom_mode, bool(base_mode & ARMED)
-        critical = system_status == STATE_CRITICAL
+            self._see_pilot(custom_mode, now_ns, armed=armed, critical=critical)
+        self.custom_mode, self.armed = custom_mode, armed
         if critical and not self.critical:
             self._report("vehicle", "is in failsafe")
         elif was_guided and not self.guided and not critical:
             self._report("vehicle", f"left {self.kind.guided_name}")
         self.critical = critical
 
-    def _see_takeover(self, mode: int, *, critical: bool) -> None:
-        """Notice that an autopilot has left its guided mode and nothing of ours made it, by the mode it reports."""
-        kind = self.kind
+    def _see_pilot(self, mode: int, now_ns: int, *, armed: bool, critical: bool) -> None:
+        """Notice from a reported mode that a vehicle is in other hands, or is given back.
+
+        A mode that none of our commands leads to is somebody's will, but for a failsafe that the vehicle reports. On
+        the ground, before it is armed, modes are set up by whoever stands there.
+        """
+        kind, before = self.kind, self.custom_mode
         if mode == kind.guided_mode:
-            self.taken_over = False
-        elif self.startup is not None and self.goal is not Goal.END and self.custom_mode == kind.guided_mode:
+            self._has_been_guided = True
+            self.taken_over = self.taken_over and now_ns - self._doubtful_ns < _FORGET_NUMBERS_NS
+        elif mode == before or self.taken_over or (self.goal is Goal.END and mode == self.end_mode):
+            return
+        elif before == kind.guided_mode:
             self.taken_over = kind.stays_guided or not critical
+        elif before < 0:
+            self.taken_over = armed and not critical and mode not in (kind.hold_mode, kind.take_off_mode)
+        elif (armed or self.armed) and not critical:
+            self.taken_over = not self._takes_off_by(mode)
+        if self.taken_over:
+            self._command = None  # sent again, it would take the vehicle back
+
+    def _takes_off_by(self, mode: int) -> bool:
+        """Whether a mode is one that a take-off goes through, and it does: it begins with one, and holds at its top."""
+        startup, kind = self.startup, self.kind
+        if startup is None or kind.guided_first or self._has_been_guided:
+            return False
+        if mode == kind.take_off_mode:
+            return self._take_off_told
+        return mode == kind.hold_mode and self.custom_mode == kind.take_off_mode and startup.is_half_way_up
 
     def acknowledge(self, fields: tuple[Any, ...], now_ns: int) -> None:
         """Take in a COMMAND_ACK."""
@@ -238,12 +278,12 @@ class RemoteVehicle:
         if command == SET_MESSAGE_INTERVAL:
             self.rates_set = self.startup is None or self.startup.rates_set
         elif command == SET_MODE:
+            self._outdated.append((now_ns, self.custom_mode, self.armed))
             self.custom_mode = commanded_mode(self.kind, waiting.parameters)
             self.critical = False
-            self._acknowledged_ns = now_ns
         elif command == ARM_DISARM:
+            self._outdated.append((now_ns, self.custom_mode, self.armed))
             self.armed = waiting.parameters[0] == 1.0
-            self._acknowledged_ns = now_ns
 
     def converse(self, now_ns: int) -> bytes | None:
         """The next frame that brings the vehicle to the wanted state, if one is due: a command, else a parameter.
@@ -277,6 +317,7 @@ class RemoteVehicle:
             if wanted is None:
                 return None
             waiting = self._command = _Command(*wanted, sent_ns=now_ns)
+            self._take_off_told = self._take_off_told or waiting.command == TAKE_OFF
         return self.encode(
             mavlink.COMMAND_LONG,
             mavlink.command_long(
@@ -288,12 +329,13 @@ class RemoteVehicle:
         )
 
     def _wanted(self) -> tuple[int, tuple[float, ...]] | None:
-        if self.goal is None or self.taken_over:
+        if self.goal is None:
             return None
         if self.goal is Goal.END:
             return None if self.ended else mode_command(self.kind, self.end_mode)
         if self.startup is not None:
-            return self._next(self.startup).command
+            command = self._next(self.startup).command
+            return command if command is None or not self.taken_over or command[0] == SET_MESSAGE_INTERVAL else None
         if not self.rates_set:
             return SET_MESSAGE_INTERVAL, (float(mavlink.LOCAL_POSITION_NED), self._telemetry_interval_us)
         if self.custom_mode != self.kind.guided_mode:
@@ -309,8 +351,11 @@ class RemoteVehicle:
         )
 
     def forget_rates(self) -> None:
-        """The vehicle seems to have started anew: its rates have to be set again."""
-        self.rates_set = self.taken_over = False
+        """The vehicle seems to have started anew: its rates have to be set again.
+
+        Who flies it is another matter: a clock that has only slipped does not give it back.
+        """
+        self.rates_set = False
         if self.startup is not None:
             self.startup.forget_rates()
         if self.upload is not None:

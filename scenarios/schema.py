@@ -24,6 +24,8 @@ Rate = Annotated[float, Field(ge=1, le=500)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Flavour = Literal["ardupilot", "px4"]
 NS_PER_S = 1_000_000_000
+DRIFT_MAX_PPM = 1000.0
+"""Most that a vehicle's clock may drift. What the station says of clocks, and the bounds it gives, hold up to this."""
 
 
 class Part(BaseModel):
@@ -255,7 +257,7 @@ class Clocks(Part):
     """Boot clocks of the vehicles: offset and drift are drawn from the seed within these bounds."""
 
     offset_max_s: Annotated[float, Field(ge=0, le=1e6)] = 100.0
-    drift_max_ppm: Annotated[float, Field(ge=0, le=1e4)] = 20.0
+    drift_max_ppm: Annotated[float, Field(ge=0, le=DRIFT_MAX_PPM)] = 20.0
 
 
 class Safety(Part):

@@ -223,7 +223,7 @@ class Shell(Generic[Flown]):
         elif message.tc1 == 0:
             self.counters["timesync_requests"] += 1
             # Not 0 even at the very boot: that would make the reply a request.
-            tc1 = max(1, self.radio.clock.boot_ns(time_ns))
+            tc1 = self.radio.clock.boot_ns(time_ns) or 1
             self.radio.send(self.radio.encoder.timesync(tc1, message.ts1), time_ns)
         else:  # a reply that was not asked for is one to another vehicle, or a duplicate
             asked = message.ts1 == self._timesync_ts1

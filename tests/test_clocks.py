@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
-from gcs.clocks import LEAST_SAMPLES, VehicleClock
+from gcs.clocks import DRIFT_BOUND, LEAST_SAMPLES, VehicleClock
+from scenarios.schema import DRIFT_MAX_PPM, Clocks
 
 MS = 1_000_000
 S = 1000 * MS
@@ -106,7 +108,7 @@ LINKS = st.tuples(
     st.sampled_from([0.0001, 0.002, 0.04, 0.4, 2.5]),
     st.sampled_from([0.0, 0.005, 0.05, 0.5]),  # mean of exponential jitter, s
     st.sampled_from([0.0, 0.3]),  # loss each way
-    st.floats(-3e-4, 3e-4),  # drift
+    st.floats(-DRIFT_BOUND, DRIFT_BOUND),  # drift
 )
 
 
@@ -162,4 +164,96 @@ def test_no_way_of_slowing_down_is_taken_for_a_jump() -> None:
         ramp = 20 * MS + (k - 200) * 4 * MS if 200 <= k < 300 else 20 * MS
         truth.at(k * S // 10, down_ns=slow, up_ns=ramp)
         assert truth.bounded(k * S // 10)
+    assert truth.clock.jumps == 0
+
+
+def test_a_scenario_may_have_the_drift_up_to_which_the_bounds_hold_and_no_more() -> None:
+    assert DRIFT_BOUND == DRIFT_MAX_PPM * 1e-6
+    assert Clocks(drift_max_ppm=1e6 * DRIFT_BOUND).drift_max_ppm == 1000.0
+    with pytest.raises(ValidationError, match="less than or equal to 1000"):
+        Clocks(drift_max_ppm=1e6 * DRIFT_BOUND + 1.0)
+
+
+def exchanged(*, down_ms: int = 20, up_ms: int = 20, drift: float = 0.0) -> Exchange:
+    """A clock known from five seconds of exchanges."""
+    truth = Exchange(offset_ns=100 * S, drift=drift)
+    for k in range(50):
+        truth.at(k * S // 10, down_ns=down_ms * MS, up_ns=up_ms * MS)
+    return truth
+
+
+def state(truth: Exchange, sampled_ns: int, *, up_ms: int = 20) -> int | None:
+    """When a state sampled at a whole millisecond of the vehicle's clock is taken to have been sampled."""
+    boot_ms = truth.boot_ns(sampled_ns) // MS
+    return truth.clock.sampled_ns(boot_ms & 0xFFFFFFFF, sampled_ns + up_ms * MS, newest=True)
+
+
+@given(
+    st.integers(0, 3000), st.integers(0, 3000), st.integers(0, 3000), st.floats(-DRIFT_BOUND, DRIFT_BOUND)
+)  # fmt: skip
+def test_no_state_of_a_clock_that_has_not_jumped_is_refused(down: int, up: int, state_up: int, drift: float) -> None:
+    truth = exchanged(down_ms=down, up_ms=up, drift=drift)
+    for k in range(250, 1000, 50):
+        assert state(truth, k * S // 50 + 10 * S, up_ms=state_up) is not None
+    assert not truth.clock.exchange_due
+
+
+@given(st.integers(41, 10**9), st.integers(0, 2000))
+def test_a_state_from_the_future_is_refused_and_the_clock_unknown_until_an_exchange(by_ms: int, way_ms: int) -> None:
+    truth = exchanged(down_ms=way_ms, up_ms=way_ms)
+    truth.offset_ns += (by_ms + 2 * way_ms) * MS
+    assert state(truth, 10 * S, up_ms=way_ms) is None
+    assert truth.clock.exchange_due
+    assert truth.clock.estimate.samples == 0
+    assert state(truth, 10 * S + 20 * MS, up_ms=way_ms) is None
+    truth.at(13 * S, down_ns=way_ms * MS, up_ns=way_ms * MS)
+    assert not truth.clock.exchange_due
+    assert truth.clock.jumps == 1
+    assert state(truth, 20 * S, up_ms=way_ms) == pytest.approx(20 * S, abs=MS)
+
+
+@given(st.integers(25, 10**9))
+def test_a_state_sampled_before_the_one_sent_before_it_is_refused_and_asks_for_an_exchange(by_ms: int) -> None:
+    """Also when the clock is set to before its boot, where time_boot_ms wraps."""
+    truth = exchanged()
+    assert state(truth, 10 * S - 20 * MS) is not None
+    truth.offset_ns -= by_ms * MS
+    assert state(truth, 10 * S) is None
+    assert truth.clock.exchange_due
+    for k in range(3):
+        truth.at(10 * S + 50 * k * MS, down_ns=20 * MS, up_ns=20 * MS)
+    assert truth.clock.jumps == 1
+    assert state(truth, 11 * S) == pytest.approx(11 * S, abs=MS)
+
+
+def test_an_overtaken_state_asks_for_no_exchange() -> None:
+    truth = exchanged()
+    assert state(truth, 10 * S) is not None
+    boot_ms = truth.boot_ns(10 * S - 200 * MS) // MS
+    assert truth.clock.sampled_ns(boot_ms, 10 * S + 30 * MS, newest=False) == 10 * S - 200 * MS
+    assert not truth.clock.exchange_due
+
+
+def test_time_boot_ms_wraps_after_49_days_in_the_air() -> None:
+    truth = Exchange(offset_ns=(1 << 32) * MS - 10 * S, drift=0.0)
+    for k in range(200):
+        truth.at(k * S // 10, down_ns=20 * MS, up_ns=20 * MS)
+        assert state(truth, k * S // 10) == k * S // 10
+    assert truth.clock.jumps == 0
+
+
+def test_replies_dated_back_as_by_arducopter_are_no_jumps_and_keep_the_bound() -> None:
+    """Up to 3.5 ms, on a third of the exchanges over links that take next to nothing."""
+    rng = np.random.default_rng(5)
+    truth = Exchange(offset_ns=7 * S, drift=30e-6)
+    truth.clock.backdated_ns = 5 * MS
+    for k in range(600):
+        now = k * S // 10
+        down_ns, up_ns = (int(rng.uniform(0.2, 3.0) * MS) for _ in range(2))
+        back_ns = int(rng.uniform(0.0, 3.5) * MS) if rng.random() < 0.33 else 0
+        ts1 = truth.clock.request(now)
+        tc1 = truth.boot_ns(now + down_ns) - back_ns
+        truth.clock.reply(tc1_ns=tc1, ts1_ns=ts1, received_ns=now + down_ns + up_ns)
+        assert truth.bounded(now)
+        assert state(truth, now + 50 * MS, up_ms=0) is not None
     assert truth.clock.jumps == 0

@@ -39,7 +39,7 @@ def test_a_drifting_clock_gains_its_drift() -> None:
 
 
 def test_positions_are_sampled_exactly_on_the_millisecond_they_name() -> None:
-    vehicle = a_vehicle(seed=3, drift_max_ppm=10_000.0)
+    vehicle = a_vehicle(seed=3, drift_max_ppm=1000.0)
     take_off(vehicle)
     start = vehicle.craft.state_at(START)
     vehicle.step([(command(511, 32, 20_000), START)], START)
@@ -49,7 +49,7 @@ def test_positions_are_sampled_exactly_on_the_millisecond_they_name() -> None:
         now += step
         sent += vehicle.step([], now)
     positions = parse_all(sent, "LOCAL_POSITION_NED")
-    assert len(positions) in (24, 25)  # 0.5 s at 50 Hz of a clock that is up to 1 % off
+    assert len(positions) in (24, 25)  # 0.5 s at 50 Hz of a clock that is up to 0.1 % off
     for message, time_ns in positions:
         assert 0 <= vehicle.radio.clock.boot_ns(time_ns) - message.time_boot_ms * MS <= 1
         flown_s = (time_ns - START) / SECOND

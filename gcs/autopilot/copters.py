@@ -90,8 +90,11 @@ class Copters:
         """Fields of the set-point that a vehicle is sent at this tick, if any: to hover, to be identified, to fly."""
         vehicle, command = self._vehicles[row], control.command_m_s2
         airborne = vehicle.startup is not None and vehicle.startup.airborne
+        if vehicle.taken_over and vehicle.kind.guided_first:
+            self._pilots.rest(row)
+            return None
         others = vehicle.taken_over and phase in (Phase.IDENTIFYING, Phase.FLYING)
-        if (phase is Phase.CONNECTING and airborne) or others:  # PX4 is given back only while set-points come
+        if (phase is Phase.CONNECTING and airborne) or others:  # PX4 enters OFFBOARD only while set-points come
             return self._pilots.hover(row, vehicle, key_ms=key_ms)
         known = control.sample_ns > 0
         if phase is Phase.IDENTIFYING and self._identification is not None:

@@ -114,6 +114,11 @@ class Startup:
         elif command == TAKE_OFF and repeated:
             self._took_off_ns = now_ns
 
+    @property
+    def is_half_way_up(self) -> bool:
+        """Whether it has reached half of the altitude it takes off to, at least."""
+        return (self.relative_altitude_m or 0.0) >= 0.5 * self.altitude_m
+
     def forget_rates(self) -> None:
         """The vehicle seems to have started anew."""
         self._accepted.clear()

@@ -21,7 +21,7 @@ What would hide the loop is taken out:
 
 import numpy as np
 
-from gcs.control import LARGEST_COMMAND_M_S2
+from gcs.limits import LARGEST_COMMAND_M_S2
 from gcs.plan import FlightPlan
 from gcs.record import TickArray
 from scenarios.schema import Link, Scenario, Vehicle

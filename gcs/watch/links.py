@@ -68,11 +68,12 @@ class WatchedVehicle:
         """Take in a position report; the local one counts where it is sent, as it is what formations fly by."""
         if frame.msg_id == mavlink.LOCAL_POSITION_NED != self._kind:
             self._kind, self.states = mavlink.LOCAL_POSITION_NED, 0
-        boot_ns = frame.fields[0] * 1_000_000
+        boot_ns = self.remote.clock.boot_ns(frame.fields[0], received_ns)
         if frame.msg_id != self._kind or (self.states and boot_ns == self.boot_ns):
             return
         if boot_ns < self.boot_ns < boot_ns + NS_PER_S:
             return  # overtaken
+        self.remote.clock.sampled_ns(frame.fields[0], received_ns, newest=self.remote.newest)  # notices a jump
         if boot_ns < self.boot_ns:
             self._least_ns = (1 << 62, 1 << 62)  # started anew
         if self.states and received_ns - self.state_ns > SILENT_NS:

@@ -22,7 +22,6 @@ from gcs import mavlink
 from gcs.autopilot.copters import locate
 from gcs.autopilot.startup import Startup
 from gcs.control import (
-    LARGEST_COMMAND_M_S2,
     Blend,
     FeedbackLaw,
     Formation,
@@ -259,11 +258,12 @@ class _Replay:
             return
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
         bound_s = nan
-        if clock.estimate.samples:
-            sample_ns = clock.estimate.to_station_ns(boot_ms * 1_000_000)
+        sample_ns = clock.sampled_ns(boot_ms, time_ns, newest=vehicle.remote.newest)
+        if sample_ns is not None:
             bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
         elif self._outline.exchanges:
-            self._telemetry_ns[row] = time_ns
+            if not clock.exchange_due:
+                self._telemetry_ns[row] = time_ns
             return
         else:
             sample_ns = boot_ms * 1_000_000 + vehicle.least_delay_ns
@@ -288,7 +288,6 @@ class _Replay:
             self._law,
             [_NO_BLEND] * len(lost),
             nominal_velocity_m_s=self._scenario.nominal_velocity_at(time_s),
-            limit_m_s2=LARGEST_COMMAND_M_S2,
         )
         nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns), axis=1).tolist()
         seen: list[VehicleTick] = []

@@ -1,0 +1,43 @@
+"""The scenario's limits, held by every set-point that leaves, whatever vehicle it is for and whoever computed it."""
+
+from dataclasses import dataclass
+from math import hypot
+from typing import Any
+
+from scenarios.schema import Limits
+
+LARGEST_COMMAND_M_S2 = 9_999.0
+"""Limit on what is sent when the scenario sets none; beyond it a command is a fault, not a manoeuvre. Vehicles refuse
+more than 1e4, and rounding to float32 must not lead there."""
+
+Vector = tuple[float, float]
+_VELOCITY, _ACCELERATION = slice(4, 6), slice(7, 9)
+"""North and east among the fields of SET_POSITION_TARGET_LOCAL_NED."""
+
+
+@dataclass(frozen=True)
+class SetPointLimits:
+    """Largest horizontal acceleration and speed that a set-point may ask for."""
+
+    acceleration_m_s2: float
+    speed_m_s: float
+
+    @classmethod
+    def of(cls, limits: Limits) -> "SetPointLimits":
+        """Those of a scenario."""
+        return cls(limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, limits.speed_max_m_s or LARGEST_COMMAND_M_S2)
+
+    def command(self, wanted_m_s2: Vector) -> Vector:
+        """A wanted acceleration, shortened to the limit; its direction is kept."""
+        return _shortened(wanted_m_s2, self.acceleration_m_s2)
+
+    def set_point(self, fields: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The fields of a set-point, with velocity and acceleration within the limits."""
+        velocity_m_s = _shortened(fields[_VELOCITY], self.speed_m_s)
+        return (*fields[:4], *velocity_m_s, fields[6], *self.command(fields[_ACCELERATION]), *fields[9:])
+
+
+def _shortened(vector: Any, longest: float) -> Vector:
+    north, east = vector
+    size = hypot(north, east)
+    return (north * longest / size, east * longest / size) if size > longest else (north, east)
