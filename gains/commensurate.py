@@ -28,7 +28,7 @@ from gains.delay_crossings import (
     polish,
     separating_points,
 )
-from gains.delay_loci import ComplexArray, Loci, UnitCrossing, unit_crossings
+from gains.delay_loci import ComplexArray, Loci, UnitCrossing, solved_beside_poles, unit_crossings
 from gains.errors import BadModelError
 from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
@@ -235,13 +235,7 @@ def companion_loci(terms_at: Callable[[FloatArray], ComplexArray], B: FloatArray
         terms = terms_at(omega)
         degree = terms.shape[1] - 1
         resolvent = 1j * omega[:, np.newaxis, np.newaxis] * identity - terms[:, 0]
-        entry = np.broadcast_to(B.astype(np.complex128), (omega.size, n, rank))
-        try:
-            states = np.linalg.solve(resolvent, entry)
-        except np.linalg.LinAlgError:
-            # exactly on a pole the modulus is infinite: one step beside it is huge, which says the same
-            states = np.linalg.solve(resolvent + 1e-14j * np.abs(resolvent).max() * identity, entry)
-        loops = B.T @ terms[:, 1:] @ states[:, np.newaxis]
+        loops = B.T @ terms[:, 1:] @ solved_beside_poles(resolvent, B)[:, np.newaxis]
         companion = np.zeros((omega.size, degree * rank, degree * rank), dtype=np.complex128)
         companion[:, :rank] = loops.swapaxes(1, 2).reshape(omega.size, rank, degree * rank)
         companion[:, rank:, :-rank] = np.eye((degree - 1) * rank)
