@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.circle_angles import PAST_HALF, at_angle, candidate_angles, circle_loci, circle_points, norm_of
-from gains.delay import Crossing, DelayAnalysis, check_horizon, stability_windows
+from gains.delay import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis, unstable_roots
 from gains.delay_crossings import (
     AxisCrossing,
     axis_crossings,
@@ -28,9 +28,10 @@ from gains.delay_crossings import (
     polish,
     separating_points,
 )
-from gains.delay_loci import ComplexArray, Loci, UnitCrossing, unit_crossings
+from gains.delay_loci import ComplexArray, Loci, UnitCrossing, solved_beside_poles, unit_crossings
+from gains.delay_zero import zero_passage
 from gains.errors import BadModelError
-from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
+from gains.structure import Block, FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
 # a locus is an eigenvalue of a companion matrix, of which many are wanted; beyond this size angles are followed instead
 _LARGEST_LOCI = 30
@@ -44,14 +45,16 @@ _ON_AXIS = 1e-9
 _SLOW, _BESIDE = 1e-6, 0.05
 
 
-def analyse_commensurate(matrices: Sequence[ArrayLike], *, horizon_s: float | None = None) -> DelayAnalysis:
+def analyse_commensurate(
+    matrices: Sequence[ArrayLike], *, horizon_s: float | None = None, leave_out_zero: bool = False
+) -> DelayAnalysis:
     """Stability windows, critical delays and margin in tau of x'(t) = sum_k A_k x(t - k tau).
 
     Parameters
     ----------
     matrices
         A_0, A_1, ..., A_m, real (n, n), 1/s; A_k acts k tau late.
-    horizon_s
+    horizon_s, leave_out_zero
         As of `gains.delay.analyse_delay`.
 
     Raises
@@ -72,28 +75,19 @@ def analyse_commensurate(matrices: Sequence[ArrayLike], *, horizon_s: float | No
     (0.6046, 1.732051)
     """
     check_horizon(horizon_s)
-    crossings: list[Crossing] = []
-    unstable, fixed_on_axis = 0, False
-    for block in distinct_blocks(*_checked(matrices)):
-        terms = balanced(*block.matrices)
-        roots = np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).astype(np.complex128)
-        if has_fixed_root(terms, roots):
-            fixed_on_axis = True
-            continue
-        found = block_crossings(terms)
-        crossings += [Crossing(c.omega, c.theta / c.omega, c.direction, 2 * block.copies) for c in found]
-        unstable += block.copies * _unstable_roots(roots, found)
-    crossings.sort(key=lambda crossing: (crossing.delay_s, crossing.omega_rad_s))
-    intervals, complete_to_s = ((), inf) if fixed_on_axis else stability_windows(crossings, unstable, horizon_s)
-    margin_s = next((end_s for start_s, end_s in intervals if start_s == 0.0), 0.0)
-    return DelayAnalysis(
-        stable_intervals_s=intervals,
-        delay_margin_s=margin_s,
-        delay_independent=margin_s == inf,
-        crossings=tuple(crossings),
-        unstable_roots_at_zero_delay=unstable,
-        complete_to_s=complete_to_s,
-    )
+    blocks = distinct_blocks(*_checked(matrices))
+    return combined_analysis([_analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
+
+
+def _analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
+    terms = balanced(*block.matrices)
+    roots = np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).astype(np.complex128)
+    passage = zero_passage(terms, np.zeros(len(terms)), np.arange(len(terms))) if leave_out_zero else None
+    if passage is None and has_fixed_root(terms, roots):
+        return BlockAnalysis(block.copies, fixed_on_axis=True)
+    found = block_crossings(terms)
+    unstable = unstable_roots(roots, found, passage)
+    return block_analysis(block.copies, found, unstable, passage, highest_frequency(terms))
 
 
 def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
@@ -201,15 +195,6 @@ def _checked(matrices: Sequence[ArrayLike]) -> list[FloatArray]:
     return checked
 
 
-def _unstable_roots(roots: ComplexArray, crossings: Sequence[AxisCrossing]) -> int:
-    # a pair that crosses at zero delay is on the axis there: rounding must not put it in either half plane
-    for crossing in crossings:
-        if crossing.theta == 0.0:
-            for sign in (1.0, -1.0):
-                roots = np.delete(roots, np.argmin(np.abs(roots - sign * 1j * crossing.omega)))
-    return int(np.count_nonzero(roots.real > 0.0))
-
-
 def _least_singular(terms: Sequence[FloatArray], omega: float, theta: float) -> float:
     matrix = 1j * omega * np.eye(terms[0].shape[0]) - at_angle(terms, np.array([theta]))[0]
     return float(np.linalg.svd(matrix, compute_uv=False)[-1])
@@ -235,13 +220,7 @@ def companion_loci(terms_at: Callable[[FloatArray], ComplexArray], B: FloatArray
         terms = terms_at(omega)
         degree = terms.shape[1] - 1
         resolvent = 1j * omega[:, np.newaxis, np.newaxis] * identity - terms[:, 0]
-        entry = np.broadcast_to(B.astype(np.complex128), (omega.size, n, rank))
-        try:
-            states = np.linalg.solve(resolvent, entry)
-        except np.linalg.LinAlgError:
-            # exactly on a pole the modulus is infinite: one step beside it is huge, which says the same
-            states = np.linalg.solve(resolvent + 1e-14j * np.abs(resolvent).max() * identity, entry)
-        loops = B.T @ terms[:, 1:] @ states[:, np.newaxis]
+        loops = B.T @ terms[:, 1:] @ solved_beside_poles(resolvent, B)[:, np.newaxis]
         companion = np.zeros((omega.size, degree * rank, degree * rank), dtype=np.complex128)
         companion[:, :rank] = loops.swapaxes(1, 2).reshape(omega.size, rank, degree * rank)
         companion[:, rank:, :-rank] = np.eye((degree - 1) * rank)

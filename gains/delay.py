@@ -11,15 +11,16 @@ used here is derived in `gains.delay_crossings`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.delay_crossings import AxisCrossing, axis_crossings
+from gains.delay_crossings import AxisCrossing, axis_crossings, highest_frequency
 from gains.delay_loci import ComplexArray
 from gains.delay_sweep import frequency_sweep_margin
+from gains.delay_zero import ZeroPassage, zero_passage
 from gains.errors import BadModelError, DisagreementError
 from gains.structure import Block, FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
@@ -44,7 +45,8 @@ class Crossing:
 
     `direction` is +1 when they go into the right half plane as the delay grows, -1 when they come out, 0 when they
     touch the axis and return; it is the same for every k. `roots` counts the roots that cross here together: 2, times
-    the number of equal blocks.
+    the number of equal blocks. At the frequency 0 a real root passes s = 0 beside one that stays there: once, at
+    `delay_s`, and alone.
     """
 
     omega_rad_s: float
@@ -63,6 +65,7 @@ class DelayAnalysis:
     when the loop is stable at every delay. `crossings` ascend by delay. `unstable_roots_at_zero_delay` counts
     eigenvalues of A0 + A1 with positive real part. The windows are complete up to `complete_to_s`, which is `inf`
     unless the caller gave a horizon or the critical delays were too many to list; the margin is exact all the same.
+    `roots_fixed_at_zero` counts the roots at s = 0 that were left out on the caller's wish.
     """
 
     stable_intervals_s: tuple[tuple[float, float], ...]
@@ -71,14 +74,33 @@ class DelayAnalysis:
     crossings: tuple[Crossing, ...]
     unstable_roots_at_zero_delay: int
     complete_to_s: float
+    roots_fixed_at_zero: int = 0
 
 
-def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = None) -> DelayAnalysis:
+@dataclass(frozen=True)
+class BlockAnalysis:
+    """What the analysis of one block found, for all its `copies`; `roots` as of `Crossing` for one of them.
+
+    `fixed_at_zero` says that a simple root at s = 0 was left out, `fixed_on_axis` that a root stays on the imaginary
+    axis and was not.
+    """
+
+    copies: int
+    crossings: Sequence[Crossing] = ()
+    unstable: int = 0
+    fixed_at_zero: bool = False
+    fixed_on_axis: bool = False
+
+
+def analyse_delay(
+    A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = None, leave_out_zero: bool = False
+) -> DelayAnalysis:
     """Stability windows, critical delays and delay margin of x'(t) = A0 x(t) + A1 x(t - tau).
 
     A loop with a root that stays on the imaginary axis at every delay is asymptotically stable at none: no window,
-    margin 0. A singular A0 + A1 is such a loop (s = 0); if the root is the common value of a consensus and of no
-    interest, take it out first with `gains.structure.project_out_equilibria`.
+    margin 0. A singular A0 + A1 is such a loop (s = 0). If the root is the common value of a consensus and of no
+    interest, ask for `leave_out_zero`; what stands still at once and late can also be taken out of the matrices, with
+    `gains.structure.project_out_equilibria`.
 
     Parameters
     ----------
@@ -86,6 +108,8 @@ def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = Non
         Real matrices (n, n), 1/s.
     horizon_s
         List windows that begin before this delay only. By default all are listed: they are finitely many.
+    leave_out_zero
+        Say all of the other roots if a block has a simple root at s = 0 that stays there at every delay.
 
     Raises
     ------
@@ -107,14 +131,17 @@ def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = Non
     """
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
     check_horizon(horizon_s)
-    crossings: list[Crossing] = []
-    unstable, fixed_on_axis = 0, False
-    for block in blocks:
-        found, unstable_of_block, fixed_of_block = _analyse_block(block)
-        crossings += found
-        unstable += unstable_of_block
-        fixed_on_axis |= fixed_of_block
+    return combined_analysis([_analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
+
+
+def combined_analysis(blocks: Sequence[BlockAnalysis], horizon_s: float | None) -> DelayAnalysis:
+    """The analysis of a loop from those of its blocks."""
+    crossings = [
+        replace(crossing, roots=crossing.roots * block.copies) for block in blocks for crossing in block.crossings
+    ]
     crossings.sort(key=lambda crossing: (crossing.delay_s, crossing.omega_rad_s))
+    unstable = sum(block.copies * block.unstable for block in blocks)
+    fixed_on_axis = any(block.fixed_on_axis for block in blocks)
     intervals, complete_to_s = ((), inf) if fixed_on_axis else stability_windows(crossings, unstable, horizon_s)
     margin_s = next((end_s for start_s, end_s in intervals if start_s == 0.0), 0.0)
     return DelayAnalysis(
@@ -124,6 +151,7 @@ def analyse_delay(A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = Non
         crossings=tuple(crossings),
         unstable_roots_at_zero_delay=unstable,
         complete_to_s=complete_to_s,
+        roots_fixed_at_zero=sum(block.copies for block in blocks if block.fixed_at_zero),
     )
 
 
@@ -150,29 +178,45 @@ def check_horizon(horizon_s: float | None) -> None:
         raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
 
 
-def _analyse_block(block: Block) -> tuple[list[Crossing], int, bool]:
-    """Crossings of one block, unstable roots of all its copies without delay, and whether a root stays on the axis."""
+def _analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
     A0, A1 = balanced(*block.matrices)
     roots = np.linalg.eigvals(A0 + A1).astype(np.complex128)
-    if _has_fixed_root(A0, A1, roots):
-        return [], block.copies * int(np.count_nonzero(roots.real > _marginal(A0, A1))), True
+    passage = zero_passage([A0, A1], np.zeros(2), np.arange(2)) if leave_out_zero else None
+    if passage is None and _has_fixed_root(A0, A1, roots):
+        unstable = int(np.count_nonzero(roots.real > _marginal(A0, A1)))
+        return BlockAnalysis(block.copies, unstable=unstable, fixed_on_axis=True)
     found = axis_crossings(A0, A1)
+    unstable = unstable_roots(roots, found, passage)
+    return block_analysis(block.copies, found, unstable, passage, highest_frequency(A0, A1))
+
+
+def block_analysis(
+    copies: int, found: Sequence[AxisCrossing], unstable: int, passage: ZeroPassage | None, highest: float
+) -> BlockAnalysis:
+    """One block's analysis from its crossings up to the frequency `highest` and its unstable roots without delay.
+
+    `passage` is what `zero_passage` says of a root at zero that is left out, None if there is none.
+    """
+    crossings = [
+        Crossing(crossing.omega, crossing.theta / crossing.omega, crossing.direction, 2)
+        for crossing in found
+        if passage is None or not passage.is_seen_at(crossing.omega, crossing.theta, highest)
+    ]
+    if passage is not None and passage.direction != 0:
+        crossings.append(Crossing(0.0, passage.delay_s, passage.direction, 1))
+    return BlockAnalysis(copies, crossings, unstable, fixed_at_zero=passage is not None)
+
+
+def unstable_roots(roots: ComplexArray, found: Sequence[AxisCrossing], passage: ZeroPassage | None) -> int:
+    """How many of the roots without delay have a positive real part; those known to be on the axis have none."""
     # a pair that crosses at zero delay is on the axis there: rounding must not put it in either half plane
     for crossing in found:
         if crossing.theta == 0.0:
             for sign in (1.0, -1.0):
                 roots = np.delete(roots, np.argmin(np.abs(roots - sign * 1j * crossing.omega)))
-    unstable = int(np.count_nonzero(roots.real > 0.0))
-    return [_to_crossing(crossing, block.copies) for crossing in found], block.copies * unstable, False
-
-
-def _to_crossing(crossing: AxisCrossing, copies: int) -> Crossing:
-    return Crossing(
-        omega_rad_s=crossing.omega,
-        delay_s=crossing.theta / crossing.omega,
-        direction=crossing.direction,
-        roots=2 * copies,
-    )
+    if passage is not None:
+        roots = np.delete(roots, np.argmin(np.abs(roots)))
+    return int(np.count_nonzero(roots.real > 0.0))
 
 
 def _marginal(A0: FloatArray, A1: FloatArray) -> float:
@@ -209,20 +253,23 @@ def stability_windows(
     omega = np.array([crossing.omega_rad_s for crossing in crossings])
     first = np.array([crossing.delay_s for crossing in crossings])
     change = np.array([crossing.direction * crossing.roots for crossing in crossings])
+    # a real root passes zero once only
+    period_s = np.divide(2.0 * pi, omega, out=np.full(omega.size, inf), where=omega > 0.0)
     # roots that leave the axis at zero delay to the right are unstable from there on, to the left they always were
     at_zero = first == 0.0
     unstable += int(change[at_zero & (change > 0)].sum())
-    first = np.where(at_zero, 2.0 * pi / omega, first)
+    first = np.where(at_zero, period_s, first)
     wanted_s, complete_to_s = _last_delay(omega, first, change, unstable, horizon_s)
     # a window that begins by then ends at a root that comes in, within one period of the fastest sequence that does
     entering = change >= 0 if bool(np.any(change >= 0)) else np.full(change.size, True)
-    last_s = float(np.maximum(first, wanted_s + 2.0 * pi / omega)[entering].min())
-    times = np.floor((last_s - first) * omega / (2.0 * pi)).astype(np.int64) + 1
+    returns_s = np.where(period_s < inf, np.maximum(first, wanted_s + period_s), np.where(first < wanted_s, inf, first))
+    last_s = min(float(returns_s[entering].min()), max(float(first.max()), wanted_s + float(period_s.min())))
+    times = np.floor((last_s - first) / period_s).astype(np.int64) + 1 if last_s < inf else np.ones(first.size, int)
     # the first delay of every sequence is listed in any case
     times = np.maximum(times, 1)
     source = np.repeat(np.arange(first.size), times)
     k = np.arange(source.size) - np.repeat(np.cumsum(times) - times, times)
-    delays = first[source] + 2.0 * pi * k / omega[source]
+    delays = first[source] + np.where(k > 0, k * np.where(period_s < inf, period_s, 0.0)[source], 0.0)
     order = np.lexsort((-change[source], delays))
     delays = np.concatenate([[0.0], delays[order], [inf]])
     count = unstable + np.concatenate([[0], np.cumsum(change[source][order])])
@@ -249,7 +296,7 @@ def _last_delay(
     offset = unstable - float((change * omega * first).sum()) / (2.0 * pi) + float(change[change < 0].sum())
     end_s = inf if growth <= 0.0 else max(-offset / growth, 0.0)
     events_per_s = float(omega.sum()) / (2.0 * pi)
-    affordable_s = _MOST_EVENTS / events_per_s
+    affordable_s = _MOST_EVENTS / events_per_s if events_per_s > 0.0 else inf
     wanted_s = end_s if horizon_s is None else min(horizon_s, end_s)
     complete_to_s = inf if wanted_s >= end_s else wanted_s
     if wanted_s > affordable_s:

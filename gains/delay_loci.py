@@ -20,6 +20,8 @@ ComplexArray = NDArray[np.complex128]
 Loci = Callable[[FloatArray], ComplexArray]
 
 _EPS = float(np.finfo(np.float64).eps)
+# the least normal number: a matrix of zeros has no scale of its own
+_LEAST = float(np.finfo(np.float64).tiny)
 # two crossings closer than this (relative) are one place: below the error of a double eigenvalue, sqrt(eps)
 _SAME_PLACE = 1e-10
 # log of the modulus of a locus at such a place
@@ -54,16 +56,25 @@ def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray) -> Loci:
     identity = np.eye(A0.shape[0])
 
     def loci(omega: FloatArray) -> ComplexArray:
-        resolvent = 1j * omega[:, np.newaxis, np.newaxis] * identity - A0
-        try:
-            states = np.linalg.solve(resolvent, B.astype(np.complex128))
-        except np.linalg.LinAlgError:
-            # exactly on a pole the modulus is infinite: one step beside it is huge, which says the same
-            states = np.linalg.solve(resolvent + 1e-14j * np.abs(resolvent).max() * identity, B.astype(np.complex128))
-        loop = C @ states
+        loop = C @ solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - A0, B)
         return loop[:, :, 0] if B.shape[1] == 1 else np.linalg.eigvals(loop).astype(np.complex128)
 
     return loci
+
+
+def solved_beside_poles(matrices: ComplexArray, right: FloatArray) -> ComplexArray:
+    """X with M X = `right` (n, r) for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
+
+    A resolvent is singular to rounding on a pole, and near a multiple one: of a double integrator from 1e-8 of its norm
+    down. A locus is infinite there, or large; a least singular value of eps in place of zero makes it large.
+    """
+    try:
+        return np.linalg.solve(matrices, right.astype(np.complex128))
+    except np.linalg.LinAlgError:
+        U, singular, Vh = np.linalg.svd(matrices)
+        floor = np.maximum(_EPS * singular[:, :1], _LEAST)
+        inner = (U.conj().swapaxes(1, 2) @ right) / np.maximum(singular, floor)[:, :, np.newaxis]
+        return Vh.conj().swapaxes(1, 2) @ inner
 
 
 def log_moduli(values: ComplexArray) -> FloatArray:

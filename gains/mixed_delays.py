@@ -9,17 +9,27 @@ roots without the unknown delay are counted by the argument principle.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, pi
+from math import pi
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.commensurate import column_space, companion_loci, highest_frequency
-from gains.delay import Crossing, DelayAnalysis, check_horizon, stability_windows
+from gains.delay import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
+from gains.delay_crossings import AxisCrossing
 from gains.delay_loci import ComplexArray, Loci, unit_crossings, without_limits_at_zero
 from gains.delay_sweep import near_unit_extrema
+from gains.delay_zero import zero_passage
 from gains.errors import BadModelError, DisagreementError
-from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
+from gains.structure import (
+    Block,
+    FloatArray,
+    IntArray,
+    balanced,
+    distinct_blocks,
+    is_singular_for_any_delay,
+    square_matrices,
+)
 
 # rad by which e^{-j omega d} turns between neighbouring frequencies
 _TURN = 0.1
@@ -28,6 +38,8 @@ _POINTS_PER_DECADE, _DECADES = 60, 9
 _MOST_POINTS = 60_000
 # rad by which the determinant may turn between neighbouring frequencies, and how often the grid is halved for it
 _DETERMINANT_TURN, _HALVINGS = 0.5, 40
+# where that begins if there is a root at zero itself, as a share of the highest frequency
+_LEAST_FREQUENCY = 1e-7
 
 
 @dataclass(frozen=True)
@@ -48,7 +60,9 @@ class MixedTerm:
     multiple: int
 
 
-def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None) -> DelayAnalysis:
+def analyse_mixed(
+    terms: Sequence[MixedTerm], *, horizon_s: float | None = None, leave_out_zero: bool = False
+) -> DelayAnalysis:
     """Stability windows, critical delays and margin in tau of x'(t) = sum A x(t - known_s - multiple tau).
 
     `unstable_roots_at_zero_delay` counts the roots at tau = 0, with the known delays. Crossing frequencies come from
@@ -58,7 +72,7 @@ def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None)
     ----------
     terms
         At least one.
-    horizon_s
+    horizon_s, leave_out_zero
         As of `gains.delay.analyse_delay`.
 
     Raises
@@ -79,22 +93,54 @@ def analyse_mixed(terms: Sequence[MixedTerm], *, horizon_s: float | None = None)
     """
     matrices = _checked(terms)
     check_horizon(horizon_s)
-    known_s, multiples = np.array([t.known_s for t in terms]), [t.multiple for t in terms]
-    crossings: list[Crossing] = []
-    unstable, on_axis = 0, False
-    for block in distinct_blocks(*matrices):
-        parts = _Parts(np.array(balanced(*block.matrices)), known_s, np.array(multiples))
-        if is_singular_for_any_delay(parts.matrices):
-            on_axis = True
-            continue
-        crossings += [
-            Crossing(omega, theta / omega, outward, 2 * block.copies) for omega, theta, outward in _crossings(parts)
-        ]
-        unstable += block.copies * _unstable_roots(parts)
-    crossings.sort(key=lambda crossing: (crossing.delay_s, crossing.omega_rad_s))
-    intervals, complete_to_s = ((), inf) if on_axis else stability_windows(crossings, unstable, horizon_s)
-    margin_s = next((end_s for start_s, end_s in intervals if start_s == 0.0), 0.0)
-    return DelayAnalysis(intervals, margin_s, margin_s == inf, tuple(crossings), unstable, complete_to_s)
+    known_s, multiples = np.array([t.known_s for t in terms]), np.array([t.multiple for t in terms])
+    blocks = distinct_blocks(*matrices)
+    return combined_analysis([_analyse_block(block, known_s, multiples, leave_out_zero) for block in blocks], horizon_s)
+
+
+def _analyse_block(block: Block, known_s: FloatArray, multiples: IntArray, leave_out_zero: bool) -> BlockAnalysis:
+    parts = _Parts(np.array(balanced(*block.matrices)), known_s, multiples)
+    passage = zero_passage(parts.matrices, known_s, multiples) if leave_out_zero else None
+    if passage is None and is_singular_for_any_delay(parts.matrices):
+        return BlockAnalysis(block.copies, fixed_on_axis=True)
+    found = [AxisCrossing(*crossing) for crossing in _crossings(parts)]
+    unstable = _unstable_roots(parts, passage is not None)
+    return block_analysis(block.copies, found, unstable, passage, parts.highest())
+
+
+def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_zero: bool = False) -> int:
+    """Roots of x'(t) = sum A x(t - d) with positive real part, by the argument principle; no spectrum is computed.
+
+    Parameters
+    ----------
+    terms
+        Pairs (A, d): a real matrix (n, n) in 1/s and its delay in s.
+    leave_out_zero
+        A block whose matrices have a singular sum has a simple root at s = 0, which is not to be counted.
+
+    Raises
+    ------
+    BadModelError
+        As of `analyse_mixed`.
+    DisagreementError
+        A root too close to the imaginary axis to count it on either side.
+
+    Examples
+    --------
+    x'(t) = -x(t - 2), beyond its margin of pi / 2:
+
+    >>> from gains.mixed_delays import count_unstable_roots
+    >>> count_unstable_roots([([[-1]], 2.0)])
+    2
+    """
+    checked = [MixedTerm(matrix, delay_s, 0) for matrix, delay_s in terms]
+    blocks, delays_s = distinct_blocks(*_checked(checked)), np.array([term.known_s for term in checked])
+    count = 0
+    for block in blocks:
+        parts = _Parts(np.array(balanced(*block.matrices)), delays_s, np.zeros(len(checked), dtype=np.intp))
+        at_zero = leave_out_zero and is_singular_for_any_delay(parts.matrices)
+        count += block.copies * _unstable_roots(parts, at_zero)
+    return count
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +149,7 @@ class _Parts:
 
     matrices: FloatArray
     known_s: FloatArray
-    multiples: FloatArray
+    multiples: IntArray
 
     @property
     def size(self) -> int:
@@ -149,21 +195,27 @@ def _loci(parts: _Parts) -> Loci:
     return companion_loci(parts.at, column_space(late))
 
 
-def _unstable_roots(parts: _Parts) -> int:
+def _unstable_roots(parts: _Parts, at_zero: bool) -> int:
     """Roots with positive real part at tau = 0: turns of det(j omega I - A(j omega)) / (j omega + c)^n.
 
     The quotient is analytic in the right half plane and tends to one, so it winds around zero once for each root
-    there as omega goes from infinity to minus infinity.
+    there as omega goes from infinity to minus infinity. A simple root at zero itself is divided out if `at_zero`.
     """
     identity, scale = np.eye(parts.size), parts.highest() + float(np.linalg.norm(parts.matrices[0]))
 
     def phase(omega: FloatArray) -> ComplexArray:
         matrix = 1j * omega[:, np.newaxis, np.newaxis] * identity - parts.at(omega).sum(axis=1)
-        return np.linalg.slogdet(matrix)[0] * np.exp(-1j * parts.size * np.angle(1j * omega + scale))
+        # s + c in the denominator once for each state, but not for the root s = j omega that is divided out
+        counted = parts.size * np.angle(1j * omega + scale)
+        if at_zero:
+            counted += pi / 2.0 - np.angle(1j * omega + scale)
+        return np.linalg.slogdet(matrix)[0] * np.exp(-1j * counted)
 
     far = parts.highest() * np.logspace(0.0, 4.0, 100)
-    omega = np.concatenate([[0.0], parts.frequencies(parts.highest()), far])
-    omega = np.unique(omega)
+    omega = np.unique(np.concatenate([[0.0], parts.frequencies(parts.highest()), far]))
+    if at_zero:
+        # nearer to zero the determinant is rounding, and it is real there up to the frequency itself
+        omega = omega[omega > _LEAST_FREQUENCY * parts.highest()]
     values = phase(omega)
     for _ in range(_HALVINGS):
         turns = np.angle(values[1:] / values[:-1])

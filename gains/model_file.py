@@ -1,10 +1,11 @@
 """A linear loop with delays, as text: the JSON model that `gcs margin` reads.
 
-Three forms::
+Four forms::
 
     {"A0": [[..]], "A1": [[..]]}                                   x'(t) = A0 x(t) + A1 x(t - tau)
     {"terms": [{"A": [[..]], "delay": 0.1}, {"A": [[..]], "delay": "2*tau"}, ...]}   x'(t) = sum A x(t - delay)
-    {"A": [[..]], "B": [[..]], "K": [[..]], "hold": true}          x' = A x + B u, u = K x sampled and held
+    {"A": [[..]], "B": [[..]], "K": [[..]], "hold": true}          x' = A x + B u, u = K x sampled and held: any period
+    {"A": [[..]], "B": [[..]], "K": [[..]], "hold": true, "period": 0.02}      the same every 0.02 s, tau late
 
 A delay is a number of seconds, a multiple of one unknown ("tau", "2*tau", "tau/3", "1.5*tau"), or their sum
 ("0.1 + tau"). Multiples are taken as the decimal fractions they are written as, so "0.1*tau" is a tenth exactly.
@@ -30,10 +31,12 @@ _MULTIPLE = re.compile(
 _PLAIN = re.compile(_NUMBER)
 # not that of an exponent
 _PLUS = re.compile(r"(?<![0-9.][eE])\+")
-_FORMS = (("A0", "A1"), ("terms",), ("A", "B", "K", "hold"))
+_FORMS = (("A0", "A1"), ("terms",), ("A", "B", "K", "hold"), ("A", "B", "K", "hold", "period"))
 _DELAY_WANTED = 'a number of seconds >= 0 or a multiple of the unknown, as "tau" or "2*tau"'
 # products and squares of the matrices stay far from the largest number that there is
 _LARGEST = 1e30
+# and far from the least: a product of two, squared, is a normal number still
+_LEAST = 1e-60
 # a text longer than this in a message is cut
 _SHOWN = 60
 
@@ -57,11 +60,15 @@ class DelayModel:
 
 @dataclass(frozen=True)
 class HeldModel:
-    """x' = A x + B u with u = K x sampled and held; the period is the unknown. A (n, n), B (n, p), K (p, n)."""
+    """x' = A x + B u with u = K x sampled and held. A (n, n), B (n, p), K (p, n).
+
+    The unknown is the delay with which u acts if the period is known, else the period.
+    """
 
     A: FloatArray
     B: FloatArray
     K: FloatArray
+    period_s: float | None = None
 
 
 def parse_model(text: str) -> DelayModel | HeldModel:
@@ -138,13 +145,13 @@ def _terms_model(terms: Any) -> DelayModel:
     read: list[Term] = []
     unknown = ""
     for i, term in enumerate(terms):
-        where = f"terms[{i}]"
+        where = f"term {i + 1}"
         if not isinstance(term, dict) or set(term) != {"A", "delay"}:
             _bad(where, ", ".join(term) if isinstance(term, dict) else term, "the keys A, delay")
-        matrix = _square(f"{where}.A", term["A"], size=len(read[0].matrix) if read else None)
-        fixed_s, multiple, name = _delay(f"{where}.delay", term["delay"])
+        matrix = _square(f"{where}, A", term["A"], size=len(read[0].matrix) if read else None)
+        fixed_s, multiple, name = _delay(f"{where}, delay", term["delay"])
         if name and unknown and name != unknown:
-            _bad(f"{where}.delay", term["delay"], f"multiples of one unknown, which is {unknown!r}")
+            _bad(f"{where}, delay", term["delay"], f"multiples of one unknown, which is {unknown!r}")
         unknown = unknown or name
         read.append(Term(matrix, fixed_s, multiple))
     return DelayModel(tuple(read), unknown)
@@ -160,7 +167,12 @@ def _held_model(data: dict[str, Any]) -> HeldModel:
     K = _matrix("K", data["K"])
     if K.shape != B.shape[::-1]:
         raise BadModelError(f"K: read {_size(K)}, wanted {B.shape[1]}x{len(A)}: u = K x")
-    return HeldModel(A, B, K)
+    period_s = None
+    if "period" in data:
+        period_s = _finite("period", data["period"], "a positive number of seconds")
+        if not period_s > 0.0:
+            _bad("period", data["period"], "a positive number of seconds")
+    return HeldModel(A, B, K, period_s)
 
 
 def _square(key: str, value: Any, size: int | None = None) -> FloatArray:
@@ -183,7 +195,7 @@ def _matrix(key: str, value: Any) -> FloatArray:
         raise BadModelError(f"{key}: read rows of {sorted(lengths)} numbers, wanted rows of equal length")
     for i, row in enumerate(value):
         for j, entry in enumerate(row):
-            _finite(f"{key}[{i}][{j}]", entry, "a finite number")
+            _finite(f"{key}, row {i + 1}, column {j + 1}", entry, "a finite number")
     return np.array(value, dtype=np.float64)
 
 
@@ -201,6 +213,8 @@ def _finite(key: str, value: Any, wanted: str) -> float:
         raise BadModelError(f"{key}: read {read}, wanted {wanted}")
     if abs(number) > _LARGEST:
         _bad(key, value, f"{wanted}, up to {_LARGEST:g}")
+    if 0.0 < abs(number) < _LEAST:
+        _bad(key, value, f"{wanted}, 0 or at least {_LEAST:g} in size")
     return number
 
 
@@ -223,9 +237,10 @@ def _delay(key: str, value: Any) -> tuple[float, Fraction, str]:
             _bad(key, value, f"multiples of one unknown, which is {unknown!r}")
         unknown = match["name"]
         divisor = Fraction(match["divisor"] or 1)
-        if divisor == 0:
+        part_of_it = Fraction(match["before"] or 1) * Fraction(match["after"] or 1)
+        if divisor == 0 or (part_of_it and not _LEAST <= part_of_it / divisor <= _LARGEST):
             _bad(key, value, _DELAY_WANTED)
-        multiple += Fraction(match["before"] or 1) * Fraction(match["after"] or 1) / divisor
+        multiple += part_of_it / divisor
     return _finite(key, fixed_s, _DELAY_WANTED), multiple, unknown
 
 

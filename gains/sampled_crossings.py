@@ -17,7 +17,7 @@ import numpy as np
 
 from gains.bracketing import bracketed_roots
 from gains.delay_crossings import separating_points
-from gains.delay_loci import ComplexArray, Loci, delay_loci, unit_crossings
+from gains.delay_loci import ComplexArray, Loci, delay_loci, solved_beside_poles, unit_crossings
 from gains.delay_sweep import near_unit_extrema, sweep_frequencies
 from gains.errors import DisagreementError
 from gains.sampled_loop import SampledPlant, block_radius, split_delay
@@ -158,7 +158,7 @@ def _matrix_loci(F: FloatArray, G: FloatArray, K: FloatArray, D: FloatArray) -> 
     identity = np.eye(F.shape[0])
 
     def loci(omega: FloatArray) -> ComplexArray:
-        states = np.linalg.solve(1j * omega[:, np.newaxis, np.newaxis] * identity - F, G.astype(np.complex128))
+        states = solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - F, G)
         return np.linalg.eigvals(D + K @ states).astype(np.complex128)
 
     return loci

@@ -245,7 +245,7 @@ def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
     return tuple(matrix * scale / scale[:, np.newaxis] for matrix in matrices)
 
 
-def is_singular_for_any_delay(matrices: Iterable[FloatArray]) -> bool:
+def is_singular_for_any_delay(matrices: Iterable[FloatArray] | FloatArray) -> bool:
     """Whether the sum of the matrices is singular to rounding: s = 0 is then a root however late each one acts.
 
     Each row is judged in its own unit: a motion that is slow beside others is none that stands still.
