@@ -1,8 +1,8 @@
-"""Fly random experiments in virtual time until one breaks an invariant: `python3 make.py soak --flights 1000 --seed 1`.
+"""Fly random experiments in virtual time and check that invariants hold: `python3 make.py soak --flights 1000`.
 
-Each flight is drawn from the seed and its number (`soak_scenarios.py`), flown through the product's own driver with real
-bytes (`soak_flight.py`) and checked (`soak_checks.py`). What breaks an invariant is written to a folder, and flown again
-with `--only NUMBER` or `--fly FILE`. Exit code 1 if one is broken that is not known.
+Each flight is drawn from the seed and its number (`soak_scenarios.py`), flown through the product's own driver with
+real bytes (`soak_flight.py`) and checked (`soak_checks.py`). What breaks an invariant is written to a folder, and flown
+again with `--only NUMBER` or `--fly FILE`. Exit code 1 if one is broken that is not known.
 """
 
 import argparse
@@ -50,8 +50,8 @@ def soak(results: Iterable[tuple[int, Result]], count: int, seed: int, folder: P
     failed: list[int] = []
     for done, (number, result) in enumerate(results, 1):
         counts[f"refused: {result.refused}" if result.refused else f"flown: {result.ended or 'not to its end'}"] += 1
-        for broken in result.broken:
-            counts[f"BROKEN: {broken.invariant}" if not broken.known else f"known: {broken.known}"] += 1
+        kinds = {f"known: {one.known}" if one.known else f"BROKEN: {one.invariant}" for one in result.broken}
+        counts.update(sorted(kinds))
         if any(not broken.known for broken in result.broken):
             failed.append(number)
             tell(number, seed, result, folder)

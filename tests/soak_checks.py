@@ -15,7 +15,7 @@ import numpy as np
 from soak_flight import Flown, Stretch, fly
 from soak_scenarios import Experiment
 
-from gains.errors import DisagreementError, GainsError
+from gains.errors import DisagreementError, GainsError, SolverError
 from gcs.control import LARGEST_COMMAND_M_S2
 from gcs.flown import margins_of
 from gcs.grade import instants, true_loop_delays_s
@@ -66,6 +66,8 @@ def judge(experiment: Experiment) -> Result:
     except DisagreementError as error:
         return Result((Broken("independent methods agree", str(error)),))
     except GainsError as error:
+        if isinstance(error, SolverError) and (experiment.scenario.control.gains or experiment.scenario.control.blocks):
+            return Result((_with_known(experiment, Broken("given gains are flown", str(error))),))
         return Result(refused=f"{type(error).__name__}: {str(error)[:60]}")
     except Exception:  # noqa: BLE001 - whatever it is, it is what the soak looks for
         return Result((_raised(experiment),))
@@ -74,7 +76,7 @@ def judge(experiment: Experiment) -> Result:
             broken, ended = _margin_kept(plan, experiment.margin_ratio)
         else:
             flown = fly(experiment, plan)
-            broken = list(_checked(experiment, flown))
+            broken = list(checked(flown))
             if experiment.twice and fly(experiment, plan).sha256 != flown.sha256:
                 broken.append(Broken("the same bytes twice", "a second flight differs"))
             ended = flown.stretches[-1].station.end_reason.split(":")[0]
@@ -96,14 +98,17 @@ def _with_known(experiment: Experiment, broken: Broken) -> Broken:
         known = "a datagram that ends in a lone 0xFE"
     elif broken.invariant == "commands within limits" and scenario.control.loop == "onboard":
         known = "the opening term is streamed beyond the limit"
-    elif steps and scenario.dynamics == "autopilot" or (steps and broken.invariant in ("collision", "loop delay")):
+    elif broken.invariant == "given gains are flown":
+        known = "given gains refused for want of a proof of alpha"
+    elif steps:
         known = "a boot clock that was set: new states by the old offset"
     elif broken.invariant == "clock bounds" and scenario.clocks.drift_max_ppm > 1000.0:
         known = "drift beyond what the bounds hold for"
     return replace(broken, known=known)
 
 
-def _checked(experiment: Experiment, flown: Flown) -> Iterator[Broken]:
+def checked(flown: Flown) -> Iterator[Broken]:
+    """Everything that does not hold in a flight."""
     limit = flown.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2
     for asked in flown.set_points:
         if asked.acceleration_m_s2 > limit * (1.0 + LEAST_CHANGE) or math.isinf(asked.velocity_m_s):
@@ -132,6 +137,9 @@ def _rows_complete(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
         return
     if (np.diff(ticks["tick"][:, 0]) != 1).any() or (np.diff(ticks["due_ns"][:, 0]) != period_ns).any():
         yield incomplete("ticks are left out")
+    for name in ("tick", *ALWAYS):
+        if (ticks[name] != ticks[name][:, :1]).any():
+            yield incomplete(f"{name} differs between the rows of a tick")
     for name in ALWAYS:
         if not np.isfinite(ticks[name]).all():
             yield incomplete(f"{name} is not finite")
@@ -169,7 +177,9 @@ def _clocks_bounded(flown: Flown, stretch: Stretch, sampled: dict[tuple[int, int
         # float64 seconds of 1e6 s have 1e-10
         if beyond_s.size and beyond_s.max() > 1e-6:
             k = int(beyond_s.argmax())
-            text = f"offset of vehicle {system_id} is {beyond_s[k]:.3g} s beyond its bound at {known['time_s'][k]:.3f} s"
+            text = (
+                f"offset of vehicle {system_id} is {beyond_s[k]:.3g} s beyond its bound at {known['time_s'][k]:.3f} s"
+            )
             yield Broken("clock bounds", text)
         used = rows[np.isfinite(rows["sample_bound_s"]) & (rows["sample_ns"] > 0)]
         keys = [(system_id, boot_ms) for boot_ms in used["sample_boot_ms"].tolist()]
@@ -261,16 +271,42 @@ def _ends_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
         allowed_m = scenario.safety.collision_distance_m + away_m[one] + away_m[two]
         if true_m > allowed_m:
             yield Broken("collision", f"{reason}, in truth {true_m:.2f} m (tolerance {allowed_m:.2f} m)")
-    if reason.startswith("completed") and summary["verdict"] == "stable" and not _was_opened(stretch):
-        for vehicle in scenario.vehicles:
-            if vehicle.follows is None or vehicle.offset_ne_m is None:
-                continue
-            error = place[vehicle.system_id] - place[vehicle.follows] - np.array(vehicle.offset_ne_m)
-            band_m = scenario.safety.settled_fraction * math.hypot(*vehicle.offset_ne_m)
-            allowed_m = band_m + away_m[vehicle.system_id] + away_m[vehicle.follows]
-            if np.hypot(*error) > allowed_m:
-                text = f"stable with {np.hypot(*error):.3f} m of error of vehicle {vehicle.system_id} in truth"
-                yield Broken("verdict", f"{text}, {allowed_m:.3f} m allowed")
+    if _was_opened(stretch):
+        return
+    errors = dict(_true_errors_m(stretch, scenario, place, away_m, at_end))
+    if reason.startswith("broken: spacing"):
+        system_id = int(reason.split("vehicle ")[1].split()[0])
+        true_m, off_m = errors[system_id]
+        if true_m + off_m < scenario.safety.spacing_error_limit_m:
+            yield Broken("verdict", f"{reason}; in truth {true_m:.2f} m (± {off_m:.2f} m)")
+    if reason.startswith("completed"):
+        fraction = scenario.safety.settled_fraction
+        bands_m = {v.system_id: fraction * math.hypot(*v.offset_ne_m) for v in scenario.vehicles if v.offset_ne_m}
+        beyond = [i for i, (true_m, off_m) in errors.items() if true_m - off_m > bands_m[i]]
+        within = all(true_m + off_m < bands_m[i] for i, (true_m, off_m) in errors.items())
+        if (summary["verdict"] == "stable" and beyond) or (summary["verdict"] == "unstable" and within):
+            text = {
+                i: f"{true_m:.3f} ± {off_m:.3f} m, band {bands_m[i]:.3f} m" for i, (true_m, off_m) in errors.items()
+            }
+            yield Broken("verdict", f"{summary['verdict']}; errors in truth at the end: {text}")
+
+
+def _true_errors_m(
+    stretch: Stretch, scenario: Scenario, place: dict[int, Any], away_m: dict[int, float], at_end: np.ndarray[Any, Any]
+) -> Iterator[tuple[int, tuple[float, float]]]:
+    """Spacing errors of the followers when the end was decided, and how far from them measured ones may be.
+
+    The measured error is of the instant of the newest state: what both can be off at that, and their relative velocity
+    since.
+    """
+    age_s = {int(row["system_id"]): float(row["telemetry_age_s"]) for row in at_end}
+    for v in scenario.vehicles:
+        if v.follows is not None and v.offset_ne_m is not None:
+            own, ahead = stretch.states_at_end[v.system_id], stretch.states_at_end[v.follows]
+            error = place[v.system_id] - place[v.follows] - np.array(v.offset_ne_m)
+            apart_m_s = math.hypot(own[2] - ahead[2], own[3] - ahead[3])
+            off_m = 2.0 * (away_m[v.system_id] + away_m[v.follows]) + apart_m_s * age_s[v.system_id]
+            yield v.system_id, (float(np.hypot(*error)), off_m if math.isfinite(off_m) else math.inf)
 
 
 def _was_opened(stretch: Stretch) -> bool:

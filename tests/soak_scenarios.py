@@ -434,9 +434,7 @@ def _autopilot(rng: Rng, duration_s: float) -> Part:
         ready_after_s=between(rng, 0.0, 2.0),
         arming_refusals=one_of(rng, 0, 0, 2),
         origin_spread_m=one_of(rng, 0.0, 20.0),
-        clock_jumps=[
-            whole(schema.ClockJump, at_s=at_s, by_s=by_s) for at_s, by_s in zip(jumps, lengths, strict=True)
-        ]
+        clock_jumps=[whole(schema.ClockJump, at_s=at_s, by_s=by_s) for at_s, by_s in zip(jumps, lengths, strict=True)]
         if chance(rng, 0.12)
         else None,
     )
@@ -495,7 +493,11 @@ def _margin_experiment(rng: Rng, name: str) -> Experiment:
         "limits": {},
         "rates": rates,
         "control": {"loop": "onboard" if onboard else "ground"}
-        | ({"delay_margin_s": round(0.05 + 1.0 / control_hz + spread(rng, 0.1, 0.8), 4)} if designed else {"gains": given}),
+        | (
+            {"delay_margin_s": round(0.05 + 1.0 / control_hz + spread(rng, 0.1, 0.8), 4)}
+            if designed
+            else {"gains": given}
+        ),
         "onboard": whole(
             schema.Onboard, sensor_hz=control_hz, rate_hz=2.0 * control_hz, position_noise_m=0.0, velocity_noise_m_s=0.0
         ),
