@@ -31,6 +31,10 @@ JOBS: dict[str, tuple[str, list[str]]] = {
     "setup": ("make .venv with everything in requirements.lock", ["python --version"]),
     "fly": ("fly scenarios/triangle5.toml", ["gcs fly scenarios/triangle5.toml"]),
     "test": ("run the tests", ["python -m pytest -n auto"]),
+    "soak": (
+        "fly random experiments in virtual time and check invariants: --flights N --seed S [--workers W]",
+        ["python tests/soak.py"],
+    ),
     "clients": (
         "fly the vehicles under MAVProxy and MAVSDK's server, which it installs (1.2 GB)",
         ["uv pip install --quiet --group clients", "python -m pytest -n 0 -rs tests/test_clients.py"],
