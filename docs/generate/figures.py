@@ -73,7 +73,7 @@ def compare(runner: Runner) -> str:
     names = {
         "settling time": lambda r: f"{r['settling_time_s']:.2f} s",
         "overshoot": lambda r: f"{r['overshoot']:.0%}",
-        "control effort": lambda r: f"{r['effort_m2_s3']:,.0f} m²/s³",
+        "control effort": lambda r: f"{float(format(r['effort_m2_s3'], '.3g')):,.0f} m²/s³",
         "delay margin, sampled": lambda r: _ms(r["delay_margin_s"], 0),
         "alpha of the whole formation": lambda r: f"{r['alpha']:.3f}",
     }  # fmt: skip
@@ -84,12 +84,10 @@ def compare(runner: Runner) -> str:
 def design_time(runner: Runner) -> str:
     """Time of designs of growing chains, as ratios to inclusion of five vehicles in the same run."""
     runner.run("gcs compare scenarios/triangle5.toml --out runs/compare")
-    grown = json.loads((runner.folder / "runs" / "compare" / "compare.json").read_text(encoding="utf-8"))[
-        "design_costs"
-    ]
-    least_s = next(each["seconds"] for each in grown if each["method"] == "inclusion" and each["vehicles"] == 5)
+    grown = json.loads((runner.folder / "runs" / "compare" / "compare.json").read_text(encoding="utf-8"))["sizes"]
+    least_s = next(each["design_s"] for each in grown if each["method"] == "inclusion" and each["vehicles"] == 5)
     sizes = sorted({each["vehicles"] for each in grown})
-    times = {(each["method"], each["vehicles"]): each["seconds"] / least_s for each in grown}
+    times = {(each["method"], each["vehicles"]): each["design_s"] / least_s for each in grown}
     methods = list(dict.fromkeys(each["method"] for each in grown))
     rows = [
         (method, *(f"{times[method, size]:.2g}" if (method, size) in times else "" for size in sizes))

@@ -8,14 +8,18 @@ from docs.generate.figures import FIGURES
 from docs.generate.runner import CommandError, measured_on, runner
 
 
-def measured(name: str) -> str:
-    """A block of figures: what the commands say, the commands, and where and when they ran."""
+_EXACT = "Exact: computed, or flown in virtual time, and the same on every machine to the digits printed."
+_VARIES = "Measured in real time: it differs from run to run and from machine to machine."
+
+
+def measured(name: str) -> dict[str, str]:
+    """The blocks of a figure: with its commands, machine and date, and `NAME-bare` without."""
     figure = FIGURES[name]
     with runner() as run:
         text = figure.make(run)
         commands = "\n".join(run.commands)
-    kind = "Exact: the same on every machine." if figure.exact else "Differs from run to run."
-    return f"{text}\n\n```sh\n{commands}\n```\n\n{measured_on()}\n{kind}"
+    whole = f"{text}\n\n```sh\n{commands}\n```\n\n{measured_on()}\n{_EXACT if figure.exact else _VARIES}"
+    return {name: whole, f"{name}-bare": text}
 
 
 def measure(names: Iterable[str]) -> int:
@@ -24,7 +28,7 @@ def measure(names: Iterable[str]) -> int:
     for name in names:
         print(f"{name} ...", flush=True)
         try:
-            changed = fill({name: measured(name)})
+            changed = fill(measured(name))
         except CommandError as error:
             print(f"{name}: {error}", file=sys.stderr)
             failed += 1
@@ -37,11 +41,11 @@ def stale(names: Iterable[str]) -> list[str]:
     """Which of these figures the commands no longer give, with the pages that say otherwise."""
     found: list[str] = []
     for name in names:
-        text = measured(name)
-        found += [f"{page}: {name} differs; the commands give\n\n{text}\n" for page in differing(name, text)]
+        for block, text in measured(name).items():
+            found += [f"{page}: {block} differs; the commands give\n\n{text}\n" for page in differing(block, text)]
     return found
 
 
 def unused() -> list[str]:
     """Figures that no page shows."""
-    return [name for name in FIGURES if not pages_with(name)]
+    return [name for name in FIGURES if not pages_with(name) + pages_with(f"{name}-bare")]
