@@ -7,7 +7,6 @@ from docs.generate.blocks import differing, fill, pages_with
 from docs.generate.figures import FIGURES
 from docs.generate.runner import CommandError, measured_on, runner
 
-
 _EXACT = "Exact: computed, or flown in virtual time, and the same on every machine to the digits printed."
 _VARIES = "Measured in real time: it differs from run to run and from machine to machine."
 
