@@ -35,6 +35,8 @@ def found_fields(value: Any, known: Iterable[str], path: str = "") -> set[str]:
     if isinstance(value, dict):
         found = (found_fields(inner, known, f"{path}.{name}" if path else name) for name, inner in value.items())
         return set[str]().union(*found)
+    if value == [] and any(each.startswith(f"{path}[]") for each in known):
+        return set()  # none of them here
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return set[str]().union(*(found_fields(inner, known, f"{path}[]") for inner in value))
     return {path}

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from docs.generate.blocks import table
+from docs.generate.blocks import ROOT, table
 from docs.generate.runner import CommandError, Runner
+from docs.generate.sessions import steps_of
 
 
 @dataclass(frozen=True)
@@ -208,10 +209,27 @@ def _flight(runner: Runner, command: str) -> dict[str, Any]:
     return summary | {"grade": runner.json("gcs grade runs/flight")}
 
 
-def fly_output(runner: Runner) -> str:
-    text = runner.run("gcs fly scenarios/triangle5.toml --out runs/triangle5")
-    lines = text.splitlines()
-    return _output("\n".join(lines[next(k for k, line in enumerate(lines) if line.startswith("verdict")) :]))
+def _readme(runner: Runner, wanted: str) -> list[str]:
+    """What the README's command that contains `wanted` prints, with the README's scenario."""
+    steps = steps_of(ROOT / "README.md")
+    for step in steps:
+        if step.file:
+            (runner.folder / step.file).write_text(step.text, encoding="utf-8")
+    [command] = [step.text.strip() for step in steps if wanted in step.text and not step.file]
+    return runner.run(command).splitlines()
+
+
+def readme_fly(runner: Runner) -> str:
+    """The verdict, without the lines of the flight before it and the files after it."""
+    lines = _readme(runner, "gcs fly")
+    begin, end = (next(k for k, line in enumerate(lines) if line.startswith(word)) for word in ("verdict", "files"))
+    return _output("\n".join(lines[begin:end]))
+
+
+def readme_onset(runner: Runner) -> str:
+    """What was found, without the files after it."""
+    lines = _readme(runner, "gcs stress")
+    return _output("\n".join(lines[: next(k for k, line in enumerate(lines) if line.startswith("files"))]))
 
 
 def flights(runner: Runner) -> str:
@@ -337,11 +355,12 @@ FIGURES = {
     "margin-held": Figure(margin_held, exact=True, quick=True),
     "margin-thesis": Figure(margin_thesis, exact=True, quick=True),
     "onset-chain3": Figure(onset_chain3, exact=True, quick=True),
+    "readme-onset": Figure(readme_onset, exact=True, quick=True),
     "onsets": Figure(onsets, exact=True),
     "maps": Figure(maps, exact=True),
     "capacity": Figure(capacity, exact=True),
     "design-time": Figure(design_time, exact=False),
-    "fly": Figure(fly_output, exact=False),
+    "readme-fly": Figure(readme_fly, exact=False),
     "flights": Figure(flights, exact=False),
     "too-late": Figure(too_late, exact=False),
     "punctuality": Figure(punctuality, exact=False),
