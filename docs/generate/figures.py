@@ -71,14 +71,14 @@ def string_limit(runner: Runner) -> str:
 
 def compare(runner: Runner) -> str:
     routes = runner.json("gcs compare scenarios/triangle5.toml --no-sizes")["routes"]
-    names = {
-        "settling time": lambda r: f"{r['settling_time_s']:.2f} s",
-        "overshoot": lambda r: f"{r['overshoot']:.0%}",
-        "control effort": lambda r: f"{float(format(r['effort_m2_s3'], '.3g')):,.0f} m²/s³",
-        "delay margin, sampled": lambda r: _ms(r["delay_margin_s"], 0),
-        "alpha of the whole formation": lambda r: f"{r['alpha']:.3f}",
-    }  # fmt: skip
-    rows = [(name, *(value(route) for route in routes)) for name, value in names.items()]
+    values: dict[str, Callable[[dict[str, Any]], str]] = {
+        "settling time": lambda route: f"{route['settling_time_s']:.2f} s",
+        "overshoot": lambda route: f"{route['overshoot']:.0%}",
+        "control effort": lambda route: f"{float(format(route['effort_m2_s3'], '.3g')):,.0f} m²/s³",
+        "delay margin, sampled": lambda route: _ms(route["delay_margin_s"], 0),
+        "alpha of the whole formation": lambda route: f"{route['alpha']:.3f}",
+    }
+    rows = [(name, *(value(route) for route in routes)) for name, value in values.items()]
     return table(("", *(route["method"] for route in routes)), rows)
 
 
