@@ -43,7 +43,10 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         [f"mypyc {COMPILED}"],
     ),
     "format": ("format the code", ["ruff check --fix-only .", "ruff format ."]),
-    "pictures": ("make the pictures in README and docs anew, from flights and designs", ["python docs/pictures.py"]),
+    "pictures": (
+        "make the pictures in README and docs anew, from flights and designs",
+        ["python -m docs.generate.pictures"],
+    ),
     "reference": (
         "write the generated reference and the scenarios' JSON Schema anew, from the code (--check: only compare)",
         ["python -m docs.generate reference"],

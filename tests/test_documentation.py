@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time  # noqa: TID251 - waits for a server process to have started
 from pathlib import Path
 from typing import Any
 
@@ -129,18 +128,23 @@ def shell(steps: list[Step], folder: Path) -> None:
             elif step.python:
                 python(step.text, session)
             elif step.server:
-                program, *arguments = step.text.split()
-                servers.append(
-                    subprocess.Popen([Path(sys.executable).with_name(program), *arguments], cwd=folder, stdout=-3)
-                )
-                time.sleep(1.0)  # a reader takes longer to open the second terminal; the vehicles call until heard
+                servers.append(server(step.text.split(), folder))
             else:
                 for command in step.text.strip().splitlines():
                     Runner(folder).run(command, wanted=(step.exit_code,))
     finally:
-        for server in servers:
-            server.terminate()
-            server.wait()
+        for each in servers:
+            each.terminate()
+            each.communicate()
+
+
+def server(command: list[str], folder: Path) -> subprocess.Popen[bytes]:
+    """A program that runs on, once it has said its first line."""
+    program = Path(sys.executable).with_name(command[0])
+    started = subprocess.Popen([program, *command[1:]], cwd=folder, stdout=subprocess.PIPE)
+    assert started.stdout is not None
+    assert started.stdout.readline()
+    return started
 
 
 def python(text: str, session: dict[str, Any]) -> None:

@@ -220,10 +220,10 @@ def _readme(runner: Runner, wanted: str) -> list[str]:
 
 
 def readme_fly(runner: Runner) -> str:
-    """The verdict, without the lines of the flight before it and the files after it."""
+    """The verdict, delay and punctuality; not the lines of the flight, the table of the vehicles and the files."""
     lines = _readme(runner, "gcs fly")
-    begin, end = (next(k for k, line in enumerate(lines) if line.startswith(word)) for word in ("verdict", "files"))
-    return _output("\n".join(lines[begin:end]))
+    wanted = ("verdict", "delay", "control")
+    return _output("\n".join(line for line in lines if line.startswith(wanted)))
 
 
 def readme_onset(runner: Runner) -> str:
