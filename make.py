@@ -48,7 +48,22 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         [f"mypyc {COMPILED}"],
     ),
     "format": ("format the code", ["ruff check --fix-only .", "ruff format ."]),
-    "pictures": ("make the pictures in README and docs anew, from flights and designs", ["python docs/pictures.py"]),
+    "pictures": (
+        "make the pictures in README and docs anew, from flights and designs",
+        ["python -m docs.generate.pictures"],
+    ),
+    "reference": (
+        "write the generated reference and the scenarios' JSON Schema anew, from the code (--check: only compare)",
+        ["python -m docs.generate reference"],
+    ),
+    "measurements": (
+        "measure the figures in README and docs anew; NAMEs: only these; --check: compare the exact ones",
+        ["python -m docs.generate measurements"],
+    ),
+    "docs": (
+        "build the documentation as a site in build/site, with packages that it installs",
+        ["uv pip install --quiet --group docs", "mkdocs build --strict"],
+    ),
     "lock": (
         "write requirements.lock anew from pyproject.toml",
         [

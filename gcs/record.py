@@ -44,7 +44,7 @@ class Mode(IntEnum):
     WAITING = 0  # not heard, or not yet ready to fly
     NOMINAL = 1  # flying, loop delay well below the margin
     CAUTION = 2  # flying, little headroom left
-    CRITICAL = 3  # flying, loop delay above the margin
+    CRITICAL = 3  # flying, next to no headroom left: the station acts
     FAILSAFE = 4  # heard, but it does not take set-points: it holds its velocity
     LOST = 5  # not heard
     RECOVERING = 6  # flying, its gains on the way back to faster ones
@@ -68,8 +68,8 @@ TICK = np.dtype(
         ("due_ns", "<i8"),  # when the tick was due, station clock
         ("sent_ns", "<i8"),  # when its set-points had been handed to the kernel, station clock
         ("key_ms", "<u4"),  # time_boot_ms of its set-points: joins this log with the vehicles' own
-        ("system_id", "u1"),
-        ("mode", "u1"),  # Mode
+        ("system_id", "u1"),  # the vehicle that the row is about
+        ("mode", "u1"),  # its mode, as a number
         ("gain_set", "u1"),  # place in the gain schedule, 0 the fastest
         ("commanded", "?"),  # a set-point was sent to this vehicle
         ("sample_boot_ms", "<u4"),  # time_boot_ms of the newest state used

@@ -142,9 +142,8 @@ class RemoteVehicle:
         if self.silent:
             return "is silent"
         if self.taken_over:
-            if not self._has_been_guided:
-                return f"is armed and not in {self.kind.guided_name}: flown by its pilot or by itself"
-            return f"left {self.kind.guided_name}, by its pilot or by itself"
+            left = "left" if self._has_been_guided else "is armed and not in"
+            return f"{left} {self.kind.guided_name}: flown by its pilot or by itself"
         if self.startup is not None:
             return self._next(self.startup).missing
         if self.refused and self.upload is not None:

@@ -29,221 +29,273 @@ DRIFT_MAX_PPM = 1000.0
 
 
 class Part(BaseModel):
-    """Base of every part of a scenario: unknown keys, wrong types, NaN and infinities are refused."""
+    """Base of every part of a scenario: unknown keys, wrong types, NaN and infinities are refused.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    The docstring under a key is its description in `scenario.schema.json` and in the reference of the documentation.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 class Vehicle(Part):
     """One UAV: whom it follows, where it flies relative to that vehicle, and its state when the flight begins."""
 
     system_id: SystemId
+    """MAVLink system id, different for each vehicle."""
     follows: SystemId | None = None
-    """System id of the vehicle in front; the one vehicle without it is the leader."""
+    """System id of the vehicle in front. Exactly one vehicle, the leader, omits it."""
     offset_ne_m: Position | None = None
-    """Wanted position relative to the vehicle in front (minus the spacing d of thesis eq. 2.10)."""
+    """Wanted position relative to the vehicle in front (minus the spacing d of thesis eq. 2.10); every vehicle but the
+    leader needs it."""
     hears: tuple[SystemId, ...] = ()
-    """Vehicles besides the one in front whose errors its command may use; with a graph method only."""
+    """Vehicles other than the one in front whose errors its command may use. Graph methods only."""
     position_ne_m: Position
+    """Position when the flight begins; with an autopilot, the place on the ground from which it takes off."""
     velocity_ne_m_s: Velocity
+    """Velocity when the flight begins."""
     flavour: Flavour | None = None
-    """Whose autopilot it is, if not that of the others; only with dynamics autopilot."""
+    """Autopilot of this vehicle, if it differs from `autopilot.flavour`. Only with `dynamics = "autopilot"`."""
 
 
 class NominalVelocity(Part):
-    """The formation's velocity v_d from a scenario time on, until the next entry."""
+    """The formation's nominal velocity v_d from one scenario time until the next entry."""
 
     from_s: NotNegative
+    """Scenario time at which this velocity begins; the first entry begins at 0."""
     velocity_ne_m_s: Velocity
+    """The nominal velocity; a change is a step."""
 
 
 class Limits(Part):
-    """Limits of every vehicle; one left out is off, but the least speed, without which the kinematics are singular."""
+    """Limits of every vehicle. Omitted ones are off, except the minimum speed: the kinematics are singular at zero."""
 
     speed_min_m_s: Positive = 1.0
+    """Least ground speed."""
     speed_max_m_s: Positive | None = None
+    """Greatest ground speed."""
     acceleration_max_m_s2: Positive | None = None
+    """Greatest horizontal acceleration."""
     turn_rate_max_rad_s: Positive | None = None
+    """Greatest rate at which the heading changes."""
 
 
 class Rates(Part):
     """How often things happen, in Hz."""
 
     control_hz: Rate = 50.0
+    """Control ticks of the station; every vehicle is sent one set-point per tick."""
     telemetry_hz: Rate = 50.0
+    """LOCAL_POSITION_NED messages from each vehicle."""
     timesync_hz: Annotated[float, Field(ge=0.01, le=50)] = 10.0
-    """Of each vehicle; at most control_hz, as each control tick logs one round trip."""
+    """TIMESYNC exchanges with each vehicle. At most `control_hz`, because each control tick logs one round trip."""
 
 
 class FixedGains(Part):
-    """Gains to be flown as they are, per axis: u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p."""
+    """Gains to fly as given, the same on both axes: u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p."""
 
     K1: Number
+    """Gain on the vehicle's own velocity error, 1/s."""
     K2: Number
+    """Gain on the velocity error of the vehicle in front, 1/s."""
     K3: Number
+    """Gain on the vehicle's own spacing error, 1/s²."""
 
 
 class GainBlock(Part):
-    """What one vehicle's errors add to another's command, or to its own: a block of the gain matrix K of u = K e."""
+    """One block of the gain matrix K of u = K e: what the errors of one vehicle add to the command of one vehicle."""
 
     vehicle: SystemId
-    """Whose command."""
+    """The vehicle whose command this is."""
     of: SystemId
-    """Whose errors."""
+    """The vehicle whose errors are used."""
     gain: tuple[tuple[Number, ...], tuple[Number, ...]]
-    """Rows for north and east; columns for the spacing error (north, east) and the velocity error (north, east). The
-    leader has a velocity error only."""
+    """Two rows, for the north and east command. Four columns: spacing error north and east (1/s²), velocity error north
+    and east (1/s). For the errors of the leader, which has no spacing error, only the last two columns."""
 
 
 class Control(Part):
-    """How the gains are found and where the loop is closed.
+    """How the gains are found, and where the loop is closed.
 
-    With neither requirement nor gains, a delay margin of 0.3 s is required. With a delay margin required, robustness is
-    made as large as possible; without, the delay margin. What is required is met or the design says why it cannot be.
+    Without any requirement or gains, a delay margin of 0.3 s is required. If a delay margin is required, the design
+    maximises robustness; otherwise it maximises the delay margin. A requirement is met, or the design says why it
+    cannot be.
     """
 
     method: Literal["inclusion", "graph-dk", "graph-lqr"] = "inclusion"
-    """inclusion: every vehicle uses its own errors and the velocity error of the one in front. The graph methods use
-    all errors of these two, and of those it hears."""
+    """`inclusion`: every vehicle uses its own errors and the velocity error of the vehicle in front. `graph-lqr`
+    (structured LQR) and `graph-dk` (the source's D-K type iteration): it uses all errors of these two vehicles and of
+    those it `hears`."""
     loop: Literal["ground", "onboard"] = "ground"
-    """ground: the station closes every loop, and all feedback is late. onboard: every vehicle feeds back its own errors
-    by itself, and the station streams what depends on those of others (thesis eq. 5.1). What is required of a design is
-    required of its ground loop; the margins reported are those of the loop flown."""
+    """`ground`: the station closes every loop, so all feedback is late. `onboard`: every vehicle feeds back its own
+    errors at once, and the station streams only what depends on other vehicles (thesis eq. 5.1). Requirements apply to
+    the ground loop; the margins reported are those of the loop that is flown."""
     delay_margin_s: Positive | None = None
-    """Least delay margin of the sampled loop."""
+    """Requirement: least delay margin of the sampled loop."""
     alpha: Annotated[float, Field(gt=0, lt=1)] | None = None
-    """Least robustness bound (thesis eq. 3.29)."""
+    """Requirement: least robustness bound (thesis eq. 3.29)."""
     decay_rate_1_s: Positive | None = None
-    """Least decay rate of the continuous loop without delay."""
+    """Requirement: least decay rate of the continuous loop without delay."""
     string_peak_max: Factor = 1.0
-    """Most that spacing errors may grow from one vehicle to the next, whatever their frequency: with 1 not at all."""
+    """Largest factor by which a spacing error may grow from one vehicle to the next at any frequency; 1 allows no
+    growth."""
     gains: FixedGains | None = None
+    """Fly these gains instead of designing any."""
     blocks: tuple[GainBlock, ...] = ()
-    """In place of a design, the gain matrix block by block; blocks left out are zero."""
+    """Fly this gain matrix, given block by block, instead of designing one. Omitted blocks are zero."""
 
 
 class Onboard(Part):
-    """The loop on board of each vehicle, with control.loop onboard, and its sensor for the vehicle ahead."""
+    """The loop on board each vehicle when `control.loop = "onboard"`, and its sensor for the vehicle in front."""
 
     rate_hz: Rate = 100.0
-    """How often the vehicle computes its own part of the command; a whole multiple of sensor_hz."""
+    """How often the vehicle computes its own part of the command; a whole multiple of `sensor_hz`."""
     sensor_hz: Rate = 50.0
-    """How often the sensor sees the vehicle ahead; a whole multiple of rates.control_hz. In between the position is
-    carried on with the relative velocity."""
+    """How often the sensor measures the vehicle in front; a whole multiple of `rates.control_hz`. Between measurements
+    the position is extrapolated with the relative velocity."""
     position_noise_m: NotNegative = 0.0
-    """Standard deviation of the sensor's relative position, in each axis; normal, independent from look to look."""
+    """Standard deviation of the measured relative position on each axis: normal noise, independent between
+    measurements."""
     velocity_noise_m_s: NotNegative = 0.0
-    """The same of its relative velocity."""
+    """Standard deviation of the measured relative velocity on each axis."""
 
 
 class Jitter(Part):
-    """What is added to the delay of each datagram anew. Delay and jitter together are cut off at 0 from below.
+    """A random delay drawn for each datagram and added to the link's delay; their sum is at least 0.
 
     uniform      from -scale_s to +scale_s: mean 0, standard deviation scale_s / sqrt(3)
     normal       mean 0, standard deviation scale_s
-    exponential  from 0 on: mean and standard deviation scale_s
-    gamma        from 0 on: mean shape * scale_s, standard deviation sqrt(shape) * scale_s
-    trace        measured delays, one datagram after the other from a place drawn for each link, then from the first
+    exponential  from 0 up: mean and standard deviation scale_s
+    gamma        from 0 up: mean shape * scale_s, standard deviation sqrt(shape) * scale_s
+    trace        measured delays in their order, starting at a place drawn for each link and wrapping around
     """
 
     distribution: Literal["uniform", "normal", "exponential", "gamma", "trace"]
+    """Kind of the distribution."""
     scale_s: Positive | None = None
+    """Scale of the distribution; needed by all but `trace`."""
     shape: Positive | None = None
+    """Shape of the gamma distribution; needed by `gamma` only."""
     trace_file: str | None = None
-    """Relative to the scenario file: a delay in s on each line, or CSV with a column delay_s. Read with the scenario,
-    which then holds the delays themselves in trace_s."""
+    """File of measured delays, relative to the scenario file: one delay in s per line, or CSV with a column `delay_s`.
+    It is read with the scenario, which from then on holds the delays themselves in `trace_s`."""
     trace_s: tuple[NotNegative, ...] | None = None
+    """The measured delays, in place of `trace_file`."""
 
 
 class LossBursts(Part):
-    """Gilbert-Elliott loss: a link is good, as at first, or bad; it may change with every datagram that enters.
+    """Gilbert-Elliott loss: a link starts good and may change between good and bad with every datagram that enters.
 
-    The part of all datagrams that find it bad is p / (p + r); a bad time lasts 1 / r datagrams in the mean.
+    The link is bad for p / (p + r) of the datagrams; a burst lasts 1 / r datagrams on average.
     """
 
     to_bad_probability: Probability
-    """p, of a good link to be bad for the next datagram."""
+    """p: probability that a good link is bad for the next datagram."""
     to_good_probability: Annotated[float, Field(gt=0, le=1)]
-    """r, of a bad link to be good for the next datagram."""
+    """r: probability that a bad link is good for the next datagram."""
     loss_good_probability: Probability = 0.0
+    """Probability that a good link loses a datagram."""
     loss_bad_probability: Probability = 1.0
+    """Probability that a bad link loses a datagram."""
 
 
 class DelayPoint(Part):
-    """The constant part of a link's delay at one time. Linear in between; two points at one time are a step."""
+    """The constant part of a link's delay at one time; linear between points. Two points at one time make a step."""
 
     at_s: NotNegative
+    """Link time of the point."""
     delay_s: NotNegative
+    """Delay at that time."""
 
 
 class Outage(Part):
-    """From `from_s` on, and before `until_s`, whatever enters the link is lost."""
+    """A time during which everything that enters the link is lost."""
 
     from_s: NotNegative
+    """Link time at which the outage begins."""
     until_s: Positive
+    """Link time at which it is over."""
 
 
 class Link(Part):
-    """One direction of a radio link. Times are link times, see Links.times_from.
+    """One direction of a radio link. Times are link times, see `links.times_from`.
 
-    What happens to a datagram, in this order: an outage or a full queue of the channel drops it, the channel takes its
-    time to send it, it is lost on the way or some of its bits are flipped, and it arrives after delay and jitter.
+    A datagram meets, in this order: an outage or a full channel queue, which drops it; the channel, which takes time to
+    send it; loss, or flipped bits; and the delay with its jitter, after which it arrives.
     """
 
     delay_s: NotNegative = 0.0
+    """Constant one-way delay."""
     delay_points: tuple[DelayPoint, ...] = ()
-    """Instead of delay_s; a datagram's delay is that of the time at which it enters."""
+    """A delay that changes over time, in place of `delay_s`. A datagram gets the delay of the time at which it
+    enters."""
     jitter: Jitter | None = None
+    """Random delay on top of the constant one."""
     reordering: bool = False
-    """Whether a datagram may overtake an earlier one. If not, it waits for it."""
+    """Whether a datagram may overtake an earlier one. If not, it waits for the earlier one."""
     loss_probability: Probability = 0.0
+    """Probability that a datagram is lost, independently of the others."""
     loss_bursts: LossBursts | None = None
+    """Loss in bursts, in addition to `loss_probability`."""
     duplicate_probability: Probability = 0.0
-    """Of what arrives. The second copy has a jitter of its own."""
+    """Probability that a datagram which arrives does so twice. The second copy has its own jitter."""
     corrupt_probability: Probability = 0.0
-    """Of a datagram to arrive with one to four of its bits flipped."""
+    """Probability that a datagram arrives with one to four of its bits flipped."""
     outages: tuple[Outage, ...] = ()
+    """Times without any connection."""
     channel: str | None = None
-    """Name of one of Links.channels; without it the link has no limit of bandwidth."""
+    """Name of the entry of `links.channels` that this link uses; without it the bandwidth is unlimited."""
 
 
 class VehicleLinks(Part):
     """The links of one vehicle, where they differ from those of the others."""
 
     system_id: SystemId
+    """The vehicle."""
     up: Link | None = None
+    """Its link to the station; replaces `links.up` as a whole."""
     down: Link | None = None
+    """Its link from the station; replaces `links.down` as a whole."""
 
 
 class Channel(Part):
-    """A limited bandwidth: one datagram is sent at a time, the others wait in order of their coming.
+    """A limited bandwidth: one datagram is sent at a time; the others wait in order of arrival.
 
-    What finds the queue full is dropped; an idle channel takes a datagram of any size. A datagram takes
-    size * bits_per_byte / bandwidth_bit_s. A serial radio has a start and a stop bit (8N1): 10 bits per byte.
+    A datagram takes size * bits_per_byte / bandwidth_bit_s. One that finds the queue full is dropped; an idle channel
+    takes a datagram of any size.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+    """Name by which links refer to the channel."""
     bandwidth_bit_s: Annotated[float, Field(ge=1, le=1e12)]
+    """Bits sent per second."""
     bits_per_byte: Annotated[int, Field(ge=8, le=16)] = 8
+    """Bits on the air per byte of the datagram. A serial radio adds a start and a stop bit (8N1): 10."""
     queue_bytes: Annotated[int, Field(ge=0, le=10**9)] | None = None
-    """Most bytes that wait; what is being sent waits no more."""
+    """Most bytes that wait, not counting the datagram being sent; unlimited if omitted."""
     queue_datagrams: Annotated[int, Field(ge=0, le=10_000)] | None = None
+    """Most datagrams that wait, not counting the one being sent; unlimited if omitted."""
     shared: bool = True
-    """One for all vehicles whose links name it; otherwise each vehicle has one of its own."""
+    """True: one channel for all vehicles whose links name it. False: each vehicle has a channel of its own."""
     half_duplex: bool = False
-    """Up and down share the bandwidth and the queue; otherwise each direction has its own."""
+    """True: up and down share the bandwidth and the queue. False: each direction has its own."""
 
 
 class Links(Part):
     """Emulated links: up is vehicle to station, down is station to vehicle."""
 
     up: Link = Link()
+    """From each vehicle to the station."""
     down: Link = Link()
+    """From the station to each vehicle."""
     vehicles: tuple[VehicleLinks, ...] = ()
+    """Vehicles whose links differ."""
     channels: tuple[Channel, ...] = ()
+    """Limited bandwidths that links may use."""
     times_from: Literal["flight", "start"] = "flight"
-    """When the time of outages and delay points is 0: when the station's first set-point enters a link (before that
-    the delay is the first point's and there is no outage), or when the vehicles start."""
+    """What link time, which outages and delay points refer to, counts from. `flight`: the station's first set-point
+    enters a link; before that the first delay point applies and there is no outage. `start`: the vehicles start."""
 
     def of(self, system_id: int) -> tuple[Link, Link]:
         """The (up, down) links of one vehicle."""
@@ -254,38 +306,47 @@ class Links(Part):
 
 
 class Clocks(Part):
-    """Boot clocks of the vehicles: offset and drift are drawn from the seed within these bounds."""
+    """Boot clocks of the vehicles. Offset and drift of each are drawn from the seed within these bounds."""
 
     offset_max_s: Annotated[float, Field(ge=0, le=1e6)] = 100.0
+    """Largest offset of a boot clock from the time at which the vehicles start."""
     drift_max_ppm: Annotated[float, Field(ge=0, le=DRIFT_MAX_PPM)] = 20.0
+    """Largest deviation of a boot clock's rate."""
 
 
 class Safety(Part):
-    """When a vehicle helps itself, when the flight is ended early, and what counts as settled."""
+    """When a vehicle enters its failsafe, when the flight is ended early, and what counts as settled."""
 
     setpoint_timeout_s: Positive = 1.0
+    """A vehicle that gets no set-point for this long enters its failsafe."""
     heartbeat_timeout_s: Positive = 3.0
+    """A vehicle that does not hear its ground station for this long enters its failsafe and may take commands from
+    another."""
     spacing_error_limit_m: Positive = 1000.0
+    """A larger spacing error ends the flight; the verdict is then `unstable`."""
     collision_distance_m: NotNegative = 5.0
-    """Vehicles nearer than this to each other have collided."""
+    """Vehicles closer to each other than this have collided, which ends the flight."""
     settled_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    """A follower has settled when its spacing error is below this part of its spacing."""
+    """A follower has settled when its spacing error stays below this fraction of its spacing."""
 
 
 class Monitor(Part):
     """When the station acts on a shrinking headroom (1 - loop delay / margin), and how."""
 
     act: bool = True
-    """Off: the modes are shown, and nothing is done."""
+    """False: the modes are shown and nothing is done."""
     caution_headroom: Headroom = 0.3
+    """A vehicle with less headroom is in CAUTION."""
     critical_headroom: Headroom = 0.15
+    """A vehicle with less headroom is in CRITICAL, and the station acts."""
     hysteresis: NotNegative = 0.05
+    """A mode is left again when headroom exceeds its threshold by this much."""
     window_s: Annotated[float, Field(gt=0, le=60)] = 1.0
-    """The loop delay judged is the one that nine tenths of the flight's ticks in this window stay below."""
+    """The monitor judges the loop delay that 90 % of the ticks in this window stay below."""
     hold_s: NotNegative = 0.3
-    """How long a condition holds before the slower side is taken,"""
+    """How long a condition must last before the monitor changes to slower gains."""
     ease_s: NotNegative = 3.0
-    """and before the faster one is taken back."""
+    """How long a condition must last before the monitor returns to faster gains."""
     blend_s: Positive = 1.0
     """How long a change of gains takes."""
     time_scales: Annotated[tuple[Factor, ...], Field(min_length=1, max_length=8)] = (
@@ -293,80 +354,104 @@ class Monitor(Part):
         2.0,
         4.0,
     )
-    """The gain schedule: the design slowed down by these factors, which multiplies its delay margin by them."""
+    """The gain schedule: the design slowed down in time by each factor, which multiplies its delay margin by it."""
     open_factor: Factor = 1.5
-    """The formation's spacing is opened by this factor when the slowest gains have too little headroom,"""
+    """When even the slowest gains have too little headroom, every spacing is multiplied by this."""
     open_s: Positive = 10.0
-    """over this time."""
+    """How long opening the formation takes."""
 
 
 class ClockJump(Part):
-    """A vehicle's boot clock is set, as that of a simulator that could not keep up."""
+    """The boot clock of every vehicle jumps, as in a simulator that cannot keep up."""
 
     at_s: Positive
     """Time since the vehicles were started."""
     by_s: Number
+    """How far the clock jumps; forwards if positive."""
 
 
 class Autopilot(Part):
-    """A simulated multicopter with dynamics `autopilot`: how it starts, and how it answers to set-points.
+    """A simulated multicopter, with `dynamics = "autopilot"`: how it starts, and how it responds to set-points.
 
-    It stands on the ground at its position until it is told to take off. The wanted acceleration is that of the
-    set-point plus `velocity_gain_1_s` times what is missing from its velocity; the real one follows with a lag.
+    It stands on the ground at its position until it is told to take off. It wants the acceleration of the set-point
+    plus `velocity_gain_1_s` times its velocity error; its real acceleration follows with a first-order lag.
     """
 
     flavour: Flavour = "ardupilot"
-    """Modes, numbers and rules of ArduCopter or of PX4."""
+    """Whose modes, numbers and rules it follows: ArduCopter's or PX4's."""
     lag_s: Positive = 0.15
-    """Time constant from wanted to real acceleration."""
+    """Time constant from the wanted to the real acceleration."""
     velocity_gain_1_s: Positive = 2.0
+    """Gain from velocity error to wanted acceleration."""
     acceleration_max_m_s2: Positive = 5.0
+    """Greatest acceleration."""
     speed_max_m_s: Positive = 12.0
+    """Greatest horizontal speed."""
     climb_max_m_s: Positive = 2.5
+    """Greatest climb rate."""
     telemetry_after_s: NotNegative = 1.0
-    """Until then it sends heartbeats only,"""
+    """Time after start-up during which it sends only heartbeats."""
     ready_after_s: NotNegative = 2.0
-    """and until then its estimator has no position and it refuses to arm."""
+    """Time after start-up during which its estimator has no position and it refuses to arm."""
     arming_refusals: Annotated[int, Field(ge=0, le=1000)] = 0
-    """How often it then still refuses to arm."""
+    """How many more arming requests it refuses after that."""
     origin_spread_m: NotNegative = 20.0
-    """The origin of each vehicle's local frame is drawn within this of the common one, north and east."""
+    """The origin of each vehicle's local frame is drawn within this distance of the common one, north and east."""
     clock_jumps: tuple[ClockJump, ...] = ()
+    """Jumps of the boot clock."""
 
 
 class Response(Part):
-    """How a vehicle answers to set-points, as the control is designed for: acceleration a, velocity v.
+    """How every vehicle responds to set-points, with acceleration a and velocity v.
 
-    lag a' = a_set + gain (v_set - v) - a. Without it the vehicles of a scenario with dynamics `autopilot` are asked to
-    show it before the formation flight.
+    lag a' = a_set + gain (v_set - v) - a. The control is designed for it. Without it, the response of vehicles with
+    `dynamics = "autopilot"` is identified in a manoeuvre before the formation flight.
     """
 
     lag_s: Positive
+    """Time constant from set-point to acceleration."""
     velocity_gain_1_s: NotNegative = 0.0
+    """Gain from velocity error to acceleration."""
 
 
 class Scenario(Part):
     """One experiment: vehicles, wanted formation, control, links, seed, duration."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+    """Name of the scenario; the run's folder begins with it."""
     seed: Annotated[int, Field(ge=0, lt=2**63)]
+    """Seed of everything random: each link and each vehicle draws from a stream of its own."""
     duration_s: Annotated[float, Field(gt=0, le=86400)]
+    """How long the formation is flown."""
     altitude_m: NotNegative = 1000.0
+    """Altitude of all vehicles above the origin."""
     vehicles: Annotated[tuple[Vehicle, ...], Field(min_length=1, max_length=250)]
+    """The formation: one tree, whose root is the leader."""
     nominal_velocity: Annotated[tuple[NominalVelocity, ...], Field(min_length=1)]
+    """The formation's velocity over time, as steps in order of time."""
     limits: Limits = Limits()
+    """What the vehicles can do."""
     rates: Rates = Rates()
+    """How often things happen."""
     control: Control = Control()
+    """How the gains are found, and where the loop is closed."""
     onboard: Onboard = Onboard()
+    """The loop on board, with `control.loop = "onboard"`."""
     links: Links = Links()
+    """The emulated radio links."""
     clocks: Clocks = Clocks()
+    """The vehicles' boot clocks."""
     safety: Safety = Safety()
+    """Time-outs and limits."""
     monitor: Monitor = Monitor()
+    """What the station does when headroom shrinks."""
     dynamics: Literal["double_integrator", "autopilot"] = "double_integrator"
-    """What the vehicles are: the source's UAVs, which follow an acceleration at once and are launched in the air, or
-    multicopters with an autopilot, which start on the ground."""
+    """`double_integrator`: the source's UAVs, which follow an acceleration at once and are launched in the air.
+    `autopilot`: multicopters with an autopilot, which start on the ground."""
     autopilot: Autopilot = Autopilot()
+    """The simulated multicopters, with `dynamics = "autopilot"`."""
     response: Response | None = None
+    """How the vehicles respond to set-points, if that is known beforehand."""
     at_end: Literal["hold", "land"] = "hold"
     """What vehicles with an autopilot are told when the flight ends."""
 

@@ -12,8 +12,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-DOCS = Path(__file__).resolve().parent
-SCENARIOS = DOCS.parent / "scenarios"
+from docs.generate.blocks import ROOT
+
+DOCS = ROOT / "docs"
+SCENARIOS = ROOT / "scenarios"
 
 
 def gcs(*arguments: str | Path) -> None:

@@ -1,0 +1,11 @@
+"""What is generated in the documentation: the reference from the code, the figures from the commands behind them.
+
+A page is written by hand and holds blocks, which are filled in between two comments that the reader does not see::
+
+    <!-- generated: NAME -->
+    <!-- end -->
+
+`blocks` finds and fills them. `reference` makes those of the reference (`keys`, `commands`, `fields`, `api`), and
+`measurements` those with figures. `__main__` is the command behind `python3 make.py reference` and `measurements`.
+`pictures` makes the pictures.
+"""

@@ -1,0 +1,73 @@
+"""The fields of what a run leaves behind: columns from the record in the code, JSON fields from `fields.toml`."""
+
+import inspect
+import re
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+import gcs.record
+import sim_vehicles.truth
+from docs.generate.blocks import table
+
+_LINE = re.compile(r'\s+\("(?P<name>\w+)", "(?P<type>[^"]+)"\),(?:  # (?P<text>.*))?$')
+_TYPES = {"f": "float", "i": "integer", "u": "unsigned", "b": "boolean"}
+
+
+def described() -> dict[str, dict[str, str]]:
+    """By file, what each of its JSON fields means."""
+    return tomllib.loads(Path(__file__).with_name("fields.toml").read_text(encoding="utf-8"))
+
+
+def json_fields(file: str) -> str:
+    """The table of one file's JSON fields."""
+    return table(("field", "meaning"), [(f"`{path}`", text) for path, text in described()[file].items()])
+
+
+def found_fields(value: Any, known: Iterable[str], path: str = "") -> set[str]:
+    """The fields of a JSON value; one that is in `known` is not looked into."""
+    if path in set(known):
+        return {path}
+    if isinstance(value, dict):
+        found = (found_fields(inner, known, f"{path}.{name}" if path else name) for name, inner in value.items())
+        return set[str]().union(*found)
+    if value == [] and any(each.startswith(f"{path}[]") for each in known):
+        return set()  # none of them here
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return set[str]().union(*(found_fields(inner, known, f"{path}[]") for inner in value))
+    return {path}
+
+
+def columns(module: ModuleType, dtype: "np.dtype[Any]") -> str:
+    """The columns of a record with the comments beside them; a line without one is described with the line above."""
+    lines = [found for line in inspect.getsource(module).splitlines() if (found := _LINE.match(line))]
+    assert tuple(line["name"] for line in lines) == dtype.names
+    rows: list[tuple[list[str], str, str]] = []
+    for line in lines:
+        kind = dtype[line["name"]]
+        words = f"{_TYPES[kind.kind]}{'' if kind.kind == 'b' else f' {8 * kind.itemsize}'}"
+        if line["text"] or not rows:
+            rows.append(([], words, line["text"] or ""))
+        rows[-1][0].append(f"`{line['name']}`")
+    return table(("columns", "type", "meaning"), [(", ".join(names), words, text) for names, words, text in rows])
+
+
+def tick_columns() -> str:
+    return columns(gcs.record, gcs.record.TICK)
+
+
+def modes() -> str:
+    """The modes of a vehicle, by the number in the tick record."""
+    source = inspect.getsource(gcs.record.Mode)
+    lines = re.findall(r"^\s+([A-Z]+) = (\d+)  # (.*)$", source, re.MULTILINE)
+    return table(("number", "mode", "meaning"), [(number, name, text) for name, number, text in lines])
+
+
+def truth_columns() -> str:
+    dtype = sim_vehicles.truth.DTYPE
+    rows = [(f"`{name}`", f"{_TYPES[dtype[name].kind]} {8 * dtype[name].itemsize}") for name in dtype.names or ()]
+    return table(("field", "type"), rows)

@@ -1,0 +1,374 @@
+"""What the figures of the documentation are, and the commands that they come from.
+
+Each function runs commands and returns Markdown. One whose figures are the same on every machine, for a flight in
+virtual time is the same to the last bit, is `exact`: the tests and CI compare it with what is committed. `quick` ones
+take a few seconds and are compared by the default tests. All others are measured, and printed as ranges.
+"""
+
+import json
+import tomllib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from docs.generate.blocks import ROOT, table
+from docs.generate.runner import CommandError, Runner
+from docs.generate.sessions import steps_of
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A block of figures: how it is made, and how it may be compared."""
+
+    make: Callable[[Runner], str]
+    exact: bool
+    quick: bool = False
+
+
+def _output(text: str) -> str:
+    """What a command prints, as code."""
+    lines = [line.rstrip() for line in text.strip().splitlines()]
+    return "\n".join(["```text", *(line for line in lines if line), "```"])
+
+
+def _ms(seconds: float | None, digits: int = 1) -> str:
+    return "no limit" if seconds is None else f"{1e3 * seconds:.{digits}f} ms"
+
+
+def _range(values: Iterable[float], form: str = ".1f", unit: str = "") -> str:
+    """The least and the largest of several runs."""
+    known = list(values)
+    least, most = format(min(known), form), format(max(known), form)
+    return f"{least}{unit}" if least == most else f"{least} to {most}{unit}"
+
+
+# --- designs ------------------------------------------------------------------------------------------------------
+
+
+def design(runner: Runner) -> str:
+    return _output(runner.run("gcs design scenarios/triangle5.toml"))
+
+
+def string_limit(runner: Runner) -> str:
+    """What the limit on the growth of spacing errors costs in robustness."""
+    rows: list[tuple[str, ...]] = []
+    text = (runner.folder / "scenarios" / "triangle5.toml").read_text(encoding="utf-8")
+    assert "string_peak_max" not in text
+    for limit in (1, 2):
+        name = f"string{limit}.toml"
+        changed = text.replace("[control]\n", f"[control]\nstring_peak_max = {limit}.0\n", 1)
+        assert tomllib.loads(changed)["control"]["string_peak_max"] == limit
+        (runner.folder / name).write_text(changed, encoding="utf-8")
+        found = runner.json(f"gcs design {name}")
+        cells = _ms(found["delay_margin_s"]), f"{found['alpha']:.4f}", f"{found['behaviour']['string_peak']:.3f}"
+        rows.append((f"{limit}", *cells))
+    head = ("`string_peak_max`", "delay margin, sampled", "alpha", "largest growth from vehicle to vehicle")
+    return f"`string1.toml` and `string2.toml` are `triangle5.toml` with `string_peak_max`:\n\n{table(head, rows)}"
+
+
+def compare(runner: Runner) -> str:
+    routes = runner.json("gcs compare scenarios/triangle5.toml --no-sizes")["routes"]
+    values: dict[str, Callable[[dict[str, Any]], str]] = {
+        "settling time": lambda route: f"{route['settling_time_s']:.2f} s",
+        "overshoot": lambda route: f"{route['overshoot']:.0%}",
+        "control effort": lambda route: f"{float(format(route['effort_m2_s3'], '.3g')):,.0f} m²/s³",
+        "delay margin, sampled": lambda route: _ms(route["delay_margin_s"], 0),
+        "alpha of the whole formation": lambda route: f"{route['alpha']:.3f}",
+    }
+    rows = [(name, *(value(route) for route in routes)) for name, value in values.items()]
+    return table(("", *(route["method"] for route in routes)), rows)
+
+
+def design_time(runner: Runner) -> str:
+    """Time of designs of growing chains, as ratios to inclusion of five vehicles in the same run."""
+    runner.run("gcs compare scenarios/triangle5.toml --out runs/compare")
+    grown = json.loads((runner.folder / "runs" / "compare" / "compare.json").read_text(encoding="utf-8"))["sizes"]
+    least_s = next(each["design_s"] for each in grown if each["method"] == "inclusion" and each["vehicles"] == 5)
+    sizes = sorted({each["vehicles"] for each in grown})
+    times = {(each["method"], each["vehicles"]): each["design_s"] / least_s for each in grown}
+    methods = list(dict.fromkeys(each["method"] for each in grown))
+    rows = [
+        (method, *(f"{times[method, size]:.2g}" if (method, size) in times else "" for size in sizes))
+        for method in methods
+    ]
+    head = ("method", *(f"{size} vehicles" for size in sizes))
+    return f"Inclusion takes {least_s:.2f} s for five vehicles; the others as multiples of that:\n\n{table(head, rows)}"
+
+
+def margin_held(runner: Runner) -> str:
+    return _output(runner.run("gcs margin docs/models/held.json"))
+
+
+def margin_thesis(runner: Runner) -> str:
+    return _output(runner.run("gcs margin scenarios/thesis_delay.toml"))
+
+
+# --- where formations break ---------------------------------------------------------------------------------------
+
+
+def _onset(runner: Runner, scenario: str, options: str) -> dict[str, Any]:
+    return runner.json(f"gcs stress scenarios/{scenario}.toml --onset{options}")
+
+
+def onset_chain3(runner: Runner) -> str:
+    onset = _onset(runner, "chain3", "")["onset"]
+    return (
+        f"The delay margin of `chain3` is **{_ms(onset['predicted_s'], 2)}** of loop delay. In flight, its errors stop "
+        f"dying away at **{_ms(onset['loop_delay_s'], 2)}**, {100 * onset['difference']:+.3f} % from that."
+    )
+
+
+_ONSETS = {
+    "chain3": ("", "0:0.6:7"),
+    "triangle5": ("", "0:0.6:7"),
+    "chain20": ("", "0:0.6:7"),
+    "chain3_bidirectional": ("", "0:0.6:7"),
+    "thesis_gains": ("", "0:0.14:7"),
+    "thesis_delay": ("", "0:2:7"),
+    "chain3_bidirectional onboard": (" --loop onboard", "0:3:7"),
+    "chain3 onboard": (" --loop onboard", "0:2:7"),
+}
+
+
+def onsets(runner: Runner) -> str:
+    """Where flights of several formations break, beside the margins of their designs."""
+    rows: list[tuple[str, ...]] = []
+    for name, (options, delays) in _ONSETS.items():
+        result = _onset(runner, name.split()[0], f"{options} --delay {delays}")
+        onset, curve = result["onset"], result["curve_error"]
+        if onset is None:
+            none = "none, as predicted" if result["onset_missing_as_predicted"] else "not found"
+            cells = ("no limit", none, "")
+        else:
+            cells = (_ms(onset["predicted_s"], 2), _ms(onset["loop_delay_s"], 2), f"{100 * onset['difference']:+.3f} %")
+        rows.append((f"`{name.split()[0]}`{options.replace(' --loop', ', loop')}", *cells, _share(curve)))
+    return table(("scenario", "sampled margin", "onset in flight", "difference", "curve"), rows)
+
+
+def _share(curve: float | None) -> str:
+    if curve is None:
+        return ""
+    return "< 0.001 %" if curve < 1e-5 else f"{100 * curve:.2g} %"
+
+
+def onsets_real_time(runner: Runner) -> str:
+    rows: list[tuple[str, ...]] = []
+    for name in ("chain3", "triangle5", "thesis_delay"):
+        result = _onset(runner, name, " --real-time --assert-onset 0.03")
+        onset, noise = result["onset"], result["noise"]
+        cells = _ms(onset["predicted_s"], 2), _ms(onset["loop_delay_s"], 2), f"{100 * onset['difference']:+.3f} %"
+        rows.append((f"`{name}`", *cells, _ms(noise["lateness_s_p99"]["median"], 2)))
+    return table(("scenario", "sampled margin", "onset in flight", "difference", "set-points late, p99"), rows)
+
+
+_MAPS = {
+    "jitter each way": ("chain3", "--delay 0.15:0.375:10 --jitter 0.02,0.04,0.06,0.08 --seeds 3", "jitter", "±{} ms"),
+    "loss each way": ("chain3", "--delay 0.15:0.35:9 --loss 0.1,0.2,0.3,0.4 --seeds 3", "loss", "{} %"),
+    "control rate": ("triangle5", "--delay 0.1:0.35:11 --rate 10:50:5", "rate", "{} Hz"),
+}  # fmt: skip
+
+
+def maps(runner: Runner) -> str:
+    """The link delay at which growth is zero, measured and predicted, for values of a second quantity."""
+    tables: list[str] = []
+    for title, (scenario, axes, name, form) in _MAPS.items():
+        points = runner.json(f"gcs stress scenarios/{scenario}.toml {axes}")["points"]
+        values = sorted({point["coordinates"][name] for point in points})
+        shown = {"jitter": 1e3, "loss": 1e2, "rate": 1.0}[name]
+        rows = [
+            (row, *(_crossing(points, name, value, field) for value in values))
+            for row, field in (("in flight", "growth_1_s"), ("predicted", "predicted_growth_1_s"))
+        ]
+        tables.append(table((title, *(form.format(f"{shown * value:g}") for value in values)), rows))
+    return "\n\n".join(["Link delay, up and down together, at which the errors stop dying away:", *tables])
+
+
+def _crossing(points: list[dict[str, Any]], name: str, value: float, field: str) -> str:
+    """Where the mean growth over the seeds passes zero, by a straight line between two delays."""
+    chosen = [p for p in points if p["coordinates"][name] == value and p["kind"] == "probe" and p[field] is not None]
+    delays = sorted({point["coordinates"]["delay"] for point in chosen})
+    growth = [np.mean([p[field] for p in chosen if p["coordinates"]["delay"] == delay]) for delay in delays]
+    for (left, low), (right, high) in pairwise(zip(delays, growth, strict=True)):
+        if low < 0.0 <= high:
+            return f"{1e3 * (left + (right - left) * low / (low - high)):.0f} ms"
+    return "not within"
+
+
+# --- flights in real time -----------------------------------------------------------------------------------------
+
+
+def _flight(runner: Runner, command: str) -> dict[str, Any]:
+    """A flight's summary, with its errors against the truth as `gcs grade` finds them."""
+    folder = runner.folder / "runs" / "flight"
+    if folder.exists():
+        folder.rename(runner.folder / "runs" / f"flight{len(list((runner.folder / 'runs').iterdir()))}")
+    summary = runner.json(f"{command} --listen 127.0.0.1:0 --out runs/flight", wanted=(0, 1))
+    return summary | {"grade": runner.json("gcs grade runs/flight")}
+
+
+def _readme(runner: Runner, wanted: str) -> list[str]:
+    """What the README's command that contains `wanted` prints, with the README's scenario."""
+    steps = steps_of(ROOT / "README.md")
+    for step in steps:
+        if step.file:
+            (runner.folder / step.file).write_text(step.text, encoding="utf-8")
+    [command] = [step.text.strip() for step in steps if wanted in step.text and not step.file]
+    return runner.run(command).splitlines()
+
+
+def readme_fly(runner: Runner) -> str:
+    """The verdict, delay and punctuality; not the lines of the flight, the table of the vehicles and the files."""
+    lines = _readme(runner, "gcs fly")
+    wanted = ("verdict", "delay", "control")
+    return _output("\n".join(line for line in lines if line.startswith(wanted)))
+
+
+def readme_onset(runner: Runner) -> str:
+    """What was found, without the files after it."""
+    lines = _readme(runner, "gcs stress")
+    return _output("\n".join(lines[: next(k for k, line in enumerate(lines) if line.startswith("files"))]))
+
+
+def flights(runner: Runner) -> str:
+    rows: list[tuple[str, ...]] = []
+    for name, times in (("triangle5", 3), ("chain20", 2)):
+        found = [_flight(runner, f"gcs fly scenarios/{name}.toml") for _ in range(times)]
+        if any(summary["verdict"] != "stable" for summary in found):
+            raise CommandError(f"{name}: a flight was not stable")
+        delays = [summary["loop_delay_s"] for summary in found]
+        errors = [summary["grade"]["loop_delay"] for summary in found]
+        trips = [summary["grade"]["rtt"] for summary in found]
+        rows.append(
+            (
+                f"`{name}`, {times} flights",
+                _range((summary["settling_time_s"] for summary in found), unit=" s"),
+                _range((1e3 * delay["p50"] for delay in delays), unit=" ms"),
+                _range((1e3 * delay["p99"] for delay in delays), unit=" ms"),
+                _range((1e3 * error["error_p50_s"] for error in errors), ".2f", " ms"),
+                _range((1e3 * error["error_p99_s"] for error in errors), ".2f", " ms"),
+                _range((1e3 * trip["error_p50_s"] for trip in trips), ".2f", " ms"),
+                _range((summary["control"]["deadline_misses"] for summary in found), "d"),
+            )
+        )
+    head = ("scenario", "settled after", "loop delay p50", "p99", "its error p50", "p99", "RTT error p50", "misses")
+    return table(head, rows)
+
+
+def too_late(runner: Runner) -> str:
+    summary = _flight(runner, "gcs fly scenarios/triangle5.toml --link-delay 0.4")
+    return (
+        f"Loop delay {_ms(summary['loop_delay_s']['p50'], 0)} at the median, margin {_ms(summary['delay_margin_s'])}: "
+        f"{summary['verdict']}, after {summary['duration_s']:.1f} s ({summary['reason']})."
+    )
+
+
+def punctuality(runner: Runner) -> str:
+    rows: list[tuple[str, ...]] = []
+    for count in (5, 20, 250):
+        found = runner.json(f"gcs bench scenarios/triangle5.toml --real-time --seconds 20 --vehicles {count}")
+        cells = [
+            f"{1e3 * found[name]['error_p50_s']:.3f} / {1e3 * found[name]['error_p99_s']:.2f}"
+            for name in ("link_delay", "loop_delay", "rtt")
+        ]
+        misses = f"{found['control']['deadline_misses']} of {found['control']['ticks']}"
+        rows.append((f"{count}", *cells, misses))
+    head = ("vehicles, 50 Hz", "emulated link delay", "loop delay", "round trip", "deadline misses")
+    return f"Errors at the median / 99th percentile, ms:\n\n{table(head, rows)}"
+
+
+def thesis_flights(runner: Runner) -> str:
+    rows: list[tuple[str, ...]] = []
+    for delay_s in (0.08, 0.45, 0.55):
+        found = _flight(runner, f"gcs fly scenarios/thesis_delay.toml --link-delay {delay_s}")
+        settled = found["settling_time_s"]
+        rest = "" if settled is None else f", settled after {settled:.1f} s"
+        largest = max(vehicle["spacing_error_max_m"] or 0.0 for vehicle in found["vehicles"])
+        verdict = f"{found['verdict']}{rest}"
+        rows.append((f"{1e3 * delay_s:.0f} ms", _ms(found["loop_delay_s"]["p50"], 0), verdict, f"{largest:.0f} m"))
+    return table(("link delay each way", "loop delay p50", "verdict", "largest spacing error"), rows)
+
+
+def copters(runner: Runner) -> str:
+    found = runner.json("gcs fly scenarios/copters5.toml --listen 127.0.0.1:0", wanted=(0, 1))
+    response = found["response"]
+    lags = [vehicle["lag_s"] for vehicle in response["vehicles"]]
+    return (
+        f"Lag identified: {_range(lags, '.3f', ' s')}; the scenario's simulated copters have 0.150 s. Delay margin "
+        f"{_ms(found['delay_margin_s'], 0)}; {_ms(response['delay_margin_at_once_s'], 0)} if they responded at once."
+    )
+
+
+def signing(runner: Runner) -> str:
+    """What signing costs on a link that reorders, and in computing time."""
+    runner.run("gcs key formation.key")
+    rows: list[tuple[str, ...]] = []
+    for how, option in (("unsigned", ""), ("signed", " --key formation.key")):
+        found = runner.json(f"gcs fly scenarios/wifi_bursts.toml --listen 127.0.0.1:0{option}", wanted=(0, 1))
+        received = sum(vehicle["received"] for vehicle in found["vehicles"])
+        refused = sum(found["refused"].values())
+        rows.append((how, f"{refused / (received + refused):.1%}", _ms(found["loop_delay_s"]["p99"], 0)))
+    cost = runner.json("gcs bench scenarios/triangle5.toml --signed")["signed"]
+    text = f"A signed flight in virtual time takes {cost['time_ratio_p50']:.2f} times as long to compute."
+    return f"{table(('`wifi_bursts`', 'frames refused by the station', 'loop delay p99'), rows)}\n\n{text}"
+
+
+# --- capacity and speed -------------------------------------------------------------------------------------------
+
+
+def capacity(runner: Runner) -> str:
+    rows: list[tuple[str, ...]] = []
+    for found in runner.json("gcs capacity scenarios/radio57600.toml")["capacities"]:
+        most, following = found["most"], found["next"]
+        delays = f"{1e3 * most['loop_delay_p50_s']:.0f} / {1e3 * most['loop_delay_p99_s']:.0f} ms"
+        ends = found["failed"] if following is None else f"{following['vehicles']} vehicles: {following['reason']}"
+        rows.append((f"{found['rate_hz']:g} Hz", f"{most['vehicles']}", delays, ends))
+    return table(("telemetry and control", "vehicles carried", "loop delay p50 / p99", "what ends it"), rows)
+
+
+def _speed(runner: Runner, *, compiled: bool) -> str:
+    rows: list[tuple[str, ...]] = []
+    for options in ("", " --vehicles 250 --seconds 2 --repeat 3"):
+        found = runner.json(f"gcs bench scenarios/triangle5.toml{options}")
+        if found["compiled"] != compiled:
+            raise CommandError(f"the hot path is {'not ' if compiled else ''}compiled: python3 make.py compile")
+        times = _range((found["real_time_factor_p50"], found["real_time_factor"]), ".3g", " times")
+        rows.append((f"{found['vehicles']}", times, f"{1e3 * found['station_s_per_tick']:.2f} ms"))
+    head = ("vehicles, 50 Hz", "faster than real time, one core (median to best)", "station, of its period of 20 ms")
+    return table(head, rows)
+
+
+def speed(runner: Runner) -> str:
+    return _speed(runner, compiled=False)
+
+
+def speed_compiled(runner: Runner) -> str:
+    return _speed(runner, compiled=True)
+
+
+FIGURES = {
+    "design": Figure(design, exact=True, quick=True),
+    "string-limit": Figure(string_limit, exact=True, quick=True),
+    "compare": Figure(compare, exact=True, quick=True),
+    "margin-held": Figure(margin_held, exact=True, quick=True),
+    "margin-thesis": Figure(margin_thesis, exact=True, quick=True),
+    "onset-chain3": Figure(onset_chain3, exact=True, quick=True),
+    "readme-onset": Figure(readme_onset, exact=True, quick=True),
+    "onsets": Figure(onsets, exact=True),
+    "maps": Figure(maps, exact=True),
+    "capacity": Figure(capacity, exact=True),
+    "design-time": Figure(design_time, exact=False),
+    "readme-fly": Figure(readme_fly, exact=False),
+    "flights": Figure(flights, exact=False),
+    "too-late": Figure(too_late, exact=False),
+    "punctuality": Figure(punctuality, exact=False),
+    "onsets-real-time": Figure(onsets_real_time, exact=False),
+    "thesis-flights": Figure(thesis_flights, exact=False),
+    "copters": Figure(copters, exact=False),
+    "signing": Figure(signing, exact=False),
+    "speed": Figure(speed, exact=False),
+    "speed-compiled": Figure(speed_compiled, exact=False),
+}
+"""Every block of figures, by its name in the pages."""

@@ -1,0 +1,201 @@
+"""The documentation says what the code does: generated parts, figures, commands, links."""
+
+import doctest
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from docs.generate import blocks, figures, measurements, reference
+from docs.generate.fields import described, found_fields
+from docs.generate.keys import schema
+from docs.generate.runner import Runner
+from docs.generate.sessions import Step, steps_of
+from gcs.lockstep import START_NS, fly_lockstep
+from gcs.margin import margin_of_file, margin_of_scenario
+from gcs.plan import flight_plan
+from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.station import Station
+from gcs.summary import finish
+from scenarios import files
+from scenarios.schema import Response
+
+ROOT = blocks.ROOT
+PAGES = {str(page.relative_to(ROOT)): page for page in blocks.pages()}
+SESSIONS = [name for name, page in PAGES.items() if any(_ for _ in steps_of(page))]
+FLOWN_S = 15.0
+"""Scenarios are flown no longer than this in real time; their commands are typed as they stand."""
+
+
+def test_the_reference_and_the_schema_follow_from_the_code() -> None:
+    assert reference.stale() == [], "python3 make.py reference"
+
+
+@pytest.mark.parametrize("name", [name for name, figure in figures.FIGURES.items() if figure.quick])
+def test_quick_exact_figures_are_those_that_the_commands_give(name: str) -> None:
+    assert measurements.stale([name]) == [], f"python3 make.py measurements {name}"
+
+
+def test_a_figure_that_was_changed_by_hand_is_noticed() -> None:
+    [page] = blocks.pages_with("margin-held")
+    text = blocks.blocks_of(page)["margin-held"]
+    other_day = re.sub(r"Measured on [\d-]+", "Measured on 2001-01-01", text)
+    assert other_day != text
+    assert blocks.differing("margin-held", other_day) == []
+    assert blocks.differing("margin-held", text.replace("1.72941", "1.72942")) == [page]
+
+
+def test_every_generated_block_has_a_maker_and_every_figure_a_page() -> None:
+    known = {*reference.MAKERS, *figures.FIGURES, *(f"{name}-bare" for name in figures.FIGURES)}
+    assert {name for page in PAGES.values() for name in blocks.blocks_of(page)} <= known
+    assert measurements.unused() == []
+
+
+def test_the_readme_is_short() -> None:
+    assert len(PAGES["README.md"].read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_every_scenario_key_has_a_description() -> None:
+    whole = schema()
+    parts = {"Scenario": whole, **whole["$defs"]}
+    missing = [
+        f"{name}.{key}"
+        for name, part in parts.items()
+        for key, value in part["properties"].items()
+        if not value.get("description")
+    ]
+    assert missing == []
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda file: file.stem)
+def test_scenarios_name_the_schema(file: Path) -> None:
+    assert file.read_text(encoding="utf-8").splitlines()[0] == "#:schema ./scenario.schema.json"
+
+
+def fly(folder: Path, name: str, **changes: Any) -> dict[str, Any]:
+    """The summary of a short flight in virtual time."""
+    scenario = files.load(ROOT / "scenarios" / f"{name}.toml").model_copy(update={"duration_s": 2.0} | changes)
+    design, plan = flight_plan(scenario)
+    (folder / SCENARIO_FILE).write_text(files.dump(scenario), encoding="utf-8")
+    (folder / DESIGN_FILE).write_text(json.dumps(design), encoding="utf-8")
+    station, writer = Station(plan, start_ns=START_NS), RunWriter(folder)
+    for rows in fly_lockstep(plan, station=station):
+        writer.tick(rows)
+    for event in station.events:
+        writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
+    writer.close()
+    return finish(folder)
+
+
+def test_every_field_of_a_summary_is_described_and_no_other(tmp_path: Path) -> None:
+    known = described()["summary"]
+    assert found_fields(fly(tmp_path, "chain3"), known) == known.keys()
+
+
+def test_every_field_of_a_design_is_described_and_no_other() -> None:
+    known = described()["design"]
+    load = {name: files.load(ROOT / "scenarios" / f"{name}.toml") for name in ("chain3", "copters5")}
+    load["two way"] = files.load(ROOT / "scenarios" / "chain3_bidirectional.toml")
+    load["onboard"] = files.with_loop(load["chain3"], "onboard", Path("chain3.toml"))
+    load["copters5"] = load["copters5"].model_copy(update={"response": Response(lag_s=0.15)})
+    found = [found_fields(flight_plan(scenario)[0], known) for scenario in load.values()]
+    assert set[str]().union(*found) == known.keys()
+
+
+def test_every_field_of_a_margin_is_described_and_no_other(tmp_path: Path) -> None:
+    known = described()["margin"]
+    numbers = tmp_path / "numbers.json"
+    numbers.write_text('{"terms": [{"A": [[0]], "delay": 0}, {"A": [[-1]], "delay": 0.1}]}', encoding="utf-8")
+    results = [margin_of_file(file) for file in (numbers, *sorted((ROOT / "docs" / "models").glob("*.json")))]
+    results.append(margin_of_scenario(ROOT / "scenarios" / "thesis_delay.toml"))
+    assert set[str]().union(*(found_fields(result, known) for result in results)) == known.keys()
+
+
+def shell(steps: list[Step], folder: Path) -> None:
+    """Type the steps of a session, and expect of each command the exit code that its page says."""
+    session: dict[str, Any] = {}
+    servers: list[subprocess.Popen[bytes]] = []
+    try:
+        for step in steps:
+            if step.file:
+                with (folder / step.file).open("a" if step.append else "w", encoding="utf-8") as file:
+                    file.write(("\n" if step.append else "") + step.text)
+            elif step.python:
+                python(step.text, session)
+            elif step.server:
+                servers.append(server(step.text.split(), folder))
+            else:
+                for command in step.text.strip().splitlines():
+                    Runner(folder).run(command, wanted=(step.exit_code,))
+    finally:
+        for each in servers:
+            each.terminate()
+            each.communicate()
+
+
+def server(command: list[str], folder: Path) -> subprocess.Popen[bytes]:
+    """A program that runs on, once it has said its first line."""
+    program = Path(sys.executable).with_name(command[0])
+    started = subprocess.Popen([program, *command[1:]], cwd=folder, stdout=subprocess.PIPE)
+    assert started.stdout is not None
+    assert started.stdout.readline()
+    return started
+
+
+def python(text: str, session: dict[str, Any]) -> None:
+    test = doctest.DocTestParser().get_doctest(text, session, "page", None, 0)
+    report: list[str] = []
+    assert doctest.DocTestRunner(verbose=False).run(test, out=report.append, clear_globs=False).failed == 0, report
+    session |= test.globs
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A place like the repository, whose scenarios are flown for a short time."""
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios", ignore=shutil.ignore_patterns("*.py*", "__pycache__"))
+    for file in (tmp_path / "scenarios").glob("*.toml"):
+        text = file.read_text(encoding="utf-8")
+        wanted_s = min(FLOWN_S, files.load(file).duration_s)
+        file.write_text(re.sub(r"^duration_s = [\d.]+", f"duration_s = {wanted_s}", text, flags=re.M), encoding="utf-8")
+    return tmp_path
+
+
+# the README's command in virtual time is that of a figure, which is compared above
+@pytest.mark.parametrize("name", [name for name in SESSIONS if name != "README.md"])
+def test_what_a_page_says_to_type_works(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    shell([step for step in steps_of(PAGES[name]) if not step.realtime], folder)
+
+
+@pytest.mark.realtime
+@pytest.mark.timeout(300)
+@pytest.mark.xdist_group("realtime")
+@pytest.mark.parametrize("name", [n for n in SESSIONS if any(step.realtime for step in steps_of(PAGES[n]))])
+def test_what_a_page_says_to_type_works_in_real_time(name: str, folder: Path) -> None:
+    steps = steps_of(PAGES[name])
+    shell([step for step in steps if step.realtime or step.file or "gcs key" in step.text], folder)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_lead_to_pages_that_exist(name: str) -> None:
+    page = PAGES[name]
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    targets = [target.partition("#") for target in re.findall(r"\]\(([^)\s]+)\)", text)]
+    broken = [
+        f"{target}#{anchor}"
+        for target, _, anchor in targets
+        if not (file := (page.parent / target if target else page)).exists() or (anchor and anchor not in anchors(file))
+    ]
+    assert broken == []
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as Markdown renderers make them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower()) for heading in headings}
