@@ -33,7 +33,7 @@ WINDOW = 128
 LEAST_SAMPLES = 5
 """Exchanges wanted before a clock counts as known."""
 LATEST_NS = 1 << 62
-"""No clock shows more, 146 years since 1970 or since boot: differences of two times fit 64 bits."""
+"""No clock shows more, to either side (a clock set back may show less than 0): 146 years. Differences fit 64 bits."""
 REQUEST_LIFETIME_NS = 20_000_000_000
 _LONG_AGO_NS = -(1 << 62)
 DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
@@ -177,7 +177,7 @@ class VehicleClock:
     def reply(self, *, tc1_ns: int, ts1_ns: int, received_ns: int) -> int | None:
         """Take a reply in; returns the round trip in ns, or None if it answers nothing that was asked, or no clock
         shows such a time."""
-        if ts1_ns not in self._pending or received_ns < ts1_ns or not 0 <= tc1_ns < LATEST_NS:
+        if ts1_ns not in self._pending or received_ns < ts1_ns or abs(tc1_ns) >= LATEST_NS:
             self.unmatched += 1
             return None
         del self._pending[ts1_ns]

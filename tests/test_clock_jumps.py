@@ -75,7 +75,7 @@ def test_the_reported_offset_is_within_its_bound_of_the_truth_at_every_tick_on_w
     flight = flown(clock_jumps=(ClockJump(at_s=45.0, by_s=3.0),), timesync_hz=0.2)
     rows = flight.ticks[flight.ticks["system_id"] == 2]
     rows = rows[np.isfinite(rows["clock_offset_s"])]
-    clock = flight.copter(2).clock
+    clock = flight.fleet.vehicle(2).radio.clock
     truth_s = np.array([(clock.boot_ns(int(ns)) - int(ns)) * 1e-9 for ns in rows["sent_ns"]])
     before = (rows["sent_ns"] - START_NS) * 1e-9 < 45.0
     truth_s[before] -= 3.0

@@ -41,13 +41,13 @@ class PilotsVehicle:
 
     @property
     def copter(self) -> Copter:
-        vehicle = self.fleet.vehicle(3)
-        assert isinstance(vehicle, Copter)
-        return vehicle
+        craft = self.fleet.vehicle(3).craft
+        assert isinstance(craft, Copter)
+        return craft
 
     def step(self, received: Sent, now_ns: int) -> Sent:
         for at_s in [at_s for at_s in self.modes if START_NS + at_s * SECOND <= now_ns]:
-            self.copter.step([(pilots_switch(self.flavour, self.modes.pop(at_s)), now_ns)], now_ns)
+            self.fleet.vehicle(3).step([(pilots_switch(self.flavour, self.modes.pop(at_s)), now_ns)], now_ns)
             self.reached_ns = self.reached_ns or now_ns + 3 * SECOND // 2
         if 0 < self.reached_ns < now_ns:
             self.told += [parse(data) for system_id, data, _ in received if system_id == 3]
