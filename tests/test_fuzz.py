@@ -34,7 +34,16 @@ from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.fleet import Fleet
 from sim_vehicles.guard import signed_links
-from tests.hostile import SAID_BY_STATIONS, SAID_BY_VEHICLES, any_message, changed, extreme, in_version_1, noise
+from tests.hostile import (
+    SAID_BY_STATIONS,
+    SAID_BY_VEHICLES,
+    any_message,
+    changed,
+    extreme,
+    in_version_1,
+    noise,
+    timesync_reply,
+)
 from tests.logged_flight import flown as logged
 from tests.logged_flight import log_bytes
 from tests.test_flight_copters import three
@@ -200,8 +209,7 @@ def test_the_worst_values_from_the_right_address_raise_nothing(kind: str, from_s
                 frames = extreme(rng, 2, SAID_BY_VEHICLES, source=own, targets=[0, 255, own])
                 if own in asked:  # only an answer to what was asked is looked at
                     tc1_ns = int(rng.choice([-(2**63), -1, 1, 2**62 - 1, 2**63 - 1]))
-                    answer = mavlink.timesync(tc1_ns=tc1_ns, ts1_ns=asked.pop(own))
-                    frames.append(mavlink.encode(mavlink.TIMESYNC, answer, sequence=200, system_id=own))
+                    frames.insert(0, timesync_reply(tc1_ns, asked.pop(own), own, 200))
                 frames += [in_version_1(frame) for frame in frames if frame[8:10] == b"\0\0"]
                 datagrams += [Datagram(frame, ("virtual", own), now_ns) for frame in frames]
         outgoing, tick = station.step(datagrams, now_ns)
@@ -228,15 +236,14 @@ def test_the_worst_values_from_the_right_address_raise_nothing(kind: str, from_s
 @pytest.mark.parametrize("timesync_hz", [0.0, 10.0], ids=["silent", "asking"])
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_watched_link_under_fire_is_still_watched(timesync_hz: float, version: int) -> None:
-    rng, watch, requests, now_ns = np.random.default_rng(version), Watch([1]), Requests(timesync_hz), START_NS
+    rng, watch, requests, now_ns = np.random.default_rng(version), Watch([1, 5]), Requests(timesync_hz), START_NS
     for step in range(COUNT // 40):
         now_ns += 10_000_000
         frames = extreme(rng, 8, [*SAID_BY_VEHICLES, 111, 111], source=step % 4, targets=[0, 254, 255])
         for sent, _ in requests.due(watch, now_ns):
             (asked,) = mavlink.decode(sent, Counter())
-            for tc1_ns in (-(2**63), 2**63 - 1, 1):
-                answer = mavlink.timesync(tc1_ns=tc1_ns, ts1_ns=asked.fields[1])
-                frames.append(mavlink.encode(mavlink.TIMESYNC, answer, sequence=step, system_id=1))
+            for k, tc1_ns in enumerate((-(2**63), 2**63 - 1, 1)):
+                frames.append(timesync_reply(tc1_ns, asked.fields[1], 5, 3 * step + k))
         if version == 1:
             frames = [in_version_1(frame) for frame in frames if frame[8:10] == b"\0\0"]
         for data in (*frames, *changed(rng, 8, frames), *noise(rng, 8)):
