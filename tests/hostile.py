@@ -6,6 +6,7 @@ worst that fit: NaN, infinities, ends of ranges, and here and there what a vehic
 
 import math
 import re
+import struct
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
@@ -119,6 +120,11 @@ def frame_of(number: int, payload: bytes, source: int, sequence: int, *, compone
     header = bytes([len(payload), 0, 0, sequence & 0xFF, source, component]) + number.to_bytes(3, "little")
     body = header + payload
     return b"\xfd" + body + mcrf4xx(body + bytes([MESSAGES[number].crc_extra])).to_bytes(2, "little")
+
+
+def timesync_reply(tc1_ns: int, ts1_ns: int, source: int, sequence: int) -> bytes:
+    """A vehicle's answer to a request of TIMESYNC."""
+    return frame_of(111, struct.pack("<qq", tc1_ns, ts1_ns), source, sequence)
 
 
 def in_version_1(frame: bytes) -> bytes:
