@@ -288,6 +288,16 @@ class Recording:
             self._stream.log(f"modes/{label}", lanes, static=True)
 
 
+def length_s(recording: Path) -> float | None:
+    """The last scenario time of a recording, None if nothing in it has a time."""
+    import pyarrow.compute as pc
+    from rerun.chunk import RrdReader
+
+    chunks = (chunk for chunk in RrdReader(recording).stream() if TIMELINE in chunk.timeline_names)
+    ends_ns = [pc.max(chunk.to_record_batch().column(TIMELINE).cast("int64")).as_py() for chunk in chunks]
+    return max((1e-9 * end_ns for end_ns in ends_ns if end_ns is not None), default=None)
+
+
 def viewer_client(address: str) -> Any:
     """A client that drives the Rerun viewer listening at an address."""
     from rerun.experimental import ViewerClient
