@@ -207,10 +207,11 @@ def to_dict(found: list[Capacity]) -> dict[str, Any]:
 def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
     """For each rate the largest formation that is carried, and the one that is not."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True)
+    from gcs.console import plain_console
+
+    console = plain_console()
     table = Table(box=box.SIMPLE_HEAD, title=f"{scenario.name}: what its links carry", title_justify="left")
     for heading in ("Hz", "UAVs", "loop delay, ms\np50  p99", "margin\nms", "byte/s", "lost, %\nup  down", ""):
         table.add_column(heading, justify="right", no_wrap=True, min_width=4)
@@ -221,7 +222,7 @@ def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
     console.print(table)
     for capacity in found:
         if capacity.failed:
-            console.print(f"{capacity.rate_hz:g} Hz: {capacity.failed}", markup=False)
+            console.print(f"{capacity.rate_hz:g} Hz: {capacity.failed}")
         elif capacity.most is None:
             console.print(f"{capacity.rate_hz:g} Hz: not even {_FEWEST} vehicles")
 

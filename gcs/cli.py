@@ -293,24 +293,30 @@ def grade(run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder")]
 def view(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder, or a .rrd file")],
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="write a picture; open no window")] = None,
-    at: Annotated[float, typer.Option(metavar="SECONDS", help="scenario time of the picture")] = 10.0,
+    at: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="scenario time of the picture; 10, or the end if sooner")
+    ] = None,
 ) -> None:
     """Open a recording in the Rerun viewer, or write a picture of it, which needs no screen.
 
     Exit code 1 if a view of the picture reports a fault.
     """
-    from gcs.show.viewer import ViewerError, find_recording, screenshot
+    from gcs.show.viewer import ViewerError, find_recording, picture_time_s, screenshot
     from gcs.show.viewer import view as open_viewer
 
-    within("--at", at, -1e6, 1e6, "seconds")
+    if at is not None:
+        within("--at", at, 0.0, 1e6, "seconds")
     if picture is not None:
         out_file("--picture", picture)
+        if picture.suffix.lower() != ".png":
+            raise InputError(f"--picture: read {picture}, wanted a name that ends in .png, as what is written is PNG")
     try:
         recording = find_recording(run)
         if picture is None:
             raise typer.Exit(open_viewer(recording))
-        complaints = screenshot(recording, picture, time_s=at)
-        typer.echo(f"picture  {picture}: {recording} at {at:g} s")
+        time_s = picture_time_s(recording, at)
+        complaints = screenshot(recording, picture, time_s=time_s)
+        typer.echo(f"picture  {picture}: {recording} at {time_s:g} s")
     except ViewerError as error:
         raise InputError(str(error)) from None
     for complaint in complaints:

@@ -118,12 +118,13 @@ def _plain_crossing(crossing: MarginCrossing) -> dict[str, Any]:
 
 def print_margin(result: dict[str, Any]) -> None:
     """The result as a short table on the terminal."""
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False)
+    from gcs.console import plain_console
+
+    console = plain_console()
     for line in _verdict_lines(result):
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line)
     if result["crossings"]:
         unknown = "period s" if result["unknown"] == "period" else "delay s"
         table = Table(
@@ -139,7 +140,7 @@ def print_margin(result: dict[str, Any]) -> None:
         console.print(table)
         _print_more(console, result["crossings"], "crossings")
     for note in result.get("notes", []):
-        console.print(note, markup=False, soft_wrap=True)
+        console.print(note)
 
 
 def _verdict_lines(result: dict[str, Any]) -> list[str]:
@@ -186,7 +187,7 @@ def _end(result: dict[str, Any], end_s: float | None) -> str:
 
 def _print_more(console: Any, rows: list[Any], what: str) -> None:
     if len(rows) > _ROWS:
-        console.print(f"and {len(rows) - _ROWS} more {what}", markup=False)
+        console.print(f"and {len(rows) - _ROWS} more {what}")
 
 
 def _plain(number: float) -> float | None:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 
 from scenarios.errors import ScenarioError
+from scenarios.places import line_of, location_of, named, wanted_of
 from scenarios.schema import MOST, Jitter, Link, Links, Outage, Scenario
 
 TRACE_DELAYS = 100_000
@@ -50,9 +51,9 @@ def parse(text: str, file: Path) -> Scenario:
         # TOML arrays become Python lists; strict validation from JSON text takes them as tuples.
         scenario = Scenario.model_validate_json(_json(data))
     except ValidationError as errors:
-        raise _first_error(errors, data, file) from None
+        raise _at_line(file, text, data, *_first_error(errors, data)) from None
     for key, read, wanted in _contradictions(scenario):
-        raise ScenarioError(file, key, read, wanted)
+        raise _at_line(file, text, data, key, read, wanted)
     return _with_traces(scenario, file)
 
 
@@ -84,8 +85,16 @@ def _json(data: dict[str, Any]) -> str:
     return json.dumps(data, default=str)  # a TOML date becomes a string, which no key of the schema takes as a number
 
 
-def _first_error(errors: ValidationError, data: dict[str, Any], file: Path) -> ScenarioError:
-    """One line for the first of pydantic's findings."""
+def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object, wanted: str) -> ScenarioError:
+    """The error with the line of the file, and vehicles by their system ids."""
+    line, key = line_of(text, location_of(key.split(" (", maxsplit=1)[0])), named(key, data)
+    if line is not None:
+        key = f"{key[:-1]}, line {line})" if key.endswith(")") else f"{key} (line {line})"
+    return ScenarioError(file, key, read, wanted)
+
+
+def _first_error(errors: ValidationError, data: dict[str, Any]) -> tuple[str, object, str]:
+    """The first of pydantic's findings: key, what was read, what was wanted."""
     found = errors.errors()
     first = next(
         (e for e in found if e["type"] == "extra_forbidden"), found[0]
@@ -96,14 +105,10 @@ def _first_error(errors: ValidationError, data: dict[str, Any], file: Path) -> S
         known = sorted(_model_at(first["loc"][:-1]).model_fields)
         near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
         wanted = f"the key {near[0]}" if near else f"one of the keys {', '.join(known)}"
-        return ScenarioError(file, f"{key} (unknown key)", first["input"], wanted)
+        return f"{key} (unknown key)", first["input"], wanted
     if first["type"] == "missing":
-        return ScenarioError(file, f"{key} (missing)", "nothing", "a value for this key")
-    wanted = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    wanted = (
-        wanted.replace("a valid array", "an array").replace("a valid integer", "an integer").replace("a valid ", "a ")
-    )
-    return ScenarioError(file, key, _value_at(data, first["loc"]), wanted)
+        return f"{key} (missing)", "nothing", "a value for this key"
+    return key, _value_at(data, first["loc"]), wanted_of(first)
 
 
 def _model_at(location: tuple[int | str, ...]) -> type[BaseModel]:

@@ -5,12 +5,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from flown_run import line, ticks_of, write_run
+from flown_run import DESIGN, line, ticks_of, write_run
 
 from gcs.cli import main
 from gcs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE
+from gcs.show.observer import record_run
+from gcs.show.report import print_summary
 from gcs.sitl import TRUTH_FILE
-from gcs.summary import finish
+from gcs.summary import finish, summarise
 from gcs.user_input import InputError, listening, mirroring
 
 CHAIN = "scenarios/chain3.toml"
@@ -139,6 +141,34 @@ def test_ticks_of_vehicles_that_are_not_in_the_scenario_are_refused(
 def test_a_mirror_to_the_stations_own_port_is_refused(listens: str, mirror: str) -> None:
     with listening("--listen", f"{listens}:0") as link, pytest.raises(InputError, match="which is this station's own"):
         mirroring(f"{mirror}:{link.address[1]}", link, None, commands=False)
+
+
+def test_a_picture_is_a_png_of_a_time_that_the_recording_has(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(*options: str) -> str:
+        return complaint(capsys, monkeypatch, "view", str(run), *options)
+
+    finish(run)
+    record_run(run)
+    assert "a.jpg, wanted a name that ends in .png" in told("--picture", str(run / "a.jpg"))
+    line = told("--picture", str(run / "a.png"), "--at", "999")
+    assert "--at: read 999, wanted seconds from 0: " in line
+    assert line.endswith(f"is {0.02 * 99:g} s long\n")
+    (run / "flight.rrd").write_bytes((run / "flight.rrd").read_bytes()[:5000])
+    assert "flight.rrd: read no flight in it, wanted" in told("--picture", str(run / "a.png"))
+    assert not list(run.glob("a.*"))
+
+
+def test_brackets_and_colons_in_text_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """A verdict's reason can name a key of a scenario, and a log's name or a vehicle's word be anything."""
+    scenario = line(2)
+    summary = summarise(scenario, DESIGN, ticks_of(scenario, start_s=0.0, count=100), [])
+    summary["reason"] = "refused: give [response] in [/the scenario] :warning:"
+    print_summary(summary, Path("[bold]"))
+    told = capsys.readouterr().out
+    assert "verdict  aborted: refused: give [response] in [/the scenario] :warning:\n" in told
+    assert "files    [bold]: " in told
 
 
 def test_an_empty_connect_is_no_leave_to_start_vehicles(

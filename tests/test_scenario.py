@@ -1,11 +1,13 @@
 """Scenario files: what is accepted, and that everything else is refused in one line that says why."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load, parse
+from scenarios.schema import Scenario
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 TRIANGLE = (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
@@ -58,7 +60,7 @@ def test_link_delay_override_reaches_vehicles_with_links_of_their_own() -> None:
 
 
 BAD = {
-    "unknown key": ("follows = 1", "folows = 1", "vehicles[1].folows", "follows"),
+    "unknown key": ("follows = 1", "folows = 1", "vehicle 2: folows", "follows"),
     "unknown section": ("[rates]", "[rate]", "rate", "rates"),
     "wrong unit": ("up = { delay_s = 0.02 }", "up = { delay_ms = 20 }", "links.up.delay_ms", "delay_s"),
     "wrong type": ("seed = 1", 'seed = "one"', "seed", "integer"),
@@ -69,19 +71,19 @@ BAD = {
     "not a number": ("[91.44, 0.0]", "[nan, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "finite"),
     "infinite": ("duration_s = 40.0", "duration_s = inf", "duration_s", "finite"),
     "beyond single precision": ("altitude_m = 1000.0", "altitude_m = 1e300", "altitude_m", "1000000"),
-    "far away": ("[-121.92, 121.92]", "[-1e300, 121.92]", "vehicles[1].offset_ne_m[0]", "-1000000"),
+    "far away": ("[-121.92, 121.92]", "[-1e300, 121.92]", "vehicle 2: offset_ne_m[0]", "-1000000"),
     "faster than anything": ("[91.44, 0.0]", "[1e5, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "10000"),
     "a delay of years": ("up = { delay_s = 0.02 }", "up = { delay_s = 1e9 }", "links.up.delay_s", "1000000"),
-    "negative delay": ("up = { delay_s = 0.02 }", "up = { delay_s = -0.02 }", "links.up.delay_s", "greater than"),
-    "zero rate": ("telemetry_hz = 50.0", "telemetry_hz = 0.0", "rates.telemetry_hz", "greater than"),
-    "unknown leader": ("follows = 1", "follows = 9", "vehicles[1].follows", "system_id of a vehicle"),
+    "negative delay": ("up = { delay_s = 0.02 }", "up = { delay_s = -0.02 }", "links.up.delay_s", "at least 0"),
+    "zero rate": ("telemetry_hz = 50.0", "telemetry_hz = 0.0", "rates.telemetry_hz", "at least 1"),
+    "unknown leader": ("follows = 1", "follows = 9", "vehicle 2: follows", "system_id of a vehicle"),
     "itself": ("follows = 1", "follows = 2", "vehicles.follows", "tree"),
     "cycle": ("follows = 1", "follows = 3", "vehicles.follows", "tree"),
-    "two with one id": ("system_id = 3", "system_id = 2", "vehicles[2].system_id", "another number"),
-    "id of a station": ("system_id = 3", "system_id = 255", "vehicles[2].system_id", "less than"),
+    "two with one id": ("system_id = 3", "system_id = 2", "vehicle in place 3: system_id", "another number"),
+    "id of a station": ("system_id = 3", "system_id = 255", "vehicle 255: system_id", "at most 250"),
     "two leaders": ("follows = 1\noffset_ne_m = [-121.92, 121.92]\n", "", "vehicles.follows", "exactly one"),
-    "offset without leader": ("follows = 1\n", "", "vehicles[1].offset_ne_m", "neither"),
-    "no distance": ("[-121.92, 121.92]", "[0.0, 0.0]", "vehicles[1].offset_ne_m", "distance"),
+    "offset without leader": ("follows = 1\n", "", "vehicle 2: offset_ne_m", "neither"),
+    "no distance": ("[-121.92, 121.92]", "[0.0, 0.0]", "vehicle 2: offset_ne_m", "distance"),
     "late first velocity": ("from_s = 0.0", "from_s = 1.0", "nominal_velocity[0].from_s", "0 for the first"),
     "too slow to fly": ("[91.44, 0.0]  #", "[0.0, 0.0]  #", "nominal_velocity[0].velocity_ne_m_s", "speed"),
     "unknown method": ('"inclusion"', '"magic"', "control.method", "inclusion"),
@@ -110,8 +112,48 @@ def test_bad_scenario_is_refused_with_file_key_and_what_was_wanted(old: str, new
     assert wanted in rest.partition("wanted ")[2]
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "wanted"),
+    [
+        ("[91.44, 0.0]", "[1.0, 2.0, 3.0]", "read [1.0, 2.0, 3.0], wanted a list of at most 2, not 3"),
+        ("seed = 1", "seed = 1.5", "read 1.5, wanted an integer"),
+        ("offset_ne_m = [-121.92, 121.92]", "offset_ne_m = 5", "read 5, wanted a list in brackets"),
+        ("control_hz = 50.0", "control_hz = 501.0", "read 501.0, wanted a number of at most 500"),
+        ('name = "triangle5"', 'name = "a b"', "read 'a b', wanted a name of letters, digits, - and _"),
+        ('name = "triangle5"', "name = 5", "read 5, wanted text in quotes"),
+        ("up = { delay_s = 0.02 }", "up = 5", "read 5, wanted a table of keys"),
+        ("up = { delay_s = 0.02 }", "up = { reordering = 1 }", "read 1, wanted true or false"),
+        ("up = { delay_s = 0.02 }", "up = { loss_probability = 2 }", "read 2, wanted a number of at most 1"),
+        ("delay_margin_s = 0.3", "delay_margin_s = 0.0", "read 0.0, wanted a number greater than 0"),
+    ],
+)
+def test_what_was_wanted_is_said_in_plain_words_with_the_line(old: str, new: str, wanted: str) -> None:
+    changed = TRIANGLE.replace(old, new, 1)
+    with pytest.raises(ScenarioError) as error:
+        parse(changed, FILE)
+    told = str(error.value)
+    assert wanted in told
+    number = next(k for k, line in enumerate(changed.splitlines(), 1) if new in line)
+    assert f"line {number})" in told
+
+
+def test_a_vehicle_is_named_by_its_system_id_and_its_line_is_told() -> None:
+    lines = TRIANGLE.splitlines()
+    at = [k for k, line in enumerate(lines) if line.startswith("system_id")][4]
+    lines.insert(at + 1, "colour = 1")
+    with pytest.raises(ScenarioError, match=rf"x\.toml: vehicle 5: colour \(unknown key, line {at + 2}\): read 1"):
+        parse("\n".join(lines), FILE)
+
+
+def test_every_error_that_the_schema_can_raise_has_words() -> None:
+    """Kinds of the schema's types, as pydantic's own core schema of it names them."""
+    kinds = set(re.findall(r"'type': '([a-z-]+)'", repr(Scenario.__pydantic_core_schema__)))
+    covered = {"model", "model-fields", "model-field", "default", "nullable", "int", "float", "bool", "str", "tuple"}
+    assert kinds <= covered | {"literal", "definitions", "definition-ref"}
+
+
 def test_links_of_an_unknown_vehicle_are_refused() -> None:
-    with pytest.raises(ScenarioError, match=r"links\.vehicles\[0\]\.system_id: read 9"):
+    with pytest.raises(ScenarioError, match=r"links of vehicle 9: system_id \(line \d+\): read 9"):
         parse(TRIANGLE + "\n[[links.vehicles]]\nsystem_id = 9\n", FILE)
 
 

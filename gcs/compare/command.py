@@ -236,10 +236,11 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
 def print_comparison(scenario: Scenario, routes: list[Route], grown: list[DesignCost]) -> None:
     """The tables on the terminal."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True)
+    from gcs.console import plain_console
+
+    console = plain_console()
     title = f"{scenario.name}: designed for what it asks for, flown over its links"
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="")
     for heading in ("", *(route.method for route in routes)):
@@ -249,7 +250,7 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Design
     console.print(table)
     for route in routes:
         if route.failed:
-            console.print(f"{route.method}: {route.failed}", markup=False)
+            console.print(f"{route.method}: {route.failed}")
     if grown:
         table = Table(box=box.SIMPLE_HEAD)
         for heading in ("design of a chain", "vehicles", "free gains an axis", "time, s", RATIO):

@@ -16,6 +16,7 @@ same for two hundred vehicles as for two.
 import itertools
 import math
 import os
+import warnings
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -286,6 +287,17 @@ class Recording:
         lanes = rr.StateConfiguration(values=names, labels=names, colors=[MODE_COLORS[mode] for mode in Mode])
         for label in labels:
             self._stream.log(f"modes/{label}", lanes, static=True)
+
+
+def length_s(recording: Path) -> float | None:
+    """The last scenario time of a recording, None if nothing in it has a time."""
+    from rerun.chunk import RrdReader
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it was cut short: what is left of it may do
+        chunks = [chunk for chunk in RrdReader(recording).stream() if TIMELINE in chunk.timeline_names]
+    columns = (chunk.to_record_batch().column(TIMELINE).cast("int64") for chunk in chunks)
+    return max((1e-9 * time_ns for column in columns for time_ns in column.to_pylist()), default=None)
 
 
 def viewer_client(address: str) -> Any:

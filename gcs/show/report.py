@@ -7,7 +7,9 @@ from typing import Any
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from gcs.console import plain_console
 from gcs.refusals import in_words
 
 UNKNOWN = "–"
@@ -15,7 +17,7 @@ UNKNOWN = "–"
 
 def print_design(design: dict[str, Any], console: Console | None = None) -> None:
     """Gains, robustness, both margins, and the trade-off between robustness and margin."""
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = console or plain_console()
     console.print(f"design   {design['method']}, loop {design['loop']}, period {design['period_s'] * 1e3:g} ms")
     if "blocks" in design:
         _print_graph_design(design, console)
@@ -84,7 +86,7 @@ def _matrix(columns: Sequence[Sequence[float]]) -> str:
 
 def print_summary(summary: dict[str, Any], folder: Path, console: Console | None = None) -> None:
     """The verdict with its figures, and where the files are."""
-    console = console or Console(highlight=False, soft_wrap=True)
+    console = console or plain_console()
     print_flight(summary, console)
     console.print(f"files    {folder}: {', '.join(summary['files'])}")
     if "flight.rrd" in summary["files"]:
@@ -94,7 +96,7 @@ def print_summary(summary: dict[str, Any], folder: Path, console: Console | None
 def print_flight(summary: dict[str, Any], console: Console) -> None:
     """The verdict with its figures; `control` may be None, where a log does not show the ticks."""
     style = {"stable": "bold green", "unstable": "bold red"}.get(summary["verdict"], "bold yellow")
-    console.print(f"verdict  [{style}]{summary['verdict']}[/]: {_reason(summary)}")
+    console.print(Text.assemble("verdict  ", (summary["verdict"], style), f": {_reason(summary)}"))
     console.print(f"delay    {delay_text(summary)}")
     console.print(_response(summary.get("response")), end="")
     control = summary["control"]

@@ -13,12 +13,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 from rich import box
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from gcs.console import plain_console
 from gcs.modes import patience_s
 from gcs.record import TICK, Mode, TickArray
 from gcs.refusals import REFUSED
@@ -292,7 +293,7 @@ class Display:
 
     def __init__(self, state: FlightState, *, shown: bool) -> None:
         self._state = state
-        self._console = Console()
+        self._console = plain_console(soft_wrap=False)
         self._shown = shown
         self._live = Live(auto_refresh=False, console=self._console) if shown and self._console.is_terminal else None
         self._plain_due_s = -np.inf

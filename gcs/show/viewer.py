@@ -12,15 +12,17 @@ import tempfile
 import time  # noqa: TID251 (waits for another program)
 from collections.abc import Generator
 from contextlib import contextmanager
+from math import floor
 from pathlib import Path
 from typing import IO, Any
 
 from gcs.interrupts import raised
 from gcs.record import RECORDING_FILE
-from gcs.show.recording import TIMELINE, UNFINISHED_FILE, viewer_client
+from gcs.show.recording import TIMELINE, UNFINISHED_FILE, length_s, viewer_client
 
 START_S = 20.0
 SETTLE_S = 20.0
+DEFAULT_PICTURE_S = 10.0
 _MAGIC = b"RRF"
 """How every .rrd file begins."""
 _WANTED = "wanted a recording of a run (.rrd)"
@@ -37,6 +39,28 @@ def view(folder_or_rrd: Path) -> int:
         raise ViewerError("no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; a picture can be made without")
     print(f"viewer   {recording}: until its window is closed", flush=True)
     return subprocess.run([_program(), str(recording)], check=False).returncode
+
+
+def picture_time_s(recording: Path, wanted_s: float | None) -> float:
+    """The scenario time of a picture: the one wanted, if the recording is that long, else ten seconds or its end.
+
+    Raises
+    ------
+    ViewerError
+        If the recording ends before, or holds no flight.
+    """
+    try:
+        end_s = length_s(recording)
+    except (OSError, RuntimeError, ValueError):  # cut short, or of another version
+        end_s = None
+    if end_s is None:
+        raise ViewerError(f"{recording}: read no flight in it, {_WANTED}")
+    if wanted_s is None:
+        return min(DEFAULT_PICTURE_S, end_s)
+    if not 0.0 <= wanted_s <= end_s:
+        length = f"{floor(1e3 * end_s) / 1e3:g} s"
+        raise ViewerError(f"--at: read {wanted_s:g}, wanted seconds from 0: {recording} is {length} long")
+    return wanted_s
 
 
 def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 1600, height: int = 900) -> list[str]:

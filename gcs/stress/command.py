@@ -244,7 +244,6 @@ def _workers(options: StressOptions) -> "Generator[Fly]":
 @contextlib.contextmanager
 def _progress(shown: bool) -> Generator[Any]:
     """While entered, gives a function (name, total or None) -> callback that advances a bar on the terminal."""
-    from rich.console import Console
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -254,10 +253,12 @@ def _progress(shown: bool) -> Generator[Any]:
         TimeRemainingColumn,
     )
 
-    console = Console(stderr=True)
+    from gcs.console import plain_console
+
+    console = plain_console(stderr=True, soft_wrap=False)
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     with Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as bar:
 

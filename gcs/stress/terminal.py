@@ -7,7 +7,9 @@ from xml.etree import ElementTree
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from gcs.console import plain_console
 from gcs.show.page import milliseconds_text as _ms
 from gcs.show.report import UNKNOWN
 from gcs.show.report import number_text as _number
@@ -22,7 +24,7 @@ _ID = 8
 
 def print_result(result: dict[str, Any], folder: Path) -> None:
     """The onset beside the margin, the sweep, and where the files are."""
-    console = Console(highlight=False, soft_wrap=True)
+    console = plain_console()
     if not console.is_terminal:
         console.width = _FILE_WIDTH
     onset = result["onset"]
@@ -32,7 +34,7 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
     if onset is not None:
         console.print(
             f"onset    {_ms(onset['loop_delay_s'])} ± {1e3 * onset['error_s']:.2f} ms in flight, "
-            f"[bold]{onset['difference']:+.3%}[/] from the sampled margin of this loop, {_ms(onset['predicted_s'])}; "
+            f"{onset['difference']:+.3%} from the sampled margin of this loop, {_ms(onset['predicted_s'])}; "
             f"the continuous model's less half a period for the hold, {_ms(onset['predicted_continuous_s'])}"
         )
         console.print(
@@ -52,14 +54,12 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
         console.print(_table(points))
     for failed in result["trials_failed"]:
         last = failed["error"].strip().splitlines()[-1]
-        console.print(
-            f"failed   {failed['id']}, seed {failed['seed']}, {place_text(failed['coordinates'])}: {last}", markup=False
-        )
+        console.print(f"failed   {failed['id']}, seed {failed['seed']}, {place_text(failed['coordinates'])}: {last}")
     console.print(f"files    {folder}: {REPORT_FILE}, stress.json, trials.jsonl, trials.parquet")
     if result["worst"]:
         console.print(f"again    {replay_command(folder, result['worst'][0])}")
     if result["failure"]:
-        console.print(f"[bold red]failed[/]   {result['failure']}")
+        console.print(Text.assemble(("failed", "bold red"), f"   {result['failure']}"))
 
 
 def _kinds(trials_of_kind: dict[str, int]) -> str:
@@ -100,7 +100,7 @@ def _table(points: list[dict[str, Any]]) -> Table:
 
 def print_replay(replay: Replay) -> None:
     """One trial that was flown again."""
-    console, outcome = Console(highlight=False, soft_wrap=True, markup=False), replay.outcome
+    console, outcome = plain_console(), replay.outcome
     console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {place_text(outcome.coordinates)}")
     console.print(f"verdict  {outcome.verdict}: {outcome.reason}")
     if outcome.growth_1_s is not None:

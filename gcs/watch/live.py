@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
-from rich.console import Console
 from rich.live import Live
 
 from gcs import mavlink
+from gcs.console import plain_console
 from gcs.guard import Guard
 from gcs.udp import StationSocket, clock_ns
 from gcs.watch.links import Requests, Watch
@@ -43,7 +43,7 @@ class _Display:
     """The figures of the last seconds on standard output: a table on a terminal, else a line now and then."""
 
     def __init__(self, *, shown: bool, start_ns: int) -> None:
-        self._console = Console()
+        self._console = plain_console(soft_wrap=False)
         self._shown = shown
         self._live: Live | None = None
         if shown and self._console.is_terminal:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
+from gcs.console import plain_console
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE, TickArray
 from gcs.run_files import read_design, read_summary
 from gcs.show.report import delay_text, print_flight
@@ -121,7 +121,7 @@ def _broken(scenario: Scenario, last: TickArray) -> str | None:
 
 def print_replay(result: dict[str, Any]) -> None:
     """The log, its links, and the flight as far as it is known."""
-    console = Console(highlight=False, soft_wrap=True)
+    console = plain_console()
     log, width = result["log"], console.width
     left_out = "".join(f"; {count} {reason}" for reason, count in log["left_out"].items())
     console.print(f"log      {log['file']}: {log['frames']} frames in {log['duration_s']:.1f} s{left_out}")

@@ -7,6 +7,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from gcs.console import plain_console
 from gcs.show.table import UNKNOWN, headroom_style
 from gcs.watch.links import Figures
 
@@ -49,7 +50,7 @@ def plain_line(report: dict[str, Any]) -> str:
 
 def print_report(report: dict[str, Any], console: Console | None = None) -> None:
     """The figures of the whole time."""
-    console = console or Console(highlight=False)
+    console = console or plain_console(soft_wrap=False)
     console.print(render(report, width=console.width))
 
 

@@ -1,0 +1,86 @@
+"""Where in a scenario file something is, and what a key wants, in words for who wrote the file."""
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+Location = tuple[int | str, ...]
+_HEADER = re.compile(r"\s*(\[\[?)\s*([\w.\s-]+?)\s*\]\]?\s*(?:#.*)?$")
+_KEY = re.compile(r"\s*([\w-]+(?:\s*\.\s*[\w-]+)*)\s*=")
+_PART = re.compile(r"([\w-]+)|\[(\d+)\]")
+
+
+def location_of(key: str) -> Location:
+    """The place that a key as "vehicles[1].follows" names."""
+    return tuple(name or int(number) for name, number in _PART.findall(key))
+
+
+def line_of(text: str, location: Location) -> int | None:
+    """The line of a TOML text, from 1, that holds a place or, where it has none of its own, the part around it."""
+    lines: dict[Location, int] = {}
+    tables: Counter[Location] = Counter()
+    table: Location = ()
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := _HEADER.match(line):
+            table = ()
+            *outer, last = re.split(r"\s*\.\s*", header[2])
+            for name in outer:
+                table = (*table, name)
+                if tables[table]:
+                    table = (*table, tables[table] - 1)
+            table = (*table, last)
+            if header[1] == "[[":
+                tables[table] += 1
+                table = (*table, tables[table] - 1)
+            lines.setdefault(table, number)
+        elif found := _KEY.match(line):
+            lines.setdefault((*table, *re.split(r"\s*\.\s*", found[1])), number)
+    return next((lines[location[:k]] for k in range(len(location), 0, -1) if location[:k] in lines), None)
+
+
+def named(key: str, data: Mapping[str, Any]) -> str:
+    """A key with a vehicle called by its system id, as "vehicle 2: follows" for "vehicles[1].follows"."""
+    match location_of(key):
+        case ("vehicles", int(k), *_):
+            kind, whole = "vehicle", data.get("vehicles")
+        case ("links", "vehicles", int(k), *_):
+            links = data.get("links")
+            kind, whole = "links of vehicle", links.get("vehicles") if isinstance(links, dict) else None
+        case _:
+            return key
+    ids = [one.get("system_id") if isinstance(one, dict) else None for one in whole] if isinstance(whole, list) else []
+    alone = k < len(ids) and type(ids[k]) is int and ids.count(ids[k]) == 1
+    rest = key.split("]", 1)[1].lstrip(".")
+    return f"{kind} {ids[k]}: {rest}" if alone else f"{kind} in place {k + 1}: {rest}"
+
+
+_WANTED = {
+    "int_type": "an integer",
+    "int_from_float": "an integer",
+    "int_parsing": "an integer",
+    "int_parsing_size": "an integer of fewer digits",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+    "string_type": "text in quotes",
+    "string_pattern_mismatch": "a name of letters, digits, - and _",
+    "literal_error": "{expected}",
+    "greater_than": "a number greater than {gt:.10g}",
+    "greater_than_equal": "a number of at least {ge:.10g}",
+    "less_than": "a number less than {lt:.10g}",
+    "less_than_equal": "a number of at most {le:.10g}",
+    "too_short": "a list of at least {min_length}, not {actual_length}",
+    "too_long": "a list of at most {max_length}, not {actual_length}",
+    "tuple_type": "a list in brackets",
+    "model_type": "a table of keys",
+    "model_attributes_type": "a table of keys",
+    "dict_type": "a table of keys",
+}
+"""Of the errors that pydantic finds with the types of the schema."""
+
+
+def wanted_of(error: Mapping[str, Any]) -> str:
+    """What was wanted where pydantic found an error, in plain words."""
+    return _WANTED[error["type"]].format(**error.get("ctx", {}))
