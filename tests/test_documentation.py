@@ -36,6 +36,7 @@ def test_the_reference_and_the_schema_follow_from_the_code() -> None:
     assert reference.stale() == [], "python3 make.py reference"
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", [name for name, figure in figures.FIGURES.items() if figure.quick])
 def test_quick_exact_figures_are_those_that_the_commands_give(name: str) -> None:
     assert measurements.stale([name]) == [], f"python3 make.py measurements {name}"
@@ -167,6 +168,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 # the README's command in virtual time is that of a figure, which is compared above
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", [name for name in SESSIONS if name != "README.md"])
 def test_what_a_page_says_to_type_works(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
