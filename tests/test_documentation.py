@@ -1,5 +1,6 @@
 """The documentation says what the code does: generated parts, figures, commands, links."""
 
+import dataclasses
 import doctest
 import json
 import re
@@ -21,6 +22,7 @@ from gcs.margin import margin_of_file, margin_of_scenario
 from gcs.plan import flight_plan
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
 from gcs.station import Station
+from gcs.stress.trial import Outcome
 from gcs.summary import finish
 from scenarios import files
 from scenarios.schema import Response
@@ -115,6 +117,10 @@ def test_every_field_of_a_margin_is_described_and_no_other(tmp_path: Path) -> No
     results = [margin_of_file(file) for file in (numbers, *sorted((ROOT / "docs" / "models").glob("*.json")))]
     results.append(margin_of_scenario(ROOT / "scenarios" / "thesis_delay.toml"))
     assert set[str]().union(*(found_fields(result, known) for result in results)) == known.keys()
+
+
+def test_every_field_of_a_trial_is_described_and_no_other() -> None:
+    assert [field.name for field in dataclasses.fields(Outcome)] == list(described()["trial"])
 
 
 def shell(steps: list[Step], folder: Path) -> None:
