@@ -1,5 +1,6 @@
 """The documentation says what the code does: generated parts, figures, commands, links."""
 
+import dataclasses
 import doctest
 import json
 import re
@@ -21,6 +22,7 @@ from gcs.margin import margin_of_file, margin_of_scenario
 from gcs.plan import flight_plan
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
 from gcs.station import Station
+from gcs.stress.trial import Outcome
 from gcs.summary import finish
 from scenarios import files
 from scenarios.schema import Response
@@ -36,6 +38,7 @@ def test_the_reference_and_the_schema_follow_from_the_code() -> None:
     assert reference.stale() == [], "python3 make.py reference"
 
 
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", [name for name, figure in figures.FIGURES.items() if figure.quick])
 def test_quick_exact_figures_are_those_that_the_commands_give(name: str) -> None:
     assert measurements.stale([name]) == [], f"python3 make.py measurements {name}"
@@ -116,6 +119,10 @@ def test_every_field_of_a_margin_is_described_and_no_other(tmp_path: Path) -> No
     assert set[str]().union(*(found_fields(result, known) for result in results)) == known.keys()
 
 
+def test_every_field_of_a_trial_is_described_and_no_other() -> None:
+    assert [field.name for field in dataclasses.fields(Outcome)] == list(described()["trial"])
+
+
 def shell(steps: list[Step], folder: Path) -> None:
     """Type the steps of a session, and expect of each command the exit code that its page says."""
     session: dict[str, Any] = {}
@@ -167,6 +174,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 # the README's command in virtual time is that of a figure, which is compared above
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", [name for name in SESSIONS if name != "README.md"])
 def test_what_a_page_says_to_type_works(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)

@@ -14,7 +14,7 @@ import gains
 def api_page() -> str:
     """A section for each module, with the signatures and the docstrings of what it offers."""
     found = pkgutil.walk_packages(gains.__path__, "gains.")
-    modules = [importlib.import_module(module.name) for module in found]
+    modules = [importlib.import_module(module.name) for module in found if "._" not in module.name]
     return "\n\n".join(text for module in modules if (text := _module(module)))
 
 

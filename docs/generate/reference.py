@@ -13,6 +13,7 @@ MAKERS: dict[str, Callable[[], str]] = {
     "truth-columns": fields.truth_columns,
     "summary-fields": lambda: fields.json_fields("summary"),
     "design-fields": lambda: fields.json_fields("design"),
+    "trial-fields": lambda: fields.json_fields("trial"),
     "margin-fields": lambda: fields.json_fields("margin"),
     "gains-api": api.api_page,
 }
