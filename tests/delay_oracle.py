@@ -1,9 +1,9 @@
 """An oracle for loops with delays that shares nothing with `gains`: it counts roots by the argument principle.
 
 det M(j omega) / (j omega + c)^n winds around zero once for each root of M(s) = sI - sum_k A_k e^{-s d_k} with positive
-real part. The winding is added up over steps that cannot hide a turn: M is Lipschitz with L = 1 + sum_k d_k ||A_k||, so
+real part. The winding is added up over steps that cannot hide a turn: M is Lipschitz, L = 1 + sum_k d_k ||A_k||, so
 over a step h with h L < rho sigma_min(M) the matrix M' M^{-1} stays within rho of the identity, and each of its n
-eigenvalues turns by less than asin(rho). With n asin(rho) < pi the principal angle of the determinant is the whole turn.
+eigenvalues turns by less than asin(rho). With n asin(rho) < pi the principal angle of the determinant is the turn.
 """
 
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_MOST_POINTS = 400_000
+_MOST_POINTS = 100_000
 
 
-class TooClose(Exception):
+class TooCloseError(Exception):
     """A root is too close to the imaginary axis for the oracle to say on which side it is."""
 
 
@@ -52,7 +52,7 @@ def unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, roots_at_zero: i
         if coarse.size == 0:
             break
         if omega.size > _MOST_POINTS or least.min() < 1e-13 * scale:
-            raise TooClose(f"{omega.size} points, least singular value {least.min()}")
+            raise TooCloseError(f"{omega.size} points, least singular value {least.min()}")
         between = (omega[coarse] + omega[coarse + 1]) / 2.0
         new_values, new_least = look(between)
         omega = np.insert(omega, coarse + 1, between)
@@ -60,5 +60,5 @@ def unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, roots_at_zero: i
     turn = float(np.angle(values[-1])) - float(np.angle(values[1:] / values[:-1]).sum())
     roots = turn / np.pi
     if abs(roots - round(roots)) > 0.05:
-        raise TooClose(f"{roots} roots counted")
+        raise TooCloseError(f"{roots} roots counted")
     return round(roots)
