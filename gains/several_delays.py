@@ -276,11 +276,12 @@ def _edge_point(
     last, beyond = between
     here, there = delays_s[last], delays_s[beyond]
     # the edge that is met first on the chord
-    met: list[tuple[float, int, float]] = []
-    for which in (0, 1):
-        for bound_s in (0.0, longest_s[which]):
-            if (there[which] < 0.0) if bound_s == 0.0 else (there[which] > bound_s):
-                met.append(((bound_s - float(here[which])) / float(there[which] - here[which]), which, bound_s))
+    met = [
+        ((bound_s - float(here[which])) / float(there[which] - here[which]), which, bound_s)
+        for which in (0, 1)
+        for bound_s in (0.0, longest_s[which])
+        if ((there[which] < 0.0) if bound_s == 0.0 else (there[which] > bound_s))
+    ]
     if not met or min(met)[0] <= 0.0:
         return None
     share, which, bound_s = min(met)

@@ -7,6 +7,7 @@ eigenvalues turns by less than asin(rho). With n asin(rho) < pi the principal an
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,11 +29,11 @@ def unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, roots_at_zero: i
     lipschitz = 1.0 + float(delays @ norms)
     rho = min(0.5, float(np.sin(2.5 / n)))
 
-    def characteristic(omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def characteristic(omega: NDArray[Any]) -> NDArray[Any]:
         turned = np.exp(-1j * omega[:, np.newaxis] * delays) @ matrices.reshape(len(matrices), -1)
         return 1j * omega[:, np.newaxis, np.newaxis] * np.eye(n) - turned.reshape(-1, n, n)
 
-    def look(omega: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+    def look(omega: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         M = characteristic(omega)
         sign = np.linalg.slogdet(M)[0]
         values = sign * np.exp(-1j * n * np.angle(1j * omega + scale))

@@ -5,6 +5,7 @@ A seeded sample by default; MARGIN_ORACLE=420 python3 make.py test tests/test_ma
 
 import json
 import os
+from collections.abc import Sequence
 from math import isfinite
 from typing import Any
 
@@ -30,7 +31,7 @@ def analysed(model: dict[str, Any]) -> LoopMargin:
     return found
 
 
-def modelled(terms: list[tuple[Matrix, object]]) -> dict[str, Any]:
+def modelled(terms: Sequence[tuple[NDArray[Any], object]]) -> dict[str, Any]:
     return {"terms": [{"A": matrix.tolist(), "delay": delay} for matrix, delay in terms]}
 
 
@@ -104,7 +105,7 @@ def random_loop(seed: int) -> dict[str, Any]:
     return modelled(list(zip(terms, [0, "tau", ("tau", "2*tau", "0.3 + tau")[seed % 3]], strict=True)))
 
 
-def hidden_followers(seed: int) -> tuple[Matrix, Matrix, float]:
+def hidden_followers(seed: int) -> tuple[NDArray[Any], NDArray[Any], float]:
     """A chain of equal followers in dense coordinates, and the margin of one of them."""
     rng = np.random.default_rng(seed)
     followers = int(rng.integers(2, 7))
@@ -118,9 +119,8 @@ def hidden_followers(seed: int) -> tuple[Matrix, Matrix, float]:
 
 
 def test_double_integrator_in_position_and_position_plus_velocity() -> None:
-    # s^2 + 2 s e^{-s tau} + e^{-s tau} of x'' = -p - 2 v: |1 + 2 j w| = w^2 at w^2 = 2 + sqrt(5), by hand
     found = analysed({"A0": [[-1, 1], [-1, 1]], "A1": [[0, 0], [0, -2]]})
-    # states p and q = p + v: q' = -p + q - 2 q(t - tau), p' = q - p: s^2 + 2 (s + 1) e^{-s tau} - ... in closed form
+    # p' = q - p, q' = -p + q - 2 q(t - tau): (s + 1) (s - 1 + 2 e^{-s tau}) + 1 = 0
     omega = found.crossings[0].omega_rad_s
     s, z = 1j * omega, np.exp(-1j * omega * found.delay_margin_s)
     assert abs((s + 1.0) * (s - 1.0 + 2.0 * z) + 1.0) < 1e-13
@@ -128,11 +128,12 @@ def test_double_integrator_in_position_and_position_plus_velocity() -> None:
     assert found.checked_by == ("sweep", "rightmost root")
 
 
-def test_integrators_in_any_unimodular_coordinates_have_a_margin() -> None:
-    for seed in range(420):
+@pytest.mark.parametrize("group", range(GROUPS))
+def test_integrators_in_any_unimodular_coordinates_have_a_margin(group: int) -> None:
+    for seed in range(group, 420, GROUPS):
         found = analysed(integrators(seed))
-        # stable without delay, and an integrator never takes any delay
-        assert 0.0 < found.delay_margin_s < 1e3 or found.delay_margin_s == float("inf") or seed % 3 == 2, seed
+        # the poles without delay are at -1 to -3; the known delay of every third loop may be too much for it
+        assert found.delay_margin_s > 0.0 or seed % 3 == 2, seed
 
 
 @pytest.mark.parametrize("family", [integrators, consensus, random_loop], ids=lambda family: family.__name__)
@@ -168,12 +169,14 @@ def test_four_followers_in_dense_coordinates_are_known_to_a_few_digits() -> None
 def test_held_loop_with_a_known_period_has_the_margin_of_its_one_period_map(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n, inputs, period_s = int(rng.integers(1, 4)), int(rng.integers(1, 3)), float(rng.uniform(0.02, 0.3))
-    A, B, K = rng.normal(size=(n, n)), rng.normal(size=(n, inputs)), rng.normal(size=(inputs, n))
-    A -= (float(np.linalg.eigvals(A + B @ K).real.max()) + 0.4) * np.eye(n)
+    free, B, K = rng.normal(size=(n, n)), rng.normal(size=(n, inputs)), rng.normal(size=(inputs, n))
+    A = free - (float(np.linalg.eigvals(free + B @ K).real.max()) + 0.4) * np.eye(n)
     model = {"A": A.tolist(), "B": B.tolist(), "K": K.tolist(), "hold": True, "period": period_s}
     found = analysed(model)
     assert found.unknown == "tau"
-    looks = np.linspace(0.0, 3.0, 31) if found.delay_margin_s > 3.0 else found.delay_margin_s * np.linspace(0, 0.999, 12)
+    looks = (
+        np.linspace(0.0, 3.0, 31) if found.delay_margin_s > 3.0 else found.delay_margin_s * np.linspace(0, 0.999, 12)
+    )
     # the state over one period, step by step: no matrix of the analysis
     assert all(_held_radius(A, B, K, period_s, float(tau_s)) < 1.0 for tau_s in looks) == (found.delay_margin_s > 0.0)
     if 0.0 < found.delay_margin_s < 3.0:
