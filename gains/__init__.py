@@ -4,8 +4,9 @@ Nothing is imported here; each module is imported by its name. Matrices are arra
 feedback u = +K x; times in s, frequencies in rad/s, state matrices in 1/s. Exceptions are in `errors`.
 
 Loops with a constant delay
-    `delay` (windows and margin, exact), `delay_sweep`, `rightmost`, `delay_opinions` (all three compared),
-    `commensurate` and `mixed_delays` (multiples of one delay, beside known ones), `several_delays`, `model_file`
+    `delay` (windows and margin, exact), `delay_sweep`, `rightmost`, `delay_opinions` (what confirms it),
+    `commensurate` and `mixed_delays` (multiples of one delay, beside known ones), `several_delays`, `model_file` and
+    `loop_margin` (any of these, and sampled loops, from one description)
 Loops as they are flown
     `sampled` (sampled and held), `period_windows`, `multirate`, `onboard`, `response` (vehicles that lag)
 Delays that vary

@@ -19,12 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.circle_angles import PAST_HALF, at_angle, candidate_angles, circle_loci, circle_points, norm_of
+from gains.crossing_error import DelayedTerm
 from gains.delay import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis, unstable_roots
 from gains.delay_crossings import (
     AxisCrossing,
     axis_crossings,
     crossings_of_loci,
     hidden_crossings,
+    is_root,
     polish,
     separating_points,
 )
@@ -81,13 +83,14 @@ def analyse_commensurate(
 
 def _analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
     terms = balanced(*block.matrices)
+    delayed = [DelayedTerm(matrix, 0.0, k) for k, matrix in enumerate(terms)]
     roots = np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).astype(np.complex128)
     passage = zero_passage(terms, np.zeros(len(terms)), np.arange(len(terms))) if leave_out_zero else None
     if passage is None and has_fixed_root(terms, roots):
-        return BlockAnalysis(block.copies, fixed_on_axis=True)
+        return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
     found = block_crossings(terms)
     unstable = unstable_roots(roots, found, passage)
-    return block_analysis(block.copies, found, unstable, passage, highest_frequency(terms))
+    return block_analysis(block.copies, delayed, found, unstable, passage, highest_frequency(terms))
 
 
 def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
@@ -133,7 +136,8 @@ def block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
 
     loci = companion_loci(terms_at, column_space(used[1:]))
     found = crossings_of_loci(loci, _candidates(used, highest), highest)
-    return sorted((polish(used, crossing) for crossing in found), key=lambda crossing: crossing.omega)
+    polished = [polish(used, crossing) for crossing in found if is_root(used, crossing)]
+    return sorted(polished, key=lambda crossing: crossing.omega)
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[AxisCrossing]:

@@ -12,11 +12,13 @@ used here is derived in `gains.delay_crossings`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.crossing_error import DelayedTerm, crossing_error
 from gains.delay_crossings import AxisCrossing, axis_crossings, highest_frequency
 from gains.delay_loci import ComplexArray
 from gains.delay_sweep import frequency_sweep_margin
@@ -37,6 +39,8 @@ __all__ = [
 _MOST_EVENTS = 200_000
 # two critical delays closer than this (relative) are one
 _SAME_DELAY = 1e-12
+# windows or gaps narrower than this (relative) are looked at again, with the errors of the critical delays
+_NARROW = 1e-2
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,7 @@ class BlockAnalysis:
     """
 
     copies: int
+    terms: Sequence[DelayedTerm]
     crossings: Sequence[Crossing] = ()
     unstable: int = 0
     fixed_at_zero: bool = False
@@ -142,7 +147,7 @@ def combined_analysis(blocks: Sequence[BlockAnalysis], horizon_s: float | None) 
     crossings.sort(key=lambda crossing: (crossing.delay_s, crossing.omega_rad_s))
     unstable = sum(block.copies * block.unstable for block in blocks)
     fixed_on_axis = any(block.fixed_on_axis for block in blocks)
-    intervals, complete_to_s = ((), inf) if fixed_on_axis else stability_windows(crossings, unstable, horizon_s)
+    intervals, complete_to_s = ((), inf) if fixed_on_axis else _windows(blocks, crossings, unstable, horizon_s)
     margin_s = next((end_s for start_s, end_s in intervals if start_s == 0.0), 0.0)
     return DelayAnalysis(
         stable_intervals_s=intervals,
@@ -153,6 +158,30 @@ def combined_analysis(blocks: Sequence[BlockAnalysis], horizon_s: float | None) 
         complete_to_s=complete_to_s,
         roots_fixed_at_zero=sum(block.copies for block in blocks if block.fixed_at_zero),
     )
+
+
+def _windows(
+    blocks: Sequence[BlockAnalysis], crossings: Sequence[Crossing], unstable: int, horizon_s: float | None
+) -> tuple[tuple[tuple[float, float], ...], float]:
+    """`stability_windows`; where critical delays are too close to be told apart, with their errors taken into account.
+
+    A multiple root is computed as several that cross near each other, some of them perhaps in the wrong order.
+    """
+    try:
+        found = stability_windows(crossings, unstable, horizon_s)
+        edges_s = [edge_s for window in found[0] for edge_s in window]
+        if all(after_s == inf or after_s - before_s > _NARROW * after_s for before_s, after_s in pairwise(edges_s)):
+            return found
+    except DisagreementError:
+        # more roots come out than went in: perhaps the order is wrong
+        pass
+    errors = {
+        (crossing.omega_rad_s, crossing.delay_s): crossing_error(block.terms, crossing.omega_rad_s, crossing.delay_s)
+        for block in blocks
+        for crossing in block.crossings
+    }
+    blurred = [errors[crossing.omega_rad_s, crossing.delay_s] for crossing in crossings]
+    return stability_windows(crossings, unstable, horizon_s, errors=blurred)
 
 
 def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
@@ -180,18 +209,24 @@ def check_horizon(horizon_s: float | None) -> None:
 
 def _analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
     A0, A1 = balanced(*block.matrices)
+    terms = DelayedTerm(A0, 0.0, 0), DelayedTerm(A1, 0.0, 1)
     roots = np.linalg.eigvals(A0 + A1).astype(np.complex128)
     passage = zero_passage([A0, A1], np.zeros(2), np.arange(2)) if leave_out_zero else None
     if passage is None and _has_fixed_root(A0, A1, roots):
         unstable = int(np.count_nonzero(roots.real > _marginal(A0, A1)))
-        return BlockAnalysis(block.copies, unstable=unstable, fixed_on_axis=True)
+        return BlockAnalysis(block.copies, terms, unstable=unstable, fixed_on_axis=True)
     found = axis_crossings(A0, A1)
     unstable = unstable_roots(roots, found, passage)
-    return block_analysis(block.copies, found, unstable, passage, highest_frequency(A0, A1))
+    return block_analysis(block.copies, terms, found, unstable, passage, highest_frequency(A0, A1))
 
 
 def block_analysis(
-    copies: int, found: Sequence[AxisCrossing], unstable: int, passage: ZeroPassage | None, highest: float
+    copies: int,
+    terms: Sequence[DelayedTerm],
+    found: Sequence[AxisCrossing],
+    unstable: int,
+    passage: ZeroPassage | None,
+    highest: float,
 ) -> BlockAnalysis:
     """One block's analysis from its crossings up to the frequency `highest` and its unstable roots without delay.
 
@@ -204,7 +239,7 @@ def block_analysis(
     ]
     if passage is not None and passage.direction != 0:
         crossings.append(Crossing(0.0, passage.delay_s, passage.direction, 1))
-    return BlockAnalysis(copies, crossings, unstable, fixed_at_zero=passage is not None)
+    return BlockAnalysis(copies, terms, crossings, unstable, fixed_at_zero=passage is not None)
 
 
 def unstable_roots(roots: ComplexArray, found: Sequence[AxisCrossing], passage: ZeroPassage | None) -> int:
@@ -245,9 +280,17 @@ def _least_singular(matrix: FloatArray | ComplexArray, omega: float) -> float:
 
 
 def stability_windows(
-    crossings: Sequence[Crossing], unstable: int, horizon_s: float | None
+    crossings: Sequence[Crossing],
+    unstable: int,
+    horizon_s: float | None,
+    *,
+    errors: Sequence[tuple[float, float]] = (),
 ) -> tuple[tuple[tuple[float, float], ...], float]:
-    """Windows without unstable roots, and the delay up to which they are complete."""
+    """Windows without unstable roots, and the delay up to which they are complete.
+
+    With the `errors` of each crossing's frequency (rad/s) and delay (s), what lies between two critical delays that may
+    be one is no window.
+    """
     if not crossings:
         return (((0.0, inf),) if unstable == 0 else ()), inf
     omega = np.array([crossing.omega_rad_s for crossing in crossings])
@@ -274,6 +317,11 @@ def stability_windows(
     delays = np.concatenate([[0.0], delays[order], [inf]])
     count = unstable + np.concatenate([[0], np.cumsum(change[source][order])])
     wide = np.diff(delays) > _SAME_DELAY * delays[:-1]
+    if errors:
+        by_omega, by_delay = np.array(errors).T
+        # an error of the frequency counts once more with every turn
+        blur = (by_delay[source] + 2.0 * pi * k / np.maximum(omega[source], 1e-300) ** 2 * by_omega[source])[order]
+        wide &= np.diff(delays) > np.maximum(np.append(0.0, blur), np.append(blur, 0.0))
     known = delays[:-1] <= wanted_s
     if bool(np.any(count[wide & known] < 0)):
         raise DisagreementError(

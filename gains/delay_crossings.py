@@ -30,6 +30,8 @@ LARGEST_ALGEBRAIC_BLOCK = 24
 _CANDIDATE_TOLERANCE = 1e-3
 # a locus this close to one (log of the modulus) at an algebraic frequency without a crossing there only touches
 _TOUCH = 1e-11
+# least singular value at a crossing, relative to the norm of what it is the sum of: rounding is far below
+_RESIDUAL = 1e-5
 
 
 @dataclass(frozen=True)
@@ -57,8 +59,20 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
         return []
     candidates = _candidates(A0, A1, B, C, highest_frequency(A0, A1))
     found = crossings_of_loci(delay_loci(A0, B, C), candidates, highest_frequency(A0, A1))
-    polished = [polish((A0, A1), crossing) for crossing in found]
+    polished = [polish((A0, A1), crossing) for crossing in found if is_root((A0, A1), crossing)]
     return sorted(polished, key=lambda crossing: (crossing.omega, crossing.theta))
+
+
+def is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
+    """Whether j omega I - sum_k A_k e^{-j k theta} is anything like singular at a crossing.
+
+    Near a multiple pole of the resolvent loci are huge, and small ones beside them are rounding: what crosses the unit
+    circle there is none.
+    """
+    turns = crossing.locus / abs(crossing.locus)
+    delayed = sum((matrix * turns**-k for k, matrix in enumerate(matrices)), np.zeros_like(matrices[0]))
+    least = np.linalg.svd(1j * crossing.omega * np.eye(len(delayed)) - delayed, compute_uv=False)[-1]
+    return bool(least <= _RESIDUAL * (crossing.omega + sum(float(np.linalg.norm(matrix)) for matrix in matrices)))
 
 
 def crossings_of_loci(loci: Loci, candidates: FloatArray, highest: float) -> list[UnitCrossing]:

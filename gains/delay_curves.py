@@ -56,6 +56,32 @@ def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[C
     return [Curve(curve[:, 0] * scale, curve[:, 1], curve[:, 2]) for curve in curves if len(curve) > 1]
 
 
+def at_delay(
+    matrices: tuple[FloatArray, ...], point: FloatArray, *, which: int, delay_s: float, turns: int
+) -> FloatArray | None:
+    """The solution near a point (omega, alpha, beta) at which one delay is `delay_s`; None if there is none near by.
+
+    That delay is (angle + 2 pi turns) / omega, of the angle alpha for `which` 0 and beta for 1.
+    """
+    scale = sum(float(np.linalg.norm(matrix)) for matrix in matrices)
+    terms = np.array(matrices) / scale
+    here = point / np.array([scale, 1.0, 1.0])
+    wanted = delay_s * scale
+    for _ in range(20):
+        here[1 + which] = wanted * here[0] - 2.0 * pi * turns
+        value, slopes = _equation(terms, here)
+        if abs(value) < 1e-14:
+            return here * np.array([scale, 1.0, 1.0])
+        # the angle follows the frequency
+        pair = np.stack([slopes[:, 0] + wanted * slopes[:, 1 + which], slopes[:, 2 - which]], axis=1)
+        step = np.linalg.lstsq(pair, np.array([value.real, value.imag]), rcond=1e-10)[0]
+        if float(np.linalg.norm(step)) > 2.0 * _STEP:
+            return None
+        here[0] -= step[0]
+        here[2 - which] -= step[1]
+    return None
+
+
 def _solutions_at(terms: FloatArray, alpha: float) -> list[FloatArray]:
     """Points (omega, alpha, beta) with omega > 0 at one alpha: eigenvalues of A(beta) that cross the imaginary axis."""
     now = terms[0] + terms[1] * np.exp(-1j * alpha)

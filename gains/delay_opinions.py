@@ -10,11 +10,12 @@ eps^(1/m). So the error of a crossing is estimated from its own sensitivity, see
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, nan
+from math import isfinite, nan
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.crossing_error import DelayedTerm, crossing_error
 from gains.delay import Crossing, DelayAnalysis, analyse_delay
 from gains.errors import BadModelError, DisagreementError
 from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
@@ -36,23 +37,6 @@ _AGREEMENT, _ERRORS = 1e-6, 4.0
 _UNDECIDED = 1e-9
 # least singular value of a characteristic matrix with rows of unit length, at a root
 _TOUCH = 1e-7
-# backward error of a crossing, in units of n eps and the norm: rounding of the matrices, a similarity, an eigenvalue
-_BACKWARD = 10.0
-# singular values below this, relative to the largest, belong to roots that cross at one place
-_TOGETHER = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class DelayedTerm:
-    """A x(t - known_s - multiple * tau): `matrix` A (n, n) in 1/s, `multiple` whole."""
-
-    matrix: FloatArray
-    known_s: float
-    multiple: int
-
-    def delay_s(self, tau_s: float) -> float:
-        """The delay (s) at one value of the unknown."""
-        return self.known_s + self.multiple * tau_s
 
 
 @dataclass(frozen=True)
@@ -126,59 +110,7 @@ def margin_error_s(analysis: DelayAnalysis, terms: Sequence[DelayedTerm]) -> flo
     if margin_s == 0.0 or not isfinite(margin_s):
         return 0.0
     ends = [crossing for crossing in analysis.crossings if crossing.delay_s == margin_s]
-    return max((crossing_error(terms, crossing)[1] for crossing in ends), default=0.0)
-
-
-def crossing_error(terms: Sequence[DelayedTerm], crossing: Crossing) -> tuple[float, float]:
-    """Estimated errors of a crossing's frequency (rad/s) and of its delay (s), by its sensitivity to rounding.
-
-    With the singular vectors u, v of the least singular value of M(j omega, tau), a change of M by E of norm
-    epsilon moves the crossing by the solution of a d omega + b d tau = -u*E v, a = u*(dM/d omega) v and
-    b = u*(dM/d tau) v: two real equations. Near a root of multiplicity m u and v become orthogonal and a and b small;
-    what is found then is capped by epsilon^(1/n), which no multiplicity exceeds.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau), known to rounding:
-
-    >>> import numpy as np
-    >>> from gains.delay import analyse_delay
-    >>> from gains.delay_opinions import DelayedTerm, crossing_error
-    >>> [crossing] = analyse_delay([[0]], [[-1]]).crossings
-    >>> omega_error, delay_error_s = crossing_error([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], crossing)
-    >>> delay_error_s < 1e-14
-    True
-    """
-    omega, tau_s = crossing.omega_rad_s, crossing.delay_s
-    delays_s, multiples = np.array([term.delay_s(tau_s) for term in terms]), np.array([t.multiple for t in terms])
-    worst, least = (0.0, 0.0), inf
-    for block in distinct_blocks(*(term.matrix for term in terms)):
-        matrices = np.array(balanced(*block.matrices))
-        n = matrices.shape[1]
-        turned = np.exp(-1j * omega * delays_s)[:, np.newaxis, np.newaxis] * matrices
-        M = 1j * omega * np.eye(n) - turned.sum(axis=0)
-        U, singular, Vh = np.linalg.svd(M)
-        scale = omega + float(np.linalg.norm(matrices, axis=(1, 2)).sum())
-        if scale == 0.0 or singular[-1] / scale > least:
-            continue
-        least = float(singular[-1] / scale)
-        near = slice(min(n - 1, int(np.count_nonzero(singular > _TOGETHER * scale))), n)
-        by_s = np.eye(n) + np.tensordot(delays_s, turned, axes=1)
-        # of roots that cross together, the one that moves most
-        left, _, right = np.linalg.svd(U[:, near].conj().T @ by_s @ Vh[near].conj().T)
-        u, v = (U[:, near] @ left[:, -1]).conj(), Vh[near].conj().T @ right[-1].conj()
-        by_omega = 1j * complex(u @ by_s @ v)
-        by_tau = 1j * omega * complex(u @ np.tensordot(multiples, turned, axes=1) @ v)
-        epsilon = _BACKWARD * n * float(np.finfo(np.float64).eps) * scale
-        determinant = abs((by_omega.conjugate() * by_tau).imag)
-        if omega == 0.0:
-            # a real root passes the one at zero: the delay is a ratio of two numbers
-            worst = (0.0, tau_s * epsilon / scale / max(abs(complex(u @ v)), 1e-300))
-            continue
-        cap = (epsilon / scale) ** (1.0 / max(n, 2))
-        found = [epsilon * abs(by) / determinant if determinant > 0.0 else inf for by in (by_tau, by_omega)]
-        worst = min(found[0], cap * omega), min(found[1], cap * max(tau_s, 1.0 / omega))
-    return worst
+    return max((crossing_error(terms, c.omega_rad_s, c.delay_s)[1] for c in ends), default=0.0)
 
 
 def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thorough: bool) -> float | None:

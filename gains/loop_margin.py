@@ -12,8 +12,9 @@ from math import ceil, floor, gcd, inf, log10, pi
 
 import numpy as np
 
+from gains.crossing_error import DelayedTerm, crossing_error
 from gains.delay import Crossing, DelayAnalysis, analyse_delay
-from gains.delay_opinions import DelayedTerm, crossing_error, second_opinions
+from gains.delay_opinions import second_opinions
 from gains.errors import BadModelError, DisagreementError
 from gains.model_file import DelayModel, HeldModel
 from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
@@ -162,8 +163,8 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
         delay_margin_s=analysis.delay_margin_s * scale,
         delay_margin_error_s=opinions.margin_error_s * scale,
         crossings=tuple(
-            _scaled(crossing, crossing_error(terms, crossing)[1] if i < _ERRORS_OF else np.nan, scale)
-            for i, crossing in enumerate(analysis.crossings)
+            _scaled(c, crossing_error(terms, c.omega_rad_s, c.delay_s)[1] if i < _ERRORS_OF else np.nan, scale)
+            for i, c in enumerate(analysis.crossings)
         ),
         unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_delay,
         roots_fixed_at_zero=fixed,

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.commensurate import column_space, companion_loci, highest_frequency
+from gains.crossing_error import DelayedTerm
 from gains.delay import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
 from gains.delay_crossings import AxisCrossing
 from gains.delay_loci import ComplexArray, Loci, unit_crossings, without_limits_at_zero
@@ -100,12 +101,13 @@ def analyse_mixed(
 
 def _analyse_block(block: Block, known_s: FloatArray, multiples: IntArray, leave_out_zero: bool) -> BlockAnalysis:
     parts = _Parts(np.array(balanced(*block.matrices)), known_s, multiples)
+    delayed = [DelayedTerm(*part) for part in zip(parts.matrices, known_s.tolist(), multiples.tolist(), strict=True)]
     passage = zero_passage(parts.matrices, known_s, multiples) if leave_out_zero else None
     if passage is None and is_singular_for_any_delay(parts.matrices):
-        return BlockAnalysis(block.copies, fixed_on_axis=True)
+        return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
     found = [AxisCrossing(*crossing) for crossing in _crossings(parts)]
     unstable = _unstable_roots(parts, passage is not None)
-    return block_analysis(block.copies, found, unstable, passage, parts.highest())
+    return block_analysis(block.copies, delayed, found, unstable, passage, parts.highest())
 
 
 def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_zero: bool = False) -> int:

@@ -52,7 +52,18 @@ class Term:
 
 @dataclass(frozen=True)
 class DelayModel:
-    """x'(t) = sum of the terms; `unknown` is the name of the unknown delay, empty when all delays are numbers."""
+    """x'(t) = sum of the terms; `unknown` is the name of the unknown delay, empty when all delays are numbers.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau):
+
+    >>> from fractions import Fraction
+    >>> import numpy as np
+    >>> from gains.model_file import DelayModel, Term
+    >>> DelayModel((Term(np.array([[-1.0]]), 0.0, Fraction(1)),), "tau").unknown
+    'tau'
+    """
 
     terms: tuple[Term, ...]
     unknown: str
@@ -63,6 +74,15 @@ class HeldModel:
     """x' = A x + B u with u = K x sampled and held. A (n, n), B (n, p), K (p, n).
 
     The unknown is the delay with which u acts if the period is known, else the period.
+
+    Examples
+    --------
+    x' = u, u = -x every 0.02 s:
+
+    >>> import numpy as np
+    >>> from gains.model_file import HeldModel
+    >>> HeldModel(np.array([[0.0]]), np.array([[1.0]]), np.array([[-1.0]]), period_s=0.02).period_s
+    0.02
     """
 
     A: FloatArray

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gains.delay import delay_margin
-from gains.delay_curves import Curve, crossing_solutions
+from gains.delay_curves import Curve, at_delay, crossing_solutions
 from gains.errors import BadModelError
 from gains.rightmost import rightmost_root
 from gains.structure import FloatArray, distinct_blocks, real_matrix, square_matrices
@@ -190,7 +190,7 @@ def crossing_curves(
     lines: list[Polyline] = []
     for block in distinct_blocks(now, first, second):
         for curve in crossing_solutions(*block.matrices):
-            lines += _offspring(curve, longest_s)
+            lines += _offspring(block.matrices, curve, longest_s)
     return tuple(lines)
 
 
@@ -210,8 +210,8 @@ def boundary_of_two_delays(
     >>> from gains.several_delays import boundary_of_two_delays
     >>> edge = boundary_of_two_delays([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
     >>> at_once = min((pair for line in edge for pair in line.delays_s.tolist()), key=lambda pair: pair[1])
-    >>> round(at_once[0], 1)
-    2.4
+    >>> round(at_once[0], 4), at_once[1]
+    (2.4184, 0.0)
     """
     pieces: list[Polyline] = []
     for line in crossing_curves(A0, A1, A2, longest_s=longest_s):
@@ -225,7 +225,7 @@ def _is_edge(A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, delays_s: list[float])
     return root.real <= _ON_AXIS * abs(root)
 
 
-def _offspring(curve: Curve, longest_s: tuple[float, float]) -> Iterator[Polyline]:
+def _offspring(matrices: tuple[FloatArray, ...], curve: Curve, longest_s: tuple[float, float]) -> Iterator[Polyline]:
     """The images of one curve of solutions in the box of delays, for all whole turns p and q."""
     omega = curve.omega
     turns = [
@@ -238,8 +238,64 @@ def _offspring(curve: Curve, longest_s: tuple[float, float]) -> Iterator[Polylin
     for p in turns[0]:
         for q in turns[1]:
             delays_s = np.stack([(curve.alpha + 2.0 * pi * p) / omega, (curve.beta + 2.0 * pi * q) / omega], axis=1)
-            inside = np.all((delays_s >= 0.0) & (delays_s <= np.array(longest_s)), axis=1)
-            yield from _runs(Polyline(delays_s, omega), inside)
+            yield from _inside(matrices, curve, Polyline(delays_s, omega), (p, q), longest_s)
+
+
+def _inside(
+    matrices: tuple[FloatArray, ...],
+    curve: Curve,
+    line: Polyline,
+    turns: tuple[int, int],
+    longest_s: tuple[float, float],
+) -> Iterator[Polyline]:
+    """The stretches of a polyline within the box, each up to the point at which the curve enters or leaves it."""
+    delays_s = line.delays_s
+    inside = np.all((delays_s >= 0.0) & (delays_s <= np.array(longest_s)), axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        points, omega = delays_s[begin:end], line.omega_rad_s[begin:end]
+        for last, beyond, at in ((begin, begin - 1, 0), (end - 1, end, end - begin)):
+            if 0 <= beyond < len(delays_s):
+                edge = _edge_point(matrices, curve, delays_s, (last, beyond), turns, longest_s)
+                if edge is not None:
+                    place = 0 if at == 0 else len(points)
+                    points, omega = np.insert(points, place, edge[0], axis=0), np.insert(omega, place, edge[1])
+        if len(points) >= _LEAST_POINTS:
+            yield Polyline(points, omega)
+
+
+def _edge_point(
+    matrices: tuple[FloatArray, ...],
+    curve: Curve,
+    delays_s: FloatArray,
+    between: tuple[int, int],
+    turns: tuple[int, int],
+    longest_s: tuple[float, float],
+) -> tuple[FloatArray, float] | None:
+    """Delays and frequency where the curve passes the edge of the box between a vertex inside and the next outside."""
+    last, beyond = between
+    here, there = delays_s[last], delays_s[beyond]
+    # the edge that is met first on the chord
+    met = [
+        ((bound_s - float(here[which])) / float(there[which] - here[which]), which, bound_s)
+        for which in (0, 1)
+        for bound_s in (0.0, longest_s[which])
+        if ((there[which] < 0.0) if bound_s == 0.0 else (there[which] > bound_s))
+    ]
+    if not met or min(met)[0] <= 0.0:
+        return None
+    share, which, bound_s = min(met)
+    vertices = np.stack([curve.omega, curve.alpha, curve.beta], axis=1)
+    start = vertices[last] + share * (vertices[beyond] - vertices[last])
+    found = at_delay(matrices, start, which=which, delay_s=bound_s, turns=turns[which])
+    if found is None:
+        return None
+    pair_s = (found[1:] + 2.0 * pi * np.array(turns)) / found[0]
+    pair_s[which] = bound_s
+    # the curve may leave by another edge before that
+    if not bool(np.all((pair_s >= 0.0) & (pair_s <= np.array(longest_s)))):
+        return None
+    return pair_s, float(found[0])
 
 
 def _runs(line: Polyline, kept: NDArray[np.bool_]) -> Iterator[Polyline]:

@@ -176,7 +176,8 @@ def margin(
     model_file: Annotated[
         Path,
         typer.Argument(
-            metavar="MODEL.json|SCENARIO.toml", help="matrices and delays of any linear loop, or a scenario"
+            metavar="MODEL.json|SCENARIO.toml",
+            help="matrices and delays of any linear loop, or of one sampled and held (see docs/models), or a scenario",
         ),
     ],
     as_json: AsJson = False,

@@ -1,20 +1,21 @@
 """An oracle for loops with delays that shares nothing with `gains`: it counts roots by the argument principle.
 
 det M(j omega) / (j omega + c)^n winds around zero once for each root of M(s) = sI - sum_k A_k e^{-s d_k} with positive
-real part. The winding is added up over steps that cannot hide a turn: M is Lipschitz with L = 1 + sum_k d_k ||A_k||, so
+real part. The winding is added up over steps that cannot hide a turn: M is Lipschitz, L = 1 + sum_k d_k ||A_k||, so
 over a step h with h L < rho sigma_min(M) the matrix M' M^{-1} stays within rho of the identity, and each of its n
-eigenvalues turns by less than asin(rho). With n asin(rho) < pi the principal angle of the determinant is the whole turn.
+eigenvalues turns by less than asin(rho). With n asin(rho) < pi the principal angle of the determinant is the turn.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_MOST_POINTS = 400_000
+_MOST_POINTS = 100_000
 
 
-class TooClose(Exception):
+class TooCloseError(Exception):
     """A root is too close to the imaginary axis for the oracle to say on which side it is."""
 
 
@@ -28,11 +29,11 @@ def unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, roots_at_zero: i
     lipschitz = 1.0 + float(delays @ norms)
     rho = min(0.5, float(np.sin(2.5 / n)))
 
-    def characteristic(omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def characteristic(omega: NDArray[Any]) -> NDArray[Any]:
         turned = np.exp(-1j * omega[:, np.newaxis] * delays) @ matrices.reshape(len(matrices), -1)
         return 1j * omega[:, np.newaxis, np.newaxis] * np.eye(n) - turned.reshape(-1, n, n)
 
-    def look(omega: NDArray[np.float64]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
+    def look(omega: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
         M = characteristic(omega)
         sign = np.linalg.slogdet(M)[0]
         values = sign * np.exp(-1j * n * np.angle(1j * omega + scale))
@@ -52,7 +53,7 @@ def unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, roots_at_zero: i
         if coarse.size == 0:
             break
         if omega.size > _MOST_POINTS or least.min() < 1e-13 * scale:
-            raise TooClose(f"{omega.size} points, least singular value {least.min()}")
+            raise TooCloseError(f"{omega.size} points, least singular value {least.min()}")
         between = (omega[coarse] + omega[coarse + 1]) / 2.0
         new_values, new_least = look(between)
         omega = np.insert(omega, coarse + 1, between)
@@ -60,5 +61,5 @@ def unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, roots_at_zero: i
     turn = float(np.angle(values[-1])) - float(np.angle(values[1:] / values[:-1]).sum())
     roots = turn / np.pi
     if abs(roots - round(roots)) > 0.05:
-        raise TooClose(f"{roots} roots counted")
+        raise TooCloseError(f"{roots} roots counted")
     return round(roots)

@@ -63,6 +63,8 @@ def test_known_margins(tmp_path: Path, model: dict[str, Any], intervals: list[li
         # the delay of the coupling has no part in it: each state is a loop of its own, the second with 2 tau
         ("terms", [0.0, 6.172581371221286 / 2]),
         ("held", [0.0, 1.7294142794798775]),
+        # from SciPy's matrix exponential over one period, bisected to its unit circle
+        ("held_late", [0.0, 1.157157060376148]),
     ],
 )
 def test_the_model_files_in_docs_have_the_margins_that_are_known_of_them(

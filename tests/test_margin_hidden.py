@@ -158,9 +158,18 @@ def test_formation_at_constant_velocity_has_two_roots_at_zero() -> None:
     assert result["roots_fixed_at_zero"] == 2
 
 
-def test_root_at_zero_without_an_equilibrium_is_said_and_not_stable() -> None:
-    # s + 1 - e^{-s tau}: A0 + A1 = 0 while neither vanishes
+def test_root_at_zero_without_an_equilibrium_is_left_out_and_said() -> None:
+    # s + 1 - e^{-s tau}: A0 + A1 = 0 while neither vanishes; |s + 1| > 1 in the right half plane
     result = result_of([[-1.0]], [[1.0]])
+    assert (result["stable_intervals_s"], result["roots_fixed_at_zero"]) == ([[0.0, None]], 1)
+    # s - 1 + e^{-s tau}: a second root passes zero at tau = 1, where s - 1 + 1 - s tau + ... has a double one
+    result = result_of([[1.0]], [[-1.0]])
+    assert result["stable_intervals_s"] == [[0.0, pytest.approx(1.0, rel=1e-14)]]
+    assert result["checked_by"] == ["root count"]
+
+
+def test_an_integrator_that_nobody_feeds_back_is_stable_at_no_delay() -> None:
+    result = result_of([[0.0, 0.0], [1.0, -1.0]], [[0.0, 0.0], [0.0, -0.5]])
     assert (result["stable_intervals_s"], result["delay_margin_s"]) == ([], 0.0)
     assert result["notes"] == ["a root stays at 0 at every delay, so the loop is asymptotically stable at none"]
 

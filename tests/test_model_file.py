@@ -57,6 +57,12 @@ def test_held_loop_keeps_its_matrices() -> None:
     assert np.array_equal(model.K, [[-1.0, -2.0]])
 
 
+def test_held_loop_may_state_its_period() -> None:
+    model = parse_model('{"A": [[0]], "B": [[1]], "K": [[-1]], "hold": true, "period": 0.02}')
+    assert isinstance(model, HeldModel)
+    assert model.period_s == 0.02
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -65,7 +71,7 @@ def test_held_loop_keeps_its_matrices() -> None:
         ('{"A0": [[1]],\n', "line 2: read nothing more, wanted JSON"),
         ('{"A0":\r\n [[1,,2]],\n', "line 2: read '[[1,,2]],', wanted JSON"),
         ("[]", "the model: read [], wanted an object"),
-        ("{}", "read the keys none; wanted A0, A1 or terms or A, B, K, hold"),
+        ("{}", "read the keys none; wanted A0, A1 or terms or A, B, K, hold or A, B, K, hold, period"),
         ('{"A0": [[1]]}', "read the keys A0; wanted A0, A1"),
         ('{"A0": [[1]], "A1": [[1]], "A2": [[1]]}', "'A2': read an unknown key, wanted A0, A1"),
         ('{"A0": [[1]], "A0": [[1]], "A1": [[1]]}', "A0: read twice, wanted once"),
@@ -75,31 +81,41 @@ def test_held_loop_keeps_its_matrices() -> None:
         ('{"A0": [], "A1": [[1]]}', "A0: read [], wanted a matrix as a list of rows"),
         ('{"A0": [[]], "A1": [[1]]}', "A0: read [[]], wanted at least one number in a row"),
         ('{"A0": 3, "A1": [[1]]}', "A0: read 3, wanted a matrix as a list of rows"),
-        ('{"A0": [["a"]], "A1": [[1]]}', "A0[0][0]: read 'a', wanted a finite number"),
-        ('{"A0": [[null]], "A1": [[1]]}', "A0[0][0]: read null, wanted a finite number"),
-        ('{"A0": [[true]], "A1": [[1]]}', "A0[0][0]: read true, wanted a finite number"),
-        ('{"A0": [[1]], "A1": [[NaN]]}', "A1[0][0]: read NaN, wanted a finite number"),
-        ('{"A0": [[1, 1], [1, -Infinity]], "A1": [[1]]}', "A0[1][1]: read a number beyond 1e308, wanted"),
-        ('{"A0": [[1e999]], "A1": [[1]]}', "A0[0][0]: read a number beyond 1e308, wanted a finite number"),
-        ('{"A0": [[1e300]], "A1": [[1]]}', "A0[0][0]: read 1e+300, wanted a finite number, up to 1e+30"),
-        ('{"terms": [{"A": [[1]], "delay": "1e31 + tau"}]}', "terms[0].delay: read 1e+31, wanted a number of seconds"),
+        ('{"A0": [["a"]], "A1": [[1]]}', "A0, row 1, column 1: read 'a', wanted a finite number"),
+        ('{"A0": [[null]], "A1": [[1]]}', "A0, row 1, column 1: read null, wanted a finite number"),
+        ('{"A0": [[true]], "A1": [[1]]}', "A0, row 1, column 1: read true, wanted a finite number"),
+        ('{"A0": [[1]], "A1": [[NaN]]}', "A1, row 1, column 1: read NaN, wanted a finite number"),
+        ('{"A0": [[1, 1], [1, -Infinity]], "A1": [[1]]}', "A0, row 2, column 2: read a number beyond 1e308, wanted"),
+        ('{"A0": [[1e999]], "A1": [[1]]}', "A0, row 1, column 1: read a number beyond 1e308, wanted a finite number"),
+        ('{"A0": [[1e300]], "A1": [[1]]}', "A0, row 1, column 1: read 1e+300, wanted a finite number, up to 1e+30"),
+        ('{"terms": [{"A": [[1]], "delay": "1e31 + tau"}]}', "term 1, delay: read 1e+31, wanted a number of seconds"),
         ('{"terms": []}', "terms: read [], wanted a list of"),
-        ('{"terms": [{"A": [[1]]}]}', "terms[0]: read 'A', wanted the keys A, delay"),
-        ('{"terms": [{"A": [[1]], "delay": -0.1}]}', "terms[0].delay: read -0.1, wanted a number of seconds >= 0"),
-        ('{"terms": [{"A": [[1]], "delay": "-tau"}]}', "terms[0].delay: read '-tau', wanted a number of seconds"),
-        ('{"terms": [{"A": [[1]], "delay": "tau/0"}]}', "terms[0].delay: read 'tau/0', wanted a number of seconds"),
-        ('{"terms": [{"A": [[1]], "delay": "0.1"}]}', "terms[0].delay: read '0.1', wanted a number of seconds"),
-        ('{"terms": [{"A": [[1]], "delay": "tau*h"}]}', "terms[0].delay: read 'tau*h', wanted a number of seconds"),
+        ('{"terms": [{"A": [[1]]}]}', "term 1: read 'A', wanted the keys A, delay"),
+        ('{"terms": [{"A": [[1]], "delay": -0.1}]}', "term 1, delay: read -0.1, wanted a number of seconds >= 0"),
+        ('{"terms": [{"A": [[1]], "delay": "-tau"}]}', "term 1, delay: read '-tau', wanted a number of seconds"),
+        ('{"terms": [{"A": [[1]], "delay": "tau/0"}]}', "term 1, delay: read 'tau/0', wanted a number of seconds"),
+        ('{"terms": [{"A": [[1]], "delay": "0.1"}]}', "term 1, delay: read '0.1', wanted a number of seconds"),
+        ('{"terms": [{"A": [[1]], "delay": "tau*h"}]}', "term 1, delay: read 'tau*h', wanted a number of seconds"),
         (
             '{"terms": [{"A": [[1]], "delay": "tau"}, {"A": [[1]], "delay": "h"}]}',
-            "terms[1].delay: read 'h', wanted multiples of one unknown, which is 'tau'",
+            "term 2, delay: read 'h', wanted multiples of one unknown, which is 'tau'",
         ),
         ('{"A": [[1]], "B": [[1]], "K": [[1]], "hold": false}', "hold: read false, wanted true"),
         ('{"A": [[1]], "B": [[1]], "K": [[1, 2]], "hold": true}', "K: read 1x2, wanted 1x1: u = K x"),
         ('{"A": [[1]], "B": [[1], [2]], "K": [[1]], "hold": true}', "B: read 2x1, wanted 1 rows as A has"),
+        (
+            '{"A": [[1]], "B": [[1]], "K": [[1]], "hold": true, "period": 0}',
+            "period: read 0, wanted a positive number of seconds",
+        ),
+        (
+            '{"A": [[1]], "B": [[1]], "K": [[1]], "hold": true, "period": "tau"}',
+            "period: read 'tau', wanted a positive number of seconds",
+        ),
+        ('{"A0": [[5e-324]], "A1": [[1]]}', "A0, row 1, column 1: read 5e-324, wanted a finite number, 0 or at least"),
+        ('{"terms": [{"A": [[1]], "delay": "1e-90*tau"}]}', "term 1, delay: read '1e-90*tau', wanted a number of"),
         ("[" * 100_000, "read lists within lists too deep to follow"),
         ('{"A0": [[1' + "0" * 5000 + ']], "A1": [[1]]}', "wanted finite numbers"),
-        ('{"A0": [[1' + "0" * 400 + ']], "A1": [[1]]}', "A0[0][0]: read a number of 401 digits"),
+        ('{"A0": [[1' + "0" * 400 + ']], "A1": [[1]]}', "A0, row 1, column 1: read a number of 401 digits"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(text: str, line: str) -> None:

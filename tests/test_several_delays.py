@@ -201,3 +201,16 @@ def test_box_of_curves_must_be_finite(longest_s: tuple[float, float]) -> None:
 def test_each_late_matrix_needs_its_delay(late: list[ArrayLike], delays_s: list[float]) -> None:
     with pytest.raises(BadModelError, match="as late matrices"):
         stable_at([[-3.0]], late, delays_s)
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_curves_reach_the_axes(seed: int) -> None:
+    now, first, second = random_loop(seed)
+    lines = crossing_curves(now, first, second, longest_s=(4.0, 4.0))
+    ends = np.array([end for line in lines for end in (line.delays_s[0], line.delays_s[-1])]).reshape(-1, 2)
+    # on an axis one delay is zero: what is left are the critical delays of the other, by another analysis
+    for which, A0, A1 in ((0, now + second, first), (1, now + first, second)):
+        on_axis = ends[ends[:, 1 - which] == 0.0, which]
+        for crossing in analyse_delay(A0, A1).crossings:
+            if 0.01 < crossing.delay_s < 3.99 and crossing.direction != 0:
+                assert np.abs(on_axis - crossing.delay_s).min() < 1e-9, (which, crossing)
