@@ -134,10 +134,8 @@ class RemoteVehicle:
     @property
     def missing(self) -> str:
         """What keeps it from being ready, in words."""
-        if self.address is None:
-            return "not heard"
-        if self.silent:
-            return "is silent"
+        if self.address is None or self.silent:
+            return "not heard" if self.address is None else "is silent"
         if self.taken_over:
             if not self._has_been_guided:
                 return f"is armed and not in {self.kind.guided_name}: flown by its pilot or by itself"

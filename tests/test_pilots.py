@@ -216,7 +216,7 @@ def test_a_take_off_that_was_not_answered_is_not_told_again_to_a_px4_whose_pilot
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_a_pilot_who_intervenes_after_the_station_has_released_a_vehicle_is_left_alone(flavour: str) -> None:
-    """A released PX4 leaves OFFBOARD by itself: from that failsafe it is called back, from the pilot's mode it is not."""
+    """A released PX4 leaves OFFBOARD by itself: it is called back from that failsafe, not from its pilot's mode."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
     station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
