@@ -201,7 +201,7 @@ class RemoteVehicle:
         armed, critical = bool(base_mode & ARMED), system_status == STATE_CRITICAL
         recent_ns = now_ns - _NS - 2 * (self.clock.rtt_ns or 0)
         self._outdated = [before for before in self._outdated if before[0] > recent_ns]
-        if any((custom_mode, armed) == before for _, *before in self._outdated):
+        if any((custom_mode, armed) == (mode, was_armed) for _, mode, was_armed in self._outdated):
             return
         found = kind_of(autopilot, vehicle_type)
         self.clock.backdated_ns = found.timesync_backdated_ns if isinstance(found, Kind) else 0
