@@ -15,7 +15,6 @@ from gcs.autopilot.kinds import (
     Kind,
     Step,
     commanded_mode,
-    kind_of,
     mode_command,
 )
 from gcs.autopilot.startup import Startup
@@ -203,11 +202,10 @@ class RemoteVehicle:
         self._outdated = [before for before in self._outdated if before[0] > recent_ns]
         if any((custom_mode, armed) == (mode, was_armed) for _, mode, was_armed in self._outdated):
             return
-        found = kind_of(autopilot, vehicle_type)
-        self.clock.backdated_ns = found.timesync_backdated_ns if isinstance(found, Kind) else 0
         was_guided = self.guided
         if self.startup is not None:
             self.startup.heartbeat(autopilot, vehicle_type)
+            self.clock.backdated_ns = self.kind.timesync_backdated_ns
             self._see_pilot(custom_mode, now_ns, armed=armed, critical=critical)
         self.custom_mode, self.armed = custom_mode, armed
         if critical and not self.critical:
