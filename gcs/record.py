@@ -94,6 +94,7 @@ TICK = np.dtype(
         ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
         ("down_bound_s", "<f8"),  # most that it can be wrong
         ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s; in the ground loop it is the newest one
+        ("delay_margin_s", "<f8"),  # of the gains flown, as known at the time; infinite if no delay is too long
         ("headroom", "<f8"),  # 1 - loop delay / margin
         ("rtt_s", "<f8"),  # a TIMESYNC round trip that has ended and is in no earlier row; NaN if there is none
         ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock, at sent_ns

@@ -89,7 +89,10 @@ def _from_parquet(file: Path) -> TickArray:
         table = pq.read_table(file)
         ticks = np.empty(table.num_rows, TICK)
         for name in TICK.names or ():
-            ticks[name] = table[name].to_numpy()
+            early = (
+                name == "delay_margin_s" and name not in table.column_names
+            )  # recorded before there was such a column
+            ticks[name] = np.nan if early else table[name].to_numpy()
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise InputError(f"{file}: {str(error).strip()}, wanted the ticks of a run") from None
     return ticks

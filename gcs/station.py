@@ -6,7 +6,7 @@ or in virtual time, with the same bytes.
 
 from collections import Counter, deque
 from collections.abc import Callable
-from math import hypot, isfinite, isnan, nan
+from math import isfinite, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from gcs.absence import absences, end_reason, told
 from gcs.autopilot.copters import Copters
 from gcs.autopilot.kinds import Goal
 from gcs.autopilot.startup import Startup
+from gcs.breakage import Breakage
 from gcs.control import VehicleControl, distances_m, formation_control
 from gcs.limits import SetPointLimits
 from gcs.modes import Phase, next_phase, patience_s
@@ -24,7 +25,7 @@ from gcs.plan import FlightPlan
 from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
 from gcs.stream import Stream, law_of, set_point, upload_of
-from gcs.telemetry import FloatArray, StateHistory
+from gcs.telemetry import StateHistory
 from gcs.vehicle import SILENCE_S, Address, RemoteVehicle
 from scenarios.schema import NS_PER_S
 
@@ -89,6 +90,7 @@ class Station:
         self._history = StateHistory(n)
         self._law = law_of(plan, [False] * n)
         self._stream = Stream(plan) if scenario.control.loop == "onboard" else None
+        self._breakage = Breakage(plan)
         self._limits = SetPointLimits.of(scenario.limits)
         self._control = formation_control if self._stream is None else self._stream.control
         self._period_ns = round(NS_PER_S / rates.control_hz)
@@ -226,12 +228,7 @@ class Station:
             vehicle.startup.take(frame.msg_id, fields)
 
     def _position(
-        self,
-        row: int,
-        vehicle: RemoteVehicle,
-        frame: mavlink.Frame,
-        datagram: Datagram,
-        outgoing: list[Outgoing],
+        self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]
     ) -> None:
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
         clock = vehicle.clock
@@ -282,7 +279,8 @@ class Station:
         distance_m = distances_m(controls, due_ns)
         nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
         if flying:
-            self._watch(controls, distance_m, nearest_m)
+            states = self._monitor.states
+            self.request_stop(self._breakage.judge(controls, states, self._absent, distance_m, nearest_m, time_s))
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
         seen: list[VehicleTick] = []
         for row, (vehicle, control, monitored, nearest) in enumerate(
@@ -409,19 +407,6 @@ class Station:
         return mavlink.acceleration_set_point(
             key_ms=key_ms, target_system=self.vehicles[row].system_id, north_m_s2=north, east_m_s2=east
         )
-
-    def _watch(self, controls: list[VehicleControl], distance_m: FloatArray, nearest_m: list[float]) -> None:
-        """End the flight on a collision or a spacing error past the limit."""
-        safety = self.plan.scenario.safety
-        closest_m = min((distance for distance in nearest_m if not isnan(distance)), default=nan)
-        if closest_m < safety.collision_distance_m:
-            one, two = (self.vehicles[row].system_id for row in divmod(int(np.nanargmin(distance_m)), len(controls)))
-            self.request_stop(f"broken: vehicles {one} and {two} have collided, {closest_m:.1f} m apart")
-        for vehicle, control, state in zip(self.vehicles, controls, self._monitor.states, strict=True):
-            error_m = hypot(*control.spacing_error_m)
-            if error_m > safety.spacing_error_limit_m and not state.released:
-                error, limit = f"{error_m:.0f} m", f"{safety.spacing_error_limit_m:g} m"
-                self.request_stop(f"broken: spacing error of vehicle {vehicle.system_id} is {error}, limit {limit}")
 
     # -- small things ----------------------------------------------------------------------------------------------
 

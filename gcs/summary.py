@@ -169,6 +169,7 @@ def _vehicle(
         "spacing_error_max_m": None if error_m is None else _number(error_m.max()),
         "rtt_s": spread_with_status(rtt),
         "loop_delay_s": spread_with_status(own["loop_delay_s"][own["commanded"]]),
+        "delay_margin_s": _margins(own["delay_margin_s"][own["commanded"]]),
         "up_delay_s": _one_way(own["up_delay_s"], own["sample_bound_s"], own["commanded"]),
         "down_delay_s": _one_way(own["down_delay_s"], own["down_bound_s"], own["commanded"]),
         "telemetry_age_s": spread_with_status(own["telemetry_age_s"][own["commanded"]]),
@@ -177,6 +178,13 @@ def _vehicle(
         "mode_final": _mode_final(rows),
         **counted,
     }
+
+
+def _margins(flown_s: NDArray[np.float64]) -> dict[str, float | None]:
+    """The least and the largest delay margin of the gains that a vehicle was flown with."""
+    if not flown_s.size:
+        return {"min": None, "max": None}
+    return {"min": _number(flown_s.min()), "max": _number(flown_s.max())}
 
 
 def _mode_final(rows: TickArray) -> str | None:

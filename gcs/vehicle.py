@@ -15,7 +15,6 @@ from gcs.autopilot.kinds import (
     Kind,
     Step,
     commanded_mode,
-    kind_of,
     mode_command,
 )
 from gcs.autopilot.startup import Startup
@@ -137,10 +136,8 @@ class RemoteVehicle:
     @property
     def missing(self) -> str:
         """What keeps it from being ready, in words."""
-        if self.address is None:
-            return "not heard"
-        if self.silent:
-            return "is silent"
+        if self.address is None or self.silent:
+            return "not heard" if self.address is None else "is silent"
         if self.taken_over:
             left = "left" if self._has_been_guided else "is armed and not in"
             return f"{left} {self.kind.guided_name}: flown by its pilot or by itself"
@@ -209,13 +206,12 @@ class RemoteVehicle:
         armed, critical = bool(base_mode & ARMED), system_status == STATE_CRITICAL
         recent_ns = now_ns - _NS - 2 * (self.clock.rtt_ns or 0)
         self._outdated = [before for before in self._outdated if before[0] > recent_ns]
-        if any((custom_mode, armed) == before for _, *before in self._outdated):
+        if any((custom_mode, armed) == (mode, was_armed) for _, mode, was_armed in self._outdated):
             return
-        found = kind_of(autopilot, vehicle_type)
-        self.clock.backdated_ns = found.timesync_backdated_ns if isinstance(found, Kind) else 0
         was_guided = self.guided
         if self.startup is not None:
             self.startup.heartbeat(autopilot, vehicle_type)
+            self.clock.backdated_ns = self.kind.timesync_backdated_ns
             self._see_pilot(custom_mode, now_ns, armed=armed, critical=critical)
         self.custom_mode, self.armed = custom_mode, armed
         if critical and not self.critical:

@@ -43,6 +43,7 @@ def ticks_of(scenario: Scenario, *, start_s: float, count: int, first: int = 0) 
     ticks["sent_ns"] = ticks["due_ns"] + 300_000
     ticks["system_id"] = [vehicle.system_id for vehicle in scenario.vehicles]
     ticks["mode"] = Mode.NOMINAL
+    ticks["delay_margin_s"] = 0.4
     ticks["telemetry_age_s"] = age_s
     positions_m = np.array([vehicle.position_ne_m for vehicle in scenario.vehicles])
     ticks["north_m"] = positions_m[:, 0] + SPEED_M_S * (ticks["time_s"] - age_s)

@@ -6,10 +6,10 @@ from functools import cache
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.lockstep import START_NS, Sent, fly_lockstep
 from gcs.station import Station
+from gcs.vehicle import RemoteVehicle
 from scenarios.schema import ClockJump, Link, Outage, Scenario, VehicleLinks
 from sim_vehicles.copter import Copter
 from sim_vehicles.copter_rules import RULES
@@ -35,7 +35,8 @@ class PilotsVehicle:
     """Mode by time since the start in s."""
     change: Callable[[bytes, int], list[tuple[bytes, int]]] = lambda data, now_ns: [(data, now_ns)]
     """What becomes of a datagram that the vehicle sends."""
-    told: list[dialect.MAVLink_message] = field(default_factory=list[dialect.MAVLink_message])
+    told: list[Any] = field(default_factory=list[Any])
+    """MAVLink messages."""
     reached_ns: int = 0
     """When the pilot's first mode must have reached the station; 0 before."""
 
@@ -216,7 +217,7 @@ def test_a_take_off_that_was_not_answered_is_not_told_again_to_a_px4_whose_pilot
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 def test_a_pilot_who_intervenes_after_the_station_has_released_a_vehicle_is_left_alone(flavour: str) -> None:
-    """A released PX4 leaves OFFBOARD by itself: from that failsafe it is called back, from the pilot's mode it is not."""
+    """A released PX4 leaves OFFBOARD by itself: it is called back from that failsafe, not from its pilot's mode."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
     station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
@@ -257,7 +258,7 @@ def test_a_pilot_within_a_second_of_an_answer_is_seen_by_the_next_heartbeat() ->
     """What the station was told by an ACK holds against heartbeats from before, not against a mode that is new."""
     scenario = flown("ardupilot")
     station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
-    own, vehicle = PilotsVehicle(pilots, "ardupilot", {}), station.vehicles[2]
+    own, vehicle, answered_s = PilotsVehicle(pilots, "ardupilot", {}), station.vehicles[2], 0.0
     for tick in fly_lockstep(station.plan, station=station, vehicles=own):
         if vehicle.guided and own.reached_ns == 0:
             answered_s = (int(tick["due_ns"][0]) - START_NS) / SECOND
@@ -266,3 +267,27 @@ def test_a_pilot_within_a_second_of_an_answer_is_seen_by_the_next_heartbeat() ->
             assert (int(tick["due_ns"][0]) - START_NS) / SECOND - answered_s < 1.1
             return
     raise AssertionError("the pilot was never seen")
+
+
+def test_a_heartbeat_from_before_a_command_does_not_undo_what_its_answer_said() -> None:
+    vehicle = RemoteVehicle(3, telemetry_hz=50.0, report=lambda _kind, _text: None)
+    vehicle.address = ("127.0.0.1", 3)
+
+    def heartbeat(mode: int, *, armed: bool, at_s: float) -> tuple[int, bool]:
+        vehicle.heartbeat((mode, 2, 3, 0x80 if armed else 0, 4, 3), round(at_s * SECOND))
+        return vehicle.custom_mode, vehicle.armed
+
+    def answered(at_s: float) -> None:
+        now_ns = round(at_s * SECOND)
+        frame = vehicle.converse(now_ns)
+        assert frame is not None
+        vehicle.acknowledge((parse(frame).command, 0, 0, 0, 255, 190), now_ns)
+
+    heartbeat(0, armed=False, at_s=1.0)
+    for at_s in (1.1, 1.2, 1.3):  # rate, mode, arming
+        answered(at_s)
+    assert vehicle.guided
+    assert heartbeat(0, armed=False, at_s=1.4) == (4, True)
+    assert heartbeat(4, armed=False, at_s=1.5) == (4, True)
+    assert heartbeat(5, armed=True, at_s=1.6) == (5, True)  # which it was not in before: that is news
+    assert heartbeat(0, armed=False, at_s=3.0) == (0, False)

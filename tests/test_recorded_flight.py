@@ -16,21 +16,30 @@ from gcs.plan import flight_plan
 from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
 from gcs.run_files import read_ticks
 from gcs.show.observer import record_run
+from gcs.show.report import delay_text
 from gcs.show.viewer import ViewerError, screenshot, vulkan_missing
 from gcs.station import Station
+from gcs.summary import finish
 from scenarios.files import dump, load
+from scenarios.schema import DelayPoint, Link, Scenario, VehicleLinks
 
 pytestmark = pytest.mark.xdist_group("recorded flight")
 
 SCENARIO = load(Path(__file__).parent.parent / "scenarios" / "triangle5.toml").model_copy(update={"duration_s": 4.0})
+SLOW = Link(delay_points=(DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=1.0, delay_s=0.16)))
+"""Past the margin of the fastest gains from the first second on."""
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a flight of four seconds, with its recording."""
-    folder = tmp_path_factory.mktemp("run")
-    design, plan = flight_plan(SCENARIO)
-    (folder / SCENARIO_FILE).write_text(dump(SCENARIO), encoding="utf-8")
+    return recorded(SCENARIO, tmp_path_factory.mktemp("run"))
+
+
+def recorded(scenario: Scenario, folder: Path) -> Path:
+    """The folder of a flight, with its recording."""
+    design, plan = flight_plan(scenario)
+    (folder / SCENARIO_FILE).write_text(dump(scenario), encoding="utf-8")
     (folder / DESIGN_FILE).write_text(json.dumps(design), encoding="utf-8")
     writer, station = RunWriter(folder), Station(plan, start_ns=START_NS)
     for rows in fly_lockstep(plan, station=station):
@@ -62,6 +71,7 @@ def test_delays_headroom_and_errors_in_the_recording_are_those_of_the_ticks(run:
     wanted: dict[str, Any] = {
         "/delay/loop_ms": 1e3 * flown["loop_delay_s"],
         "/headroom/percent": 100 * flown["headroom"],
+        "/delay/margin_ms": 1e3 * flown["delay_margin_s"],
         "/spacing/error_m": errors_m,
     }
     for entity, values in wanted.items():
@@ -70,6 +80,31 @@ def test_delays_headroom_and_errors_in_the_recording_are_those_of_the_ticks(run:
         np.testing.assert_allclose(found, values, rtol=1e-12, atol=1e-9)
     assert len(flown) > 200
     assert np.nanmax(errors_m[0]) > 10 > np.nanmax(errors_m[-1])
+
+
+def test_a_margin_is_drawn_for_the_gains_each_vehicle_is_flown_with(tmp_path: Path) -> None:
+    """The loop delay of vehicle 2 passes the margin of the fastest gains, and it changes to slower ones."""
+    links = SCENARIO.links.model_copy(update={"vehicles": (VehicleLinks(system_id=2, up=SLOW, down=SLOW),)})
+    folder = recorded(SCENARIO.model_copy(update={"links": links}), tmp_path)
+    times_s, margins_ms = read_back(folder / "flight.rrd", "/delay/margin_ms", "Scalars:scalars")
+    _, headroom = read_back(folder / "flight.rrd", "/headroom/percent", "Scalars:scalars")
+    _, loops_ms = read_back(folder / "flight.rrd", "/delay/loop_ms", "Scalars:scalars")
+    flown = times_s < 3.9
+    margins_ms, headroom, loops_ms = margins_ms[flown], headroom[flown], loops_ms[flown]
+    own = [vehicle.system_id for vehicle in SCENARIO.vehicles].index(2)
+    assert margins_ms[0] == pytest.approx([300.0] * 5, abs=0.1)
+    design = json.loads((folder / DESIGN_FILE).read_text(encoding="utf-8"))
+    slower_s = design["schedule"][1]["delay_margin_s"]
+    assert slower_s > 0.6
+    assert margins_ms[-1, own] == pytest.approx(1e3 * slower_s)
+    assert np.delete(margins_ms[-1], own) == pytest.approx([300.0] * 4, abs=0.1)
+    known = np.isfinite(headroom)
+    np.testing.assert_allclose((100.0 * (1.0 - loops_ms / margins_ms))[known], headroom[known], rtol=1e-9, atol=1e-9)
+    summary = finish(folder)
+    margins = {vehicle["system_id"]: vehicle["delay_margin_s"] for vehicle in summary["vehicles"]}
+    assert margins[2] == {"min": pytest.approx(0.3, abs=1e-4), "max": pytest.approx(slower_s, abs=1e-6)}
+    assert margins[3]["max"] == pytest.approx(0.3, abs=1e-4)
+    assert "margin 300.0 ms, up to 610.0 ms with slower gains" in delay_text(summary)
 
 
 @pytest.mark.skipif(vulkan_missing(), reason="no Vulkan driver installed (Debian: mesa-vulkan-drivers)")

@@ -159,12 +159,17 @@ def test_the_recording_brings_its_own_screen(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("margin", [None, float("inf")])
-def test_a_design_without_a_finite_margin_draws_no_margin(tmp_path: Path, margin: float | None) -> None:
+def test_gains_without_a_finite_margin_draw_no_margin(tmp_path: Path, margin: float | None) -> None:
+    ticks = ticks_of(FIVE, start_s=0.0, count=5)
+    ticks["delay_margin_s"] = np.inf
     with Recording(tmp_path, FIVE, DESIGN | {"delay_margin_s": margin}) as recording:
-        recording.add(ticks_of(FIVE, start_s=0.0, count=5), [])
+        recording.add(ticks, [])
     paths = {chunk.entity_path for chunk in RrdReader(tmp_path / RECORDING_FILE).stream()}
-    assert "/delay/margin_continuous_ms" in paths
-    assert "/delay/margin_sampled_ms" not in paths
+    drawn = "/delay/margin_ms" in paths and any(
+        chunk.entity_path == "/delay/margin_ms" and not chunk.is_static
+        for chunk in RrdReader(tmp_path / RECORDING_FILE).stream()
+    )
+    assert not drawn
 
 
 def test_ticks_are_given_when_whole_and_gaps_are_unknown() -> None:

@@ -46,7 +46,7 @@ def test_every_column_holds_what_its_name_says() -> None:
         "velocity_error_north_m_s": 7.0, "velocity_error_east_m_s": 8.0,
         "command_north_m_s2": 9.0, "command_east_m_s2": 10.0,
         "nearest_m": 121.5, "queue_s": 0.001, "up_delay_s": 0.025, "sample_bound_s": 3e-6, "down_delay_s": 0.03,
-        "down_bound_s": 4e-6, "loop_delay_s": 0.09, "headroom": 0.775,
+        "down_bound_s": 4e-6, "loop_delay_s": 0.09, "delay_margin_s": 0.4, "headroom": 0.775,
         "rtt_s": 0.07, "clock_offset_s": 3.0, "clock_offset_bound_s": 55e-6,  # 5 µs, and 0.1 % of 50 ms
         "received": 5, "lost": 1, "late": 1, "duplicate": 1,
     }  # fmt: skip
@@ -64,5 +64,5 @@ def test_what_is_not_known_is_not_a_number() -> None:
     seen = VehicleTick(vehicle, VehicleState(), nothing, Reported(), nan, nan, False, 0.4)
     rows, delays_s = tick_rows(Tick(0, -1.0, S, 0, [seen]), S)
     unknown = {name for name in TICK.names or () if rows[name].dtype.kind == "f" and np.isnan(rows[name][0])}
-    assert unknown == {name for name in TICK.names or () if TICK[name].kind == "f"} - {"time_s"}
+    assert unknown == {name for name in TICK.names or () if TICK[name].kind == "f"} - {"time_s", "delay_margin_s"}
     assert np.isnan(delays_s).all()

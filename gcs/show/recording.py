@@ -7,7 +7,7 @@ same for two hundred vehicles as for two.
     formation/...   vehicles, trails, wanted places and links as seen from the leader, in m north, east, down of it
     ground/...      the same over the ground, local NED
     spacing/...     spacing errors of the followers, and below what they count as settled
-    delay/...       loop delay and round trip of each vehicle, and the delay margins, in ms
+    delay/...       loop delay and round trip of each vehicle, and the margin of the gains it is flown with, in ms
     headroom/...    in %
     command/...     accelerations sent
     modes/ID        what the station thinks of a vehicle;  events: what happened
@@ -86,7 +86,7 @@ class Recording:
         self._scenario = scenario
         self._tree = tree_of(scenario)
         self._labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
-        self._levels = _levels(scenario, design)
+        self._levels = _levels(scenario)
         self._before_s = patience_s(scenario)
         self._ticks: list[TickArray] = []
         self._events: list[dict[str, Any]] = []
@@ -97,7 +97,7 @@ class Recording:
         self._trail_times = PictureTimes(TRAIL_STEP_S)
         self._trail_ends_m: Floats | None = None
         self._stream = rr.RecordingStream("formation-gcs")
-        self._stream.save(folder / UNFINISHED_FILE, default_blueprint=_blueprint(scenario, self._levels))
+        self._stream.save(folder / UNFINISHED_FILE, default_blueprint=_blueprint(scenario, design))
         self._stream.send_recording_name(scenario.name)
         self._log_scene_styles()
         self._log_plot_styles()
@@ -120,10 +120,8 @@ class Recording:
         self._events += events
 
     def redesigned(self, design: dict[str, Any]) -> None:
-        """Compare with the margins of another design; for before anything is flown."""
-        self._levels = _levels(self._scenario, design)
-        self._log_plot_styles()
-        self._stream.send_blueprint(_blueprint(self._scenario, self._levels))
+        """Name the margins of another design."""
+        self._stream.send_blueprint(_blueprint(self._scenario, design))
 
     def send(self) -> None:
         """Write what was added."""
@@ -163,6 +161,9 @@ class Recording:
             errors_m = np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])
             self._scalars("spacing/error_m", times_s, errors_m[:, self._tree.followers])
         self._scalars("delay/loop_ms", times_s, 1e3 * ticks["loop_delay_s"])
+        margins_ms = 1e3 * ticks["delay_margin_s"]
+        if np.isfinite(margins_ms).any():
+            self._scalars("delay/margin_ms", times_s, np.where(np.isfinite(margins_ms), margins_ms, np.nan))
         # Round trips end at some ticks only: each is shown until the next.
         self._scalars("delay/rtt_ms", times_s, self._newest_rtt_ms.fill(1e3 * ticks["rtt_s"]))
         self._scalars("headroom/percent", times_s, 100 * ticks["headroom"])
@@ -279,6 +280,7 @@ class Recording:
         lines("spacing/error_m", [labels[k] for k in followers], [colors[k] for k in followers])
         lines("delay/loop_ms", labels, colors)
         lines("delay/rtt_ms", [f"{label} RTT" for label in labels], [dimmed(color) for color in colors], 0.8)
+        lines("delay/margin_ms", [f"{label} margin" for label in labels], [LIMIT_COLOR] * len(labels), 3.5)
         for path in ("headroom/percent", "command/north_m_s2", "command/east_m_s2"):
             lines(path, labels, colors)
         for level in self._levels:
@@ -307,15 +309,10 @@ def viewer_client(address: str) -> Any:
     return ViewerClient.connect(address)
 
 
-def _levels(scenario: Scenario, design: dict[str, Any]) -> list[Level]:
+def _levels(scenario: Scenario) -> list[Level]:
     """What the curves are to be compared with, and zero where it would be out of sight."""
     levels = [Level("delay/zero", "0", 0.0), Level("headroom/all", "100 %", 100.0)]
     levels.append(Level("headroom/none", "0 %: loop delay = margin", 0.0, limit=True))
-    for key, name in (("delay_margin_s", "sampled"), ("delay_margin_continuous_s", "continuous")):
-        margin_s = design.get(key)
-        if margin_s is not None and math.isfinite(margin_s):
-            text = f"delay margin {1e3 * margin_s:.0f} ms ({name})"
-            levels.append(Level(f"delay/margin_{name}_ms", text, 1e3 * margin_s, limit=name == "sampled"))
     spacings_m = [math.hypot(*v.offset_ne_m) for v in scenario.vehicles if v.offset_ne_m is not None]
     settled_m = sorted({round(scenario.safety.settled_fraction * spacing_m, 6) for spacing_m in spacings_m})
     # With spacings of many lengths, the least and the greatest bound enclose the others.
@@ -336,7 +333,14 @@ def _event_level(event: dict[str, Any]) -> str:
     return "WARN" if "CAUTION" in last else "INFO"
 
 
-def _blueprint(scenario: Scenario, levels: list[Level]) -> Any:
+def _margins_text(design: dict[str, Any]) -> str:
+    """The margins of a design, by model, as far as there are any."""
+    named = (("sampled", design.get("delay_margin_s")), ("continuous", design.get("delay_margin_continuous_s")))
+    known = [f"{1e3 * s:.0f} ms {name}" for name, s in named if s is not None and math.isfinite(s)]
+    return "; of the fastest gains " + ", ".join(known) if known else ""
+
+
+def _blueprint(scenario: Scenario, design: dict[str, Any]) -> Any:
     """The screen: the scene on the left, with modes and events; plots on the right; time below."""
     import rerun.blueprint as rrb
     from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
@@ -346,7 +350,6 @@ def _blueprint(scenario: Scenario, levels: list[Level]) -> Any:
         return rrb.TimeSeriesView(name=name, origin="/", contents=list(contents), plot_legend=corner)
 
     few = len(scenario.vehicles) <= LEGEND_MAX
-    margins = "".join(f", {level.name}" for level in levels if level.path.startswith("delay/margin"))
     events = rrb.TextLogColumns(
         timeline_columns=[TimelineColumn(timeline=TIMELINE, visible=False)],  # the text says it, as it was before 0 too
         text_log_columns=[TextLogColumn(kind="loglevel"), TextLogColumn(kind="body")],
@@ -364,7 +367,7 @@ def _blueprint(scenario: Scenario, levels: list[Level]) -> Any:
             ),
             rrb.Vertical(
                 plot("Spacing errors [m]", "/spacing/**", legend=few),
-                plot(f"Loop delay and RTT (dim) [ms]{margins}", "/delay/**"),
+                plot(f"Loop delay, RTT (dim), margin (red{_margins_text(design)}) [ms]", "/delay/**"),
                 plot("Headroom: 1 − loop delay / margin [%]", "/headroom/**"),
                 rrb.Tabs(
                     plot("Command north [m/s²]", "/command/north_m_s2"),

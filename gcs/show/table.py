@@ -65,8 +65,8 @@ class FlightState:
 
     def __init__(self, scenario: Scenario, design: dict[str, Any]) -> None:
         self.scenario = scenario
-        self.margins_s: list[float] = []
-        """Delay margin of each gain set, the fastest first."""
+        self.margin_s = np.nan
+        """Delay margin of the fastest gains."""
         self.redesigned(design)
         self.phase = UNKNOWN
         self.refused = ""
@@ -87,8 +87,8 @@ class FlightState:
 
     def redesigned(self, design: dict[str, Any]) -> None:
         """Compare with the margins of a design."""
-        schedule = design.get("schedule") or [design]
-        self.margins_s = [np.nan if s["delay_margin_s"] is None else float(s["delay_margin_s"]) for s in schedule]
+        margin_s = design["delay_margin_s"]
+        self.margin_s = np.nan if margin_s is None else float(margin_s)
 
     def add(self, ticks: TickArray, events: list[dict[str, Any]]) -> None:
         """Take whole ticks, shape (ticks, vehicles), and events."""
@@ -185,7 +185,8 @@ def _headline(state: FlightState) -> Text:
     time = UNKNOWN if np.isnan(state.time_s) else time_text(state.time_s, state.before_s, ".1f")
     line = Text.assemble((state.scenario.name, "bold"), "  ", (state.phase, "bold cyan"), f"  {time}")
     loop = state.scenario.control.loop
-    line.append(f"   delay margin {_number(1e3 * state.margins_s[0], '.0f')} ms (sampled, {loop} loop)", style="dim")
+    margin = _number(1e3 * state.margin_s, ".0f")
+    line.append(f"   delay margin {margin} ms (sampled, {loop} loop, fastest gains)", style="dim")
     line.no_wrap = True
     return line
 
@@ -236,7 +237,7 @@ def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int
             _number(1e3 * figures.rtt_s[k], ".1f"),
             _number(1e3 * figures.loop_delay_s_p50[k], ".1f"),
             _number(1e3 * figures.loop_delay_s_p99[k], ".1f"),
-            _number(1e3 * state.margins_s[state.newest["gain_set"][k]], ".0f"),
+            _number(1e3 * state.newest["delay_margin_s"][k], ".0f"),
             Text(_number(100 * headroom, ".0f"), headroom_style(headroom)),
             Text(_bar(headroom), headroom_style(headroom)),
             str(figures.lost[k]),
