@@ -214,7 +214,7 @@ def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
         outcome,
         growth_1_s=finite(growth.growth_1_s),
         growth_error_1_s=finite(growth.error_1_s),
-        frequency_rad_s=finite(growth.frequency_rad_s),
+        frequency_rad_s=None if growth.frequency_rad_s is None else finite(growth.frequency_rad_s),
         fit_start_s=round(growth.start_s, 6),
         fit_end_s=round(growth.end_s, 6),
         fit_samples=growth.samples,

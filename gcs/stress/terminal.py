@@ -30,6 +30,8 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
     console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
     console.print(f"trials   {result['trials']}: {_kinds(result['trials_of_kind'])}")
     if onset is not None:
+        frequency = onset["frequency_rad_s"]
+        breaks = "" if frequency is None else f"; breaks at {frequency:.2f} rad/s"
         console.print(
             f"onset    {_ms(onset['loop_delay_s'])} ± {1e3 * onset['error_s']:.2f} ms in flight, "
             f"[bold]{onset['difference']:+.3%}[/] from the sampled margin of this loop, {_ms(onset['predicted_s'])}; "
@@ -37,7 +39,7 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
         )
         console.print(
             f"         {_ms(onset['link_delay_s'])} of link delay, up + down: vehicle {onset['critical']} waits "
-            f"{_ms(onset['waiting_s'])} for the control tick; breaks at {onset['frequency_rad_s']:.2f} rad/s"
+            f"{_ms(onset['waiting_s'])} for the control tick{breaks}"
         )
     if result["onset_missing"]:
         found = "none, as predicted" if result["onset_missing_as_predicted"] else "not found"
