@@ -152,17 +152,17 @@ def test_a_coupled_loop_on_links_that_differ_is_its_linear_model_with_the_statio
 def test_effective_delay_of_regular_commands_is_their_loop_delay() -> None:
     acted_ns = 1_000_000_000 + 20_000_000 * np.arange(50, dtype=np.int64)
     commands = np.stack([acted_ns, acted_ns - 130_000_000], axis=1)
-    assert effective_delay_s(commands, period_s=PERIOD_S) == pytest.approx(0.130, abs=1e-12)
+    assert effective_delay_s(commands, held_s=PERIOD_S) == pytest.approx(0.130, abs=1e-12)
 
 
 def test_every_second_command_lost_adds_half_a_period_to_the_effective_delay() -> None:
     acted_ns = 1_000_000_000 + 40_000_000 * np.arange(50, dtype=np.int64)
     commands = np.stack([acted_ns, acted_ns - 130_000_000], axis=1)
-    assert effective_delay_s(commands, period_s=PERIOD_S) == pytest.approx(0.140, abs=1e-12)
+    assert effective_delay_s(commands, held_s=PERIOD_S) == pytest.approx(0.140, abs=1e-12)
 
 
 def test_no_commands_have_no_delay() -> None:
-    assert effective_delay_s(np.empty((0, 2), dtype=np.int64), period_s=PERIOD_S) == 0.0
+    assert effective_delay_s(np.empty((0, 2), dtype=np.int64), held_s=PERIOD_S) == 0.0
 
 
 def test_loss_is_predicted_by_the_effective_delay_and_not_by_the_median() -> None:

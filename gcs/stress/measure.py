@@ -25,7 +25,7 @@ from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, p
 
 AMPLITUDES = (1.0, 0.03, 0.001)
 """Initial error of a probe in m (the leader's in m/s); the next is for growth that leaves the linear range too soon."""
-_PILOT_S = 1.0
+_PILOT_S, _PILOT_PERIODS = 1.0, 6.0
 _SETTLED_LOOP_DELAYS = 4.0
 """Modes other than the slowest are gone, or small enough to be fitted along, after this many loop delays."""
 _FLYING_LOOP_DELAYS = 1.0
@@ -96,7 +96,8 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     """One loop alone, on links that are all those of the loop that is the first to break."""
     base = plan_of(trial)
-    pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": _PILOT_S})))
+    pilot_s = max(_PILOT_S, _PILOT_PERIODS * base.timing.held_s)
+    pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": pilot_s})))
     fresh = first_uses(pilot.ticks)
     probed, critical, waiting_s = _choose(base, median_delays_s(fresh, base.formation.system_ids), trial.probe)
     up, down = links = base.scenario.link_of(critical.system_ids[0])
@@ -175,7 +176,7 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
         probed = critical = next(loop for loop in loops if probe in loop.system_ids)
     slowest = max(critical.system_ids, key=lambda system_id: loop_delay_s[system_id])
     up, down = links.of(slowest)
-    return probed, critical, (loop_delay_s[slowest] - up.delay_s - down.delay_s) % critical.period_s
+    return probed, critical, (loop_delay_s[slowest] - up.delay_s - down.delay_s) % critical.timing.step_s
 
 
 def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcome:
@@ -187,10 +188,10 @@ def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcom
     since_s = own["time_s"] - own["time_s"][0]
     delay_s = max(response.loop_delays_s(own, loop.system_ids).values())
     settled = _SETTLED_LOOP_DELAYS if loop.has_late_terms else _FLYING_LOOP_DELAYS
-    start_s = settled * delay_s + 2.0 * loop.period_s
+    start_s = settled * delay_s + 2.0 * loop.timing.held_s
     # as many as its states, and as many again of what is late; given gains may differ north and east, or couple them
     modes = 2 * max(FOLLOWER_MODES, len(loop.A))
-    motion = motion_of(own, loop.system_ids, period_s=loop.period_s)
+    motion = motion_of(own, loop.system_ids, period_s=loop.timing.held_s)
     if response.varying:
         growth = norm_growth(motion, start_s=start_s, end_s=response.until_s)
     else:

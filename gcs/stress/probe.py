@@ -76,7 +76,7 @@ def probe_scenario(
     The links are changed so that telemetry waits `waiting_s` for the control tick.
     """
     scenario = in_place(plan, system_ids, amplitude=amplitude)
-    up, down = with_waiting(*links, period_s=1.0 / scenario.rates.control_hz, waiting_s=waiting_s)
+    up, down = with_waiting(*links, period_s=plan.timing.step_s, waiting_s=waiting_s)
     update = {
         "links": scenario.links.model_copy(update={"up": up, "down": down, "vehicles": ()}),
         "clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0, "offset_max_s": 0.0}),

@@ -120,8 +120,8 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         raise _no_limit(study, run, tolerance=tolerance)
     if predicted_s <= 0.0:
         raise NoOnset(f"the predicted margin is {predicted_s:g} s: there is no delay at which it is stable")
-    seed, period_s = study.plan.scenario.seed, 1.0 / study.plan.scenario.rates.control_hz
-    centre_s, width_s = predicted_s - period_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
+    seed = study.plan.scenario.seed
+    centre_s, width_s = predicted_s - study.plan.timing.faster_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
     flights: dict[str, Outcome] = {}
     noisy = study.real_time or not has_constant_links(
         study.plan.scenario

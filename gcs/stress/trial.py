@@ -128,10 +128,9 @@ def plan_of(trial: Trial) -> FlightPlan:
 
 
 def plan_loops(plan: FlightPlan) -> list[Loop]:
-    """The loops of a plan at its control period."""
+    """The loops of a plan."""
     predecessors, system_ids = plan.formation.predecessor.tolist(), plan.formation.system_ids
-    period_s = 1.0 / plan.scenario.rates.control_hz
-    return loops_of(predecessors, system_ids, plan.gain, period_s=period_s, onboard=timing_of(plan.scenario))
+    return loops_of(predecessors, system_ids, plan.gain, timing=plan.timing, onboard=timing_of(plan.scenario))
 
 
 def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
