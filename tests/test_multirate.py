@@ -38,7 +38,7 @@ def advanced(loop: Loop, x: Matrix, u: Matrix, duration_s: float) -> Matrix:
     if key not in STEPS:
         generator = np.zeros((n + inputs, n + inputs))
         generator[:n, :n], generator[:n, n:] = A, B
-        STEPS[key] = expm(duration_s * generator)
+        STEPS[key] = np.asarray(expm(duration_s * generator), dtype=np.float64)
     return (STEPS[key] @ np.concatenate([x, u]))[:n]
 
 
@@ -80,7 +80,7 @@ def flown(
         else:
             seen.append(x)
     whole = len(first_uses) // timing.commands * timing.commands
-    return np.array(seen, dtype=np.float64), float(np.mean(list(first_uses.values())[:whole]))
+    return np.array(seen).astype(np.float64), float(np.mean(list(first_uses.values())[:whole]))
 
 
 @pytest.mark.parametrize("loop", [FOLLOWER, TWO_INPUTS], ids=["follower", "two inputs"])

@@ -20,7 +20,7 @@ from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import FreeResponse, effective_delays_s, fly_calm, response_alone, response_paired
 from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth
 from gcs.stress.onset import Loop, critical_loop
-from gcs.stress.probe import PROBE_S, probe_scenario
+from gcs.stress.probe import PROBE_S, past_limits, probe_scenario
 from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_loops, plan_of, with_summary
 
 AMPLITUDES = (1.0, 0.03, 0.001)
@@ -135,6 +135,7 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
         critical=probed.system_ids[0],
         link_delay_s=up.delay_s + down.delay_s,
         waiting_s=round(delays_s[slowest] - up.delay_s - down.delay_s, 9),
+        past_limits=past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]]),
     )
 
     def respond(amplitude: float) -> FreeResponse:

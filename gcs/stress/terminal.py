@@ -48,6 +48,12 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
         console.print(
             f"curve    measured and predicted growth differ by at most {result['curve_error']:.3%} of the range"
         )
+    if result["past_limits"]:
+        console.print(
+            f"limits   the links alone push vehicles past [limits] in {result['past_limits']} probes, which are flown "
+            "without; where limits bind, errors last that the loop alone would bring down",
+            markup=False,
+        )
     _print_noise(console, result["noise"])
     points = [point for point in result["points"] if point["kind"] == "probe"] or result["points"]
     if points:
