@@ -126,6 +126,8 @@ def linear_until_s(scenario: Scenario, own: TickArray, *, share: float) -> float
 def past_limits(scenario: Scenario, own: TickArray) -> bool:
     """Whether vehicles with the scenario's limits could not have done what is in these rows."""
     limits = scenario.limits
+    if limits == Limits():
+        return False
     speed_m_s = np.hypot(own["velocity_north_m_s"], own["velocity_east_m_s"])
     _, size_m_s2 = _sizes(own)
     most_m_s2 = np.minimum(limits.acceleration_max_m_s2 or np.inf, (limits.turn_rate_max_rad_s or np.inf) * speed_m_s)
