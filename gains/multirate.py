@@ -1,34 +1,48 @@
-"""Telemetry at one rate, control at another: the sampled and held loop over the common period of both.
+"""Telemetry at one rate, control at another: when samples are used, and the loop of `gains.sampled` with that.
 
-Within a common period T the vehicle samples its state p times, at phase + i T / p, and the station computes a command
-q times, at j T / q. A sample reaches the station `up_s` later; each command uses the newest sample that has arrived,
-u = K x(sample), acts `down_s` later and is held until the next one acts. Between events the plant x' = A x + B u is
-integrated exactly, so one common period is a linear map of the state and of the samples still in use; the loop is
-stable exactly when its spectral radius is below one. With p = q, no phase and no uplink delay this is `gains.sampled`.
+The vehicle samples its state every `telemetry_s`, the station computes a command every `control_s` from the newest
+sample that has arrived. Only the slower of the two counts: a command from a sample that was used before repeats what is
+held already, and a sample that a newer one overtakes is never used. So over a common period T of both, n commands act,
+n being the number of periods of the slower one in T:
+
+* The slower period is a whole multiple of the faster one, n = 1: every command is late by the same, and the loop is
+  that of `gains.sampled` with the slower period.
+* It is not: a command's loop delay is the least one plus 0, g, 2 g, ... (n - 1) g in an order that the rates fix,
+  g being the faster period / n. A phase between vehicle and station, and how the delay is split between the ways up
+  and down, only turn this order round. So the least loop delay says it all, and so does the mean one, which is by
+  (n - 1) g / 2 longer and changes less from rate to rate: *loop delay* here is the mean of those of the commands that
+  are the first from their sample.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import pairwise
-from math import ceil, floor, inf, isfinite, lcm
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from math import ceil, floor, inf, isfinite
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.bracketing import met_end
 from gains.delay import delay_margin
 from gains.errors import BadModelError
-from gains.sampled import checked_loop
-from gains.sampled_loop import HeldPlant, held_blocks
+from gains.sampled import checked_loop, growth_rate, sampled_delay_margin
+from gains.sampled_loop import held_blocks
 from gains.structure import FloatArray
 
 # instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
 _SAME_INSTANT = 1e-11
-# delays looked at in the time of the shorter of the two periods
-_LOOKS = 16
-# the margin is searched up to this many continuous margins, and common periods more
+# Periods of the slower one in a common period at most. Rates that have no such period take those nearest to them that
+# have one: over so many the phase of real ones creeps by less than a clock drifts within seconds.
+_MOST_COMMANDS = 20
+# delays looked at in the time of the slower period, in which no motion that it shows turns by more than half a circle,
+# or in that of the continuous margin
+_LOOKS, _LOOKS_MARGIN = 6, 40
+# the margin is searched up to this many continuous margins, and slower periods more
 _SEARCHED_MARGINS, _SEARCHED_PERIODS = 3.0, 10.0
-# halvings of a bracket: a sixteenth of a period down to rounding
-_HALVINGS = 48
+# the radius at a margin is this far below one at most
+_RESOLUTION = 1e-13
 # a local maximum of the radius is refined when its sample is above this
 _NEAR_ONE = 0.99
 _GOLDEN = (3.0 - 5.0**0.5) / 2.0
@@ -36,89 +50,111 @@ _GOLDEN = (3.0 - 5.0**0.5) / 2.0
 
 @dataclass(frozen=True)
 class Timing:
-    """When samples are taken, commands computed, and how long both travel.
-
-    Attributes
-    ----------
-    common_period_s
-        T (s); rates of 50 and 20 Hz have 0.1 s.
-    samples, commands
-        p and q: samples and commands in a common period.
-    phase_s
-        How long (s) after a command's instant the first sample is taken, 0 <= phase < T / p.
-    up_s, down_s
-        Delay (s) of a sample on its way to the station and of a command on its way to the vehicle.
+    """Periods (s) of control and telemetry, and what follows from them.
 
     Raises
     ------
     BadModelError
-        A number out of its range; the message names it.
+        A period that is not positive and finite.
 
     Examples
     --------
-    Five samples and two commands in 0.1 s: 50 Hz and 20 Hz. The command at 0.05 s uses the sample of 0.04 s.
+    Control at 50 Hz, telemetry at 20 Hz: samples at 0 and 50 ms are first used at 0 and 60 ms.
 
     >>> from gains.multirate import Timing
-    >>> timing = Timing(0.1, samples=5, commands=2)
-    >>> timing.sampling_s, timing.control_s, timing.sample_used(1)
-    (0.02, 0.05, 2)
+    >>> timing = Timing(control_s=0.02, telemetry_s=0.05)
+    >>> timing.held_s, timing.commands, timing.common_s, timing.spread_s
+    (0.05, 2, 0.1, 0.005)
     """
 
-    common_period_s: float
-    samples: int
-    commands: int
-    phase_s: float = 0.0
-    up_s: float = 0.0
-    down_s: float = 0.0
+    control_s: float
+    telemetry_s: float
 
     def __post_init__(self) -> None:
-        if not (isfinite(self.common_period_s) and self.common_period_s > 0.0):
-            raise BadModelError(f"common_period_s is {self.common_period_s}; a positive number of seconds is wanted")
-        for name in ("samples", "commands"):
-            if getattr(self, name) < 1:
-                raise BadModelError(f"{name} is {getattr(self, name)}; 1 or more in a common period are wanted")
-        for name in ("up_s", "down_s"):
-            if not (isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise BadModelError(f"{name} is {getattr(self, name)}; a number of seconds >= 0 is wanted")
-        if not 0.0 <= self.phase_s < self.common_period_s / self.samples:
-            raise BadModelError(
-                f"phase_s is {self.phase_s}; 0 to below the sampling period of "
-                f"{self.common_period_s / self.samples} s is wanted"
-            )
+        for name in ("control_s", "telemetry_s"):
+            if not (isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise BadModelError(f"{name} is {getattr(self, name)}; a positive number of seconds is wanted")
 
     @property
-    def sampling_s(self) -> float:
-        """From one sample to the next, s."""
-        return self.common_period_s / self.samples
+    def held_s(self) -> float:
+        """The slower period: how long a command from a new sample is held, in the mean."""
+        return max(self.control_s, self.telemetry_s)
 
     @property
-    def control_s(self) -> float:
-        """From one command to the next, s."""
-        return self.common_period_s / self.commands
+    def commands(self) -> int:
+        """n: commands from new samples in a common period."""
+        return self._ratio.denominator
 
-    def sample_used(self, command: int) -> int:
-        """Index of the newest sample that has arrived at the instant of a command; sample 0 is taken at the phase."""
-        periods = (command * self.control_s - self.phase_s - self.up_s) / self.sampling_s
-        return floor(periods + _SAME_INSTANT * self.samples)
+    @property
+    def common_s(self) -> float:
+        """T: the common period of both."""
+        return self.commands * self.held_s
 
-    def commands_acting(self) -> list[tuple[float, int]]:
-        """Instants in [0, T) from which a command acts, with its index; the first one acts at 0 already."""
-        first = floor(-self.down_s / self.control_s + _SAME_INSTANT * self.commands)
-        acting = [(0.0, first)]
-        for command in range(first + 1, first + self.commands + 1):
-            instant_s = command * self.control_s + self.down_s
-            if instant_s < self.common_period_s * (1.0 - _SAME_INSTANT):
-                acting.append((instant_s, command))
-        return acting
+    @property
+    def faster_s(self) -> float:
+        """The faster period, as a part of T."""
+        return self.common_s / self._ratio.numerator
+
+    @property
+    def step_s(self) -> float:
+        """g: by multiples of this the loop delays of commands differ; the faster period where n = 1."""
+        return self.faster_s / self.commands
+
+    @property
+    def spread_s(self) -> float:
+        """By how much the mean loop delay of a common period is longer than the least one."""
+        return (self.faster_s - self.step_s) / 2.0
+
+    @property
+    def _ratio(self) -> Fraction:
+        """Slower over faster period."""
+        return Fraction(self.held_s / min(self.control_s, self.telemetry_s)).limit_denominator(_MOST_COMMANDS)
+
+    def commands_from(self, first: int, last: int) -> list[tuple[float, float]]:
+        """(Instant of its sample, instant at which it is computed) of the commands first to last, without any delay.
+
+        Command 0 is computed from a sample that arrives just then, at 0.
+        """
+        slower_s, faster_s = self.held_s, self.faster_s
+        near = _SAME_INSTANT * self.commands
+        numbers = range(first, last + 1)
+        if self.telemetry_s >= self.control_s:
+            return [(i * slower_s, ceil(i * slower_s / faster_s - near) * faster_s) for i in numbers]
+        return [(floor(i * slower_s / faster_s + near) * faster_s, i * slower_s) for i in numbers]
 
 
-def multirate_spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
-    """Factor by which the slowest motion shrinks (< 1) or grows (> 1) in one common period.
+class LiftedPlant(Protocol):
+    """What is under held commands: linear, and the same in every common period.
+
+    Examples
+    --------
+    x' = u from 0 to 0.3 s and on to 0.5 s:
+
+    >>> import numpy as np
+    >>> from gains.multirate import LiftedPlant
+    >>> from gains.sampled_loop import HeldPlant
+    >>> plant: LiftedPlant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
+    >>> [part.ravel().round(6).tolist() for part in plant.between([0.0, 0.3, 0.5])]
+    [[1.0, 1.0], [0.3, 0.2]]
+    """
+
+    @property
+    def K(self) -> FloatArray: ...  # noqa: N802 - the source's letter
+
+    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """From each instant to the next: maps of the state (k, n, n), and of an input held since then (k, n, r)."""
+        ...
+
+
+def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing, *, delay_s: float) -> float:
+    """Exponential rate (1/s) of the slowest motion at a (mean) loop delay: negative when stable.
 
     Parameters
     ----------
     A, B, K
         Real matrices (n, n), (n, p), (p, n); the feedback is u = +K x.
+    delay_s
+        Loop delay; one below the least that these rates can have counts as that.
 
     Raises
     ------
@@ -127,150 +163,161 @@ def multirate_spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: 
 
     Examples
     --------
-    x' = u, u = -x with one sample and two commands in 0.5 s: both commands use the one sample, x_{k+1} = (1 - T) x_k.
+    x' = u, u = -x with a sample every 0.5 s and two commands from it, which are the same: x_{k+1} = (1 - T) x_k.
 
-    >>> from gains.multirate import Timing, multirate_spectral_radius
-    >>> round(multirate_spectral_radius([[0]], [[1]], [[-1]], Timing(0.5, samples=1, commands=2)), 6)
+    >>> from math import exp
+    >>> from gains.multirate import Timing, multirate_growth_rate
+    >>> round(exp(0.5 * multirate_growth_rate([[0]], [[1]], [[-1]], Timing(0.25, 0.5), delay_s=0.0)), 6)
     0.5
     """
-    return max(_radius(plant, timing) for plant in _blocks(A, B, K, timing))
+    if timing.commands == 1:
+        return growth_rate(A, B, K, period_s=timing.held_s, delay_s=delay_s)
+    plants = held_blocks(*checked_loop(A, B, K), period_s=timing.common_s)
+    return lifted_growth(plants, timing, delay_s=delay_s)
 
 
-def multirate_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> FloatArray:
-    """The matrix that takes (x, K x(sample -1), K x(sample -2), ...) one common period on.
+def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
+    """The least (mean) loop delay (s) at which the loop loses stability; 0 if at once, `inf` if none is found.
 
-    Arguments and exceptions as of `multirate_spectral_radius`.
-
-    Examples
-    --------
-    x' = u, u = -x with one sample and two commands in 0.5 s, the sample used 0.25 s after it was taken:
-
-    >>> from gains.multirate import Timing, multirate_map
-    >>> multirate_map([[0]], [[1]], [[-1]], Timing(0.5, samples=1, commands=2, up_s=0.25)).round(6).tolist()
-    [[0.75, 0.25], [-1.0, 0.0]]
-    """
-    return _lifted(HeldPlant(*checked_loop(A, B, K), timing.common_period_s), timing)
-
-
-def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing, *, up_share: float = 0.5) -> float:
-    """The least delay (s) up and down together, added to that of `timing`, at which the loop loses stability.
-
-    `up_share` of it is on the way up, the rest on the way down. The delay up matters only through which sample a
-    command finds, so the spectral radius jumps with it; between jumps it is continuous. Every jump is looked at from
-    both sides, the stretches between at a sixteenth of a period, peaks refined: a search, not a proof. 0 if the loop is
-    unstable as it is, `inf` if no limit is found within three times the margin of the continuous loop and ten common
-    periods. Arguments as of `multirate_spectral_radius`.
+    Where the slower period is a multiple of the faster one it is that of `gains.sampled`, exact. Else the least loop
+    delay is raised in small steps, peaks refined: a search, not a proof, up to three
+    times the margin of the continuous loop and ten of the slower periods. Arguments as of `multirate_growth_rate`.
 
     Raises
     ------
     BadModelError
         Naming the argument, what was read and what was wanted.
+    DisagreementError
+        See `gains.sampled.sampled_delay_margin`.
 
     Examples
     --------
-    x' = u, u = -x at one rate, all delay on the way down: the margin of `gains.sampled`, 1 s with a period of 1 s.
+    x' = u, u = -x: with a period of 1 s it takes a delay of 1 s, whichever of the two rates has it.
 
     >>> from gains.multirate import Timing, multirate_delay_margin
-    >>> round(multirate_delay_margin([[0]], [[1]], [[-1]], Timing(1.0, samples=1, commands=1), up_share=0.0), 6)
-    1.0
+    >>> [round(multirate_delay_margin([[0]], [[1]], [[-1]], Timing(*s)), 6) for s in ((1.0, 0.2), (0.2, 1.0))]
+    [1.0, 1.0]
     """
-    if not 0.0 <= up_share <= 1.0:
-        raise BadModelError(f"up_share is {up_share}; 0 (all on the way down) to 1 is wanted")
-    plants = _blocks(A, B, K, timing)
+    if timing.commands == 1:
+        return sampled_delay_margin(A, B, K, period_s=timing.held_s)
     plant, entry, feedback = checked_loop(A, B, K)
     continuous_s = delay_margin(plant, entry @ feedback)
-    known_s = continuous_s if isfinite(continuous_s) else 0.0
-    last_s = _SEARCHED_MARGINS * known_s + _SEARCHED_PERIODS * timing.common_period_s
-
-    def radius(added_s: float) -> float:
-        late = replace(timing, up_s=timing.up_s + up_share * added_s, down_s=timing.down_s + (1.0 - up_share) * added_s)
-        return max(_radius(block, late) for block in plants)
-
-    if radius(0.0) >= 1.0:
-        return 0.0
-    for begin_s, end_s in pairwise(_jumps(timing, up_share, last_s)):
-        inset_s = 10.0 * _SAME_INSTANT * timing.common_period_s
-        points = ceil((end_s - begin_s) / min(timing.sampling_s, timing.control_s) * _LOOKS) + 2
-        looks = np.linspace(begin_s + inset_s, end_s - inset_s, points).tolist()
-        found_s = _first_unstable(radius, looks)
-        if found_s < inf:
-            # unstable just after a jump: the jump is the limit
-            return begin_s if found_s == looks[0] else found_s
-    return inf
+    return lifted_margin(held_blocks(plant, entry, feedback, period_s=timing.common_s), timing, near_s=continuous_s)
 
 
-def _first_unstable(radius: Callable[[float], float], looks: list[float]) -> float:
-    """The least delay of a stretch at which the radius reaches one, `inf` if it does nowhere."""
-    radii: list[float] = []
-    for i, look in enumerate(looks):
-        radii.append(radius(look))
-        if radii[i] >= 1.0:
-            return _bisected(radius, looks[i - 1], look) if i > 0 else look
-        # a peak between two looks
-        if i > 1 and radii[i - 1] > _NEAR_ONE and radii[i - 2] < radii[i - 1] > radii[i]:
-            peak_s = _peak(radius, looks[i - 2], look)
-            if radius(peak_s) >= 1.0:
-                return _bisected(radius, looks[i - 2], peak_s)
-    return inf
+def multirate_map(plant: LiftedPlant, timing: Timing, *, delay_s: float) -> FloatArray:
+    """The matrix that takes (x, K x(sample -1), K x(sample -2), ...) one common period on.
 
+    Examples
+    --------
+    x' = u, u = -x, a sample and a command every 0.5 s that acts 0.25 s later:
 
-def _blocks(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> list[HeldPlant]:
-    return held_blocks(*checked_loop(A, B, K), period_s=timing.common_period_s)
-
-
-def _radius(plant: HeldPlant, timing: Timing) -> float:
-    return float(np.abs(np.linalg.eigvals(_lifted(plant, timing))).max())
-
-
-def _lifted(plant: HeldPlant, timing: Timing) -> FloatArray:
-    """One common period, event by event; x and every K x(sample) as linear maps of the state at its beginning."""
-    n, inputs = plant.B.shape
-    acting = timing.commands_acting()
-    used = {command: timing.sample_used(command) for _, command in acting}
-    kept = max(0, -min(used.values()))
-    size = n + kept * inputs
-    start = np.eye(size)
+    >>> import numpy as np
+    >>> from gains.multirate import Timing, multirate_map
+    >>> from gains.sampled_loop import HeldPlant
+    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
+    >>> multirate_map(plant, Timing(0.5, 0.5), delay_s=0.25).round(6).tolist()
+    [[0.75, 0.25], [-1.0, 0.0]]
+    """
+    inputs, n = plant.K.shape
+    common_s, count, least_s = timing.common_s, timing.commands, max(0.0, delay_s - timing.spread_s)
+    earlier = count * (ceil(least_s / common_s) + 2)
+    known = list(enumerate(timing.commands_from(-earlier, count - 1), start=-earlier))
+    close_s = _SAME_INSTANT * common_s
+    acting = [(computed_s + least_s, i) for i, (_, computed_s) in known]
+    oldest = max(i for acts_s, i in acting if acts_s <= close_s)
+    kept = max(0, -oldest)
+    start = np.eye(n + kept * inputs)
     x = start[:n]
     samples = {-age: start[n + (age - 1) * inputs : n + age * inputs] for age in range(1, kept + 1)}
-    sampled = [(timing.phase_s + i * timing.sampling_s, i) for i in range(timing.samples)]
-    instants = _merged([instant for instant, _ in (*acting, *sampled)], timing.common_period_s)
-    states, holds = plant.transition(np.diff([*instants, timing.common_period_s]))
-    close_s = _SAME_INSTANT * timing.common_period_s
-    for instant, Phi, hold in zip(instants, states, holds, strict=True):
-        samples |= {i: plant.K @ x for taken, i in sampled if abs(taken - instant) <= close_s}
-        command = max(command for begin, command in acting if begin <= instant + close_s)
-        x = Phi @ x + hold @ samples[used[command]]
-    history = [samples[timing.samples - age] for age in range(1, kept + 1)]
-    return np.vstack([x, *history])
+    sampled = [(taken_s, i) for i, (taken_s, _) in known if i >= 0]
+    inside = [acts_s for acts_s, i in acting if i > oldest and acts_s < common_s - close_s]
+    instants = _merged([0.0, *inside, *(taken_s for taken_s, _ in sampled), common_s], close_s)
+    for instant, Phi, hold in zip(instants, *plant.between(instants), strict=False):
+        samples |= {i: plant.K @ x for taken_s, i in sampled if abs(taken_s - instant) <= close_s}
+        command = max(i for acts_s, i in acting if acts_s <= instant + close_s)
+        x = Phi @ x + hold @ samples[command]
+    return np.vstack([x, *(samples[count - age] for age in range(1, kept + 1))])
 
 
-def _merged(instants: list[float], period_s: float) -> list[float]:
+def lifted_growth(plants: Sequence[LiftedPlant], timing: Timing, *, delay_s: float) -> float:
+    """As `multirate_growth_rate`, of the blocks of a loop whose plants run in a common period.
+
+    Examples
+    --------
+    x' = u, u = -x, sampled every 0.5 s: x_{k+1} = 0.5 x_k.
+
+    >>> import numpy as np
+    >>> from gains.multirate import Timing, lifted_growth
+    >>> from gains.sampled_loop import HeldPlant
+    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
+    >>> round(lifted_growth([plant], Timing(0.5, 0.5), delay_s=0.0), 6)
+    -1.386294
+    """
+    radius = max(_radius(plant, timing, delay_s) for plant in plants)
+    return float(np.log(radius)) / timing.common_s if radius > 0.0 else -inf
+
+
+def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: float) -> float:
+    """As `multirate_delay_margin`, likewise; `near_s` is the margin of the continuous loop.
+
+    Examples
+    --------
+    x' = u, u = -x, sampled every second:
+
+    >>> import numpy as np
+    >>> from gains.multirate import Timing, lifted_margin
+    >>> from gains.sampled_loop import HeldPlant
+    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=1.0)
+    >>> round(lifted_margin([plant], Timing(1.0, 1.0), near_s=np.pi / 2), 6)
+    1.0
+    """
+    known_s = near_s if isfinite(near_s) else 0.0
+    last_s = _SEARCHED_MARGINS * known_s + _SEARCHED_PERIODS * timing.held_s
+    step_s = max(timing.held_s / _LOOKS, known_s / _LOOKS_MARGIN)
+    looks = (timing.spread_s + np.arange(0.0, last_s, step_s)).tolist()
+    margins_s: list[float] = []
+    for plant in plants:
+        # without feedback one look tells
+        found_s = _first_unstable(partial(_radius, plant, timing), looks if plant.K.any() else looks[:1])
+        margins_s.append(found_s)
+    return min(margins_s)
+
+
+def _radius(plant: LiftedPlant, timing: Timing, delay_s: float) -> float:
+    return float(np.abs(np.linalg.eigvals(multirate_map(plant, timing, delay_s=delay_s))).max())
+
+
+def _merged(instants: list[float], close_s: float) -> list[float]:
     """Ascending instants, those within rounding of each other once."""
     merged: list[float] = []
     for instant in sorted(instants):
-        if not merged or instant - merged[-1] > _SAME_INSTANT * period_s:
+        if not merged or instant - merged[-1] > close_s:
             merged.append(instant)
     return merged
 
 
-def _jumps(timing: Timing, up_share: float, last_s: float) -> list[float]:
-    """Added delays (s), ascending from 0 to `last_s`, at which a command begins to find an older sample."""
-    if up_share == 0.0:
-        return [0.0, last_s]
-    # instants of commands and of samples differ by the phase and multiples of this
-    step_s = timing.common_period_s / lcm(timing.samples, timing.commands)
-    offset_s = timing.phase_s + timing.up_s
-    first, last = ceil(offset_s / step_s), floor((offset_s + up_share * last_s) / step_s)
-    jumps = [(k * step_s - offset_s) / up_share for k in range(first, last + 1)]
-    close_s = 100.0 * _SAME_INSTANT * timing.common_period_s
-    return [0.0, *(jump for jump in jumps if close_s < jump < last_s - close_s), last_s]
+def _first_unstable(radius: Callable[[float], float], looks: list[float]) -> float:
+    """The least delay at which the radius reaches one: 0 if at the first look, `inf` if at none."""
+    radii: list[float] = []
+    for i, look in enumerate(looks):
+        radii.append(radius(look))
+        if radii[i] >= 1.0:
+            return _edge(radius, looks[i - 1], look) if i > 0 else 0.0
+        # a peak between two looks
+        if i > 1 and radii[i - 1] > _NEAR_ONE and radii[i - 2] < radii[i - 1] > radii[i]:
+            peak_s = _peak(radius, looks[i - 2], look)
+            if radius(peak_s) >= 1.0:
+                return _edge(radius, looks[i - 2], peak_s)
+    return inf
 
 
-def _bisected(radius: Callable[[float], float], stable_s: float, unstable_s: float) -> float:
-    for _ in range(_HALVINGS):
-        middle_s = (stable_s + unstable_s) / 2.0
-        stable_s, unstable_s = (stable_s, middle_s) if radius(middle_s) >= 1.0 else (middle_s, unstable_s)
-    return stable_s
+def _edge(radius: Callable[[float], float], stable_s: float, unstable_s: float) -> float:
+    def excess(delay_s: float) -> float:
+        return 1.0 - radius(delay_s)
+
+    met, missed = ((delay_s, excess(delay_s)) for delay_s in (stable_s, unstable_s))
+    return met_end(excess, met, missed, resolution=_RESOLUTION)
 
 
 def _peak(radius: Callable[[float], float], begin_s: float, end_s: float) -> float:

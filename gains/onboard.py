@@ -10,7 +10,8 @@ As it is flown nothing of it is continuous. With the control period T of the sta
   instant. Its spacing error it knows from its sensor, which looks at every `steps_per_sample`-th step; between two
   looks the spacing is carried on with the relative velocity that the sensor saw.
 * The station computes its part from states that all vehicles sampled at one instant t_k = k T, with the first of the
-  vehicles' steps. It acts from t_k + tau on, at that very instant, and is held for T.
+  vehicles' steps. It acts from t_k + tau on, at that very instant, and is held for T. With telemetry at another rate
+  than control T is the slower period, or the common one as `gains.multirate` has it.
 
 So over one period T the local loop is a linear map of the state alone, and what is late enters it as the command of a
 held loop enters a plant: everything that `gains.sampled_crossings` says of such loops holds for this one too. The
@@ -18,9 +19,11 @@ vehicles' steps are taken to be in step with each other; clocks that are apart b
 the second order of the step.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf
+from itertools import pairwise
+from math import ceil, inf
 
 import numpy as np
 
@@ -28,6 +31,7 @@ from gains.delay import delay_margin
 from gains.delay_loci import factor_rank
 from gains.errors import BadModelError
 from gains.formation import FloatArray, FormationModel
+from gains.multirate import Timing, lifted_growth, lifted_margin
 from gains.sampled_crossings import block_delay_margin
 from gains.sampled_loop import HeldPlant, block_radius, matrix_exponentials
 from gains.structure import IntArray, balanced, distinct_blocks
@@ -43,11 +47,13 @@ class OnboardTiming:
     Attributes
     ----------
     control_s
-        Period (s) of telemetry, of what the station computes, and of its hold.
+        Period (s) of what the station computes.
     steps
         Steps of the vehicle's own loop in a control period.
     steps_per_sample
         The sensor looks at one of so many steps; a divisor of `steps`.
+    telemetry_s
+        Period (s) of telemetry; that of the control if None.
 
     Examples
     --------
@@ -55,12 +61,13 @@ class OnboardTiming:
 
     >>> from gains.onboard import OnboardTiming
     >>> OnboardTiming(control_s=0.1, steps=5)
-    OnboardTiming(control_s=0.1, steps=5, steps_per_sample=1)
+    OnboardTiming(control_s=0.1, steps=5, steps_per_sample=1, telemetry_s=None)
     """
 
     control_s: float
     steps: int = 1
     steps_per_sample: int = 1
+    telemetry_s: float | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.control_s < inf:
@@ -70,6 +77,18 @@ class OnboardTiming:
                 f"steps is {self.steps} and steps_per_sample {self.steps_per_sample}; positive whole numbers are "
                 "wanted, the second a divisor of the first"
             )
+
+    @property
+    def rates(self) -> Timing:
+        """When states are used."""
+        return Timing(self.control_s, self.control_s if self.telemetry_s is None else self.telemetry_s)
+
+    @property
+    def common(self) -> "OnboardTiming":
+        """The same over the common period of control and telemetry, as the period of both."""
+        common_s = self.rates.common_s
+        times = round(common_s / self.control_s)
+        return OnboardTiming(common_s, self.steps * times, self.steps_per_sample)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,22 +121,29 @@ class OnboardLoop:
         gains.errors.DisagreementError
             See `gains.sampled.sampled_delay_margin`.
         """
-        return min(block_delay_margin(plant) for plant in self._plants())
+        plants, rates = self.plants(), self.timing.rates
+        if rates.commands == 1:
+            return min(block_delay_margin(plant) for plant in plants)
+        return lifted_margin([SteppedPlant(plant) for plant in plants], rates, near_s=self.continuous_margin_s())
 
     def growth_1_s(self, delay_s: float) -> float:
         """Exponential rate of the slowest motion of the loop as flown: negative when stable."""
-        radius = max(block_radius(plant, delay_s) for plant in self._plants())
-        return float(np.log(radius)) / self.timing.control_s if radius > 0.0 else -inf
+        plants, rates = self.plants(), self.timing.rates
+        if rates.commands > 1:
+            return lifted_growth([SteppedPlant(plant) for plant in plants], rates, delay_s=delay_s)
+        radius = max(block_radius(plant, delay_s) for plant in plants)
+        return float(np.log(radius)) / rates.held_s if radius > 0.0 else -inf
 
     def continuous_at_once(self) -> list[tuple[FloatArray, float]]:
         """What is not late in the continuous model, each term with its delay (s): a hold counts as half a step."""
         return [(self.A, 0.0), (self.sensed + self.known, self.timing.control_s / self.timing.steps / 2.0)]
 
-    def _plants(self) -> "list[LocalPlant]":
+    def plants(self) -> "list[LocalPlant]":
+        """The blocks that have late terms of their own or none, one of each kind."""
         plants: list[LocalPlant] = []
         for block in distinct_blocks(self.A, self.sensed, self.known, self.late):
             A, sensed, known, late = balanced(*block.matrices)
-            plants.append(LocalPlant(A, sensed, known, late, self.timing))
+            plants.append(LocalPlant(A, sensed, known, late, self.timing.common))
         return plants
 
 
@@ -192,6 +218,51 @@ class LocalPlant:
             from_both = from_both @ np.block(one_step)
             on_state.append(from_both[:, :n])
         return np.array(on_state[::-1]), np.array(on_input[::-1])
+
+
+@dataclass(frozen=True, eq=False)
+class SteppedPlant:
+    """A local plant that can be looked at between its steps too, as a `gains.multirate.LiftedPlant`.
+
+    Its state is that of the block, what the sensor saw of it last, and what the vehicle itself adds to x'.
+    """
+
+    local: LocalPlant
+
+    @property
+    def K(self) -> FloatArray:  # noqa: N802 - the source's letter
+        K = self.local.K
+        return np.hstack([K, np.zeros((len(K), 2 * K.shape[1]))])
+
+    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """From each of the instants of a period to the next: maps of the state, and of an input held since then."""
+        local, step_s = self.local, self.local.period_s / self.local.timing.steps
+        n, inputs = local.B.shape
+        generator = np.zeros((3 * n + inputs, 3 * n + inputs))
+        generator[:n, :n], generator[:n, 2 * n : 3 * n], generator[:n, 3 * n :] = local.free, np.eye(n), local.B
+        maps: list[FloatArray] = []
+        for begin_s, end_s in pairwise(instants):
+            first, last = (ceil(instant / step_s - _SAME_INSTANT) for instant in (begin_s, end_s))
+            stops = np.array([begin_s, *(step_s * k for k in range(first, last)), end_s])
+            whole = np.eye(3 * n + inputs)
+            for k, flow in enumerate(matrix_exponentials(np.diff(stops)[:, np.newaxis, np.newaxis] * generator)):
+                whole = flow @ (whole if k == 0 else self._step(first + k - 1) @ whole)
+            maps.append(whole)
+        every = np.array(maps)
+        return every[:, : 3 * n, : 3 * n], every[:, : 3 * n, 3 * n :]
+
+    def _step(self, number: int) -> FloatArray:
+        """What a step of the vehicle's loop does to the state and the input held."""
+        local, timing = self.local, self.local.timing
+        n, inputs = local.B.shape
+        age_steps = number % timing.steps_per_sample
+        look = np.eye(3 * n + inputs)
+        if age_steps == 0:
+            look[n : 2 * n, :n], look[n : 2 * n, n : 2 * n] = np.eye(n), 0.0
+        carried = np.eye(n) + age_steps * local.period_s / timing.steps * local.free
+        compute = np.eye(3 * n + inputs)
+        compute[2 * n : 3 * n, : 3 * n] = np.hstack([local.known, local.sensed @ carried, np.zeros((n, n))])
+        return compute @ look
 
 
 def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) -> OnboardLoop:

@@ -6,7 +6,7 @@ A vehicle takes an acceleration u and the velocity v_s that goes with it, v_s' =
 
 so a / u = (s + g) / (lag s² + s + g), which is 1 / (lag s + 1) for g = 0. In place of v_s the state holds the velocity
 still owed, d = v_s - v, d' = u - a. With A, B of this and u = K e the margin is that of `gains.delay` and
-`gains.sampled`: one delay, exact.
+`gains.multirate`: one delay, exact.
 """
 
 from collections.abc import Sequence
@@ -19,8 +19,8 @@ from gains.bracketing import met_end
 from gains.delay import delay_margin
 from gains.errors import BadModelError, InfeasibleError
 from gains.formation import FormationModel
+from gains.multirate import Timing, multirate_delay_margin
 from gains.requirement import Requirement
-from gains.sampled import sampled_delay_margin
 from gains.search import largest_alpha
 from gains.structure import FloatArray
 
@@ -109,10 +109,13 @@ def formation_loop(
     return A, B, np.hstack([K, np.zeros((model.inputs, n - model.states))])
 
 
-def sampled_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response], *, period_s: float) -> float:
-    """The least delay (s) at which the sampled and held loop of these vehicles loses stability.
+def sampled_margin(
+    model: FormationModel, K: FloatArray, responses: Sequence[Response] | None, *, timing: Timing
+) -> float:
+    """The least loop delay (s) at which the sampled and held loop of these vehicles loses stability.
 
-    Arguments and exceptions as of `formation_loop` and `gains.sampled.sampled_delay_margin`.
+    Without responses they answer at once. Arguments and exceptions as of `formation_loop` and
+    `gains.multirate.multirate_delay_margin`.
 
     Examples
     --------
@@ -120,12 +123,14 @@ def sampled_margin(model: FormationModel, K: FloatArray, responses: Sequence[Res
 
     >>> import numpy as np
     >>> from gains.formation import FormationModel
+    >>> from gains.multirate import Timing
     >>> from gains.response import Response, sampled_margin
     >>> leader, K = FormationModel((-1,), axes=1), np.array([[-1.0]])
-    >>> round(sampled_margin(leader, K, [Response(1.0, 0.0)], period_s=0.02), 3)
+    >>> round(sampled_margin(leader, K, [Response(1.0, 0.0)], timing=Timing(0.02, 0.02)), 3)
     1.141
     """
-    return float(sampled_delay_margin(*formation_loop(model, K, responses), period_s=period_s))
+    loop = (model.A, model.B, K) if responses is None else formation_loop(model, K, responses)
+    return float(multirate_delay_margin(*loop, timing))
 
 
 def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response]) -> float:
@@ -175,50 +180,54 @@ def string_peak(gains: Gains, response: Response, *, delay_s: float) -> float:
     return max(1.0, float(growth.max()))
 
 
-def requirement_with(requirement: Requirement, response: Response, *, period_s: float) -> Requirement:
-    """The requirement on vehicles that answer at once whose design has the wanted margin with this response.
+def requirement_with(requirement: Requirement, response: Response | None, *, timing: Timing) -> Requirement:
+    """The requirement on vehicles that answer at once, with one period for telemetry and control, the slower one, whose
+    design has the wanted margin with this response and these periods.
 
-    The margin with the response grows with the one without it: found by false position. A requirement without a margin
-    stays as it is.
+    The margin with them grows with the one without: found by false position. A requirement without a margin stays as
+    it is.
 
     Raises
     ------
     InfeasibleError
-        If no gains have this margin with this response.
+        If no gains have this margin so.
 
     Examples
     --------
     Without a delay margin there is nothing to find:
 
+    >>> from gains.multirate import Timing
     >>> from gains.requirement import Requirement
     >>> from gains.response import Response, requirement_with
-    >>> requirement_with(Requirement(alpha=0.4), Response(0.1, 0.0), period_s=0.02) == Requirement(alpha=0.4)
+    >>> wanted = Requirement(alpha=0.4)
+    >>> requirement_with(wanted, Response(0.1, 0.0), timing=Timing(0.02, 0.02)) == wanted
     True
     """
     wanted_s = requirement.delay_margin_s
-    if wanted_s is None:
+    if wanted_s is None or (response is None and timing.commands == 1):
         return requirement
 
+    responses, lag_s = (None, timing.faster_s) if response is None else ([response] * 2, response.lag_s)
     pair = FormationModel((-1, 0), axes=1)  # a leader-follower tree has the roots of these two, whatever its size
 
     def excess(without_s: float) -> float:
-        found = largest_alpha(without_s, period_s, requirement.string_peak_max, requirement.decay_rate_1_s or 0.0)
+        found = largest_alpha(without_s, timing.held_s, requirement.string_peak_max, requirement.decay_rate_1_s or 0.0)
         if found is None:
             return -wanted_s
         K = pair.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
-        return sampled_margin(pair, K, [response] * 2, period_s=period_s) - wanted_s
+        return sampled_margin(pair, K, responses, timing=timing) - wanted_s
 
     # the response takes about its lag of the margin
-    low, high = wanted_s, wanted_s + response.lag_s
+    low, high = wanted_s, wanted_s + lag_s
     f_low, f_high = excess(low), excess(high)
     while f_high < 0.0 and high < _MARGIN_MAX_S:
-        low, f_low, high = high, f_high, min(high + wanted_s + response.lag_s, _MARGIN_MAX_S)
+        low, f_low, high = high, f_high, min(high + wanted_s + lag_s, _MARGIN_MAX_S)
         f_high = excess(high)
     if f_high < 0.0 or high > _MARGIN_MAX_S:
-        raise InfeasibleError(
-            f"no gains have a sampled delay margin of {wanted_s} s with lag_s = {response.lag_s} and "
-            f"velocity_gain_1_s = {response.velocity_gain_1_s}; ask for less"
+        answer = (
+            f" with lag_s = {response.lag_s} and velocity_gain_1_s = {response.velocity_gain_1_s}" if response else ""
         )
+        raise InfeasibleError(f"no gains have a sampled delay margin of {wanted_s} s{answer}; ask for less")
     if f_low >= 0.0:
         return requirement
     found_s = met_end(excess, (high, f_high), (low, f_low), resolution=_MARGIN_RESOLUTION * wanted_s)

@@ -1,5 +1,6 @@
 """The sampled and held loop in matrices: one block, its hold integrals and its one-period map."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -49,6 +50,10 @@ class HeldPlant:
         generator[:n, :n], generator[:n, n:] = self.A, self.B
         exponentials = matrix_exponentials(duration_s[:, np.newaxis, np.newaxis] * generator)
         return exponentials[:, :n, :n], exponentials[:, :n, n:]
+
+    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """The same from each of the instants to the next."""
+        return self.transition(np.diff(instants))
 
 
 def matrix_exponentials(exponents: FloatArray) -> FloatArray:

@@ -38,15 +38,16 @@ def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
-def effective_delay_s(commands: NDArray[np.int64], *, period_s: float) -> float:
+def effective_delay_s(commands: NDArray[np.int64], *, held_s: float) -> float:
     """The constant loop delay that commands like these stand for: mean age of the state behind them, less T / 2.
 
-    The command in action grows older until the next one acts, T / 2 more in the mean when all arrive. Unlike the
+    T = `held_s` is the slower of the periods of telemetry and control. The command in action grows older until one from
+    a newer state acts, T / 2 more in the mean when all arrive (`gains.multirate`). Unlike the
     median of the loop delays this counts commands that never came. Where delays change fast against the loop's motion
     only the mean age matters, to first order.
     """
     if len(commands) < 2:
         return 0.0
     acted_ns, sampled_ns = commands[:, 0], commands[:-1, 1]
-    held_s, late_s = np.diff(acted_ns) * 1e-9, (acted_ns[:-1] - sampled_ns) * 1e-9
-    return float((held_s * (late_s + held_s / 2.0)).sum() / held_s.sum()) - period_s / 2.0
+    acting_s, late_s = np.diff(acted_ns) * 1e-9, (acted_ns[:-1] - sampled_ns) * 1e-9
+    return float((acting_s * (late_s + acting_s / 2.0)).sum() / acting_s.sum()) - held_s / 2.0

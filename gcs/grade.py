@@ -50,7 +50,7 @@ def grade(folder: Path) -> dict[str, Any]:
     late_s = (left["time_ns"] - left["due_ns"]) * 1e-9
     return {
         "vehicles": len(system_ids),
-        "loop_delay": graded(flown["loop_delay_s"], true_loop_delays_s(flown, truth)),
+        "loop_delay": graded(flown["loop_delay_s"] + flown["repeated_s"], true_loop_delays_s(flown, truth)),
         "rtt": graded(trip_errors_s, np.zeros(len(trip_errors_s))),
         "link_delay": graded(late_s, np.zeros(len(late_s))),
     }
@@ -116,7 +116,8 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
 
 
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
-    """The true loop delay of each row of ticks, in s; NaN where its set-point never acted or no state is known.
+    """The true age (s) of the state behind each row's set-point when that acted; NaN where it never did, or no state is
+    known.
 
     `ticks` are whole: a row for every vehicle.
     """
@@ -139,7 +140,7 @@ def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
     """
     vehicles = len(np.unique(ticks["system_id"]))
     age_s = ticks["telemetry_age_s"].reshape(-1, vehicles)
-    used_s = (ticks["loop_delay_s"] - ticks["down_delay_s"]).reshape(-1, vehicles)
+    used_s = (ticks["loop_delay_s"] + ticks["repeated_s"] - ticks["down_delay_s"]).reshape(-1, vehicles)
     apart_s = np.abs(age_s[:, np.newaxis, :] - used_s[:, :, np.newaxis])
     own = np.arange(vehicles)
     apart_s[:, own, own] -= 1e-9  # its own, where another one is as old

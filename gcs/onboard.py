@@ -33,6 +33,7 @@ def timing_of(scenario: Scenario) -> OnboardTiming | None:
         1.0 / control_hz,
         steps=round(own.rate_hz / control_hz),
         steps_per_sample=round(own.rate_hz / own.sensor_hz),
+        telemetry_s=1.0 / scenario.rates.telemetry_hz,
     )
 
 

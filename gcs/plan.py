@@ -9,9 +9,10 @@ import numpy as np
 from gains.design import Design, design, evaluate_gains
 from gains.formation import FormationModel
 from gains.graph_design import evaluate_graph_gain, time_scaled
+from gains.multirate import Timing
 from gains.pattern import Pattern, leader_follower, with_links, without_links
-from gains.requirement import Requirement
-from gains.response import Response, continuous_margin, requirement_with, string_peak
+from gains.requirement import Requirement, plain
+from gains.response import Response, continuous_margin, requirement_with, sampled_margin, string_peak
 from gains.structure import strongly_connected_blocks
 from gcs.autopilot.responses import Responses, given_responses, margins_with
 from gcs.control import Formation
@@ -22,6 +23,9 @@ from scenarios.schema import Scenario
 NOT_YET_KNOWN = "not yet known"
 _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
+
+_MORE = 1.1
+"""What the rates take of a margin asked for is asked for so many times more: it is a small part of the margin."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +62,20 @@ class FlightPlan:
     def model(self) -> FormationModel:
         return FormationModel(tuple(self.formation.predecessor.tolist()))
 
-    def with_margins(self, margins_s: tuple[float, ...], responses: Responses) -> "FlightPlan":
+    @property
+    def timing(self) -> Timing:
+        """How often the station hears and commands."""
+        return loop_timing(self.scenario)
+
+    def with_margins(self, margins_s: tuple[float, ...], responses: Responses | None) -> "FlightPlan":
         """The same gains with the margins that they have on vehicles that answer so."""
         slower = tuple((gain, s) for (gain, _), s in zip(self.slower, margins_s[1:], strict=True))
         return replace(self, delay_margin_s=margins_s[0], slower=slower, responses=responses)
+
+
+def loop_timing(scenario: Scenario) -> Timing:
+    """The periods at which states and commands of a scenario are sent."""
+    return Timing(1.0 / scenario.rates.control_hz, 1.0 / scenario.rates.telemetry_hz)
 
 
 def plan_formation(scenario: Scenario) -> Formation:
@@ -112,10 +126,14 @@ def _with_responses(
     """Design and plan with the margins of given responses."""
     if responses is None:
         unknown = {"response": {"source": NOT_YET_KNOWN}} if plan.scenario.dynamics == "autopilot" else {}
-        return whole | unknown, plan
-    period_s = 1.0 / plan.scenario.rates.control_hz
+        if plan.timing.commands == 1:  # what the design was found with
+            return whole | unknown, plan
+        plan = plan.with_margins(margins_with(plan.model, plan.gains, None, plan.timing), None)
+        margins = [{"delay_margin_s": plain(margin_s)} for margin_s in plan.margins_s]
+        schedule = [entry | margin for entry, margin in zip(whole["schedule"], margins, strict=True)]
+        return whole | margins[0] | {"schedule": schedule} | unknown, plan
     of = responses.in_order(plan.formation.system_ids)
-    plan = plan.with_margins(margins_with(plan.model, plan.gains, of, period_s=period_s), responses)
+    plan = plan.with_margins(margins_with(plan.model, plan.gains, of, plan.timing), responses)
     return described(whole, plan), plan
 
 
@@ -153,7 +171,7 @@ def _schedule(scenario: Scenario, model: FormationModel, found: Design) -> list[
 
     With K1 / s, K2 / s and K3 / s² the loop does the same things s times slower, so its delay margin is s times larger.
     """
-    period_s = 1.0 / scenario.rates.control_hz
+    period_s = loop_timing(scenario).held_s
     return [
         (s, evaluate_gains(model, found.K1 / s, found.K2 / s, found.K3 / s**2, period_s=period_s))
         for s in scenario.monitor.time_scales[1:]
@@ -167,15 +185,12 @@ def _entry(time_scale: float, design: Design) -> dict[str, Any]:
 
 
 def _design(scenario: Scenario, model: FormationModel, response: Response | None) -> Design:
-    control = scenario.control
-    period_s = 1.0 / scenario.rates.control_hz
+    control, timing = scenario.control, loop_timing(scenario)
     if control.gains is not None:
         own, front, spacing = (gain * np.eye(2) for gain in (control.gains.K1, control.gains.K2, control.gains.K3))
-        return evaluate_gains(model, own, front, spacing, period_s=period_s)
-    requirement = _requirement(scenario)
-    if response is not None:
-        requirement = requirement_with(requirement, response, period_s=period_s)
-    return design(model, requirement, period_s=period_s)
+        return evaluate_gains(model, own, front, spacing, period_s=timing.held_s)
+    requirement = requirement_with(_requirement(scenario), response, timing=timing)
+    return design(model, requirement, period_s=timing.held_s)
 
 
 def _requirement(scenario: Scenario) -> Requirement:
@@ -190,13 +205,19 @@ def _requirement(scenario: Scenario) -> Requirement:
 
 def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel) -> tuple[dict[str, Any], FlightPlan]:
     """Design and plan on an information pattern, designed or given block by block."""
-    control, period_s = scenario.control, 1.0 / scenario.rates.control_hz
+    control, timing = scenario.control, loop_timing(scenario)
+    period_s = timing.held_s
     pattern = _pattern(scenario, formation, model)
     if control.blocks:
         found = evaluate_graph_gain(model, pattern, _given_gain(scenario, formation, model), period_s=period_s)
     else:
         assert control.method != "inclusion"
-        found = design(model, _requirement(scenario), method=control.method, pattern=pattern, period_s=period_s)
+        wanted = _requirement(scenario)
+        found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
+        short_s = (wanted.delay_margin_s or 0.0) - sampled_margin(model, found.K, None, timing=timing)
+        if timing.commands > 1 and short_s > 0.0:
+            wanted = replace(wanted, delay_margin_s=(wanted.delay_margin_s or 0.0) + _MORE * short_s)
+            found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
     scales = scenario.monitor.time_scales
     gains = [time_scaled(model, found.K, scale) for scale in scales]
     slower = [evaluate_graph_gain(model, pattern, gain, period_s=period_s) for gain in gains[1:]]

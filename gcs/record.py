@@ -93,7 +93,8 @@ TICK = np.dtype(
         ("sample_bound_s", "<f8"),  # most that sample_ns, telemetry_age_s and up_delay_s can be wrong (gcs/clocks.py)
         ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
         ("down_bound_s", "<f8"),  # most that it can be wrong
-        ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s; in the ground loop it is the newest one
+        ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s - repeated_s; ground loop: of the newest
+        ("repeated_s", "<f8"),  # how long the set-point has repeated an earlier one, as far as telemetry is slower
         ("delay_margin_s", "<f8"),  # of the gains flown, as known at the time; infinite if no delay is too long
         ("headroom", "<f8"),  # 1 - loop delay / margin
         ("rtt_s", "<f8"),  # a TIMESYNC round trip that has ended and is in no earlier row; NaN if there is none

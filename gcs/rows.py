@@ -1,7 +1,7 @@
 """Filling the rows of the tick record from what the station holds."""
 
 import struct
-from math import nan
+from math import ceil, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +10,11 @@ from gcs.control import VehicleControl
 from gcs.monitor import VehicleState, headroom
 from gcs.record import TICK, TickArray
 from gcs.vehicle import RemoteVehicle
+from scenarios.schema import NS_PER_S, Rates
 
 _CODES = {"<i8": "q", "<u4": "I", "<f8": "d", "|u1": "B", "|b1": "?"}
+_SAME_RATE = 1e-4
+"""Rates whose ratio is this close to a whole number are in this ratio."""
 _ROW = struct.Struct("<" + "".join(_CODES[np.dtype(TICK[name]).str] for name in TICK.names or ()))
 
 
@@ -42,6 +45,9 @@ class VehicleTick(NamedTuple):
     commanded: bool
     margin_s: float
     """Delay margin of the gains flown."""
+    repeated_s: float
+    """How long ago the first command was computed from the state that this one is from, as far as telemetry that is
+    slower than control makes it. A repetition changes nothing, and the loop is no later for it."""
 
 
 class Tick(NamedTuple):
@@ -54,12 +60,29 @@ class Tick(NamedTuple):
     vehicles: list[VehicleTick]
 
 
+class Repetitions:
+    """How long each vehicle's set-points have repeated themselves for want of a newer state."""
+
+    def __init__(self, rates: Rates, vehicles: int) -> None:
+        ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
+        self._longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
+        self._first: list[tuple[int, int]] = [(0, 0)] * vehicles
+
+    def repeated_s(self, row: int, used_ns: int, due_ns: int) -> float:
+        """Since when, at a tick, the same state has been used, in s; no longer than telemetry at its rate makes it."""
+        if self._longest_ns == 0:
+            return 0.0
+        if self._first[row][0] != used_ns:
+            self._first[row] = used_ns, due_ns
+        return min(due_ns - self._first[row][1], self._longest_ns) * 1e-9
+
+
 def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
     """The rows of a tick whose set-points were handed over at `sent_ns`, and the loop delay of each vehicle in s."""
     packed: list[bytes] = []
     delays_s: list[float] = []
     for seen in tick.vehicles:
-        vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, margin_s = seen
+        vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, margin_s, repeated_s = seen
         clock, frames = vehicle.clock, vehicle.frames
         estimate = clock.estimate
         age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
@@ -71,7 +94,8 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
         offset_s = bound_s = nan
         if estimate.samples > 0:
             offset_s, bound_s = estimate.offset_at_ns(sent_ns) * 1e-9, estimate.bound_at_ns(sent_ns) * 1e-9
-        delays_s.append(used_s + down_s)
+        loop_s = used_s + down_s - repeated_s
+        delays_s.append(loop_s)
         packed.append(
             _ROW.pack(
                 tick.number, tick.time_s, tick.due_ns, sent_ns, tick.key_ms, vehicle.system_id,
@@ -81,7 +105,7 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
                 *control.spacing_error_m, *control.velocity_error_m_s,
                 *(control.command_m_s2 if commanded else (nan, nan)),
                 nearest_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
-                used_s + down_s, margin_s, headroom(used_s + down_s, margin_s), rtt_s,
+                loop_s, repeated_s, margin_s, headroom(loop_s, margin_s), rtt_s,
                 offset_s, bound_s,
                 frames.received, frames.lost, frames.late, frames.duplicate,
             )

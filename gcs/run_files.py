@@ -81,6 +81,10 @@ def read_ticks(folder: Path) -> TickArray:
     return ticks
 
 
+_ADDED = {"delay_margin_s": np.nan, "repeated_s": 0.0}
+"""Columns that older runs lack, and what is read for them."""
+
+
 def _from_parquet(file: Path) -> TickArray:
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -89,10 +93,8 @@ def _from_parquet(file: Path) -> TickArray:
         table = pq.read_table(file)
         ticks = np.empty(table.num_rows, TICK)
         for name in TICK.names or ():
-            early = (
-                name == "delay_margin_s" and name not in table.column_names
-            )  # recorded before there was such a column
-            ticks[name] = np.nan if early else table[name].to_numpy()
+            added = name in _ADDED and name not in table.column_names
+            ticks[name] = _ADDED[name] if added else table[name].to_numpy()
     except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
         raise InputError(f"{file}: {str(error).strip()}, wanted the ticks of a run") from None
     return ticks

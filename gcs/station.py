@@ -23,7 +23,7 @@ from gcs.modes import Phase, next_phase, patience_s
 from gcs.monitor import FleetView, FormationMonitor
 from gcs.plan import FlightPlan
 from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
-from gcs.rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.rows import Repetitions, Reported, Tick, VehicleTick, tick_rows
 from gcs.stream import Stream, law_of, set_point, upload_of
 from gcs.telemetry import StateHistory
 from gcs.vehicle import SILENCE_S, Address, RemoteVehicle
@@ -117,6 +117,7 @@ class Station:
         self._stop = ""
         self._now_ns = start_ns
         self._reported = [Reported()] * n
+        self._repetitions = Repetitions(rates, n)
         self._telemetry_ns = [0] * n
         self._fresh_rtt_s = [deque[float]() for _ in range(n)]
         self._loop_delay_s = [nan] * n
@@ -295,7 +296,10 @@ class Station:
             margin_s = self.plan.margins_s[monitored.gain_set]
             fresh_s = self._fresh_rtt_s[row]
             reported, rtt_s = self._reported[row], fresh_s.popleft() if fresh_s else nan
-            seen.append(VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, margin_s))
+            repeated_s = self._repetitions.repeated_s(row, control.used_ns, due_ns)
+            seen.append(
+                VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, margin_s, repeated_s)
+            )
         for vehicle in self.vehicles:
             frame = vehicle.converse(self._now_ns)
             if frame is not None and vehicle.address is not None:

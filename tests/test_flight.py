@@ -20,7 +20,7 @@ from gcs.show.report import print_flight
 from gcs.station import Station
 from gcs.summary import summarise
 from scenarios.files import load
-from scenarios.schema import FixedGains, Monitor, Scenario
+from scenarios.schema import FixedGains, Limits, Monitor, Scenario
 from sim_vehicles.fleet import Fleet
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
@@ -255,3 +255,17 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
     _, summary = flown(plan, design)
     assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design["delay_margin_s"]
     assert (summary["verdict"], summary["settling_time_s"]) == ("unstable", None)
+
+
+def test_the_main_scenario_asks_nothing_of_its_aircraft_that_they_cannot_do() -> None:
+    """Commands stay below the 3 g of its limits from the first tick on, so that limits change nothing in the flight."""
+    plan, design = planned("triangle5", duration_s=4.0)
+    limits = plan.scenario.limits
+    assert limits.acceleration_max_m_s2 is not None
+    assert limits.acceleration_max_m_s2 <= 3.0 * 9.81
+    ticks, _ = flown(plan, design)
+    own = ticks[ticks["commanded"]]
+    assert np.hypot(own["command_north_m_s2"], own["command_east_m_s2"]).max() < limits.acceleration_max_m_s2
+    without, _ = flown(replace(plan, scenario=plan.scenario.model_copy(update={"limits": Limits()})), design)
+    for name in ("spacing_error_north_m", "spacing_error_east_m"):
+        assert np.nanmax(np.abs(ticks[name] - without[name])) < 1e-2

@@ -19,7 +19,7 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.onset import Loop
 from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
-from scenarios.schema import Link, VehicleLinks
+from scenarios.schema import Limits, Link, VehicleLinks
 
 PERIOD_S = 0.02
 
@@ -152,17 +152,30 @@ def test_a_coupled_loop_on_links_that_differ_is_its_linear_model_with_the_statio
 def test_effective_delay_of_regular_commands_is_their_loop_delay() -> None:
     acted_ns = 1_000_000_000 + 20_000_000 * np.arange(50, dtype=np.int64)
     commands = np.stack([acted_ns, acted_ns - 130_000_000], axis=1)
-    assert effective_delay_s(commands, period_s=PERIOD_S) == pytest.approx(0.130, abs=1e-12)
+    assert effective_delay_s(commands, held_s=PERIOD_S) == pytest.approx(0.130, abs=1e-12)
 
 
 def test_every_second_command_lost_adds_half_a_period_to_the_effective_delay() -> None:
     acted_ns = 1_000_000_000 + 40_000_000 * np.arange(50, dtype=np.int64)
     commands = np.stack([acted_ns, acted_ns - 130_000_000], axis=1)
-    assert effective_delay_s(commands, period_s=PERIOD_S) == pytest.approx(0.140, abs=1e-12)
+    assert effective_delay_s(commands, held_s=PERIOD_S) == pytest.approx(0.140, abs=1e-12)
 
 
 def test_no_commands_have_no_delay() -> None:
-    assert effective_delay_s(np.empty((0, 2), dtype=np.int64), period_s=PERIOD_S) == 0.0
+    assert effective_delay_s(np.empty((0, 2), dtype=np.int64), held_s=PERIOD_S) == 0.0
+
+
+@pytest.mark.parametrize(
+    "coordinates", [{"delay": 0.15, "jitter": 0.02, "loss": 0.05}, {"delay": 0.15, "loss": 0.05}, {"delay": 0.15}]
+)
+def test_a_probe_measures_the_loop_whatever_limits_the_vehicles_have(coordinates: dict[str, float]) -> None:
+    """Jitter alone pushes the vehicles past 2 m/s², and a flight that is cut off there is no free response."""
+    limits = Limits(speed_min_m_s=55.0, speed_max_m_s=65.0, acceleration_max_m_s2=2.0, turn_rate_max_rad_s=0.1)
+    limited = replace(pair_plan(), scenario=SCENARIO.model_copy(update={"limits": limits}))
+    one, other = (fly_trial(Study(plan).trial("probe", coordinates, seed=7)) for plan in (limited, pair_plan()))
+    assert one.growth_1_s is not None
+    assert (one.growth_1_s, one.loop_delay_s) == (other.growth_1_s, other.loop_delay_s)
+    assert (one.past_limits, other.past_limits) == ("jitter" in coordinates, False)
 
 
 def test_loss_is_predicted_by_the_effective_delay_and_not_by_the_median() -> None:

@@ -86,17 +86,31 @@ def test_rate_of_a_motion_through_varying_delays_is_its_mean_rate_and_the_error_
     time_s = np.arange(500, dtype=np.float64) * PERIOD_S
     off: list[float] = []
     errors: list[float] = []
+    frequencies: list[float] = []
     for _ in range(60):
         wander = 0.1 * np.cumsum(rng.standard_normal(time_s.size)) * np.sqrt(PERIOD_S)
         angle = 3.7 * time_s + wander
         values = np.exp(growth * time_s + wander)[:, None] * np.stack([np.cos(angle), 3.7 * np.sin(angle)], axis=1)
         found = norm_growth(Motion(time_s, values, PERIOD_S), start_s=0.0)
         assert found is not None
+        assert found.frequency_rad_s is not None
         off.append(found.growth_1_s - growth)
         errors.append(found.error_1_s)
+        frequencies.append(found.frequency_rad_s)
+    assert np.median(frequencies) == pytest.approx(3.7, rel=0.01)
+    assert frequencies == pytest.approx([3.7] * 60, rel=0.1)  # ten seconds: six turns, of which the wander takes part
     spread = float(np.std(off))
     assert abs(np.mean(off)) < 3.0 * spread / np.sqrt(60.0)
     assert spread / 2.0 < np.sqrt(np.mean(np.square(errors))) < 2.0 * spread
+
+
+def test_a_motion_that_turns_no_sign_has_no_frequency() -> None:
+    for found in (
+        norm_growth(motion((-0.3, 1.0)), start_s=0.0),
+        envelope_growth(np.exp(-0.1 * np.arange(80.0)), period_s=0.25, start_s=0.0),
+    ):
+        assert found is not None
+        assert found.frequency_rad_s is None
 
 
 def ticks_with_samples(boot_ms: NDArray[np.int64]) -> TickArray:

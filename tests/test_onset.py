@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gains.formation import FormationModel
+from gains.multirate import Timing
 from gcs.stress.onset import GrowthPoint, Loop, critical_loop, distinct, locate_zero, loops_of
 
 TREE = (-1, 0, 1, 0, 3)
@@ -14,7 +15,7 @@ K1, K2, K3 = -3.4, 0.6, 5.6
 
 def tree_loops(period_s: float = 0.02) -> list[Loop]:
     K = FormationModel(TREE).overlapping_gain(K1 * np.eye(2), K2 * np.eye(2), K3 * np.eye(2))
-    return loops_of(TREE, (1, 2, 3, 4, 5), K, period_s=period_s)
+    return loops_of(TREE, (1, 2, 3, 4, 5), K, timing=Timing(period_s, period_s))
 
 
 def test_every_vehicle_of_a_tree_is_a_loop_of_its_own_and_followers_are_alike() -> None:
@@ -30,7 +31,7 @@ def test_vehicles_that_act_on_each_other_are_one_loop() -> None:
     model = FormationModel((-1, 0, 1))
     K = model.overlapping_gain(K1 * np.eye(2), K2 * np.eye(2), K3 * np.eye(2))
     K[model.input_slice(1), model.velocity_slice(2)] = 0.1 * np.eye(2)  # vehicle 2 looks back as well
-    loops = loops_of((-1, 0, 1), (7, 8, 9), K, period_s=0.02)
+    loops = loops_of((-1, 0, 1), (7, 8, 9), K, timing=Timing(0.02, 0.02))
     assert [loop.system_ids for loop in loops] == [(7,), (8, 9)]
 
 

@@ -11,6 +11,7 @@ from gains.delay import delay_margin
 from gains.design import design
 from gains.errors import BadModelError, InfeasibleError
 from gains.formation import FormationModel
+from gains.multirate import Timing
 from gains.requirement import Requirement
 from gains.response import (
     Response,
@@ -25,6 +26,7 @@ from gains.rightmost import rightmost_root
 GAINS = (-2.1 * np.eye(2), 0.6 * np.eye(2), 2.0 * np.eye(2))
 PAIR = FormationModel((-1, 0))
 K = PAIR.overlapping_gain(*GAINS)
+TIMING = Timing(0.02, 0.02)
 RESPONSES = [Response(0.08, 1.67), Response(0.15, 2.0), Response(0.3, 0.5), Response(0.15, 0.0)]
 
 
@@ -83,7 +85,7 @@ def grows(response: Response, delay_s: float, period_s: float) -> bool:
 @pytest.mark.parametrize("response", RESPONSES)
 def test_a_simulated_follower_diverges_beyond_the_sampled_margin_and_not_below(response: Response) -> None:
     period_s = 0.02
-    margin_s = sampled_margin(PAIR, K, [response] * 2, period_s=period_s)
+    margin_s = sampled_margin(PAIR, K, [response] * 2, timing=Timing(period_s, period_s))
     assert not grows(response, 0.97 * margin_s, period_s)
     assert grows(response, 1.03 * margin_s, period_s)
 
@@ -101,8 +103,8 @@ def test_a_lag_costs_about_its_length() -> None:
 def test_the_margin_of_a_tree_is_that_of_the_vehicle_with_the_least() -> None:
     tree = FormationModel((-1, 0, 1, 0, 3))
     of = [RESPONSES[0], *RESPONSES]
-    each = [sampled_margin(PAIR, K, [response] * 2, period_s=0.02) for response in RESPONSES]
-    together = sampled_margin(tree, tree.overlapping_gain(*GAINS), of, period_s=0.02)
+    each = [sampled_margin(PAIR, K, [response] * 2, timing=TIMING) for response in RESPONSES]
+    together = sampled_margin(tree, tree.overlapping_gain(*GAINS), of, timing=TIMING)
     assert together == pytest.approx(min(each), rel=1e-9)
 
 
@@ -128,12 +130,12 @@ def test_a_gain_of_another_formation_is_refused() -> None:
 
 
 @pytest.mark.parametrize("response", RESPONSES[:2])
-def test_a_design_for_a_response_has_the_margin_asked_for(response: Response) -> None:
-    model, period_s = FormationModel((-1, 0)), 0.02
-    wanted = Requirement(delay_margin_s=0.4, string_peak_max=1.0)
-    found = design(model, requirement_with(wanted, response, period_s=period_s), period_s=period_s)
+@pytest.mark.parametrize("timing", [Timing(0.02, 0.02), Timing(0.02, 0.1), Timing(0.05, 0.03)], ids=str)
+def test_a_design_for_a_response_has_the_margin_asked_for(response: Response, timing: Timing) -> None:
+    model, wanted = FormationModel((-1, 0)), Requirement(delay_margin_s=0.4, string_peak_max=1.0)
+    found = design(model, requirement_with(wanted, response, timing=timing), period_s=timing.held_s)
     margin_s = sampled_margin(
-        model, model.overlapping_gain(found.K1, found.K2, found.K3), [response] * 2, period_s=period_s
+        model, model.overlapping_gain(found.K1, found.K2, found.K3), [response] * 2, timing=timing
     )
     assert margin_s == pytest.approx(0.4, abs=1e-7)
     assert found.delay_margin_s > 0.4
@@ -141,7 +143,7 @@ def test_a_design_for_a_response_has_the_margin_asked_for(response: Response) ->
 
 def test_a_margin_that_no_gains_have_is_refused_with_the_response_named() -> None:
     with pytest.raises(InfeasibleError, match=r"lag_s = 0\.15"):
-        requirement_with(Requirement(delay_margin_s=29.9), Response(0.15, 2.0), period_s=0.02)
+        requirement_with(Requirement(delay_margin_s=29.9), Response(0.15, 2.0), timing=TIMING)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.2])

@@ -75,7 +75,6 @@ class Identification:
     def _worked_out(self) -> Iterator[FlightPlan | str | None]:
         """The result, after a None for each piece of work before it."""
         found: dict[int, Response] = {}
-        period_s = 1.0 / self._plan.scenario.rates.control_hz
         for row, vehicle in enumerate(self._vehicles):
             seen = self._fit(row)
             if seen is None:
@@ -94,7 +93,7 @@ class Identification:
         responses = Responses("identified", found)
         of, margins_s = responses.in_order(self._plan.formation.system_ids), list[float]()
         for K in self._plan.gains:
-            margins_s.append(sampled_margin(self._plan.model, K, of, period_s=period_s))
+            margins_s.append(sampled_margin(self._plan.model, K, of, timing=self._plan.timing))
             yield None
         yield self._plan.with_margins(tuple(margins_s), responses)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gains.formation import FormationModel
+from gains.multirate import Timing
 from gains.response import Response, sampled_margin
 from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
@@ -32,7 +33,7 @@ def given_responses(scenario: Scenario) -> Responses | None:
 
 
 def margins_with(
-    model: FormationModel, gains: Sequence[FloatArray], responses: Sequence[Response], *, period_s: float
+    model: FormationModel, gains: Sequence[FloatArray], responses: Sequence[Response] | None, timing: Timing
 ) -> tuple[float, ...]:
     """The sampled delay margin of each gain matrix with these responses, one for each vehicle of the model."""
-    return tuple(sampled_margin(model, K, responses, period_s=period_s) for K in gains)
+    return tuple(sampled_margin(model, K, responses, timing=timing) for K in gains)

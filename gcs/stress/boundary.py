@@ -89,7 +89,7 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     every = [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link)]
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in every):
         return None
-    period_s = max(1.0 / scenario.rates.control_hz, 1.0 / scenario.rates.telemetry_hz)
+    period_s = study.plan.timing.held_s
     loops = [(loop.A, loop.B @ loop.K) for loop in distinct(plan_loops(study.plan))]
     try:
         any_s = min(varying_delay_bound(A0, A1, rate=inf) for A0, A1 in loops)
@@ -118,7 +118,7 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     late = late_by_vehicle(model.B, plan.gain, [model.input_slice(k) for k in range(model.vehicles)])
     others = sum((late[k] for k in range(model.vehicles) if k not in places), model.A)
     # from the model's delay to that of the links: less the hold, and the waiting for the control tick
-    less_s = np.array([0.5 / plan.scenario.rates.control_hz + _waiting_s(outcomes, system_id) for system_id in ids])
+    less_s = np.array([plan.timing.held_s / 2.0 + _waiting_s(outcomes, system_id) for system_id in ids])
     longest_s = (axes[0].values[-1] + float(less_s[0]), axes[1].values[-1] + float(less_s[1]))
     lines = boundary_of_two_delays(others, late[places[0]], late[places[1]], longest_s=longest_s)
     return [line.delays_s - less_s for line in lines]

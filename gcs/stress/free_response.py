@@ -53,9 +53,8 @@ def response_alone(
 ) -> FreeResponse:
     """Fly a probe's scenario, see `gcs.stress.probe.probe_scenario`."""
     probe = replace(plan, scenario=scenario)
-    # where a state is used at several ticks loop delays differ from tick to tick, and their median says nothing
-    slow = scenario.rates.telemetry_hz < scenario.rates.control_hz
-    flight = fly_plan(probe, real_time=real_time, folder=folder, with_truth=slow)
+    # loop delays that differ from command to command count with their mean, which only the truth has exactly
+    flight = fly_plan(probe, real_time=real_time, folder=folder, with_truth=plan.timing.commands > 1)
     errors = _rows_of(flight.ticks, system_ids)
     return FreeResponse(probe, flight, errors, linear_until_s(scenario, errors, share=_LINEAR_SHARE))
 
@@ -91,12 +90,12 @@ def effective_delays_s(
     truth = flight.truth
     assert truth is not None
     whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
-    on_board, period_s = plan.scenario.control.loop == "onboard", 1.0 / plan.scenario.rates.control_hz
+    on_board, held_s = plan.scenario.control.loop == "onboard", plan.timing.held_s
 
     def commands(system_id: int) -> IntArray:
         return commands_on_board(whole, truth, system_id) if on_board else commands_of(rows, truth, system_id)
 
-    return {system_id: effective_delay_s(commands(system_id), period_s=period_s) for system_id in system_ids}
+    return {system_id: effective_delay_s(commands(system_id), held_s=held_s) for system_id in system_ids}
 
 
 def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:

@@ -11,7 +11,7 @@ grows or shrinks by orders of magnitude count alike.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ _MOST_SAMPLES = 300
 """More are thinned out: the accuracy is in the length of the window, the cost in the number of samples."""
 _ENVELOPE_S = 1.0
 _FEWEST_ENVELOPE = 4
+_FEWEST_SIGNS = 3
+"""Changes of sign from which a frequency is read: one whole turn."""
 _LONGEST_HANKEL = 120
 FOLLOWER_MODES = 4
 """Two of its own and two of what is late: enough for a vehicle that nobody behind acts on."""
@@ -67,13 +69,13 @@ class Growth:
     """Rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
 
     `error_1_s` is the standard error: the larger of what the misfit allows and of half the difference between the
-    first and the second half of the window. The window is `start_s` to `end_s` of the motion's time. A rate that is no
-    mode's has the frequency 0.
+    first and the second half of the window. The window is `start_s` to `end_s` of the motion's time. The frequency is
+    None where the motion shows none.
     """
 
     growth_1_s: float
     error_1_s: float
-    frequency_rad_s: float
+    frequency_rad_s: float | None
     start_s: float
     end_s: float
     samples: int
@@ -134,13 +136,17 @@ def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Gro
     """The growth rate of a motion through delays that vary: slope of the logarithm of its size, all channels together.
 
     Such a motion has no modes of its own, only a mean rate; to fit modes to it finds some that are not there. The
-    window is that of `fit_growth`, the standard error half the difference between its halves.
+    window is that of `fit_growth`, the standard error half the difference between its halves. The frequency is that of
+    the changes of sign.
     """
     time_s, values = _window(motion, start_s, end_s)
     scale = np.sqrt((values**2).mean(axis=0)) if len(values) else np.zeros(0)
-    size = np.linalg.norm(values[:, scale > 0.0] / scale[scale > 0.0], axis=1)
-    time_s, size = time_s[size > 0.0], size[size > 0.0]
-    return None if size.size < FEWEST_SAMPLES else _slope(time_s, np.log(size))
+    values = values[:, scale > 0.0] / scale[scale > 0.0]
+    size = np.linalg.norm(values, axis=1)
+    moving = size > 0.0
+    if np.count_nonzero(moving) < FEWEST_SAMPLES:
+        return None
+    return replace(_slope(time_s[moving], np.log(size[moving])), frequency_rad_s=_frequency(time_s, values))
 
 
 def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Growth | None:
@@ -168,11 +174,23 @@ def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
     return Growth(
         growth_1_s=slopes[0],
         error_1_s=abs(slopes[1] - slopes[2]) / 2.0,
-        frequency_rad_s=0.0,
+        frequency_rad_s=None,
         start_s=float(time_s[0]),
         end_s=float(time_s[-1]),
         samples=time_s.size,
     )
+
+
+def _frequency(time_s: FloatArray, values: FloatArray) -> float | None:
+    """The median of the channels' mean frequencies, two changes of sign a turn; None if none has `_FEWEST_SIGNS`."""
+    found: list[float] = []
+    for channel in values.T:
+        before = np.flatnonzero(channel[:-1] * channel[1:] < 0.0)
+        share = channel[before] / (channel[before] - channel[before + 1])
+        crossed_s = time_s[before] + share * (time_s[before + 1] - time_s[before])
+        if crossed_s.size >= _FEWEST_SIGNS:
+            found.append(np.pi * (crossed_s.size - 1) / float(np.ptp(crossed_s)))
+    return float(np.median(found)) if found else None
 
 
 def _whole_and_halves(time_s: FloatArray, level: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

@@ -20,12 +20,12 @@ from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import FreeResponse, effective_delays_s, fly_calm, response_alone, response_paired
 from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth
 from gcs.stress.onset import Loop, critical_loop
-from gcs.stress.probe import PROBE_S, probe_scenario
+from gcs.stress.probe import PROBE_S, past_limits, probe_scenario
 from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_loops, plan_of, with_summary
 
 AMPLITUDES = (1.0, 0.03, 0.001)
 """Initial error of a probe in m (the leader's in m/s); the next is for growth that leaves the linear range too soon."""
-_PILOT_S = 1.0
+_PILOT_S, _PILOT_PERIODS = 1.0, 6.0
 _SETTLED_LOOP_DELAYS = 4.0
 """Modes other than the slowest are gone, or small enough to be fitted along, after this many loop delays."""
 _FLYING_LOOP_DELAYS = 1.0
@@ -96,7 +96,8 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     """One loop alone, on links that are all those of the loop that is the first to break."""
     base = plan_of(trial)
-    pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": _PILOT_S})))
+    pilot_s = max(_PILOT_S, _PILOT_PERIODS * base.timing.held_s)
+    pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": pilot_s})))
     fresh = first_uses(pilot.ticks)
     probed, critical, waiting_s = _choose(base, median_delays_s(fresh, base.formation.system_ids), trial.probe)
     up, down = links = base.scenario.link_of(critical.system_ids[0])
@@ -134,6 +135,7 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
         critical=probed.system_ids[0],
         link_delay_s=up.delay_s + down.delay_s,
         waiting_s=round(delays_s[slowest] - up.delay_s - down.delay_s, 9),
+        past_limits=past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]]),
     )
 
     def respond(amplitude: float) -> FreeResponse:
@@ -175,7 +177,7 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
         probed = critical = next(loop for loop in loops if probe in loop.system_ids)
     slowest = max(critical.system_ids, key=lambda system_id: loop_delay_s[system_id])
     up, down = links.of(slowest)
-    return probed, critical, (loop_delay_s[slowest] - up.delay_s - down.delay_s) % critical.period_s
+    return probed, critical, (loop_delay_s[slowest] - up.delay_s - down.delay_s) % critical.timing.step_s
 
 
 def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcome:
@@ -187,10 +189,10 @@ def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcom
     since_s = own["time_s"] - own["time_s"][0]
     delay_s = max(response.loop_delays_s(own, loop.system_ids).values())
     settled = _SETTLED_LOOP_DELAYS if loop.has_late_terms else _FLYING_LOOP_DELAYS
-    start_s = settled * delay_s + 2.0 * loop.period_s
+    start_s = settled * delay_s + 2.0 * loop.timing.held_s
     # as many as its states, and as many again of what is late; given gains may differ north and east, or couple them
     modes = 2 * max(FOLLOWER_MODES, len(loop.A))
-    motion = motion_of(own, loop.system_ids, period_s=loop.period_s)
+    motion = motion_of(own, loop.system_ids, period_s=loop.timing.held_s)
     if response.varying:
         growth = norm_growth(motion, start_s=start_s, end_s=response.until_s)
     else:
@@ -214,7 +216,7 @@ def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
         outcome,
         growth_1_s=finite(growth.growth_1_s),
         growth_error_1_s=finite(growth.error_1_s),
-        frequency_rad_s=finite(growth.frequency_rad_s),
+        frequency_rad_s=None if growth.frequency_rad_s is None else finite(growth.frequency_rad_s),
         fit_start_s=round(growth.start_s, 6),
         fit_end_s=round(growth.end_s, 6),
         fit_samples=growth.samples,

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from gains.delay import delay_margin
 from gains.formation import FormationModel
+from gains.multirate import Timing, multirate_delay_margin, multirate_growth_rate
 from gains.onboard import OnboardLoop, OnboardTiming, onboard_loop
 from gains.rightmost import rightmost_root
-from gains.sampled import growth_rate, sampled_delay_margin
 from gains.several_delays import late_by_vehicle
 from gains.structure import strongly_connected_blocks
 
@@ -33,7 +33,7 @@ class Loop:
     A: FloatArray
     B: FloatArray
     K: FloatArray
-    period_s: float
+    timing: Timing
     onboard: OnboardLoop | None = None
 
     @property
@@ -45,18 +45,18 @@ class Loop:
         """The least loop delay at which the sampled and held loop loses stability."""
         if self.onboard is not None:
             return self.onboard.sampled_margin_s()
-        return float(sampled_delay_margin(self.A, self.B, self.K, period_s=self.period_s))
+        return float(multirate_delay_margin(self.A, self.B, self.K, self.timing))
 
     def margin_continuous_s(self) -> float:
         """The least loop delay at which the continuous model loses stability; the hold counts as half a period."""
         whole_s = delay_margin(self.A, self.B @ self.K) if self.onboard is None else self.onboard.continuous_margin_s()
-        return whole_s - self.period_s / 2.0
+        return whole_s - self.timing.held_s / 2.0
 
     def growth_1_s(self, delay_s: float) -> float:
         """Growth rate of the sampled and held loop at a loop delay."""
         if self.onboard is not None:
             return self.onboard.growth_1_s(delay_s)
-        return growth_rate(self.A, self.B, self.K, period_s=self.period_s, delay_s=delay_s)
+        return multirate_growth_rate(self.A, self.B, self.K, self.timing, delay_s=delay_s)
 
     def growth_continuous_1_s(self, delay_s: float) -> float:
         """Real part of the rightmost root of the continuous model; the hold counts as half a period of delay."""
@@ -67,7 +67,7 @@ class Loop:
         late_gain = self.K if self.onboard is None else self.B.T @ self.onboard.late
         at_once = [(self.A, 0.0)] if self.onboard is None else self.onboard.continuous_at_once()
         late = late_by_vehicle(self.B, late_gain, [slice(2 * k, 2 * k + 2) for k in range(len(self.system_ids))])
-        delays_s = [loop_delay_s[system_id] + self.period_s / 2.0 for system_id in self.system_ids]
+        delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
         return rightmost_root([*at_once, *zip(late, delays_s, strict=True)]).real
 
     def growth_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
@@ -86,7 +86,7 @@ class Loop:
     def same_as(self, other: "Loop") -> bool:
         """Whether the other loop is the same system, of other vehicles."""
         mine, its = (self.A, self.B, self.K), (other.A, other.B, other.K)
-        return self.period_s == other.period_s and all(
+        return self.timing == other.timing and all(
             a.shape == b.shape and bool((a == b).all()) for a, b in zip(mine, its, strict=True)
         )
 
@@ -121,7 +121,7 @@ def loops_of(
     system_ids: Sequence[int],
     K: FloatArray,
     *,
-    period_s: float,
+    timing: Timing,
     onboard: OnboardTiming | None = None,
 ) -> list[Loop]:
     """The loops of a formation flown with a gain matrix K, those ahead first.
@@ -149,7 +149,7 @@ def loops_of(
                 A=A[np.ix_(own, own)],
                 B=B[np.ix_(own, inputs)],
                 K=K[np.ix_(inputs, own)],
-                period_s=period_s,
+                timing=timing,
                 onboard=None if whole is None else whole.part(own),
             )
         )

@@ -17,6 +17,9 @@ What would hide the loop is taken out:
   Its loop is the same for that: what the station uses of the others is brought to the instant of its own state.
 * Changes of the nominal velocity, and the noise of the vehicles' sensors.
 * The vehicles' failsafe, which lossy links would now and then call for: it opens the loop.
+* The vehicles' limits. A small error stays within them, and so within them the loop is this one; but links that lose or
+  delay at random push vehicles by more than an error of a millimetre, and what is cut off then is no linear response.
+  `past_limits` says when they do.
 """
 
 import numpy as np
@@ -24,9 +27,12 @@ import numpy as np
 from gcs.limits import LARGEST_COMMAND_M_S2
 from gcs.plan import FlightPlan
 from gcs.record import TickArray
-from scenarios.schema import Link, Scenario, Vehicle
+from gcs.telemetry import FloatArray
+from scenarios.schema import Limits, Link, Scenario, Vehicle
 
 PROBE_S = 20.0
+_SPEED_MIN_M_S = 1e-3
+"""The kinematics are singular at speed 0 only."""
 _DIRECTION_NE = np.array([1.0, -0.8])
 """Of a probe's error: no diagonal, as gains that couple north and east have modes in just these; and near one, as two
 modes that are nearly the same are told apart badly where both are large."""
@@ -35,7 +41,7 @@ modes that are nearly the same are told apart badly where both are large."""
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
     """The plan's scenario with every vehicle in place at its nominal velocity, but for an error of the given vehicles.
 
-    No vehicle goes to its failsafe.
+    No vehicle goes to its failsafe or meets a limit.
 
     The error is in the position of a follower (m) and in the velocity of the leader (m/s), whose position is not
     controlled; in `_DIRECTION_NE`, and different for each vehicle.
@@ -59,6 +65,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     update = {
         "vehicles": tuple(vehicles),
         "nominal_velocity": scenario.nominal_velocity[:1],
+        "limits": Limits(speed_min_m_s=_SPEED_MIN_M_S),
         "duration_s": PROBE_S,
         "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
         "safety": scenario.safety.model_copy(
@@ -76,7 +83,7 @@ def probe_scenario(
     The links are changed so that telemetry waits `waiting_s` for the control tick.
     """
     scenario = in_place(plan, system_ids, amplitude=amplitude)
-    up, down = with_waiting(*links, period_s=1.0 / scenario.rates.control_hz, waiting_s=waiting_s)
+    up, down = with_waiting(*links, period_s=plan.timing.step_s, waiting_s=waiting_s)
     update = {
         "links": scenario.links.model_copy(update={"up": up, "down": down, "vehicles": ()}),
         "clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0, "offset_max_s": 0.0}),
@@ -105,19 +112,30 @@ def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> 
 
 
 def linear_until_s(scenario: Scenario, own: TickArray, *, share: float) -> float:
-    """Time since the first of the rows at which an error leaves the range in which no limit and no singularity is near.
+    """Time since the first of the rows at which an error comes near the singularity at speed zero.
 
-    `own` are rows of the probed vehicles, in order of time; infinity if none leaves it. `share` is the part of the
-    nominal speed that an error may reach: the kinematics are singular at speed zero.
+    `own` are rows of the probed vehicles, in order of time; infinity if none does. `share` is the part of the nominal
+    speed that an error may reach.
     """
-    limits = scenario.limits
     speed = float(np.hypot(*scenario.nominal_velocity[0].velocity_ne_m_s))
-    room_m_s = [share * speed, speed - limits.speed_min_m_s, (limits.speed_max_m_s or np.inf) - speed]
-    command_m_s2 = 0.9 * min(
-        limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2,
-        (limits.turn_rate_max_rad_s or np.inf) * (1.0 - share) * speed,
-    )
-    error_m_s = np.hypot(own["velocity_error_north_m_s"], own["velocity_error_east_m_s"])
-    size_m_s2 = np.hypot(own["command_north_m_s2"], own["command_east_m_s2"])
-    beyond = np.flatnonzero((error_m_s > min(room_m_s)) | (size_m_s2 > command_m_s2))
+    error_m_s, size_m_s2 = _sizes(own)
+    beyond = np.flatnonzero((error_m_s > share * speed) | (size_m_s2 > 0.9 * LARGEST_COMMAND_M_S2))
     return float(own["time_s"][beyond[0]] - own["time_s"][0]) if beyond.size else np.inf
+
+
+def past_limits(scenario: Scenario, own: TickArray) -> bool:
+    """Whether vehicles with the scenario's limits could not have done what is in these rows."""
+    limits = scenario.limits
+    if limits == Limits():
+        return False
+    speed_m_s = np.hypot(own["velocity_north_m_s"], own["velocity_east_m_s"])
+    _, size_m_s2 = _sizes(own)
+    most_m_s2 = np.minimum(limits.acceleration_max_m_s2 or np.inf, (limits.turn_rate_max_rad_s or np.inf) * speed_m_s)
+    slow, fast = speed_m_s < limits.speed_min_m_s, speed_m_s > (limits.speed_max_m_s or np.inf)
+    return bool((slow | fast | (size_m_s2 > most_m_s2)).any())
+
+
+def _sizes(own: TickArray) -> tuple[FloatArray, FloatArray]:
+    """Velocity errors (m/s) and commands (m/s²)."""
+    error_m_s = np.hypot(own["velocity_error_north_m_s"], own["velocity_error_east_m_s"])
+    return error_m_s, np.hypot(own["command_north_m_s2"], own["command_east_m_s2"])

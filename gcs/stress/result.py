@@ -62,6 +62,7 @@ def result_of(
         "worst": [o.id for o in worst],
         "flight_time_s": round(sum(outcome.elapsed_s for outcome in outcomes), 3),
         "points": [_point(outcome) for outcome in sweep],
+        "past_limits": sum(outcome.past_limits for outcome in outcomes),
         "noise": noise_of(outcomes) if study.real_time else None,
         "provenance": provenance(study.plan.scenario.seed),
     }

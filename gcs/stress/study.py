@@ -74,7 +74,7 @@ class Onset:
     link_delay_s: float
     waiting_s: float
     slope_1_s2: float
-    frequency_rad_s: float
+    frequency_rad_s: float | None
     probed: int
     critical: int
     rounds: int
@@ -120,8 +120,8 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         raise _no_limit(study, run, tolerance=tolerance)
     if predicted_s <= 0.0:
         raise NoOnset(f"the predicted margin is {predicted_s:g} s: there is no delay at which it is stable")
-    seed, period_s = study.plan.scenario.seed, 1.0 / study.plan.scenario.rates.control_hz
-    centre_s, width_s = predicted_s - period_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
+    seed = study.plan.scenario.seed
+    centre_s, width_s = predicted_s - study.plan.timing.faster_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
     flights: dict[str, Outcome] = {}
     noisy = study.real_time or not has_constant_links(
         study.plan.scenario
@@ -207,9 +207,13 @@ def _downhill(near: Sequence[Outcome]) -> float:
     return -1.0 if rates and min(rates) > 0.0 else 1.0
 
 
+def _median(known: Sequence[float]) -> float | None:
+    return float(np.median(known)) if known else None
+
+
 def _waiting_s(outcomes: Sequence[Outcome]) -> float:
     waits = [o.loop_delay_s - o.link_delay_s for o in outcomes if o.loop_delay_s and o.link_delay_s is not None]
-    return float(np.median(waits)) if waits else 0.0
+    return _median(waits) or 0.0
 
 
 def _found(
@@ -243,7 +247,7 @@ def _found(
         link_delay_s=link_s,
         waiting_s=waiting_s,
         slope_1_s2=zero.slope_1_s2,
-        frequency_rad_s=nearest.frequency_rad_s or 0.0,
+        frequency_rad_s=_median([o.frequency_rad_s for o in near if o.frequency_rad_s is not None]),
         probed=nearest.probed,
         critical=nearest.critical,
         rounds=rounds,

@@ -32,6 +32,8 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
     console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
     console.print(f"trials   {result['trials']}: {_kinds(result['trials_of_kind'])}")
     if onset is not None:
+        frequency = onset["frequency_rad_s"]
+        breaks = "" if frequency is None else f"; breaks at {frequency:.2f} rad/s"
         console.print(
             f"onset    {_ms(onset['loop_delay_s'])} ± {1e3 * onset['error_s']:.2f} ms in flight, "
             f"{onset['difference']:+.3%} from the sampled margin of this loop, {_ms(onset['predicted_s'])}; "
@@ -39,7 +41,7 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
         )
         console.print(
             f"         {_ms(onset['link_delay_s'])} of link delay, up + down: vehicle {onset['critical']} waits "
-            f"{_ms(onset['waiting_s'])} for the control tick; breaks at {onset['frequency_rad_s']:.2f} rad/s"
+            f"{_ms(onset['waiting_s'])} for the control tick{breaks}"
         )
     if result["onset_missing"]:
         found = "none, as predicted" if result["onset_missing_as_predicted"] else "not found"
@@ -47,6 +49,12 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
     if result["curve_error"] is not None:
         console.print(
             f"curve    measured and predicted growth differ by at most {result['curve_error']:.3%} of the range"
+        )
+    if result["past_limits"]:
+        console.print(
+            f"limits   the links alone push vehicles past [limits] in {result['past_limits']} probes, which are flown "
+            "without; where limits bind, errors last that the loop alone would bring down",
+            markup=False,
         )
     _print_noise(console, result["noise"])
     points = [point for point in result["points"] if point["kind"] == "probe"] or result["points"]

@@ -62,6 +62,8 @@ class Outcome:
     much the 90th percentile of the measured ones is above their median. `predicted_*` are the models' growth rates at
     that delay. The growth of an own trial is that of the envelope of all spacing errors, which is rough.
     `ticks_sha256` is that of the tick log, in virtual time: the same trial has the same in any process.
+    `past_limits` says that random links alone, without any error, push vehicles past the scenario's limits, without
+    which a probe is flown.
     `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`. `error` holds a traceback if the
     trial itself failed.
     """
@@ -95,6 +97,7 @@ class Outcome:
     lateness_s_p99: float | None = None
     steal_share: float | None = None
     busy_share: float | None = None
+    past_limits: bool = False
     ticks_sha256: str | None = None
     trace_period_s: float = TRACE_PERIOD_S
     trace_m: list[float] = field(default_factory=list[float])
@@ -128,10 +131,9 @@ def plan_of(trial: Trial) -> FlightPlan:
 
 
 def plan_loops(plan: FlightPlan) -> list[Loop]:
-    """The loops of a plan at its control period."""
+    """The loops of a plan."""
     predecessors, system_ids = plan.formation.predecessor.tolist(), plan.formation.system_ids
-    period_s = 1.0 / plan.scenario.rates.control_hz
-    return loops_of(predecessors, system_ids, plan.gain, period_s=period_s, onboard=timing_of(plan.scenario))
+    return loops_of(predecessors, system_ids, plan.gain, timing=plan.timing, onboard=timing_of(plan.scenario))
 
 
 def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:

@@ -32,7 +32,7 @@ from gcs.control import (
 from gcs.monitor import VehicleState
 from gcs.plan import flight_plan, plan_formation
 from gcs.record import CLOCK_JUMPED, GAIN_SET, TICK, Mode, TickArray
-from gcs.rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.rows import Repetitions, Reported, Tick, VehicleTick, tick_rows
 from gcs.station import SILENCE_S
 from gcs.stream import Stream, law_of
 from gcs.telemetry import StateHistory
@@ -147,6 +147,7 @@ class _Replay:
         self._scenario, self._margins_s, self._outline = scenario, margins_s, outline
         self._formation = plan_formation(scenario)
         ids = self._formation.system_ids
+        self._repetitions = Repetitions(scenario.rates, len(ids))
         self.watch = Watch(ids)
         self._vehicles = [self.watch.vehicles[system_id] for system_id in ids]
         self._row = {system_id: row for row, system_id in enumerate(ids)}
@@ -306,6 +307,7 @@ class _Replay:
                     nearest_m[row],
                     command is not None,
                     margin_s,
+                    self._repetitions.repeated_s(row, control.used_ns, due_ns),
                 )
             )
         number = round((due_ns - self._start_ns) / self._period_ns)
