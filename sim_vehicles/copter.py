@@ -61,16 +61,16 @@ class Copter:
         *,
         record: Record | None = None,
         signed: bool = False,
+        experiment: str = "",
     ) -> None:
         self.system_id = own.system_id
         self.settings = scenario.autopilot
         self.rules = RULES[own.flavour or scenario.autopilot.flavour]
         self.counters: Counter[str] = Counter()
         self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
-        self.last_heard_ns = start_ns
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.parameters = parameters(self.rules, own.system_id)
-        self._authority = Authority(scenario.safety.heartbeat_timeout_s)
+        self.authority = Authority(scenario.safety.heartbeat_timeout_s)
         self.mode = self.rules.first_mode
         self.armed = self.failsafe = False
         self.landed = True
@@ -109,8 +109,14 @@ class Copter:
         self._schedule.add_once(mavlink.HEARTBEAT, start_ns)
         self._schedule.set_interval(mavlink.HEARTBEAT, HEARTBEAT_INTERVAL_US, start_ns)
         self._schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, telemetry_ns)
-        self._services = Services(
-            self._encoder, self._schedule, self.parameters, self.rules.version, intervals_us(self.rules), telemetry_ns
+        self.services = Services(
+            self._encoder,
+            self._schedule,
+            self.parameters,
+            self.rules.version,
+            intervals_us(self.rules),
+            telemetry_ns,
+            experiment,
         )
 
     @property
@@ -183,9 +189,8 @@ class Copter:
         for source, message in mavlink.read_datagram(data, self.counters):
             self._speaks_version_1 = False
             if isinstance(message, mavlink.Heartbeat):
-                if message.vehicle_type == mavlink.TYPE_GCS and self._authority.hears(source, time_ns):
+                if message.vehicle_type == mavlink.TYPE_GCS and self.authority.hears(source, time_ns):
                     self.counters["heartbeats"] += 1
-                    self.last_heard_ns = time_ns
                 continue
             if isinstance(message, mavlink.Timesync):
                 self._take_timesync(message, time_ns)
@@ -196,10 +201,9 @@ class Copter:
             ):
                 self.counters["ignored_not_addressed"] += 1
                 continue
-            if not self._authority.obeys(source, message, time_ns):
+            if not self.authority.obeys(source, message, time_ns):
                 self._refuse(source, time_ns)
                 continue
-            self.last_heard_ns = time_ns
             at_ns = max(time_ns, self._motion_ns)
             self._advance(at_ns)
             if isinstance(message, mavlink.Setpoint):
@@ -211,7 +215,7 @@ class Copter:
                 at = len(self._out)
                 answer = self._answers.get(message.command)
                 if answer is None:
-                    result, frames = self._services.command(message, at_ns)
+                    result, frames = self.services.command(message, at_ns)
                 else:
                     result, frames = answer(message, at_ns), []
                 ack = self._encoder.command_ack(message.command, result, message.source)
@@ -219,7 +223,7 @@ class Copter:
                 self._out += [(frame, at_ns) for frame in frames]
 
     def _refuse(self, source: int, time_ns: int) -> None:
-        text = self._authority.refusal(source, self.counters)
+        text = self.authority.refusal(source, self.counters)
         if text:
             self._tell(time_ns, text)
             self._send(self._encoder.statustext(mavlink.SEVERITY_WARNING, text), time_ns)
@@ -229,7 +233,6 @@ class Copter:
             self.counters["ignored_not_addressed"] += 1
         elif message.tc1 == 0:
             self.counters["timesync_requests"] += 1
-            self.last_heard_ns = time_ns
             self._send(self._encoder.timesync(max(1, self.clock.boot_ns(time_ns)), message.ts1), time_ns)
         else:
             known = message.ts1 == self._timesync_ts1
@@ -261,7 +264,7 @@ class Copter:
             if request.base_mode & mavlink.BASE_MODE_CUSTOM:
                 self._change_mode(request.custom_mode, time_ns)
             return
-        for frame in self._services.answer(request, self.counters, time_ns):
+        for frame in self.services.answer(request, self.counters, time_ns):
             self._send(frame, time_ns)
         if isinstance(request, ParameterSet):
             before = self._setpoint_timeout_ns, self._ground_disarm_ns
@@ -348,7 +351,7 @@ class Copter:
             self._send(self._encoder.timesync(0, self._timesync_ts1), time_ns)
             return
         if message_id == PARAMETER_VALUE:
-            self._send(self._services.next_parameter(time_ns), time_ns)
+            self._send(self.services.next_parameter(time_ns), time_ns)
             return
         state = self.mode, self.armed, self.landed, self.failsafe, self.home_ne_m
         facts = Facts(self.motion, self.origin_neu_m, *state, self._ready(time_ns))

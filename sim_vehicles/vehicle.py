@@ -67,16 +67,15 @@ class Vehicle:
         *,
         record: Record | None = None,
         onboard: OnboardLoop | None = None,
+        experiment: str = "",
     ) -> None:
         self.system_id = own.system_id
         self.counters: Counter[str] = Counter()
         self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
         """Appended to; whoever reads may clear it."""
-        self.last_heard_ns = start_ns
-        """When the last valid frame for this vehicle, or for all, arrived."""
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.autopilot = Autopilot(scenario.safety)
-        self._authority = Authority(scenario.safety.heartbeat_timeout_s)
+        self.authority = Authority(scenario.safety.heartbeat_timeout_s)
         formation = [] if onboard is None else formation_parameters()
         self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot(), *formation])
         self._onboard = onboard
@@ -101,8 +100,8 @@ class Vehicle:
         self._schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, start_ns)
         for message_id, interval_us in DEFAULT_INTERVAL_US.items():
             self._schedule.set_interval(message_id, interval_us, start_ns)
-        self._services = Services(
-            self._encoder, self._schedule, self.parameters, VERSION, DEFAULT_INTERVAL_US, start_ns
+        self.services = Services(
+            self._encoder, self._schedule, self.parameters, VERSION, DEFAULT_INTERVAL_US, start_ns, experiment
         )
         if onboard is not None:
             self._schedule.set_interval(STEP, onboard.interval_us, start_ns)
@@ -157,10 +156,9 @@ class Vehicle:
                 continue
             if not self._is_for_us(message.target_system, message.target_component):
                 continue
-            if not self._authority.obeys(source, message, time_ns):
+            if not self.authority.obeys(source, message, time_ns):
                 self._refuse(source, time_ns)
                 continue
-            self.last_heard_ns = time_ns
             if isinstance(message, mavlink.Setpoint):
                 self._take_setpoint(message, time_ns)
             elif isinstance(message, mavlink.Command):
@@ -176,7 +174,7 @@ class Vehicle:
 
     def _refuse(self, source: int, time_ns: int) -> None:
         """No COMMAND_ACK: the station has no way to tell it from the answer to an equal command of its own."""
-        text = self._authority.refusal(source, self.counters)
+        text = self.authority.refusal(source, self.counters)
         if text:
             self._tell(time_ns, text)
             self._send(self._encoder.statustext(mavlink.SEVERITY_WARNING, text), time_ns)
@@ -184,11 +182,10 @@ class Vehicle:
     def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
         if heartbeat.vehicle_type != mavlink.TYPE_GCS:
             self.counters["ignored_heartbeat"] += 1
-        elif not self._authority.hears(source, time_ns):
+        elif not self.authority.hears(source, time_ns):
             self.counters["ignored_not_the_station"] += 1
         else:
             self.counters["heartbeats"] += 1
-            self.last_heard_ns = time_ns
             self.autopilot.hear_heartbeat(max(time_ns, self._state_ns))
 
     def _take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
@@ -228,13 +225,11 @@ class Vehicle:
             self.counters["ignored_not_addressed"] += 1
         elif message.tc1 == 0:
             self.counters["timesync_requests"] += 1
-            self.last_heard_ns = time_ns
             # Not 0 even at the very boot: that would make the reply a request.
             tc1 = max(1, self.clock.boot_ns(time_ns))
             self._send(self._encoder.timesync(tc1, message.ts1), time_ns)
         elif message.ts1 == self._timesync_ts1:
             self.counters["timesync_replies"] += 1
-            self.last_heard_ns = time_ns
         else:
             self.counters["ignored_timesync_reply"] += 1  # to another vehicle, or a duplicate
 
@@ -242,7 +237,7 @@ class Vehicle:
         if isinstance(request, SetMode):
             self._change_mode(request.base_mode, request.custom_mode, time_ns)
             return
-        for frame in self._services.answer(request, self.counters, time_ns):
+        for frame in self.services.answer(request, self.counters, time_ns):
             self._send(frame, time_ns)
         if isinstance(request, ParameterSet):
             timeouts_s = self.parameters["GUID_TIMEOUT"], self.parameters["FS_GCS_TIMEOUT"]
@@ -257,7 +252,7 @@ class Vehicle:
         answer = self._answers.get(command.command)
         time_ns = max(time_ns, self._state_ns)
         if answer is None:
-            result, frames = self._services.command(command, time_ns)
+            result, frames = self.services.command(command, time_ns)
         else:
             result, frames = answer(command, time_ns), []
         # The acknowledgement goes before what the command asks for, as request and reply are read.
@@ -354,7 +349,7 @@ class Vehicle:
             self._timesync_ts1 = self.clock.boot_ns(time_ns)
             frame = self._encoder.timesync(0, self._timesync_ts1)
         elif message_id == PARAMETER_VALUE:
-            frame = self._services.next_parameter(time_ns)
+            frame = self.services.next_parameter(time_ns)
         elif message_id == mavlink.HOME_POSITION:
             frame = self._encoder.home_position(ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M)
         elif message_id in EXTRA:
