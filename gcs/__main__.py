@@ -1,23 +1,16 @@
-"""The start of `gcs`: Ctrl-C ends it in one line from here on, also while it imports."""
+"""The start of `gcs`: the signals that end a command do so in one line from here on, also while it imports."""
 
-import os
-import signal
-
-from gcs.interrupts import EXIT_INTERRUPTED
+from gcs.interrupts import end_at_once
+from gcs.output import open_what_is_closed
 
 
 def main() -> None:
     """Entry point."""
-    signal.signal(signal.SIGINT, _end)
+    end_at_once()
+    open_what_is_closed()
     from gcs.cli import main as command
 
     command()
-
-
-def _end(*_: object) -> None:
-    """End at once: where something has to be brought to an end first, `gcs.interrupts.raised` is in force."""
-    os.write(2, b"interrupted\n")
-    os._exit(EXIT_INTERRUPTED)
 
 
 if __name__ == "__main__":

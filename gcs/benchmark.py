@@ -10,6 +10,7 @@ from statistics import median
 from typing import Any
 
 from gcs import station
+from gcs.interrupts import raised
 from gcs.lockstep import Sent, Vehicles, fly_lockstep, signed_ends, vehicles_of
 from gcs.plan import FlightPlan, flight_plan
 from scenarios.schema import FixedGains, Scenario, Vehicle
@@ -101,10 +102,13 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]
     from gcs.summary import finish
 
     designed, plan = flight_plan(_without_solver(scenario, seconds))
-    with tempfile.TemporaryDirectory(prefix="bench-") as name:
+    with raised(), tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name) / "run"
         _, _, _, spent = fly_real_time(plan, designed, folder)
-        summary, graded = finish(folder), grade(folder)
+        summary = finish(folder)
+        if summary["reason"].startswith("interrupted"):
+            raise KeyboardInterrupt
+        graded = grade(folder)
     return {
         "control": summary["control"],
         "reason": summary["reason"],

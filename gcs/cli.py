@@ -1,7 +1,6 @@
 """The `gcs` command. Slow imports (cvxpy, rerun) are made by the commands that need them, so that --help is quick."""
 
 import contextlib
-import errno
 import json
 import os
 import sys
@@ -13,10 +12,12 @@ import typer
 
 from gcs.interrupts import EXIT_INTERRUPTED
 from gcs.loop_option import LoopOption, load_with_loop
+from gcs.output import DISK_FULL, outlive_readers
 from gcs.stress.command import stress
 from gcs.user_input import (
     InputError,
     KeyFile,
+    address,
     listening,
     mirroring,
     opened_guard,
@@ -83,12 +84,14 @@ def fly(
 ) -> None:
     """Design the control, start the vehicles, fly, show, record.
 
-    Exit code 1 if the flight is not stable.
+    Exit code 1 if the flight is not stable, or not all of it could be logged.
     """
     from gcs.fly import FlyOptions, new_folder
     from gcs.fly import fly as fly_now
     from gcs.plan import flight_plan
+    from gcs.takeover import CONNECTED, TAKEN_OVER, Presence
 
+    outlive_readers()
     scenario = load_with_loop(scenario_file, loop)
     if link_delay is not None:
         within("--link-delay", link_delay, 0, 60, "seconds")
@@ -104,11 +107,21 @@ def fly(
         warn_if_open(link, signed=key is not None)
         to = None if mirror is None else opened.enter_context(mirroring(mirror, link, guard, commands=mirror_commands))
         design, plan = flight_plan(scenario)
+        there = Presence(link, plan.scenario, guard)
+        taken_over = there.taken_over() if connect is None else []
         if not as_json:
             _print_design(design)
         folder = out_folder(out) if out is not None else new_folder(scenario.name)
-        options = FlyOptions(folder=folder, start_vehicles=connect is None, show_table=not as_json, key_file=key)
+        options = FlyOptions(
+            folder=folder,
+            show_table=not as_json,
+            fleet=CONNECTED if connect is not None else TAKEN_OVER if taken_over else "",
+            outlive_station=address(*at)[1] != 0,  # nobody listens again at a port that the system chose
+            key_file=key,
+        )
         summary = fly_now(plan, design, link, options, guard, to)
+        if taken_over:
+            there.shut_down()
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:
@@ -158,6 +171,7 @@ def compare(
     from gcs.compare.cost import design_costs
     from gcs.fly import new_folder
 
+    outlive_readers()
     scenario = _scenario(scenario_file)
     folder = out_folder(out) if out is not None else new_folder(f"{scenario.name}-compare")
     routes, flights = comparing.compare(scenario)
@@ -370,7 +384,7 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = EXIT_FAILED
     except OSError as error:
-        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if error.filename is None and error.errno not in DISK_FULL:
             raise  # no file of the user's
         code = _fail(f"{error.filename or 'write'}: {error.strerror}, wanted a file or folder that can be used")
     sys.exit(code if isinstance(code, int) else 0)
@@ -396,7 +410,7 @@ def _print_design(result: dict[str, Any]) -> None:
 def _exit_code(summary: dict[str, Any]) -> int:
     if summary["reason"].startswith("interrupted"):
         return EXIT_INTERRUPTED
-    return 0 if summary["verdict"] == "stable" else EXIT_FAILED
+    return 0 if summary["verdict"] == "stable" and not summary["not_logged"] else EXIT_FAILED
 
 
 if __name__ == "__main__":

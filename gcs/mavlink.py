@@ -26,6 +26,8 @@ COMMAND_LONG = 76
 COMMAND_ACK = 77
 SET_POSITION_TARGET_LOCAL_NED = 84
 TIMESYNC = 111
+PARAM_EXT_REQUEST_READ = 320
+PARAM_EXT_VALUE = 322
 EKF_STATUS_REPORT = 193
 ESTIMATOR_STATUS = 230
 HOME_POSITION = 242
@@ -259,6 +261,11 @@ def param_set(name: str, value: float, *, target_system: int) -> tuple[Any, ...]
 
 def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
     """Fields of PARAM_REQUEST_READ by name."""
+    return (-1, target_system, 1, name.encode())
+
+
+def param_ext_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
+    """Fields of PARAM_EXT_REQUEST_READ by name."""
     return (-1, target_system, 1, name.encode())
 
 

@@ -46,8 +46,13 @@ _ROUND_TRIPS = 40.0
 def patience_s(scenario: Scenario) -> float:
     """How long a flight may take to begin. Until then scenario time is that since the station's start less this."""
     least_s = START_PATIENCE_S if scenario.dynamics == "autopilot" else CONNECT_PATIENCE_S
+    return max(least_s, _ROUND_TRIPS * longest_round_trip_s(scenario))
+
+
+def longest_round_trip_s(scenario: Scenario) -> float:
+    """The longest time that a question and its answer are on the links of a scenario, without jitter."""
     links = (scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles)
-    return max(least_s, _ROUND_TRIPS * max(_longest_s(up) + _longest_s(down) for up, down in links))
+    return max(_longest_s(up) + _longest_s(down) for up, down in links)
 
 
 def _longest_s(link: Link) -> float:

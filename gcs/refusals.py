@@ -38,18 +38,27 @@ def in_words(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in sorted(counts.items(), key=lambda each: -each[1]))
 
 
-def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
-    """What the vehicles of a run refused, by reason; None if they have not said."""
+def counted_by_vehicles(folder: Path) -> dict[str, int] | None:
+    """What the vehicles of a run counted; None if they have not said."""
     try:
-        counters = _COUNTERS.validate_json((folder / VEHICLES_FILE).read_bytes())
+        return _COUNTERS.validate_json((folder / VEHICLES_FILE).read_bytes())
     except (OSError, ValueError):
         return None
+
+
+def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
+    """What they refused, by reason."""
+    counters = counted_by_vehicles(folder)
     prefix = "refused_"
-    return {
-        name.removeprefix(prefix).replace("_", " "): count
-        for name, count in counters.items()
-        if name.startswith(prefix)
-    }
+    return (
+        None
+        if counters is None
+        else {
+            name.removeprefix(prefix).replace("_", " "): count
+            for name, count in counters.items()
+            if name.startswith(prefix)
+        }
+    )
 
 
 def counts_of(events: list[dict[str, Any]], kind: str = REFUSED) -> dict[str, int]:

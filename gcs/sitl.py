@@ -1,5 +1,6 @@
 """Simulated vehicles for the station, as a process of their own."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,25 +12,36 @@ from gcs.vehicle import Address
 
 VEHICLES_LOG = "vehicles.log"
 TRUTH_FILE = "truth.bin"
-_SILENCE_S = 60.0
+ORPHAN_S = 60.0
+"""How long vehicles whose station was killed wait for another one to take them over."""
+_AT_ONCE_S = 0.1
 _STOP_PATIENCE_S = 5.0
 
 
 class VehicleProcess:
-    """The simulated vehicles of a scenario as a child process that survives this one.
+    """The simulated vehicles of a scenario as a child process.
 
-    If the station is killed, the vehicles fly on in their failsafe and can be taken over again; without any station
-    they end after a minute.
+    If this process is killed, vehicles that outlive it fly on in their failsafe and can be taken over: they end when
+    no station has commanded them for ORPHAN_S. The others end with it.
     """
 
-    def __init__(self, scenario_file: Path, *, station: Address, folder: Path, key_file: Path | None = None) -> None:
+    def __init__(
+        self,
+        scenario_file: Path,
+        *,
+        station: Address,
+        folder: Path,
+        key_file: Path | None = None,
+        outlive_station: bool = False,
+    ) -> None:
         host, port = station
         self._log = folder / VEHICLES_LOG
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
                 [
                     sys.executable, "-m", "sim_vehicles.cli", str(scenario_file), "--station", f"{host}:{port}",
-                    "--truth", str(folder / TRUTH_FILE), "--stop-after-silence", str(_SILENCE_S),
+                    "--truth", str(folder / TRUTH_FILE), "--parent", str(os.getpid()),
+                    "--stop-after-silence", str(ORPHAN_S if outlive_station else _AT_ONCE_S),
                     "--counters", str(folder / VEHICLES_FILE),
                     *([] if key_file is None else ["--key", str(key_file)]),
                 ],

@@ -5,6 +5,7 @@ Works from the files alone, so a run whose station was killed is finished by the
 
 import json
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,24 @@ from gcs.mirror import MIRROR
 from gcs.record import (
     CLOCK_JUMPED,
     DESIGN_FILE,
+    END,
+    EVENTS_FILE,
+    FLEET,
+    LOG_ENDED,
     PARQUET_FILE,
+    RECORDING_FILE,
     SCENARIO_FILE,
+    STARTED,
     SUMMARY_FILE,
     TICK,
     TICKS_FILE,
     Mode,
     TickArray,
+    write_whole,
 )
-from gcs.refusals import counts_of, refused_by_vehicles
+from gcs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
 from gcs.run_files import RunTail, read_design, read_scenario, read_ticks
+from gcs.sitl import TRUTH_FILE
 from gcs.user_input import InputError
 from scenarios.schema import Scenario
 
@@ -33,13 +42,18 @@ _SKEW_SPAN_S = 1.0
 SILENT_END = "interrupted: the station ended without a word"
 
 
-def finish(folder: Path) -> dict[str, Any]:
+def finish(folder: Path, *, unwritten: list[dict[str, Any]] | None = None) -> dict[str, Any]:
     """Write ticks.parquet and summary.json of a run that has ended, and return the summary.
+
+    `unwritten` is given at the end of a flight: its events that could not be written. What cannot be written now is
+    then named in the summary, as `not_logged`, and the log of ticks stays as it is.
 
     Raises
     ------
     InputError
         If the folder is not a run, or a file of it is damaged.
+    OSError
+        If a file cannot be written, unless `unwritten` is given.
     """
     scenario = read_scenario(folder)
     design = read_design(folder / DESIGN_FILE)
@@ -48,13 +62,30 @@ def finish(folder: Path) -> dict[str, Any]:
         raise InputError(
             f"{folder}: read ticks of vehicles {sorted(strangers)}, wanted those of its {SCENARIO_FILE} only"
         )
-    summary = summarise(scenario, design, ticks, RunTail(folder).events())
-    _write_parquet(folder, ticks)
+    summary = summarise(scenario, design, ticks, RunTail(folder).events() + (unwritten or []))
+    not_logged: list[str] = summary["not_logged"]
+    if unwritten:
+        not_logged.append(f"{EVENTS_FILE}: the last {len(unwritten)}")
+    if unwritten is not None and not (folder / RECORDING_FILE).exists():
+        not_logged.append(f"{RECORDING_FILE}: see gcs recover")
+    if lost := (counted_by_vehicles(folder) or {}).get("truth_lost"):
+        not_logged.append(f"{TRUTH_FILE}: {lost} records")
+
+    def write(name: str, how: Callable[[], None]) -> None:
+        try:
+            how()
+        except OSError as error:
+            if unwritten is None:
+                raise
+            not_logged.append(f"{name}: {error.strerror or error}")
+
+    write(PARQUET_FILE, lambda: _write_parquet(folder, ticks))
     summary["refused_by_vehicles"] = refused_by_vehicles(folder)
-    summary["files"] = sorted(file.name for file in folder.iterdir() if not file.name.startswith("."))
-    if SUMMARY_FILE not in summary["files"]:
-        summary["files"] = sorted([*summary["files"], SUMMARY_FILE])
-    _write_whole(folder / SUMMARY_FILE, json.dumps(summary, indent=2, allow_nan=False).encode())
+    there = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
+    summary["files"] = sorted(there | {SUMMARY_FILE})
+    text = json.dumps(summary, indent=2, allow_nan=False).encode()
+    write(SUMMARY_FILE, lambda: write_whole(folder / SUMMARY_FILE, text))
+    summary["files"] = [name for name in summary["files"] if (folder / name).exists()]
     return summary
 
 
@@ -65,15 +96,13 @@ def _write_parquet(folder: Path, ticks: TickArray) -> None:
 
     table = pa.table({name: np.ascontiguousarray(ticks[name]) for name in TICK.names or ()})
     part = folder / (PARQUET_FILE + ".new")
-    pq.write_table(table, part, compression="zstd")
-    part.replace(folder / PARQUET_FILE)
+    try:
+        pq.write_table(table, part, compression="zstd")
+        part.replace(folder / PARQUET_FILE)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
     (folder / TICKS_FILE).unlink(missing_ok=True)
-
-
-def _write_whole(file: Path, data: bytes) -> None:
-    part = file.with_suffix(".new")
-    part.write_bytes(data)
-    part.replace(file)
 
 
 def summarise(
@@ -82,7 +111,9 @@ def summarise(
     """The summary of a run, as plain types; an unknown is None."""
     commanded = ticks["tick"][ticks["commanded"]]
     flown = ticks[(ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1))]
-    ends = [event["text"] for event in events if event["kind"] == "end"]
+    said = {kind: [event["text"] for event in events if event["kind"] == kind] for kind in (END, FLEET)}
+    ends = said[END]
+    not_logged = [f"{e['text']}, from {e['time_s']:.2f} s on" for e in events if e["kind"] == LOG_ENDED]
     reason = ends[-1] if ends else SILENT_END
     followers = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
     errors = {system_id: _error(flown, system_id) for system_id in followers}
@@ -95,8 +126,10 @@ def summarise(
     headroom = flown["headroom"][flown["commanded"]]
     return {
         "scenario": scenario.name,
-        "verdict": verdict(reason, settled),
+        "verdict": verdict(reason, settled, logged=not any(text.startswith(TICKS_FILE) for text in not_logged)),
         "reason": reason,
+        "fleet": said[FLEET][-1] if said[FLEET] else STARTED,
+        "not_logged": not_logged,
         "loop": scenario.control.loop,
         "delay_margin_s": _number(design["delay_margin_s"]),
         "delay_margin_continuous_s": _number(design["delay_margin_continuous_s"]),
@@ -122,17 +155,20 @@ Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Times (s) and the norm of the spacing error (m) of one follower."""
 
 
-def verdict(reason: str, settling_time_s: float | None) -> str:
-    """ "stable", "unstable" or "aborted".
+def verdict(reason: str, settling_time_s: float | None, *, logged: bool = True) -> str:
+    """ "stable", "unstable", "aborted" or "unknown".
 
     Stable: flown to the end of its duration, and every spacing error had settled by then. Unstable: a limit was broken,
     or a spacing error had not settled, be it that it grows, circles in a limit cycle or shrinks too slowly for the
-    scenario's duration. Aborted: ended early for any other reason.
+    scenario's duration. Aborted: ended early for any other reason. Unknown: flown to the end, but not all of it is in
+    the log of ticks.
     """
     if reason.startswith("broken"):
         return "unstable"
     if not reason.startswith("completed"):
         return "aborted"
+    if not logged:
+        return "unknown"
     return "unstable" if settling_time_s is None else "stable"
 
 

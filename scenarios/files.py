@@ -5,6 +5,7 @@ The one error is ScenarioError: file, key, what was read, what was wanted, in on
 
 import csv
 import difflib
+import hashlib
 import itertools
 import math
 import tomllib
@@ -77,6 +78,11 @@ def dump(scenario: Scenario) -> str:
     import tomlkit
 
     return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True))
+
+
+def fingerprint(scenario: Scenario) -> str:
+    """Sixteen hexadecimal digits that tell scenarios apart: vehicles, links, seed and everything else in them."""
+    return hashlib.sha256(scenario.model_dump_json(exclude_none=True).encode()).hexdigest()[:16]
 
 
 def _json(data: dict[str, Any]) -> str:

@@ -28,6 +28,8 @@ class Authority:
     def __init__(self, silence_s: float) -> None:
         self.station: int | None = None
         self._silence_ns = round(silence_s * NS_PER_S)
+        self.commanded_ns = 0
+        """When that system last commanded it: to ask, to listen and to send heartbeats is not to command."""
         self._heard_ns = 0
         self._refused: set[int] = set()
 
@@ -42,7 +44,7 @@ class Authority:
             return False
         if command == COMMAND_INTERVAL or isinstance(message, DataStream):
             return True
-        self.station, self._heard_ns = source, time_ns
+        self.station, self._heard_ns, self.commanded_ns = source, time_ns, time_ns
         return True
 
     def hears(self, source: int, time_ns: int) -> bool:

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import json
 import math
+import os
 import signal
 import socket
 import sys
@@ -16,12 +17,15 @@ from typing import TYPE_CHECKING, Never
 
 if TYPE_CHECKING:
     from scenarios.schema import Scenario
+    from sim_vehicles.fleet import Fleet
     from sim_vehicles.shell import Change
     from sim_vehicles.truth import TruthLog
     from sim_vehicles.udp import Sockets
 
 SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
 NS_PER_S = 1_000_000_000
+GOODBYE_NS = NS_PER_S
+"""After the vehicles were shut down: their answers are under way."""
 
 DESCRIPTION = """\
 Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
@@ -105,7 +109,9 @@ def _fly(
     if not signed:
         say.openness([options.station], "others may send from there and nothing is signed; see --key")
     say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
-    fly(fleet, ports, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log, ports.sockets))
+    stop = _stop_rule(signals, start_ns, options, say, fleet)
+    if not stop(start_ns, start_ns):
+        fly(fleet, ports, stop=stop, tell=_teller(say, log, ports.sockets))
     say.changes(fleet.take_changes())
     counters = fleet.counters + ports.counters
     say.summary(counters, log)
@@ -137,15 +143,30 @@ def _links_only(
     ports = ", ".join(map(_shown, options.vehicle_port))
     say.openness(options.vehicle_port, "links pass on what anybody sends; only stations and vehicles can sign")
     say.line(f"the links of {scenario.name}, from vehicles at {ports}, to {_shown(options.station)}")
-    relay(links, peers, stop=_stop_rule(signals, start_ns, options), tell=_teller(say, log, peers.sockets))
+    relay(links, peers, stop=_stop_rule(signals, start_ns, options, say), tell=_teller(say, log, peers.sockets))
     say.summary(links.counters + peers.sockets.counters, log)
 
 
-def _stop_rule(signals: list[int], start_ns: int, options: argparse.Namespace) -> Callable[[int, int], bool]:
+def _stop_rule(
+    signals: list[int], start_ns: int, options: argparse.Namespace, say: "_Lines", fleet: "Fleet | None" = None
+) -> Callable[[int, int], bool]:
+    """When to end, from the time and the instant of a station's last command."""
     duration_ns, silence_ns = options.duration * NS_PER_S, options.stop_after_silence * NS_PER_S
+    alone_since_ns = start_ns if options.parent is None else math.inf
 
-    def stop(now_ns: int, last_heard_ns: int) -> bool:
-        return bool(signals) or now_ns - start_ns >= duration_ns or now_ns - last_heard_ns >= silence_ns
+    def stop(now_ns: int, commanded_ns: int) -> bool:
+        nonlocal alone_since_ns
+        if alone_since_ns == math.inf and os.getppid() != options.parent:
+            alone_since_ns = now_ns
+            say.line("the process that started this has gone")
+            if commanded_ns == start_ns:
+                return True  # nobody has flown them: there is nothing to be taken over
+            if fleet is not None:
+                fleet.orphan()
+        if fleet is not None and now_ns - fleet.shut_down_ns >= GOODBYE_NS:
+            return True
+        silent = now_ns - max(commanded_ns, alone_since_ns) >= silence_ns
+        return bool(signals) or now_ns - start_ns >= duration_ns or silent
 
     return stop
 
@@ -209,9 +230,11 @@ class _Lines:
 
 @contextlib.contextmanager
 def _signals() -> Generator[list[int]]:
-    """The list that SIGINT and SIGTERM are appended to while the context lasts."""
+    """The list that the signals to end are appended to while the context lasts; under nohup SIGHUP is none of them."""
     caught: list[int] = []
-    wanted = (signal.SIGINT, signal.SIGTERM)
+    wanted = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        wanted.append(signal.SIGHUP)
     before = [signal.signal(number, lambda number, _: caught.append(number)) for number in wanted]
     try:
         yield caught
@@ -247,7 +270,13 @@ def _parser() -> argparse.ArgumentParser:
         type=_seconds,
         default=math.inf,
         metavar="SECONDS",
-        help="end when no station was heard for that long (never)",
+        help="end when no station has commanded a vehicle for that long (never)",
+    )
+    parser.add_argument(
+        "--parent",
+        type=int,
+        metavar="PID",
+        help="the process that starts this one; with --stop-after-silence: silence counts once it has ended",
     )
     parser.add_argument(
         "--duration", type=_seconds, default=math.inf, metavar="SECONDS", help="end after that time (never)"

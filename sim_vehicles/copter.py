@@ -49,12 +49,14 @@ def multicopter(
     *,
     record: Record | None = None,
     signed: bool = False,
+    experiment: str = "",
 ) -> "Shell[Copter]":
     """A multicopter on the ground."""
     radio = Radio(scenario, own, start_ns, record)
     craft = Copter(scenario, own, radio)
     # MAVLink 1 cannot be signed.
-    return Shell(scenario, radio, craft, version_1_first=craft.rules.version_1_first and not signed)
+    version_1_first = craft.rules.version_1_first and not signed
+    return Shell(scenario, radio, craft, version_1_first=version_1_first, experiment=experiment)
 
 
 class Copter:

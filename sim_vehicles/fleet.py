@@ -11,11 +11,13 @@ from dataclasses import dataclass
 from operator import itemgetter
 
 from scenarios import schema
+from scenarios.files import fingerprint
 from scenarios.signing.link import SignedLink
 from sim_vehicles.copter import Copter, multicopter
 from sim_vehicles.dynamics import State
 from sim_vehicles.links import NEVER_NS, Link, LinkSet
 from sim_vehicles.onboard import OnboardLoop
+from sim_vehicles.services import LONGEST_TEXT
 from sim_vehicles.shell import Change, Shell
 from sim_vehicles.truth import Record
 from sim_vehicles.vehicle import Vehicle, launched
@@ -60,6 +62,7 @@ class Fleet:
     ) -> None:
         self._refused: Counter[str] = Counter()
         self._record = record
+        self._start_ns = start_ns
         self._members: dict[int, _Member] = {}
         self._heap: list[tuple[int, int]] = []
         """(leaves_ns, system id); entries that no longer agree with the member are stale and skipped."""
@@ -70,13 +73,16 @@ class Fleet:
         """In order of time only: (time, system id, number, data) of what the station has sent, earliest first."""
         self._entered = 0
         sensors = scenario.control.loop == "onboard"
+        experiment = f"{fingerprint(scenario)} {scenario.name}"[:LONGEST_TEXT]
         self._in_order = sensors or self._links.have_channels
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
             if scenario.dynamics == "autopilot":
-                vehicle = multicopter(scenario, own, start_ns, record=record, signed=bool(signed))
+                vehicle = multicopter(
+                    scenario, own, start_ns, record=record, signed=bool(signed), experiment=experiment
+                )
             else:
                 onboard = OnboardLoop(scenario, own.system_id, self._seen) if sensors else None
-                vehicle = launched(scenario, own, start_ns, record=record, onboard=onboard)
+                vehicle = launched(scenario, own, start_ns, record=record, onboard=onboard, experiment=experiment)
             self._members[own.system_id] = _Member(
                 vehicle, *self._links.of(own.system_id), signed[own.system_id] if signed else None
             )
@@ -97,9 +103,20 @@ class Fleet:
         return heap[0][0] if heap else NEVER_NS
 
     @property
-    def last_heard_ns(self) -> int:
-        """When a vehicle last heard a valid frame meant for it; the start if never."""
-        return max(member.vehicle.last_heard_ns for member in self._members.values())
+    def commanded_ns(self) -> int:
+        """When a station last commanded a vehicle, with a set-point or otherwise; the start if never."""
+        return max(self._start_ns, *(member.vehicle.authority.commanded_ns for member in self._members.values()))
+
+    @property
+    def shut_down_ns(self) -> int:
+        """When the last vehicle was told to shut down; NEVER_NS while one is not."""
+        told_ns = [member.vehicle.services.shut_down_ns for member in self._members.values()]
+        return NEVER_NS if None in told_ns else max(ns for ns in told_ns if ns is not None)
+
+    def orphan(self) -> None:
+        """From now on the vehicles shut down when they are told to: the station that started them has gone."""
+        for member in self._members.values():
+            member.vehicle.services.orphaned = True
 
     @property
     def counters(self) -> Counter[str]:

@@ -9,6 +9,7 @@ PARAMETER_READ = dialect.MAVLINK_MSG_ID_PARAM_REQUEST_READ
 PARAMETER_LIST = dialect.MAVLINK_MSG_ID_PARAM_REQUEST_LIST
 PARAMETER_VALUE = dialect.MAVLINK_MSG_ID_PARAM_VALUE
 PARAMETER_SET = dialect.MAVLINK_MSG_ID_PARAM_SET
+TEXT_READ = dialect.MAVLINK_MSG_ID_PARAM_EXT_REQUEST_READ
 REAL32, INT32 = dialect.MAV_PARAM_TYPE_REAL32, dialect.MAV_PARAM_TYPE_INT32
 DOES_NOT_EXIST = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
 BY_NAME = -1
@@ -49,6 +50,7 @@ _LAYOUTS = {
     PARAMETER_LIST: dialect.MAVLink_param_request_list_message.unpacker,
     PARAMETER_READ: dialect.MAVLink_param_request_read_message.unpacker,
     PARAMETER_SET: struct.Struct("<4sBB16sB"),
+    TEXT_READ: dialect.MAVLink_param_ext_request_read_message.unpacker,
     MISSION_LIST: dialect.MAVLink_mission_request_list_message.unpacker,
     MISSION_COUNT: dialect.MAVLink_mission_count_message.unpacker,
     MISSION_ITEM: dialect.MAVLink_mission_request_message.unpacker,
@@ -87,6 +89,14 @@ class ParameterSet(NamedTuple):
     value: bytes
     kind: int
     """MAV_PARAM_TYPE"""
+
+
+class TextRead(NamedTuple):
+    """PARAM_EXT_REQUEST_READ of a parameter whose value is text."""
+
+    target_system: int
+    target_component: int
+    name: str
 
 
 class Mission(NamedTuple):
@@ -129,7 +139,7 @@ class SetMode(NamedTuple):
     custom_mode: int
 
 
-Request = ParameterList | ParameterRead | ParameterSet | Mission | FileTransfer | DataStream | SetMode
+Request = ParameterList | ParameterRead | ParameterSet | TextRead | Mission | FileTransfer | DataStream | SetMode
 
 
 def request(number: int, source: tuple[int, int], payload: bytes) -> Request:
@@ -145,6 +155,9 @@ def request(number: int, source: tuple[int, int], payload: bytes) -> Request:
     elif number == PARAMETER_SET:
         value, system, component, name, kind = values
         asked = ParameterSet(system, component, _name(name), value, kind)
+    elif number == TEXT_READ:
+        _, system, component, name = values
+        asked = TextRead(system, component, _name(name))
     elif number == FILE_TRANSFER:
         asked = FileTransfer(source, *values[1:])
     elif number == DATA_STREAM:
@@ -173,6 +186,12 @@ def parameter_error(message: ParameterRead | ParameterSet, error: int) -> Messag
 def message_interval(number: int, interval_us: int) -> Message:
     """MESSAGE_INTERVAL."""
     return dialect.MAVLink_message_interval_message(number, interval_us)
+
+
+def text_value(name: str, text: str) -> Message:
+    """PARAM_EXT_VALUE of the one parameter whose value is text."""
+    kind = dialect.MAV_PARAM_EXT_TYPE_CUSTOM
+    return dialect.MAVLink_param_ext_value_message(name.encode("ascii"), text.encode("ascii"), kind, 1, 0)
 
 
 def mission_count(message: Mission) -> Message:

@@ -28,6 +28,7 @@ from sim_vehicles.service_messages import (
     FileTransfer,
     Mission,
     Request,
+    TextRead,
 )
 
 SHORTEST_INTERVAL_US = US_PER_MS
@@ -50,6 +51,14 @@ STREAMS: dict[int, tuple[int, ...]] = {
     12: (BATTERY_STATUS, mavlink.EKF_STATUS),
 }
 """MAV_DATA_STREAM: the messages of each group, as ArduPilot groups them."""
+
+SCENARIO = "SCENARIO"
+"""The extended parameter, a text, that says which experiment a simulated vehicle belongs to: the fingerprint of its
+scenario, links and seed included, and the scenario's name. It is sent only when asked for, so that stations that know
+nothing of it never see it."""
+LONGEST_TEXT = 128
+KEEP, SHUT_DOWN = 0.0, 2.0
+"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, parameter 1: do nothing, shut down."""
 
 FTP_TERMINATE, FTP_RESET, FTP_ACK, FTP_NAK = 1, 2, 128, 129
 FTP_OPENS = (3, 4, 14)
@@ -113,7 +122,7 @@ class Services:
     """The parameters and message rates of one vehicle, and its answers about them.
 
     `defaults_us` are the messages that can be asked for, with the interval each has if nobody asks, 0 for none. No
-    report is sent before `reports_from_ns`.
+    report is sent before `reports_from_ns`. `experiment` is the text of the parameter SCENARIO.
     """
 
     def __init__(
@@ -124,8 +133,14 @@ class Services:
         version: tuple[int, int, int],
         defaults_us: Mapping[int, int],
         reports_from_ns: int,
+        experiment: str,
     ) -> None:
         self.parameters = parameters
+        self.orphaned = False
+        """Whether the station that started the simulation has gone: whoever flies the vehicles now may end it."""
+        self.shut_down_ns: int | None = None
+        """When an orphan was told to shut down."""
+        self._experiment = experiment
         self._encoder = encoder
         self._schedule = schedule
         self._version = version
@@ -138,6 +153,10 @@ class Services:
             return [self._encoder.pack(_mission_answer(request))]
         if isinstance(request, FileTransfer):
             return [self._encoder.pack(_file_answer(request))]
+        if isinstance(request, TextRead):
+            if request.name != SCENARIO:
+                return []
+            return [self._encoder.pack(service_messages.text_value(SCENARIO, self._experiment))]
         if isinstance(request, DataStream):
             interval_us = max(SHORTEST_INTERVAL_US, round(1e6 / request.rate_hz)) if request.rate_hz else 0
             for message_id in STREAMS.get(request.stream, ()):
@@ -173,6 +192,8 @@ class Services:
             answer = self._request(mavlink.HOME_POSITION, time_ns), []
         elif wants_message:
             answer = self._request(message_id, time_ns), []
+        elif number == mavlink.COMMAND_SHUTDOWN and command.param1 in (KEEP, SHUT_DOWN):
+            answer = ACCEPTED if command.param1 == KEEP else self._shut_down(time_ns), []
         else:
             answer = UNSUPPORTED, []
         return answer
@@ -193,6 +214,12 @@ class Services:
         if message_id not in self._defaults_us or time_ns < self._reports_from_ns:
             return DENIED
         self._schedule.add_once(message_id, time_ns)
+        return ACCEPTED
+
+    def _shut_down(self, time_ns: int) -> int:
+        if not self.orphaned:
+            return DENIED
+        self.shut_down_ns = self.shut_down_ns or time_ns
         return ACCEPTED
 
     def _greet(self, time_ns: int) -> tuple[int, list[service_messages.Message]]:

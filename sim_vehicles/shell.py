@@ -113,17 +113,26 @@ Flown = TypeVar("Flown", bound=Craft, covariant=True)  # noqa: PLC0105 - the cra
 
 
 class Shell(Generic[Flown]):
-    """A vehicle as its link sees it. With `version_1_first` it speaks MAVLink 1 until it hears MAVLink 2, as a PX4."""
+    """A vehicle as its link sees it.
 
-    def __init__(self, scenario: schema.Scenario, radio: Radio, craft: Flown, *, version_1_first: bool = False) -> None:
+    With `version_1_first` it speaks MAVLink 1 until it hears MAVLink 2, as a PX4. `experiment` is the text of its
+    parameter SCENARIO.
+    """
+
+    def __init__(
+        self,
+        scenario: schema.Scenario,
+        radio: Radio,
+        craft: Flown,
+        *,
+        version_1_first: bool = False,
+        experiment: str = "",
+    ) -> None:
         self.system_id = radio.system_id
         self.craft = craft
         self.radio = radio
         self.counters, self.changes = radio.counters, radio.changes
-        self.last_heard_ns = radio.start_ns
-        """When a station's heartbeat that counts, or something that is obeyed, last arrived. TIMESYNC says nothing of
-        a station: who only watches the links asks as well, and the vehicles of a station that has gone must notice."""
-        self._authority = Authority(scenario.safety.heartbeat_timeout_s)
+        self.authority = Authority(scenario.safety.heartbeat_timeout_s)
         self._speaks_version_1 = version_1_first
         self._timesync_ts1 = -1
         from_ns = craft.reports_from_ns
@@ -135,7 +144,9 @@ class Shell(Generic[Flown]):
             schedule.set_interval(
                 message_id, interval_us, radio.start_ns if message_id == mavlink.HEARTBEAT else from_ns
             )
-        self._services = Services(radio.encoder, schedule, craft.parameters, craft.version, intervals_us, from_ns)
+        self.services = Services(
+            radio.encoder, schedule, craft.parameters, craft.version, intervals_us, from_ns, experiment
+        )
 
     @property
     def next_event_ns(self) -> int:
@@ -179,7 +190,7 @@ class Shell(Generic[Flown]):
             self._timesync_ts1 = radio.clock.boot_ns(time_ns)
             frame = radio.encoder.timesync(0, self._timesync_ts1)
         elif message_id == PARAMETER_VALUE:
-            frame = self._services.next_parameter(time_ns)
+            frame = self.services.next_parameter(time_ns)
         else:
             own = craft.report(message_id, time_ns, boot_ms)
             if own is None:
@@ -190,7 +201,7 @@ class Shell(Generic[Flown]):
         radio.send(frame, time_ns)
 
     def _receive(self, data: bytes, time_ns: int) -> None:
-        counters, authority = self.counters, self._authority
+        counters, authority = self.counters, self.authority
         for source, message in mavlink.read_datagram(data, counters):
             self._speaks_version_1 = False
             if isinstance(message, mavlink.Heartbeat):
@@ -200,7 +211,6 @@ class Shell(Generic[Flown]):
             elif message.target_system != self.system_id or message.target_component not in mavlink.OUR_COMPONENTS:
                 counters["ignored_not_addressed"] += 1
             elif authority.obeys(source, message, time_ns):
-                self.last_heard_ns = time_ns
                 self._obey(message, self.craft.acts_at(time_ns))
             elif text := authority.refusal(source, counters):
                 # No COMMAND_ACK: the station has no way to tell it from the answer to an equal command of its own.
@@ -210,11 +220,10 @@ class Shell(Generic[Flown]):
     def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
         if heartbeat.vehicle_type != mavlink.TYPE_GCS:
             self.counters["ignored_heartbeat"] += 1
-        elif not self._authority.hears(source, time_ns):
+        elif not self.authority.hears(source, time_ns):
             self.counters["ignored_not_the_station"] += 1
         else:
             self.counters["heartbeats"] += 1
-            self.last_heard_ns = time_ns
             self.craft.hear_heartbeat(time_ns)
 
     def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
@@ -239,7 +248,7 @@ class Shell(Generic[Flown]):
             if text := self.craft.change_mode(mode, time_ns)[1]:
                 self.radio.say(time_ns, text)
         else:
-            for frame in self._services.answer(message, self.counters, time_ns):
+            for frame in self.services.answer(message, self.counters, time_ns):
                 self.radio.send(frame, time_ns)
             if isinstance(message, ParameterSet):
                 self.craft.parameters_set(time_ns)
@@ -248,7 +257,7 @@ class Shell(Generic[Flown]):
         """The acknowledgement goes before what the command makes the vehicle say, as request and reply are read."""
         self.counters["commands"] += 1
         radio, answer = self.radio, self.craft.command(command, time_ns)
-        result, more = self._services.command(command, time_ns) if answer is None else (answer[0], [])
+        result, more = self.services.command(command, time_ns) if answer is None else (answer[0], [])
         radio.send(radio.encoder.command_ack(command.command, result, command.source), time_ns)
         for message in more:
             radio.send(radio.encoder.pack(message), time_ns)

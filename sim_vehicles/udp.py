@@ -216,7 +216,7 @@ def fly(
     stop: Callable[[int, int], bool],
     tell: Callable[[list[Change]], None],
 ) -> None:
-    """Run the vehicles in real time until `stop(now_ns, last_heard_ns)`.
+    """Run the vehicles in real time until `stop(now_ns, commanded_ns)`.
 
     `stop` and `tell` (with what happened to the vehicles since) are called about ten times a second.
     """
@@ -230,7 +230,7 @@ def fly(
             if now_ns >= next_look_ns:
                 next_look_ns = now_ns + LONGEST_WAIT_NS
                 tell(fleet.take_changes())
-                if stop(now_ns, fleet.last_heard_ns):
+                if stop(now_ns, fleet.commanded_ns):
                     return
 
 

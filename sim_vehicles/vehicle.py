@@ -32,10 +32,11 @@ def launched(
     *,
     record: Record | None = None,
     onboard: OnboardLoop | None = None,
+    experiment: str = "",
 ) -> "Shell[Vehicle]":
     """A vehicle on its launcher; with `onboard` it has a loop of its own."""
     radio = Radio(scenario, own, start_ns, record)
-    return Shell(scenario, radio, Vehicle(scenario, own, radio, onboard))
+    return Shell(scenario, radio, Vehicle(scenario, own, radio, onboard), experiment=experiment)
 
 
 class Vehicle:

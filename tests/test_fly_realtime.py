@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import socket
 import struct
@@ -18,7 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.record import TICK, TickArray
 from gcs.run_files import read_ticks
-from gcs.sitl import TRUTH_FILE
+from gcs.sitl import ORPHAN_S, TRUTH_FILE
 from scenarios.files import dump, load
 from sim_vehicles.truth import ACTED, SAMPLED, read_truth
 
@@ -153,17 +154,28 @@ def test_too_late_a_link_is_unstable_and_exit_code_1(tmp_path: Path) -> None:
     assert summary["headroom_min"] < 0
 
 
-@pytest.mark.parametrize("early", [True, False], ids=["at once", "in flight"])
-def test_ctrl_c_leaves_whole_files_and_no_traceback(tmp_path: Path, early: bool) -> None:
+@pytest.mark.parametrize(
+    ("early", "number"),
+    [
+        (True, signal.SIGINT),
+        (False, signal.SIGINT),
+        (False, signal.SIGTERM),
+        (True, signal.SIGHUP),
+        (False, signal.SIGHUP),
+    ],
+)
+def test_ctrl_c_sigterm_and_a_closed_terminal_leave_whole_files_and_no_traceback(
+    tmp_path: Path, early: bool, number: signal.Signals
+) -> None:
     folder = tmp_path / "run"
     process = fly(short(tmp_path, "chain3", 60.0), "--listen", "127.0.0.1:0", "--out", folder)
     until(lambda: (folder / "scenario.toml").exists() if early else flying(folder))
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     assert "Traceback" not in err
     summary = json.loads((folder / "summary.json").read_text())
-    assert (summary["verdict"], summary["reason"]) == ("aborted", "interrupted: SIGINT")
+    assert (summary["verdict"], summary["reason"]) == ("aborted", f"interrupted: {number.name}")
     assert (folder / "flight.rrd").stat().st_size > 100
     assert not children_named(str(folder))
 
@@ -184,14 +196,68 @@ def test_killed_station_leaves_readable_logs_and_a_new_one_takes_the_vehicles_ba
         assert summary["verdict"] == "aborted"
         ticks = read_ticks(first)
         assert 0 <= killed_ns - ticks["due_ns"][-1] < 1e9
+        for options, flown in ((["--link-delay", "0.4"], "fly triangle5 with other links"), ([], "fly triangle5,")):
+            another = scenario if options else short(tmp_path, "chain3", 10.0)
+            refused = fly(another, "--listen", listen, "--out", tmp_path / "refused", *options)
+            out, err = refused.communicate(timeout=PATIENCE_S)
+            assert (refused.returncode, out, err.count("\n")) == (2, "", 1)
+            assert flown in err
         again = fly(scenario, "--listen", listen, "--out", second, "--json")
         out, err = again.communicate(timeout=PATIENCE_S)
         assert (again.returncode, err) == (0, "")
-        assert json.loads(out)["verdict"] == "stable"
+        summary = json.loads(out)
+        assert (summary["verdict"], summary["fleet"]) == ("stable", "taken over: they were there already")
         assert not (second / "vehicles.log").exists()  # it started none
+        until(lambda: not children_named(str(first)))  # and has ended those it took over
     finally:
         for pid in children_named(str(first)):
             os.kill(pid, signal.SIGTERM)
+
+
+def test_vehicles_at_a_port_that_nobody_listens_at_again_end_with_their_station(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = fly(short(tmp_path, "chain3", 60.0), "--listen", "127.0.0.1:0", "--out", folder)
+    until(lambda: flying(folder))
+    process.kill()
+    process.communicate(timeout=PATIENCE_S)
+    killed_s = time.monotonic()
+    until(lambda: not children_named(str(folder)))
+    assert time.monotonic() - killed_s < ORPHAN_S / 4
+
+
+def test_a_reader_that_leaves_neither_ends_nor_changes_a_flight(tmp_path: Path) -> None:
+    process = fly(short(tmp_path, "chain3", 4.0), "--listen", "127.0.0.1:0", "--out", tmp_path / "run")
+    assert process.stdout is not None
+    assert process.stderr is not None
+    assert process.stdout.readline().startswith("design")
+    process.stdout.close()  # as `gcs fly | head -1` does
+    assert (process.wait(PATIENCE_S), process.stderr.read()) == (0, "")
+    process.stderr.close()
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["verdict"], summary["not_logged"]) == ("stable", [])
+    assert (tmp_path / "run" / "flight.rrd").exists()
+
+
+def test_a_full_disk_ends_the_logs_and_not_the_flight(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = fly(short(tmp_path, "chain3", 4.0), "--listen", "127.0.0.1:0", "--out", folder)
+    until(lambda: flying(folder))
+    full_bytes = (folder / "ticks.part").stat().st_size + TICK.itemsize // 2  # within a record
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (full_bytes, full_bytes))
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, err) == (1, "")
+    assert "verdict  unknown: completed: duration reached" in out
+    assert "log      not written: ticks.part: File too large, from" in out
+    summary = json.loads((folder / "summary.json").read_text())
+    ended_s = read_ticks(folder)["time_s"][-1]
+    assert [text.split(":")[0] for text in summary["not_logged"]].count("ticks.part") == 1
+    assert 0.0 < ended_s < 3.5
+    # set-points went on to the end: three vehicles at 50 Hz
+    assert json.loads((folder / "vehicles.json").read_text())["setpoints"] > 3 * 50 * 3.5
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    assert [event["text"] for event in events if event["kind"] == "log"].count("ticks.part: File too large") == 1
+    assert events[-1]["kind"] == "end"
+    assert not children_named(str(folder))
 
 
 def test_vehicles_with_loops_of_their_own_keep_their_places_without_a_station_and_are_taken_back(

@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment, as a terminal sends it to all processes of a command: no traceback, exit code 130."""
+"""Ctrl-C and a closed terminal at any moment, as sent to all processes of a command: no traceback, exit code 130."""
 
 import os
 import signal
@@ -16,18 +16,22 @@ FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "module", "times"),
+    ("arguments", "module", "times", "number"),
     [
-        (STRESS, "typer", 1),
-        (STRESS, "numpy", 1),
-        (STRESS, "site", 3),  # a worker starts: this process and the tracker of resources have
-        (STRESS, "numpy", 2),
-        (FLY, "numpy", 1),
-        (FLY, "site", 2),  # the observer starts
+        (STRESS, "typer", 1, signal.SIGINT),
+        (STRESS, "numpy", 1, signal.SIGINT),
+        (STRESS, "site", 3, signal.SIGINT),  # a worker starts: this process and the tracker of resources have
+        (STRESS, "numpy", 2, signal.SIGINT),
+        (FLY, "numpy", 1, signal.SIGINT),
+        (FLY, "site", 2, signal.SIGINT),  # the observer starts
+        (STRESS, "numpy", 1, signal.SIGHUP),
+        (STRESS, "site", 3, signal.SIGHUP),
+        (STRESS, "numpy", 2, signal.SIGHUP),
+        (FLY, "site", 2, signal.SIGHUP),
     ],
 )
-def test_ctrl_c_while_a_command_or_its_workers_import_is_no_traceback(
-    arguments: list[str], module: str, times: int, tmp_path: Path
+def test_ctrl_c_or_a_closed_terminal_while_a_command_or_its_workers_import_is_no_traceback(
+    arguments: list[str], module: str, times: int, number: signal.Signals, tmp_path: Path
 ) -> None:
     command = [sys.executable, "-m", "gcs", *arguments, str(tmp_path / "out")]
     environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1"}  # each process tells what it has imported
@@ -41,7 +45,7 @@ def test_ctrl_c_while_a_command_or_its_workers_import_is_no_traceback(
             seen += line.split("|")[-1].strip() == module
             if seen == times:
                 break
-        os.killpg(process.pid, signal.SIGINT)
+        os.killpg(process.pid, number)
         told = process.stderr.read()
         code = process.wait(60)
     assert (seen, code) == (times, 130)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from scenarios.errors import ScenarioError
-from scenarios.files import dump, load, parse
+from scenarios.files import dump, fingerprint, load, parse
 from scenarios.schema import Scenario
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
@@ -19,6 +19,15 @@ def test_every_scenario_in_the_repository_is_valid_and_survives_writing(file: Pa
     scenario = load(file)
     assert scenario.name == file.stem
     assert parse(dump(scenario), FILE) == scenario
+
+
+def test_a_fingerprint_survives_writing_and_tells_links_seeds_and_scenarios_apart() -> None:
+    given = [load(file) for file in sorted(SCENARIOS.glob("*.toml"))]
+    assert all(fingerprint(parse(dump(scenario), Path("again"))) == fingerprint(scenario) for scenario in given)
+    first = given[0]
+    others = [first.with_link_delay(up_s=0.4, down_s=None), first.model_copy(update={"seed": first.seed + 1})]
+    found = {fingerprint(scenario) for scenario in (*given, *others)}
+    assert len(found) == len(given) + 2
 
 
 def test_triangle5_is_the_thesis_formation() -> None:

@@ -125,11 +125,13 @@ def test_the_truth_says_when_states_were_sampled_and_set_points_acted() -> None:
         assert all(row[3] >= row[5] for row in links)
 
 
-def test_when_a_station_was_last_heard_and_what_was_counted() -> None:
+def test_only_commands_count_as_those_of_a_station_not_its_heartbeats_and_questions() -> None:
     fleet = Fleet(scenario(2, down_s=0.1), START)
-    assert fleet.last_heard_ns == START
     fleet.step([(2, heartbeat(), START + SECOND), (1, b"noise", START + 2 * SECOND)], START + 3 * SECOND)
-    assert fleet.last_heard_ns == START + 1100 * MS
+    fleet.step([(1, pack(dialect.MAVLink_timesync_message(0, 5)), START + 3 * SECOND)], START + 4 * SECOND)
+    assert fleet.commanded_ns == START
+    fleet.step([(1, arm(1), START + 5 * SECOND)], START + 6 * SECOND)
+    assert fleet.commanded_ns == START + 5100 * MS
     assert fleet.counters["refused_garbage"] == 1
     assert fleet.counters["heartbeats"] == 1
 

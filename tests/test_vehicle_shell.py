@@ -30,18 +30,17 @@ def test_who_only_watches_the_link_does_not_pass_for_a_station(make: Make) -> No
     vehicle.step([(request, START + 30 * SECOND), (reply, START + 30 * SECOND)], START + 30 * SECOND)
     assert vehicle.counters["timesync_requests"] == 1
     assert vehicle.counters["timesync_replies"] == 1
-    assert vehicle.last_heard_ns == START + SECOND
+    assert vehicle.authority.commanded_ns == 0
 
 
 @every_kind
-def test_a_station_is_heard_by_its_heartbeats_and_by_what_is_obeyed(make: Make) -> None:
+def test_only_what_is_obeyed_and_changes_the_vehicle_is_a_command(make: Make) -> None:
     vehicle = make()
-    for k, data in enumerate((heartbeat(), command(512, 148)), start=1):
-        vehicle.step([(data, START + k * SECOND)], START + k * SECOND)
-        assert vehicle.last_heard_ns == START + k * SECOND
-    for data in (heartbeat(dialect.MAV_TYPE_QUADROTOR), command(512, 148, system=9), command(512, 148, component=9)):
+    vehicle.step([(arm(), START + SECOND)], START + SECOND)
+    assert vehicle.authority.commanded_ns == START + SECOND
+    for data in (heartbeat(), heartbeat(dialect.MAV_TYPE_QUADROTOR), arm(system=9), command(400, 1, component=9)):
         vehicle.step([(data, START + 5 * SECOND)], START + 5 * SECOND)
-        assert vehicle.last_heard_ns == START + 2 * SECOND
+        assert vehicle.authority.commanded_ns == START + SECOND
     assert (vehicle.counters["ignored_heartbeat"], vehicle.counters["ignored_not_addressed"]) == (1, 2)
 
 
@@ -52,7 +51,7 @@ def test_a_heartbeat_of_another_than_its_station_is_counted_as_such(make: Make) 
     other = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(MONITOR)
     vehicle.step([(other, START + 2 * SECOND)], START + 2 * SECOND)
     assert (vehicle.counters["heartbeats"], vehicle.counters["ignored_not_the_station"]) == (0, 1)
-    assert vehicle.last_heard_ns == START + SECOND
+    assert vehicle.authority.commanded_ns == START + SECOND
 
 
 @every_kind

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from gcs.output import outlive_readers
 from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE
 from gcs.run_files import RunTail, read_design, read_scenario, read_ticks
 from gcs.show.grid import WholeTicks
@@ -62,16 +63,21 @@ def main(argv: list[str] | None = None) -> int:
     for decided_by_parent in (signal.SIGINT, signal.SIGHUP):
         signal.signal(decided_by_parent, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, stop)
-    os.nice(10)
+    outlive_readers()
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun would write over the table what is told in one line at the end
     Recording.prepare()
+    os.nice(10)  # not before: the station waits until this is ready
     ready = arguments.folder / READY_FILE
-    ready.touch()
     try:
+        ready.touch()
         inputs = _inputs(arguments.folder, parent)
         if inputs is not None:
             observe(arguments.folder, *inputs, parent=parent, show_table=not arguments.no_table)
         if inputs is not None and parent.gone():
             finish(arguments.folder)  # the station was killed: its run is summed up here
+    except OSError as error:  # a full disk; the flight goes on
+        print(f"{arguments.folder}: {error.strerror or error}; wanted room for it, then gcs recover", file=sys.stderr)
+        return 1
     finally:
         ready.unlink(missing_ok=True)
     return 0

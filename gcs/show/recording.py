@@ -13,6 +13,7 @@ same for two hundred vehicles as for two.
     modes/ID        what the station thinks of a vehicle;  events: what happened
 """
 
+import errno
 import itertools
 import math
 import os
@@ -139,9 +140,12 @@ class Recording:
             self._send_scene(ticks)
 
     def close(self) -> None:
-        """Write what is left and give the file its final name."""
+        """Write what is left and give the file its final name; raises OSError if not all of it could be written."""
         self.send()
-        self._stream.flush()
+        try:
+            self._stream.flush()
+        except RuntimeError as error:
+            raise OSError(errno.EIO, f"the recording is not whole ({error})") from None
         self._stream.disconnect()
         os.replace(self._folder / UNFINISHED_FILE, self._folder / RECORDING_FILE)
 

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gcs.console import plain_console
+from gcs.record import STARTED
 from gcs.refusals import in_words
 
 UNKNOWN = "–"
@@ -96,7 +97,11 @@ def print_summary(summary: dict[str, Any], folder: Path, console: Console | None
 def print_flight(summary: dict[str, Any], console: Console) -> None:
     """The verdict with its figures; `control` may be None, where a log does not show the ticks."""
     style = {"stable": "bold green", "unstable": "bold red"}.get(summary["verdict"], "bold yellow")
-    console.print(Text.assemble("verdict  ", (summary["verdict"], style), f": {_reason(summary)}"))
+    fleet = summary.get("fleet", STARTED)
+    flown = "" if fleet == STARTED else f"; vehicles {fleet}"
+    console.print(Text.assemble("verdict  ", (summary["verdict"], style), f": {_reason(summary)}{flown}"))
+    for text in summary.get("not_logged", ()):
+        console.print(f"log      not written: {text}")
     console.print(f"delay    {delay_text(summary)}")
     console.print(_response(summary.get("response")), end="")
     control = summary["control"]

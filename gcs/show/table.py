@@ -4,8 +4,6 @@
 terminal, and `Display` chooses between the two.
 """
 
-import os
-import sys
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -327,13 +325,8 @@ class Display:
             self._say(plain_line(state))
 
     def _say(self, line: str) -> None:
-        if not self._shown:
-            return
-        try:
+        if self._shown:
             print(line, flush=True)
-        except OSError:  # nobody reads any more; the recording goes on
-            self._shown = False
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _quantiles(values: Floats, probabilities: tuple[float, ...]) -> Floats:

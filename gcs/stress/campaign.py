@@ -17,8 +17,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from gcs.interrupts import held_back
-from gcs.record import SCENARIO_FILE
+from gcs.interrupts import FROM_TERMINAL, held_back
+from gcs.output import DISK_FULL
+from gcs.record import SCENARIO_FILE, RecordLog
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
 
@@ -48,11 +49,11 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self.file = folder / TRIALS_FILE
         self.outcomes: dict[str, Outcome] = {}
-        self._descriptor = os.open(self.file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        self._log = RecordLog(self.file)
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._log.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            os.close(self._descriptor)
+            self._log.close()
             raise CampaignError(f"{folder}: another gcs stress works there; wanted a folder of its own") from None
         text = self.file.read_bytes()
         for line in text.splitlines():
@@ -60,15 +61,29 @@ class Store:
                 outcome = Outcome.from_json(line.decode())
                 self.outcomes[outcome.id] = outcome
         if text and not text.endswith(b"\n"):
-            os.write(self._descriptor, b"\n")
+            self._log.add(b"\n")
 
     def add(self, outcome: Outcome) -> None:
-        """Store an outcome; it is in the file when this returns."""
+        """Store an outcome; it is in the file when this returns.
+
+        Raises
+        ------
+        CampaignError
+            If it cannot be written.
+        """
+        try:
+            self._log.add((outcome.to_json() + "\n").encode())
+        except OSError as error:
+            raise CampaignError(f"{self.file}: {error.strerror}; {self.resume}") from None
         self.outcomes[outcome.id] = outcome
-        os.write(self._descriptor, (outcome.to_json() + "\n").encode())
+
+    @property
+    def resume(self) -> str:
+        """How to go on with the campaign."""
+        return f"{len(self.outcomes)} trials are stored; go on with --resume --out {self.file.parent}"
 
     def close(self) -> None:
-        os.close(self._descriptor)
+        self._log.close()
 
 
 def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None:
@@ -101,13 +116,18 @@ def run_campaign(
     """
     missing = {trial.id: trial for trial in trials if trial.id not in store.outcomes}
     left = len(missing)
-    for outcome in fly(list(missing.values())) if missing else ():
-        if (outcome.reason or "").startswith("interrupted"):
-            raise KeyboardInterrupt
-        store.add(outcome)
-        left -= 1
-        if ended is not None:
-            ended(outcome, left)
+    try:
+        for outcome in fly(list(missing.values())) if missing else ():
+            if (outcome.reason or "").startswith("interrupted"):
+                raise KeyboardInterrupt
+            store.add(outcome)
+            left -= 1
+            if ended is not None:
+                ended(outcome, left)
+    except OSError as error:
+        if error.errno not in DISK_FULL:
+            raise
+        raise CampaignError(f"{error.filename}: {error.strerror}; {store.resume}") from None
     # the same trial may stand at another place of another sweep
     return [replace(store.outcomes[trial.id], coordinates=dict(trial.coordinates)) for trial in trials]
 
@@ -197,10 +217,15 @@ def _pool(count: int) -> ProcessPoolExecutor:
     )
 
 
+def _leave_to_parent(*_: object) -> None: ...
+
+
 def _prepare_worker(parent: int) -> None:
-    """Ctrl-C is the parent's to answer; and without a parent there is nobody to fly for."""
+    """What a terminal sends is the parent's to answer; and without a parent there is nobody to fly for."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup, which a flight would keep to
+        signal.signal(signal.SIGHUP, _leave_to_parent)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, FROM_TERMINAL)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent:  # it died while this process was starting, before it could be told
         os._exit(1)

@@ -16,6 +16,7 @@ import typer
 
 from gcs.interrupts import raised
 from gcs.loop_option import Loop, LoopOption, load_with_loop
+from gcs.output import outlive_readers
 from gcs.user_input import InputError, out_file, out_folder
 
 if TYPE_CHECKING:
@@ -109,6 +110,7 @@ def stress(
         assert_onset=assert_onset,
     )
     _check(options, out, trial)
+    outlive_readers()
     if junit is not None:
         out_file("--junit", junit)
     from gcs.stress.campaign import CampaignError
@@ -152,6 +154,7 @@ def _check(options: StressOptions, out: Path | None, trial: str) -> None:
 def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple[dict[str, Any], Path]:
     """Fly what was asked for; the result as plain types, and the folder it is in."""
     from gcs.fly import new_folder
+    from gcs.record import write_whole
     from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
     from gcs.stress.report import write_report
     from gcs.stress.result import result_of
@@ -172,7 +175,7 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
             folder = new_folder(f"{study.plan.scenario.name}-stress")
         else:
             folder = out if options.resume else out_folder(out, "a new or empty folder, or --resume")
-        (folder / SCENARIO_FILE).write_text(scenario, encoding="utf-8")
+        write_whole(folder / SCENARIO_FILE, scenario.encode())
         store = stack.enter_context(contextlib.closing(Store(folder)))
         progress = stack.enter_context(_progress(shown))
         try:
@@ -189,13 +192,13 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
                 except NoOnset as reason:
                     no_onset = reason
         except KeyboardInterrupt:
-            typer.echo(f"{len(store.outcomes)} trials are stored; go on with --resume --out {folder}", err=True)
+            typer.echo(store.resume, err=True)
             raise
         outcomes = list(store.outcomes.values())
         write_parquet(outcomes, folder)
     allowed = options.assert_onset
     result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, no_onset=no_onset, allowed=allowed)
-    (folder / RESULT_FILE).write_text(json.dumps(result, indent=2, allow_nan=False), encoding="utf-8")
+    write_whole(folder / RESULT_FILE, json.dumps(result, indent=2, allow_nan=False).encode())
     write_report(folder, result, study=study, axes=axes, sweep=sweep, onset=onset)
     return result, folder
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gcs.flown import first_uses, fly_plan, fly_virtual, median_delays_s
+from gcs.output import DISK_FULL
 from gcs.plan import FlightPlan
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import FreeResponse, effective_delays_s, fly_calm, response_alone, response_paired
@@ -41,7 +42,7 @@ _WANTED_ERROR = 0.01
 
 
 def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
-    """Fly a trial and judge it; never raises: what it meets is in the outcome's `error`.
+    """Fly a trial and judge it; what it meets is in the outcome's `error`. Only a full disk is raised, as OSError.
 
     With `folder` the files of its flight are left there as `gcs fly` leaves them, for a probe in one folder for each
     size of the initial error that was flown. In real time they are written anyway, and go again without `folder`.
@@ -58,7 +59,9 @@ def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
     try:
         measure = _own if trial.kind == "own" else _pair if _needs_pair(trial) else _probe
         outcome = measure(trial, outcome, folder)
-    except Exception:  # noqa: BLE001 - a campaign of thousands goes on; what happened is recorded with its inputs
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno in DISK_FULL:
+            raise
         outcome = replace(outcome, error=traceback.format_exc())
     return replace(outcome, elapsed_s=round(time.perf_counter() - began_s, 3))
 

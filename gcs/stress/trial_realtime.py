@@ -1,5 +1,6 @@
 """A trial flown as `gcs fly` flies it: processes, UDP sockets and the real clock, the machine's noise on record."""
 
+import errno
 import shutil
 import tempfile
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, NamedTuple
 from gcs.fly import FlyOptions, fly
 from gcs.grade import TRUTH_FILE, Truth, read_truth
 from gcs.plan import FlightPlan
-from gcs.record import TickArray
+from gcs.record import EVENTS_FILE, TICKS_FILE, TickArray
 from gcs.run_files import RunTail, read_ticks
 from gcs.udp import StationSocket
 
@@ -40,7 +41,10 @@ def fly_real_time(
     try:
         before = _processor_times()
         with StationSocket("127.0.0.1", 0) as link:
-            fly(plan, design, link, FlyOptions(folder=folder, start_vehicles=True, show_table=False))
+            summary = fly(plan, design, link, FlyOptions(folder=folder, show_table=False))
+        needed = (TICKS_FILE, EVENTS_FILE, TRUTH_FILE)
+        if lost := [text for text in summary["not_logged"] if text.startswith(needed)]:
+            raise OSError(errno.ENOSPC, "; ".join(lost), str(folder))
         spent = [after - former for after, former in zip(_processor_times(), before, strict=True)]
         total = max(1, sum(spent))
         shares = ProcessorShares(spent[_STEAL] / total, 1.0 - (spent[_IDLE] + spent[_WAITING]) / total)

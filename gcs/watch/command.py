@@ -4,12 +4,14 @@ The work is in `links` (what frames say), `live` (the socket), `tlog` and `repla
 """
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from gcs.output import outlive_readers
 from gcs.user_input import InputError, KeyFile, listening, opened_guard
 
 _FAILED, _INTERRUPTED = 1, 130
@@ -46,11 +48,13 @@ def monitor(
     """
     if margin is not None and design is not None:
         raise InputError("read --margin and --design, wanted one of them")
+    if sys.stdout.isatty():  # a closed terminal ends it by a signal; a reader that has enough, by what is printed
+        outlive_readers()
     guard = opened_guard(key, role="monitor")
     with listening("--listen", listen) as link:
         scenario, margin_s, margin_of = _compared_with(scenario_file, margin, design)
         # After the socket: what comes while these load keeps its receive stamp.
-        from gcs.fly import stop_signals
+        from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
         from gcs.watch.live import MonitorOptions, monitor_links
         from gcs.watch.table import print_report

@@ -1,0 +1,56 @@
+"""Standard output that may go away: a reader that has enough, as `head`, a closed terminal, a full disk."""
+
+import errno
+import io
+import os
+import sys
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Of an OSError: nothing more can be written there."""
+_GONE = (*DISK_FULL, errno.EPIPE, errno.EIO, errno.EBADF)
+_STANDARD = (0, 1, 2)
+
+
+def open_what_is_closed() -> None:
+    """Open nothing in place of standard files that are closed: a socket that got such a number would be printed to."""
+    for number in _STANDARD:
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the least number that is free
+
+
+def outlive_readers() -> None:
+    """From now on what is printed is dropped once nobody takes it any more, and no print raises."""
+    if sys.stdout is sys.__stdout__:
+        sys.stdout = _unfailing(1, sys.stdout)
+    if sys.stderr is sys.__stderr__:
+        sys.stderr = _unfailing(2, sys.stderr)
+
+
+class _Unfailing(io.FileIO):
+    """A standard file that turns into the null device when it cannot be written."""
+
+    def write(self, data: "ReadableBuffer", /) -> int:
+        try:
+            return super().write(data) or 0
+        except OSError as error:
+            if error.errno not in _GONE:
+                raise
+            with open(os.devnull, "wb") as null:
+                os.dup2(null.fileno(), self.fileno())
+            return memoryview(data).nbytes
+
+
+def _unfailing(number: int, former: TextIO | None) -> io.TextIOWrapper:
+    """In place of the former, which is None if the file was closed at the start."""
+    return io.TextIOWrapper(
+        io.BufferedWriter(_Unfailing(number, "w", closefd=False)),
+        encoding="utf-8" if former is None else former.encoding,
+        errors=None if former is None else former.errors,
+        line_buffering=number == 2 or os.isatty(number),
+    )
