@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gains.behaviour import Behaviour, BlockMargin, Gains, behaviour, block_margin, follower_block, leader_block
 from gains.delay import delay_margin
-from gains.errors import BadModelError, DisagreementError
+from gains.errors import BadModelError, DisagreementError, SolverError
 from gains.formation import FormationModel, checked_gain
 from gains.graph_design import GraphDesign, GraphMethod, graph_design
 from gains.pattern import Pattern, leader_follower
@@ -58,7 +58,8 @@ class Design:
     alpha
         Exact sector bound for W = I, `gains.robust.robustness`; 0 if the loop is unstable.
     certificate
-        Lyapunov proof of 0.9999 α; None if the loop is unstable or its α is below 5e-4.
+        Lyapunov proof of 0.9999 α; None if the loop is unstable, its α is below 5e-4, or the solver finds none for
+        given gains.
     delay_margin_s, delay_margin_continuous_s
         Margin of the sampled loop and of the continuous one, all feedback late.
     leader, follower
@@ -284,11 +285,23 @@ def _assess(
         leader=leader,
         follower=follower,
         behaviour=behaviour(gains, (margin_s + period_s) / 2),
-        certificate=certify(*gains, _CERTIFIED_SHARE * alpha) if alpha >= ALPHA_MIN else None,
+        certificate=_certificate(gains, alpha, given=method == "given"),
         requirement=requirement,
         trade_off=trade_off(period_s=period_s, string_peak_max=requirement.string_peak_max if requirement else None),
         method=method,
     )
+
+
+def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | None:
+    """The proof of α. Given gains, however badly scaled, are assessed without one where the solver finds none."""
+    if alpha < ALPHA_MIN:
+        return None
+    try:
+        return certify(*gains, _CERTIFIED_SHARE * alpha)
+    except SolverError:
+        if given:
+            return None
+        raise
 
 
 def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple[TradeOffPoint, ...]:
