@@ -129,13 +129,18 @@ def behaviour(gains: Gains, delay_s: float) -> Behaviour:
     late = [rightmost_root([(A0, 0.0), (A1, delay_s)]) for A0, A1 in (leader_block(gains), follower_block(gains))]
     return Behaviour(
         decay_rate_1_s=float(-roots.real.max()),
-        damping=float((-roots.real / np.abs(roots)).min()),
+        damping=min(_damping(root) for root in roots.tolist()),
         decay_rate_delayed_1_s=float(-max(root.real for root in late)),
-        damping_delayed=float(-late[1].real / abs(late[1])),
+        damping_delayed=_damping(late[1]),
         string_peak=string_peak(gains, 0.0),
         string_peak_delayed=string_peak(gains, delay_s),
         delay_s=delay_s,
     )
+
+
+def _damping(root: complex) -> float:
+    """Damping ratio −Re s / |s|; 0 for a root at zero, which nothing brings back."""
+    return -root.real / abs(root) if root else 0.0
 
 
 def string_peak(gains: Gains, delay_s: float) -> float:

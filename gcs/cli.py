@@ -22,6 +22,7 @@ from gcs.user_input import (
     opened_guard,
     out_file,
     out_folder,
+    refuse,
     warn_if_open,
     within,
 )
@@ -36,6 +37,9 @@ app = typer.Typer(
 
 ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file, as scenarios/triangle5.toml")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
+AllowUnstable = Annotated[
+    bool, typer.Option("--allow-unstable", help="accept gains whose loop is unstable without any delay")
+]
 
 
 class Method(Enum):
@@ -78,6 +82,7 @@ def fly(
         bool, typer.Option("--mirror-commands", help="let what that station sends through to the vehicles")
     ] = False,
     key: KeyFile = None,
+    allow_unstable: AllowUnstable = False,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="run folder; default runs/<scenario>-<time>")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -85,6 +90,7 @@ def fly(
 
     Exit code 1 if the flight is not stable.
     """
+    from gcs import preflight
     from gcs.fly import FlyOptions, new_folder
     from gcs.fly import fly as fly_now
     from gcs.plan import flight_plan
@@ -93,6 +99,8 @@ def fly(
     if link_delay is not None:
         within("--link-delay", link_delay, 0, 60, "seconds")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
+    if connect is None:
+        refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
     guard = opened_guard(key, role="station")
     if mirror_commands and mirror is None:
         raise InputError("read --mirror-commands without --mirror, wanted both")
@@ -104,6 +112,9 @@ def fly(
         warn_if_open(link, signed=key is not None)
         to = None if mirror is None else opened.enter_context(mirroring(mirror, link, guard, commands=mirror_commands))
         design, plan = flight_plan(scenario)
+        if (unstable := preflight.unstable_loop(plan)) is not None:
+            _refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
+            plan = preflight.without_actions(plan)
         if not as_json:
             _print_design(design)
         folder = out_folder(out) if out is not None else new_folder(scenario.name)
@@ -125,16 +136,20 @@ def design(
         Method | None, typer.Option(help="in place of the scenario's: inclusion principle, or a graph method")
     ] = None,
     loop: LoopOption = None,
+    allow_unstable: AllowUnstable = False,
     as_json: AsJson = False,
 ) -> None:
     """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
     from gcs.plan import flight_plan
+    from gcs.preflight import unstable_loop
 
     scenario = load_with_loop(scenario_file, loop)
     if method is not None:
         control = scenario.control.model_copy(update={"method": method.value, "gains": None, "blocks": ()})
         scenario = scenario.model_copy(update={"control": control})
-    result, _ = flight_plan(scenario)
+    result, plan = flight_plan(scenario)
+    if (unstable := unstable_loop(plan)) is not None:
+        _refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     else:
@@ -378,6 +393,12 @@ def _scenario(file: Path) -> Any:
     from scenarios.files import load
 
     return load(file)
+
+
+def _refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
+    if not allow:
+        refuse(file, finding)
+    print(f"warning: {file}: {finding}", file=sys.stderr)
 
 
 def _print_design(result: dict[str, Any]) -> None:

@@ -44,6 +44,8 @@ def _print_margins(design: dict[str, Any], console: Console) -> None:
     sampled_s, continuous_s = design["delay_margin_s"], design["delay_margin_continuous_s"]
     if design["loop"] == "onboard" and sampled_s is None:
         console.print("margin   no limit: no delay of what the station streams makes this loop unstable")
+    elif sampled_s == 0.0:
+        console.print("margin   none: the sampled loop is unstable without any delay")
     else:
         console.print(
             f"margin   {_ms(sampled_s)} of loop delay in the sampled loop, {_ms(continuous_s)} in the continuous model"
