@@ -7,7 +7,8 @@ Loops with a constant delay
     `delay` (windows and margin, exact), `delay_sweep`, `rightmost`, `delay_opinions` (all three compared),
     `commensurate` and `mixed_delays` (multiples of one delay, beside known ones), `several_delays`, `model_file`
 Loops as they are flown
-    `sampled` (sampled and held), `period_windows`, `multirate`, `onboard`, `response` (vehicles that lag)
+    `sampled` (sampled and held), `period_windows`, `multirate`, `onboard`, `response` (vehicles that lag),
+    `flown_loop` (what a delay leaves of robustness and string stability)
 Delays that vary
     `varying_delay`, `jitter` (which bound covers what was observed)
 Formations and patterns

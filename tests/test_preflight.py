@@ -1,4 +1,4 @@
-"""What is found before take-off: unstable loops, bad starts and links too slow for a flight, one line each, exit code 2."""
+"""Found before take-off, in one line with exit code 2: unstable loops, bad starts, links too slow for a flight."""
 
 import itertools
 import json
