@@ -287,7 +287,11 @@ def _assess(
         behaviour=behaviour(gains, (margin_s + period_s) / 2),
         certificate=_certificate(gains, alpha, given=method == "given"),
         requirement=requirement,
-        trade_off=trade_off(period_s=period_s, string_peak_max=requirement.string_peak_max if requirement else None),
+        trade_off=trade_off(
+            period_s=period_s,
+            string_peak_max=requirement.string_peak_max if requirement else None,
+            loop=requirement.loop if requirement else "ground",
+        ),
         method=method,
     )
 
@@ -304,14 +308,16 @@ def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | No
         raise
 
 
-def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple[TradeOffPoint, ...]:
+def trade_off(
+    *, period_s: float, string_peak_max: float | None = None, loop: Literal["ground", "onboard"] = "ground"
+) -> tuple[TradeOffPoint, ...]:
     """Return the largest α at sampled delay margins from 0.05 to 1 s; margins no gains have are left out.
 
     Parameters
     ----------
     period_s
         Period of the control loop: sample, hold.
-    string_peak_max
+    string_peak_max, loop
         As in `gains.requirement.Requirement`.
 
     Raises
@@ -327,7 +333,7 @@ def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple
     (0.05, 1.0, True)
     """
     _check_period(period_s)
-    limit = Requirement(string_peak_max=string_peak_max).string_peak_max
+    limit = Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit
     points = ((margin_s, largest_alpha(margin_s, period_s, limit)) for margin_s in _TRADE_OFF_MARGINS_S)
     return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)
 

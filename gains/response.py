@@ -179,7 +179,7 @@ def requirement_with(requirement: Requirement, response: Response, *, period_s: 
     pair = FormationModel((-1, 0), axes=1)  # a leader-follower tree has the roots of these two, whatever its size
 
     def excess(without_s: float) -> float:
-        found = largest_alpha(without_s, period_s, requirement.string_peak_max, requirement.decay_rate_1_s or 0.0)
+        found = largest_alpha(without_s, period_s, requirement.peak_limit, requirement.decay_rate_1_s or 0.0)
         if found is None:
             return -wanted_s
         K = pair.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])

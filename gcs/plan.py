@@ -189,6 +189,7 @@ def _requirement(scenario: Scenario) -> Requirement:
         alpha=control.alpha,
         decay_rate_1_s=control.decay_rate_1_s,
         string_peak_max=control.string_peak_max,
+        loop=control.loop,
     )
 
 

@@ -105,8 +105,8 @@ class Control(Part):
     all errors of these two, and of those it hears."""
     loop: Literal["ground", "onboard"] = "ground"
     """ground: the station closes every loop, and all feedback is late. onboard: every vehicle feeds back its own errors
-    by itself, and the station streams what depends on those of others (thesis eq. 5.1). What is required of a design is
-    required of its ground loop; the margins reported are those of the loop flown."""
+    by itself, and the station streams what depends on those of others (thesis eq. 5.1). There string_peak_max is judged
+    at every delay, and delay_margin_s limits the vehicles' own gains: to those that would take it in a ground loop."""
     delay_margin_s: Positive | None = None
     """Least delay margin of the sampled loop."""
     alpha: Annotated[float, Field(gt=0, lt=1)] | None = None
