@@ -161,7 +161,8 @@ def design(
     Parameters
     ----------
     formation
-        At least a leader and one follower.
+        A leader and any number of followers. The gains of a leader alone are those for followers too, but its margin is
+        that of its own velocity loop.
     requirement
         A sampled delay margin of 0.3 s if not given.
     period_s
@@ -174,7 +175,7 @@ def design(
     Raises
     ------
     BadModelError
-        If the formation has no follower, or the period is not positive.
+        If the period is not positive.
     InfeasibleError
         If no gains meet the requirement; the message says what can be reached.
     DisagreementError
@@ -227,7 +228,7 @@ def evaluate_gains(
     Raises
     ------
     BadModelError
-        If a gain is not finite or not of that shape, the formation has no follower, or the period is not positive.
+        If a gain is not finite or not of that shape, or the period is not positive.
 
     Examples
     --------
@@ -258,8 +259,6 @@ def _assess(
     # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
     from gains.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
 
-    if formation.vehicles < 2:
-        raise BadModelError("the formation has no follower; wanted a leader and at least one follower")
     A, B, K = formation.A, formation.B, formation.overlapping_gain(*gains)
     expansion, K_expanded = expand(formation), modified_gain(formation, expanded_gain(formation, *gains))
     verify_inclusion(expansion, A, B, K=K, K_expanded=K_expanded)
@@ -268,10 +267,11 @@ def _assess(
     margin_s = float(sampled_delay_margin(A, B, K, period_s=period_s))
     continuous_s = delay_margin(A, B @ K)
     leader, follower = block_margin(*leader_block(gains)), block_margin(*follower_block(gains))
-    if not np.isclose(continuous_s, min(leader.delay_margin_s, follower.delay_margin_s), rtol=1e-9, atol=0):
+    blocks_s = [leader.delay_margin_s, follower.delay_margin_s][: formation.vehicles]
+    if not np.isclose(continuous_s, min(blocks_s), rtol=1e-9, atol=0):
         raise DisagreementError(
-            f"the formation's delay margin is {continuous_s!r}, its leader's and follower's are "
-            f"{leader.delay_margin_s!r} and {follower.delay_margin_s!r}; wanted the less of the two"
+            f"the formation's delay margin is {continuous_s!r}, those of its leader and followers are {blocks_s}; "
+            "wanted the least of them"
         )
     return Design(
         K1=gains[0],
