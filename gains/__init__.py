@@ -8,7 +8,8 @@ Loops with a constant delay
     `commensurate` and `mixed_delays` (multiples of one delay, beside known ones), `several_delays`, `model_file` and
     `loop_margin` (any of these, and sampled loops, from one description)
 Loops as they are flown
-    `sampled` (sampled and held), `period_windows`, `multirate`, `onboard`, `response` (vehicles that lag)
+    `sampled` (sampled and held), `period_windows`, `multirate`, `onboard`, `response` (vehicles that lag),
+    `flown_loop` (what a delay leaves of robustness and string stability)
 Delays that vary
     `varying_delay`, `jitter` (which bound covers what was observed)
 Formations and patterns

@@ -7,6 +7,7 @@ Source: Sahoo 2012 (see `gains.formation`), eq. (2.11) with the gains (3.26).
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from gains.delay import analyse_delay
 from gains.rightmost import rightmost_root
 from gains.robust import subsystem_loop
+from gains.string_stability import Response, response_peak
 
 FloatArray = NDArray[np.float64]
 Gains = tuple[FloatArray, FloatArray, FloatArray]
@@ -129,20 +131,36 @@ def behaviour(gains: Gains, delay_s: float) -> Behaviour:
     late = [rightmost_root([(A0, 0.0), (A1, delay_s)]) for A0, A1 in (leader_block(gains), follower_block(gains))]
     return Behaviour(
         decay_rate_1_s=float(-roots.real.max()),
-        damping=float((-roots.real / np.abs(roots)).min()),
+        damping=min(_damping(root) for root in roots.tolist()),
         decay_rate_delayed_1_s=float(-max(root.real for root in late)),
-        damping_delayed=float(-late[1].real / abs(late[1])),
+        damping_delayed=_damping(late[1]),
         string_peak=string_peak(gains, 0.0),
         string_peak_delayed=string_peak(gains, delay_s),
         delay_s=delay_s,
     )
 
 
-def string_peak(gains: Gains, delay_s: float) -> float:
-    """Return the largest singular value of Γ(jω) over ω, at least |Γ(0)| = 1: a search on a grid, refined once.
+def _damping(root: complex) -> float:
+    """Damping ratio −Re s / |s|; 0 for a root at zero, which nothing brings back."""
+    return -root.real / abs(root) if root else 0.0
 
-    Γ(s) = (s² I − (s K1 − K3) e^{−sτ})^{-1} (s K2 + K3) e^{−sτ} takes the velocity error of the vehicle in front to the
-    own one, and for gains that act on every axis alike also the spacing error in front to the own one.
+
+def string_peak(
+    gains: Gains, delay_s: float, *, front_delay_s: float | None = None, answer: Response = np.ones_like
+) -> float:
+    """Return the largest singular value of Γ(jω) over ω, at least |Γ(0)| = 1, as `gains.string_stability` finds it.
+
+    Γ takes the velocity error of the vehicle in front to the own one, and for gains that act on every axis alike also
+    the spacing error in front to the own one. With own feedback delayed by a and that of the vehicle in front by b::
+
+        Γ(s) = (s² I − (s K1 − K3) h e^{−sa})^{-1} (s K2 e^{−sb} + K3 e^{−sa}) h
+
+    Parameters
+    ----------
+    delay_s, front_delay_s
+        a and b; b = a if not given, as when a ground station closes every loop.
+    answer
+        h(jω), from wanted to real acceleration: frequencies (k,) to values (k,). One if not given.
 
     Examples
     --------
@@ -153,16 +171,20 @@ def string_peak(gains: Gains, delay_s: float) -> float:
     >>> round(string_peak((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), 0.0), 4)
     1.1547
     """
+    identity = np.eye(gains[0].shape[0])
     own, front, spacing = gains
-    fastest = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)) + 1 / (delay_s + 1))
-    omega = np.geomspace(1e-4 * fastest, 10 * fastest, 500)
-    peak = 1.0
-    for _ in range(2):
-        s = 1j * omega[:, None, None]
-        late = np.exp(-s * delay_s)
-        loop = s**2 * np.eye(own.shape[0]) - (s * own - spacing) * late
-        growth = np.linalg.norm(np.linalg.solve(loop, (s * front + spacing) * late), ord=2, axis=(1, 2))
-        at = int(np.argmax(growth))
-        peak = max(peak, float(growth[at]))
-        omega = np.linspace(omega[max(at - 1, 0)], omega[min(at + 1, omega.size - 1)], 100)
-    return peak
+    if all(np.array_equal(gain, gain[0, 0] * identity) for gain in gains):  # one axis says it for all
+        own, front, spacing, identity = own[:1, :1], front[:1, :1], spacing[:1, :1], identity[:1, :1]
+    behind_s = delay_s if front_delay_s is None else front_delay_s
+
+    def growth(omega: FloatArray) -> NDArray[Any]:
+        s, h = 1j * omega, answer(omega)
+        at_once, late = ((h * np.exp(-s * delay))[:, None, None] for delay in (delay_s, behind_s))
+        s = s[:, None, None]
+        loop, entry = s**2 * identity - (s * own - spacing) * at_once, s * front * late + spacing * at_once
+        if len(identity) == 1:
+            return (entry / loop)[:, 0, 0]
+        return np.linalg.norm(np.linalg.solve(loop, entry), ord=2, axis=(1, 2))
+
+    near = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)))
+    return response_peak(growth, near_rad_s=near or 1.0)[0]

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gains.behaviour import Behaviour, BlockMargin, Gains, behaviour, block_margin, follower_block, leader_block
 from gains.delay import delay_margin
-from gains.errors import BadModelError, DisagreementError
+from gains.errors import BadModelError, DisagreementError, SolverError
 from gains.formation import FormationModel, checked_gain
 from gains.graph_design import GraphDesign, GraphMethod, graph_design
 from gains.pattern import Pattern, leader_follower
@@ -58,7 +58,8 @@ class Design:
     alpha
         Exact sector bound for W = I, `gains.robust.robustness`; 0 if the loop is unstable.
     certificate
-        Lyapunov proof of 0.9999 α; None if the loop is unstable or its α is below 5e-4.
+        Lyapunov proof of 0.9999 α; None if the loop is unstable, its α is below 5e-4, or the solver finds none for
+        given gains.
     delay_margin_s, delay_margin_continuous_s
         Margin of the sampled loop and of the continuous one, all feedback late.
     leader, follower
@@ -160,7 +161,8 @@ def design(
     Parameters
     ----------
     formation
-        At least a leader and one follower.
+        A leader and any number of followers. The gains of a leader alone are those for followers too, but its margin is
+        that of its own velocity loop.
     requirement
         A sampled delay margin of 0.3 s if not given.
     period_s
@@ -173,7 +175,7 @@ def design(
     Raises
     ------
     BadModelError
-        If the formation has no follower, or the period is not positive.
+        If the period is not positive.
     InfeasibleError
         If no gains meet the requirement; the message says what can be reached.
     DisagreementError
@@ -226,7 +228,7 @@ def evaluate_gains(
     Raises
     ------
     BadModelError
-        If a gain is not finite or not of that shape, the formation has no follower, or the period is not positive.
+        If a gain is not finite or not of that shape, or the period is not positive.
 
     Examples
     --------
@@ -257,8 +259,6 @@ def _assess(
     # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
     from gains.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
 
-    if formation.vehicles < 2:
-        raise BadModelError("the formation has no follower; wanted a leader and at least one follower")
     A, B, K = formation.A, formation.B, formation.overlapping_gain(*gains)
     expansion, K_expanded = expand(formation), modified_gain(formation, expanded_gain(formation, *gains))
     verify_inclusion(expansion, A, B, K=K, K_expanded=K_expanded)
@@ -267,10 +267,11 @@ def _assess(
     margin_s = float(sampled_delay_margin(A, B, K, period_s=period_s))
     continuous_s = delay_margin(A, B @ K)
     leader, follower = block_margin(*leader_block(gains)), block_margin(*follower_block(gains))
-    if not np.isclose(continuous_s, min(leader.delay_margin_s, follower.delay_margin_s), rtol=1e-9, atol=0):
+    blocks_s = [leader.delay_margin_s, follower.delay_margin_s][: formation.vehicles]
+    if not np.isclose(continuous_s, min(blocks_s), rtol=1e-9, atol=0):
         raise DisagreementError(
-            f"the formation's delay margin is {continuous_s!r}, its leader's and follower's are "
-            f"{leader.delay_margin_s!r} and {follower.delay_margin_s!r}; wanted the less of the two"
+            f"the formation's delay margin is {continuous_s!r}, those of its leader and followers are {blocks_s}; "
+            "wanted the least of them"
         )
     return Design(
         K1=gains[0],
@@ -284,21 +285,39 @@ def _assess(
         leader=leader,
         follower=follower,
         behaviour=behaviour(gains, (margin_s + period_s) / 2),
-        certificate=certify(*gains, _CERTIFIED_SHARE * alpha) if alpha >= ALPHA_MIN else None,
+        certificate=_certificate(gains, alpha, given=method == "given"),
         requirement=requirement,
-        trade_off=trade_off(period_s=period_s, string_peak_max=requirement.string_peak_max if requirement else None),
+        trade_off=trade_off(
+            period_s=period_s,
+            string_peak_max=requirement.string_peak_max if requirement else None,
+            loop=requirement.loop if requirement else "ground",
+        ),
         method=method,
     )
 
 
-def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple[TradeOffPoint, ...]:
+def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | None:
+    """The proof of α. Given gains, however badly scaled, are assessed without one where the solver finds none."""
+    if alpha < ALPHA_MIN:
+        return None
+    try:
+        return certify(*gains, _CERTIFIED_SHARE * alpha)
+    except SolverError:
+        if given:
+            return None
+        raise
+
+
+def trade_off(
+    *, period_s: float, string_peak_max: float | None = None, loop: Literal["ground", "onboard"] = "ground"
+) -> tuple[TradeOffPoint, ...]:
     """Return the largest α at sampled delay margins from 0.05 to 1 s; margins no gains have are left out.
 
     Parameters
     ----------
     period_s
         Period of the control loop: sample, hold.
-    string_peak_max
+    string_peak_max, loop
         As in `gains.requirement.Requirement`.
 
     Raises
@@ -314,7 +333,7 @@ def trade_off(*, period_s: float, string_peak_max: float | None = None) -> tuple
     (0.05, 1.0, True)
     """
     _check_period(period_s)
-    limit = Requirement(string_peak_max=string_peak_max).string_peak_max
+    limit = Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit
     points = ((margin_s, largest_alpha(margin_s, period_s, limit)) for margin_s in _TRADE_OFF_MARGINS_S)
     return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)
 

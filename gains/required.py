@@ -7,7 +7,7 @@ from dataclasses import replace
 from math import floor, log10
 
 from gains.errors import InfeasibleError
-from gains.requirement import DELAY_MARGIN_MAX_S, Requirement
+from gains.requirement import DELAY_MARGIN_MAX_S, PeakLimit, Requirement
 from gains.scalar_gains import ScalarGains
 from gains.search import fastest_decay, largest_alpha, largest_margin
 
@@ -53,7 +53,7 @@ def required_gains(wanted: Requirement, period_s: float) -> ScalarGains:
 
 def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains | None:
     """The gains of `required_gains`, None if there are none."""
-    limit, decay = wanted.string_peak_max, wanted.decay_rate_1_s or 0.0
+    limit, decay = wanted.peak_limit, wanted.decay_rate_1_s or 0.0
     margin_s = wanted.delay_margin_s
     if margin_s is None and wanted.alpha is not None:
         found = largest_margin(wanted.alpha, period_s, limit, decay)
@@ -66,7 +66,7 @@ def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains | None:
     return None if gains is None or gains.alpha < (wanted.alpha or 0.0) else gains
 
 
-def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: float | None) -> float:
+def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: PeakLimit) -> float:
     """The largest margin (s) of which gains decay as fast as this, 0 if none do: the fastest decay falls with it."""
     low, high = 0.0, DELAY_MARGIN_MAX_S
     if fastest_decay(high, period_s, limit) >= decay_rate_1_s:
@@ -99,7 +99,7 @@ def _conflict(wanted: Requirement, period_s: float) -> str:
 
 def _most(name: str, wanted: Requirement, period_s: float) -> float:
     """The largest value of one part of the requirement that leaves the others as they are; 0 if none does."""
-    limit, margin_s = wanted.string_peak_max, wanted.delay_margin_s or 0.0
+    limit, margin_s = wanted.peak_limit, wanted.delay_margin_s or 0.0
     alpha, decay = wanted.alpha or 0.0, wanted.decay_rate_1_s or 0.0
     if name == "alpha":
         gains = largest_alpha(margin_s, period_s, limit, decay)

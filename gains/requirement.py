@@ -1,7 +1,7 @@
 """What a design must reach, and the plain form in which designs are written."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -10,6 +10,23 @@ from gains.errors import BadModelError
 DEFAULT_DELAY_MARGIN_S = 0.3
 # Below this α, which belongs to margins beyond 30 s, the numbers in a proof spread too far for the solver.
 ALPHA_MIN, DELAY_MARGIN_MAX_S = 5e-4, 30.0
+
+
+@dataclass(frozen=True)
+class OnboardPeak:
+    """A limit on the growth of spacing errors in a loop of which only what is from other vehicles is late.
+
+    Examples
+    --------
+    >>> from gains.requirement import OnboardPeak, Requirement
+    >>> Requirement(string_peak_max=1.2, loop="onboard").peak_limit == OnboardPeak(1.2)
+    True
+    """
+
+    peak: float
+
+
+PeakLimit = float | OnboardPeak | None
 
 
 @dataclass(frozen=True)
@@ -29,8 +46,12 @@ class Requirement:
     decay_rate_1_s
         Least decay rate of the continuous loop without delay, 1/s.
     string_peak_max
-        Limit, at least 1, on the growth of spacing errors from vehicle to vehicle, without delay and at half the
-        margin. 1 lets no error grow down the chain and costs little α. Not limited if None.
+        Limit, at least 1, on the growth of spacing errors from vehicle to vehicle: in the ground loop without delay
+        and at half the margin, on board, where the delay has no end, at every delay. 1 lets no error grow down the
+        chain and costs little α. Not limited if None.
+    loop
+        The loop that is flown. On board the tree takes any delay, so that `delay_margin_s` limits a vehicle's own
+        gains alone: they are those that would take it if a ground station closed every loop.
 
     Raises
     ------
@@ -50,6 +71,7 @@ class Requirement:
     alpha: float | None = None
     string_peak_max: float | None = None
     decay_rate_1_s: float | None = None
+    loop: Literal["ground", "onboard"] = "ground"
 
     def __post_init__(self) -> None:
         for name in ("delay_margin_s", "alpha", "decay_rate_1_s"):
@@ -64,6 +86,12 @@ class Requirement:
             raise BadModelError(f"string_peak_max = {self.string_peak_max}; wanted a number of at least 1")
         if self.delay_margin_s is None and self.alpha is None and self.decay_rate_1_s is None:
             object.__setattr__(self, "delay_margin_s", DEFAULT_DELAY_MARGIN_S)
+
+    @property
+    def peak_limit(self) -> PeakLimit:
+        """`string_peak_max` as a limit in the loop that is flown."""
+        peak = self.string_peak_max
+        return peak if peak is None or self.loop == "ground" else OnboardPeak(peak)
 
 
 def plain(value: Any) -> Any:

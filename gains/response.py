@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gains.behaviour import Gains
 from gains.bracketing import met_end
 from gains.delay import delay_margin
 from gains.errors import BadModelError, InfeasibleError
@@ -54,6 +54,11 @@ class Response:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= least):
                 raise BadModelError(f"{name} = {value}; wanted a number of at least {least:g}")
+
+    def transfer(self, omega: FloatArray) -> NDArray[np.complex128]:
+        """a / u at jω, from wanted to real acceleration: (s + g) / (lag s² + s + g)."""
+        s, g = 1j * omega, self.velocity_gain_1_s
+        return (s + g) / (self.lag_s * s**2 + s + g)
 
 
 def formation_loop(
@@ -152,34 +157,6 @@ def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[
     return float(delay_margin(A, B @ K_all))
 
 
-def string_peak(gains: Gains, response: Response, *, delay_s: float) -> float:
-    """Largest growth of a spacing error from one vehicle to the next, as `gains.behaviour.string_peak`, with response.
-
-    Γ(s) = (s² I - h (s K1 - K3))^{-1} (s K2 + K3) h, h = e^{-sτ} (s + g) / (lag s² + s + g); at least |Γ(0)| = 1. On a
-    grid of frequencies: a search, not a proof. `gains` are K1, K2, K3, each of shape (axes, axes).
-
-    Examples
-    --------
-    Vehicles with a short lag have the peak 2 / √3 of |1 / (s² + s + 1)|, others a larger one:
-
-    >>> import numpy as np
-    >>> from gains.response import Response, string_peak
-    >>> gains = (np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]]))
-    >>> [round(string_peak(gains, Response(lag_s, 0.0), delay_s=0.0), 3) for lag_s in (1e-6, 0.3)]
-    [1.155, 1.431]
-    """
-    own, front, spacing = gains
-    at_once = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)))
-    fastest = at_once + 1.0 / (delay_s + response.lag_s)
-    # a very short lag is far above the frequencies of the loop, which are looked at all the same
-    s = 1j * np.geomspace(1e-4 * (at_once or fastest), 10.0 * fastest, 1000)[:, None, None]
-    g = response.velocity_gain_1_s
-    h = np.exp(-s * delay_s) * (s + g) / (response.lag_s * s**2 + s + g)
-    loop = s**2 * np.eye(own.shape[0]) - h * (s * own - spacing)
-    growth = np.linalg.norm(np.linalg.solve(loop, h * (s * front + spacing)), ord=2, axis=(1, 2))
-    return max(1.0, float(growth.max()))
-
-
 def requirement_with(requirement: Requirement, response: Response | None, *, timing: Timing) -> Requirement:
     """The requirement on vehicles that answer at once, with one period for telemetry and control, the slower one, whose
     design has the wanted margin with this response and these periods.
@@ -211,7 +188,7 @@ def requirement_with(requirement: Requirement, response: Response | None, *, tim
     pair = FormationModel((-1, 0), axes=1)  # a leader-follower tree has the roots of these two, whatever its size
 
     def excess(without_s: float) -> float:
-        found = largest_alpha(without_s, timing.held_s, requirement.string_peak_max, requirement.decay_rate_1_s or 0.0)
+        found = largest_alpha(without_s, timing.held_s, requirement.peak_limit, requirement.decay_rate_1_s or 0.0)
         if found is None:
             return -wanted_s
         K = pair.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])

@@ -5,11 +5,13 @@ depends on (k1, k3) alone and the gains of a given margin form a curve with an e
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+Factor = NDArray[np.complexfloating[Any, Any]] | float
 
 # Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three of
 # those, and a parabola through the last, bring σ_min to about 1e-10 of itself.
@@ -18,7 +20,14 @@ _FREQUENCIES, _FREQUENCIES_CLOSER, _CLOSER_LOOKS = 40, 9, 3
 
 @dataclass(frozen=True)
 class ScalarGains:
-    """Gains of u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p (1/s, 1/s, 1/s²) and the α they have."""
+    """Gains of u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p (1/s, 1/s, 1/s²) and the α they have.
+
+    Examples
+    --------
+    >>> from gains.scalar_gains import ScalarGains
+    >>> ScalarGains(k1=3.0, k2=2.0, k3=2.0, alpha=0.532).k1
+    3.0
+    """
 
     k1: float
     k2: float
@@ -124,6 +133,47 @@ def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string
     return np.sqrt(np.where(least >= 0, least, np.nan))
 
 
+def onboard_front_gain_limit(k1: FloatArray, k3: FloatArray, string_peak_max: float) -> FloatArray:
+    """Return the largest |k2| with which spacing errors grow by at most `string_peak_max` at every delay, on board.
+
+    A vehicle feeds back its own errors at once, and only the velocity of the vehicle in front is late:
+
+        Γ(s) = (k3 + k2 s e^{−sτ}) / (s² + k1 s + k3)
+
+    |Γ| ≤ L for every delay is k3 + |k2| ω ≤ L |D(jω)| for every frequency. With L = 1 that leaves k2 = 0, if
+    k1² ≥ 2 k3 at all: at low frequencies k2² + 2 k3 + 2 k2 k3 τ ≤ k1² is wanted.
+
+    Returns
+    -------
+    array
+        Of the shape of `k1`; NaN where no k2 will do.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.scalar_gains import onboard_front_gain_limit
+    >>> onboard_front_gain_limit(np.array([2.0, 1.0]), np.array([1.0, 1.0]), 1.0).tolist()
+    [0.0, nan]
+    """
+    if string_peak_max == 1.0:
+        return np.where(k1**2 >= 2 * k3, 0.0, np.nan)
+    k1, k3 = k1[..., None], k3[..., None]
+
+    def bound(omega: FloatArray) -> FloatArray:
+        size = np.sqrt((k3 - omega**2) ** 2 + (k1 * omega) ** 2)
+        return (string_peak_max * size - k3) / omega
+
+    # 0 at rest is +∞ of the bound, and above 2 k1 + √(2 k3) it grows
+    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
+    omega = np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape[:-1], 96))
+    limit, at = _with_least_inside(bound(omega))
+    for _ in range(_CLOSER_LOOKS):
+        omega = _between_neighbours(omega, at)
+        limit, at = _with_least_inside(bound(omega))
+    least = limit.min(axis=-1)
+    return np.where(least >= 0, least, np.nan)
+
+
 def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: FloatArray) -> FloatArray:
     """Return σ_min(jωI − A_cl) of the follower subsystem (3.25, 3.26) for each gain and frequency (broadcast).
 
@@ -147,7 +197,42 @@ def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: 
     loop = (k3 - x) ** 2 + a2 * x
     c2 = 3 * x + 2 * a2 + 2 + k2**2 + k3**2
     c1 = loop + (k2 - k1) ** 2 + x + k3**2 + k2**2 * x + own * (own + k3**2 + 1 + x)
-    c0 = own * loop
+    return _least_root(c2, c1, own * loop)
+
+
+def delayed_singular_value(gains: ScalarGains, omega: FloatArray, own: Factor, front: Factor) -> FloatArray:
+    """Return σ_min of the characteristic matrix of the subsystem with late feedback, at each frequency.
+
+    With the complex factors d on a vehicle's own errors and f on the velocity error of the vehicle in front, e^{−jωτ}
+    for a delay τ, times what the vehicle makes of a command, the matrix is::
+
+        [[jω + k1 d, 0, 0], [−1, jω, 1], [−k2 f, −k3 d, jω + k1 d]]
+
+    σ_min² is found as in `least_singular_value`, which is the case d = f = 1, in half the time.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.scalar_gains import ScalarGains, delayed_singular_value, least_singular_value
+    >>> at_once = delayed_singular_value(ScalarGains(3.0, 2.0, 2.0, 0.0), np.array(1.0), 1.0, 1.0)
+    >>> bool(abs(at_once - least_singular_value(3.0, 2.0, 2.0, np.array(1.0))) < 1e-12)
+    True
+    """
+    jw = 1j * omega
+    leader, spacing, ahead = jw + gains.k1 * own, gains.k3 * own, gains.k2 * front
+    x, a2, g2, h2 = omega**2, _squared(leader), _squared(ahead), _squared(spacing)
+    loop = _squared(jw * leader + spacing)
+    c2 = 2 * a2 + x + 2 + g2 + h2
+    c1 = loop + _squared(ahead - leader) + _squared(spacing + jw * ahead) + a2 * (x + 1 + h2 + a2)
+    return _least_root(c2, c1, a2 * loop)
+
+
+def _squared(value: Factor) -> FloatArray:
+    return np.abs(value) ** 2
+
+
+def _least_root(c2: FloatArray, c1: FloatArray, c0: FloatArray) -> FloatArray:
+    """Root of the least root of λ³ − c2 λ² + c1 λ − c0, whose roots are real and positive."""
     root = c0 / c1
     for _ in range(5):
         root = root + (c0 - root * (c1 - root * (c2 - root))) / (c1 - root * (2 * c2 - 3 * root))

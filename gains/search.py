@@ -8,7 +8,16 @@ and `gains.robust`, which share no formula with it.
 import numpy as np
 
 from gains.bracketing import met_end
-from gains.scalar_gains import FloatArray, ScalarGains, alpha_of, decay_rate_of, front_gain_limit, gains_of_margin
+from gains.requirement import OnboardPeak, PeakLimit
+from gains.scalar_gains import (
+    FloatArray,
+    ScalarGains,
+    alpha_of,
+    decay_rate_of,
+    front_gain_limit,
+    gains_of_margin,
+    onboard_front_gain_limit,
+)
 
 # Points of the first, coarse scan along the curve and over k2, of the later ones, and of both over the spare margin.
 # A round keeps ±2 cells about the best point, so the window halves; 18 rounds leave 1e-5 of it (k2 begins five
@@ -35,7 +44,7 @@ _SCAN_FASTEST, _ROUNDS_FASTEST = 33, 12
 
 
 def largest_alpha(
-    delay_margin_s: float, period_s: float, string_peak_max: float | None = None, decay_rate_1_s: float = 0.0
+    delay_margin_s: float, period_s: float, string_peak_max: PeakLimit = None, decay_rate_1_s: float = 0.0
 ) -> ScalarGains | None:
     """Return the gains of largest α among those with at least the given delay margin, None if there are none.
 
@@ -47,7 +56,7 @@ def largest_alpha(
         Period of sample and hold.
     string_peak_max
         Largest growth of spacing errors from vehicle to vehicle, both without delay and with half the margin as loop
-        delay (plus half a period for the hold); not limited if None.
+        delay (plus half a period for the hold); on board at every delay; not limited if None.
     decay_rate_1_s
         Least decay rate of the continuous loop without delay.
 
@@ -90,7 +99,7 @@ def largest_alpha(
 
 
 def largest_margin(
-    alpha: float, period_s: float, string_peak_max: float | None = None, decay_rate_1_s: float = 0.0
+    alpha: float, period_s: float, string_peak_max: PeakLimit = None, decay_rate_1_s: float = 0.0
 ) -> tuple[float, ScalarGains] | None:
     """Return the largest delay margin (s) at which α can be reached, and the gains; None if no margin is left.
 
@@ -129,7 +138,7 @@ def largest_margin(
     return margin_s, gains
 
 
-def fastest_decay(delay_margin_s: float, period_s: float, string_peak_max: float | None = None) -> float:
+def fastest_decay(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit = None) -> float:
     """Return the largest decay rate (1/s) without delay of gains of a margin, 0 if no gains have it.
 
     Arguments as of `largest_alpha`.
@@ -147,7 +156,7 @@ def fastest_decay(delay_margin_s: float, period_s: float, string_peak_max: float
     return _fastest(delay_margin_s, period_s, string_peak_max)[0]
 
 
-def _fastest(delay_margin_s: float, period_s: float, string_peak_max: float | None) -> tuple[float, float]:
+def _fastest(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit) -> tuple[float, float]:
     """The largest decay rate of a margin and the share of the crossing angle that has it.
 
     Along the curve the decay rate rises to that share, critical damping or the last that is usable, and falls.
@@ -164,7 +173,7 @@ def _fastest(delay_margin_s: float, period_s: float, string_peak_max: float | No
 
 
 def _fast_shares(
-    decay_rate_1_s: float, delay_margin_s: float, period_s: float, string_peak_max: float | None
+    decay_rate_1_s: float, delay_margin_s: float, period_s: float, string_peak_max: PeakLimit
 ) -> tuple[float, float] | None:
     """The shares of the crossing angle between which gains of a margin decay as fast as this; None if none do."""
     rate, share = _fastest(delay_margin_s, period_s, string_peak_max)
@@ -184,9 +193,7 @@ def _fast_shares(
     return last_fast(_SHARE_MIN), last_fast(_SHARE_MAX)
 
 
-def _decay_rates(
-    share: FloatArray, delay_margin_s: float, period_s: float, string_peak_max: float | None
-) -> FloatArray:
+def _decay_rates(share: FloatArray, delay_margin_s: float, period_s: float, string_peak_max: PeakLimit) -> FloatArray:
     """The decay rate at each share, the largest over the margin to spare; 0 where no gains can be used."""
     spare_max = _spare_max(delay_margin_s, period_s)
     spare = np.linspace(0.0, spare_max, _SCAN_SPARE if spare_max else 1)[:, None]
@@ -200,7 +207,7 @@ def _spare_max(delay_margin_s: float, period_s: float) -> float:
 
 
 def _usable_gains(
-    share: FloatArray, margin_s: FloatArray, period_s: float, string_peak_max: float | None
+    share: FloatArray, margin_s: FloatArray, period_s: float, string_peak_max: PeakLimit
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """k1, k3 of each share and margin (broadcast), and the largest |k2| to try: NaN where they cannot be used."""
     share, margin_s = np.broadcast_arrays(share, margin_s)
@@ -213,7 +220,7 @@ def _best_of_grid(
     grids: list[FloatArray],
     delay_margin_s: float,
     period_s: float,
-    string_peak_max: float | None,
+    string_peak_max: PeakLimit,
     decay_rate_1_s: float,
 ) -> tuple[ScalarGains, tuple[float, float, float]] | None:
     """The gains of largest α on the grids of share, front and spare, and where they are; None if none can be used."""
@@ -229,15 +236,17 @@ def _best_of_grid(
     k2 = limit[:, None] * front
     alpha = alpha_of(k1[:, None], k2, k3[:, None])
     i, j = np.unravel_index(int(np.argmax(alpha)), alpha.shape)
-    gains = ScalarGains(float(k1[i]), float(k2[i, j]), float(k3[i]), float(alpha[i, j]))
+    gains = ScalarGains(float(k1[i]), float(k2[i, j]) + 0.0, float(k3[i]), float(alpha[i, j]))
     return gains, (float(share[i]), float(front[j]), float(spare[i]))
 
 
-def _front_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string_peak_max: float | None) -> FloatArray:
+def _front_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string_peak_max: PeakLimit) -> FloatArray:
     """Largest |k2| to try: a multiple of k1, less where spacing errors would grow, NaN where they grow in any case."""
     limit = _FRONT_MAX * k1
     if string_peak_max is None:
         return limit
+    if isinstance(string_peak_max, OnboardPeak):
+        return np.minimum(limit, onboard_front_gain_limit(k1, k3, string_peak_max.peak))
     for delay in (np.zeros_like(delay_s), delay_s):
         limit = np.minimum(limit, front_gain_limit(k1, k3, delay, string_peak_max))
     return limit

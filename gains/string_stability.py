@@ -14,6 +14,7 @@ taken against the known velocity of the formation instead of that of the vehicle
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf, isfinite
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,13 +177,23 @@ def response_peak(response: Response, *, near_rad_s: float) -> tuple[float, floa
     >>> round(peak, 6), round(peak_rad_s, 4)
     (1.154701, 0.7071)
     """
-    omega = _frequencies(near_rad_s)
-
-    def value(at: FloatArray) -> FloatArray:
-        return np.abs(response(at))
-
-    peak, at = _largest(value, omega)
+    peak, at = largest_magnitude(response, near_rad_s=near_rad_s)
     return (peak, at) if peak > 1.0 else (1.0, 0.0)
+
+
+def largest_magnitude(response: Callable[[FloatArray], NDArray[Any]], *, near_rad_s: float) -> tuple[float, float]:
+    """Largest magnitude of any response and its frequency (rad/s). Arguments and exceptions as of `response_peak`.
+
+    Examples
+    --------
+    |s / (s² + s + 1)| is largest, 1, at 1 rad/s:
+
+    >>> from gains.string_stability import largest_magnitude
+    >>> peak, at = largest_magnitude(lambda omega: omega / (1 - omega**2 + 1j * omega), near_rad_s=1.0)
+    >>> round(peak, 9), round(at, 6)
+    (1.0, 1.0)
+    """
+    return _largest(lambda at: np.abs(response(at)), _frequencies(near_rad_s))
 
 
 def low_frequency_coefficient(response: Response, *, near_rad_s: float) -> float:

@@ -23,6 +23,7 @@ from gcs.user_input import (
     opened_guard,
     out_file,
     out_folder,
+    refuse,
     warn_if_open,
     within,
 )
@@ -37,6 +38,9 @@ app = typer.Typer(
 
 ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file, as scenarios/triangle5.toml")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
+AllowUnstable = Annotated[
+    bool, typer.Option("--allow-unstable", help="accept gains whose loop is unstable without any delay")
+]
 
 
 class Method(Enum):
@@ -79,6 +83,7 @@ def fly(
         bool, typer.Option("--mirror-commands", help="let what that station sends through to the vehicles")
     ] = False,
     key: KeyFile = None,
+    allow_unstable: AllowUnstable = False,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="run folder; default runs/<scenario>-<time>")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -86,6 +91,7 @@ def fly(
 
     Exit code 1 if the flight is not stable, or not all of it could be logged.
     """
+    from gcs import preflight
     from gcs.fly import FlyOptions, new_folder
     from gcs.fly import fly as fly_now
     from gcs.plan import flight_plan
@@ -96,6 +102,8 @@ def fly(
     if link_delay is not None:
         within("--link-delay", link_delay, 0, 60, "seconds")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
+    if connect is None:
+        refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
     guard = opened_guard(key, role="station")
     if mirror_commands and mirror is None:
         raise InputError("read --mirror-commands without --mirror, wanted both")
@@ -107,6 +115,9 @@ def fly(
         warn_if_open(link, signed=key is not None)
         to = None if mirror is None else opened.enter_context(mirroring(mirror, link, guard, commands=mirror_commands))
         design, plan = flight_plan(scenario)
+        if (unstable := preflight.unstable_loop(plan)) is not None:
+            _refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
+            plan = preflight.without_actions(plan)
         there = Presence(link, plan.scenario, guard)
         taken_over = there.taken_over() if connect is None else []
         if not as_json:
@@ -138,16 +149,20 @@ def design(
         Method | None, typer.Option(help="in place of the scenario's: inclusion principle, or a graph method")
     ] = None,
     loop: LoopOption = None,
+    allow_unstable: AllowUnstable = False,
     as_json: AsJson = False,
 ) -> None:
     """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
     from gcs.plan import flight_plan
+    from gcs.preflight import unstable_loop
 
     scenario = load_with_loop(scenario_file, loop)
     if method is not None:
         control = scenario.control.model_copy(update={"method": method.value, "gains": None, "blocks": ()})
         scenario = scenario.model_copy(update={"control": control})
-    result, _ = flight_plan(scenario)
+    result, plan = flight_plan(scenario)
+    if (unstable := unstable_loop(plan)) is not None:
+        _refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
     if as_json:
         typer.echo(json.dumps(result, indent=2))
     else:
@@ -399,6 +414,12 @@ def _scenario(file: Path) -> Any:
     from scenarios.files import load
 
     return load(file)
+
+
+def _refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
+    if not allow:
+        refuse(file, finding)
+    print(f"warning: {file}: {finding}", file=sys.stderr)
 
 
 def _print_design(result: dict[str, Any]) -> None:

@@ -6,14 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from gains.behaviour import string_peak
 from gains.design import Design, design, evaluate_gains
 from gains.formation import FormationModel
 from gains.graph_design import evaluate_graph_gain, time_scaled
 from gains.multirate import Timing
 from gains.pattern import Pattern, leader_follower, with_links, without_links
 from gains.requirement import Requirement, plain
-from gains.response import Response, continuous_margin, requirement_with, sampled_margin, string_peak
+from gains.response import Response, continuous_margin, requirement_with, sampled_margin
 from gains.structure import strongly_connected_blocks
+from gcs.at_delay import with_figures_at_delay
 from gcs.autopilot.responses import Responses, given_responses, margins_with
 from gcs.control import Formation
 from gcs.onboard import onboard_plan
@@ -116,8 +118,10 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
 
 
 def _flown_loop(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, Any], FlightPlan]:
-    """Design and plan of a ground loop, made those of the scenario's loop."""
-    return onboard_plan(design, plan) if plan.scenario.control.loop == "onboard" else (design, plan)
+    """Design and plan of a ground loop, made those of the scenario's loop, with the figures at its delay."""
+    if plan.scenario.control.loop == "onboard":
+        design, plan = onboard_plan(design, plan)
+    return with_figures_at_delay(design, plan.scenario), plan
 
 
 def _with_responses(
@@ -161,9 +165,9 @@ def described(design: dict[str, Any], plan: FlightPlan) -> dict[str, Any]:
     }
     if len(blocks) == 3:  # the same for each vehicle, as on a leader-follower tree only
         own, front, spacing = blocks
-        peaks = [string_peak((own, front, spacing), answer, delay_s=0.0) for answer in set(every)]
+        peaks = [string_peak((own, front, spacing), 0.0, answer=answer.transfer) for answer in set(every)]
         response["string_peak"] = max(peaks)
-    return design | margins[0] | {"schedule": schedule, "response": response}
+    return with_figures_at_delay(design | margins[0] | {"schedule": schedule, "response": response}, plan.scenario)
 
 
 def _schedule(scenario: Scenario, model: FormationModel, found: Design) -> list[tuple[float, Design]]:
@@ -200,6 +204,7 @@ def _requirement(scenario: Scenario) -> Requirement:
         alpha=control.alpha,
         decay_rate_1_s=control.decay_rate_1_s,
         string_peak_max=control.string_peak_max,
+        loop=control.loop,
     )
 
 

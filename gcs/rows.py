@@ -105,7 +105,7 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
                 *control.spacing_error_m, *control.velocity_error_m_s,
                 *(control.command_m_s2 if commanded else (nan, nan)),
                 nearest_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
-                loop_s, repeated_s, margin_s, headroom(loop_s, margin_s), rtt_s,
+                loop_s, repeated_s, margin_s, headroom(loop_s, margin_s) if margin_s > 0.0 else nan, rtt_s,
                 offset_s, bound_s,
                 frames.received, frames.lost, frames.late, frames.duplicate,
             )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gcs.at_delay import figures_at
 from gcs.mirror import MIRROR
 from gcs.record import (
     CLOCK_JUMPED,
@@ -118,6 +119,8 @@ def summarise(
     followers = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
     errors = {system_id: _error(flown, system_id) for system_id in followers}
     settled = _settling_time_s(errors, followers, scenario.safety.settled_fraction)
+    if not followers:
+        settled = _settled_velocity_s(scenario, flown)
     jumps: dict[int, list[float]] = defaultdict(list)
     for event in events:
         if event["text"] == CLOCK_JUMPED:
@@ -135,6 +138,7 @@ def summarise(
         "delay_margin_continuous_s": _number(design["delay_margin_continuous_s"]),
         "response": design.get("response"),
         "loop_delay_s": _spread(loop_delay),
+        "at_loop_delay": figures_at(design, _slowest_median_s(flown)),
         "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
         "settling_time_s": settled,
         "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,
@@ -149,6 +153,16 @@ def summarise(
         "mode_changes": [e for e in events if e["kind"] == "mode" and e["time_s"] >= 0],
         "files": [],
     }
+
+
+def _slowest_median_s(flown: TickArray) -> float | None:
+    """The largest of the vehicles' median loop delays."""
+    medians: list[float] = []
+    for system_id in np.unique(flown["system_id"]):
+        own = flown["loop_delay_s"][(flown["system_id"] == system_id) & flown["commanded"]]
+        if (known := own[np.isfinite(own)]).size:
+            medians.append(float(np.median(known)))
+    return _number(max(medians, default=None))
 
 
 Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -189,6 +203,16 @@ def _settling_time_s(errors: dict[int, Errors], spacing_m: dict[int, float], fra
         if outside.size:
             latest = max(latest, float(time_s[outside[-1] + 1]))
     return round(latest, 6)
+
+
+def _settled_velocity_s(scenario: Scenario, flown: TickArray) -> float | None:
+    """When a vehicle without followers came to its nominal velocity for good, within the same part of its speed."""
+    speed_m_s = float(np.hypot(*scenario.nominal_velocity[-1].velocity_ne_m_s))
+    error_m_s = np.hypot(flown["velocity_error_north_m_s"], flown["velocity_error_east_m_s"])
+    known = np.isfinite(error_m_s)
+    [leader] = scenario.vehicles
+    errors = {leader.system_id: (flown["time_s"][known], error_m_s[known])}
+    return _settling_time_s(errors, {leader.system_id: max(speed_m_s, 1.0)}, scenario.safety.settled_fraction)
 
 
 def _vehicle(

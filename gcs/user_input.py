@@ -26,6 +26,13 @@ def within(option: str, value: float, least: float, most: float, unit: str = "")
         raise InputError(f"{option}: read {value:g}, wanted {unit or 'a number'} from {least:g} to {most:g}")
 
 
+def refuse(file: Path, *findings: str | None) -> None:
+    """Refuse a scenario for the first thing found in it, if there is one."""
+    for finding in findings:
+        if finding is not None:
+            raise InputError(f"{file}: {finding}")
+
+
 def out_folder(out: Path, wanted: str = "a new or empty folder") -> Path:
     """The new or empty folder that --out names, made if need be."""
     try:

@@ -129,8 +129,9 @@ class Control(Part):
     those it `hears`."""
     loop: Literal["ground", "onboard"] = "ground"
     """`ground`: the station closes every loop, so all feedback is late. `onboard`: every vehicle feeds back its own
-    errors at once, and the station streams only what depends on other vehicles (thesis eq. 5.1). Requirements apply to
-    the ground loop; the margins reported are those of the loop that is flown."""
+    errors at once, and the station streams only what depends on other vehicles (thesis eq. 5.1). On board,
+    `string_peak_max` holds at every delay, and `delay_margin_s` bounds the vehicles' own gains as if the station closed
+    their loop."""
     delay_margin_s: Positive | None = None
     """Requirement: least delay margin of the sampled loop."""
     alpha: Annotated[float, Field(gt=0, lt=1)] | None = None

@@ -262,11 +262,9 @@ def test_requirement_out_of_range_is_refused_by_name(name: str, value: float) ->
         Requirement(**{name: value})
 
 
-def test_period_and_formation_are_checked() -> None:
+def test_period_and_gains_are_checked() -> None:
     with pytest.raises(BadModelError, match="period_s = 0"):
         design(TRIANGLE, period_s=0.0)
-    with pytest.raises(BadModelError, match="no follower"):
-        design(FormationModel((-1,)), period_s=PERIOD_S)
     with pytest.raises(BadModelError, match="K1 has shape"):
         evaluate_gains(TRIANGLE, [[1.0]], EYE, EYE, period_s=PERIOD_S)
     with pytest.raises(BadModelError, match="period_s = -1"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from gains.behaviour import string_peak as string_peak_at_once
+from gains.behaviour import string_peak
 from gains.delay import delay_margin
 from gains.design import design
 from gains.errors import BadModelError, InfeasibleError
@@ -19,7 +19,6 @@ from gains.response import (
     formation_loop,
     requirement_with,
     sampled_margin,
-    string_peak,
 )
 from gains.rightmost import rightmost_root
 
@@ -150,15 +149,16 @@ def test_a_margin_that_no_gains_have_is_refused_with_the_response_named() -> Non
 @pytest.mark.parametrize("front_1_s", [0.6, 1.6])  # errors shrink, errors grow
 def test_string_growth_tends_to_that_of_vehicles_that_answer_at_once(front_1_s: float, delay_s: float) -> None:
     gains = (GAINS[0], front_1_s * np.eye(2), GAINS[2])
-    at_once = string_peak_at_once(gains, delay_s)
-    assert string_peak(gains, Response(1e-6, 0.0), delay_s=delay_s) == pytest.approx(at_once, rel=1e-4)
+    at_once = string_peak(gains, delay_s)
+    answer = Response(1e-6, 0.0).transfer
+    assert string_peak(gains, delay_s, answer=answer) == pytest.approx(at_once, rel=1e-4)
 
 
 def test_a_lag_makes_spacing_errors_grow_more_as_a_delay_of_its_length_does() -> None:
     gains = (GAINS[0], 1.6 * np.eye(2), GAINS[2])  # more of the velocity in front: errors grow
-    with_lag = string_peak(gains, Response(0.05, 0.0), delay_s=0.2)
-    assert with_lag == pytest.approx(string_peak_at_once(gains, 0.25), rel=0.02)
-    assert with_lag > 1.05 * string_peak_at_once(gains, 0.2)
+    with_lag = string_peak(gains, 0.2, answer=Response(0.05, 0.0).transfer)
+    assert with_lag == pytest.approx(string_peak(gains, 0.25), rel=0.02)
+    assert with_lag > 1.05 * string_peak(gains, 0.2)
 
 
 @pytest.mark.parametrize(("lag_s", "gain"), [(0.0, 1.0), (math.nan, 1.0), (0.1, -1.0), (0.1, math.inf)])

@@ -30,9 +30,10 @@ def print_design(design: dict[str, Any], console: Console | None = None) -> None
     _print_margins(design, console)
     console.print(_response(design.get("response")), end="")
     console.print(
-        f"alpha    {design['alpha']:.4f} (robustness bound); spacing errors grow by {behaviour['string_peak']:.2f} "
-        f"at most from vehicle to vehicle, decay {behaviour['decay_rate_1_s']:.2f} 1/s without delay"
+        f"alpha    {design['alpha']:.4f} (robustness bound), decay {behaviour['decay_rate_1_s']:.2f} 1/s without delay"
     )
+    if (flown := design.get("at_loop_delay")) is not None:
+        _print_figures_at_delay(flown, console)
     if not design["trade_off"]:
         return
     table = Table(box=box.SIMPLE_HEAD, title="the trade-off it sits on", title_justify="left", title_style="")
@@ -47,13 +48,41 @@ def _print_margins(design: dict[str, Any], console: Console) -> None:
     sampled_s, continuous_s = design["delay_margin_s"], design["delay_margin_continuous_s"]
     if design["loop"] == "onboard" and sampled_s is None:
         console.print("margin   no limit: no delay of what the station streams makes this loop unstable")
+    elif sampled_s == 0.0:
+        console.print("margin   none: the sampled loop is unstable without any delay")
     else:
         console.print(
             f"margin   {_ms(sampled_s)} of loop delay in the sampled loop, {_ms(continuous_s)} in the continuous model"
         )
+    if design["vehicles"] == 1:
+        console.print("         of the one vehicle's own velocity loop, as nobody follows it")
     if design["loop"] == "onboard":
         ground_s = design["onboard"]["ground_delay_margin_s"]
         console.print(f"         {_ms(ground_s)} if the station closed every loop with the same gains")
+
+
+def _print_figures_at_delay(flown: dict[str, Any], console: Console) -> None:
+    console.print(f"         {figures_text(flown)} (that of the scenario's links)")
+    console.print(
+        f"         at least {flown['alpha_kept']:.4f} {_up_to(flown['alpha_kept_to_s'])}; growth at most "
+        f"{flown['string_peak_kept']:.2f} times {_up_to(flown['string_peak_kept_to_s'])}"
+    )
+
+
+def figures_text(flown: dict[str, Any]) -> str:
+    """α and the growth of spacing errors at a loop delay, in words."""
+    peak = flown["string_peak"]
+    grows = "without bound" if peak is None else f"{peak:.2f} times at most"
+    return (
+        f"{flown['alpha']:.4f} at {_ms(flown['loop_delay_s'])} of loop delay, where spacing errors grow {grows} from "
+        "vehicle to vehicle"
+    )
+
+
+def _up_to(delay_s: float | None) -> str:
+    if delay_s is None:
+        return "at every loop delay"
+    return "at no loop delay" if delay_s == 0.0 else f"up to {_ms(delay_s)} of it"
 
 
 def _print_graph_design(design: dict[str, Any], console: Console) -> None:
@@ -103,6 +132,9 @@ def print_flight(summary: dict[str, Any], console: Console) -> None:
     for text in summary.get("not_logged", ()):
         console.print(f"log      not written: {text}")
     console.print(f"delay    {delay_text(summary)}")
+    flown = summary.get("at_loop_delay")
+    if flown is not None and flown["alpha"] is not None:
+        console.print(f"alpha    {figures_text(flown)}")
     console.print(_response(summary.get("response")), end="")
     control = summary["control"]
     if control is not None:

@@ -17,6 +17,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from gcs.at_delay import figures_at
 from gcs.console import plain_console
 from gcs.modes import patience_s
 from gcs.record import TICK, Mode, TickArray
@@ -85,8 +86,23 @@ class FlightState:
 
     def redesigned(self, design: dict[str, Any]) -> None:
         """Compare with the margins of a design."""
+        self._design = design
+        self._at_delay: dict[tuple[int, int], str] = {}
         margin_s = design["delay_margin_s"]
         self.margin_s = np.nan if margin_s is None else float(margin_s)
+
+    def at_delay(self, figures: "Figures") -> str:
+        """α and the growth of spacing errors at the largest median of the loop delays, to the millisecond, in words."""
+        delay_s, gain_set = _worst(figures.loop_delay_s_p50), int(self.newest["gain_set"].max(initial=0))
+        if np.isnan(delay_s):
+            return ""
+        key = round(1e3 * delay_s), gain_set
+        if key not in self._at_delay:
+            found = figures_at(self._design, key[0] / 1e3, gain_set)
+            grows = "without bound" if found["string_peak"] is None else f"{found['string_peak']:.2f} times"
+            text = "" if found["alpha"] is None else f"alpha {found['alpha']:.3f}, errors grow {grows} at {key[0]} ms"
+            self._at_delay[key] = text
+        return self._at_delay[key]
 
     def add(self, ticks: TickArray, events: list[dict[str, Any]]) -> None:
         """Take whole ticks, shape (ticks, vehicles), and events."""
@@ -254,7 +270,8 @@ def _footer(state: FlightState, figures: Figures) -> list[Text]:
     if state.skipped:
         line.append(f"   {state.skipped} ticks skipped", style="yellow")
     refused = [Text(f"refused: {state.refused}", style="yellow", no_wrap=True)] if state.refused else []
-    return [line, *refused, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
+    flown = [Text(at_delay, no_wrap=True)] if (at_delay := state.at_delay(figures)) else []
+    return [line, *flown, *refused, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
 
 
 def plain_line(state: FlightState) -> str:
@@ -264,11 +281,12 @@ def plain_line(state: FlightState) -> str:
         f"{mode.name} {' '.join(str(state.system_ids[k]) for k in indices)}"
         for mode, indices in figures.not_nominal().items()
     ]
-    time = time_text(state.time_s, state.before_s)
+    time, at_delay = time_text(state.time_s, state.before_s), state.at_delay(figures)
     return (
         f"{time}  spacing error max {_number(_worst(figures.spacing_error_m), '.2f')} m"
         f"  loop delay p99 max {_number(1e3 * _worst(figures.loop_delay_s_p99), '.1f')} ms"
         f"  headroom min {_worst_headroom(state, figures)}  {', '.join(modes) or 'all NOMINAL'}"
+        f"{at_delay and f'  {at_delay}'}"
     )
 
 

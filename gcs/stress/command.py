@@ -17,7 +17,7 @@ import typer
 from gcs.interrupts import raised
 from gcs.loop_option import Loop, LoopOption, load_with_loop
 from gcs.output import outlive_readers
-from gcs.user_input import InputError, out_file, out_folder
+from gcs.user_input import InputError, out_file, out_folder, refuse
 
 if TYPE_CHECKING:
     from gcs.stress.campaign import Fly
@@ -205,6 +205,7 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
 
 def _study(options: StressOptions) -> "tuple[Study, dict[str, Any]]":
     from gcs.plan import flight_plan
+    from gcs.preflight import bad_start, unstable_loop
     from gcs.stress.study import Study
 
     scenario = load_with_loop(options.scenario_file, options.loop)
@@ -215,7 +216,9 @@ def _study(options: StressOptions) -> "tuple[Study, dict[str, Any]]":
     scheduled = scenario.model_copy(
         update={"monitor": scenario.monitor.model_copy(update={"time_scales": (1.0,), "act": False})}
     )
+    refuse(options.scenario_file, bad_start(scenario))
     design, plan = flight_plan(scheduled)
+    refuse(options.scenario_file, unstable_loop(plan))
     return Study(plan, real_time=options.real_time), design
 
 

@@ -25,6 +25,7 @@ from gains.pattern import Pattern, bidirectional, formation_plant, leader_follow
 from gains.requirement import Requirement
 from gains.rightmost import rightmost_root
 from gains.robust import robust_lmi
+from gcs.thesis import errata
 from gcs.thesis.flights import ALPHA, CHAIN, DELAYS_S, PERIOD_S, SPEED_M_S, flown, nonlinear_response, printed_gains
 from gcs.thesis.nonlinear import fly_with_late_neighbours
 
@@ -48,7 +49,16 @@ class Claim:
 
 def claims() -> list[Claim]:
     """All of them, in the order of the source."""
-    return [*_modelling(), *_inclusion(), *_graph(), *_delay(), *_comparison()]
+    return [
+        *_modelling(),
+        *_inclusion(),
+        *_expansion(),
+        *_graph(),
+        *_sweep_algorithm(),
+        *_delay(),
+        *_subsets(),
+        *_comparison(),
+    ]
 
 
 def late_neighbours(K: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatArray]:
@@ -114,6 +124,50 @@ def _inclusion() -> Iterator[Claim]:
         f"delay margin {1e3 * found.delay_margin_s:.0f} ms sampled at 50 Hz, all feedback late",
         f"{1e3 * frequency_sweep_margin(CHAIN.A, CHAIN.B @ K):.0f} ms continuous by the frequency sweep",
         "not checkable",
+    )  # fmt: skip
+
+
+def _expansion() -> Iterator[Claim]:
+    (rank_a, hautus_a), (rank_b, hautus_b) = (errata.controllable_dimensions(kind) for kind in ("a", "b"))
+    yield Claim(
+        "4.5, 6.1", "“the expanded system is uncontrollable”", "uncontrollable",
+        f"of (3.13), type (a), {rank_a} of 7 dimensions an axis are controllable: all; only of type (b) they are "
+        f"{rank_b}", f"rank of [A, B] at the one eigenvalue, 0: {hautus_a} and {hautus_b} of 7", "erratum",
+    )  # fmt: skip
+    _, minus, plus = errata.s_procedure_counterexample()
+    yield Claim(
+        "3.3", "S-procedure: F > 0 wherever G ≤ 0 follows from F + τG ≻ 0", "without that sign",
+        f"F = G = −1: F > 0 nowhere, yet F − τG ≻ 0 {'for some' if minus else 'for no'} τ ≥ 0",
+        f"F + τG ≻ 0 {'for some' if plus else 'for no'} τ ≥ 0", "erratum",
+    )  # fmt: skip
+
+
+def _sweep_algorithm() -> Iterator[Claim]:
+    (least, _), (least_late, most_late) = errata.pencil_moduli(-2.0, 1.0), errata.pencil_moduli(-1.0, -2.0)
+    yield Claim(
+        "(5.7)", "no delay destabilises if ρ(jωI − A0, A1) < 1", "ρ < 1",
+        f"the least modulus above 1 is wanted: x' = −2x + x(t − τ) has it at {least:.1f} and margin "
+        f"{delay_margin([[-2.0]], [[1.0]])}; a largest one below 1 has no loop, as |λ| grows with ω",
+        f"x' = −x − 2x(t − τ): least {least_late:.1f}, margin {delay_margin([[-1.0]], [[-2.0]]):.4f} s; moduli pass 1 "
+        f"on the way to {most_late:.0f} at 100 rad/s", "erratum",
+    )  # fmt: skip
+    right, wrong = (errata.first_crossing(-1.0, -2.0, sign) for sign in (-1.0, 1.0))
+    yield Claim(
+        "(5.7), steps 2, 3", "crossings from ρ ≠ 0, and θ without e^{−jθ}", "ρ ≠ 0, λ = e^{jθ}",
+        f"|λ| = 1 is to be looked for, and λ = e^{{−jθ}}: θ/ω = {right:.4f} s for x' = −x − 2x(t − τ); with e^{{jθ}} "
+        f"{wrong:.4f} s", f"exact margin {delay_margin([[-1.0]], [[-2.0]]):.4f} s = 2π / (3√3)", "erratum",
+    )  # fmt: skip
+
+
+def _subsets() -> Iterator[Claim]:
+    margins = errata.subset_margins()
+    low, high = errata.PUBLISHED_S
+    inside = int(((margins >= low) & (margins <= high)).sum())
+    nearest = int(np.argmin(np.abs(margins - 0.19)))
+    yield Claim(
+        "5.3", "any choice of which of the twelve scalar gains are late that gives 0.19 s", "0.19 s",
+        f"{inside or 'none'} of all {len(margins):,} gives {low} to {high} s; the nearest is {margins[nearest]:.4f} s",
+        f"{errata.subset_margin_by_sweep(nearest):.4f} s by the sweep", "erratum",
     )  # fmt: skip
 
 

@@ -123,7 +123,7 @@ class WatchedVehicle:
             "rtt_s": rtt_s,
             "telemetry_age_s": age_s,
             "loop_delay_s": loop_s,
-            "headroom": left,
+            "headroom": left if margin_s else None,
             "received": frames.received,
             "lost": frames.lost,
             "late": frames.late,
