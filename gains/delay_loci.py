@@ -9,6 +9,7 @@ bracketing safe: between two frequencies at which a different number of moduli e
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,12 +58,12 @@ def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray) -> Loci:
 
     def loci(omega: FloatArray) -> ComplexArray:
         loop = C @ solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - A0, B)
-        return loop[:, :, 0] if B.shape[1] == 1 else np.linalg.eigvals(loop).astype(np.complex128)
+        return (loop[:, :, 0] if B.shape[1] == 1 else np.linalg.eigvals(loop)).astype(np.complex128, copy=False)
 
     return loci
 
 
-def solved_beside_poles(matrices: ComplexArray, right: FloatArray) -> ComplexArray:
+def solved_beside_poles(matrices: NDArray[Any], right: FloatArray) -> NDArray[Any]:
     """X with M X = `right` (n, r) for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
 
     A resolvent is singular to rounding on a pole, and near a multiple one: of a double integrator from 1e-8 of its norm

@@ -8,7 +8,7 @@ import json
 import math
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,9 @@ from soak_flight import Flown, Stretch, fly
 from soak_scenarios import Experiment
 
 from gains.errors import DisagreementError, GainsError, SolverError
-from gcs.control import LARGEST_COMMAND_M_S2
 from gcs.flown import margins_of
 from gcs.grade import instants, true_loop_delays_s
+from gcs.limits import LARGEST_COMMAND_M_S2
 from gcs.plan import FlightPlan, flight_plan
 from gcs.record import CLOCK_JUMPED, Mode
 from gcs.stress.measure import fly_trial
@@ -41,11 +41,10 @@ LEAST_CHANGE = 1e-6
 
 @dataclass(frozen=True)
 class Broken:
-    """An invariant that does not hold. `known` names the defect, if it is one that is known and not yet mended."""
+    """An invariant that does not hold."""
 
     invariant: str
     text: str
-    known: str = ""
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def judge(experiment: Experiment) -> Result:
         return Result((Broken("independent methods agree", str(error)),))
     except GainsError as error:
         if isinstance(error, SolverError) and (experiment.scenario.control.gains or experiment.scenario.control.blocks):
-            return Result((_with_known(experiment, Broken("given gains are flown", str(error))),))
+            return Result((Broken("given gains are flown", str(error)),))
         return Result(refused=f"{type(error).__name__}: {str(error)[:60]}")
     except Exception:  # noqa: BLE001 - whatever it is, it is what the soak looks for
         return Result((_raised(experiment),))
@@ -82,29 +81,11 @@ def judge(experiment: Experiment) -> Result:
             ended = flown.stretches[-1].station.end_reason.split(":")[0]
     except Exception:  # noqa: BLE001
         return Result((_raised(experiment),))
-    return Result(tuple(_with_known(experiment, one) for one in broken), ended=ended)
+    return Result(tuple(broken), ended=ended)
 
 
 def _raised(experiment: Experiment) -> Broken:
-    return _with_known(experiment, Broken("no exception", traceback.format_exc()))
-
-
-def _with_known(experiment: Experiment, broken: Broken) -> Broken:
-    """Tell what is known to be wrong. A defect that is mended goes from here in the commit that mends it."""
-    scenario = experiment.scenario
-    steps = bool(scenario.autopilot.clock_jumps) or any(fault.kind == "clock step" for fault in experiment.faults)
-    known = ""
-    if "in decode_1" in broken.text:
-        known = "a datagram that ends in a lone 0xFE"
-    elif broken.invariant == "commands within limits" and scenario.control.loop == "onboard":
-        known = "the opening term is streamed beyond the limit"
-    elif broken.invariant == "given gains are flown":
-        known = "given gains refused for want of a proof of alpha"
-    elif steps:
-        known = "a boot clock that was set: new states by the old offset"
-    elif broken.invariant == "clock bounds" and scenario.clocks.drift_max_ppm > 1000.0:
-        known = "drift beyond what the bounds hold for"
-    return replace(broken, known=known)
+    return Broken("no exception", traceback.format_exc())
 
 
 def checked(flown: Flown) -> Iterator[Broken]:

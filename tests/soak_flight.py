@@ -151,10 +151,10 @@ class World:
         for system_id in fault.system_ids:
             self.fleet.state(system_id, now_ns)  # brings it up to now
             vehicle = self.fleet.vehicle(system_id)
-            shown_ns = vehicle.clock.boot_ns(now_ns)
+            clock = vehicle.radio.clock
+            shown_ns = clock.boot_ns(now_ns)
             to_ns = max(1_000_000, shown_ns + round(fault.by_s * NS_PER_S))  # no clock shows less than its boot
-            vehicle.clock = BootClock(now_ns, to_ns, vehicle.clock.drift_ppb)
-            vehicle._schedule.set_clock(vehicle.clock, now_ns)  # pyright: ignore[reportPrivateUsage]
+            vehicle.radio.set_clock(BootClock(now_ns, to_ns, clock.drift_ppb), now_ns)
             self.fleet.state(system_id, now_ns)
 
     def _note(self, data: bytes, time_ns: int) -> None:
@@ -181,7 +181,7 @@ def fly(experiment: Experiment, plan: FlightPlan) -> Flown:
     signed = signed_links(KEY, ids, epoch_ns=EPOCH_NS, stamps=Stamps()) if experiment.signed else None
     guard = Guard(KEY, epoch_ns=EPOCH_NS, stamps=Stamps()) if experiment.signed else None
     fleet = Fleet(scenario, START_NS, record=rows.append, signed=signed)
-    clocks = {system_id: fleet.vehicle(system_id).clock for system_id in ids}
+    clocks = {system_id: fleet.vehicle(system_id).radio.clock for system_id in ids}
     world = World(experiment, fleet)
     deaths = [fault for fault in experiment.faults if fault.kind == "station replaced"]
     stretches: list[Stretch] = []

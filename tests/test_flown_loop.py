@@ -1,6 +1,7 @@
 """α and the growth of spacing errors with delay, each by a second way that shares no formula with the first."""
 
 from math import inf, pi
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from gains.delay import delay_margin
 from gains.flown_loop import FlownLoop
 from gains.formation import FormationModel
+from gains.multirate import Timing
 from gains.response import Response, sampled_margin
 from gains.rightmost import rightmost_root
 from gains.sampled import period_map, sampled_delay_margin, spectral_radius
@@ -32,13 +34,14 @@ def subsystem(gains: ScalarGains, axes: int) -> tuple[NDArray[np.float64], NDArr
 def smallest_singular_value(A0: NDArray[np.float64], A1: NDArray[np.float64], delay_s: float) -> tuple[float, float]:
     """A certified interval of min over ω of σ_min(jωI − A0 − A1 e^{−jωτ}), which is Lipschitz with 1 + τ ‖A1‖."""
     slope = 1.0 + delay_s * np.linalg.norm(A1, 2)
-    ends = np.linspace(0.0, 2.0 * (np.linalg.norm(A0, 2) + np.linalg.norm(A1, 2)), 400)
+    ends: NDArray[np.float64] = np.linspace(0.0, 2.0 * float(np.linalg.norm(A0, 2) + np.linalg.norm(A1, 2)), 400)
     low, high = ends[:-1], ends[1:]
     best = inf
     for _ in range(40):
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         matrix = 1j * middle[:, None, None] * np.eye(len(A0)) - A0 - A1 * np.exp(-1j * middle * delay_s)[:, None, None]
-        sigma = np.linalg.svd(matrix, compute_uv=False)[:, -1]
+        sigma: NDArray[np.floating[Any]] = np.linalg.svd(matrix, compute_uv=False)
+        sigma = sigma[:, -1]
         best = min(best, float(sigma.min()))
         bound = sigma - slope * half
         if bound.min() > best - 1e-5:
@@ -200,7 +203,7 @@ def test_the_motion_of_a_follower_on_board_grows_by_the_peak() -> None:
 def test_a_response_takes_of_alpha_and_of_growth_what_it_takes_of_the_margin() -> None:
     response, pair = Response(0.15, 2.0), FormationModel((-1, 0), axes=1)
     K = pair.overlapping_gain([[-2.1]], [[0.6]], [[2.0]])
-    margin_s = sampled_margin(pair, K, [response] * 2, period_s=PERIOD_S)
+    margin_s = sampled_margin(pair, K, [response] * 2, timing=Timing(PERIOD_S, PERIOD_S))
     flown = FlownLoop(ScalarGains(2.1, 0.6, 2.0, 0.0), margin_s, PERIOD_S, response=response)
     alphas = [flown.alpha(share * margin_s) for share in (0.6, 0.9, 0.999)]
     assert alphas == sorted(alphas, reverse=True)
