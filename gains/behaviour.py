@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gains.arrays import FloatArray
 from gains.delay import analyse_delay
 from gains.rightmost import rightmost_root
 from gains.robust import subsystem_loop
 from gains.string_stability import Response, response_peak
 
-FloatArray = NDArray[np.float64]
 Gains = tuple[FloatArray, FloatArray, FloatArray]
 
 

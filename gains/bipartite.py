@@ -17,8 +17,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError, DisagreementError
-from gains.pattern import FloatArray, Link, Pattern, Plant, check_fits, checked_pattern_gain
+from gains.pattern import Link, Pattern, Plant, check_fits, checked_pattern_gain
 from gains.structure import real_matrix
 
 Origin = Literal["by input", "by output", "greedy", "search"]

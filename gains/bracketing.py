@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.structure import FloatArray
+from gains.arrays import FloatArray
 
 Functions = Callable[[FloatArray], FloatArray]
 

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError, SolverError
 from gains.pattern import Plant
 from gains.robust import SolverFacts, disturbance_bound, negative, solved
-
-FloatArray = NDArray[np.float64]
 
 # Room for the solver's rounding, as a share, when the bound it claims is compared with the exact one.
 _ROUNDING = 1e-6

@@ -11,9 +11,9 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.delay_loci import ComplexArray, Loci
+from gains.arrays import ComplexArray, FloatArray
+from gains.delay_loci import Loci
 from gains.delay_sweep import near_unit_extrema
-from gains.structure import FloatArray
 
 # the pencil's companion matrix takes 0.1 s at this size; larger ones leave the frequencies to the sweep
 _LARGEST_PENCIL = 450

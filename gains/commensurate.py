@@ -18,6 +18,7 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.circle_angles import PAST_HALF, at_angle, candidate_angles, circle_loci, circle_points, norm_of
 from gains.crossing_error import DelayedTerm
 from gains.delay import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis, unstable_roots
@@ -30,10 +31,10 @@ from gains.delay_crossings import (
     polish,
     separating_points,
 )
-from gains.delay_loci import ComplexArray, Loci, UnitCrossing, solved_beside_poles, unit_crossings
+from gains.delay_loci import Loci, UnitCrossing, solved_beside_poles, unit_crossings
 from gains.delay_zero import zero_passage
 from gains.errors import BadModelError
-from gains.structure import Block, FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
+from gains.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
 # a locus is an eigenvalue of a companion matrix, of which many are wanted; beyond this size angles are followed instead
 _LARGEST_LOCI = 30

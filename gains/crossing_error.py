@@ -9,7 +9,8 @@ from math import inf
 
 import numpy as np
 
-from gains.structure import FloatArray, balanced, distinct_blocks
+from gains.arrays import FloatArray
+from gains.structure import balanced, distinct_blocks
 
 # backward error of a crossing, in units of n eps and the norm: rounding of the matrices, a similarity, an eigenvalue
 _BACKWARD = 2.0

@@ -18,13 +18,13 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.crossing_error import DelayedTerm, crossing_error
 from gains.delay_crossings import AxisCrossing, axis_crossings, highest_frequency
-from gains.delay_loci import ComplexArray
 from gains.delay_sweep import frequency_sweep_margin
 from gains.delay_zero import ZeroPassage, zero_passage
 from gains.errors import BadModelError, DisagreementError
-from gains.structure import Block, FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
+from gains.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
 __all__ = [
     "Crossing",

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.delay_loci import (
-    ComplexArray,
     Loci,
     UnitCrossing,
     delay_loci,
@@ -21,7 +21,6 @@ from gains.delay_loci import (
     unit_crossings,
     without_limits_at_zero,
 )
-from gains.structure import FloatArray
 
 # n^2 eigenvalues of an n^2 x n^2 matrix: 0.3 s at 20, and growing with the sixth power
 LARGEST_ALGEBRAIC_BLOCK = 24

@@ -10,9 +10,9 @@ from math import pi
 
 import numpy as np
 
-from gains.delay_loci import ComplexArray, UnitCrossing, unit_crossings
+from gains.arrays import ComplexArray, FloatArray
+from gains.delay_loci import UnitCrossing, unit_crossings
 from gains.delay_sweep import near_unit_extrema
-from gains.structure import FloatArray
 
 # angles from which curves are looked for, and angles of the other delay in each search
 _SEED_ANGLES, _SEARCH_ANGLES = 48, 160

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.bracketing import bracketed_roots
-from gains.structure import FloatArray
 
-ComplexArray = NDArray[np.complex128]
 Loci = Callable[[FloatArray], ComplexArray]
 
 _EPS = float(np.finfo(np.float64).eps)

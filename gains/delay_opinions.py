@@ -15,10 +15,11 @@ from math import isfinite, nan
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.crossing_error import DelayedTerm, crossing_error
 from gains.delay import Crossing, DelayAnalysis, analyse_delay
 from gains.errors import BadModelError, DisagreementError
-from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
+from gains.structure import balanced, distinct_blocks, square_matrices
 
 # a sweep of blocks of n states costs some n^3: these are 0.2 s, and 0.08 s one of 12 states
 _SWEEP_BUDGET = 14_000

@@ -11,9 +11,10 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.bracketing import may_reach_zero, peaks
 from gains.delay_loci import Loci, delay_loci, log_moduli, unit_crossings, without_limits_at_zero
-from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
+from gains.structure import balanced, distinct_blocks, square_matrices
 
 # points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
 _POINTS_PER_DECADE = 60

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gains.structure import FloatArray, IntArray, is_singular_for_any_delay
+from gains.arrays import FloatArray, IntArray
+from gains.structure import is_singular_for_any_delay
 
 # the cosine of the angle between the null vectors of a simple eigenvalue, rounding being far below
 _SIMPLE = 1e-6

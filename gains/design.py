@@ -14,8 +14,9 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, Self, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.behaviour import Behaviour, BlockMargin, Gains, behaviour, block_margin, follower_block, leader_block
 from gains.delay import delay_margin
 from gains.errors import BadModelError, DisagreementError, SolverError
@@ -27,8 +28,6 @@ from gains.requirement import ALPHA_MIN, Requirement, plain
 from gains.robust import Certificate, SolverFacts, certify, robustness
 from gains.sampled import sampled_delay_margin
 from gains.search import largest_alpha
-
-FloatArray = NDArray[np.float64]
 
 PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
 # The certificate proves this share of α: at α itself the proof is on the edge of existence.

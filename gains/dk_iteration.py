@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError, DisagreementError, InfeasibleError, SolverError
-from gains.pattern import FloatArray, Pattern, Plant, check_fits
+from gains.pattern import Pattern, Plant, check_fits
 from gains.robust import SolverFacts
 from gains.structure import strongly_connected_blocks
 

@@ -25,12 +25,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.errors import DisagreementError, InfeasibleError
-from gains.pattern import FloatArray, Link, Pattern, Plant, check_fits
+from gains.pattern import Link, Pattern, Plant, check_fits
 from gains.structure import distinct_blocks, strongly_connected_blocks
 from gains.submodular import least_exhaustive, least_submodular
-
-ComplexArray = NDArray[np.complex128]
 
 # up to this many inputs in one component all subsets are tried (256 ranks); above, the submodular minimum is computed
 LARGEST_EXHAUSTIVE = 8

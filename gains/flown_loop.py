@@ -20,10 +20,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.behaviour import string_peak
 from gains.bracketing import met_end, peaks
 from gains.response import Response
-from gains.scalar_gains import FloatArray, ScalarGains, delayed_singular_value
+from gains.scalar_gains import ScalarGains, delayed_singular_value
 from gains.string_stability import largest_magnitude
 
 # Frequencies of the first look at σ_min; its least ones are refined by golden section.

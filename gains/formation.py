@@ -7,11 +7,11 @@ M.Tech thesis, NIT Rourkela, 2012, eqs. (2.10)-(2.12), written there for a chain
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError
 
-FloatArray = NDArray[np.float64]
 LEADER = -1
 
 

@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
+from gains.arrays import FloatArray
 from gains.bipartite import partition_by_input, smallest_partition
 from gains.delay import delay_margin
 from gains.dk_iteration import DecayProof, abscissa, decay_proof
 from gains.errors import BadModelError, InfeasibleError, SolverError
 from gains.fixed_modes import check_stabilisable
 from gains.formation import FormationModel
-from gains.pattern import FloatArray, Link, Pattern, Plant, checked_pattern_gain, formation_plant
+from gains.pattern import Link, Pattern, Plant, checked_pattern_gain, formation_plant
 from gains.requirement import Requirement, plain
 from gains.robust import SolverFacts, disturbance_bound
 from gains.sampled import sampled_delay_margin

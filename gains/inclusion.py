@@ -12,13 +12,13 @@ from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError
 from gains.formation import FormationModel, checked_gain
 
-FloatArray = NDArray[np.float64]
 # scipy has no types: any of its two-dimensional sparse arrays
 Sparse = Any
 Restriction = Literal["a", "b"]

@@ -13,12 +13,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.delay import analyse_delay
 from gains.delay_crossings import highest_frequency
-from gains.delay_loci import ComplexArray, factor_rank
+from gains.delay_loci import factor_rank
 from gains.errors import BadModelError
 from gains.lmi import Unknown, positive_definite_solution
-from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
+from gains.structure import balanced, distinct_blocks, square_matrices
 from gains.varying_delay import varying_delay_bound
 
 Cover = Literal["constant", "rate", "spread", "any", "none"]

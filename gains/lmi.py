@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gains.structure import FloatArray
+from gains.arrays import FloatArray
 
 Inequalities = Callable[[Sequence[FloatArray]], Sequence[FloatArray]]
 

@@ -12,12 +12,13 @@ from math import ceil, floor, gcd, inf, log10, pi
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.crossing_error import DelayedTerm, crossing_error
 from gains.delay import Crossing, DelayAnalysis, analyse_delay
 from gains.delay_opinions import second_opinions
 from gains.errors import BadModelError, DisagreementError
 from gains.model_file import DelayModel, HeldModel
-from gains.structure import FloatArray, balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
+from gains.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
 
 # multiples of the unknown up to this many times their common divisor
 _MOST_STEPS = 200

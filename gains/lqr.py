@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError, InfeasibleError
-from gains.pattern import FloatArray, Pattern, Plant, check_fits, checked_pattern_gain
+from gains.pattern import Pattern, Plant, check_fits, checked_pattern_gain
 from gains.structure import real_matrix, strongly_connected_blocks
 
 

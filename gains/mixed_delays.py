@@ -14,23 +14,16 @@ from math import pi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import ComplexArray, FloatArray, IntArray
 from gains.commensurate import column_space, companion_loci, highest_frequency
 from gains.crossing_error import DelayedTerm
 from gains.delay import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
 from gains.delay_crossings import AxisCrossing
-from gains.delay_loci import ComplexArray, Loci, unit_crossings, without_limits_at_zero
+from gains.delay_loci import Loci, unit_crossings, without_limits_at_zero
 from gains.delay_sweep import near_unit_extrema
 from gains.delay_zero import zero_passage
 from gains.errors import BadModelError, DisagreementError
-from gains.structure import (
-    Block,
-    FloatArray,
-    IntArray,
-    balanced,
-    distinct_blocks,
-    is_singular_for_any_delay,
-    square_matrices,
-)
+from gains.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 
 # rad by which e^{-j omega d} turns between neighbouring frequencies
 _TURN = 0.1

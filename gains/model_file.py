@@ -20,8 +20,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError
-from gains.structure import FloatArray
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _MULTIPLE = re.compile(

@@ -24,12 +24,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.bracketing import met_end
 from gains.delay import delay_margin
 from gains.errors import BadModelError
 from gains.sampled import checked_loop, growth_rate, sampled_delay_margin
 from gains.sampled_loop import held_blocks
-from gains.structure import FloatArray
 
 # instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
 _SAME_INSTANT = 1e-11

@@ -27,14 +27,15 @@ from math import ceil, inf
 
 import numpy as np
 
+from gains.arrays import FloatArray, IntArray
 from gains.delay import delay_margin
 from gains.delay_loci import factor_rank
 from gains.errors import BadModelError
-from gains.formation import FloatArray, FormationModel
+from gains.formation import FormationModel
 from gains.multirate import Timing, lifted_growth, lifted_margin
 from gains.sampled_crossings import block_delay_margin
 from gains.sampled_loop import HeldPlant, block_radius, matrix_exponentials
-from gains.structure import IntArray, balanced, distinct_blocks
+from gains.structure import balanced, distinct_blocks
 
 # an instant this close to a step (in steps) is that of the step
 _SAME_INSTANT = 1e-9

@@ -11,14 +11,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from gains.arrays import BoolArray, FloatArray
 from gains.errors import BadModelError
 from gains.formation import FormationModel
 from gains.structure import real_matrix, square_matrices
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Link = tuple[int, int]
 
 

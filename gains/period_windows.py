@@ -12,13 +12,14 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.bracketing import bracketed_roots
-from gains.delay_loci import ComplexArray, factor_rank
+from gains.delay_loci import factor_rank
 from gains.errors import GainsError
 from gains.sampled import checked_loop, sampling_period_limit
 from gains.sampled_loop import HeldPlant
 from gains.sampled_period import last_period, next_periods, with_peaks
-from gains.structure import FloatArray, balanced, distinct_blocks
+from gains.structure import balanced, distinct_blocks
 
 # windows are listed up to this many times the first limit, or of the slowest time constant without one
 _HORIZON = 20.0

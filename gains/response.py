@@ -10,21 +10,17 @@ still owed, d = v_s - v, d' = u - a. With A, B of this and u = K e the margin is
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.bracketing import met_end
+from gains.arrays import FloatArray
 from gains.delay import delay_margin
-from gains.errors import BadModelError, InfeasibleError
+from gains.errors import BadModelError
 from gains.formation import FormationModel
 from gains.multirate import Timing, multirate_delay_margin
-from gains.requirement import Requirement
-from gains.search import largest_alpha
-from gains.structure import FloatArray
 
-_MARGIN_MAX_S = 30.0
 _MARGIN_RESOLUTION = 1e-9
 
 
@@ -155,57 +151,3 @@ def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[
     """
     A, B, K_all = formation_loop(model, K, responses)
     return float(delay_margin(A, B @ K_all))
-
-
-def requirement_with(requirement: Requirement, response: Response | None, *, timing: Timing) -> Requirement:
-    """The requirement on vehicles that answer at once, with one period for telemetry and control, the slower one, whose
-    design has the wanted margin with this response and these periods.
-
-    The margin with them grows with the one without: found by false position. A requirement without a margin stays as
-    it is.
-
-    Raises
-    ------
-    InfeasibleError
-        If no gains have this margin so.
-
-    Examples
-    --------
-    Without a delay margin there is nothing to find:
-
-    >>> from gains.multirate import Timing
-    >>> from gains.requirement import Requirement
-    >>> from gains.response import Response, requirement_with
-    >>> wanted = Requirement(alpha=0.4)
-    >>> requirement_with(wanted, Response(0.1, 0.0), timing=Timing(0.02, 0.02)) == wanted
-    True
-    """
-    wanted_s = requirement.delay_margin_s
-    if wanted_s is None or (response is None and timing.commands == 1):
-        return requirement
-
-    responses, lag_s = (None, timing.faster_s) if response is None else ([response] * 2, response.lag_s)
-    pair = FormationModel((-1, 0), axes=1)  # a leader-follower tree has the roots of these two, whatever its size
-
-    def excess(without_s: float) -> float:
-        found = largest_alpha(without_s, timing.held_s, requirement.peak_limit, requirement.decay_rate_1_s or 0.0)
-        if found is None:
-            return -wanted_s
-        K = pair.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
-        return sampled_margin(pair, K, responses, timing=timing) - wanted_s
-
-    # the response takes about its lag of the margin
-    low, high = wanted_s, wanted_s + lag_s
-    f_low, f_high = excess(low), excess(high)
-    while f_high < 0.0 and high < _MARGIN_MAX_S:
-        low, f_low, high = high, f_high, min(high + wanted_s + lag_s, _MARGIN_MAX_S)
-        f_high = excess(high)
-    if f_high < 0.0 or high > _MARGIN_MAX_S:
-        answer = (
-            f" with lag_s = {response.lag_s} and velocity_gain_1_s = {response.velocity_gain_1_s}" if response else ""
-        )
-        raise InfeasibleError(f"no gains have a sampled delay margin of {wanted_s} s{answer}; ask for less")
-    if f_low >= 0.0:
-        return requirement
-    found_s = met_end(excess, (high, f_high), (low, f_low), resolution=_MARGIN_RESOLUTION * wanted_s)
-    return replace(requirement, delay_margin_s=found_s)

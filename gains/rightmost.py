@@ -14,9 +14,9 @@ from math import ceil
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.delay_loci import ComplexArray
+from gains.arrays import ComplexArray, FloatArray
 from gains.errors import BadModelError
-from gains.structure import Block, FloatArray, balanced, distinct_blocks, square_matrices
+from gains.structure import Block, balanced, distinct_blocks, square_matrices
 
 # a starting value for Newton's method is wanted, not the root: 12 points, and one more for every two radians of |s| tau
 _POINTS = 12

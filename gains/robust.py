@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError, InfeasibleError, SolverError
 from gains.formation import checked_gain
-
-FloatArray = NDArray[np.float64]
 
 # The level-set search stops when no frequency exceeds the largest gain found by this relative step; it is far above
 # the rounding of a 6×6 eigenvalue problem and far below what any figure shown to a user resolves.

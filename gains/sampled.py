@@ -15,11 +15,12 @@ T / 2, up to terms in T^2.
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError
 from gains.sampled_crossings import block_delay_margin
 from gains.sampled_loop import HeldPlant, block_radius, held_blocks, lifted_map
 from gains.sampled_period import block_period_limit
-from gains.structure import FloatArray, balanced, distinct_blocks, real_matrix, square_matrices
+from gains.structure import balanced, distinct_blocks, real_matrix, square_matrices
 
 
 def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> FloatArray:

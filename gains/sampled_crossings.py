@@ -15,13 +15,13 @@ from math import ceil, floor, inf, pi
 
 import numpy as np
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.bracketing import bracketed_roots
 from gains.delay_crossings import separating_points
-from gains.delay_loci import ComplexArray, Loci, delay_loci, solved_beside_poles, unit_crossings
+from gains.delay_loci import Loci, delay_loci, solved_beside_poles, unit_crossings
 from gains.delay_sweep import near_unit_extrema, sweep_frequencies
 from gains.errors import DisagreementError
 from gains.sampled_loop import SampledPlant, block_radius, split_delay
-from gains.structure import FloatArray
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
 _FRACTIONS = 8

@@ -6,8 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.delay_loci import factor_rank
-from gains.structure import FloatArray, balanced, distinct_blocks
+from gains.structure import balanced, distinct_blocks
 
 # a delay this close to a whole number of periods (in periods) is that number: (3 * 0.02) / 0.02 is not exactly 3
 _WHOLE = 1e-12

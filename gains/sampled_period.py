@@ -4,11 +4,11 @@ from math import inf
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.bracketing import Functions, bracketed_roots, may_reach_zero, peaks
 from gains.delay_loci import factor_rank
 from gains.errors import GainsError
 from gains.sampled_loop import HeldPlant
-from gains.structure import FloatArray
 
 # periods looked at in one go, and goes before giving up
 _CHUNK, _CHUNKS = 256, 200

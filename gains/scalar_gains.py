@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from gains.arrays import FloatArray
+
 Factor = NDArray[np.complexfloating[Any, Any]] | float
 
 # Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three of

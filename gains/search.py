@@ -7,10 +7,10 @@ and `gains.robust`, which share no formula with it.
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.bracketing import met_end
 from gains.requirement import OnboardPeak, PeakLimit
 from gains.scalar_gains import (
-    FloatArray,
     ScalarGains,
     alpha_of,
     decay_rate_of,

@@ -21,11 +21,12 @@ from math import ceil, inf, isfinite, pi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gains.arrays import FloatArray
 from gains.delay import delay_margin
 from gains.delay_curves import Curve, at_delay, crossing_solutions
 from gains.errors import BadModelError
 from gains.rightmost import rightmost_root
-from gains.structure import FloatArray, distinct_blocks, real_matrix, square_matrices
+from gains.structure import distinct_blocks, real_matrix, square_matrices
 
 # a rightmost root counts as on the axis when it is this close to it, relative to its own size
 _ON_AXIS = 1e-6

@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.arrays import ComplexArray, FloatArray
 from gains.bracketing import peaks
 from gains.delay import delay_margin
 from gains.errors import BadModelError
-from gains.structure import FloatArray
 
-ComplexArray = NDArray[np.complex128]
 Response = Callable[[FloatArray], ComplexArray]
 
 # the sweep of a peak: frequencies in each of its decades

@@ -11,16 +11,12 @@ import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import log2
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gains.arrays import FloatArray, IntArray, RealArray
 from gains.errors import BadModelError
-
-FloatArray = NDArray[np.float64]
-RealArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.intp]
 
 # states up to which the components are found by squaring the pattern
 _LARGEST_CLOSURE = 64

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError, InfeasibleError, SolverError
 from gains.lqr import Cost, CostPoint, Weights, centralised_lqr
-from gains.pattern import FloatArray, Pattern, Plant, check_fits, checked_pattern_gain
+from gains.pattern import Pattern, Plant, check_fits, checked_pattern_gain
 
 # The decrement g'M⁻¹g / J estimates the share of the cost that is still to be gained. Costs are known to about 1e-13.
 _DECREMENT = 1e-13

@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.errors import DisagreementError
-from gains.structure import FloatArray
 
 SetFunction = Callable[[frozenset[int]], int]
 

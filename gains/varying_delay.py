@@ -20,11 +20,12 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.arrays import FloatArray
 from gains.delay import delay_margin
 from gains.delay_loci import factor_rank
 from gains.errors import BadModelError
 from gains.lmi import Unknown, positive_definite_solution
-from gains.structure import FloatArray, balanced, distinct_blocks, square_matrices
+from gains.structure import balanced, distinct_blocks, square_matrices
 
 # bisection stops at this relative accuracy
 _ACCURACY = 1e-4

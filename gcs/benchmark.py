@@ -10,9 +10,10 @@ from statistics import median
 from typing import Any
 
 from gcs import station
+from gcs.flight_plan import FlightPlan
 from gcs.interrupts import raised
 from gcs.lockstep import Sent, Vehicles, fly_lockstep, signed_ends, vehicles_of
-from gcs.plan import FlightPlan, flight_plan
+from gcs.plan import flight_plan
 from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
 

@@ -10,11 +10,11 @@ from math import hypot, inf, isfinite, isnan, log, nan, sqrt
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gcs.control import VehicleControl
+from gcs.flight_plan import FlightPlan
 from gcs.monitor import VehicleState
-from gcs.plan import FlightPlan
-from gcs.record import Mode
-from gcs.telemetry import FloatArray
+from gcs.tick import Mode
 
 _TIME_CONSTANTS = 3.0
 """After so many an error has decayed to a twentieth."""

@@ -9,19 +9,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.errors import GainsError
 from gcs.benchmark import with_vehicles
+from gcs.errors import InputError
 from gcs.lockstep import START_NS, LinkLosses, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan import flight_plan
-from gcs.record import TickArray
 from gcs.show.report import number_text
 from gcs.station import Station
-from gcs.user_input import InputError
+from gcs.tick import TickArray
 from scenarios.schema import Scenario
-
-FloatArray = NDArray[np.float64]
 
 _START_ERROR_M = 2.0
 """Every second vehicle begins so far aside of its place."""

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 import typer
 
+from gcs.errors import InputError
 from gcs.interrupts import EXIT_INTERRUPTED
 from gcs.loop_option import LoopOption, load_with_loop
 from gcs.output import DISK_FULL, outlive_readers
 from gcs.stress.command import stress
 from gcs.user_input import (
-    InputError,
     KeyFile,
     address,
     listening,

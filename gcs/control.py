@@ -9,37 +9,16 @@ its margin.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import nan
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.formation import FormationModel
-from gcs.telemetry import FloatArray, IntArray, Report, State, StateHistory
-
-
-@dataclass(frozen=True)
-class Formation:
-    """Who follows whom, in an order in which every vehicle comes after the one it follows.
-
-    `predecessor` (n,) holds rows, -1 for the leader; `offset_ne_m` (n, 2) is the wanted position relative to the
-    predecessor, zero for the leader.
-    """
-
-    system_ids: tuple[int, ...]
-    predecessor: IntArray
-    offset_ne_m: FloatArray
-
-    def place_ne_m(self) -> FloatArray:
-        """Wanted positions relative to the leader, (n, 2)."""
-        place = self.offset_ne_m.copy()
-        for row, ahead in enumerate(self.predecessor.tolist()):
-            if ahead >= 0:
-                place[row] += place[ahead]
-        return place
-
+from gcs.formation import Formation
+from gcs.telemetry import Report, State, StateHistory
 
 Gain = tuple[float, float, float, float, float, float, float, float]
 """A block G (2, 4), row by row: command (north, east) from position and velocity (north, east)."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs.grade import ACTED, SAMPLED, Truth, instants, true_loop_delays_s
-from gcs.record import TickArray
+from gcs.tick import TickArray
 
 _TRUTH = np.dtype([("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_ns", "<i8")])
 

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from gcs.effective_delay import truth_of
+from gcs.flight_plan import FlightPlan
 from gcs.grade import Truth
 from gcs.lockstep import START_NS, fly_lockstep, vehicles_of
-from gcs.plan import FlightPlan
-from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter, TickArray
+from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
 from gcs.station import Station
+from gcs.tick import TickArray
 from scenarios import files as scenario_files
 
 

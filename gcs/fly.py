@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gcs.flight_plan import FlightPlan
 from gcs.guard import Guard
 from gcs.interrupts import held_back, stop_signals
 from gcs.mirror import Mirror
-from gcs.plan import FlightPlan, described
+from gcs.plan import described
 from gcs.record import DESIGN_FILE, END, FLEET, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter, write_whole
 from gcs.sitl import VehicleProcess
 from gcs.station import Station

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.record import TickArray
+from gains.arrays import FloatArray
+from gcs.errors import InputError
+from gcs.record import TRUTH_FILE
 from gcs.run_files import read_ticks
-from gcs.show.report import UNKNOWN
-from gcs.sitl import TRUTH_FILE
-from gcs.user_input import InputError
+from gcs.tick import TickArray
 from sim_vehicles.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
 
-FloatArray = NDArray[np.float64]
 Truth = NDArray[np.void]
 """Records as sim_vehicles.truth.DTYPE lays them out."""
 
@@ -71,7 +70,7 @@ def print_grade(result: dict[str, Any]) -> None:
 
 
 def _ms(value_s: float | None) -> str:
-    return UNKNOWN if value_s is None else f"{1e3 * value_s:.3f}"
+    return "–" if value_s is None else f"{1e3 * value_s:.3f}"
 
 
 def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gcs import mavlink
-from gcs.station import ANOTHER_ADDRESS, Datagram, Outgoing
+from gcs.datagram import Datagram, Outgoing
+from gcs.station import ANOTHER_ADDRESS
 from scenarios.signing.keys import Key, read_key
 from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps, open_stamps

@@ -8,11 +8,12 @@ as it would in a socket, and no decision is made in between.
 from collections.abc import Iterator
 from typing import Protocol
 
+from gcs.datagram import Datagram
+from gcs.flight_plan import FlightPlan
 from gcs.guard import Guard
 from gcs.modes import Phase
-from gcs.plan import FlightPlan
-from gcs.record import TickArray
-from gcs.station import Datagram, Station
+from gcs.station import Station
+from gcs.tick import TickArray
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.fleet import Fleet

@@ -13,12 +13,10 @@ from typing import Self
 
 from gcs import mavlink
 from gcs.autopilot.kinds import SET_MESSAGE_INTERVAL
-from gcs.station import Outgoing
-from gcs.vehicle import Address, RemoteVehicle
+from gcs.datagram import Address, Outgoing
+from gcs.vehicle import RemoteVehicle
 from scenarios.signing.link import SignedLink
 
-MIRROR = "mirror"
-"""Kind of the event that holds what a mirror counted."""
 _LARGEST_DATAGRAM = 2048
 _STREAMS_WITH_POSITION = (0, 6)
 """MAV_DATA_STREAM: all, position."""

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gcs.control import Blend
-from gcs.record import Mode
+from gcs.tick import Mode
 from scenarios.schema import Monitor
 
 

@@ -7,19 +7,17 @@ autopilots understand it, with the formation's velocity v_d as the velocity.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.formation import FormationModel
 from gains.onboard import OnboardTiming, onboard_loop, own_part
 from gains.requirement import plain
-from gcs.control import Formation
-from gcs.telemetry import FloatArray
+from gcs.flight_plan import FlightPlan
+from gcs.formation import Formation
 from scenarios.schema import Scenario
-
-if TYPE_CHECKING:
-    from gcs.plan import FlightPlan
 
 AXES = "NE"
 
@@ -37,7 +35,7 @@ def timing_of(scenario: Scenario) -> OnboardTiming | None:
     )
 
 
-def onboard_plan(design: dict[str, Any], plan: "FlightPlan") -> tuple[dict[str, Any], "FlightPlan"]:
+def onboard_plan(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, Any], FlightPlan]:
     """Design and plan of a ground loop, made those of the onboard loop with the same gains.
 
     Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. The

@@ -1,25 +1,25 @@
 """From a scenario to what is flown: formation, gains, margins."""
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.behaviour import string_peak
 from gains.design import Design, design, evaluate_gains
 from gains.formation import FormationModel
 from gains.graph_design import evaluate_graph_gain, time_scaled
-from gains.multirate import Timing
 from gains.pattern import Pattern, leader_follower, with_links, without_links
+from gains.required import requirement_with
 from gains.requirement import Requirement, plain
-from gains.response import Response, continuous_margin, requirement_with, sampled_margin
+from gains.response import Response, continuous_margin, sampled_margin
 from gains.structure import strongly_connected_blocks
 from gcs.at_delay import with_figures_at_delay
 from gcs.autopilot.responses import Responses, given_responses, margins_with
-from gcs.control import Formation
+from gcs.flight_plan import FlightPlan, loop_timing
+from gcs.formation import Formation, plan_formation
 from gcs.onboard import onboard_plan
-from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
 
 NOT_YET_KNOWN = "not yet known"
@@ -28,67 +28,6 @@ _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 
 _MORE = 1.1
 """What the rates take of a margin asked for is asked for so many times more: it is a small part of the margin."""
-
-
-@dataclass(frozen=True)
-class FlightPlan:
-    """What the station flies: the formation, the gains and the margin they have."""
-
-    scenario: Scenario
-    formation: Formation
-    gain: FloatArray
-    """K of u = K e, rows and columns in the order of `gains.formation.FormationModel`."""
-    delay_margin_s: float
-    slower: tuple[tuple[FloatArray, float], ...] = ()
-    """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
-    separable: bool = True
-    """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
-    responses: Responses | None = None
-    """How the vehicles answer; None if at once, or not yet known."""
-    around_loss: tuple[FloatArray, ...] = ()
-    """In place of `gains` while a vehicle is lost; empty if they serve. A leader-follower tree stays stable when the
-    nearest vehicle ahead stands in for a lost one; gains on another pattern may not without all of their terms, so
-    they are left for the inclusion gains of the same delay margin. The step in the commands is accepted."""
-
-    @cached_property
-    def gains(self) -> tuple[FloatArray, ...]:
-        """The gain schedule, fastest first."""
-        return (self.gain, *(gain for gain, _ in self.slower))
-
-    @cached_property
-    def margins_s(self) -> tuple[float, ...]:
-        """The delay margins of the gain schedule."""
-        return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
-
-    @cached_property
-    def model(self) -> FormationModel:
-        return FormationModel(tuple(self.formation.predecessor.tolist()))
-
-    @property
-    def timing(self) -> Timing:
-        """How often the station hears and commands."""
-        return loop_timing(self.scenario)
-
-    def with_margins(self, margins_s: tuple[float, ...], responses: Responses | None) -> "FlightPlan":
-        """The same gains with the margins that they have on vehicles that answer so."""
-        slower = tuple((gain, s) for (gain, _), s in zip(self.slower, margins_s[1:], strict=True))
-        return replace(self, delay_margin_s=margins_s[0], slower=slower, responses=responses)
-
-
-def loop_timing(scenario: Scenario) -> Timing:
-    """The periods at which states and commands of a scenario are sent."""
-    return Timing(1.0 / scenario.rates.control_hz, 1.0 / scenario.rates.telemetry_hz)
-
-
-def plan_formation(scenario: Scenario) -> Formation:
-    """The scenario's formation as arrays, vehicles in `leader_first` order."""
-    ordered = scenario.leader_first()
-    row = {vehicle.system_id: k for k, vehicle in enumerate(ordered)}
-    return Formation(
-        system_ids=tuple(row),
-        predecessor=np.array([-1 if v.follows is None else row[v.follows] for v in ordered], dtype=np.int64),
-        offset_ne_m=np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered]),
-    )
 
 
 def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:

@@ -9,14 +9,14 @@ from math import hypot
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.onboard import onboard_loop
 from gains.response import formation_loop
 from gains.sampled import growth_rate
 from gains.structure import strongly_connected_blocks
 from gcs.clocks import REQUEST_LIFETIME_NS
+from gcs.flight_plan import FlightPlan
 from gcs.onboard import timing_of
-from gcs.plan import FlightPlan
-from gcs.telemetry import FloatArray
 from scenarios.schema import NS_PER_S, Scenario
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gcs.control import VehicleControl
 from gcs.monitor import VehicleState, headroom
-from gcs.record import TICK, TickArray
+from gcs.tick import TICK, TickArray
 from gcs.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S, Rates
 

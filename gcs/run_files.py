@@ -1,6 +1,6 @@
 """The files of a run's folder, each with its one reader: what is damaged, or of another kind, is told in one line.
 
-Raised everywhere here: gcs.user_input.InputError.
+Raised everywhere here: gcs.errors.InputError.
 """
 
 from pathlib import Path
@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from gcs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICK, TICKS_FILE, Mode, TickArray
-from gcs.user_input import InputError
+from gcs.errors import InputError
+from gcs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE
+from gcs.tick import TICK, Mode, TickArray
 from scenarios import files as scenario_files
 from scenarios.schema import Scenario
 

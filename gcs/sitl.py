@@ -7,11 +7,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from gcs.datagram import Address
+from gcs.record import TRUTH_FILE
 from gcs.refusals import VEHICLES_FILE
-from gcs.vehicle import Address
 
 VEHICLES_LOG = "vehicles.log"
-TRUTH_FILE = "truth.bin"
 ORPHAN_S = 60.0
 """How long vehicles whose station was killed wait for another one to take them over."""
 _AT_ONCE_S = 0.1

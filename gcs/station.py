@@ -18,15 +18,16 @@ from gcs.autopilot.kinds import Goal
 from gcs.autopilot.startup import Startup
 from gcs.breakage import Breakage
 from gcs.control import VehicleControl, distances_m, formation_control
+from gcs.datagram import Datagram, Outgoing
+from gcs.flight_plan import FlightPlan
 from gcs.limits import SetPointLimits
 from gcs.modes import Phase, next_phase, patience_s
 from gcs.monitor import FleetView, FormationMonitor
-from gcs.plan import FlightPlan
-from gcs.record import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.rows import Repetitions, Reported, Tick, VehicleTick, tick_rows
 from gcs.stream import Stream, law_of, set_point, upload_of
 from gcs.telemetry import StateHistory
-from gcs.vehicle import SILENCE_S, Address, RemoteVehicle
+from gcs.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
+from gcs.vehicle import SILENCE_S, RemoteVehicle
 from scenarios.schema import NS_PER_S
 
 AUTOPILOT_COMPONENT = 1
@@ -35,27 +36,11 @@ ANOTHER_ADDRESS = "known system id from another address"
 _HEARTBEAT_NS = NS_PER_S
 
 
-class Datagram(NamedTuple):
-    """One received datagram."""
-
-    data: bytes
-    address: Address
-    received_ns: int
-    """The kernel's stamp, on the station's clock."""
-    queued_ns: int = 0
-    """How long it waited in the socket after that for the station to be free."""
-
-
 class Event(NamedTuple):
     time_s: float
     kind: str
     text: str
     system_id: int | None = None
-
-
-class Outgoing(NamedTuple):
-    data: bytes
-    address: Address
 
 
 class Station:

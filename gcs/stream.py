@@ -10,8 +10,8 @@ from typing import Any
 from gains.onboard import own_part
 from gcs import mavlink
 from gcs.control import Blend, FeedbackLaw, VehicleControl, VehicleLaw, command_at, feedback_law, formation_control
+from gcs.flight_plan import FlightPlan
 from gcs.onboard import own_parameters
-from gcs.plan import FlightPlan
 from gcs.telemetry import StateHistory
 from gcs.upload import Upload
 from gcs.vehicle import RemoteVehicle

@@ -13,29 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs.at_delay import figures_at
-from gcs.mirror import MIRROR
+from gcs.errors import InputError
 from gcs.record import (
-    CLOCK_JUMPED,
     DESIGN_FILE,
     END,
     EVENTS_FILE,
     FLEET,
     LOG_ENDED,
+    MIRROR,
     PARQUET_FILE,
     RECORDING_FILE,
     SCENARIO_FILE,
     STARTED,
     SUMMARY_FILE,
-    TICK,
     TICKS_FILE,
-    Mode,
-    TickArray,
+    TRUTH_FILE,
     write_whole,
 )
 from gcs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
 from gcs.run_files import RunTail, read_design, read_scenario, read_ticks
-from gcs.sitl import TRUTH_FILE
-from gcs.user_input import InputError
+from gcs.tick import CLOCK_JUMPED, TICK, Mode, TickArray
 from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0

@@ -9,12 +9,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 
 from gcs import mavlink
+from gcs.datagram import Address, Outgoing
+from gcs.errors import InputError
 from gcs.guard import Guard
 from gcs.modes import longest_round_trip_s
-from gcs.station import Outgoing
 from gcs.udp import StationSocket, clock_ns
-from gcs.user_input import InputError
-from gcs.vehicle import Address
 from scenarios.files import fingerprint
 from scenarios.schema import NS_PER_S, Scenario
 

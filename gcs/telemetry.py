@@ -5,12 +5,6 @@ Scalars and plain tuples: with one report a call, numpy would cost ten times wha
 
 from collections import deque
 
-import numpy as np
-from numpy.typing import NDArray
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 State = tuple[float, float, float, float]
 """Position north and east in m, velocity north and east in m/s."""
 Report = tuple[int, State]

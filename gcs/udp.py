@@ -15,14 +15,14 @@ from types import TracebackType
 from typing import Self
 
 from gcs import mavlink
+from gcs.datagram import Address, Datagram, Outgoing
+from gcs.flight_plan import FlightPlan
 from gcs.guard import Guard
-from gcs.mirror import MIRROR, Mirror
+from gcs.mirror import Mirror
 from gcs.modes import Phase
-from gcs.plan import FlightPlan
-from gcs.record import RunWriter
+from gcs.record import MIRROR, RunWriter
 from gcs.refusals import REFUSED, Refusals, in_words
-from gcs.station import Datagram, Outgoing, Station
-from gcs.vehicle import Address
+from gcs.station import Station
 
 _SO_TIMESTAMPNS = 35
 _TIMESPEC = struct.Struct("qq")

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gcs.errors import InputError
+
 if TYPE_CHECKING:
     from gcs.guard import Guard
     from gcs.mirror import Mirror
@@ -14,10 +16,6 @@ if TYPE_CHECKING:
 KeyFile = Annotated[
     Path | None, typer.Option(metavar="FILE", help="sign, and take only what is signed with this key (see gcs key)")
 ]
-
-
-class InputError(Exception):
-    """The user's input cannot be used: one line with what was read and what was wanted; exit code 2."""
 
 
 def within(option: str, value: float, least: float, most: float, unit: str = "") -> None:

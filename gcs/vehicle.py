@@ -19,10 +19,9 @@ from gcs.autopilot.kinds import (
 )
 from gcs.autopilot.startup import Startup
 from gcs.clocks import LEAST_SAMPLES, VehicleClock
+from gcs.datagram import Address
 from gcs.sequence import DUPLICATE, LATE, NEW, SequenceCounter
 from gcs.upload import Upload
-
-Address = tuple[str, int]
 
 ARMED = 0x80
 STATE_CRITICAL = 5

@@ -10,7 +10,7 @@ LOITER and BRAKE are the same here: it holds its course. Stations say either whe
 """
 
 from scenarios.schema import NS_PER_S, Safety
-from sim_vehicles.links import NEVER_NS
+from sim_vehicles.clock import NEVER_NS
 from sim_vehicles.mavlink import (
     ACCEPTED,
     BASE_MODE_ARMED,

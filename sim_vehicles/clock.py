@@ -38,3 +38,6 @@ class BootClock:
     def host_ns(self, boot_ns: int) -> int:
         """The first host nanosecond at which the clock shows at least `boot_ns`."""
         return self.start_ns - (self.offset_ns - boot_ns) * PARTS // (PARTS + self.drift_ppb)
+
+
+NEVER_NS = 2**63 - 1

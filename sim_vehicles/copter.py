@@ -14,7 +14,7 @@ import numpy as np
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles import mavlink
-from sim_vehicles.clock import BootClock
+from sim_vehicles.clock import NEVER_NS, BootClock
 from sim_vehicles.copter_dynamics import Motion, Target, advance
 from sim_vehicles.copter_reports import Facts, report, reported
 from sim_vehicles.copter_rules import (
@@ -28,7 +28,6 @@ from sim_vehicles.copter_rules import (
 )
 from sim_vehicles.dynamics import State, state_from
 from sim_vehicles.earth import ORIGIN_ALTITUDE_M
-from sim_vehicles.links import NEVER_NS
 from sim_vehicles.setpoints import ABSURD
 from sim_vehicles.shell import Answer, Radio, Shell
 from sim_vehicles.truth import Record

@@ -13,9 +13,10 @@ from operator import itemgetter
 from scenarios import schema
 from scenarios.files import fingerprint
 from scenarios.signing.link import SignedLink
+from sim_vehicles.clock import NEVER_NS
 from sim_vehicles.copter import Copter, multicopter
 from sim_vehicles.dynamics import State
-from sim_vehicles.links import NEVER_NS, Link, LinkSet
+from sim_vehicles.links import Link, LinkSet
 from sim_vehicles.onboard import OnboardLoop
 from sim_vehicles.services import LONGEST_TEXT
 from sim_vehicles.shell import Change, Shell

@@ -8,6 +8,7 @@ import heapq
 from collections import Counter
 
 from scenarios import schema
+from sim_vehicles.clock import NEVER_NS
 from sim_vehicles.link_channel import Channel
 from sim_vehicles.link_fate import Stream, behaviour_of, constant, flipped, outcome
 from sim_vehicles.mavlink import message_id
@@ -26,7 +27,6 @@ from sim_vehicles.truth import (
     Row,
 )
 
-NEVER_NS = 2**63 - 1
 CAPACITY = 10_000
 """Most datagrams on their way: 100 s of delay at 50 Hz twice over. What does not fit is dropped and counted."""
 

@@ -10,7 +10,8 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from scenarios import schema
-from sim_vehicles.links import NEVER_NS, Link, LinkSet
+from sim_vehicles.clock import NEVER_NS
+from sim_vehicles.links import Link, LinkSet
 from sim_vehicles.truth import LINK_DOWN, LINK_UP, Record
 
 MAGIC_1, MAGIC_2 = 0xFE, 0xFD

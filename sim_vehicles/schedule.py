@@ -6,8 +6,7 @@ since boot, each moved up to the next millisecond, so asking for the same rate a
 
 import heapq
 
-from sim_vehicles.clock import NS_PER_MS, BootClock
-from sim_vehicles.links import NEVER_NS
+from sim_vehicles.clock import NEVER_NS, NS_PER_MS, BootClock
 
 US_PER_MS = 1000
 ONCE = 0

@@ -8,9 +8,9 @@ import numpy as np
 
 from gcs.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan import flight_plan
-from gcs.record import TickArray
 from gcs.station import Station
 from gcs.summary import summarise
+from gcs.tick import TickArray
 from scenarios.schema import Scenario
 
 EPOCH_NS = 1_750_000_000_000_000_000

@@ -16,14 +16,15 @@ from soak_flight import Flown, Stretch, fly
 from soak_scenarios import Experiment
 
 from gains.errors import DisagreementError, GainsError, SolverError
+from gcs.flight_plan import FlightPlan
 from gcs.flown import margins_of
 from gcs.grade import instants, true_loop_delays_s
 from gcs.limits import LARGEST_COMMAND_M_S2
-from gcs.plan import FlightPlan, flight_plan
-from gcs.record import CLOCK_JUMPED, Mode
+from gcs.plan import flight_plan
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Trial, sparse_gain
 from gcs.summary import summarise
+from gcs.tick import CLOCK_JUMPED, Mode
 from scenarios.schema import Link, Scenario
 from sim_vehicles.truth import SAMPLED
 

@@ -15,13 +15,14 @@ import numpy as np
 from soak_scenarios import AUTOPILOT_START_S, Experiment, Fault
 from test_fuzz import TO_VEHICLES, any_message, changed, noise
 
+from gcs.datagram import Datagram
+from gcs.flight_plan import FlightPlan
 from gcs.flown import Flight
 from gcs.guard import Guard
 from gcs.lockstep import EPOCH_NS, START_NS, Sent, fly_lockstep
 from gcs.modes import Phase
-from gcs.plan import FlightPlan
-from gcs.record import TickArray
-from gcs.station import Datagram, Station
+from gcs.station import Station
+from gcs.tick import TickArray
 from scenarios.schema import NS_PER_S
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps

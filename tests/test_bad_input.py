@@ -8,12 +8,12 @@ import pytest
 from flown_run import DESIGN, line, ticks_of, write_run
 
 from gcs.cli import main
-from gcs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE
+from gcs.errors import InputError
+from gcs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE, TRUTH_FILE
 from gcs.show.observer import record_run
 from gcs.show.report import print_summary
-from gcs.sitl import TRUTH_FILE
 from gcs.summary import finish, summarise
-from gcs.user_input import InputError, listening, mirroring
+from gcs.user_input import listening, mirroring
 
 CHAIN = "scenarios/chain3.toml"
 ROOT = Path(__file__).parent.parent

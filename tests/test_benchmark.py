@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from gcs.benchmark import benchmark, with_vehicles
 from gcs.cli import app
-from gcs.user_input import InputError
+from gcs.errors import InputError
 from scenarios.files import load
 
 TRIANGLE = Path(__file__).parent.parent / "scenarios" / "triangle5.toml"

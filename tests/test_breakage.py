@@ -8,12 +8,12 @@ import pytest
 
 from gcs.breakage import Breakage, recovery_time_s, slowest_decay_1_s
 from gcs.control import VehicleControl
+from gcs.flight_plan import FlightPlan
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.monitor import VehicleState
-from gcs.plan import FlightPlan
-from gcs.record import Mode
 from gcs.station import Station
 from gcs.summary import verdict
+from gcs.tick import Mode
 from scenarios.schema import Limits, Scenario
 from sim_vehicles.copter_rules import RULES
 from sim_vehicles.fleet import Fleet

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from gcs.capacity import capacity, fly_loaded, worst_load
 from gcs.cli import app
-from gcs.user_input import InputError
+from gcs.errors import InputError
 from scenarios.files import load
 from scenarios.schema import Scenario
 

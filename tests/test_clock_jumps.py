@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.lockstep import START_NS, Sent, fly_lockstep
 from gcs.plan import flight_plan
-from gcs.record import CLOCK_JUMPED
 from gcs.station import Station
+from gcs.tick import CLOCK_JUMPED
 from scenarios.schema import ClockJump, Link, Links, Rates, Scenario, Vehicle
 from sim_vehicles.fleet import Fleet
 from tests.sim_client import parse

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from gains.arrays import FloatArray
 from gains.formation import FormationModel
-from gcs.control import Blend, Formation, feedback_law, formation_control
+from gcs.control import Blend, feedback_law, formation_control
+from gcs.formation import Formation
 from gcs.limits import SetPointLimits
-from gcs.telemetry import HISTORY, FloatArray, StateHistory
+from gcs.telemetry import HISTORY, StateHistory
 
 MS = 1_000_000
 RNG = np.random.default_rng(11)

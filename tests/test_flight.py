@@ -12,13 +12,14 @@ from rich.console import Console
 
 from gains.sampled import growth_rate
 from gcs import mavlink
+from gcs.flight_plan import FlightPlan
 from gcs.lockstep import START_NS, Sent, fly_lockstep
 from gcs.modes import Phase
-from gcs.plan import FlightPlan, flight_plan
-from gcs.record import Mode, TickArray
+from gcs.plan import flight_plan
 from gcs.show.report import print_flight
 from gcs.station import Station
 from gcs.summary import summarise
+from gcs.tick import Mode, TickArray
 from scenarios.files import load
 from scenarios.schema import FixedGains, Limits, Monitor, Scenario
 from sim_vehicles.fleet import Fleet

@@ -11,12 +11,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.absence import TAKEN_OVER
+from gcs.datagram import Datagram
+from gcs.flight_plan import FlightPlan
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.modes import START_PATIENCE_S
-from gcs.plan import FlightPlan, described, flight_plan
-from gcs.record import TickArray
-from gcs.station import Datagram, Event, Station
+from gcs.plan import described, flight_plan
+from gcs.station import Event, Station
 from gcs.summary import verdict
+from gcs.tick import TickArray
 from scenarios.files import load
 from scenarios.schema import ClockJump, Link, Links, Outage, Response, Scenario, VehicleLinks
 from sim_vehicles.copter import Copter

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from gcs.flight_plan import FlightPlan
 from gcs.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
-from gcs.plan import FlightPlan, flight_plan
-from gcs.record import Mode, TickArray
+from gcs.plan import flight_plan
 from gcs.station import Station
 from gcs.summary import summarise
+from gcs.tick import Mode, TickArray
 from scenarios.files import load
 from scenarios.schema import DelayPoint, Jitter, Link, Links, Monitor, Safety
 

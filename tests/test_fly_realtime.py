@@ -17,9 +17,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.record import TICK, TickArray
+from gcs.record import TRUTH_FILE
 from gcs.run_files import read_ticks
-from gcs.sitl import ORPHAN_S, TRUTH_FILE
+from gcs.sitl import ORPHAN_S
+from gcs.tick import TICK, TickArray
 from scenarios.files import dump, load
 from sim_vehicles.truth import ACTED, SAMPLED, read_truth
 

@@ -9,12 +9,13 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 from stress_pair import SCENARIO, pair_plan
 
+from gains.arrays import FloatArray
 from gcs.effective_delay import commands_of, effective_delay_s
+from gcs.flight_plan import FlightPlan
 from gcs.grade import ACTED, SAMPLED, instants
-from gcs.plan import FlightPlan
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import FreeResponse, fly_calm, response_paired
-from gcs.stress.growth import CHANNELS, FloatArray
+from gcs.stress.growth import CHANNELS
 from gcs.stress.measure import fly_trial
 from gcs.stress.onset import Loop
 from gcs.stress.study import Study

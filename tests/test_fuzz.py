@@ -19,12 +19,14 @@ import numpy as np
 import pytest
 
 from gcs import mavlink
+from gcs.datagram import Datagram
+from gcs.flight_plan import FlightPlan
 from gcs.guard import Guard
 from gcs.lockstep import EPOCH_NS, START_NS
 from gcs.modes import Phase
-from gcs.plan import FlightPlan, flight_plan
-from gcs.record import TickArray
-from gcs.station import Datagram, Event, Station
+from gcs.plan import flight_plan
+from gcs.station import Event, Station
+from gcs.tick import TickArray
 from gcs.watch.links import Requests, Watch
 from gcs.watch.replay_report import Replayed, replay
 from gcs.watch.tlog import parse_tlog

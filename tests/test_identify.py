@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from gains.arrays import FloatArray
 from gains.response import Response
 from gcs.autopilot.identify import LONGEST_S, MISFIT_MAX, PROFILE, identify, manoeuvre_m_s2, step_velocity
-from gcs.telemetry import FloatArray
 
 AMPLITUDE, DOWN_S = 1.5, 0.037
 ACTED_S = np.array([at_s + DOWN_S for at_s, _ in PROFILE])

@@ -9,9 +9,9 @@ import pytest
 from gcs.grade import Truth, graded, true_loop_delays_s, true_round_trips
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.plan import flight_plan
-from gcs.record import TickArray
 from gcs.station import Station
 from gcs.summary import summarise
+from gcs.tick import TickArray
 from scenarios.files import load
 from scenarios.schema import Clocks, FixedGains, Jitter, Link, Links, Monitor, Outage, Safety
 from sim_vehicles.clock import BootClock

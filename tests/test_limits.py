@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gcs.flight_plan import FlightPlan
 from gcs.lockstep import START_NS, Sent, fly_lockstep
-from gcs.plan import FlightPlan, flight_plan
+from gcs.plan import flight_plan
 from gcs.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains, Limits, Vehicle

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gcs.monitor import FleetView, FormationMonitor, Observation, VehicleState, monitored
-from gcs.record import Mode
+from gcs.tick import Mode
 from scenarios.schema import Monitor
 
 MARGINS_S = (0.3, 0.6, 1.2)

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gcs.flight_plan import FlightPlan
 from gcs.flown import fly_virtual, median_delays_s
 from gcs.grade import instants, true_loop_delays_s
 from gcs.lockstep import START_NS, fly_lockstep
 from gcs.onboard import own_parameters
-from gcs.plan import FlightPlan, flight_plan
-from gcs.record import Mode, TickArray
+from gcs.plan import flight_plan
 from gcs.station import Station
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import fly_calm, response_paired
@@ -24,6 +24,7 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Study, find_onset
 from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
 from gcs.summary import summarise
+from gcs.tick import Mode, TickArray
 from gcs.upload import float32
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load, parse, with_loop

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gains.arrays import FloatArray
 from gains.delay_sweep import frequency_sweep_margin
 from gains.errors import BadModelError
-from gains.formation import FloatArray, FormationModel
+from gains.formation import FormationModel
 from gains.onboard import LocalPlant, OnboardLoop, OnboardTiming, onboard_loop
 from gains.pattern import bidirectional, split_own
 from gains.sampled import growth_rate, sampled_delay_margin

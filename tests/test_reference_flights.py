@@ -25,8 +25,8 @@ import pytest
 
 from gcs.flown import fly_virtual
 from gcs.plan import flight_plan
-from gcs.record import TickArray
 from gcs.stress.axes import at_coordinates
+from gcs.tick import TickArray
 from scenarios.files import load
 from scenarios.schema import Control, FixedGains, Scenario
 

@@ -11,7 +11,7 @@ from logged_flight import EPOCH_NS, flown, log_bytes
 from test_flight_monitor import ramp
 
 from gcs import mavlink
-from gcs.record import TickArray
+from gcs.tick import TickArray
 from gcs.watch.replay import rebuild
 from gcs.watch.replay_report import Replayed, replay
 from gcs.watch.tlog import parse_tlog

@@ -12,14 +12,9 @@ from gains.design import design
 from gains.errors import BadModelError, InfeasibleError
 from gains.formation import FormationModel
 from gains.multirate import Timing
+from gains.required import requirement_with
 from gains.requirement import Requirement
-from gains.response import (
-    Response,
-    continuous_margin,
-    formation_loop,
-    requirement_with,
-    sampled_margin,
-)
+from gains.response import Response, continuous_margin, formation_loop, sampled_margin
 from gains.rightmost import rightmost_root
 
 GAINS = (-2.1 * np.eye(2), 0.6 * np.eye(2), 2.0 * np.eye(2))

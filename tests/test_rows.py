@@ -6,8 +6,8 @@ import pytest
 from gcs.clocks import ClockEstimate
 from gcs.control import VehicleControl
 from gcs.monitor import VehicleState
-from gcs.record import TICK, Mode
 from gcs.rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.tick import TICK, Mode
 from gcs.vehicle import RemoteVehicle
 
 S = 1_000_000_000

@@ -10,12 +10,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from signed_peer import EPOCH_NS, KEY, OTHER_KEY, a_sender, stamp
 
+from gcs.datagram import Datagram
+from gcs.flight_plan import FlightPlan
 from gcs.guard import Guard
 from gcs.lockstep import START_NS, Sent, fly_lockstep
 from gcs.modes import Phase
-from gcs.plan import FlightPlan, flight_plan
-from gcs.record import TickArray
-from gcs.station import Datagram, Station
+from gcs.plan import flight_plan
+from gcs.station import Station
+from gcs.tick import TickArray
 from scenarios.files import load
 from scenarios.schema import FixedGains, Flavour, Response
 from scenarios.signing.keys import Key

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from scenarios import schema
 from scenarios.schema import DelayPoint, Jitter, LossBursts, Outage
-from sim_vehicles.links import NEVER_NS, Entry, Link
+from sim_vehicles.clock import NEVER_NS
+from sim_vehicles.links import Entry, Link
 from sim_vehicles.truth import CORRUPTED, DROPPED, DUPLICATE, LINK_FULL, LINK_UP, OUTAGE, Row
 
 MS = 1_000_000

@@ -16,8 +16,9 @@ from sim_client import scenario
 
 from scenarios import schema
 from scenarios.schema import Jitter, LossBursts
+from sim_vehicles.clock import NEVER_NS
 from sim_vehicles.link_fate import flipped
-from sim_vehicles.links import NEVER_NS, Link, LinkSet
+from sim_vehicles.links import Link, LinkSet
 from sim_vehicles.truth import CORRUPTED, DUPLICATE, Row
 
 MS = 1_000_000

@@ -18,7 +18,8 @@ from sim_client import MS, SECOND, START, heartbeat, scenario, setpoint
 from scenarios import schema
 from scenarios.files import dump
 from scenarios.schema import Jitter, Links
-from sim_vehicles.links import CAPACITY, NEVER_NS, LinkSet
+from sim_vehicles.clock import NEVER_NS
+from sim_vehicles.links import CAPACITY, LinkSet
 from sim_vehicles.relay import Passing, Relay, sender
 from sim_vehicles.relay_udp import MOST_PEERS, Peers
 from sim_vehicles.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, LOST, Row, read_truth

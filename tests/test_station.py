@@ -8,8 +8,10 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gains.formation import FormationModel
-from gcs.plan import FlightPlan, plan_formation
-from gcs.station import Datagram, Outgoing, Station
+from gcs.datagram import Datagram, Outgoing
+from gcs.flight_plan import FlightPlan
+from gcs.formation import plan_formation
+from gcs.station import Station
 from scenarios.files import load
 
 S, MS = 1_000_000_000, 1_000_000

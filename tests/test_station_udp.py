@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from gcs.station import Datagram
+from gcs.datagram import Datagram
 from gcs.udp import StationSocket, clock_ns
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]

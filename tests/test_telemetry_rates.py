@@ -11,10 +11,10 @@ from gains.onboard import SteppedPlant, onboard_loop
 from gcs.flown import fly_virtual, margins_of
 from gcs.onboard import timing_of
 from gcs.plan import flight_plan
-from gcs.record import Mode
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.summary import summarise
+from gcs.tick import Mode
 from scenarios.files import load
 from scenarios.schema import Control, FixedGains, Link, Outage, Response, Scenario
 

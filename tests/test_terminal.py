@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from terminals import Terminal, is_restored, rows, terminal, wait_for
 
-from gcs.record import Mode
+from gcs.tick import Mode
 from scenarios.files import dump, load
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]

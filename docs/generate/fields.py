@@ -57,12 +57,12 @@ def columns(module: ModuleType, dtype: "np.dtype[Any]") -> str:
 
 
 def tick_columns() -> str:
-    return columns(gcs.record, gcs.record.TICK)
+    return columns(gcs.record, gcs.tick.TICK)
 
 
 def modes() -> str:
     """The modes of a vehicle, by the number in the tick record."""
-    source = inspect.getsource(gcs.record.Mode)
+    source = inspect.getsource(gcs.tick.Mode)
     lines = re.findall(r"^\s+([A-Z]+) = (\d+)  # (.*)$", source, re.MULTILINE)
     return table(("number", "mode", "meaning"), [(number, name, text) for name, number, text in lines])
 

@@ -8,8 +8,8 @@ from gcs.autopilot.manoeuvre import Identification
 from gcs.autopilot.pilots import Pilots
 from gcs.autopilot.startup import Startup, between
 from gcs.control import VehicleControl
+from gcs.flight_plan import FlightPlan
 from gcs.modes import START_PATIENCE_S, Phase
-from gcs.plan import FlightPlan
 from gcs.telemetry import StateHistory
 from gcs.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S

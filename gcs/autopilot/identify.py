@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gains.arrays import FloatArray
 from gains.response import Response
-from gcs.telemetry import FloatArray
 
 LONGEST_S = 6.0
 PROFILE = ((0.0, 1.0), (1.0, -2.0), (3.0, 2.0), (4.0, -1.0))

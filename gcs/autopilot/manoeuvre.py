@@ -16,7 +16,7 @@ from gcs.autopilot.identify import (
     manoeuvre_m_s2,
 )
 from gcs.autopilot.responses import Responses
-from gcs.plan import FlightPlan
+from gcs.flight_plan import FlightPlan
 from gcs.telemetry import StateHistory
 from gcs.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S

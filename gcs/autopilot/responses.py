@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from gains.arrays import FloatArray
 from gains.formation import FormationModel
 from gains.multirate import Timing
 from gains.response import Response, sampled_margin
-from gcs.telemetry import FloatArray
 from scenarios.schema import Scenario
 
 

@@ -11,23 +11,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.dk_iteration import LARGEST_STATES, abscissa
 from gains.errors import GainsError
 from gains.formation import FormationModel
 from gains.robust import disturbance_bound
 from gains.string_stability import largest_magnitude
 from gcs.compare.cost import RATIO, DesignCost, left_out, ratios
+from gcs.flight_plan import FlightPlan
 from gcs.flown import fly_virtual
-from gcs.plan import FlightPlan, flight_plan
-from gcs.record import TickArray
+from gcs.plan import flight_plan
 from gcs.show.report import UNKNOWN, number_text
 from gcs.summary import summarise
+from gcs.tick import TickArray
 from scenarios.files import dump
 from scenarios.schema import Control, Scenario
 
-FloatArray = NDArray[np.float64]
 Method = Literal["inclusion", "graph-lqr", "graph-dk"]
 METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr", "graph-dk")
 REPORT_FILE, RESULT_FILE = "compare.html", "compare.json"

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from gcs.compare.cost import DesignCost
-from gcs.record import TickArray
 from gcs.stress.figures import figure_of, saved
+from gcs.tick import TickArray
 
 _COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#777777", "#b8860b")
 _FLOOR_M = 1e-3

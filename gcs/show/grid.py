@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gcs.record import TICK, TickArray
+from gcs.tick import TICK, TickArray
 
 
 class WholeTicks:

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from gcs.errors import InputError
 from gcs.output import outlive_readers
 from gcs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE
 from gcs.run_files import RunTail, read_design, read_scenario, read_ticks
@@ -27,7 +28,6 @@ from gcs.show.grid import WholeTicks
 from gcs.show.recording import Recording
 from gcs.show.table import Display, FlightState
 from gcs.summary import finish
-from gcs.user_input import InputError
 from scenarios.schema import Scenario
 
 POLL_S = 0.1

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from gcs.modes import patience_s
-from gcs.record import RECORDING_FILE, Mode, TickArray
+from gcs.record import RECORDING_FILE
 from gcs.show.scene import (
     PICTURE_S,
     TRAIL_STEP_S,
@@ -40,6 +40,7 @@ from gcs.show.scene import (
     wanted_extent_m,
 )
 from gcs.show.table import event_text
+from gcs.tick import Mode, TickArray
 from scenarios.schema import Scenario
 
 TIMELINE = "sim_time"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.record import TickArray
+from gcs.tick import TickArray
 from scenarios.schema import Scenario
 
 Floats = NDArray[np.float64]

@@ -20,9 +20,9 @@ from rich.text import Text
 from gcs.at_delay import figures_at
 from gcs.console import plain_console
 from gcs.modes import patience_s
-from gcs.record import TICK, Mode, TickArray
 from gcs.refusals import REFUSED
 from gcs.show.grid import unknown
+from gcs.tick import TICK, Mode, TickArray
 from scenarios.schema import Scenario
 
 Floats = NDArray[np.float64]

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.errors import BadModelError
 from gains.jitter import spread_bound
 from gains.several_delays import boundary_of_two_delays, late_by_vehicle
 from gains.varying_delay import varying_delay_bound
 from gcs.stress.axes import Axis, at_coordinates
 from gcs.stress.figures import MEASURED, figure_of, saved
-from gcs.stress.growth import FloatArray
 from gcs.stress.onset import distinct
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, plan_loops

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gcs.errors import InputError
 from gcs.interrupts import raised
 from gcs.loop_option import Loop, LoopOption, load_with_loop
 from gcs.output import outlive_readers
-from gcs.user_input import InputError, out_file, out_folder, refuse
+from gcs.user_input import out_file, out_folder, refuse
 
 if TYPE_CHECKING:
     from gcs.stress.campaign import Fly

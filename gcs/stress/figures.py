@@ -5,14 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gcs.stress.axes import Axis, place_text
 from gcs.stress.onset import Loop, distinct
 from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, plan_loops
-
-FloatArray = NDArray[np.float64]
 
 SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
 _DPI = 130

@@ -14,12 +14,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcs.record import TickArray
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from gains.arrays import ComplexArray, FloatArray
+from gcs.tick import TickArray
 
 DECAY_KEPT = 0.02
 """A motion is followed until it has shrunk to this part of what it was: rounding of the telemetry, which the loop feeds

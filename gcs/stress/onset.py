@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.delay import delay_margin
 from gains.formation import FormationModel
 from gains.multirate import Timing, multirate_delay_margin, multirate_growth_rate
@@ -18,8 +18,6 @@ from gains.onboard import OnboardLoop, OnboardTiming, onboard_loop
 from gains.rightmost import rightmost_root
 from gains.several_delays import late_by_vehicle
 from gains.structure import strongly_connected_blocks
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,10 +24,10 @@ What would hide the loop is taken out:
 
 import numpy as np
 
+from gains.arrays import FloatArray
+from gcs.flight_plan import FlightPlan
 from gcs.limits import LARGEST_COMMAND_M_S2
-from gcs.plan import FlightPlan
-from gcs.record import TickArray
-from gcs.telemetry import FloatArray
+from gcs.tick import TickArray
 from scenarios.schema import Limits, Link, Scenario, Vehicle
 
 PROBE_S = 20.0

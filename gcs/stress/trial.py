@@ -11,13 +11,14 @@ from typing import Literal, Self
 
 import numpy as np
 
+from gains.arrays import FloatArray
+from gcs.flight_plan import FlightPlan
 from gcs.flown import Flight, margins_of
+from gcs.formation import plan_formation
 from gcs.onboard import timing_of
-from gcs.plan import FlightPlan, plan_formation
-from gcs.record import TickArray
-from gcs.stress.growth import FloatArray
 from gcs.stress.onset import Loop, loops_of
 from gcs.summary import summarise
+from gcs.tick import TickArray
 from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]

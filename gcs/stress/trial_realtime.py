@@ -6,11 +6,12 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from gcs.flight_plan import FlightPlan
 from gcs.fly import FlyOptions, fly
-from gcs.grade import TRUTH_FILE, Truth, read_truth
-from gcs.plan import FlightPlan
-from gcs.record import EVENTS_FILE, TICKS_FILE, TickArray
+from gcs.grade import Truth, read_truth
+from gcs.record import EVENTS_FILE, TICKS_FILE, TRUTH_FILE
 from gcs.run_files import RunTail, read_ticks
+from gcs.tick import TickArray
 from gcs.udp import StationSocket
 
 _IDLE, _WAITING, _STEAL = 3, 4, 7

@@ -10,8 +10,8 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.bipartite import expanded_gain, partition_by_input, verify_expansion
 from gains.delay import delay_margin
 from gains.delay_opinions import checked_delay_margin
@@ -29,7 +29,6 @@ from gcs.thesis import errata
 from gcs.thesis.flights import ALPHA, CHAIN, DELAYS_S, PERIOD_S, SPEED_M_S, flown, nonlinear_response, printed_gains
 from gcs.thesis.nonlinear import fly_with_late_neighbours
 
-FloatArray = NDArray[np.float64]
 PAGE_FILE = "thesis.md"
 SINGLE = FormationModel((-1, 0, 1), axes=1)
 

@@ -3,15 +3,14 @@
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.delay import delay_margin
 from gains.delay_sweep import frequency_sweep_margin
 from gains.formation import FormationModel
 from gains.inclusion import Restriction, expand
 from gcs.thesis.flights import printed_gains
 
-FloatArray = NDArray[np.float64]
 SINGLE = FormationModel((-1, 0, 1), axes=1)
 PUBLISHED_S = (0.185, 0.195)
 """What rounds to the published 0.19 s."""

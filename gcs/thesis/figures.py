@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs.record import TickArray
 from gcs.stress.figures import figure_of, saved
 from gcs.thesis.flights import CHAIN, DELAYS_S, flown, late_flight
+from gcs.tick import TickArray
 
 _COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#8a6d1f")
 _FT = 0.3048

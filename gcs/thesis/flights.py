@@ -5,21 +5,20 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import scenarios
+from gains.arrays import FloatArray
 from gains.design import design
 from gains.formation import FormationModel
 from gains.requirement import Requirement
 from gcs.flown import fly_virtual
 from gcs.plan import flight_plan
-from gcs.record import TickArray
 from gcs.summary import summarise
 from gcs.thesis.nonlinear import fly_with_late_neighbours
+from gcs.tick import TickArray
 from scenarios.files import load
 from scenarios.schema import Scenario
 
-FloatArray = NDArray[np.float64]
 PERIOD_S = 0.02
 ALPHA = 0.93
 SPEED_M_S = 91.44  # 300 ft/s

@@ -6,11 +6,10 @@ the flights.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.arrays import FloatArray
 from gains.formation import FormationModel
 
-FloatArray = NDArray[np.float64]
 STEP_S = 1e-3
 
 

@@ -11,8 +11,9 @@ from typing import Annotated, Any
 
 import typer
 
+from gcs.errors import InputError
 from gcs.output import outlive_readers
-from gcs.user_input import InputError, KeyFile, listening, opened_guard
+from gcs.user_input import KeyFile, listening, opened_guard
 
 _FAILED, _INTERRUPTED = 1, 130
 _TIMESYNC_HZ = 10.0

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs import mavlink
+from gcs.datagram import Address, Outgoing
 from gcs.monitor import headroom
-from gcs.station import Outgoing
 from gcs.summary import spread_with_status
-from gcs.vehicle import Address, RemoteVehicle
+from gcs.vehicle import RemoteVehicle
 from scenarios.schema import NS_PER_S
 
 SYSTEM_ID = 254

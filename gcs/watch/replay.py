@@ -21,21 +21,15 @@ from gains.formation import FormationModel
 from gcs import mavlink
 from gcs.autopilot.copters import locate
 from gcs.autopilot.startup import Startup
-from gcs.control import (
-    Blend,
-    FeedbackLaw,
-    Formation,
-    distances_m,
-    feedback_law,
-    formation_control,
-)
+from gcs.control import Blend, FeedbackLaw, distances_m, feedback_law, formation_control
+from gcs.formation import Formation, plan_formation
 from gcs.monitor import VehicleState
-from gcs.plan import flight_plan, plan_formation
-from gcs.record import CLOCK_JUMPED, GAIN_SET, TICK, Mode, TickArray
+from gcs.plan import flight_plan
 from gcs.rows import Repetitions, Reported, Tick, VehicleTick, tick_rows
 from gcs.station import SILENCE_S
 from gcs.stream import Stream, law_of
 from gcs.telemetry import StateHistory
+from gcs.tick import CLOCK_JUMPED, GAIN_SET, TICK, Mode, TickArray
 from gcs.watch.links import Watch, WatchedVehicle
 from scenarios.schema import NS_PER_S, Scenario
 

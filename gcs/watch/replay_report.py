@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from gcs.console import plain_console
-from gcs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE, TickArray
+from gcs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
 from gcs.run_files import read_design, read_summary
 from gcs.show.report import delay_text, print_flight
 from gcs.summary import summarise
+from gcs.tick import TickArray
 from gcs.watch.replay import Rebuilt, rebuild, watched
 from gcs.watch.table import links_table
 from gcs.watch.tlog import TelemetryLog

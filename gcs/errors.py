@@ -1,0 +1,5 @@
+"""Errors that a user is shown: one line with what was read and what was wanted."""
+
+
+class InputError(Exception):
+    """The user's input cannot be used: one line with what was read and what was wanted; exit code 2."""
