@@ -19,12 +19,13 @@ LOCK = ROOT / "requirements.lock"
 # name: (what it is for, the commands; further arguments go to the last one)
 # The hot path of a flight in virtual time, and of the station: these modules can be compiled.
 COMPILED = (
-    "gcs/clocks.py gcs/control.py gcs/guard.py gcs/lockstep.py gcs/mavlink.py gcs/modes.py gcs/monitor.py gcs/rows.py "
-    "gcs/sequence.py gcs/station.py gcs/telemetry.py gcs/vehicle.py sim_vehicles/autopilot.py sim_vehicles/clock.py "
-    "sim_vehicles/dynamics.py sim_vehicles/fleet.py sim_vehicles/link_channel.py sim_vehicles/links.py "
-    "sim_vehicles/mavlink.py sim_vehicles/schedule.py sim_vehicles/setpoints.py sim_vehicles/shell.py "
-    "sim_vehicles/vehicle.py "
-    "scenarios/signing/link.py scenarios/signing/stamps.py"
+    "gcs/control/history.py gcs/control/law.py gcs/control/phases.py gcs/drive/guard.py gcs/drive/lockstep.py "
+    "gcs/link/clocks.py gcs/link/mavlink.py gcs/link/sequence.py gcs/link/vehicle.py gcs/station/monitor.py "
+    "gcs/station/station.py gcs/station/tick_rows.py scenarios/signing/link.py scenarios/signing/stamps.py "
+    "sim_vehicles/drive/fleet.py sim_vehicles/links/channel.py sim_vehicles/links/links.py "
+    "sim_vehicles/services/clock.py sim_vehicles/services/mavlink.py sim_vehicles/services/schedule.py "
+    "sim_vehicles/vehicles/autopilot.py sim_vehicles/vehicles/double_integrator.py "
+    "sim_vehicles/vehicles/dynamics.py sim_vehicles/vehicles/setpoints.py sim_vehicles/vehicles/shell.py"
 )
 
 JOBS: dict[str, tuple[str, list[str]]] = {
@@ -94,7 +95,9 @@ def install() -> None:
 def drop_stale() -> None:
     """Remove what was compiled from sources that have changed since: Python would run it in their place."""
     compiled = [
-        file for folder in (".", "gcs", "sim_vehicles", "scenarios/signing") for file in (ROOT / folder).glob("*.so")
+        file
+        for folder in (".", *{str(Path(source).parent) for source in COMPILED.split()})
+        for file in (ROOT / folder).glob("*.so")
     ]
     newest = max((ROOT / source).stat().st_mtime for source in COMPILED.split())
     # the newest of them is the library that all share; the others are written when they change

@@ -25,10 +25,10 @@ Examples
 --------
 Gains for a leader and two followers that take 0.3 s at 50 Hz; without sampling the loop takes half a period more:
 
->>> from gains.delay import delay_margin
->>> from gains.design import design
->>> from gains.formation import FormationModel
->>> from gains.requirement import Requirement
+>>> from gains.delay.constant import delay_margin
+>>> from gains.design.design import design
+>>> from gains.formation.model import FormationModel
+>>> from gains.core.requirement import Requirement
 >>> chain = FormationModel((-1, 0, 1))
 >>> found = design(chain, Requirement(delay_margin_s=0.3), period_s=0.02)
 >>> round(found.delay_margin_s, 3), round(delay_margin(*chain.ground_loop(found.K1, found.K2, found.K3)), 3)

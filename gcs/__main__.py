@@ -8,7 +8,7 @@ def main() -> None:
     """Entry point."""
     end_at_once()
     open_what_is_closed()
-    from gcs.cli import main as command
+    from gcs.cli.main import main as command
 
     command()
 

@@ -1,6 +1,6 @@
 """`gcs margin`: how much delay any linear loop takes, read from a JSON model or a scenario and printed.
 
-The mathematics is `gains.loop_margin`.
+The mathematics is `gains.margin.loop_margin`.
 """
 
 from fractions import Fraction
@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from gains.errors import BadModelError
-from gains.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
-from gains.model_file import DelayModel, HeldModel, Term, parse_model
+from gains.core.errors import BadModelError
+from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
+from gains.margin.model_file import DelayModel, HeldModel, Term, parse_model
 
 # rows of a table on the terminal
 _ROWS = 20
@@ -51,8 +51,8 @@ def margin_of_scenario(file: Path) -> dict[str, Any]:
     ModelFileError, scenarios.errors.ScenarioError, GainsError
         One line with what was read and what was wanted.
     """
-    from gains.onboard import own_part
-    from gcs.plan import flight_plan
+    from gains.sampled.onboard import own_part
+    from gcs.plan.planner import flight_plan
     from scenarios.files import load
 
     scenario = load(file)
@@ -120,7 +120,7 @@ def print_margin(result: dict[str, Any]) -> None:
     """The result as a short table on the terminal."""
     from rich.table import Table
 
-    from gcs.console import plain_console
+    from gcs.views.console import plain_console
 
     console = plain_console()
     for line in _verdict_lines(result):

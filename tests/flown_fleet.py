@@ -40,7 +40,7 @@ def fleet(scenario: Scenario, folder: Path, *options: str) -> Generator[int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
-    command = [sys.executable, "-m", "sim_vehicles.cli", str(file), "--station", f"127.0.0.1:{port}", *options]
+    command = [sys.executable, "-m", "sim_vehicles.drive.cli", str(file), "--station", f"127.0.0.1:{port}", *options]
     with subprocess.Popen([*command, "--duration", "90"], stdout=subprocess.DEVNULL) as process:
         try:
             yield port

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
-from gcs.tick import TICK, Mode, TickArray
+from gcs.control.tick import TICK, Mode, TickArray
+from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
 from scenarios import files
 from scenarios.schema import NominalVelocity, Scenario, Vehicle
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from gcs.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
-from gcs.plan import flight_plan
-from gcs.station import Station
-from gcs.summary import summarise
-from gcs.tick import TickArray
+from gcs.control.tick import TickArray
+from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from gcs.station.station import Station
 from scenarios.schema import Scenario
 
 EPOCH_NS = 1_750_000_000_000_000_000

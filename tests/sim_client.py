@@ -5,9 +5,9 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.schema import Clocks, Limits, Link, Links, NominalVelocity, Safety, Scenario, Vehicle
-from sim_vehicles.shell import Shell
-from sim_vehicles.vehicle import Vehicle as SimulatedVehicle
-from sim_vehicles.vehicle import launched
+from sim_vehicles.vehicles.double_integrator import Vehicle as SimulatedVehicle
+from sim_vehicles.vehicles.double_integrator import launched
+from sim_vehicles.vehicles.shell import Shell
 
 SECOND = 1_000_000_000
 MS = 1_000_000

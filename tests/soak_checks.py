@@ -15,18 +15,18 @@ import numpy as np
 from soak_flight import Flown, Stretch, fly
 from soak_scenarios import Experiment
 
-from gains.errors import DisagreementError, GainsError, SolverError
-from gcs.flight_plan import FlightPlan
-from gcs.flown import margins_of
-from gcs.grade import instants, true_loop_delays_s
-from gcs.limits import LARGEST_COMMAND_M_S2
-from gcs.plan import flight_plan
+from gains.core.errors import DisagreementError, GainsError, SolverError
+from gcs.control.limits import LARGEST_COMMAND_M_S2
+from gcs.control.tick import CLOCK_JUMPED, Mode
+from gcs.drive.flown import margins_of
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.runs.grade import instants, true_loop_delays_s
+from gcs.runs.summary import summarise
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Trial, sparse_gain
-from gcs.summary import summarise
-from gcs.tick import CLOCK_JUMPED, Mode
 from scenarios.schema import Link, Scenario
-from sim_vehicles.truth import SAMPLED
+from sim_vehicles.links.truth import SAMPLED
 
 ALWAYS = ("time_s", "due_ns", "sent_ns")
 WHEN_COMMANDED = (

@@ -15,21 +15,21 @@ import numpy as np
 from soak_scenarios import AUTOPILOT_START_S, Experiment, Fault
 from test_fuzz import TO_VEHICLES, any_message, changed, noise
 
-from gcs.datagram import Datagram
-from gcs.flight_plan import FlightPlan
-from gcs.flown import Flight
-from gcs.guard import Guard
-from gcs.lockstep import EPOCH_NS, START_NS, Sent, fly_lockstep
-from gcs.modes import Phase
-from gcs.station import Station
-from gcs.tick import TickArray
+from gcs.control.phases import Phase
+from gcs.control.tick import TickArray
+from gcs.drive.flown import Flight
+from gcs.drive.guard import Guard
+from gcs.drive.lockstep import EPOCH_NS, START_NS, Sent, fly_lockstep
+from gcs.link.datagram import Datagram
+from gcs.plan.flight_plan import FlightPlan
+from gcs.station.station import Station
 from scenarios.schema import NS_PER_S
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
-from sim_vehicles.clock import BootClock
-from sim_vehicles.fleet import Fleet
-from sim_vehicles.guard import signed_links
-from sim_vehicles.truth import DTYPE, Row
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.drive.guard import signed_links
+from sim_vehicles.links.truth import DTYPE, Row
+from sim_vehicles.services.clock import BootClock
 
 CONNECT_S = 25.0
 """Longest start of vehicles without an autopilot. A flight that has not ended in its time is told to."""
@@ -75,7 +75,7 @@ class Flown:
     plan: FlightPlan
     stretches: list[Stretch]
     truth: np.ndarray[Any, Any]
-    """Records of sim_vehicles.truth.DTYPE."""
+    """Records of sim_vehicles.links.truth.DTYPE."""
     clocks: dict[int, BootClock]
     """Of the vehicles, at the start."""
     steps_ns: dict[int, int]

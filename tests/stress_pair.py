@@ -1,7 +1,7 @@
 """A leader and a follower with given gains: the cheapest formation, for tests of campaigns."""
 
-from gcs.flight_plan import FlightPlan
-from gcs.plan import flight_plan
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
 from scenarios.schema import Control, FixedGains, Monitor, NominalVelocity, Scenario, Vehicle
 
 SCENARIO = Scenario(

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcs.at_delay import expected_loop_delay_s, figures_at
-from gcs.flown import fly_virtual
-from gcs.plan import flight_plan
-from gcs.show.table import FlightState, plain_line
-from gcs.summary import summarise
+from gcs.drive.flown import fly_virtual
+from gcs.plan.at_delay import expected_loop_delay_s, figures_at
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from gcs.views.table import FlightState, plain_line
 from scenarios.files import load
 from scenarios.schema import DelayPoint, Jitter, Link, Links, Rates, VehicleLinks
 

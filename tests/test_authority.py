@@ -9,14 +9,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sim_client import SECOND, START, a_vehicle, arm, guided, heartbeat, parse, scenario, setpoint, take_off
 
-from gcs.lockstep import START_NS, Sent, fly_lockstep
-from gcs.plan import flight_plan
-from gcs.station import Station
+from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains
-from sim_vehicles.copter import Copter, multicopter
-from sim_vehicles.fleet import Fleet
-from sim_vehicles.shell import Craft, Shell
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.vehicles.copter import Copter, multicopter
+from sim_vehicles.vehicles.shell import Craft, Shell
 
 OTHER = 245
 

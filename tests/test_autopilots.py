@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER, Kind, Seen, commanded_mode, kind_of, mode_command, next_step
-from gcs.autopilot.startup import Startup, between, shifted
+from gcs.link.kinds import ARDUCOPTER, PX4_COPTER, Kind, Seen, commanded_mode, kind_of, mode_command, next_step
+from gcs.link.startup import Startup, between, shifted
 
 ALTITUDE_M = 20.0
 GOOD = 0x33F

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from flown_run import DESIGN, line, ticks_of, write_run
 
-from gcs.cli import main
+from gcs.cli.main import main
+from gcs.cli.options import listening, mirroring
 from gcs.errors import InputError
-from gcs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE, TRUTH_FILE
-from gcs.show.observer import record_run
-from gcs.show.report import print_summary
-from gcs.summary import finish, summarise
-from gcs.user_input import listening, mirroring
+from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE, TRUTH_FILE
+from gcs.runs.summary import finish, summarise
+from gcs.views.observer import record_run
+from gcs.views.report import print_summary
 
 CHAIN = "scenarios/chain3.toml"
 ROOT = Path(__file__).parent.parent

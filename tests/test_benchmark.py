@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from gcs.benchmark import benchmark, with_vehicles
-from gcs.cli import app
+from gcs.cli.main import app
 from gcs.errors import InputError
+from gcs.studies.benchmark import benchmark, with_vehicles
 from scenarios.files import load
 
 TRIANGLE = Path(__file__).parent.parent / "scenarios" / "triangle5.toml"

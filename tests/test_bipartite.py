@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gains.bipartite import (
+from gains.core.errors import BadModelError, DisagreementError
+from gains.formation.bipartite import (
     LARGEST_SEARCH_LINKS,
     Partition,
     Subgraph,
@@ -18,9 +19,16 @@ from gains.bipartite import (
     smallest_partition,
     verify_expansion,
 )
-from gains.errors import BadModelError, DisagreementError
-from gains.formation import FormationModel
-from gains.pattern import Pattern, Plant, all_to_all, bidirectional, formation_plant, leader_follower, with_links
+from gains.formation.model import FormationModel
+from gains.formation.pattern import (
+    Pattern,
+    Plant,
+    all_to_all,
+    bidirectional,
+    formation_plant,
+    leader_follower,
+    with_links,
+)
 
 CHAIN = FormationModel((-1, 0, 1))
 small_blocks = st.tuples(st.integers(1, 4), st.integers(1, 4)).flatmap(lambda shape: arrays(np.bool_, shape))

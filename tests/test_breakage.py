@@ -6,17 +6,17 @@ from math import hypot, nan
 import numpy as np
 import pytest
 
-from gcs.breakage import Breakage, recovery_time_s, slowest_decay_1_s
-from gcs.control import VehicleControl
-from gcs.flight_plan import FlightPlan
-from gcs.lockstep import START_NS, fly_lockstep
-from gcs.monitor import VehicleState
-from gcs.station import Station
-from gcs.summary import verdict
-from gcs.tick import Mode
+from gcs.control.law import VehicleControl
+from gcs.control.tick import Mode
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.summary import verdict
+from gcs.station.breakage import Breakage, recovery_time_s, slowest_decay_1_s
+from gcs.station.monitor import VehicleState
+from gcs.station.station import Station
 from scenarios.schema import Limits, Scenario
-from sim_vehicles.copter_rules import RULES
-from sim_vehicles.fleet import Fleet
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.vehicles.copter_rules import RULES
 from tests.test_flight_copters import TRUTH, Flight, plan_for, three
 from tests.test_pilots import PILOTS_MODE, PilotsVehicle, flight_s
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from gcs.capacity import capacity, fly_loaded, worst_load
-from gcs.cli import app
+from gcs.cli.main import app
 from gcs.errors import InputError
+from gcs.studies.capacity import capacity, fly_loaded, worst_load
 from scenarios.files import load
 from scenarios.schema import Scenario
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.lockstep import START_NS, Sent, fly_lockstep
-from gcs.plan import flight_plan
-from gcs.station import Station
-from gcs.tick import CLOCK_JUMPED
+from gcs.control.tick import CLOCK_JUMPED
+from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
 from scenarios.schema import ClockJump, Link, Links, Rates, Scenario, Vehicle
-from sim_vehicles.fleet import Fleet
+from sim_vehicles.drive.fleet import Fleet
 from tests.sim_client import parse
 from tests.test_flight_copters import COPTERS5, TRUTH, Flight, fly
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from gcs.clocks import DRIFT_BOUND, LEAST_SAMPLES, VehicleClock
+from gcs.link.clocks import DRIFT_BOUND, LEAST_SAMPLES, VehicleClock
 from scenarios.schema import DRIFT_MAX_PPM, Clocks
 
 MS = 1_000_000

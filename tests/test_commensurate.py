@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gains.commensurate import analyse_commensurate, circle_sweep_margin
-from gains.delay import analyse_delay
-from gains.errors import BadModelError
-from gains.mixed_delays import MixedTerm, analyse_mixed
-from gains.rightmost import rightmost_root
+from gains.core.errors import BadModelError
+from gains.delay.commensurate import analyse_commensurate, circle_sweep_margin
+from gains.delay.constant import analyse_delay
+from gains.delay.mixed import MixedTerm, analyse_mixed
+from gains.delay.rightmost import rightmost_root
 
 Matrix = NDArray[np.float64]
 BENCHMARKS: list[dict[str, Any]] = json.loads((Path(__file__).parent / "data/delay_benchmarks.json").read_text())

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from gains.design import design
-from gains.formation import FormationModel
-from gcs.cli import app
-from gcs.compare.command import METHODS, string_peak
-from gcs.compare.cost import DesignCost, left_out
+from gains.design.design import design
+from gains.formation.model import FormationModel
+from gcs.cli.main import app
+from gcs.studies.compare import METHODS, string_peak
+from gcs.studies.compare_cost import DesignCost, left_out
 
 SCENARIO = Path(__file__).parent.parent / "scenarios" / "chain3.toml"
 CHAIN = FormationModel((-1, 0, 1))

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from gains.arrays import FloatArray
-from gains.formation import FormationModel
-from gcs.control import Blend, feedback_law, formation_control
-from gcs.formation import Formation
-from gcs.limits import SetPointLimits
-from gcs.telemetry import HISTORY, StateHistory
+from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
+from gcs.control.history import HISTORY, StateHistory
+from gcs.control.law import Blend, feedback_law, formation_control
+from gcs.control.limits import SetPointLimits
+from gcs.plan.formation import Formation
 
 MS = 1_000_000
 RNG = np.random.default_rng(11)

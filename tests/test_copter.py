@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from scenarios.schema import Autopilot, ClockJump, Flavour, Scenario
-from sim_vehicles.copter import Copter, multicopter
-from sim_vehicles.shell import Shell
+from sim_vehicles.vehicles.copter import Copter, multicopter
+from sim_vehicles.vehicles.shell import Shell
 from tests.sim_client import MS, SECOND, START, arm, command, mode, parse_all, scenario, setpoint
 
 VELOCITY_ACCELERATION, VELOCITY, ACCELERATION = 0x0C07, 0x0DC7, 0x0C3F

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from gains.delay import analyse_delay, delay_margin, frequency_sweep_margin
-from gains.delay_opinions import checked_delay_margin
-from gains.rightmost import rightmost_root
-from gains.sampled import sampling_period_limit
+from gains.delay.constant import analyse_delay, delay_margin, frequency_sweep_margin
+from gains.delay.rightmost import rightmost_root
+from gains.margin.opinions import checked_delay_margin
+from gains.sampled.constant import sampling_period_limit
 
 BENCHMARKS: list[dict[str, Any]] = json.loads((Path(__file__).parent / "data/delay_benchmarks.json").read_text())
 

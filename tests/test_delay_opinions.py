@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gains.delay import analyse_delay, delay_margin, frequency_sweep_margin
-from gains.delay_opinions import checked_delay_margin
-from gains.errors import BadModelError
-from gains.rightmost import rightmost_root
-from gains.varying_delay import hierarchy_bound, small_gain_bound, varying_delay_bound
+from gains.core.errors import BadModelError
+from gains.delay.constant import analyse_delay, delay_margin, frequency_sweep_margin
+from gains.delay.rightmost import rightmost_root
+from gains.margin.opinions import checked_delay_margin
+from gains.varying.bounds import hierarchy_bound, small_gain_bound, varying_delay_bound
 
 Matrix = NDArray[np.float64]
 RANDOM_LOOPS = int(os.environ.get("RANDOM_LOOPS", "200"))

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from gains.delay import Crossing, analyse_delay, delay_margin, frequency_sweep_margin
-from gains.errors import BadModelError
-from gains.rightmost import rightmost_root
-from gains.structure import project_out_equilibria
+from gains.core.errors import BadModelError
+from gains.core.structure import project_out_equilibria
+from gains.delay.constant import Crossing, analyse_delay, delay_margin, frequency_sweep_margin
+from gains.delay.rightmost import rightmost_root
 
 Matrix = NDArray[np.float64]
 Pair = tuple[Matrix, Matrix]

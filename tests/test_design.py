@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gains.delay import delay_margin
-from gains.design import Design, Requirement, design, evaluate_gains, trade_off
-from gains.errors import BadModelError, InfeasibleError
-from gains.formation import FormationModel
-from gains.robust import robustness
-from gains.sampled import sampled_delay_margin, spectral_radius
+from gains.core.errors import BadModelError, InfeasibleError
+from gains.delay.constant import delay_margin
+from gains.design.design import Design, Requirement, design, evaluate_gains, trade_off
+from gains.formation.model import FormationModel
+from gains.performance.robust import robustness
+from gains.sampled.constant import sampled_delay_margin, spectral_radius
 
 TRIANGLE = FormationModel((-1, 0, 1, 0, 3))
 PERIOD_S = 0.05
@@ -278,8 +278,6 @@ def test_period_and_gains_are_checked() -> None:
 
 def test_importing_the_design_imports_no_slow_library() -> None:
     """cvxpy takes seconds to import and scipy.optimize most of one; commands that only ask for help must not wait."""
-    code = (
-        "import sys, gains.design; print([m for m in ('cvxpy', 'scipy.optimize', 'scipy.signal') if m in sys.modules])"
-    )
+    code = "import sys, gains.design.design; print([m for m in ('cvxpy', 'scipy.optimize', 'scipy.signal') if m in sys.modules])"
     printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert printed.strip() == "[]"

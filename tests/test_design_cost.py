@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from gains.centralised import centralised_lmi
-from gains.errors import BadModelError
-from gains.formation import FormationModel
-from gains.lqr import Weights, centralised_lqr
-from gains.pattern import Plant, formation_plant
-from gains.robust import disturbance_bound
-from gcs.compare.cost import DesignCost, ratios
+from gains.core.errors import BadModelError
+from gains.design.centralised import centralised_lmi
+from gains.design.lqr import Weights, centralised_lqr
+from gains.formation.model import FormationModel
+from gains.formation.pattern import Plant, formation_plant
+from gains.performance.robust import disturbance_bound
+from gcs.studies.compare_cost import DesignCost, ratios
 
 CHAIN = formation_plant(FormationModel((-1, 0, 1), axes=1))
 

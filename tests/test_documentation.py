@@ -17,13 +17,13 @@ from docs.generate.fields import described, found_fields
 from docs.generate.keys import schema
 from docs.generate.runner import Runner
 from docs.generate.sessions import Step, steps_of
-from gcs.lockstep import START_NS, fly_lockstep
+from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.margin import margin_of_file, margin_of_scenario
-from gcs.plan import flight_plan
-from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
-from gcs.station import Station
+from gcs.plan.planner import flight_plan
+from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.runs.summary import finish
+from gcs.station.station import Station
 from gcs.stress.trial import Outcome
-from gcs.summary import finish
 from scenarios import files
 from scenarios.schema import Response
 

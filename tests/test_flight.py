@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gains.sampled import growth_rate
-from gcs import mavlink
-from gcs.flight_plan import FlightPlan
-from gcs.lockstep import START_NS, Sent, fly_lockstep
-from gcs.modes import Phase
-from gcs.plan import flight_plan
-from gcs.show.report import print_flight
-from gcs.station import Station
-from gcs.summary import summarise
-from gcs.tick import Mode, TickArray
+from gains.sampled.constant import growth_rate
+from gcs.control.phases import Phase
+from gcs.control.tick import Mode, TickArray
+from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.link import mavlink
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from gcs.station.station import Station
+from gcs.views.report import print_flight
 from scenarios.files import load
 from scenarios.schema import FixedGains, Limits, Monitor, Scenario
-from sim_vehicles.fleet import Fleet
+from sim_vehicles.drive.fleet import Fleet
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 S = 1_000_000_000

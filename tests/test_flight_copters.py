@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.absence import TAKEN_OVER
-from gcs.datagram import Datagram
-from gcs.flight_plan import FlightPlan
-from gcs.lockstep import START_NS, fly_lockstep
-from gcs.modes import START_PATIENCE_S
-from gcs.plan import described, flight_plan
-from gcs.station import Event, Station
-from gcs.summary import verdict
-from gcs.tick import TickArray
+from gcs.control.phases import START_PATIENCE_S
+from gcs.control.tick import TickArray
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.link.datagram import Datagram
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import described, flight_plan
+from gcs.runs.summary import verdict
+from gcs.station.absence import TAKEN_OVER
+from gcs.station.station import Event, Station
 from scenarios.files import load
 from scenarios.schema import ClockJump, Link, Links, Outage, Response, Scenario, VehicleLinks
-from sim_vehicles.copter import Copter
-from sim_vehicles.copter_rules import RULES
-from sim_vehicles.fleet import Fleet
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.vehicles.copter import Copter
+from sim_vehicles.vehicles.copter_rules import RULES
 from tests.sim_client import command
 from tests.test_station import HOME, Peer, messages
 

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.flight_plan import FlightPlan
-from gcs.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
-from gcs.plan import flight_plan
-from gcs.station import Station
-from gcs.summary import summarise
-from gcs.tick import Mode, TickArray
+from gcs.control.tick import Mode, TickArray
+from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import DelayPoint, Jitter, Link, Links, Monitor, Safety
 

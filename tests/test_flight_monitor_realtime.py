@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from gcs.lockstep import START_NS, fly_lockstep
-from gcs.plan import flight_plan
-from gcs.station import Station
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
 from scenarios.files import dump, load
 from scenarios.schema import DelayPoint, Jitter, Link, Links, Monitor, Scenario
 
@@ -47,7 +47,7 @@ def test_over_udp_the_monitor_comes_to_the_verdicts_and_modes_of_virtual_time(tm
     for name, scenario in SCENARIOS.items():
         file = tmp_path / f"{name}.toml"
         file.write_text(dump(scenario), encoding="utf-8")
-        command = [sys.executable, "-m", "gcs.cli", "fly", str(file), "--listen", "127.0.0.1:0", "--json"]
+        command = [sys.executable, "-m", "gcs.cli.main", "fly", str(file), "--listen", "127.0.0.1:0", "--json"]
         flights[name] = subprocess.Popen(
             [*command, "--out", str(tmp_path / name)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

@@ -9,15 +9,15 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from gains.delay import delay_margin
-from gains.flown_loop import FlownLoop
-from gains.formation import FormationModel
-from gains.multirate import Timing
-from gains.response import Response, sampled_margin
-from gains.rightmost import rightmost_root
-from gains.sampled import period_map, sampled_delay_margin, spectral_radius
-from gains.scalar_gains import ScalarGains
-from gains.string_stability import Follower, string_verdict
+from gains.delay.constant import delay_margin
+from gains.delay.rightmost import rightmost_root
+from gains.formation.model import FormationModel
+from gains.performance.flown_loop import FlownLoop
+from gains.performance.response import Response, sampled_margin
+from gains.performance.scalar_gains import ScalarGains
+from gains.performance.string_stability import Follower, string_verdict
+from gains.sampled.constant import period_map, sampled_delay_margin, spectral_radius
+from gains.sampled.multirate import Timing
 
 PERIOD_S = 0.02
 GAINS = ScalarGains(3.4079559741115664, 0.6308727089934395, 5.608081773264997, 0.8168)

@@ -28,7 +28,7 @@ def free_port() -> int:
 
 @contextmanager
 def vehicles_of(scenario_file: Path, port: int) -> Generator[None]:
-    command = [sys.executable, "-m", "sim_vehicles.cli", str(scenario_file), "--station", f"127.0.0.1:{port}"]
+    command = [sys.executable, "-m", "sim_vehicles.drive.cli", str(scenario_file), "--station", f"127.0.0.1:{port}"]
     process = subprocess.Popen([*command, "--duration", str(RUN_S)], stdout=subprocess.DEVNULL)
     try:
         yield
@@ -43,7 +43,7 @@ def test_three_arducopters_and_two_px4_that_were_not_started_here_are_identified
     scenario = scenario.model_copy(update={"vehicles": tuple(mixed), "duration_s": 10.0, "altitude_m": 5.0})
     file, port = tmp_path / "copters.toml", free_port()
     file.write_text(files.dump(scenario), encoding="utf-8")
-    command = [sys.executable, "-m", "gcs.cli", "fly", str(file), "--connect", f"127.0.0.1:{port}", "--json"]
+    command = [sys.executable, "-m", "gcs.cli.main", "fly", str(file), "--connect", f"127.0.0.1:{port}", "--json"]
     with vehicles_of(file, port):
         done = subprocess.run(
             [*command, "--out", str(tmp_path / "run")], capture_output=True, text=True, timeout=RUN_S, check=False

@@ -17,17 +17,17 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.record import TRUTH_FILE
-from gcs.run_files import read_ticks
-from gcs.sitl import ORPHAN_S
-from gcs.tick import TICK, TickArray
+from gcs.control.tick import TICK, TickArray
+from gcs.drive.sitl import ORPHAN_S
+from gcs.runs.files import read_ticks
+from gcs.runs.record import TRUTH_FILE
 from scenarios.files import dump, load
-from sim_vehicles.truth import ACTED, SAMPLED, read_truth
+from sim_vehicles.links.truth import ACTED, SAMPLED, read_truth
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
-GCS = [sys.executable, "-m", "gcs.cli"]
+GCS = [sys.executable, "-m", "gcs.cli.main"]
 PATIENCE_S = 60.0
 
 
@@ -81,7 +81,7 @@ def children_named(text: str) -> list[int]:
                 command = (entry / "cmdline").read_bytes().decode(errors="replace")
             except OSError:
                 continue
-            if text in command and "sim_vehicles.cli" in command:
+            if text in command and "sim_vehicles.drive.cli" in command:
                 found.append(int(entry.name))
     return found
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gains.errors import BadModelError
-from gains.formation import FormationModel
+from gains.core.errors import BadModelError
+from gains.formation.model import FormationModel
 
 EYE = np.eye(2)
 

@@ -9,10 +9,10 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 from stress_pair import SCENARIO, pair_plan
 
-from gains.arrays import FloatArray
-from gcs.effective_delay import commands_of, effective_delay_s
-from gcs.flight_plan import FlightPlan
-from gcs.grade import ACTED, SAMPLED, instants
+from gains.core.arrays import FloatArray
+from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.effective_delay import commands_of, effective_delay_s
+from gcs.runs.grade import ACTED, SAMPLED, instants
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import FreeResponse, fly_calm, response_paired
 from gcs.stress.growth import CHANNELS

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from flown_run import line, prepare, ticks_of
 
-from gcs.run_files import RunTail, read_ticks
+from gcs.runs.files import RunTail, read_ticks
+from gcs.runs.summary import finish
 from gcs.stress.campaign import CampaignError, Store
 from gcs.stress.trial import Outcome
-from gcs.summary import finish
 
 THREE = line(3)
 

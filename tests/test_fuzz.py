@@ -18,24 +18,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcs import mavlink
-from gcs.datagram import Datagram
-from gcs.flight_plan import FlightPlan
-from gcs.guard import Guard
-from gcs.lockstep import EPOCH_NS, START_NS
-from gcs.modes import Phase
-from gcs.plan import flight_plan
-from gcs.station import Event, Station
-from gcs.tick import TickArray
+from gcs.control.phases import Phase
+from gcs.control.tick import TickArray
+from gcs.drive.guard import Guard
+from gcs.drive.lockstep import EPOCH_NS, START_NS
+from gcs.link import mavlink
+from gcs.link.datagram import Datagram
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Event, Station
 from gcs.watch.links import Requests, Watch
-from gcs.watch.replay_report import Replayed, replay
+from gcs.watch.rebuild_report import Replayed, replay
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load, with_loop
 from scenarios.schema import FixedGains, Scenario
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
-from sim_vehicles.fleet import Fleet
-from sim_vehicles.guard import signed_links
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.drive.guard import signed_links
 from tests.hostile import (
     SAID_BY_STATIONS,
     SAID_BY_VEHICLES,
@@ -118,7 +118,7 @@ class Fire:
 
 
 def flown(plan: FlightPlan, fire: Fire | None, key: Key | None) -> tuple[TickArray, Station, Fleet]:
-    """A flight in virtual time, as gcs.lockstep flies it, with what is fired at both ends."""
+    """A flight in virtual time, as gcs.drive.lockstep flies it, with what is fired at both ends."""
     links, guard = None, None
     if key is not None:
         links = signed_links(key, plan.formation.system_ids, epoch_ns=EPOCH_NS, stamps=Stamps())

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from gcs.mirror import Mirror
-from gcs.vehicle import RemoteVehicle
+from gcs.drive.mirror import Mirror
+from gcs.link.vehicle import RemoteVehicle
 from scenarios.files import load
-from sim_vehicles.relay import Relay
-from sim_vehicles.relay_udp import Peers
+from sim_vehicles.drive.relay_udp import Peers
+from sim_vehicles.links.relay import Relay
 from tests.hostile import SAID_BY_STATIONS, SAID_BY_VEHICLES, any_message, changed, extreme, in_version_1, noise
 from tests.test_fuzz import SCENARIOS
 from tests.test_sim_relay import free_port

@@ -6,16 +6,16 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from gains.bipartite import expanded_gain, partition_by_input, smallest_partition, verify_expansion
-from gains.delay import delay_margin
-from gains.design import design
-from gains.errors import BadModelError, InfeasibleError
-from gains.formation import FormationModel
-from gains.graph_design import GraphDesign, GraphMethod, evaluate_graph_gain, time_scaled
-from gains.pattern import Pattern, bidirectional, formation_plant, leader_follower, with_links, without_links
-from gains.requirement import Requirement
-from gains.sampled import spectral_radius
-from gcs.plan import flight_plan
+from gains.core.errors import BadModelError, InfeasibleError
+from gains.core.requirement import Requirement
+from gains.delay.constant import delay_margin
+from gains.design.design import design
+from gains.design.graph import GraphDesign, GraphMethod, evaluate_graph_gain, time_scaled
+from gains.formation.bipartite import expanded_gain, partition_by_input, smallest_partition, verify_expansion
+from gains.formation.model import FormationModel
+from gains.formation.pattern import Pattern, bidirectional, formation_plant, leader_follower, with_links, without_links
+from gains.sampled.constant import spectral_radius
+from gcs.plan.planner import flight_plan
 from scenarios.errors import ScenarioError
 from scenarios.files import load, parse
 

@@ -5,13 +5,21 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gains.dk_iteration import dk_iteration
-from gains.errors import InfeasibleError
-from gains.fixed_modes import check_stabilisable, fixed_modes
-from gains.formation import FormationModel
-from gains.lqr import Weights, lqr_cost
-from gains.pattern import Pattern, Plant, all_to_all, bidirectional, formation_plant, leader_follower, without_links
-from gains.structured_lqr import stabilising_gain, structured_lqr
+from gains.core.errors import InfeasibleError
+from gains.design.dk_iteration import dk_iteration
+from gains.design.lqr import Weights, lqr_cost
+from gains.design.structured_lqr import stabilising_gain, structured_lqr
+from gains.formation.fixed_modes import check_stabilisable, fixed_modes
+from gains.formation.model import FormationModel
+from gains.formation.pattern import (
+    Pattern,
+    Plant,
+    all_to_all,
+    bidirectional,
+    formation_plant,
+    leader_follower,
+    without_links,
+)
 
 CHAIN = FormationModel((-1, 0, 1))
 PLANT = formation_plant(CHAIN)

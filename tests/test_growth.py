@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from gcs.control.tick import TICK, TickArray
 from gcs.stress.growth import Motion, envelope_growth, fit_growth, motion_of, norm_growth
-from gcs.tick import TICK, TickArray
 
 PERIOD_S = 0.02
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from gains.arrays import FloatArray
-from gains.response import Response
+from gains.core.arrays import FloatArray
+from gains.performance.response import Response
 from gcs.autopilot.identify import LONGEST_S, MISFIT_MAX, PROFILE, identify, manoeuvre_m_s2, step_velocity
 
 AMPLITUDE, DOWN_S = 1.5, 0.037

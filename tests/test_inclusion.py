@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from gains.errors import BadModelError
-from gains.formation import FormationModel
-from gains.inclusion import contracted_gain, expand, expanded_gain, modified_gain, verify_inclusion
+from gains.core.errors import BadModelError
+from gains.formation.inclusion import contracted_gain, expand, expanded_gain, modified_gain, verify_inclusion
+from gains.formation.model import FormationModel
 
 EYE = np.eye(2)
 GAINS = (-3.0 * EYE, 2.0 * EYE, 5.0 * EYE)

@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcs.grade import Truth, graded, true_loop_delays_s, true_round_trips
-from gcs.lockstep import START_NS, fly_lockstep
-from gcs.plan import flight_plan
-from gcs.station import Station
-from gcs.summary import summarise
-from gcs.tick import TickArray
+from gcs.control.tick import TickArray
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.plan.planner import flight_plan
+from gcs.runs.grade import Truth, graded, true_loop_delays_s, true_round_trips
+from gcs.runs.summary import summarise
+from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import Clocks, FixedGains, Jitter, Link, Links, Monitor, Outage, Safety
-from sim_vehicles.clock import BootClock
-from sim_vehicles.fleet import Fleet
-from sim_vehicles.truth import DTYPE, LINK_UP, SAMPLED, Row
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.links.truth import DTYPE, LINK_UP, SAMPLED, Row
+from sim_vehicles.services.clock import BootClock
 
 CHAIN = load(Path(__file__).parent.parent / "scenarios" / "chain3.toml")
 WEAK = FixedGains(K1=-0.05, K2=0.0, K3=0.001)

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcs.flight_plan import FlightPlan
-from gcs.lockstep import START_NS, Sent, fly_lockstep
-from gcs.plan import flight_plan
-from gcs.station import Station
+from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains, Limits, Vehicle
-from sim_vehicles.fleet import Fleet
+from sim_vehicles.drive.fleet import Fleet
 from tests.sim_client import parse
 from tests.test_flight_copters import planned, three
 

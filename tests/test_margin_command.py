@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gains.errors import BadModelError, DisagreementError
-from gains.model_file import parse_model
+from gains.core.errors import BadModelError, DisagreementError
+from gains.margin.model_file import parse_model
 from gcs.margin import ModelFileError, margin_of_file, margin_of_model, margin_of_scenario, print_margin
 
 CLASSIC = {"A0": [[-2.0, 0.0], [0.0, -0.9]], "A1": [[-1.0, 0.0], [-1.0, -1.0]]}
@@ -26,7 +26,7 @@ def result_of(model: object) -> dict[str, Any]:
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "gcs.cli", "margin", *arguments],
+        [sys.executable, "-m", "gcs.cli.main", "margin", *arguments],
         capture_output=True,
         text=True,
         check=False,
@@ -67,7 +67,7 @@ def test_commands_libraries_are_only_those_it_needs(tmp_path: Path) -> None:
     heavy = ("scipy", "cvxpy", "clarabel", "rerun", "rich", "scenarios.schema")
     code = (
         "import sys; sys.argv = ['gcs', 'margin', sys.argv[1], '--json']\n"
-        "from gcs.cli import main\n"
+        "from gcs.cli.main import main\n"
         "try: main()\n"
         f"finally: print([m for m in {heavy} if m in sys.modules])"
     )

@@ -38,7 +38,7 @@ KNOWN: dict[str, tuple[dict[str, Any], list[list[float | None]]]] = {
 def run(tmp_path: Path, text: str, *options: str) -> "subprocess.CompletedProcess[str]":
     file = tmp_path / "model.json"
     file.write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "gcs.cli", "margin", str(file), *options]
+    command = [sys.executable, "-m", "gcs.cli.main", "margin", str(file), *options]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 

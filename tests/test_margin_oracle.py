@@ -14,9 +14,9 @@ import pytest
 from delay_oracle import TooCloseError, unstable_roots
 from numpy.typing import NDArray
 
-from gains.delay import delay_margin
-from gains.loop_margin import LoopAtGivenDelays, LoopMargin, as_known, loop_margin
-from gains.model_file import DelayModel, parse_model
+from gains.delay.constant import delay_margin
+from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, as_known, loop_margin
+from gains.margin.model_file import DelayModel, parse_model
 
 Matrix = NDArray[np.float64]
 SYSTEMS = int(os.environ.get("MARGIN_ORACLE", "24"))

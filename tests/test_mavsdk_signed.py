@@ -15,7 +15,7 @@ from mavsdk.plugins.telemetry import Telemetry
 from scenarios.signing.keys import make_key, read_key
 from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps
-from sim_vehicles.mavlink import CRC_EXTRA
+from sim_vehicles.services.mavlink import CRC_EXTRA
 from tests.flown_fleet import copters, fleet, until
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]

@@ -21,12 +21,12 @@ import numpy as np
 import pytest
 from test_fly_realtime import free_port, until
 
-from gcs.run_files import RunTail, read_ticks
-from gcs.takeover import TAKEN_OVER
+from gcs.drive.takeover import TAKEN_OVER
+from gcs.runs.files import RunTail, read_ticks
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import dump, load
 from scenarios.schema import FixedGains
-from sim_vehicles.truth import read_truth
+from sim_vehicles.links.truth import read_truth
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime"), pytest.mark.timeout(400)]
 
@@ -172,7 +172,7 @@ def test_harm_at_a_random_instant_leaves_no_process_whole_files_and_a_next_fligh
     assert "Traceback" not in errors
 
     def others(orphans: bool) -> Callable[[], bool]:
-        return lambda: not [c for c in run.processes().values() if not (orphans and "sim_vehicles.cli" in c)]
+        return lambda: not [c for c in run.processes().values() if not (orphans and "sim_vehicles.drive.cli" in c)]
 
     until(others(orphans=kind == "kill"))
     assert is_recovered(run.folder)

@@ -16,11 +16,11 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.telemetry import Telemetry
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs import mavlink
-from gcs.guard import Guard
-from gcs.mirror import Mirror
-from gcs.run_files import read_ticks
-from gcs.vehicle import RemoteVehicle
+from gcs.drive.guard import Guard
+from gcs.drive.mirror import Mirror
+from gcs.link import mavlink
+from gcs.link.vehicle import RemoteVehicle
+from gcs.runs.files import read_ticks
 from gcs.watch.tlog import read_tlog
 from scenarios.files import dump, load
 from scenarios.signing.keys import Key
@@ -31,7 +31,7 @@ from tests.signed_peer import EPOCH_NS, KEY, NOW_NS, a_sender
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
 ROOT = Path(__file__).parent.parent
-GCS = [sys.executable, "-m", "gcs.cli"]
+GCS = [sys.executable, "-m", "gcs.cli.main"]
 PATIENCE_S = 60.0
 PROBE = 31000
 """A command that nobody else sends."""

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gains.errors import BadModelError
-from gains.model_file import DelayModel, HeldModel, parse_model
+from gains.core.errors import BadModelError
+from gains.margin.model_file import DelayModel, HeldModel, parse_model
 
 
 def delays_of(text: str) -> tuple[float, Fraction, str]:

@@ -2,7 +2,7 @@
 
 from itertools import product
 
-from gcs.modes import END_PATIENCE_S, Phase, next_phase
+from gcs.control.phases import END_PATIENCE_S, Phase, next_phase
 
 
 def test_phases_follow_each_other_in_one_order_only() -> None:

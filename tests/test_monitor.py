@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcs.monitor import FleetView, FormationMonitor, Observation, VehicleState, monitored
-from gcs.tick import Mode
+from gcs.control.tick import Mode
+from gcs.station.monitor import FleetView, FormationMonitor, Observation, VehicleState, monitored
 from scenarios.schema import Monitor
 
 MARGINS_S = (0.3, 0.6, 1.2)

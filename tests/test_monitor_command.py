@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs import mavlink
+from gcs.link import mavlink
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
 ROOT = Path(__file__).parent.parent
-MONITOR = [sys.executable, "-m", "gcs.cli", "monitor"]
+MONITOR = [sys.executable, "-m", "gcs.cli.main", "monitor"]
 PATIENCE_S = 60.0
 
 
@@ -35,7 +35,7 @@ def monitor(*arguments: str) -> "subprocess.Popen[str]":
 @contextmanager
 def vehicles(address: str) -> Generator[None]:
     """The vehicles of chain3, 20 ms each way."""
-    command = [sys.executable, "-m", "sim_vehicles.cli", "scenarios/chain3.toml", "--station", address]
+    command = [sys.executable, "-m", "sim_vehicles.drive.cli", "scenarios/chain3.toml", "--station", address]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=ROOT) as process:
         try:
             yield

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from gains.errors import BadModelError
-from gains.multirate import Timing, lifted_growth, multirate_delay_margin, multirate_growth_rate, multirate_map
-from gains.sampled import growth_rate
-from gains.sampled_loop import HeldPlant
+from gains.core.errors import BadModelError
+from gains.sampled.constant import growth_rate
+from gains.sampled.loop import HeldPlant
+from gains.sampled.multirate import Timing, lifted_growth, multirate_delay_margin, multirate_growth_rate, multirate_map
 from gcs.stress.growth import Motion, fit_growth
 
 Matrix = NDArray[np.float64]
@@ -133,7 +133,7 @@ def test_any_rates_have_a_common_period_that_is_nearly_theirs(control_hz: float,
 def test_whole_ratios_are_the_sampled_loop_with_the_slower_period(
     delay_s: float, control_s: float, telemetry_s: float
 ) -> None:
-    """The map of events and that of `gains.sampled`, which share no formula."""
+    """The map of events and that of `gains.sampled.constant`, which share no formula."""
     timing, plant = Timing(control_s, telemetry_s), HeldPlant(*TWO_INPUTS, period_s=0.1)
     alone = growth_rate(*TWO_INPUTS, period_s=0.1, delay_s=delay_s)
     assert lifted_growth([plant], timing, delay_s=delay_s) == pytest.approx(alone, rel=1e-9)

@@ -20,8 +20,8 @@ import pytest
 from flown_run import line, prepare, ticks_of
 from test_recording import read_back
 
-from gcs.record import READY_FILE, RECORDING_FILE, TICKS_FILE
-from gcs.show.recording import UNFINISHED_FILE
+from gcs.runs.record import READY_FILE, RECORDING_FILE, TICKS_FILE
+from gcs.views.recording import UNFINISHED_FILE
 
 pytestmark = pytest.mark.realtime
 FIVE = line(5)
@@ -35,7 +35,7 @@ def wait_for(condition: Callable[[], object], what: str, *, patience_s: float = 
 
 
 def command(folder: Path, *options: str) -> list[str]:
-    return [sys.executable, "-m", "gcs.show.observer", str(folder), *options]
+    return [sys.executable, "-m", "gcs.views.observer", str(folder), *options]
 
 
 @contextmanager

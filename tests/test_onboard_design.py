@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gains.design import design
-from gains.flown_loop import FlownLoop
-from gains.formation import FormationModel
-from gains.required import required_gains
-from gains.requirement import Requirement
-from gains.scalar_gains import ScalarGains, onboard_front_gain_limit
-from gcs.plan import flight_plan
+from gains.core.requirement import Requirement
+from gains.design.design import design
+from gains.design.required import required_gains
+from gains.formation.model import FormationModel
+from gains.performance.flown_loop import FlownLoop
+from gains.performance.scalar_gains import ScalarGains, onboard_front_gain_limit
+from gcs.plan.planner import flight_plan
 from scenarios.files import load, with_loop
 
 FILE = Path(__file__).parent.parent / "scenarios/triangle5.toml"

@@ -10,29 +10,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gcs.flight_plan import FlightPlan
-from gcs.flown import fly_virtual, median_delays_s
-from gcs.grade import instants, true_loop_delays_s
-from gcs.lockstep import START_NS, fly_lockstep
-from gcs.onboard import own_parameters
-from gcs.plan import flight_plan
-from gcs.station import Station
+from gcs.control.tick import Mode, TickArray
+from gcs.drive.flown import fly_virtual, median_delays_s
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.link.upload import float32
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.onboard import own_parameters
+from gcs.plan.planner import flight_plan
+from gcs.runs.grade import instants, true_loop_delays_s
+from gcs.runs.summary import summarise
+from gcs.station.station import Station
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import fly_calm, response_paired
 from gcs.stress.growth import fit_growth, motion_of
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Study, find_onset
 from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
-from gcs.summary import summarise
-from gcs.tick import Mode, TickArray
-from gcs.upload import float32
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load, parse, with_loop
 from scenarios.schema import Link, Outage, Scenario, VehicleLinks
-from sim_vehicles.fleet import Fleet
-from sim_vehicles.mavlink import STATUS_CRITICAL
-from sim_vehicles.truth import ACTED, DTYPE, SAMPLED
-from sim_vehicles.vehicle import Vehicle
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.links.truth import ACTED, DTYPE, SAMPLED
+from sim_vehicles.services.mavlink import STATUS_CRITICAL
+from sim_vehicles.vehicles.double_integrator import Vehicle
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 THESIS = SCENARIOS / "thesis_delay.toml"

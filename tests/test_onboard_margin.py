@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gains.arrays import FloatArray
-from gains.delay_sweep import frequency_sweep_margin
-from gains.errors import BadModelError
-from gains.formation import FormationModel
-from gains.onboard import LocalPlant, OnboardLoop, OnboardTiming, onboard_loop
-from gains.pattern import bidirectional, split_own
-from gains.sampled import growth_rate, sampled_delay_margin
-from gains.sampled_loop import lifted_map
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+from gains.delay.sweep import frequency_sweep_margin
+from gains.formation.model import FormationModel
+from gains.formation.pattern import bidirectional, split_own
+from gains.sampled.constant import growth_rate, sampled_delay_margin
+from gains.sampled.loop import lifted_map
+from gains.sampled.onboard import LocalPlant, OnboardLoop, OnboardTiming, onboard_loop
 
 FINE = OnboardTiming(0.02, steps=2, steps_per_sample=1)
 CHAIN = FormationModel((-1, 0, 1), axes=1)

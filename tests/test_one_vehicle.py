@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from gcs.flown import fly_virtual
-from gcs.plan import flight_plan
-from gcs.summary import summarise
+from gcs.drive.flown import fly_virtual
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
 from scenarios.schema import Control, NominalVelocity, Scenario, Vehicle
 
 LONE = Scenario(

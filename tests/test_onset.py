@@ -5,8 +5,8 @@ from math import atan, pi, sqrt
 import numpy as np
 import pytest
 
-from gains.formation import FormationModel
-from gains.multirate import Timing
+from gains.formation.model import FormationModel
+from gains.sampled.multirate import Timing
 from gcs.stress.onset import GrowthPoint, Loop, critical_loop, distinct, locate_zero, loops_of
 
 TREE = (-1, 0, 1, 0, 3)

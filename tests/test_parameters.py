@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sim_client import SECOND, START, a_vehicle, arm, heartbeat, mode, pack, parse_all, setpoint, take_off
 
-from sim_vehicles.shell import Craft, Shell
+from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.vehicle_kinds import VEHICLES, copter
 
 REAL32, INT32 = dialect.MAV_PARAM_TYPE_REAL32, dialect.MAV_PARAM_TYPE_INT32

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcs import mavlink
+from gcs.link import mavlink
 from gcs.watch.tlog import parse_tlog
 from scenarios.signing.keys import Key
 from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps
-from sim_vehicles import mavlink as vehicles_mavlink
-from sim_vehicles import relay
+from sim_vehicles.links import relay
+from sim_vehicles.services import mavlink as vehicles_mavlink
 
 KEY = Key(bytes(range(32)))
 HEARTBEAT_2 = mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=7)

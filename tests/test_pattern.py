@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gains.delay import delay_margin
-from gains.errors import BadModelError
-from gains.formation import FormationModel
-from gains.pattern import (
+from gains.core.errors import BadModelError
+from gains.delay.constant import delay_margin
+from gains.formation.model import FormationModel
+from gains.formation.pattern import (
     Pattern,
     Plant,
     all_to_all,

@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from gcs.lockstep import START_NS, Sent, fly_lockstep
-from gcs.station import Station
-from gcs.vehicle import RemoteVehicle
+from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.link.vehicle import RemoteVehicle
+from gcs.station.station import Station
 from scenarios.schema import ClockJump, Link, Outage, Scenario, VehicleLinks
-from sim_vehicles.copter import Copter
-from sim_vehicles.copter_rules import RULES
-from sim_vehicles.fleet import Fleet
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.vehicles.copter import Copter
+from sim_vehicles.vehicles.copter_rules import RULES
 from tests.sim_client import command, parse
 from tests.test_flight_copters import COPTERS5, TRUTH, plan_for, three
 

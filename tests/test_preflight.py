@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from gcs.cli import app, main
-from gcs.plan import flight_plan
-from gcs.preflight import bad_start, endless_link, unstable_loop, without_actions
-from gcs.summary import summarise
+from gcs.cli.main import app, main
+from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_actions
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
 from scenarios.files import load
 from scenarios.schema import DelayPoint, Link, Links
 
@@ -93,7 +93,7 @@ def test_a_stable_loop_beyond_its_margin_is_flown() -> None:
 
 
 def test_an_unstable_loop_flown_all_the_same_shows_no_headroom(tmp_path: Path) -> None:
-    from gcs.flown import fly_virtual
+    from gcs.drive.flown import fly_virtual
 
     designed, plan = flight_plan(load(with_gains(tmp_path, 3.0, 0.6, 5.6)))
     flight = fly_virtual(without_actions(plan))

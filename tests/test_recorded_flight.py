@@ -11,15 +11,15 @@ import pytest
 from matplotlib.image import imread
 from test_recording import read_back
 
-from gcs.lockstep import START_NS, fly_lockstep
-from gcs.plan import flight_plan
-from gcs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
-from gcs.run_files import read_ticks
-from gcs.show.observer import record_run
-from gcs.show.report import delay_text
-from gcs.show.viewer import ViewerError, screenshot, vulkan_missing
-from gcs.station import Station
-from gcs.summary import finish
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.plan.planner import flight_plan
+from gcs.runs.files import read_ticks
+from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.runs.summary import finish
+from gcs.station.station import Station
+from gcs.views.observer import record_run
+from gcs.views.report import delay_text
+from gcs.views.viewer import ViewerError, screenshot, vulkan_missing
 from scenarios.files import dump, load
 from scenarios.schema import DelayPoint, Link, Scenario, VehicleLinks
 

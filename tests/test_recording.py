@@ -10,13 +10,13 @@ import pytest
 from flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
 from rerun.chunk import RrdReader
 
-from gcs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE
-from gcs.show.grid import WholeTicks
-from gcs.show.observer import record_run
-from gcs.show.recording import UNFINISHED_FILE, Recording
-from gcs.show.scene import vehicle_colors
-from gcs.show.viewer import ViewerError, find_recording, view
-from gcs.tick import TICK, Mode, TickArray
+from gcs.control.tick import TICK, Mode, TickArray
+from gcs.runs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE
+from gcs.views.grid import WholeTicks
+from gcs.views.observer import record_run
+from gcs.views.recording import UNFINISHED_FILE, Recording
+from gcs.views.scene import vehicle_colors
+from gcs.views.viewer import ViewerError, find_recording, view
 
 FIVE = line(5)
 

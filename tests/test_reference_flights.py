@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gcs.flown import fly_virtual
-from gcs.plan import flight_plan
+from gcs.control.tick import TickArray
+from gcs.drive.flown import fly_virtual
+from gcs.plan.planner import flight_plan
 from gcs.stress.axes import at_coordinates
-from gcs.tick import TickArray
 from scenarios.files import load
 from scenarios.schema import Control, FixedGains, Scenario
 

@@ -3,9 +3,9 @@
 from collections import Counter
 from pathlib import Path
 
-from gcs.record import RunWriter
-from gcs.refusals import REFUSED, VEHICLES_FILE, Refusals, counts_of, in_words, refused_by_vehicles
-from gcs.run_files import RunTail
+from gcs.runs.files import RunTail
+from gcs.runs.record import RunWriter
+from gcs.runs.refusals import REFUSED, VEHICLES_FILE, Refusals, counts_of, in_words, refused_by_vehicles
 
 
 def test_each_reason_is_told_once_and_all_counts_at_the_end() -> None:

@@ -10,10 +10,10 @@ import pytest
 from logged_flight import EPOCH_NS, flown, log_bytes
 from test_flight_monitor import ramp
 
-from gcs import mavlink
-from gcs.tick import TickArray
-from gcs.watch.replay import rebuild
-from gcs.watch.replay_report import Replayed, replay
+from gcs.control.tick import TickArray
+from gcs.link import mavlink
+from gcs.watch.rebuild import rebuild
+from gcs.watch.rebuild_report import Replayed, replay
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
 from scenarios.schema import Scenario

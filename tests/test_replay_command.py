@@ -14,7 +14,7 @@ from scenarios.files import dump, load
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
 ROOT = Path(__file__).parent.parent
-GCS = [sys.executable, "-m", "gcs.cli"]
+GCS = [sys.executable, "-m", "gcs.cli.main"]
 PATIENCE_S = 60.0
 LISTENER = """
 import select, sys, time
@@ -79,7 +79,14 @@ def test_a_log_written_by_pymavlinks_own_logger_shows_its_links_and_errors(tmp_p
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
     log = tmp_path / "theirs.tlog"
-    vehicles = [sys.executable, "-m", "sim_vehicles.cli", "scenarios/chain3.toml", "--station", f"127.0.0.1:{port}"]
+    vehicles = [
+        sys.executable,
+        "-m",
+        "sim_vehicles.drive.cli",
+        "scenarios/chain3.toml",
+        "--station",
+        f"127.0.0.1:{port}",
+    ]
     with subprocess.Popen(vehicles, stdout=subprocess.DEVNULL, cwd=ROOT) as process:
         subprocess.run([sys.executable, "-c", LISTENER, port, str(log)], check=True, timeout=PATIENCE_S)
         process.terminate()

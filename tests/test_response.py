@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from gains.behaviour import string_peak
-from gains.delay import delay_margin
-from gains.design import design
-from gains.errors import BadModelError, InfeasibleError
-from gains.formation import FormationModel
-from gains.multirate import Timing
-from gains.required import requirement_with
-from gains.requirement import Requirement
-from gains.response import Response, continuous_margin, formation_loop, sampled_margin
-from gains.rightmost import rightmost_root
+from gains.core.errors import BadModelError, InfeasibleError
+from gains.core.requirement import Requirement
+from gains.delay.constant import delay_margin
+from gains.delay.rightmost import rightmost_root
+from gains.design.design import design
+from gains.design.required import requirement_with
+from gains.formation.model import FormationModel
+from gains.performance.behaviour import string_peak
+from gains.performance.response import Response, continuous_margin, formation_loop, sampled_margin
+from gains.sampled.multirate import Timing
 
 GAINS = (-2.1 * np.eye(2), 0.6 * np.eye(2), 2.0 * np.eye(2))
 PAIR = FormationModel((-1, 0))

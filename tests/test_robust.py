@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gains.errors import BadModelError, InfeasibleError, SolverError
-from gains.robust import certify, disturbance_bound, robust_lmi, robustness, subsystem_loop
+from gains.core.errors import BadModelError, InfeasibleError, SolverError
+from gains.performance.robust import certify, disturbance_bound, robust_lmi, robustness, subsystem_loop
 
 EYE = np.eye(2)
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from gcs.clocks import ClockEstimate
-from gcs.control import VehicleControl
-from gcs.monitor import VehicleState
-from gcs.rows import Reported, Tick, VehicleTick, tick_rows
-from gcs.tick import TICK, Mode
-from gcs.vehicle import RemoteVehicle
+from gcs.control.law import VehicleControl
+from gcs.control.tick import TICK, Mode
+from gcs.link.clocks import ClockEstimate
+from gcs.link.vehicle import RemoteVehicle
+from gcs.station.monitor import VehicleState
+from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
 
 S = 1_000_000_000
 

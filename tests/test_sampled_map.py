@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from gains.errors import BadModelError
-from gains.sampled import growth_rate, period_map, spectral_radius
-from gains.sampled_loop import matrix_exponentials
+from gains.core.errors import BadModelError
+from gains.sampled.constant import growth_rate, period_map, spectral_radius
+from gains.sampled.loop import matrix_exponentials
 
 Matrix = NDArray[np.float64]
 

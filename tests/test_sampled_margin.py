@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gains.delay import delay_margin
-from gains.sampled import sampled_delay_margin, sampling_period_limit, spectral_radius
+from gains.delay.constant import delay_margin
+from gains.sampled.constant import sampled_delay_margin, sampling_period_limit, spectral_radius
 
 Matrix = NDArray[np.float64]
 Loop = tuple[Matrix, Matrix, Matrix]

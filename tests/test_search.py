@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gains.delay import delay_margin
-from gains.formation import FormationModel
-from gains.robust import robustness
-from gains.sampled import sampled_delay_margin
-from gains.scalar_gains import alpha_of, front_gain_limit, gains_of_margin
-from gains.search import largest_alpha, largest_margin
+from gains.delay.constant import delay_margin
+from gains.design.search import largest_alpha, largest_margin
+from gains.formation.model import FormationModel
+from gains.performance.robust import robustness
+from gains.performance.scalar_gains import alpha_of, front_gain_limit, gains_of_margin
+from gains.sampled.constant import sampled_delay_margin
 
 FOLLOWER = FormationModel((-1, 0), axes=1)
 

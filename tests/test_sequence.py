@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcs.sequence import SequenceCounter
+from gcs.link.sequence import SequenceCounter
 
 MS = 1_000_000
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sim_vehicles.copter import Copter
-from sim_vehicles.shell import Craft, Shell
+from sim_vehicles.vehicles.copter import Copter
+from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.sim_client import (
     MS,
     SECOND,

@@ -7,17 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from gains.delay import analyse_delay, delay_margin
-from gains.errors import BadModelError
-from gains.formation import FormationModel
-from gains.several_delays import (
-    Polyline,
-    boundary_of_two_delays,
-    crossing_curves,
-    delay_box,
-    late_by_vehicle,
-    stable_at,
-)
+from gains.core.errors import BadModelError
+from gains.delay.constant import analyse_delay, delay_margin
+from gains.delay.several import Polyline, boundary_of_two_delays, crossing_curves, delay_box, late_by_vehicle, stable_at
+from gains.formation.model import FormationModel
 
 Matrix = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from signed_peer import EPOCH_NS, KEY, NOW, NOW_NS, OTHER_KEY, a_sender, position, stamp
 
-from gcs import mavlink
+from gcs.link import mavlink
 from scenarios.signing.keys import Key
 from scenarios.signing.link import LARGEST, MINUTE, REMEMBERED, SignedLink
 from scenarios.signing.stamps import Stamps
-from sim_vehicles.mavlink import CRC_EXTRA
+from sim_vehicles.services.mavlink import CRC_EXTRA
 
 
 def a_link(*, stamps: Stamps | None = None, key: bytes = KEY, owner: int = 0) -> SignedLink:

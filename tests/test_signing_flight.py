@@ -10,20 +10,20 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from signed_peer import EPOCH_NS, KEY, OTHER_KEY, a_sender, stamp
 
-from gcs.datagram import Datagram
-from gcs.flight_plan import FlightPlan
-from gcs.guard import Guard
-from gcs.lockstep import START_NS, Sent, fly_lockstep
-from gcs.modes import Phase
-from gcs.plan import flight_plan
-from gcs.station import Station
-from gcs.tick import TickArray
+from gcs.control.phases import Phase
+from gcs.control.tick import TickArray
+from gcs.drive.guard import Guard
+from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.link.datagram import Datagram
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains, Flavour, Response
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
-from sim_vehicles.fleet import Fleet
-from sim_vehicles.guard import signed_links
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.drive.guard import signed_links
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 

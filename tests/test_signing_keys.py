@@ -27,7 +27,7 @@ def a_file(folder: Path, data: bytes, mode: int = 0o600) -> Path:
 
 
 def gcs(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "gcs.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "gcs.cli.main", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 
 
@@ -146,11 +146,11 @@ def test_the_command_makes_a_key_and_says_nothing_of_it(tmp_path: Path) -> None:
     assert again.stderr == f"{file}: is there already, wanted a new file: a key is not written over\n"
 
 
-@pytest.mark.parametrize("program", ["gcs.cli", "sim_vehicles.cli"])
+@pytest.mark.parametrize("program", ["gcs.cli.main", "sim_vehicles.drive.cli"])
 def test_a_key_that_others_may_read_is_one_line_and_exit_code_2(tmp_path: Path, program: str) -> None:
     file = a_file(tmp_path, SECRET, 0o644)
     scenario = Path(__file__).parent.parent / "scenarios" / "chain3.toml"
-    fly = [*(["fly"] if program == "gcs.cli" else []), str(scenario), "--key", str(file)]
+    fly = [*(["fly"] if program == "gcs.cli.main" else []), str(scenario), "--key", str(file)]
     done = subprocess.run(
         [sys.executable, "-m", program, *fly], capture_output=True, text=True, check=False, timeout=60, cwd=tmp_path
     )

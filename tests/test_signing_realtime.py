@@ -18,10 +18,10 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from signed_peer import KEY, OTHER_KEY, position
 from test_fly_realtime import PATIENCE_S, SCENARIOS, children_named, fly, flying, free_port, short, until
 
-from gcs.guard import Guard
-from gcs.plan import flight_plan
-from gcs.station import Station
-from gcs.udp import StationSocket, clock_ns, realtime_offset_ns
+from gcs.drive.guard import Guard
+from gcs.drive.udp import StationSocket, clock_ns, realtime_offset_ns
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains
 from scenarios.signing.keys import Key, make_key, read_key
@@ -135,7 +135,7 @@ def signed_vehicles(tmp_path: Path, station_port: int) -> Generator[None]:
     key_file = tmp_path / "vehicles.key"
     key_file.write_bytes(KEY)
     key_file.chmod(0o600)
-    command = [sys.executable, "-m", "sim_vehicles.cli", str(SCENARIOS / "chain3.toml"), "--key", str(key_file)]
+    command = [sys.executable, "-m", "sim_vehicles.drive.cli", str(SCENARIOS / "chain3.toml"), "--key", str(key_file)]
     process = subprocess.Popen(
         [*command, "--station", f"127.0.0.1:{station_port}", "--duration", "30"], stdout=subprocess.DEVNULL
     )
@@ -149,7 +149,17 @@ def signed_vehicles(tmp_path: Path, station_port: int) -> Generator[None]:
 def test_a_monitor_with_the_key_is_answered_and_one_without_hears_only(tmp_path: Path) -> None:
     port = free_port()
     with signed_vehicles(tmp_path, port):
-        watch = [sys.executable, "-m", "gcs.cli", "monitor", "--listen", f"127.0.0.1:{port}", "--for", "2", "--json"]
+        watch = [
+            sys.executable,
+            "-m",
+            "gcs.cli.main",
+            "monitor",
+            "--listen",
+            f"127.0.0.1:{port}",
+            "--for",
+            "2",
+            "--json",
+        ]
         for key, status in ((["--key", str(tmp_path / "vehicles.key")], "measured"), ([], "no exchange")):
             done = subprocess.run([*watch, *key], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
             assert (done.returncode, done.stderr) == (0, "")

@@ -14,10 +14,10 @@ import pytest
 from sim_client import MS, arm, command, guided, heartbeat, parse, scenario, setpoint
 
 from scenarios.files import dump
-from sim_vehicles.truth import ACTED, LINK_UP, SAMPLED, read_truth
+from sim_vehicles.links.truth import ACTED, LINK_UP, SAMPLED, read_truth
 
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
-RUN = [sys.executable, "-m", "sim_vehicles.cli"]
+RUN = [sys.executable, "-m", "sim_vehicles.drive.cli"]
 
 
 class Client:
@@ -185,7 +185,7 @@ def test_wrong_input_is_answered_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    from sim_vehicles.cli import run
+    from sim_vehicles.drive.cli import run
 
     monkeypatch.chdir(tmp_path)
     try:
@@ -202,7 +202,7 @@ def test_wrong_input_is_answered_in_one_line(
 def test_help_loads_nothing_slow() -> None:
     """numpy, pydantic and pymavlink take half a second together."""
     program = (
-        "import sys\nfrom sim_vehicles.cli import run\n"
+        "import sys\nfrom sim_vehicles.drive.cli import run\n"
         "try:\n    run(['--help'])\nexcept SystemExit as end:\n    assert not end.code\n"
         "assert not {'numpy', 'pydantic', 'pymavlink'} & set(sys.modules)"
     )

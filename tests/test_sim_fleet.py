@@ -5,8 +5,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sim_client import MS, SECOND, START, arm, command, guided, heartbeat, pack, parse, parse_all, scenario, setpoint
 
 from scenarios.schema import Link, Links, VehicleLinks
-from sim_vehicles.fleet import Datagram, Fleet
-from sim_vehicles.truth import ACTED, LINK_DOWN, LINK_UP, SAMPLED, Row
+from sim_vehicles.drive.fleet import Datagram, Fleet
+from sim_vehicles.links.truth import ACTED, LINK_DOWN, LINK_UP, SAMPLED, Row
 
 COUNT = 4
 

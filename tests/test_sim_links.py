@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from scenarios import schema
 from scenarios.schema import DelayPoint, Jitter, LossBursts, Outage
-from sim_vehicles.clock import NEVER_NS
-from sim_vehicles.links import Entry, Link
-from sim_vehicles.truth import CORRUPTED, DROPPED, DUPLICATE, LINK_FULL, LINK_UP, OUTAGE, Row
+from sim_vehicles.links.links import Entry, Link
+from sim_vehicles.links.truth import CORRUPTED, DROPPED, DUPLICATE, LINK_FULL, LINK_UP, OUTAGE, Row
+from sim_vehicles.services.clock import NEVER_NS
 
 MS = 1_000_000
 SECOND = 1_000_000_000

@@ -16,10 +16,10 @@ from sim_client import scenario
 
 from scenarios import schema
 from scenarios.schema import Jitter, LossBursts
-from sim_vehicles.clock import NEVER_NS
-from sim_vehicles.link_fate import flipped
-from sim_vehicles.links import Link, LinkSet
-from sim_vehicles.truth import CORRUPTED, DUPLICATE, Row
+from sim_vehicles.links.fate import flipped
+from sim_vehicles.links.links import Link, LinkSet
+from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, Row
+from sim_vehicles.services.clock import NEVER_NS
 
 MS = 1_000_000
 COUNT = 20_000

@@ -18,11 +18,11 @@ from sim_client import MS, SECOND, START, heartbeat, scenario, setpoint
 from scenarios import schema
 from scenarios.files import dump
 from scenarios.schema import Jitter, Links
-from sim_vehicles.clock import NEVER_NS
-from sim_vehicles.links import CAPACITY, LinkSet
-from sim_vehicles.relay import Passing, Relay, sender
-from sim_vehicles.relay_udp import MOST_PEERS, Peers
-from sim_vehicles.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, LOST, Row, read_truth
+from sim_vehicles.drive.relay_udp import MOST_PEERS, Peers
+from sim_vehicles.links.links import CAPACITY, LinkSet
+from sim_vehicles.links.relay import Passing, Relay, sender
+from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, LOST, Row, read_truth
+from sim_vehicles.services.clock import NEVER_NS
 
 WILD = schema.Link(
     delay_s=0.02,
@@ -137,7 +137,7 @@ def running(
     (folder / "links.toml").write_text(dump(flown))
     port = free_port()
     station_at = f"127.0.0.1:{station.getsockname()[1]}"
-    command = [sys.executable, "-m", "sim_vehicles.cli", str(folder / "links.toml"), "--links-only"]
+    command = [sys.executable, "-m", "sim_vehicles.drive.cli", str(folder / "links.toml"), "--links-only"]
     with subprocess.Popen(
         [*command, "--vehicle-port", str(port), "--station", station_at, "--truth", str(folder / "truth")],
         stdout=subprocess.PIPE,

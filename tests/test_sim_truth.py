@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_vehicles.truth import ACTED, CORRUPTED, DTYPE, DUPLICATE, LINK_UP, SAMPLED, Row, TruthLog, read_truth
+from sim_vehicles.links.truth import ACTED, CORRUPTED, DTYPE, DUPLICATE, LINK_UP, SAMPLED, Row, TruthLog, read_truth
 
 ROWS: list[Row] = [
     (SAMPLED, 1, 2**32 - 1, 10, 10, 10, 0, 0),

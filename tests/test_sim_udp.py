@@ -8,7 +8,7 @@ from collections.abc import Generator
 
 import pytest
 
-from sim_vehicles.udp import Ports
+from sim_vehicles.drive.udp import Ports
 
 pytestmark = pytest.mark.realtime
 MS = 1_000_000

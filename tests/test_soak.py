@@ -13,7 +13,7 @@ from soak_checks import checked, judge
 from soak_flight import Flown, fly
 from soak_scenarios import Experiment, experiment, whole
 
-from gcs.plan import flight_plan
+from gcs.plan.planner import flight_plan
 from scenarios import files, schema
 from scenarios.schema import Clocks, Control, FixedGains, Limits
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gains.formation import FormationModel
-from gcs.datagram import Datagram, Outgoing
-from gcs.flight_plan import FlightPlan
-from gcs.formation import plan_formation
-from gcs.station import Station
+from gains.formation.model import FormationModel
+from gcs.link.datagram import Datagram, Outgoing
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import plan_formation
+from gcs.station.station import Station
 from scenarios.files import load
 
 S, MS = 1_000_000_000, 1_000_000

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs import mavlink
+from gcs.link import mavlink
 
 vehicle: Any = dialect.MAVLink(None, srcSystem=7, srcComponent=1)
 

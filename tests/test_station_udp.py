@@ -4,8 +4,8 @@ import socket
 
 import pytest
 
-from gcs.datagram import Datagram
-from gcs.udp import StationSocket, clock_ns
+from gcs.drive.udp import StationSocket, clock_ns
+from gcs.link.datagram import Datagram
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 

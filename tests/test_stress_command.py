@@ -11,7 +11,7 @@ SCENARIOS = Path(__file__).parent.parent / "scenarios"
 
 
 def stress_command(*arguments: str | Path) -> list[str]:
-    return [sys.executable, "-m", "gcs.cli", "stress", *map(str, arguments)]
+    return [sys.executable, "-m", "gcs.cli.main", "stress", *map(str, arguments)]
 
 
 def stress(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":

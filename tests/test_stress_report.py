@@ -13,13 +13,13 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it comes
 from stress_pair import SCENARIO, pair_plan
 from typer.testing import CliRunner
 
+from gcs.cli.stress import stress
+from gcs.cli.stress_output import write_junit
 from gcs.errors import InputError
-from gcs.flight_plan import FlightPlan
+from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.summary import SUMMARY_FILE
 from gcs.stress.campaign import TRIALS_FILE, Store, local_workers, run_campaign
-from gcs.stress.command import stress
 from gcs.stress.study import Onset, Study, find_onset
-from gcs.stress.terminal import write_junit
-from gcs.summary import SUMMARY_FILE
 from scenarios.files import dump
 
 app = typer.Typer()

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gains.behaviour import string_peak
-from gains.errors import BadModelError
-from gains.string_stability import (
+from gains.core.errors import BadModelError
+from gains.performance.behaviour import string_peak
+from gains.performance.string_stability import (
     Follower,
     least_headway,
     low_frequency_coefficient,

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gains.arrays import FloatArray
-from gains.errors import BadModelError
-from gains.structure import (
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+from gains.core.structure import (
     balanced,
     distinct_blocks,
     project_out_equilibria,

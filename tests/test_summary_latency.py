@@ -3,8 +3,8 @@
 import numpy as np
 from flown_run import DESIGN, line, ticks_of
 
-from gcs.summary import summarise
-from gcs.tick import CLOCK_JUMPED
+from gcs.control.tick import CLOCK_JUMPED
+from gcs.runs.summary import summarise
 
 
 def test_each_estimate_bears_its_status_and_samples_and_an_unknown_is_none() -> None:

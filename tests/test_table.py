@@ -7,8 +7,8 @@ import pytest
 from flown_run import DESIGN, line, ticks_of
 from rich.console import Console
 
-from gcs.show.table import FlightState, plain_line, render
-from gcs.tick import Mode, TickArray
+from gcs.control.tick import Mode, TickArray
+from gcs.views.table import FlightState, plain_line, render
 from scenarios.schema import Scenario
 
 

@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gains.multirate import lifted_growth
-from gains.onboard import SteppedPlant, onboard_loop
-from gcs.flown import fly_virtual, margins_of
-from gcs.onboard import timing_of
-from gcs.plan import flight_plan
+from gains.sampled.multirate import lifted_growth
+from gains.sampled.onboard import SteppedPlant, onboard_loop
+from gcs.control.tick import Mode
+from gcs.drive.flown import fly_virtual, margins_of
+from gcs.plan.onboard import timing_of
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from gcs.summary import summarise
-from gcs.tick import Mode
 from scenarios.files import load
 from scenarios.schema import Control, FixedGains, Link, Outage, Response, Scenario
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from terminals import Terminal, is_restored, rows, terminal, wait_for
 
-from gcs.tick import Mode
+from gcs.control.tick import Mode
 from scenarios.files import dump, load
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
@@ -25,7 +25,7 @@ KINDS = [
 
 
 def command(*arguments: str | Path) -> str:
-    return " ".join([sys.executable, "-m", "gcs.cli", *map(str, arguments)]) + "\r"
+    return " ".join([sys.executable, "-m", "gcs.cli.main", *map(str, arguments)]) + "\r"
 
 
 def start_flight(shown: Terminal, folder: Path) -> None:
@@ -86,7 +86,7 @@ def test_the_monitors_table_shows_links_and_ctrl_c_gives_the_shell_back(tmp_path
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
-    vehicles = [sys.executable, "-m", "sim_vehicles.cli", "scenarios/chain3.toml", "--station", address]
+    vehicles = [sys.executable, "-m", "sim_vehicles.drive.cli", "scenarios/chain3.toml", "--station", address]
     measured = re.compile("measured")
     with terminal("pseudo", 120, 30, tmp_path) as shown:
         process = subprocess.Popen(vehicles, stdout=subprocess.DEVNULL, cwd=ROOT)

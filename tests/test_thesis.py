@@ -9,14 +9,14 @@ import pytest
 from scipy.linalg import expm
 from typer.testing import CliRunner
 
-from gains.delay import delay_margin
-from gains.inclusion import expand
-from gains.pattern import bidirectional
-from gains.rightmost import rightmost_root
-from gcs.cli import app
-from gcs.thesis import errata
-from gcs.thesis.command import late_neighbours
-from gcs.thesis.flights import CHAIN, nonlinear_response, printed_gains
+from gains.delay.constant import delay_margin
+from gains.delay.rightmost import rightmost_root
+from gains.formation.inclusion import expand
+from gains.formation.pattern import bidirectional
+from gcs.cli.main import app
+from gcs.studies import thesis_errata as errata
+from gcs.studies.thesis import late_neighbours
+from gcs.studies.thesis_flights import CHAIN, nonlinear_response, printed_gains
 
 
 def test_printed_gains_take_a_second_of_their_neighbours_delay_and_not_the_published_0_19() -> None:

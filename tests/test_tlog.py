@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v10 import ardupilotmega as dialect_1
 from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
-from gcs import mavlink
-from gcs.record import TLOG_FILE, RunWriter
+from gcs.link import mavlink
+from gcs.runs.record import TLOG_FILE, RunWriter
 from gcs.watch.tlog import TlogError, parse_tlog, read_tlog
 
 START_US = 1_750_000_000_000_000

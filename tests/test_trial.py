@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stress_pair import SCENARIO, pair_plan
 
-from gcs.flown import fly_virtual
-from gcs.plan import flight_plan
-from gcs.record import DESIGN_FILE, SCENARIO_FILE, TICKS_FILE
+from gcs.drive.flown import fly_virtual
+from gcs.plan.planner import flight_plan
+from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, TICKS_FILE
 from gcs.stress.axes import at_coordinates
 from gcs.stress.measure import fly_trial
 from gcs.stress.probe import probe_scenario, with_waiting

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcs import mavlink
-from gcs.upload import ATTEMPTS, Upload, float32
+from gcs.link import mavlink
+from gcs.link.upload import ATTEMPTS, Upload, float32
 
 MS = 1_000_000
 NUMBERS = {"FORM_A": -17.0089, "FORM_B": 0.1, "FORM_C": 1.0}

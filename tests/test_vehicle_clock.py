@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from sim_client import MS, SECOND, START, a_vehicle, command, guided, parse_all, scenario, take_off
 
 from scenarios.schema import Clocks
-from sim_vehicles.clock import BootClock
-from sim_vehicles.vehicle import launched
+from sim_vehicles.services.clock import BootClock
+from sim_vehicles.vehicles.double_integrator import launched
 
 times = st.integers(0, 10**15)
 clocks = st.builds(BootClock, times, times, st.integers(-(10**7), 10**7))

@@ -7,8 +7,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from sim_client import MS, SECOND, START, a_vehicle, arm, command, guided, mode, pack, parse_all, setpoint, take_off
 
-from sim_vehicles.shell import Shell
-from sim_vehicles.vehicle import Vehicle
+from sim_vehicles.vehicles.double_integrator import Vehicle
+from sim_vehicles.vehicles.shell import Shell
 
 
 def answers(vehicle: Shell[Vehicle], request: bytes, time_ns: int = START) -> list[Any]:

@@ -22,9 +22,9 @@ from sim_client import (
     take_off,
 )
 
-from sim_vehicles.mavlink import read_datagram
-from sim_vehicles.shell import Shell
-from sim_vehicles.vehicle import Vehicle
+from sim_vehicles.services.mavlink import read_datagram
+from sim_vehicles.vehicles.double_integrator import Vehicle
+from sim_vehicles.vehicles.shell import Shell
 
 NAN, INFINITY = float("nan"), float("inf")
 VALID = [setpoint(3.0, -2.0), arm(), guided(), heartbeat(), command(511, 32, 20_000), mode(5)]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from scenarios.schema import Limits
-from sim_vehicles.dynamics import COAST, Bounds, Command, State, advance, bounds_of, state_from
+from sim_vehicles.vehicles.dynamics import COAST, Bounds, Command, State, advance, bounds_of, state_from
 
 UNLIMITED = bounds_of(Limits())
 

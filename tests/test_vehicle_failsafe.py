@@ -17,8 +17,8 @@ from sim_client import (
     take_off,
 )
 
-from sim_vehicles.shell import Shell
-from sim_vehicles.vehicle import Vehicle
+from sim_vehicles.vehicles.double_integrator import Vehicle
+from sim_vehicles.vehicles.shell import Shell
 
 
 def texts(sent: list[tuple[bytes, int]]) -> list[tuple[str, int]]:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sim_vehicles.shell import Craft, Shell
+from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.sim_client import SECOND, START, arm, command, guided, heartbeat, pack, parse_all
 from tests.vehicle_kinds import VEHICLES
 

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from rich.console import Console
 from sim_client import arm, guided, heartbeat, setpoint
 
-from gcs import mavlink
+from gcs.link import mavlink
 from gcs.watch.links import SYSTEM_ID, Requests, Watch
 from gcs.watch.table import links_table
 from scenarios.files import load
 from scenarios.schema import Jitter, Link, Links, Scenario
-from sim_vehicles.fleet import Fleet
-from sim_vehicles.truth import SAMPLED, Row
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.links.truth import SAMPLED, Row
 
 START_NS = 1_000_000_000
 MS = 1_000_000

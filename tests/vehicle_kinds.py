@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 from scenarios.schema import Autopilot, Flavour
-from sim_vehicles.copter import Copter, multicopter
-from sim_vehicles.shell import Craft, Shell
+from sim_vehicles.vehicles.copter import Copter, multicopter
+from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.sim_client import START, a_vehicle, scenario
 
 

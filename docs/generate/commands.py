@@ -12,7 +12,7 @@ from docs.generate.blocks import table
 
 def commands_page() -> str:
     """A section for each command of `gcs`, in the order of its help, and one for `sim-vehicles`."""
-    from gcs.cli import app
+    from gcs.cli.main import app
 
     group: Any = typer.main.get_command(app)
     sections = [_section(f"gcs {name}", command) for name, command in group.commands.items()]

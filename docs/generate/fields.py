@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-import gcs.record
-import sim_vehicles.truth
+import gcs.runs.record
+import sim_vehicles.links.truth
 from docs.generate.blocks import table
 
 _LINE = re.compile(r'\s+\("(?P<name>\w+)", "(?P<type>[^"]+)"\),(?:  # (?P<text>.*))?$')
@@ -57,17 +57,17 @@ def columns(module: ModuleType, dtype: "np.dtype[Any]") -> str:
 
 
 def tick_columns() -> str:
-    return columns(gcs.record, gcs.tick.TICK)
+    return columns(gcs.runs.record, gcs.control.tick.TICK)
 
 
 def modes() -> str:
     """The modes of a vehicle, by the number in the tick record."""
-    source = inspect.getsource(gcs.tick.Mode)
+    source = inspect.getsource(gcs.control.tick.Mode)
     lines = re.findall(r"^\s+([A-Z]+) = (\d+)  # (.*)$", source, re.MULTILINE)
     return table(("number", "mode", "meaning"), [(number, name, text) for name, number, text in lines])
 
 
 def truth_columns() -> str:
-    dtype = sim_vehicles.truth.DTYPE
+    dtype = sim_vehicles.links.truth.DTYPE
     rows = [(f"`{name}`", f"{_TYPES[dtype[name].kind]} {8 * dtype[name].itemsize}") for name in dtype.names or ()]
     return table(("field", "type"), rows)

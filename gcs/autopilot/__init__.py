@@ -1,1 +1,1 @@
-"""What vehicles with an autopilot of their own need: start-up, one frame, their response found and flown with."""
+"""ArduPilot and PX4: the start of their flights, identification of their response, their pilots."""

@@ -6,12 +6,12 @@ from typing import Any
 
 from gcs.autopilot.manoeuvre import Identification
 from gcs.autopilot.pilots import Pilots
-from gcs.autopilot.startup import Startup, between
-from gcs.control import VehicleControl
-from gcs.flight_plan import FlightPlan
-from gcs.modes import START_PATIENCE_S, Phase
-from gcs.telemetry import StateHistory
-from gcs.vehicle import RemoteVehicle
+from gcs.control.history import StateHistory
+from gcs.control.law import VehicleControl
+from gcs.control.phases import START_PATIENCE_S, Phase
+from gcs.link.startup import Startup, between
+from gcs.link.vehicle import RemoteVehicle
+from gcs.plan.flight_plan import FlightPlan
 from scenarios.schema import NS_PER_S
 
 PATIENCE_S = 120.0

@@ -2,8 +2,8 @@
 
 All vehicles are told the same acceleration at the same time, forwards, twice as long backwards and forwards again, so
 that they end where they began and keep their distances. The velocity they report is fitted with that of the model of
-`gains.response`. When a command acted is known from the time it was sent and the measured way down, when a state was
-sampled from the vehicle's clock: the delay of the link is not part of what is found.
+`gains.performance.response`. When a command acted is known from the time it was sent and the measured way down, when a
+state was sampled from the vehicle's clock: the delay of the link is not part of what is found.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gains.arrays import FloatArray
-from gains.response import Response
+from gains.core.arrays import FloatArray
+from gains.performance.response import Response
 
 LONGEST_S = 6.0
 PROFILE = ((0.0, 1.0), (1.0, -2.0), (3.0, 2.0), (4.0, -1.0))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gains.response import Response, sampled_margin
+from gains.performance.response import Response, sampled_margin
 from gcs.autopilot.identify import (
     LONGEST_S,
     MISFIT_MAX,
@@ -15,10 +15,10 @@ from gcs.autopilot.identify import (
     identify,
     manoeuvre_m_s2,
 )
-from gcs.autopilot.responses import Responses
-from gcs.flight_plan import FlightPlan
-from gcs.telemetry import StateHistory
-from gcs.vehicle import RemoteVehicle
+from gcs.control.history import StateHistory
+from gcs.link.vehicle import RemoteVehicle
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.responses import Responses
 from scenarios.schema import NS_PER_S
 
 _UNNOTICED_NS = NS_PER_S

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from math import hypot
 from typing import Any
 
-from gcs import mavlink
-from gcs.vehicle import RemoteVehicle
+from gcs.link import mavlink
+from gcs.link.vehicle import RemoteVehicle
 
 _CLIMB_GAIN_1_S = 0.5
 _CLIMB_MAX_M_S = 1.0

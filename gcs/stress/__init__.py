@@ -1,1 +1,1 @@
-"""`gcs stress`: campaigns of flights over delays and what else links do, and where formations break."""
+"""Campaigns: trials over link parameters, growth rates, the onset of instability, maps and their report."""

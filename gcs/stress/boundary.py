@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.arrays import FloatArray
-from gains.errors import BadModelError
-from gains.jitter import spread_bound
-from gains.several_delays import boundary_of_two_delays, late_by_vehicle
-from gains.varying_delay import varying_delay_bound
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+from gains.delay.several import boundary_of_two_delays, late_by_vehicle
+from gains.varying.bounds import varying_delay_bound
+from gains.varying.jitter import spread_bound
 from gcs.stress.axes import Axis, at_coordinates
 from gcs.stress.figures import MEASURED, figure_of, saved
 from gcs.stress.onset import distinct
@@ -74,8 +74,8 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
 
     With jitter of at most j each way and periods T of telemetry and control, the age of the state behind the command
     in action lies between d - 2 j and d + 2 j + 2 T. It is covered as a deviation from its middle
-    (`gains.jitter.spread_bound`, a search on a grid of frequencies) or as any variation from 0 on
-    (`gains.varying_delay.varying_delay_bound`). None for other axes, for jitter that has no largest value, and for the
+    (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies) or as any variation from 0 on
+    (`gains.varying.bounds.varying_delay_bound`). None for other axes, for jitter that has no largest value, and for the
     onboard loop, of which not all feedback is late.
     """
     scenario = study.plan.scenario

@@ -19,7 +19,7 @@ from typing import Any
 
 from gcs.interrupts import FROM_TERMINAL, held_back
 from gcs.output import DISK_FULL
-from gcs.record import SCENARIO_FILE, RecordLog
+from gcs.runs.record import SCENARIO_FILE, RecordLog
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gains.arrays import FloatArray
+from gains.core.arrays import FloatArray
 from gcs.stress.axes import Axis, place_text
 from gcs.stress.onset import Loop, distinct
 from gcs.stress.study import Onset, Study

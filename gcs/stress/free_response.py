@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from gains.arrays import IntArray
-from gcs.effective_delay import commands_of, commands_on_board, effective_delay_s
-from gcs.flight_plan import FlightPlan
-from gcs.flown import Flight, fly_plan, fly_virtual, median_delays_s
+from gains.core.arrays import IntArray
+from gcs.control.tick import TickArray
+from gcs.drive.flown import Flight, fly_plan, fly_virtual, median_delays_s
+from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.effective_delay import commands_of, commands_on_board, effective_delay_s
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
 from gcs.stress.probe import in_place, linear_until_s
-from gcs.tick import TickArray
 from scenarios.schema import Scenario
 
 _LINEAR_SHARE = 0.8

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gains.arrays import ComplexArray, FloatArray
-from gcs.tick import TickArray
+from gains.core.arrays import ComplexArray, FloatArray
+from gcs.control.tick import TickArray
 
 DECAY_KEPT = 0.02
 """A motion is followed until it has shrunk to this part of what it was: rounding of the telemetry, which the loop feeds

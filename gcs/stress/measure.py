@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs.flight_plan import FlightPlan
-from gcs.flown import first_uses, fly_plan, fly_virtual, median_delays_s
+from gcs.drive.flown import first_uses, fly_plan, fly_virtual, median_delays_s
 from gcs.output import DISK_FULL
+from gcs.plan.flight_plan import FlightPlan
 from gcs.stress.axes import has_constant_links
 from gcs.stress.free_response import FreeResponse, effective_delays_s, fly_calm, response_alone, response_paired
 from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth

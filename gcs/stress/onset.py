@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gains.arrays import FloatArray
-from gains.delay import delay_margin
-from gains.formation import FormationModel
-from gains.multirate import Timing, multirate_delay_margin, multirate_growth_rate
-from gains.onboard import OnboardLoop, OnboardTiming, onboard_loop
-from gains.rightmost import rightmost_root
-from gains.several_delays import late_by_vehicle
-from gains.structure import strongly_connected_blocks
+from gains.core.arrays import FloatArray
+from gains.core.structure import strongly_connected_blocks
+from gains.delay.constant import delay_margin
+from gains.delay.rightmost import rightmost_root
+from gains.delay.several import late_by_vehicle
+from gains.formation.model import FormationModel
+from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
+from gains.sampled.onboard import OnboardLoop, OnboardTiming, onboard_loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Loop:
         return self.growth_continuous_at_1_s(dict.fromkeys(self.system_ids, delay_s))
 
     def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
-        """The same with a loop delay of its own for each vehicle's command, as in `gains.several_delays`."""
+        """The same with a loop delay of its own for each vehicle's command, as in `gains.delay.several`."""
         late_gain = self.K if self.onboard is None else self.B.T @ self.onboard.late
         at_once = [(self.A, 0.0)] if self.onboard is None else self.onboard.continuous_at_once()
         late = late_by_vehicle(self.B, late_gain, [slice(2 * k, 2 * k + 2) for k in range(len(self.system_ids))])
@@ -124,8 +124,8 @@ def loops_of(
 ) -> list[Loop]:
     """The loops of a formation flown with a gain matrix K, those ahead first.
 
-    `predecessors` and the order of K are those of `gains.formation.FormationModel`. `onboard` is the timing of the
-    onboard loop; without it the station closes every loop.
+    `predecessors` and the order of K are those of `gains.formation.model.FormationModel`. `onboard` is the timing of
+    the onboard loop; without it the station closes every loop.
     """
     model = FormationModel(tuple(predecessors))
     whole = None if onboard is None else onboard_loop(model, K, onboard)

@@ -24,10 +24,10 @@ What would hide the loop is taken out:
 
 import numpy as np
 
-from gains.arrays import FloatArray
-from gcs.flight_plan import FlightPlan
-from gcs.limits import LARGEST_COMMAND_M_S2
-from gcs.tick import TickArray
+from gains.core.arrays import FloatArray
+from gcs.control.limits import LARGEST_COMMAND_M_S2
+from gcs.control.tick import TickArray
+from gcs.plan.flight_plan import FlightPlan
 from scenarios.schema import Limits, Link, Scenario, Vehicle
 
 PROBE_S = 20.0

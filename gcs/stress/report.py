@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gcs.show.page import data_uri, rendered
 from gcs.stress.axes import Axis
 from gcs.stress.result import exact
 from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, plan_loops
+from gcs.views.page import data_uri, rendered
 
 REPORT_FILE = "report.html"
 _TEMPLATE = "stress_report.html.j2"

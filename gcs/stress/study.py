@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gcs.flight_plan import FlightPlan
+from gcs.plan.flight_plan import FlightPlan
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.campaign import Run
 from gcs.stress.onset import GrowthPoint, Loop, Zero, distinct, locate_zero

@@ -11,14 +11,14 @@ from typing import Literal, Self
 
 import numpy as np
 
-from gains.arrays import FloatArray
-from gcs.flight_plan import FlightPlan
-from gcs.flown import Flight, margins_of
-from gcs.formation import plan_formation
-from gcs.onboard import timing_of
+from gains.core.arrays import FloatArray
+from gcs.control.tick import TickArray
+from gcs.drive.flown import Flight, margins_of
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import plan_formation
+from gcs.plan.onboard import timing_of
+from gcs.runs.summary import summarise
 from gcs.stress.onset import Loop, loops_of
-from gcs.summary import summarise
-from gcs.tick import TickArray
 from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]
@@ -58,10 +58,10 @@ class Outcome:
 
     `verdict` is that of the whole flight for an own trial, the sign of the growth rate for a probe. `probed` is the
     first vehicle of the loop that was measured; it stands for the loop of vehicle `critical`, whose `waiting_s` for
-    the control tick it has. `loop_delay_s` is the effective one over the window of the fit (`gcs.effective_delay`; on
-    constant links each is it), for an own trial the median that was measured in flight. `loop_delay_spread_s` is by how
-    much the 90th percentile of the measured ones is above their median. `predicted_*` are the models' growth rates at
-    that delay. The growth of an own trial is that of the envelope of all spacing errors, which is rough.
+    the control tick it has. `loop_delay_s` is the effective one over the window of the fit (`gcs.runs.effective_delay`;
+    on constant links each is it), for an own trial the median that was measured in flight. `loop_delay_spread_s` is by
+    how much the 90th percentile of the measured ones is above their median. `predicted_*` are the models' growth rates
+    at that delay. The growth of an own trial is that of the envelope of all spacing errors, which is rough.
     `ticks_sha256` is that of the tick log, in virtual time: the same trial has the same in any process.
     `past_limits` says that random links alone, without any error, push vehicles past the scenario's limits, without
     which a probe is flown.

@@ -1,1 +1,1 @@
-"""`gcs monitor` and `gcs replay`: what links and telemetry logs say, without a say in the flight."""
+"""What the frames on a link or in a telemetry log say about latency, without commanding anything."""

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs import mavlink
-from gcs.datagram import Address, Outgoing
-from gcs.monitor import headroom
-from gcs.summary import spread_with_status
-from gcs.vehicle import RemoteVehicle
+from gcs.link import mavlink
+from gcs.link.datagram import Address, Outgoing
+from gcs.link.vehicle import RemoteVehicle
+from gcs.runs.summary import spread_with_status
+from gcs.station.monitor import headroom
 from scenarios.schema import NS_PER_S
 
 SYSTEM_ID = 254

@@ -12,10 +12,10 @@ from typing import Any, Self
 
 from rich.live import Live
 
-from gcs import mavlink
-from gcs.console import plain_console
-from gcs.guard import Guard
-from gcs.udp import StationSocket, clock_ns
+from gcs.drive.guard import Guard
+from gcs.drive.udp import StationSocket, clock_ns
+from gcs.link import mavlink
+from gcs.views.console import plain_console
 from gcs.watch.links import Requests, Watch
 from gcs.watch.table import plain_line, render
 from scenarios.schema import NS_PER_S

@@ -7,8 +7,8 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gcs.console import plain_console
-from gcs.show.table import UNKNOWN, headroom_style
+from gcs.views.console import plain_console
+from gcs.views.table import UNKNOWN, headroom_style
 from gcs.watch.links import Figures
 
 STATUS_STYLES = {"measured": "green", "past the margin": "bold red", "silent": "bold red", "not heard": "bold red"}

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs import mavlink
-from gcs.clocks import LATEST_NS
+from gcs.link import mavlink
+from gcs.link.clocks import LATEST_NS
 
 _STAMP = struct.Struct(">Q")
 _MAGIC = re.compile(b"[\xfd\xfe]")

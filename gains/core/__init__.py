@@ -1,0 +1,1 @@
+"""What every part of the mathematics needs: array types, errors, block structure, bracketing, requirements."""

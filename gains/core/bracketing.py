@@ -1,0 +1,119 @@
+"""Roots and peaks of scalar functions, within brackets.
+
+Most functions here take all abscissae (k,) and return all values (k,): one batch of eigenvalue problems a step, which
+is what the time goes to.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+
+Functions = Callable[[FloatArray], FloatArray]
+
+_EPS = float(np.finfo(np.float64).eps)
+_GOLDEN = (3.0 - 5.0**0.5) / 2.0
+# 60 steps shrink a bracket to 1e-13: a smooth peak is known to 1e-8 only, a kink to rounding
+_GOLDEN_STEPS = 60
+# a peak between samples is higher than the highest of them by less than this many times what they differ
+_REACH = 4.0
+# Steps of false position at most, where the function is too rough for its resolution
+_FALSE_POSITIONS = 30
+
+
+def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Places of the local maxima of functions with one maximum in [a, b] each, by golden section."""
+    c, d = a + _GOLDEN * (b - a), b - _GOLDEN * (b - a)
+    at_c, at_d = function(c), function(d)
+    for _ in range(_GOLDEN_STEPS):
+        to_left = at_c > at_d
+        a, b = np.where(to_left, a, c), np.where(to_left, d, b)
+        new = np.where(to_left, a + _GOLDEN * (b - a), b - _GOLDEN * (b - a))
+        at_new = function(new)
+        c, d = np.where(to_left, new, d), np.where(to_left, c, new)
+        at_c, at_d = np.where(to_left, at_new, at_d), np.where(to_left, at_c, at_new)
+    return (a + b) / 2.0
+
+
+def may_reach_zero(points: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
+    """Where a local maximum below zero of samples (k, r) of r functions may hide values of zero, shape (k - 2, r).
+
+    A smooth peak exceeds its highest sample by an eighth of what the neighbours are lower by; a kink by as much as the
+    line through its neighbour rises over the other step.
+    """
+    inner, left, right = values[1:-1], values[:-2], values[2:]
+    before, after = np.diff(points)[:-1, np.newaxis], np.diff(points)[1:, np.newaxis]
+    rise = np.maximum(
+        (inner - left) * np.maximum(1.0, after / before), (inner - right) * np.maximum(1.0, before / after)
+    )
+    return (inner >= left) & (inner >= right) & (inner <= 0.0) & (inner + _REACH * rise >= 0.0)
+
+
+def bracketed_roots(
+    function: Callable[[FloatArray], FloatArray], a: FloatArray, b: FloatArray, fa: FloatArray, fb: FloatArray
+) -> FloatArray:
+    """Roots of many scalar functions at once, each within its bracket [a, b], to rounding.
+
+    Chandrupatla's method: inverse quadratic interpolation where it is safe, bisection elsewhere. `function` takes all
+    abscissae (k,) and returns all values (k,); `fa` and `fb` differ in sign.
+    """
+    a, b, fa, fb = a.copy(), b.copy(), fa.copy(), fb.copy()
+    c, fc = a.copy(), fa.copy()
+    fraction = np.full(a.size, 0.5)
+    # 100 halvings exhaust any bracket of doubles; interpolation needs about 6
+    for _ in range(100):
+        x = a + fraction * (b - a)
+        fx = function(x)
+        same = np.sign(fx) == np.sign(fa)
+        c, fc = np.where(same, a, b), np.where(same, fa, fb)
+        b, fb = np.where(same, b, a), np.where(same, fb, fa)
+        a, fa = x, fx
+        best = np.where(np.abs(fa) < np.abs(fb), a, b)
+        width = np.abs(b - a)
+        tolerance = 2.0 * _EPS * np.abs(best)
+        if bool(np.all((width <= 2.0 * tolerance) | (fa == 0.0))):
+            break
+        fraction = _next_fraction(a, b, c, fa, fb, fc)
+        least = np.minimum(tolerance / np.maximum(width, tolerance), 0.5)
+        fraction = np.clip(fraction, least, 1.0 - least)
+        fraction = np.where(fa == 0.0, 0.0, fraction)
+    return np.where(np.abs(fa) <= np.abs(fb), a, b)
+
+
+def _next_fraction(
+    a: FloatArray, b: FloatArray, c: FloatArray, fa: FloatArray, fb: FloatArray, fc: FloatArray
+) -> FloatArray:
+    """Chandrupatla's choice of the next abscissa, as a fraction of the way from a to b."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+        interpolate = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
+        quadratic = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+        return np.where(interpolate & np.isfinite(quadratic), quadratic, 0.5)
+
+
+def met_end(
+    excess: Callable[[float], float], met: tuple[float, float], missed: tuple[float, float], *, resolution: float
+) -> float:
+    """An abscissa where an expensive, slightly rough function is between 0 and `resolution`: false position.
+
+    `met` and `missed` are abscissae with their excess, >= 0 and < 0. When one end moves twice in a row the value at the
+    other is halved, so that both close in (the Illinois rule); about six steps.
+    """
+    (x, value), (outside, f_outside) = met, missed
+    f_inside, moved = value, 0
+    for _ in range(_FALSE_POSITIONS):
+        if value <= resolution or f_outside >= 0.0:
+            break
+        middle = x + (outside - x) * min(max(f_inside / (f_inside - f_outside), 0.01), 0.99)
+        f_middle = excess(middle)
+        if f_middle >= 0.0:
+            x, value, f_inside = middle, f_middle, f_middle
+            f_outside = f_outside / 2.0 if moved > 0 else f_outside
+            moved = 1
+        else:
+            outside, f_outside = middle, f_middle
+            f_inside = f_inside / 2.0 if moved < 0 else f_inside
+            moved = -1
+    return x

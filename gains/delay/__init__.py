@@ -1,0 +1,1 @@
+"""Delay margins of continuous loops with constant delays."""

@@ -1,0 +1,178 @@
+"""Where roots of x'(t) = A0 x(t) + A1 x(t - tau) cross the imaginary axis, found without a grid.
+
+The algebraic test gives a finite list of frequencies that contains every crossing. The loci of the loop
+(`gains.delay.loci`) are then counted between these frequencies, which says how many crossings there are and in which
+direction, brackets them, and does not rely on the list being accurate; Newton's method on the characteristic matrix
+gives the last digits.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.delay.loci import (
+    Loci,
+    UnitCrossing,
+    delay_loci,
+    factor_rank,
+    slope_sign,
+    unit_crossings,
+    without_limits_at_zero,
+)
+
+# n^2 eigenvalues of an n^2 x n^2 matrix: 0.3 s at 20, and growing with the sixth power
+LARGEST_ALGEBRAIC_BLOCK = 24
+# a candidate is kept when it is this close to the imaginary axis, relative to the norm; an m-fold eigenvalue is known
+# to eps^(1/m), and a false candidate costs one evaluation of the loci only
+_CANDIDATE_TOLERANCE = 1e-3
+# a locus this close to one (log of the modulus) at an algebraic frequency without a crossing there only touches
+_TOUCH = 1e-11
+# least singular value at a crossing, relative to the norm of what it is the sum of: rounding is far below
+_RESIDUAL = 1e-5
+
+
+@dataclass(frozen=True)
+class AxisCrossing:
+    """Roots +-j omega at the delays (theta + 2 pi k) / omega, k = 0, 1, ..., theta in [0, 2 pi).
+
+    `direction` is +1 when the pair goes into the right half plane as the delay grows, -1 when it comes out of it, and
+    0 when it touches the axis and returns.
+    """
+
+    omega: float
+    theta: float
+    direction: int
+
+
+def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
+    """All crossings of the imaginary axis of one block, omega > 0, in ascending frequency.
+
+    As |e^{j omega tau}| = 1, the root moves right exactly where the modulus of the locus falls with the frequency:
+    with lambda(s) = e^{s tau}, 1 / (ds/dtau) = (d ln lambda / ds - tau) / s, whose real part at s = j omega is
+    -(d ln|lambda| / d omega) / omega.
+    """
+    B, C = factor_rank(A1)
+    if B.shape[1] == 0:
+        return []
+    candidates = _candidates(A0, A1, B, C, highest_frequency(A0, A1))
+    found = crossings_of_loci(delay_loci(A0, B, C), candidates, highest_frequency(A0, A1))
+    polished = [polish((A0, A1), crossing) for crossing in found if is_root((A0, A1), crossing)]
+    return sorted(polished, key=lambda crossing: (crossing.omega, crossing.theta))
+
+
+def is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
+    """Whether j omega I - sum_k A_k e^{-j k theta} is anything like singular at a crossing.
+
+    Near a multiple pole of the resolvent loci are huge, and small ones beside them are rounding: what crosses the unit
+    circle there is none.
+    """
+    turns = crossing.locus / abs(crossing.locus)
+    delayed = sum((matrix * turns**-k for k, matrix in enumerate(matrices)), np.zeros_like(matrices[0]))
+    least = np.linalg.svd(1j * crossing.omega * np.eye(len(delayed)) - delayed, compute_uv=False)[-1]
+    return bool(least <= _RESIDUAL * (crossing.omega + sum(float(np.linalg.norm(matrix)) for matrix in matrices)))
+
+
+def crossings_of_loci(loci: Loci, candidates: FloatArray, highest: float) -> list[UnitCrossing]:
+    """All crossings of the unit circle, mere touches included, given frequencies that come near each of them."""
+    crossings = unit_crossings(loci, separating_points(candidates, highest))
+    return without_limits_at_zero(loci, crossings + hidden_crossings(loci, candidates, crossings), highest)
+
+
+def highest_frequency(A0: FloatArray, A1: FloatArray) -> float:
+    """Bound (rad/s) of every crossing frequency: lambda_max((A0 - A0')/(2j)) + ||A1||, in the Frobenius norm."""
+    return float(np.linalg.norm(A0 - A0.T) / 2.0 + np.linalg.norm(A1))
+
+
+def _candidates(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, highest: float) -> FloatArray:
+    """Frequencies that contain every crossing up to rounding, ascending."""
+    if B.shape[1] == 1:
+        # |C (jw - A0)^-1 B| = 1 exactly if jw is an eigenvalue of this Hamiltonian matrix (2n x 2n)
+        roots = np.linalg.eigvals(np.block([[A0, B @ B.T], [-C.T @ C, -A0.T]])).astype(np.complex128)
+    elif A0.shape[0] <= LARGEST_ALGEBRAIC_BLOCK:
+        roots = _kronecker_roots(A0, A1)
+    else:
+        from gains.delay.sweep import sweep_frequencies
+
+        return sweep_frequencies(A0, A1)
+    near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
+    omega = np.sort(roots.imag[near_axis & (roots.imag > 0.0)])
+    return omega[omega < 1.1 * highest]
+
+
+def _kronecker_roots(A0: FloatArray, A1: FloatArray) -> ComplexArray:
+    """Square roots (in the upper half plane) of the eigenvalues of K- K+, where K+-X = A0 X +- A1 X'.
+
+    With (A0 + z A1) v = j w v, |z| = 1, z = e^{-j theta}, the matrix Y = e^{j theta/2} v v* satisfies
+    A0 Y + A1 Y* = j w Y; its real and imaginary parts R, S give K+ R = -w S, K- S = w R, so K- K+ R = -w^2 R.
+    """
+    n = A0.shape[0]
+    identity = np.eye(n)
+    straight = np.einsum("im,jl->ijml", A0, identity).reshape(n * n, n * n)
+    crossed = np.einsum("il,jm->ijml", A1, identity).reshape(n * n, n * n)
+    squares = np.linalg.eigvals((straight - crossed) @ (straight + crossed)).astype(np.complex128)
+    roots = np.sqrt(squares)
+    return np.where(roots.imag >= 0.0, roots, -roots)
+
+
+def separating_points(candidates: FloatArray, highest: float) -> FloatArray:
+    """Frequencies that bracket every candidate narrowly and separate it from its neighbours."""
+    lowest = 1e-12 * highest
+    middles = (candidates[1:] + candidates[:-1]) / 2.0
+    margin = 1e-7 * candidates + 1e-15 * highest
+    points = np.concatenate([[lowest, 1.1 * highest], middles, candidates - margin, candidates + margin])
+    return np.unique(points[(points >= lowest) & (points <= 1.1 * highest)])
+
+
+def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossing]) -> list[UnitCrossing]:
+    """Crossings that leave the count unchanged: two in opposite directions at one frequency, or a mere touch."""
+    if candidates.size == 0:
+        return []
+    values = loci(candidates)
+    hidden: list[UnitCrossing] = []
+    for omega, row in zip(candidates.tolist(), values, strict=True):
+        for locus in row[np.abs(np.log(np.clip(np.abs(row), 1e-300, 1e300))) < _TOUCH].tolist():
+            known = (*found, *hidden)
+            if not any(abs(c.omega - omega) < 1e-6 * omega and abs(c.locus - locus) < 1e-4 for c in known):
+                hidden.append(UnitCrossing(omega=omega, locus=locus, outward=slope_sign(loci, omega, locus)))
+    return hidden
+
+
+def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> AxisCrossing:
+    """Newton steps on u*(j w I - sum_k A_k e^{-j k theta}) v = 0, u, v the singular vectors of the least value.
+
+    A step is taken only while it lowers the least singular value, and not where two are small at once (several roots
+    cross at one place) or the two unknowns act alike (near-tangent): there the bracketed value is the better one.
+    """
+    omega, theta = crossing.omega, float(np.angle(crossing.locus))
+    identity = np.eye(matrices[0].shape[0])
+    best = np.inf
+    result = (omega, theta)
+    for _ in range(3):
+        delayed = [matrix * np.exp(-1j * k * theta) for k, matrix in enumerate(matrices)]
+        U, singular, Vh = np.linalg.svd(1j * omega * identity - sum(delayed))
+        if singular[-1] >= best:
+            break
+        best, result = singular[-1], (omega, theta)
+        if singular.size > 1 and singular[-2] < 1e-6 * singular[0]:
+            break
+        u, v = U[:, -1].conj(), Vh[-1].conj()
+        # the residual is singular[-1]; its derivatives are j u*v and sum_k j k e^{-j k theta} u*A_k v
+        by_omega, by_theta = 1j * (u @ v), 1j * (u @ sum(k * matrix for k, matrix in enumerate(delayed)) @ v)
+        determinant = by_omega.real * by_theta.imag - by_omega.imag * by_theta.real
+        if abs(determinant) < 1e-6 * abs(by_omega) * abs(by_theta):
+            break
+        step_omega = -singular[-1] * by_theta.imag / determinant
+        step_theta = singular[-1] * by_omega.imag / determinant
+        if abs(step_omega) > 1e-6 * omega:
+            break
+        omega, theta = omega + float(step_omega), theta + float(step_theta)
+    omega, theta = result
+    # a theta of -1e-17 is a crossing at zero delay, not one a whole period later
+    theta = 0.0 if abs(theta) < _ZERO_ANGLE else theta % (2.0 * np.pi)
+    return AxisCrossing(omega=omega, theta=theta, direction=crossing.outward)
+
+
+# rad; the angle of a computed unit eigenvalue is known to a few hundred eps
+_ZERO_ANGLE = 1e-11

@@ -1,0 +1,169 @@
+"""Eigenvalue loci of a delayed loop, and the frequencies at which one of them crosses the unit circle.
+
+x'(t) = A0 x(t) + A1 x(t - tau) with A1 = B C of rank r has the root s = j omega at the delay tau exactly when
+e^{j omega tau} is an eigenvalue of the r x r loop G(j omega) = C (j omega I - A0)^{-1} B. The moduli of these
+eigenvalues do not depend on tau: crossings of the imaginary axis happen at the frequencies where a modulus is one.
+Sorted moduli are continuous functions of the frequency however the eigenvalues are numbered, which makes
+bracketing safe: between two frequencies at which a different number of moduli exceeds one, there is a crossing.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.bracketing import bracketed_roots
+
+Loci = Callable[[FloatArray], ComplexArray]
+
+_EPS = float(np.finfo(np.float64).eps)
+# the least normal number: a matrix of zeros has no scale of its own
+_LEAST = float(np.finfo(np.float64).tiny)
+# two crossings closer than this (relative) are one place: below the error of a double eigenvalue, sqrt(eps)
+_SAME_PLACE = 1e-10
+# log of the modulus of a locus at such a place
+_ON_CIRCLE = 1e-8
+# below this share of the highest frequency a locus that moves less than this when the frequency doubles is at its limit
+_SLOW, _FLAT = 1e-5, 1e-2
+
+
+@dataclass(frozen=True)
+class UnitCrossing:
+    """An eigenvalue `locus` of the loop (modulus one to rounding) at the frequency `omega`.
+
+    `outward` is the number by which the count of moduli above one drops as the frequency rises through `omega`: +1
+    modulus falling, -1 rising, 0 touching one and returning.
+    """
+
+    omega: float
+    locus: complex
+    outward: int
+
+
+def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """B (n, r) and C (r, n) with B C = `matrix` to rounding, r its numerical rank, and equal norms of both."""
+    U, singular, Vh = np.linalg.svd(matrix)
+    rank = int(np.count_nonzero(singular > matrix.shape[0] * _EPS * singular[0])) if singular[0] > 0.0 else 0
+    root = np.sqrt(singular[:rank])
+    return U[:, :rank] * root, root[:, np.newaxis] * Vh[:rank]
+
+
+def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray) -> Loci:
+    """The function omega (k,) -> eigenvalues (k, r) of C (j omega I - A0)^{-1} B."""
+    identity = np.eye(A0.shape[0])
+
+    def loci(omega: FloatArray) -> ComplexArray:
+        loop = C @ solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - A0, B)
+        return (loop[:, :, 0] if B.shape[1] == 1 else np.linalg.eigvals(loop)).astype(np.complex128, copy=False)
+
+    return loci
+
+
+def solved_beside_poles(matrices: NDArray[Any], right: FloatArray) -> NDArray[Any]:
+    """X with M X = `right` (n, r) for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
+
+    A resolvent is singular to rounding on a pole, and near a multiple one: of a double integrator from 1e-8 of its norm
+    down. A locus is infinite there, or large; a least singular value of eps in place of zero makes it large.
+    """
+    try:
+        return np.linalg.solve(matrices, right.astype(np.complex128))
+    except np.linalg.LinAlgError:
+        U, singular, Vh = np.linalg.svd(matrices)
+        floor = np.maximum(_EPS * singular[:, :1], _LEAST)
+        inner = (U.conj().swapaxes(1, 2) @ right) / np.maximum(singular, floor)[:, :, np.newaxis]
+        return Vh.conj().swapaxes(1, 2) @ inner
+
+
+def log_moduli(values: ComplexArray) -> FloatArray:
+    """Natural logarithms of the moduli along the last axis, largest first; zero and infinity become large numbers."""
+    return -np.sort(-_log(values), axis=-1)
+
+
+def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
+    """All crossings of the unit circle that change the number of moduli above one between neighbouring `points`.
+
+    Parameters
+    ----------
+    loci
+        Frequencies (k,) to eigenvalues (k, r).
+    points
+        Ascending frequencies that separate the crossings of opposite direction from each other; crossings of the
+        same direction need not be separated.
+    """
+    logs = log_moduli(loci(points))
+    above = np.count_nonzero(logs > 0.0, axis=1)
+    intervals = np.flatnonzero(above[1:] != above[:-1])
+    if intervals.size == 0:
+        return []
+    lower: list[int] = []
+    rank: list[int] = []
+    for i in intervals.tolist():
+        ranks = range(min(above[i], above[i + 1]), max(above[i], above[i + 1]))
+        lower.extend([i] * len(ranks))
+        rank.extend(ranks)
+    at, nth = np.array(lower), np.array(rank)
+
+    def nth_log(omega: FloatArray) -> FloatArray:
+        return log_moduli(loci(omega))[np.arange(omega.size), nth]
+
+    omega = bracketed_roots(nth_log, points[at], points[at + 1], logs[at, nth], logs[at + 1, nth])
+    outward = np.sign(above[at] - above[at + 1])
+    return _read_loci(loci, omega, outward)
+
+
+def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: float) -> list[UnitCrossing]:
+    """The crossings without those that rounding makes of a locus of modulus one at zero frequency.
+
+    Where A0 + z A1 is singular for some |z| = 1 (x' = -x - x(t - tau): z = -1), a locus tends to 1/z as the frequency
+    tends to zero, and its modulus differs from one by less than rounding. No finite delay belongs to it. A slow motion
+    that does cross, of a loop with fast ones beside it, has a locus that changes with the frequency at its own pace.
+    """
+    return [
+        crossing
+        for crossing in crossings
+        if crossing.omega > _SLOW * highest or not _is_flat(loci, crossing.omega, crossing.locus)
+    ]
+
+
+def _is_flat(loci: Loci, omega: float, locus: complex) -> bool:
+    rows = loci(np.array([omega / 2.0, 2.0 * omega]))
+    return bool(np.all(np.min(np.abs(rows - locus), axis=1) < _FLAT))
+
+
+def slope_sign(loci: Loci, omega: float, locus: complex) -> int:
+    """+1 when the modulus of this locus falls through one at omega, -1 when it rises, 0 when it does neither."""
+    # far above the accuracy of a locus, far below the distance of frequencies at which anything else happens
+    step = 1e-5 * omega
+    before, after = (_log(row[np.argmin(np.abs(row - locus))]) for row in loci(np.array([omega - step, omega + step])))
+    return 0 if before * after >= 0.0 else int(np.sign(before))
+
+
+def _read_loci(loci: Loci, omega: FloatArray, outward: NDArray[np.int_]) -> list[UnitCrossing]:
+    """Crossings at the frequencies found, loci that cross at one frequency told apart.
+
+    Loci of equal modulus at all frequencies (symmetric formations) change places in the sorted order from one
+    evaluation to the next, so all that cross at one place are read from one evaluation. Where the count goes up and
+    down at one place, by rounding or because loci cross in opposite directions, each locus is followed by itself.
+    """
+    order = np.argsort(omega, kind="stable")
+    omega, outward = omega[order], outward[order]
+    places = np.split(np.arange(omega.size), np.flatnonzero(np.diff(omega) > _SAME_PLACE * omega[1:]) + 1)
+    centres = np.array([omega[place].mean() for place in places])
+    crossings: list[UnitCrossing] = []
+    for place, centre, row in zip(places, centres.tolist(), loci(centres), strict=True):
+        from_one = np.abs(_log(row))
+        if np.unique(outward[place]).size == 1 and place.size <= row.size:
+            nearest = row[np.argsort(from_one)[: place.size]].tolist()
+            crossings += [UnitCrossing(centre, locus, int(outward[place[0]])) for locus in nearest]
+        else:
+            on_circle = row[from_one < _ON_CIRCLE].tolist()
+            crossings += [UnitCrossing(centre, locus, slope_sign(loci, centre, locus)) for locus in on_circle]
+    return crossings
+
+
+def _log(values: ComplexArray) -> FloatArray:
+    """Natural logarithms of the moduli, zero and infinity as large numbers."""
+    return np.log(np.clip(np.abs(values), 1e-300, 1e300))

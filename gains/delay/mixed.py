@@ -1,0 +1,246 @@
+"""Known delays beside one unknown: x'(t) = sum_i A_i x(t - d_i - k_i tau) with d_i in seconds and k_i whole.
+
+As in `gains.delay.commensurate` the loci lambda(j omega) = e^{j omega tau} are eigenvalues of a block companion matrix;
+the known delays merely make its blocks depend on the frequency by e^{-j omega d_i}. A root is on the imaginary axis
+where a modulus is one and goes right where the modulus falls, for every delay. What is lost is the algebra: the
+frequencies come from a sweep, fine enough for the turning of e^{-j omega d_i} and with extrema near one refined. The
+unstable roots without the unknown delay are counted by the argument principle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import ComplexArray, FloatArray, IntArray
+from gains.core.errors import BadModelError, DisagreementError
+from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
+from gains.delay.commensurate import column_space, companion_loci, highest_frequency
+from gains.delay.constant import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
+from gains.delay.crossing_error import DelayedTerm
+from gains.delay.crossings import AxisCrossing
+from gains.delay.loci import Loci, unit_crossings, without_limits_at_zero
+from gains.delay.sweep import near_unit_extrema
+from gains.delay.zero_root import zero_passage
+
+# rad by which e^{-j omega d} turns between neighbouring frequencies
+_TURN = 0.1
+_POINTS_PER_DECADE, _DECADES = 60, 9
+# more frequencies than this take more than a few seconds
+_MOST_POINTS = 60_000
+# rad by which the determinant may turn between neighbouring frequencies, and how often the grid is halved for it
+_DETERMINANT_TURN, _HALVINGS = 0.5, 40
+# where that begins if there is a root at zero itself, as a share of the highest frequency
+_LEAST_FREQUENCY = 1e-7
+
+
+@dataclass(frozen=True)
+class MixedTerm:
+    """A x(t - known_s - multiple * tau): `matrix` A real (n, n) in 1/s, `known_s` >= 0, `multiple` whole and >= 0.
+
+    Examples
+    --------
+    -x(t - 0.5 - 2 tau):
+
+    >>> from gains.delay.mixed import MixedTerm
+    >>> MixedTerm([[-1]], known_s=0.5, multiple=2)
+    MixedTerm(matrix=[[-1]], known_s=0.5, multiple=2)
+    """
+
+    matrix: ArrayLike
+    known_s: float
+    multiple: int
+
+
+def analyse_mixed(
+    terms: Sequence[MixedTerm], *, horizon_s: float | None = None, leave_out_zero: bool = False
+) -> DelayAnalysis:
+    """Stability windows, critical delays and margin in tau of x'(t) = sum A x(t - known_s - multiple tau).
+
+    `unstable_roots_at_zero_delay` counts the roots at tau = 0, with the known delays. Crossing frequencies come from
+    a sweep: a search, not a proof.
+
+    Parameters
+    ----------
+    terms
+        At least one.
+    horizon_s, leave_out_zero
+        As of `gains.delay.constant.analyse_delay`.
+
+    Raises
+    ------
+    BadModelError
+        No term, matrices that are not square, finite and of one size, a delay that is negative or not finite, known
+        delays so long that the sweep would be too large, or a horizon that is not a positive number.
+    DisagreementError
+        A root too close to the imaginary axis at tau = 0 to count it on either side.
+
+    Examples
+    --------
+    x'(t) = -x(t - 0.5 - tau) leaves pi / 2 - 0.5 for tau:
+
+    >>> from gains.delay.mixed import MixedTerm, analyse_mixed
+    >>> round(analyse_mixed([MixedTerm([[-1]], known_s=0.5, multiple=1)]).delay_margin_s, 6)
+    1.070796
+    """
+    matrices = _checked(terms)
+    check_horizon(horizon_s)
+    known_s, multiples = np.array([t.known_s for t in terms]), np.array([t.multiple for t in terms])
+    blocks = distinct_blocks(*matrices)
+    return combined_analysis([_analyse_block(block, known_s, multiples, leave_out_zero) for block in blocks], horizon_s)
+
+
+def _analyse_block(block: Block, known_s: FloatArray, multiples: IntArray, leave_out_zero: bool) -> BlockAnalysis:
+    parts = _Parts(np.array(balanced(*block.matrices)), known_s, multiples)
+    delayed = [DelayedTerm(*part) for part in zip(parts.matrices, known_s.tolist(), multiples.tolist(), strict=True)]
+    passage = zero_passage(parts.matrices, known_s, multiples) if leave_out_zero else None
+    if passage is None and is_singular_for_any_delay(parts.matrices):
+        return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
+    found = [AxisCrossing(*crossing) for crossing in _crossings(parts)]
+    unstable = _unstable_roots(parts, passage is not None)
+    return block_analysis(block.copies, delayed, found, unstable, passage, parts.highest())
+
+
+def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_zero: bool = False) -> int:
+    """Roots of x'(t) = sum A x(t - d) with positive real part, by the argument principle; no spectrum is computed.
+
+    Parameters
+    ----------
+    terms
+        Pairs (A, d): a real matrix (n, n) in 1/s and its delay in s.
+    leave_out_zero
+        A block whose matrices have a singular sum has a simple root at s = 0, which is not to be counted.
+
+    Raises
+    ------
+    BadModelError
+        As of `analyse_mixed`.
+    DisagreementError
+        A root too close to the imaginary axis to count it on either side.
+
+    Examples
+    --------
+    x'(t) = -x(t - 2), beyond its margin of pi / 2:
+
+    >>> from gains.delay.mixed import count_unstable_roots
+    >>> count_unstable_roots([([[-1]], 2.0)])
+    2
+    """
+    checked = [MixedTerm(matrix, delay_s, 0) for matrix, delay_s in terms]
+    blocks, delays_s = distinct_blocks(*_checked(checked)), np.array([term.known_s for term in checked])
+    count = 0
+    for block in blocks:
+        parts = _Parts(np.array(balanced(*block.matrices)), delays_s, np.zeros(len(checked), dtype=np.intp))
+        at_zero = leave_out_zero and is_singular_for_any_delay(parts.matrices)
+        count += block.copies * _unstable_roots(parts, at_zero)
+    return count
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """One block: `matrices` (terms, n, n), `known_s` (terms,), `multiples` (terms,)."""
+
+    matrices: FloatArray
+    known_s: FloatArray
+    multiples: IntArray
+
+    @property
+    def size(self) -> int:
+        return self.matrices.shape[1]
+
+    @property
+    def degree(self) -> int:
+        late = np.array([bool(matrix.any()) for matrix in self.matrices])
+        return int(self.multiples[late].max(initial=0))
+
+    def at(self, omega: FloatArray) -> ComplexArray:
+        """The sums of A_i e^{-j omega d_i} of each multiple 0, ..., m, shape (frequencies, m + 1, n, n)."""
+        turned = np.exp(-1j * omega[:, np.newaxis] * self.known_s)[:, :, np.newaxis, np.newaxis] * self.matrices
+        return np.stack([turned[:, self.multiples == k].sum(axis=1) for k in range(self.degree + 1)], axis=1)
+
+    def highest(self) -> float:
+        """Bound (rad/s) of every root on the imaginary axis."""
+        at_once = (self.known_s == 0.0) & (self.multiples == 0)
+        return highest_frequency([self.matrices[at_once].sum(axis=0), *self.matrices[~at_once]])
+
+    def frequencies(self, highest: float) -> FloatArray:
+        turning = np.linspace(0.0, highest, int(highest * float(self.known_s.max()) / _TURN) + 200)
+        decades = highest * np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE)
+        # away from poles of the resolvent on the axis at round numbers
+        return np.union1d(turning[1:], decades) * (1.0 + 1e-9)
+
+
+def _crossings(parts: _Parts) -> list[tuple[float, float, int]]:
+    """Frequency, angle theta = omega tau modulo 2 pi and direction of every crossing of the imaginary axis."""
+    if parts.degree == 0:
+        return []
+    loci = _loci(parts)
+    omega = parts.frequencies(1.1 * parts.highest())
+    omega = np.union1d(omega, near_unit_extrema(loci, omega))
+    return [
+        (crossing.omega, float(np.angle(crossing.locus)) % (2.0 * pi), crossing.outward)
+        for crossing in without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
+    ]
+
+
+def _loci(parts: _Parts) -> Loci:
+    late = [matrix for matrix, k in zip(parts.matrices, parts.multiples, strict=True) if k > 0]
+    return companion_loci(parts.at, column_space(late))
+
+
+def _unstable_roots(parts: _Parts, at_zero: bool) -> int:
+    """Roots with positive real part at tau = 0: turns of det(j omega I - A(j omega)) / (j omega + c)^n.
+
+    The quotient is analytic in the right half plane and tends to one, so it winds around zero once for each root
+    there as omega goes from infinity to minus infinity. A simple root at zero itself is divided out if `at_zero`.
+    """
+    identity, scale = np.eye(parts.size), parts.highest() + float(np.linalg.norm(parts.matrices[0]))
+
+    def phase(omega: FloatArray) -> ComplexArray:
+        matrix = 1j * omega[:, np.newaxis, np.newaxis] * identity - parts.at(omega).sum(axis=1)
+        # s + c in the denominator once for each state, but not for the root s = j omega that is divided out
+        counted = parts.size * np.angle(1j * omega + scale)
+        if at_zero:
+            counted += pi / 2.0 - np.angle(1j * omega + scale)
+        return np.linalg.slogdet(matrix)[0] * np.exp(-1j * counted)
+
+    far = parts.highest() * np.logspace(0.0, 4.0, 100)
+    omega = np.unique(np.concatenate([[0.0], parts.frequencies(parts.highest()), far]))
+    if at_zero:
+        # nearer to zero the determinant is rounding, and it is real there up to the frequency itself
+        omega = omega[omega > _LEAST_FREQUENCY * parts.highest()]
+    values = phase(omega)
+    for _ in range(_HALVINGS):
+        turns = np.angle(values[1:] / values[:-1])
+        coarse = np.flatnonzero(np.abs(turns) > _DETERMINANT_TURN)
+        if coarse.size == 0:
+            break
+        between = (omega[coarse] + omega[coarse + 1]) / 2.0
+        omega = np.insert(omega, coarse + 1, between)
+        values = np.insert(values, coarse + 1, phase(between))
+    else:
+        raise DisagreementError("a root is too close to the imaginary axis at tau = 0 to count it on either side")
+    # from the far end, where the quotient is one up to a few n / 10^4, to zero, where it is real
+    total = float(np.angle(values[-1])) - float(np.sum(np.angle(values[1:] / values[:-1])))
+    return round(total / pi)
+
+
+def _checked(terms: Sequence[MixedTerm]) -> list[FloatArray]:
+    if len(terms) == 0:
+        raise BadModelError("terms is empty; at least one is wanted")
+    for i, term in enumerate(terms):
+        if not (np.isfinite(term.known_s) and term.known_s >= 0.0):
+            raise BadModelError(f"terms[{i}].known_s is {term.known_s}; a number of seconds >= 0 is wanted")
+        if term.multiple < 0:
+            raise BadModelError(f"terms[{i}].multiple is {term.multiple}; a whole number >= 0 is wanted")
+    matrices = square_matrices(**{f"terms[{i}].matrix": term.matrix for i, term in enumerate(terms)})
+    longest_s = max(term.known_s for term in terms)
+    points = longest_s * sum(float(np.linalg.norm(matrix)) for matrix in matrices) / _TURN
+    if points > _MOST_POINTS:
+        raise BadModelError(
+            f"the longest known delay is {longest_s} s, which takes {points:.3g} frequencies; "
+            f"at most {_MOST_POINTS} are wanted"
+        )
+    return matrices

@@ -1,0 +1,145 @@
+"""Rightmost root of a linear system with any number of constant delays: the spectrum at given delays.
+
+x'(t) = sum_k A_k x(t - tau_k) is the abstract ordinary equation u' = D u on functions over [-tau_max, 0] with the
+equation itself as boundary condition. On Chebyshev points D is a matrix whose eigenvalues approximate the roots;
+Newton's method on the characteristic matrix makes the rightmost ones exact.
+
+This approach and others are compared in D. Breda, "Methods for numerical computation of characteristic roots for delay
+differential equations: experimental comparison", Scientiae Mathematicae Japonicae Online 8 (2003), 317-328.
+"""
+
+from collections.abc import Sequence
+from math import ceil
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.errors import BadModelError
+from gains.core.structure import Block, balanced, distinct_blocks, square_matrices
+
+# a starting value for Newton's method is wanted, not the root: 12 points, and one more for every two radians of |s| tau
+_POINTS = 12
+# a larger discretisation than this takes tens of seconds
+_LARGEST_MATRIX = 1500
+
+
+def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
+    """The root of det(sI - sum_k A_k e^{-s tau_k}) with the largest real part (1/s), imaginary part >= 0.
+
+    Parameters
+    ----------
+    terms
+        Pairs (A_k, tau_k): a real matrix (n, n) in 1/s and its delay in s; zero for what acts at once.
+
+    Raises
+    ------
+    BadModelError
+        No term, matrices that are not square, finite and of one size, a delay that is negative or not finite, or
+        delays so long against the time constants that the discretisation would be too large.
+
+    Examples
+    --------
+    At tau = pi / 2 x'(t) = -x(t - tau) has the roots +-j, and with tau = 1 one that is Lambert's W(-1):
+
+    >>> from math import pi
+    >>> from gains.delay.rightmost import rightmost_root
+    >>> rightmost, later = (rightmost_root([([[-1]], delay_s)]) for delay_s in (1, pi / 2))
+    >>> round(rightmost.real, 6), round(rightmost.imag, 6), round(later.imag, 6)
+    (-0.318132, 1.337236, 1.0)
+    """
+    if len(terms) == 0:
+        raise BadModelError("terms is empty; at least one pair (matrix, delay) is wanted")
+    delays = np.array([float(delay_s) for _, delay_s in terms])
+    if not (np.isfinite(delays).all() and (delays >= 0.0).all()):
+        raise BadModelError(f"terms have the delays {delays.tolist()}; finite numbers of seconds >= 0 are wanted")
+    matrices = square_matrices(**{f"terms[{k}]": matrix for k, (matrix, _) in enumerate(terms)})
+    roots = [_rightmost_of_block(block, delays) for block in distinct_blocks(*matrices)]
+    return max(roots, key=lambda root: root.real)
+
+
+def _rightmost_of_block(block: Block, delays: FloatArray) -> complex:
+    matrices = np.array(balanced(*block.matrices))
+    late = np.array([bool(matrix.any()) for matrix in matrices]) & (delays > 0.0)
+    if not late.any():
+        return _upper(max(np.linalg.eigvals(matrices.sum(axis=0)).astype(np.complex128), key=lambda root: root.real))
+    matrices = np.concatenate([matrices[~late].sum(axis=0)[np.newaxis], matrices[late]])
+    delays = np.concatenate([[0.0], delays[late]])
+    approximations = _pseudospectral_roots(matrices, delays)
+    # the rightmost approximation need not be the rightmost root: all within its own error band are refined
+    order = np.argsort(-approximations.real)
+    best = approximations[order[0]]
+    band = 0.05 * (abs(best) + 1.0 / delays.max())
+    near = [root for root in approximations[order].tolist() if root.real > best.real - band and root.imag >= 0.0]
+    refined = [_newton(matrices, delays, root) for root in near[:12]]
+    return _upper(max(refined, key=lambda root: root.real))
+
+
+def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray) -> ComplexArray:
+    """Eigenvalues of the discretised generator; block row 0 is the equation, the others differentiate."""
+    n, longest = matrices.shape[1], float(delays.max())
+    # roots near or right of the axis have |Im s| below this bound
+    turning = float(np.linalg.norm((matrices[0] - matrices[0].T) / 2.0, 2))
+    highest = turning + float(np.linalg.norm(matrices[1:], 2, axis=(1, 2)).sum())
+    points = _POINTS + highest * longest / 2.0
+    if not n * (points + 1.0) <= _LARGEST_MATRIX:
+        raise BadModelError(
+            f"the longest delay is {longest} s and a block of {n} states may oscillate at {highest:.3g} rad/s, "
+            f"which takes {points:.3g} points; n times points below {_LARGEST_MATRIX} is wanted"
+        )
+    points = ceil(points)
+    nodes, derivative = _chebyshev(points)
+    generator = np.kron(derivative * (2.0 / longest), np.eye(n))
+    rows = np.array([_lagrange_row(nodes, 1.0 - 2.0 * delay / longest) for delay in delays])
+    generator[:n] = np.einsum("kp,kij->ipj", rows, matrices).reshape(n, -1)
+    return np.linalg.eigvals(generator).astype(np.complex128)
+
+
+def _chebyshev(points: int) -> tuple[FloatArray, FloatArray]:
+    """Chebyshev points 1 = x_0 > ... > x_N = -1 and the differentiation matrix on them.
+
+    The diagonal is the negative sum of its row, so that a constant has derivative zero to the last bit.
+    """
+    k = np.arange(points + 1)
+    nodes = np.cos(np.pi * k / points)
+    weights = np.where((k == 0) | (k == points), 2.0, 1.0) * (-1.0) ** k
+    difference = nodes[:, np.newaxis] - nodes + np.eye(points + 1)
+    derivative = np.outer(weights, 1.0 / weights) / difference
+    return nodes, derivative - np.diag(derivative.sum(axis=1))
+
+
+def _lagrange_row(nodes: FloatArray, at: float) -> FloatArray:
+    """Values at one abscissa of the Lagrange polynomials on Chebyshev points (barycentric formula)."""
+    distance = at - nodes
+    hit = np.abs(distance) < 1e-14
+    if hit.any():
+        return hit.astype(np.float64) / np.count_nonzero(hit)
+    weights = (-1.0) ** np.arange(nodes.size) / distance
+    weights[[0, -1]] /= 2.0
+    return weights / weights.sum()
+
+
+def _newton(matrices: FloatArray, delays: FloatArray, root: complex) -> complex:
+    """Newton steps on u*M(s)v = 0 with the singular vectors of the least singular value of M(s); the best iterate.
+
+    An iteration that runs away from its start (a multiple root, or an approximation that is none) returns the start.
+    """
+    identity = np.eye(matrices.shape[1])
+    best, best_value, s = root, np.inf, root
+    for _ in range(20):
+        factors = np.exp(-s * delays)[:, np.newaxis, np.newaxis] * matrices
+        U, singular, Vh = np.linalg.svd(s * identity - factors.sum(axis=0))
+        if singular[-1] < best_value:
+            best, best_value = s, float(singular[-1])
+        slope = U[:, -1].conj() @ (identity + np.einsum("k,kij->ij", delays, factors)) @ Vh[-1].conj()
+        if slope == 0.0:
+            break
+        step = complex(singular[-1] / slope)
+        s -= step
+        if abs(step) <= 4e-16 * abs(s) or abs(s - root) > 0.1 * (abs(root) + 1.0 / float(delays.max())):
+            break
+    return best
+
+
+def _upper(root: complex) -> complex:
+    return complex(root.real, abs(root.imag))

@@ -1,0 +1,307 @@
+"""Several independent delays, one for each link: which combinations does the loop take?
+
+x'(t) = A0 x(t) + A1 x(t - tau_1) + A2 x(t - tau_2) has a root j omega where det(j omega I - A0 - A1 e^{-j alpha} -
+A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. Fixing alpha leaves one delay and a complex A0, whose
+crossings are found along the unit circle of beta; from them the curves of solutions (omega, alpha, beta) are followed.
+Each solution belongs to the delays ((alpha + 2 pi p) / omega, (beta + 2 pi q) / omega), p and q whole: the crossing
+curves of the delay plane, across which the number of unstable roots changes. The edge of the stable region is made of
+the pieces with no root to the right of them.
+
+A leader-follower formation is block triangular, and when each block knows one delay only, the region is a rectangle
+(`delay_box`).
+
+See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, which parameterises the
+same curves.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import ceil, inf, isfinite, pi
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+from gains.core.structure import distinct_blocks, real_matrix, square_matrices
+from gains.delay.constant import delay_margin
+from gains.delay.curves import Curve, at_delay, crossing_solutions
+from gains.delay.rightmost import rightmost_root
+
+# a rightmost root counts as on the axis when it is this close to it, relative to its own size
+_ON_AXIS = 1e-6
+# pieces of a crossing curve shorter than this many points are corners that touch the box
+_LEAST_POINTS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Polyline:
+    """Delays (tau_1, tau_2) `delays_s` (k, 2) with roots +-j `omega_rad_s` (k,) on the imaginary axis."""
+
+    delays_s: FloatArray
+    omega_rad_s: FloatArray
+
+
+@dataclass(frozen=True)
+class DelayBox:
+    """Which delays tau_1, ..., tau_m the loop takes independently of each other.
+
+    `limits_s` is the limit of each delay as far as blocks with that delay alone set it; `inf` without limit, and all
+    zero if a block is unstable without delay. `coupled` lists the sets of delays (indices into the delays) that meet
+    in one block, where the limits of one depend on the others. With `coupled` empty the box is exact: the loop is
+    stable at every delay inside, and loses stability on its faces.
+    """
+
+    limits_s: tuple[float, ...]
+    coupled: tuple[frozenset[int], ...]
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether no limit depends on another delay."""
+        return not self.coupled
+
+
+def stable_at(A0: ArrayLike, late: Sequence[ArrayLike], delays_s: Sequence[float]) -> bool:
+    """Whether x'(t) = A0 x(t) + sum_k late[k] x(t - delays_s[k]) is asymptotically stable.
+
+    Parameters
+    ----------
+    A0, late
+        Real matrices (n, n), 1/s: what acts at once, and what acts late, one for each delay.
+
+    Raises
+    ------
+    BadModelError
+        As of `gains.delay.rightmost.rightmost_root`, or there are not as many delays as late matrices.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau_1) - x(t - tau_2) is stable up to pi / 4 = 0.785 if the delays are equal:
+
+    >>> from gains.delay.several import stable_at
+    >>> stable_at([[0]], [[[-1]], [[-1]]], [0.78, 0.78]), stable_at([[0]], [[[-1]], [[-1]]], [0.79, 0.79])
+    (True, False)
+    """
+    if len(late) != len(delays_s):
+        raise BadModelError(f"delays_s has {len(delays_s)} delays; {len(late)} are wanted, as late matrices")
+    return rightmost_root([(A0, 0.0), *zip(late, delays_s, strict=True)]).real < 0.0
+
+
+def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
+    """The rectangle of delays that x'(t) = A0 x(t) + sum_k late[k] x(t - tau_k) takes, block by block.
+
+    Couplings between strongly connected blocks do not count: in a leader-follower tree with one delay for each vehicle
+    every block has one delay, and the box is exact.
+
+    Parameters
+    ----------
+    A0, late
+        Real matrices (n, n), 1/s: what acts at once, and what acts tau_1, tau_2, ... late.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size.
+
+    Examples
+    --------
+    x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2): up to pi / 2 and pi / 4, whatever the other delay.
+
+    >>> from gains.delay.several import delay_box
+    >>> box = delay_box([[0, 0], [1, 0]], [[[-1, 0], [0, 0]], [[0, 0], [0, -2]]])
+    >>> [round(limit_s, 6) for limit_s in box.limits_s], box.is_exact
+    ([1.570796, 0.785398], True)
+    """
+    now, *delayed = square_matrices(A0=A0, **{f"late[{k}]": matrix for k, matrix in enumerate(late)})
+    limits_s = [inf] * len(delayed)
+    coupled: list[frozenset[int]] = []
+    for block in distinct_blocks(now, *delayed):
+        here, *parts = block.matrices
+        acting = [k for k, part in enumerate(parts) if part.any()]
+        if float(np.linalg.eigvals(here + sum(parts, np.zeros_like(here))).real.max()) >= 0.0:
+            return DelayBox((0.0,) * len(delayed), ())
+        if len(acting) == 1:
+            limits_s[acting[0]] = min(limits_s[acting[0]], delay_margin(here, parts[acting[0]]))
+        elif len(acting) > 1 and frozenset(acting) not in coupled:
+            coupled.append(frozenset(acting))
+    return DelayBox(tuple(limits_s), tuple(coupled))
+
+
+def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list[FloatArray]:
+    """The part of B K that each vehicle's command contributes, one matrix (n, n) a vehicle: its own delayed term.
+
+    Parameters
+    ----------
+    B, K
+        (n, p) and (p, n), u = K x.
+    inputs
+        For each vehicle the place of its command in u, as `gains.formation.model.FormationModel.input_slice`.
+
+    Raises
+    ------
+    BadModelError
+        B or K is not a matrix of finite numbers, or their shapes do not fit.
+
+    Examples
+    --------
+    Two vehicles of one axis, each with a command of its own:
+
+    >>> from gains.delay.several import late_by_vehicle
+    >>> [late.tolist() for late in late_by_vehicle([[1, 0], [0, 1]], [[-1, 0], [1, -1]], [slice(0, 1), slice(1, 2)])]
+    [[[-1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [1.0, -1.0]]]
+    """
+    entry, feedback = real_matrix("B", B), real_matrix("K", K)
+    if feedback.shape != entry.shape[::-1]:
+        raise BadModelError(f"K has shape {feedback.shape}; {entry.shape[::-1]} is wanted, the transpose of B's")
+    return [entry[:, place] @ feedback[place] for place in inputs]
+
+
+def crossing_curves(
+    A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, *, longest_s: tuple[float, float]
+) -> tuple[Polyline, ...]:
+    """All curves in the plane of two delays along which roots lie on the imaginary axis, up to `longest_s`.
+
+    On every point the least singular value of the characteristic matrix is zero to rounding. Curves are followed from
+    crossings on a grid of angles: a search, not a proof.
+
+    Parameters
+    ----------
+    A0, A1, A2
+        Real matrices (n, n), 1/s: what acts at once, tau_1 late and tau_2 late.
+    longest_s
+        The largest tau_1 and tau_2 of interest.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size, or a longest delay is not positive and finite.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) has roots +-j omega with 0.5 <= omega <= 1.5 only:
+
+    >>> from gains.delay.several import crossing_curves
+    >>> curves = crossing_curves([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
+    >>> all(0.49 < line.omega_rad_s.min() <= line.omega_rad_s.max() < 1.51 for line in curves)
+    True
+    """
+    if not all(isfinite(longest) and longest > 0.0 for longest in longest_s):
+        raise BadModelError(f"longest_s is {longest_s}; two positive numbers of seconds are wanted")
+    now, first, second = square_matrices(A0=A0, A1=A1, A2=A2)
+    lines: list[Polyline] = []
+    for block in distinct_blocks(now, first, second):
+        for curve in crossing_solutions(*block.matrices):
+            lines += _offspring(block.matrices, curve, longest_s)
+    return tuple(lines)
+
+
+def boundary_of_two_delays(
+    A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, *, longest_s: tuple[float, float]
+) -> tuple[Polyline, ...]:
+    """The edge of the stable region in the plane of two delays, up to `longest_s`: pieces of `crossing_curves`.
+
+    A piece is part of the edge when no root lies to the right of the axis on it. The edge may surround several
+    regions, and the axes and `longest_s` bound it where no piece does. Arguments and exceptions as of
+    `crossing_curves`.
+
+    Examples
+    --------
+    Without tau_2 the loop x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) takes tau_1 up to acos(-0.5) / sqrt(0.75) = 2.4184:
+
+    >>> from gains.delay.several import boundary_of_two_delays
+    >>> edge = boundary_of_two_delays([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
+    >>> at_once = min((pair for line in edge for pair in line.delays_s.tolist()), key=lambda pair: pair[1])
+    >>> round(at_once[0], 4), at_once[1]
+    (2.4184, 0.0)
+    """
+    pieces: list[Polyline] = []
+    for line in crossing_curves(A0, A1, A2, longest_s=longest_s):
+        edge = np.array([_is_edge(A0, A1, A2, pair) for pair in line.delays_s.tolist()])
+        pieces += _runs(line, edge)
+    return tuple(pieces)
+
+
+def _is_edge(A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, delays_s: list[float]) -> bool:
+    root = rightmost_root([(A0, 0.0), (A1, delays_s[0]), (A2, delays_s[1])])
+    return root.real <= _ON_AXIS * abs(root)
+
+
+def _offspring(matrices: tuple[FloatArray, ...], curve: Curve, longest_s: tuple[float, float]) -> Iterator[Polyline]:
+    """The images of one curve of solutions in the box of delays, for all whole turns p and q."""
+    omega = curve.omega
+    turns = [
+        range(
+            ceil(float((-angle / (2.0 * pi)).min())),
+            int(np.floor(float(((longest * omega - angle) / (2.0 * pi)).max()))) + 1,
+        )
+        for angle, longest in ((curve.alpha, longest_s[0]), (curve.beta, longest_s[1]))
+    ]
+    for p in turns[0]:
+        for q in turns[1]:
+            delays_s = np.stack([(curve.alpha + 2.0 * pi * p) / omega, (curve.beta + 2.0 * pi * q) / omega], axis=1)
+            yield from _inside(matrices, curve, Polyline(delays_s, omega), (p, q), longest_s)
+
+
+def _inside(
+    matrices: tuple[FloatArray, ...],
+    curve: Curve,
+    line: Polyline,
+    turns: tuple[int, int],
+    longest_s: tuple[float, float],
+) -> Iterator[Polyline]:
+    """The stretches of a polyline within the box, each up to the point at which the curve enters or leaves it."""
+    delays_s = line.delays_s
+    inside = np.all((delays_s >= 0.0) & (delays_s <= np.array(longest_s)), axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        points, omega = delays_s[begin:end], line.omega_rad_s[begin:end]
+        for last, beyond, at in ((begin, begin - 1, 0), (end - 1, end, end - begin)):
+            if 0 <= beyond < len(delays_s):
+                edge = _edge_point(matrices, curve, delays_s, (last, beyond), turns, longest_s)
+                if edge is not None:
+                    place = 0 if at == 0 else len(points)
+                    points, omega = np.insert(points, place, edge[0], axis=0), np.insert(omega, place, edge[1])
+        if len(points) >= _LEAST_POINTS:
+            yield Polyline(points, omega)
+
+
+def _edge_point(
+    matrices: tuple[FloatArray, ...],
+    curve: Curve,
+    delays_s: FloatArray,
+    between: tuple[int, int],
+    turns: tuple[int, int],
+    longest_s: tuple[float, float],
+) -> tuple[FloatArray, float] | None:
+    """Delays and frequency where the curve passes the edge of the box between a vertex inside and the next outside."""
+    last, beyond = between
+    here, there = delays_s[last], delays_s[beyond]
+    # the edge that is met first on the chord
+    met = [
+        ((bound_s - float(here[which])) / float(there[which] - here[which]), which, bound_s)
+        for which in (0, 1)
+        for bound_s in (0.0, longest_s[which])
+        if ((there[which] < 0.0) if bound_s == 0.0 else (there[which] > bound_s))
+    ]
+    if not met or min(met)[0] <= 0.0:
+        return None
+    share, which, bound_s = min(met)
+    vertices = np.stack([curve.omega, curve.alpha, curve.beta], axis=1)
+    start = vertices[last] + share * (vertices[beyond] - vertices[last])
+    found = at_delay(matrices, start, which=which, delay_s=bound_s, turns=turns[which])
+    if found is None:
+        return None
+    pair_s = (found[1:] + 2.0 * pi * np.array(turns)) / found[0]
+    pair_s[which] = bound_s
+    # the curve may leave by another edge before that
+    if not bool(np.all((pair_s >= 0.0) & (pair_s <= np.array(longest_s)))):
+        return None
+    return pair_s, float(found[0])
+
+
+def _runs(line: Polyline, kept: NDArray[np.bool_]) -> Iterator[Polyline]:
+    """The stretches of a polyline whose points are all kept."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(np.int8)))
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if end - begin >= _LEAST_POINTS:
+            yield Polyline(line.delays_s[begin:end], line.omega_rad_s[begin:end])

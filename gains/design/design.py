@@ -1,0 +1,370 @@
+"""Overlapping gains for a formation, with the delay they take and the disturbance they withstand.
+
+`design` finds gains of largest robustness α with a wanted delay margin, or of largest delay margin with a wanted α;
+`evaluate_gains` says the same of gains that are given. Both check their result with the functions of
+`gains.delay.constant`, `gains.sampled.constant`, `gains.performance.robust` and `gains.formation.inclusion` on the
+whole formation.
+
+The margin that is asked for is that of the loop really flown: `sampled`, with period and zero-order hold, and `ground`,
+with all feedback late. It is about half a period less than the continuous one. Both are reported.
+
+Source: Sahoo 2012 (see `gains.formation.model`), sections 3 and 5.
+"""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal, Self, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError, DisagreementError, SolverError
+from gains.core.requirement import ALPHA_MIN, Requirement, plain
+from gains.delay.constant import delay_margin
+from gains.design.graph import GraphDesign, GraphMethod, graph_design
+from gains.design.required import required_gains
+from gains.design.search import largest_alpha
+from gains.formation.model import FormationModel, checked_gain
+from gains.formation.pattern import Pattern, leader_follower
+from gains.performance.behaviour import (
+    Behaviour,
+    BlockMargin,
+    Gains,
+    behaviour,
+    block_margin,
+    follower_block,
+    leader_block,
+)
+from gains.performance.robust import Certificate, SolverFacts, certify, robustness
+from gains.sampled.constant import sampled_delay_margin
+
+PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
+# The certificate proves this share of α: at α itself the proof is on the edge of existence.
+_CERTIFIED_SHARE = 1 - 1e-4
+# A decay rate that is asked for is met to this share of itself: a double root is known to the root of the rounding.
+_DECAY_ROUNDING = 1e-6
+_TRADE_OFF_MARGINS_S = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
+
+
+@dataclass(frozen=True)
+class TradeOffPoint:
+    """Largest α (exact, W = I) at a sampled delay margin."""
+
+    delay_margin_s: float
+    alpha: float
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Gains, what they are good for, and how that is known.
+
+    Attributes
+    ----------
+    K1, K2, K3
+        Gains on the own velocity error (1/s), that of the vehicle in front (1/s) and the spacing error (1/s²), each of
+        shape (axes, axes).
+    alpha
+        Exact sector bound for W = I, `gains.performance.robust.robustness`; 0 if the loop is unstable.
+    certificate
+        Lyapunov proof of 0.9999 α; None if the loop is unstable, its α is below 5e-4, or the solver finds none for
+        given gains.
+    delay_margin_s, delay_margin_continuous_s
+        Margin of the sampled loop and of the continuous one, all feedback late.
+    leader, follower
+        The continuous margin block by block.
+    trade_off
+        Points of the curve of best designs with this period and limit on spacing errors.
+    """
+
+    K1: FloatArray
+    K2: FloatArray
+    K3: FloatArray
+    alpha: float
+    delay_margin_s: float
+    delay_margin_continuous_s: float
+    period_s: float
+    vehicles: int
+    leader: BlockMargin
+    follower: BlockMargin
+    behaviour: Behaviour
+    certificate: Certificate | None
+    requirement: Requirement | None = None
+    trade_off: tuple[TradeOffPoint, ...] = field(default=())
+    method: Literal["inclusion", "given"] = "inclusion"
+    loop: Literal["ground"] = "ground"
+    pattern: str = PATTERN
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists, numbers and strings, for JSON; a number that is not finite becomes None."""
+        renamed = {"K1": "K1_1_s", "K2": "K2_1_s", "K3": "K3_1_s2"}
+        return {renamed.get(name, name): plain(value) for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Return the design that `to_dict` was called on.
+
+        Raises
+        ------
+        BadModelError
+            If a field is missing or is not of the kind wanted.
+        """
+        try:
+            certificate, requirement = data["certificate"], data["requirement"]
+            return cls(
+                K1=np.array(data["K1_1_s"], dtype=float),
+                K2=np.array(data["K2_1_s"], dtype=float),
+                K3=np.array(data["K3_1_s2"], dtype=float),
+                alpha=_number(data["alpha"]),
+                delay_margin_s=_number(data["delay_margin_s"]),
+                delay_margin_continuous_s=_number(data["delay_margin_continuous_s"]),
+                period_s=_number(data["period_s"]),
+                vehicles=int(data["vehicles"]),
+                leader=BlockMargin(**_numbers(data["leader"])),
+                follower=BlockMargin(**_numbers(data["follower"])),
+                behaviour=Behaviour(**_numbers(data["behaviour"])),
+                certificate=None if certificate is None else _certificate_from(certificate),
+                requirement=None if requirement is None else Requirement(**requirement),
+                trade_off=tuple(TradeOffPoint(**_numbers(point)) for point in data["trade_off"]),
+                method=data["method"],
+                loop=data["loop"],
+                pattern=data["pattern"],
+            )
+        except KeyError as error:
+            raise BadModelError(f"the design has no field {error}; wanted all fields that to_dict writes") from error
+        except (TypeError, AttributeError) as error:
+            raise BadModelError(f"the design is not as to_dict writes it: {error}") from error
+
+
+@overload
+def design(
+    formation: FormationModel,
+    requirement: Requirement | None = None,
+    *,
+    period_s: float,
+    method: Literal["inclusion"] = "inclusion",
+) -> Design: ...
+
+
+@overload
+def design(
+    formation: FormationModel,
+    requirement: Requirement | None = None,
+    *,
+    period_s: float,
+    method: GraphMethod,
+    pattern: Pattern | None = None,
+) -> GraphDesign: ...
+
+
+def design(
+    formation: FormationModel,
+    requirement: Requirement | None = None,
+    *,
+    period_s: float,
+    method: Literal["inclusion"] | GraphMethod = "inclusion",
+    pattern: Pattern | None = None,
+) -> Design | GraphDesign:
+    """Return the gains that meet the requirement and are the best in what it leaves open.
+
+    Parameters
+    ----------
+    formation
+        A leader and any number of followers. The gains of a leader alone are those for followers too, but its margin is
+        that of its own velocity loop.
+    requirement
+        A sampled delay margin of 0.3 s if not given.
+    period_s
+        Period of the control loop: sample, hold.
+    method
+        The inclusion principle, or a method of the graph route, see `gains.design.graph`.
+    pattern
+        For the graph route, who may use whose output; the leader-follower pattern (4.6) if not given.
+
+    Raises
+    ------
+    BadModelError
+        If the period is not positive.
+    InfeasibleError
+        If no gains meet the requirement; the message says what can be reached.
+    DisagreementError
+        If the exact analysis contradicts the search.
+
+    Examples
+    --------
+    A leader and two followers in a chain, with a delay margin of 0.3 s at 50 Hz:
+
+    >>> from gains.design.design import design
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.core.requirement import Requirement
+    >>> found = design(FormationModel((-1, 0, 1)), Requirement(delay_margin_s=0.3), period_s=0.02)
+    >>> round(found.delay_margin_s, 4), found.K1.shape
+    (0.3, (2, 2))
+    """
+    if method != "inclusion":
+        links = leader_follower(formation) if pattern is None else pattern
+        return graph_design(formation, links, requirement, method=method, period_s=period_s)
+    wanted = Requirement() if requirement is None else requirement
+    _check_period(period_s)
+    gains = required_gains(wanted, period_s)
+    identity = np.eye(formation.axes)
+    result = _assess(
+        formation,
+        (0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity),
+        period_s=period_s,
+        requirement=wanted,
+        method="inclusion",
+    )
+    short_of_margin = wanted.delay_margin_s is not None and result.delay_margin_s < wanted.delay_margin_s
+    short_of_alpha = wanted.alpha is not None and result.alpha < wanted.alpha
+    decay = result.behaviour.decay_rate_1_s
+    short_of_decay = decay < (1.0 - _DECAY_ROUNDING) * (wanted.decay_rate_1_s or 0.0)
+    if short_of_margin or short_of_alpha or short_of_decay:
+        raise DisagreementError(
+            f"the search found gains for {wanted}, but the exact analysis gives them delay_margin_s = "
+            f"{result.delay_margin_s!r}, alpha = {result.alpha!r} and decay_rate_1_s = {decay!r}"
+        )
+    return result
+
+
+def evaluate_gains(
+    formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, *, period_s: float
+) -> Design:
+    """Return margins, α and behaviour of given gains, each of shape (axes, axes).
+
+    Gains of an unstable loop are reported too: α and the continuous margin are 0 and there is no certificate.
+
+    Raises
+    ------
+    BadModelError
+        If a gain is not finite or not of that shape, or the period is not positive.
+
+    Examples
+    --------
+    K1 = −1, K3 = 1: a follower takes 0.711119 s, or half a period less when sampled.
+
+    >>> from gains.design.design import evaluate_gains
+    >>> from gains.formation.model import FormationModel
+    >>> found = evaluate_gains(FormationModel((-1, 0), axes=1), [[-1]], [[0]], [[1]], period_s=0.02)
+    >>> round(found.delay_margin_continuous_s, 6), round(found.delay_margin_s, 3)
+    (0.711119, 0.701)
+    """
+    _check_period(period_s)
+    own, front, spacing = (
+        checked_gain(name, gain, formation.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
+    )
+    return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None, method="given")
+
+
+def _assess(
+    formation: FormationModel,
+    gains: Gains,
+    *,
+    period_s: float,
+    requirement: Requirement | None,
+    method: Literal["inclusion", "given"],
+) -> Design:
+    """Everything that is reported of the gains, by the exact methods and on the whole formation."""
+    # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
+    from gains.formation.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
+
+    A, B, K = formation.A, formation.B, formation.overlapping_gain(*gains)
+    expansion, K_expanded = expand(formation), modified_gain(formation, expanded_gain(formation, *gains))
+    verify_inclusion(expansion, A, B, K=K, K_expanded=K_expanded)
+
+    alpha = robustness(*gains)
+    margin_s = float(sampled_delay_margin(A, B, K, period_s=period_s))
+    continuous_s = delay_margin(A, B @ K)
+    leader, follower = block_margin(*leader_block(gains)), block_margin(*follower_block(gains))
+    blocks_s = [leader.delay_margin_s, follower.delay_margin_s][: formation.vehicles]
+    if not np.isclose(continuous_s, min(blocks_s), rtol=1e-9, atol=0):
+        raise DisagreementError(
+            f"the formation's delay margin is {continuous_s!r}, those of its leader and followers are {blocks_s}; "
+            "wanted the least of them"
+        )
+    return Design(
+        K1=gains[0],
+        K2=gains[1],
+        K3=gains[2],
+        alpha=alpha,
+        delay_margin_s=margin_s,
+        delay_margin_continuous_s=continuous_s,
+        period_s=period_s,
+        vehicles=formation.vehicles,
+        leader=leader,
+        follower=follower,
+        behaviour=behaviour(gains, (margin_s + period_s) / 2),
+        certificate=_certificate(gains, alpha, given=method == "given"),
+        requirement=requirement,
+        trade_off=trade_off(
+            period_s=period_s,
+            string_peak_max=requirement.string_peak_max if requirement else None,
+            loop=requirement.loop if requirement else "ground",
+        ),
+        method=method,
+    )
+
+
+def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | None:
+    """The proof of α. Given gains, however badly scaled, are assessed without one where the solver finds none."""
+    if alpha < ALPHA_MIN:
+        return None
+    try:
+        return certify(*gains, _CERTIFIED_SHARE * alpha)
+    except SolverError:
+        if given:
+            return None
+        raise
+
+
+def trade_off(
+    *, period_s: float, string_peak_max: float | None = None, loop: Literal["ground", "onboard"] = "ground"
+) -> tuple[TradeOffPoint, ...]:
+    """Return the largest α at sampled delay margins from 0.05 to 1 s; margins no gains have are left out.
+
+    Parameters
+    ----------
+    period_s
+        Period of the control loop: sample, hold.
+    string_peak_max, loop
+        As in `gains.core.requirement.Requirement`.
+
+    Raises
+    ------
+    BadModelError
+        If the period is not positive or the limit is below 1.
+
+    Examples
+    --------
+    >>> from gains.design.design import trade_off
+    >>> points = trade_off(period_s=0.02)
+    >>> points[0].delay_margin_s, points[-1].delay_margin_s, points[0].alpha > points[-1].alpha
+    (0.05, 1.0, True)
+    """
+    _check_period(period_s)
+    limit = Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit
+    points = ((margin_s, largest_alpha(margin_s, period_s, limit)) for margin_s in _TRADE_OFF_MARGINS_S)
+    return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)
+
+
+def _check_period(period_s: float) -> None:
+    if not (np.isfinite(period_s) and period_s > 0):
+        raise BadModelError(f"period_s = {period_s}; wanted a positive number of seconds")
+
+
+def _number(value: float | None) -> float:
+    """Inverse of `plain` for a number; which kind of not finite it was is not kept, except that no margin ends: ∞."""
+    return float("inf") if value is None else float(value)
+
+
+def _numbers(data: dict[str, Any]) -> dict[str, float]:
+    return {name: _number(value) for name, value in data.items()}
+
+
+def _certificate_from(data: dict[str, Any]) -> Certificate:
+    return Certificate(
+        P=np.array(data["P"], dtype=float),
+        alpha=float(data["alpha"]),
+        P_eigenvalue_min=float(data["P_eigenvalue_min"]),
+        s_procedure_eigenvalue_max=float(data["s_procedure_eigenvalue_max"]),
+        solver=SolverFacts(**data["solver"]),
+    )

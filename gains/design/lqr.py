@@ -1,0 +1,235 @@
+"""The linear quadratic cost of a gain with a given pattern, its gradient, and the centralised optimum.
+
+For x' = A x + B u, y = C x, u = K y the cost (4.5) is the mean of ∫ x'Qx + u'Ru dt over initial states with covariance
+X0, or over white noise of intensity X0 (the squared H2 norm)::
+
+    J(K) = trace(P X0),   A_K'P + P A_K + Q + C'K'RKC = 0,   A_K = A + B K C
+    ∇J(K) = 2 (R K C + B'P) L C',   A_K L + L A_K' + X0 = 0
+
+Sources: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5); W. S. Levine and M. Athans, "On the
+determination of the optimal constant output feedback gains for linear multivariable systems", IEEE Trans. Automatic
+Control 15 (1970), 44-48, for the gradient.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError, InfeasibleError
+from gains.core.structure import real_matrix, strongly_connected_blocks
+from gains.formation.pattern import Pattern, Plant, check_fits, checked_pattern_gain
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """Weights of the cost: Q (n, n) on states, R (inputs, inputs), and the covariance X0 (n, n) of initial states.
+
+    X0 = I if not given.
+
+    Raises
+    ------
+    BadModelError
+        If a weight is not symmetric, Q or X0 not positive semidefinite, or R not positive definite.
+
+    Examples
+    --------
+    >>> from gains.design.lqr import Weights
+    >>> Weights([[1, 0], [0, 2]], [[1]]).X0.tolist()
+    [[1.0, 0.0], [0.0, 1.0]]
+    """
+
+    Q: FloatArray
+    R: FloatArray
+    X0: FloatArray
+
+    def __init__(self, Q: ArrayLike, R: ArrayLike, X0: ArrayLike | None = None) -> None:
+        state = _checked_weight("Q", Q, definite=False)
+        object.__setattr__(self, "Q", state)
+        object.__setattr__(self, "R", _checked_weight("R", R, definite=True))
+        spread = np.eye(len(state)) if X0 is None else _checked_weight("X0", X0, definite=False)
+        object.__setattr__(self, "X0", spread)
+
+    def check_fits(self, plant: Plant) -> None:
+        """Raise BadModelError unless the sizes are those of the plant."""
+        for name, matrix, wanted in (("Q", self.Q, plant.states), ("X0", self.X0, plant.states)):
+            if len(matrix) != wanted:
+                raise BadModelError(f"{name} has shape {matrix.shape}; ({wanted}, {wanted}) is wanted, as A")
+        if len(self.R) != plant.B.shape[1]:
+            raise BadModelError(f"R has shape {self.R.shape}; one row for each of {plant.B.shape[1]} inputs is wanted")
+
+
+@dataclass(frozen=True, eq=False)
+class CostPoint:
+    """A stabilising gain, its cost, projected gradient and the covariance C L C' of the outputs."""
+
+    K: FloatArray
+    cost: float
+    gradient: FloatArray
+    covariance: FloatArray
+
+
+class LyapunovEquations:
+    """Both Lyapunov equations of one closed loop from one Schur form that follows the loop's block triangular form.
+
+    The eigenvalues of the strongly connected blocks are computed block by block: a chain of identical followers is one
+    defective eigenvalue as a whole, which rounding would spread into the right half plane.
+    """
+
+    def __init__(self, A: FloatArray, blocks: list[NDArray[np.intp]]) -> None:
+        # driven blocks first makes the matrix block upper triangular
+        order = np.concatenate(blocks[::-1])
+        self._basis = np.zeros(A.shape)
+        triangular = A[np.ix_(order, order)]
+        self._abscissa = -np.inf
+        start = 0
+        for block in blocks[::-1]:
+            place = slice(start, start + block.size)
+            schur = linalg.schur(triangular[place, place])
+            diagonal, vectors = schur[0], schur[1]
+            self._basis[order[place], place] = vectors
+            triangular[:, place] = triangular[:, place] @ vectors
+            triangular[place] = vectors.T @ triangular[place]
+            triangular[place, place] = diagonal
+            # LAPACK's standard form has equal diagonal entries, the real parts, in every 2×2 block
+            self._abscissa = max(self._abscissa, float(diagonal.diagonal().max()))
+            start = place.stop
+        self._triangular = triangular
+
+    @property
+    def abscissa(self) -> float:
+        """Largest real part of an eigenvalue of A, 1/s."""
+        return self._abscissa
+
+    def observed(self, Q: FloatArray) -> FloatArray:
+        """P with A'P + P A + Q = 0."""
+        return self._solve(Q, "T", "N")
+
+    def reached(self, X0: FloatArray) -> FloatArray:
+        """L with A L + L A' + X0 = 0."""
+        return self._solve(X0, "N", "T")
+
+    def _solve(self, constant: FloatArray, left: str, right: str) -> FloatArray:
+        Z = self._basis
+        [trsyl] = linalg.get_lapack_funcs(["trsyl"], (Z,))
+        solution, scale, _ = trsyl(self._triangular, self._triangular, -Z.T @ constant @ Z, trana=left, tranb=right)
+        full = Z @ (solution / scale) @ Z.T
+        return (full + full.T) / 2
+
+
+class Cost:
+    """J and its gradient for one plant, pattern and weights."""
+
+    def __init__(self, plant: Plant, mask: NDArray[np.bool_], weights: Weights) -> None:
+        self.plant, self.mask, self.weights = plant, mask, weights
+        feedback = (plant.B != 0.0).astype(float) @ mask.astype(float) @ (plant.C != 0.0).astype(float)
+        self.blocks = strongly_connected_blocks(plant.A, feedback)
+        # rows of K with the same free columns share one system of equations
+        self._row_groups = [
+            (np.flatnonzero((mask == free).all(axis=1)), np.flatnonzero(free))
+            for free in np.unique(mask, axis=0)
+            if free.any()
+        ]
+
+    def lyapunov(self, K: FloatArray) -> LyapunovEquations:
+        return LyapunovEquations(self.plant.closed_loop(K), self.blocks)
+
+    def at(self, K: FloatArray) -> CostPoint | None:
+        """The point of a gain, None if it does not stabilise."""
+        plant, weights = self.plant, self.weights
+        equations = self.lyapunov(K)
+        if equations.abscissa >= 0.0:
+            return None
+        F = K @ plant.C
+        P = equations.observed(weights.Q + F.T @ weights.R @ F)
+        L = equations.reached(weights.X0)
+        gradient = 2.0 * (weights.R @ F + plant.B.T @ P) @ L @ plant.C.T
+        cost = float(np.sum(P * weights.X0))
+        # a loop so near its limit of stability that rounding decides: covariances are not negative
+        if not (np.isfinite(cost) and np.trace(L) > 0.0 and np.diag(L).min() > -1e-9 * np.trace(L)):
+            return None
+        return CostPoint(K, cost, np.where(self.mask, gradient, 0.0), plant.C @ L @ plant.C.T)
+
+    def scaled(self, point: CostPoint, gradient: FloatArray) -> FloatArray:
+        """M⁻¹g with M the curvature of the cost at fixed P and L: 2 R_aa (C L C') on the free entries of every row a.
+
+        A step of −M⁻¹g is the one of Anderson and Moore; M makes the descent indifferent to units and to how fast the
+        vehicles are.
+        """
+        direction = np.zeros_like(gradient)
+        for rows, columns in self._row_groups:
+            covariance = point.covariance[np.ix_(columns, columns)]
+            # outputs that never move, or hardly beside others, leave the covariance singular to rounding
+            values, vectors = np.linalg.eigh(covariance)
+            values = values.clip(min=1e-13 * max(float(np.trace(covariance)), 1e-300))
+            solved = gradient[np.ix_(rows, columns)] @ vectors / values @ vectors.T
+            direction[np.ix_(rows, columns)] = solved / (2.0 * self.weights.R[rows, rows][:, np.newaxis])
+        return direction
+
+
+def lqr_cost(plant: Plant, pattern: Pattern, weights: Weights, K: ArrayLike) -> tuple[float, FloatArray]:
+    """J(K) and its gradient, zero outside the pattern; infinity and zeros for a gain that does not stabilise.
+
+    Both K and the gradient are of shape (inputs, outputs).
+
+    Raises
+    ------
+    BadModelError
+        If sizes do not fit or K does not have the pattern.
+
+    Examples
+    --------
+    x' = u, u = −2 x: ∫ (1 + 4) e^{−4t} dt.
+
+    >>> from gains.formation.pattern import Pattern, Plant
+    >>> from gains.design.lqr import Weights, lqr_cost
+    >>> cost, gradient = lqr_cost(Plant([[0]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]), [[-2]])
+    >>> round(cost, 6), gradient.round(6).tolist()
+    (1.25, [[-0.375]])
+    """
+    check_fits(plant, pattern)
+    weights.check_fits(plant)
+    point = Cost(plant, pattern.mask, weights).at(checked_pattern_gain(pattern, K))
+    return (np.inf, np.zeros(pattern.mask.shape)) if point is None else (point.cost, point.gradient)
+
+
+def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
+    """The optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P X0), of the algebraic Riccati equation.
+
+    Raises
+    ------
+    InfeasibleError
+        If the Riccati equation has no stabilising solution.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.formation.pattern import Plant
+    >>> from gains.design.lqr import Weights, centralised_lqr
+    >>> integrator = Plant(A=np.zeros((1, 1)), B=np.eye(1), C=np.eye(1))
+    >>> K, cost = centralised_lqr(integrator, Weights(Q=4 * np.eye(1), R=np.eye(1), X0=np.eye(1)))
+    >>> K.round(12).tolist(), round(cost, 12)
+    ([[-2.0]], 2.0)
+    """
+    weights.check_fits(plant)
+    try:
+        P = linalg.solve_continuous_are(plant.A, plant.B, weights.Q, weights.R)
+    except np.linalg.LinAlgError as error:
+        raise InfeasibleError(
+            f"the Riccati equation has no stabilising solution ({error}): (A, B) must be stabilisable and Q must weigh "
+            "every mode on the imaginary axis"
+        ) from error
+    return -np.linalg.solve(weights.R, plant.B.T @ P), float(np.sum(P * weights.X0))
+
+
+def _checked_weight(name: str, value: ArrayLike, *, definite: bool) -> FloatArray:
+    matrix = real_matrix(name, value)
+    if matrix.shape[0] != matrix.shape[1] or not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
+        raise BadModelError(f"{name} is not symmetric; a symmetric matrix is wanted")
+    least, largest = float(np.linalg.eigvalsh(matrix)[0]), float(np.abs(matrix).max())
+    if least < -1e-12 * largest or (definite and least <= 1e-14 * largest):
+        wanted = "positive definite" if definite else "positive semidefinite"
+        raise BadModelError(f"{name} has the eigenvalue {least:.3g}; a {wanted} matrix is wanted")
+    return matrix

@@ -1,0 +1,186 @@
+"""Gains of the inclusion principle that meet a requirement, or which part of it to relax and how far.
+
+Every combination is one search of `gains.design.search`: what is given limits it, what is open is made as large as
+possible.
+"""
+
+from dataclasses import replace
+from math import floor, log10
+
+from gains.core.bracketing import met_end
+from gains.core.errors import InfeasibleError
+from gains.core.requirement import DELAY_MARGIN_MAX_S, PeakLimit, Requirement
+from gains.design.search import fastest_decay, largest_alpha, largest_margin
+from gains.formation.model import FormationModel
+from gains.performance.response import Response, sampled_margin
+from gains.performance.scalar_gains import ScalarGains
+from gains.sampled.multirate import Timing
+
+# The search aims this much above a margin asked for, so that rounding cannot leave it below.
+_MARGIN_AIM_S = 2e-10
+# A margin is found to this share of itself, a decay rate for a message to a coarser one.
+_MARGIN_RESOLUTION, _DECAY_STEPS = 1e-9, 14
+
+
+def required_gains(wanted: Requirement, period_s: float) -> ScalarGains:
+    """Return the gains that meet the requirement and are the best in what it leaves open.
+
+    With a delay margin they have the largest α of all that meet the rest, without one the largest margin, and of those
+    the largest α.
+
+    Parameters
+    ----------
+    wanted
+        What to reach.
+    period_s
+        Period of the control loop: sample, hold.
+
+    Raises
+    ------
+    InfeasibleError
+        If no gains meet the requirement; the message says which part of it to relax, and how far.
+
+    Examples
+    --------
+    Two equal poles at −1 have the largest margin of all gains that decay like e^{−t}:
+
+    >>> from gains.design.required import required_gains
+    >>> from gains.core.requirement import Requirement
+    >>> gains = required_gains(Requirement(decay_rate_1_s=1.0), 0.02)
+    >>> round(gains.k1, 3), round(gains.k3, 3)
+    (2.0, 1.0)
+    """
+    gains = _best_gains(wanted, period_s)
+    if gains is None:
+        raise InfeasibleError(_conflict(wanted, period_s))
+    return gains
+
+
+def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains | None:
+    """The gains of `required_gains`, None if there are none."""
+    limit, decay = wanted.peak_limit, wanted.decay_rate_1_s or 0.0
+    margin_s = wanted.delay_margin_s
+    if margin_s is None and wanted.alpha is not None:
+        found = largest_margin(wanted.alpha, period_s, limit, decay)
+        return None if found is None else found[1]
+    if margin_s is None:
+        margin_s = _margin_of_decay(decay, period_s, limit)
+    else:
+        margin_s += _MARGIN_AIM_S
+    gains = largest_alpha(margin_s, period_s, limit, decay)
+    return None if gains is None or gains.alpha < (wanted.alpha or 0.0) else gains
+
+
+def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: PeakLimit) -> float:
+    """The largest margin (s) of which gains decay as fast as this, 0 if none do: the fastest decay falls with it."""
+    low, high = 0.0, DELAY_MARGIN_MAX_S
+    if fastest_decay(high, period_s, limit) >= decay_rate_1_s:
+        return high
+    if fastest_decay(low, period_s, limit) < decay_rate_1_s:
+        return 0.0
+    while high - low > _MARGIN_RESOLUTION * high:
+        middle = (low + high) / 2
+        low, high = (middle, high) if fastest_decay(middle, period_s, limit) >= decay_rate_1_s else (low, middle)
+    return low
+
+
+def _conflict(wanted: Requirement, period_s: float) -> str:
+    """What cannot be had, and how far each part alone would have to be relaxed."""
+    given = {
+        name: value
+        for name in ("delay_margin_s", "alpha", "decay_rate_1_s")
+        if (value := getattr(wanted, name)) is not None
+    }
+    reached = {name: _rounded_down(most) for name in given if (most := _most(name, wanted, period_s)) > 0.0}
+    lower = [f"lower {name} to {most:g}" for name, most in reached.items()]
+    unlimited = replace(wanted, string_peak_max=None)
+    if wanted.string_peak_max is not None and _best_gains(unlimited, period_s) is not None:
+        lower.append(f"raise string_peak_max = {wanted.string_peak_max:g}")
+    named = " and ".join(f"{name} = {value:g}" for name, value in given.items())
+    conflict = "exclude each other" if len(given) > 1 else "cannot be reached"
+    advice = " or ".join(lower) if lower else "lower more than one of them" if len(given) > 1 else "lower period_s"
+    return f"{named} {conflict} with period_s = {period_s:g}: {advice}"
+
+
+def _most(name: str, wanted: Requirement, period_s: float) -> float:
+    """The largest value of one part of the requirement that leaves the others as they are; 0 if none does."""
+    limit, margin_s = wanted.peak_limit, wanted.delay_margin_s or 0.0
+    alpha, decay = wanted.alpha or 0.0, wanted.decay_rate_1_s or 0.0
+    if name == "alpha":
+        gains = largest_alpha(margin_s, period_s, limit, decay)
+        return gains.alpha if gains else 0.0
+    if name == "delay_margin_s":
+        found = largest_margin(alpha, period_s, limit, decay) if alpha > 0.0 else None
+        return _margin_of_decay(decay, period_s, limit) if alpha == 0.0 else found[0] if found else 0.0
+    low, high = 0.0, fastest_decay(margin_s, period_s, limit)
+    if alpha == 0.0:
+        return high
+    for _ in range(_DECAY_STEPS):
+        middle = (low + high) / 2
+        gains = largest_alpha(margin_s, period_s, limit, middle)
+        low, high = (middle, high) if gains is not None and gains.alpha >= alpha else (low, middle)
+    return low
+
+
+def _rounded_down(value: float) -> float:
+    """Four digits, and no more than the value."""
+    unit = 10.0 ** (floor(log10(value)) - 3)
+    return floor(value / unit) * unit
+
+
+_MARGIN_MAX_S = 30.0
+
+
+def requirement_with(requirement: Requirement, response: Response | None, *, timing: Timing) -> Requirement:
+    """The requirement on vehicles that answer at once, with one period for telemetry and control, the slower one, whose
+    design has the wanted margin with this response and these periods.
+
+    The margin with them grows with the one without: found by false position. A requirement without a margin stays as
+    it is.
+
+    Raises
+    ------
+    InfeasibleError
+        If no gains have this margin so.
+
+    Examples
+    --------
+    Without a delay margin there is nothing to find:
+
+    >>> from gains.sampled.multirate import Timing
+    >>> from gains.core.requirement import Requirement
+    >>> from gains.design.required import requirement_with
+    >>> from gains.performance.response import Response
+    >>> wanted = Requirement(alpha=0.4)
+    >>> requirement_with(wanted, Response(0.1, 0.0), timing=Timing(0.02, 0.02)) == wanted
+    True
+    """
+    wanted_s = requirement.delay_margin_s
+    if wanted_s is None or (response is None and timing.commands == 1):
+        return requirement
+
+    responses, lag_s = (None, timing.faster_s) if response is None else ([response] * 2, response.lag_s)
+    pair = FormationModel((-1, 0), axes=1)  # a leader-follower tree has the roots of these two, whatever its size
+
+    def excess(without_s: float) -> float:
+        found = largest_alpha(without_s, timing.held_s, requirement.peak_limit, requirement.decay_rate_1_s or 0.0)
+        if found is None:
+            return -wanted_s
+        K = pair.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
+        return sampled_margin(pair, K, responses, timing=timing) - wanted_s
+
+    # the response takes about its lag of the margin
+    low, high = wanted_s, wanted_s + lag_s
+    f_low, f_high = excess(low), excess(high)
+    while f_high < 0.0 and high < _MARGIN_MAX_S:
+        low, f_low, high = high, f_high, min(high + wanted_s + lag_s, _MARGIN_MAX_S)
+        f_high = excess(high)
+    if f_high < 0.0 or high > _MARGIN_MAX_S:
+        answer = (
+            f" with lag_s = {response.lag_s} and velocity_gain_1_s = {response.velocity_gain_1_s}" if response else ""
+        )
+        raise InfeasibleError(f"no gains have a sampled delay margin of {wanted_s} s{answer}; ask for less")
+    if f_low >= 0.0:
+        return requirement
+    found_s = met_end(excess, (high, f_high), (low, f_low), resolution=_MARGIN_RESOLUTION * wanted_s)
+    return replace(requirement, delay_margin_s=found_s)

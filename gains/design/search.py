@@ -1,0 +1,259 @@
+"""The exact trade-off between robustness, delay margin and decay rate of one follower, as a two-dimensional search.
+
+The search runs along the curve of all (k1, k3) of a margin (`gains.performance.scalar_gains`) and over k2. Nothing here
+is random, and no frequency grid decides a margin. The designs found are checked by the functions of
+`gains.delay.constant`, `gains.sampled.constant` and `gains.performance.robust`, which share no formula with it.
+"""
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.bracketing import met_end
+from gains.core.requirement import OnboardPeak, PeakLimit
+from gains.performance.scalar_gains import (
+    ScalarGains,
+    alpha_of,
+    decay_rate_of,
+    front_gain_limit,
+    gains_of_margin,
+    onboard_front_gain_limit,
+)
+
+# Points of the first, coarse scan along the curve and over k2, of the later ones, and of both over the spare margin.
+# A round keeps ±2 cells about the best point, so the window halves; 18 rounds leave 1e-5 of it (k2 begins five
+# rounds later: 1e-4), and α, flat at its maximum, is then exact to about 1e-9.
+_ROUNDS_ALL_FRONT = 5
+_SCAN_FIRST, _SCAN_NEXT, _SCAN_SPARE, _ROUNDS = (25, 17), (9, 9), 9, 18
+# The angle of the crossing, as a share of the one at which k3 = 0 in the continuous loop. The sampled loop's share goes
+# a little above 1; what lies beyond k3 = 0 is discarded.
+_SHARE_MIN, _SHARE_MAX = 0.02, 1.3
+# |k2| is sought up to this multiple of k1. The optimum of α is near k1.
+_FRONT_MAX = 2.0
+# Without delay the sampled leader moves by the factor 1 − k1 T a period. At k1 T = 2 it is unstable with no delay at
+# all; this keeps the factor above −0.8.
+_OWN_STEP_MAX = 1.8
+# α is exact to about this, so an α asked for is aimed at from above by it, and no finer root is sought.
+_ALPHA_RESOLUTION = 1e-9
+# Gains of exactly a margin that is short against the period are so high that few are good or usable, and a larger
+# margin comes with a larger α. Up to this margin in periods, one larger by up to so many periods is looked at too.
+_SHORT_MARGIN, _SPARE_MAX = 2.0, 2.0
+# Where the search for a margin begins, and where it ends: α is then below 1e-4 and the loop of no use to anyone.
+_MARGIN_FIRST_S, _MARGIN_MAX_S = 0.3, 75.0
+# Points along the curve of a margin in the search of the fastest decay, and rounds that keep ±1 cell: 1e-13 of it.
+_SCAN_FASTEST, _ROUNDS_FASTEST = 33, 12
+
+
+def largest_alpha(
+    delay_margin_s: float, period_s: float, string_peak_max: PeakLimit = None, decay_rate_1_s: float = 0.0
+) -> ScalarGains | None:
+    """Return the gains of largest α among those with at least the given delay margin, None if there are none.
+
+    Parameters
+    ----------
+    delay_margin_s
+        Margin of the loop with all feedback late, sampled with `period_s`, or continuous if `period_s` is 0.
+    period_s
+        Period of sample and hold.
+    string_peak_max
+        Largest growth of spacing errors from vehicle to vehicle, both without delay and with half the margin as loop
+        delay (plus half a period for the hold); on board at every delay; not limited if None.
+    decay_rate_1_s
+        Least decay rate of the continuous loop without delay.
+
+    Examples
+    --------
+    The gains found have the margin asked for:
+
+    >>> from gains.delay.constant import delay_margin
+    >>> from gains.design.search import largest_alpha
+    >>> gains = largest_alpha(0.3, 0.0)
+    >>> round(delay_margin([[0, -1], [0, 0]], [[0, 0], [gains.k3, -gains.k1]]), 6)
+    0.3
+    """
+    # Axes of the scan: share of the crossing angle, k2 as a share of its limit, margin left over in periods.
+    shares = (_SHARE_MIN, _SHARE_MAX)
+    if decay_rate_1_s > 0.0:
+        fast = _fast_shares(decay_rate_1_s, delay_margin_s, period_s, string_peak_max)
+        if fast is None:
+            return None
+        shares = fast
+    spare_max = _spare_max(delay_margin_s, period_s)
+    bounds = (shares, (-1.0, 1.0), (0.0, spare_max))
+    windows, best = bounds, None
+    for turn in range(_ROUNDS):
+        points = (*(_SCAN_FIRST if turn == 0 else _SCAN_NEXT), _SCAN_SPARE if spare_max else 1)
+        grids = [np.linspace(*window, count) for window, count in zip(windows, points, strict=True)]
+        found = _best_of_grid(grids, delay_margin_s, period_s, string_peak_max, decay_rate_1_s)
+        if found is not None and (best is None or found[0].alpha > best[0].alpha):
+            best = found
+        if best is None:
+            return None
+        narrowed = [
+            _narrowed(window, centre, count, ends)
+            for window, centre, count, ends in zip(windows, best[1], points, bounds, strict=True)
+        ]
+        # High gains make α nearly the same for every k2, and the best k2 of a coarse scan of the rest means nothing.
+        windows = (narrowed[0], narrowed[1] if turn >= _ROUNDS_ALL_FRONT else bounds[1], narrowed[2])
+    assert best is not None
+    return best[0]
+
+
+def largest_margin(
+    alpha: float, period_s: float, string_peak_max: PeakLimit = None, decay_rate_1_s: float = 0.0
+) -> tuple[float, ScalarGains] | None:
+    """Return the largest delay margin (s) at which α can be reached, and the gains; None if no margin is left.
+
+    The largest α falls as the margin grows, so this is its inverse, by false position.
+
+    Examples
+    --------
+    The way back: the α that is reached at a margin is reached at no longer one.
+
+    >>> from gains.design.search import largest_alpha, largest_margin
+    >>> margin_s, _ = largest_margin(largest_alpha(0.3, 0.02).alpha, 0.02)
+    >>> round(margin_s, 4)
+    0.3
+    """
+
+    def excess(margin_s: float) -> float:
+        gains = largest_alpha(margin_s, period_s, string_peak_max, decay_rate_1_s)
+        return (gains.alpha if gains else 0.0) - alpha - _ALPHA_RESOLUTION
+
+    # Double the margin until α is lost, or halve it until α is there; below two periods the last half is all of it.
+    low, high = 0.0, _MARGIN_FIRST_S
+    f_low, f_high = -1.0, excess(high)
+    while f_high >= 0 and high < _MARGIN_MAX_S:
+        low, f_low, high = high, f_high, 2 * high
+        f_high = excess(high)
+    while f_low < 0:
+        low = high / 2 if high > 2 * period_s else 0.0
+        f_low = excess(low)
+        if f_low < 0 and low == 0.0:
+            return None
+        if f_low < 0:
+            high, f_high = low, f_low
+    margin_s = met_end(excess, (low, f_low), (high, f_high), resolution=_ALPHA_RESOLUTION)
+    gains = largest_alpha(margin_s, period_s, string_peak_max, decay_rate_1_s)
+    assert gains is not None
+    return margin_s, gains
+
+
+def fastest_decay(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit = None) -> float:
+    """Return the largest decay rate (1/s) without delay of gains of a margin, 0 if no gains have it.
+
+    Arguments as of `largest_alpha`.
+
+    Examples
+    --------
+    Critical damping, k3 = k1² / 4, is the fastest:
+
+    >>> from gains.delay.constant import delay_margin
+    >>> from gains.design.search import fastest_decay
+    >>> k1 = 2 * fastest_decay(0.3, 0.0)
+    >>> round(delay_margin([[0, -1], [0, 0]], [[0, 0], [k1**2 / 4, -k1]]), 6)
+    0.3
+    """
+    return _fastest(delay_margin_s, period_s, string_peak_max)[0]
+
+
+def _fastest(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit) -> tuple[float, float]:
+    """The largest decay rate of a margin and the share of the crossing angle that has it.
+
+    Along the curve the decay rate rises to that share, critical damping or the last that is usable, and falls.
+    """
+    low, high = _SHARE_MIN, _SHARE_MAX
+    rate, share = 0.0, (low + high) / 2
+    for _ in range(_ROUNDS_FASTEST):
+        shares = np.linspace(low, high, _SCAN_FASTEST)
+        rates = _decay_rates(shares, delay_margin_s, period_s, string_peak_max)
+        at = int(np.argmax(rates))
+        rate, share = float(rates[at]), float(shares[at])
+        low, high = float(shares[max(at - 1, 0)]), float(shares[min(at + 1, shares.size - 1)])
+    return rate, share
+
+
+def _fast_shares(
+    decay_rate_1_s: float, delay_margin_s: float, period_s: float, string_peak_max: PeakLimit
+) -> tuple[float, float] | None:
+    """The shares of the crossing angle between which gains of a margin decay as fast as this; None if none do."""
+    rate, share = _fastest(delay_margin_s, period_s, string_peak_max)
+    if rate < decay_rate_1_s:
+        return None
+
+    def last_fast(end: float) -> float:
+        """The last share from the fastest one towards an end that is fast enough."""
+        fast, slow = share, end
+        for _ in range(_ROUNDS_FASTEST):
+            shares = np.linspace(fast, slow, _SCAN_FASTEST)
+            rates = _decay_rates(shares, delay_margin_s, period_s, string_peak_max)
+            count = int(np.argmin(rates >= decay_rate_1_s)) or shares.size
+            fast, slow = float(shares[count - 1]), float(shares[min(count, shares.size - 1)])
+        return fast
+
+    return last_fast(_SHARE_MIN), last_fast(_SHARE_MAX)
+
+
+def _decay_rates(share: FloatArray, delay_margin_s: float, period_s: float, string_peak_max: PeakLimit) -> FloatArray:
+    """The decay rate at each share, the largest over the margin to spare; 0 where no gains can be used."""
+    spare_max = _spare_max(delay_margin_s, period_s)
+    spare = np.linspace(0.0, spare_max, _SCAN_SPARE if spare_max else 1)[:, None]
+    k1, k3, limit = _usable_gains(share, delay_margin_s + spare * period_s, period_s, string_peak_max)
+    return np.where(np.isfinite(limit), decay_rate_of(k1, k3), 0.0).max(axis=0)
+
+
+def _spare_max(delay_margin_s: float, period_s: float) -> float:
+    """How much more of a margin than is asked for is looked at, in periods."""
+    return _SPARE_MAX if delay_margin_s <= _SHORT_MARGIN * period_s else 0.0
+
+
+def _usable_gains(
+    share: FloatArray, margin_s: FloatArray, period_s: float, string_peak_max: PeakLimit
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """k1, k3 of each share and margin (broadcast), and the largest |k2| to try: NaN where they cannot be used."""
+    share, margin_s = np.broadcast_arrays(share, margin_s)
+    k1, k3 = gains_of_margin(share, margin_s, period_s)
+    limit = _front_limit(k1, k3, (margin_s + period_s) / 2, string_peak_max)
+    return k1, k3, np.where((k1 > 0) & (k3 > 0) & (k1 * period_s <= _OWN_STEP_MAX), limit, np.nan)
+
+
+def _best_of_grid(
+    grids: list[FloatArray],
+    delay_margin_s: float,
+    period_s: float,
+    string_peak_max: PeakLimit,
+    decay_rate_1_s: float,
+) -> tuple[ScalarGains, tuple[float, float, float]] | None:
+    """The gains of largest α on the grids of share, front and spare, and where they are; None if none can be used."""
+    front = grids[1]
+    share, spare = (grid.ravel() for grid in np.meshgrid(grids[0], grids[2]))
+    k1, k3, limit = _usable_gains(share, delay_margin_s + spare * period_s, period_s, string_peak_max)
+    usable = np.isfinite(limit)
+    if decay_rate_1_s > 0.0:
+        usable &= np.where(usable, decay_rate_of(k1, k3), 0.0) >= decay_rate_1_s
+    if not usable.any():
+        return None
+    k1, k3, limit, share, spare = (grid[usable] for grid in (k1, k3, limit, share, spare))
+    k2 = limit[:, None] * front
+    alpha = alpha_of(k1[:, None], k2, k3[:, None])
+    i, j = np.unravel_index(int(np.argmax(alpha)), alpha.shape)
+    gains = ScalarGains(float(k1[i]), float(k2[i, j]) + 0.0, float(k3[i]), float(alpha[i, j]))
+    return gains, (float(share[i]), float(front[j]), float(spare[i]))
+
+
+def _front_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string_peak_max: PeakLimit) -> FloatArray:
+    """Largest |k2| to try: a multiple of k1, less where spacing errors would grow, NaN where they grow in any case."""
+    limit = _FRONT_MAX * k1
+    if string_peak_max is None:
+        return limit
+    if isinstance(string_peak_max, OnboardPeak):
+        return np.minimum(limit, onboard_front_gain_limit(k1, k3, string_peak_max.peak))
+    for delay in (np.zeros_like(delay_s), delay_s):
+        limit = np.minimum(limit, front_gain_limit(k1, k3, delay, string_peak_max))
+    return limit
+
+
+def _narrowed(
+    window: tuple[float, float], centre: float, points: int, bounds: tuple[float, float]
+) -> tuple[float, float]:
+    reach = 2 * (window[1] - window[0]) / max(points - 1, 1)
+    return max(bounds[0], centre - reach), min(bounds[1], centre + reach)

@@ -1,0 +1,278 @@
+"""Linear quadratic gains with a given information pattern, to first-order optimality.
+
+The cost J(K) of `gains.design.lqr` is minimised over the gains with the pattern.
+
+The gradient is exact and is projected on the pattern. J has no minimum outside the stabilising gains: it grows without
+bound towards their border, so a descent never leaves them. It need not be convex; what is found is a local minimum, and
+the centralised optimum, with all states for every input, says how much better any other could be.
+
+Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5), which solves it by other means.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError, InfeasibleError, SolverError
+from gains.design.lqr import Cost, CostPoint, Weights, centralised_lqr
+from gains.formation.pattern import Pattern, Plant, check_fits, checked_pattern_gain
+
+# The decrement g'M⁻¹g / J estimates the share of the cost that is still to be gained. Costs are known to about 1e-13.
+_DECREMENT = 1e-13
+# a line search that fails above this has failed; below, rounding is what stopped it
+_DECREMENT_ACCEPTED = 1e-9
+_ITERATIONS = 2000
+_MEMORY = 20
+_LINE_STEPS = 50
+_HOMOTOPY_ROUNDS = 200
+# share of the way to the border of stability that the homotopy keeps as distance
+_HOMOTOPY_DISTANCE = 0.1
+# random starts of the descent of the abscissa: of the patterns of three vehicles that a static gain stabilises, and the
+# homotopy does not, the hardest takes 22
+_ABSCISSA_STARTS = 60
+# share of the norm of A: an abscissa above is rounding of a defective eigenvalue
+_CLEARLY_STABLE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredLqr:
+    """A gain with the pattern at which the cost is stationary, and lower than at the start.
+
+    Attributes
+    ----------
+    K
+        Shape (inputs, outputs).
+    cost
+        J(K).
+    cost_centralised
+        Least cost of all gains on the full state, a lower bound of J.
+    decrement
+        g'M⁻¹g / J at the end, with the gradient g and the curvature M of the cost at fixed P and L: an estimate of the
+        share of the cost that is still to be gained.
+    gradient_norm
+        Frobenius norm of the projected gradient.
+    costs
+        J after every iteration, falling; the first is that of the start.
+    """
+
+    K: FloatArray
+    cost: float
+    cost_centralised: float
+    decrement: float
+    gradient_norm: float
+    costs: tuple[float, ...]
+
+    @property
+    def loss(self) -> float:
+        """Share by which the cost is above the centralised one: 0.1 is 10 %."""
+        return self.cost / self.cost_centralised - 1.0
+
+
+def structured_lqr(
+    plant: Plant, pattern: Pattern, weights: Weights, *, start: ArrayLike | None = None
+) -> StructuredLqr:
+    """Return a gain with the pattern at which the quadratic cost has a local minimum.
+
+    Parameters
+    ----------
+    plant, pattern, weights
+        For 50 vehicles of one axis (99 states) it takes a few seconds.
+    start
+        A stabilising gain with the pattern; found by `stabilising_gain` if not given.
+
+    Raises
+    ------
+    BadModelError
+        If sizes do not fit or the start does not stabilise.
+    InfeasibleError
+        If no stabilising gain is found.
+    SolverError
+        If the descent ends where the cost is not stationary.
+
+    Examples
+    --------
+    x' = u with ∫ x² + u² dt: u = −x, and the cost is x(0)².
+
+    >>> from gains.formation.pattern import Pattern, Plant
+    >>> from gains.design.lqr import Weights
+    >>> from gains.design.structured_lqr import structured_lqr
+    >>> found = structured_lqr(Plant([[0]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]))
+    >>> found.K.round(4).tolist(), round(found.cost, 6)
+    ([[-1.0]], 1.0)
+    """
+    check_fits(plant, pattern)
+    weights.check_fits(plant)
+    cost = Cost(plant, pattern.mask, weights)
+    K = stabilising_gain(plant, pattern, weights) if start is None else checked_pattern_gain(pattern, start)
+    first = cost.at(K)
+    if first is None:
+        raise BadModelError(
+            f"the start does not stabilise: the rightmost eigenvalue of A + B K C has real part "
+            f"{cost.lyapunov(K).abscissa:.3g} 1/s; a negative one is wanted"
+        )
+    point, decrement, costs = _descend(cost, first, _ITERATIONS, _DECREMENT)
+    if decrement > _DECREMENT_ACCEPTED:
+        raise SolverError(
+            f"the descent ended after {len(costs) - 1} iterations with decrement {decrement:.3g} (wanted "
+            f"{_DECREMENT_ACCEPTED}): scale states and inputs to like size, or give another start"
+        )
+    return StructuredLqr(
+        K=point.K,
+        cost=point.cost,
+        cost_centralised=centralised_lqr(plant, weights)[1],
+        decrement=decrement,
+        gradient_norm=float(np.linalg.norm(point.gradient)),
+        costs=tuple(costs),
+    )
+
+
+def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatArray:
+    """A gain with the pattern that stabilises, found from K = 0 by a homotopy, or from random gains.
+
+    A − σI is stable for large σ. Its cost is lowered for a while; the gain then stabilises more than was asked for, and
+    σ is lowered nearly as far, until it is 0. Where that ends at a σ > 0, as in patterns in which vehicles steer each
+    other only, the real part of the rightmost eigenvalue is lowered itself, from seeded random gains.
+
+    Raises
+    ------
+    InfeasibleError
+        If no gain is found. To decide whether any static gain stabilises is NP-hard in general: there
+        may be one all the same, but none exists if `gains.formation.fixed_modes` finds an unstable mode.
+
+    Examples
+    --------
+    x' = x + u needs a gain below −1:
+
+    >>> from gains.formation.pattern import Pattern, Plant
+    >>> from gains.design.lqr import Weights
+    >>> from gains.design.structured_lqr import stabilising_gain
+    >>> gain = stabilising_gain(Plant([[1]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]))
+    >>> bool(gain[0, 0] < -1)
+    True
+    """
+    check_fits(plant, pattern)
+    weights.check_fits(plant)
+    full_spread = Weights(weights.Q + 1e-6 * np.eye(plant.states), weights.R, np.eye(plant.states))
+    gain = np.zeros(pattern.mask.shape)
+    cost = Cost(plant, pattern.mask, full_spread)
+    abscissa = cost.lyapunov(gain).abscissa
+    shift = max(abscissa, 0.0) + max(1.0, float(np.linalg.norm(plant.A, 1)))
+    for _ in range(_HOMOTOPY_ROUNDS):
+        if abscissa < 0.0:
+            return gain
+        shift = abscissa + _HOMOTOPY_DISTANCE * (shift - abscissa)
+        shifted = Plant(plant.A - shift * np.eye(plant.states), plant.B, plant.C)
+        cost = Cost(shifted, pattern.mask, full_spread)
+        point = cost.at(gain)
+        if point is None:
+            break
+        point = _descend(cost, point, 30, 1e-4)[0]
+        gain = point.K
+        abscissa = cost.lyapunov(gain).abscissa + shift
+    gain, found = _gain_of_least_abscissa(plant, pattern)
+    if found < 0.0:
+        return gain
+    raise InfeasibleError(
+        f"no static gain with this pattern was found that stabilises: the best leaves a mode at "
+        f"{min(abscissa, found):.3g} 1/s; add links, or outputs, or give a stabilising start"
+    )
+
+
+def _gain_of_least_abscissa(plant: Plant, pattern: Pattern) -> tuple[FloatArray, float]:
+    """The first gain found that stabilises by more than rounding, or the best, and the real part (1/s) it leaves.
+
+    Quasi-Newton descent of the abscissa, whose derivative for an eigenvalue with left and right vectors w, v is
+    Re w B dK C v / w v. It is not smooth where eigenvalues meet, and has many local minima: hence many starts.
+    """
+    from scipy import optimize
+
+    minimize: Any = optimize.minimize
+    mask = pattern.mask
+    rng = np.random.default_rng(0)
+    scale = max(float(np.linalg.norm(plant.A, 2)), 1e-300)
+    best, least = np.zeros(mask.shape), np.inf
+
+    def gain(entries: FloatArray) -> FloatArray:
+        K = np.zeros(mask.shape)
+        K[mask] = entries
+        return K
+
+    def abscissa(entries: FloatArray) -> tuple[float, FloatArray]:
+        roots, right = np.linalg.eig(plant.closed_loop(gain(entries)))
+        real_parts = np.real(roots)
+        at = int(np.argmax(real_parts))
+        left = np.linalg.pinv(right)[at]
+        slope = np.real(np.outer(left @ plant.B, plant.C @ right[:, at]))
+        return float(real_parts[at]), slope[mask].astype(np.float64)
+
+    for _ in range(_ABSCISSA_STARTS):
+        start = scale * rng.normal(size=int(mask.sum())) * 10.0 ** rng.uniform(-1.0, 1.0)
+        found = minimize(abscissa, start, jac=True, method="BFGS", options={"maxiter": 200})
+        if found.fun < least:
+            best, least = gain(found.x), float(found.fun)
+        if least < -_CLEARLY_STABLE * scale:
+            return best, least
+    return best, max(least, 0.0)
+
+
+def _descend(cost: Cost, point: CostPoint, iterations: int, tolerance: float) -> tuple[CostPoint, float, list[float]]:
+    """Quasi-Newton descent (L-BFGS) in the metric M; the last point, its decrement and all costs."""
+    steps: list[tuple[FloatArray, FloatArray]] = []
+    costs = [point.cost]
+    while True:
+        newton_like = cost.scaled(point, point.gradient)
+        decrement = float(np.sum(point.gradient * newton_like)) / max(point.cost, 1e-300)
+        if decrement <= tolerance or len(costs) > iterations:
+            return point, decrement, costs
+        direction = -_quasi_newton(point, steps, cost.scaled)
+        if float(np.sum(direction * point.gradient)) >= 0.0:
+            steps, direction = [], -newton_like
+        following = _line_search(cost, point, direction)
+        if following is None:
+            if not steps:
+                return point, decrement, costs
+            steps = []
+            continue
+        step, change = following.K - point.K, following.gradient - point.gradient
+        if float(np.sum(step * change)) > 0.0:
+            steps = [*steps[1 - _MEMORY :], (step, change)]
+        point = following
+        costs.append(point.cost)
+
+
+def _quasi_newton(
+    point: CostPoint,
+    steps: list[tuple[FloatArray, FloatArray]],
+    scaled: Callable[[CostPoint, FloatArray], FloatArray],
+) -> FloatArray:
+    """Two-loop recursion of L-BFGS with M⁻¹ for the inverse Hessian at the far end (Nocedal and Wright, alg. 7.4)."""
+    q = point.gradient.copy()
+    factors: list[float] = []
+    for step, change in reversed(steps):
+        factors.append(float(np.sum(step * q) / np.sum(step * change)))
+        q -= factors[-1] * change
+    result = scaled(point, q)
+    for (step, change), factor in zip(steps, reversed(factors), strict=True):
+        result += (factor - float(np.sum(change * result) / np.sum(step * change))) * step
+    return result
+
+
+def _line_search(cost: Cost, point: CostPoint, direction: FloatArray) -> CostPoint | None:
+    """A stabilising point on the ray that meets the weak Wolfe conditions, by bisection; None if rounding hides it."""
+    slope = float(np.sum(point.gradient * direction))
+    low, high, length = 0.0, np.inf, 1.0
+    best: CostPoint | None = None
+    for _ in range(_LINE_STEPS):
+        trial = cost.at(point.K + length * direction)
+        if trial is None or trial.cost > point.cost + 1e-4 * length * slope:
+            high = length
+        elif float(np.sum(trial.gradient * direction)) < 0.9 * slope:
+            low, best = length, trial
+        else:
+            return trial
+        length = 2.0 * low if np.isinf(high) else (low + high) / 2.0
+    return best

@@ -1,0 +1,1 @@
+"""Formation models and information patterns, the inclusion principle, partitions and fixed modes."""

@@ -1,0 +1,371 @@
+"""From an information pattern to a block-diagonal gain: complete bipartite subgraphs of inputs and outputs.
+
+The links of a pattern are the edges of a bipartite graph, inputs on one side and outputs on the other. A partition of
+the edges into complete bipartite subgraphs (bicliques), vertices repeated as needed, expands the gain: K = φ1 K̄ φ2 with
+K̄ block diagonal, one block for each subgraph, and constant 0/1 matrices φ1, φ2. The expanded plant has B̄ = B φ1 and
+C̄ = φ2 C; as B̄ K̄ C̄ = B K C its closed loop is the same.
+
+The partition is not unique. Grouped by input, φ1 = I. The smallest partition is NP-hard to find in general.
+
+Source: Sahoo 2012 (see `gains.formation.model`), section 4, eqs. (4.3), (4.4), (4.6), (4.7).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError, DisagreementError
+from gains.core.structure import real_matrix
+from gains.formation.pattern import Link, Pattern, Plant, check_fits, checked_pattern_gain
+
+Origin = Literal["by input", "by output", "greedy", "search"]
+
+# The search is made up to this many links (equal rows and columns of the pattern counted once)
+LARGEST_SEARCH_LINKS = 40
+# and up to this many steps: some seconds. Beyond, the partition is reported as not known to be the smallest.
+_SEARCH_STEPS = 200_000
+
+
+@dataclass(frozen=True)
+class Subgraph:
+    """A complete bipartite subgraph: every input of it uses every output of it."""
+
+    inputs: tuple[int, ...]
+    outputs: tuple[int, ...]
+
+    @property
+    def links(self) -> tuple[Link, ...]:
+        """Every (i, j) of the subgraph."""
+        return tuple((i, j) for i in self.inputs for j in self.outputs)
+
+
+@dataclass(frozen=True)
+class Partition:
+    """Subgraphs that hold every link of a pattern exactly once.
+
+    Attributes
+    ----------
+    subgraphs
+        Sorted by their first link.
+    origin
+        How it was found.
+    lower_bound
+        No partition has fewer subgraphs than this.
+
+    Examples
+    --------
+    >>> from gains.formation.bipartite import Partition, Subgraph
+    >>> Partition((Subgraph((0, 1), (0,)),), "by output", lower_bound=1).smallest
+    True
+    """
+
+    subgraphs: tuple[Subgraph, ...]
+    origin: Origin
+    lower_bound: int
+
+    @property
+    def smallest(self) -> bool:
+        """Whether it is known that no partition has fewer subgraphs."""
+        return len(self.subgraphs) == self.lower_bound
+
+
+@dataclass(frozen=True, eq=False)
+class ExpandedGain:
+    """The maps of K = φ1 K̄ φ2 for a partition.
+
+    Attributes
+    ----------
+    phi1, phi2
+        0/1 matrices, shapes (inputs, expanded inputs) and (expanded outputs, outputs).
+    mask
+        Entries of K̄ that may differ from zero: block diagonal, shape (expanded inputs, expanded outputs).
+
+    Examples
+    --------
+    Back and forth gives the gain again:
+
+    >>> from gains.formation.bipartite import expanded_gain, partition_by_input
+    >>> from gains.formation.pattern import Pattern
+    >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 1))
+    >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
+    >>> expanded.expand([[-1, 0], [2, -3]]).tolist()
+    [[-1.0, 0.0, 0.0], [0.0, 2.0, -3.0]]
+    >>> expanded.contract([[-1, 0, 0], [0, 2, -3]]).tolist()
+    [[-1.0, 0.0], [2.0, -3.0]]
+    """
+
+    pattern: Pattern
+    partition: Partition
+    phi1: FloatArray
+    phi2: FloatArray
+    mask: NDArray[np.bool_]
+
+    def contract(self, K_expanded: ArrayLike) -> FloatArray:
+        """K = φ1 K̄ φ2 (4.3).
+
+        Raises
+        ------
+        BadModelError
+            If K̄ has not the shape or not the zeros of the mask.
+        """
+        gain = real_matrix("K_expanded", K_expanded)
+        if gain.shape != self.mask.shape:
+            raise BadModelError(f"K_expanded has shape {gain.shape}; {self.mask.shape} is wanted")
+        if gain[~self.mask].any():
+            raise BadModelError("K_expanded has entries outside its diagonal blocks; zeros are wanted there")
+        return self.phi1 @ gain @ self.phi2
+
+    def expand(self, K: ArrayLike) -> FloatArray:
+        """K̄ with `contract(K̄)` = K: every block of K goes to the one subgraph that holds its link.
+
+        Raises
+        ------
+        BadModelError
+            If K does not have the pattern.
+        """
+        gain = checked_pattern_gain(self.pattern, K)
+        # every link is in exactly one subgraph: within the mask no entry is met twice
+        return np.where(self.mask, self.phi1.T @ gain @ self.phi2.T, 0.0)
+
+    def expand_plant(self, plant: Plant) -> Plant:
+        """The plant with B̄ = B φ1 and C̄ = φ2 C (4.4)."""
+        check_fits(plant, self.pattern)
+        return Plant(plant.A, plant.B @ self.phi1, self.phi2 @ plant.C)
+
+
+def partition_by_input(pattern: Pattern) -> Partition:
+    """One subgraph for each input with the outputs it uses: φ1 = I if no input is without outputs.
+
+    For the pattern (4.6) {K11}, {K21, K22}, {K32, K33}.
+
+    Examples
+    --------
+    >>> from gains.formation.bipartite import partition_by_input
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import leader_follower
+    >>> [graph.links for graph in partition_by_input(leader_follower(FormationModel((-1, 0, 1)))).subgraphs]
+    [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
+    """
+    rows = [Subgraph((i,), tuple(np.flatnonzero(row).tolist())) for i, row in enumerate(pattern.blocks) if row.any()]
+    return Partition(tuple(rows), "by input", _rank_bound(pattern.blocks))
+
+
+def smallest_partition(pattern: Pattern) -> Partition:
+    """The partition with the fewest subgraphs, or the best that is found: see `Partition.smallest`.
+
+    Equal rows, and equal columns, share their subgraphs. The best of three heuristics (by input, by output, largest
+    first) is the smallest if it meets the rank of the pattern, below which no partition goes (Graham and Pollak's
+    bound). If not, and there are at most `LARGEST_SEARCH_LINKS` different links, all smaller ones are tried, within a
+    fixed number of steps.
+
+    Examples
+    --------
+    All to all is one subgraph, whatever the number of vehicles:
+
+    >>> from gains.formation.bipartite import smallest_partition
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import all_to_all
+    >>> found = smallest_partition(all_to_all(FormationModel((-1, 0, 1))))
+    >>> len(found.subgraphs), found.smallest
+    (1, True)
+    """
+    core, row_class, column_class = _without_repeats(pattern.blocks)
+    bound = _rank_bound(core)
+    guesses: list[tuple[Origin, list[Subgraph]]] = [
+        ("by input", _rows(core)),
+        ("by output", [Subgraph(graph.outputs, graph.inputs) for graph in _rows(core.T)]),
+        ("greedy", _largest_first(core)),
+    ]
+    origin, best = min(guesses, key=lambda guess: len(guess[1]))
+    if len(best) > bound and int(core.sum()) <= LARGEST_SEARCH_LINKS:
+        steps = iter(range(_SEARCH_STEPS))
+        while bound < len(best):
+            found, exhausted = _search(core, bound, steps)
+            if found is not None:
+                origin, best = "search", found
+            if not exhausted:
+                break
+            bound = bound if found is not None else bound + 1
+    copied = [_with_repeats(graph, row_class, column_class) for graph in best]
+    return Partition(tuple(sorted(copied, key=lambda graph: graph.links)), origin, bound)
+
+
+def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
+    """φ1, φ2 and the block-diagonal mask of a partition.
+
+    Raises
+    ------
+    BadModelError
+        If the partition does not hold every link of the pattern exactly once.
+
+    Examples
+    --------
+    The sizes of (4.7), and φ1 = I:
+
+    >>> import numpy as np
+    >>> from gains.formation.bipartite import expanded_gain, partition_by_input
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import leader_follower
+    >>> pattern = leader_follower(FormationModel((-1, 0, 1)))
+    >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
+    >>> expanded.mask.shape, expanded.phi2.shape, np.array_equal(expanded.phi1, np.eye(6))
+    ((6, 16), (16, 10), True)
+    """
+    _check_partition(pattern, partition)
+    graphs = partition.subgraphs
+    phi1 = _stacked([i for graph in graphs for i in graph.inputs], pattern.input_sizes).T
+    phi2 = _stacked([j for graph in graphs for j in graph.outputs], pattern.output_sizes)
+    rows = np.repeat(np.arange(len(graphs)), [sum(pattern.input_sizes[i] for i in graph.inputs) for graph in graphs])
+    columns = np.repeat(
+        np.arange(len(graphs)), [sum(pattern.output_sizes[j] for j in graph.outputs) for graph in graphs]
+    )
+    return ExpandedGain(pattern, partition, phi1, phi2, rows[:, np.newaxis] == columns)
+
+
+def verify_expansion(plant: Plant, expanded: ExpandedGain, K: ArrayLike) -> float:
+    """Largest difference of the closed loops A + B K C and A + B̄ K̄ C̄, relative to the latter's largest entry.
+
+    Their modes are then the same to the conditioning of the eigenvalues.
+
+    Parameters
+    ----------
+    K
+        Gain with the pattern, shape (inputs, outputs).
+
+    Raises
+    ------
+    BadModelError
+        If K does not have the pattern, or the plant does not fit it.
+    DisagreementError
+        If it is more than rounding.
+
+    Examples
+    --------
+    >>> from gains.formation.bipartite import expanded_gain, partition_by_input, verify_expansion
+    >>> from gains.formation.pattern import Pattern, Plant
+    >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 1))
+    >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
+    >>> verify_expansion(Plant([[0, 0], [1, 0]], [[1, 0], [0, 1]]), expanded, [[-1, 0], [2, -3]])
+    0.0
+    """
+    gain = checked_pattern_gain(expanded.pattern, K)
+    closed = plant.closed_loop(gain)
+    expanded_closed = expanded.expand_plant(plant).closed_loop(expanded.expand(gain))
+    residual = float(np.abs(closed - expanded_closed).max() / max(np.abs(expanded_closed).max(), np.finfo(float).tiny))
+    if residual > 1e-12:
+        raise DisagreementError(
+            f"the closed loops with K and with the expanded gain differ by {residual:.3g} of their largest entry; "
+            "rounding (1e-12) at most is wanted"
+        )
+    return residual
+
+
+def _check_partition(pattern: Pattern, partition: Partition) -> None:
+    links = [link for graph in partition.subgraphs for link in graph.links]
+    twice = sorted({link for link in links if links.count(link) > 1}) if len(set(links)) < len(links) else []
+    if twice:
+        raise BadModelError(f"link {twice[0]} is in more than one subgraph; exactly one is wanted")
+    difference = sorted(set(links) ^ set(pattern.links))
+    if difference:
+        where = "the pattern" if difference[0] in links else "any subgraph"
+        raise BadModelError(f"link {difference[0]} is not in {where}; subgraphs are wanted that hold all links once")
+
+
+def _stacked(vehicles: list[int], sizes: tuple[int, ...]) -> FloatArray:
+    """0/1 matrix that stacks the named parts of a vector, in the order given."""
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    index = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in vehicles] or [np.zeros(0, dtype=np.intp)])
+    return np.eye(int(starts[-1]))[index.astype(np.intp)]
+
+
+def _rank_bound(blocks: NDArray[np.bool_]) -> int:
+    return int(np.linalg.matrix_rank(blocks.astype(float)))
+
+
+def _without_repeats(
+    blocks: NDArray[np.bool_],
+) -> tuple[NDArray[np.bool_], list[list[int]], list[list[int]]]:
+    """The different rows and columns that are not empty, and for each the original indices."""
+    row_class = _classes(blocks)
+    column_class = _classes(blocks.T)
+    core = blocks[np.ix_([rows[0] for rows in row_class], [columns[0] for columns in column_class])]
+    return core, row_class, column_class
+
+
+def _classes(rows: NDArray[np.bool_]) -> list[list[int]]:
+    found: dict[bytes, list[int]] = {}
+    for k, row in enumerate(rows):
+        if row.any():
+            found.setdefault(row.tobytes(), []).append(k)
+    return list(found.values())
+
+
+def _with_repeats(graph: Subgraph, row_class: list[list[int]], column_class: list[list[int]]) -> Subgraph:
+    return Subgraph(
+        tuple(sorted(i for k in graph.inputs for i in row_class[k])),
+        tuple(sorted(j for k in graph.outputs for j in column_class[k])),
+    )
+
+
+def _rows(core: NDArray[np.bool_]) -> list[Subgraph]:
+    return [Subgraph((i,), tuple(np.flatnonzero(row).tolist())) for i, row in enumerate(core)]
+
+
+def _largest_first(core: NDArray[np.bool_]) -> list[Subgraph]:
+    """Take away the largest subgraph spanned by the common outputs of one or two inputs until no link is left."""
+    left = core.copy()
+    graphs: list[Subgraph] = []
+    while left.any():
+        rows = np.unique(left[left.any(axis=1)], axis=0)
+        common = np.unique((rows[:, np.newaxis, :] & rows[np.newaxis]).reshape(-1, rows.shape[1]), axis=0)
+        # an input joins a subgraph if it has all its outputs; the product of the two counts is the number of links
+        lacking = common.astype(int) @ ~left.T
+        best = int(np.argmax((lacking == 0).sum(axis=1) * common.sum(axis=1)))
+        inputs, outputs = np.flatnonzero(lacking[best] == 0), np.flatnonzero(common[best])
+        left[np.ix_(inputs, outputs)] = False
+        graphs.append(Subgraph(tuple(inputs.tolist()), tuple(outputs.tolist())))
+    return graphs
+
+
+def _search(core: NDArray[np.bool_], count: int, steps: Iterator[int]) -> tuple[list[Subgraph] | None, bool]:
+    """A partition into at most `count` subgraphs if there is one, and whether the steps sufficed to know.
+
+    The first link not yet covered joins one of the subgraphs begun, with every further link that makes it complete
+    again, or begins one. Subgraphs are begun in the order of their first links, so that no partition is met twice.
+    """
+    links = [(int(i), int(j)) for i, j in np.argwhere(core)]
+    allowed: list[list[bool]] = core.tolist()
+    owner = np.full(core.shape, -1)
+    graphs: list[tuple[set[int], set[int]]] = []
+
+    def fill(first: int) -> bool | None:
+        while first < len(links) and owner[links[first]] >= 0:
+            first += 1
+        if first == len(links):
+            return True
+        if next(steps, None) is None:
+            return None
+        i, j = links[first]
+        for k in range(min(len(graphs) + 1, count)):
+            rows, columns = graphs[k] if k < len(graphs) else (set[int](), set[int]())
+            added = [(r, c) for r in rows | {i} for c in columns | {j} if owner[r, c] != k]
+            if any(not allowed[r][c] or owner[r, c] >= 0 for r, c in added):
+                continue
+            for link in added:
+                owner[link] = k
+            graphs[k:] = [(rows | {i}, columns | {j}), *graphs[k + 1 :]]
+            verdict = fill(first + 1)
+            if verdict is not False:
+                return verdict
+            for link in added:
+                owner[link] = -1
+            graphs[k:] = [(rows, columns), *graphs[k + 1 :]] if rows else []
+        return False
+
+    verdict = fill(0)
+    found = [Subgraph(tuple(sorted(rows)), tuple(sorted(columns))) for rows, columns in graphs] if verdict else None
+    return found, verdict is not None

@@ -1,0 +1,343 @@
+"""Modes that no gain with a given information pattern can move, and the links that would free them.
+
+λ is a fixed mode of x' = A x + B u, y = C x under a pattern if it is an eigenvalue of A + B K C for every K with the
+pattern. If it lies in the closed right half plane, no such gain stabilises the plant, and no design should be tried. It
+is found in two ways, which have to agree:
+
+* by rank: λ is fixed if and only if the inputs can be split into two sets D and E such that
+
+      rank [[A − λI, B_D], [C_E, 0]] < n                                                          (1)
+
+  with C_E the outputs that the inputs in E use. The rank is a submodular function of D, so the least one is found
+  without trying all 2^m sets;
+* by chance: λ is an eigenvalue of A + B K C for several random K with the pattern.
+
+Both are made for one strongly connected component of plant and pattern at a time: the closed loop is block triangular,
+and λ is fixed if and only if it is so in one of the diagonal blocks.
+
+Sources: Sahoo 2012 (see `gains.formation.model`), section 4, for the expanded decentralised plant, in which every input
+is a station; B. D. O. Anderson and D. J. Clements, "Algebraic characterization of fixed modes in decentralized
+control", Automatica 17 (1981), 703-712, for (1).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.errors import DisagreementError, InfeasibleError
+from gains.core.structure import distinct_blocks, strongly_connected_blocks
+from gains.formation.pattern import Link, Pattern, Plant, check_fits
+from gains.formation.submodular import least_exhaustive, least_submodular
+
+# up to this many inputs in one component all subsets are tried (256 ranks); above, the submodular minimum is computed
+LARGEST_EXHAUSTIVE = 8
+# singular values below this share of the largest are zero: rounding is 1e-15, a mode that moves does so by far more
+_RANK_TOLERANCE = 1e-10
+# eigenvalues of A closer than this share of its norm are one defective eigenvalue; their mean is exact to rounding
+_SAME_EIGENVALUE = 1e-5
+_RANDOM_GAINS = 3
+
+
+@dataclass(frozen=True)
+class FixedMode:
+    """An eigenvalue of A + B K C that is the same for every K with the pattern.
+
+    Attributes
+    ----------
+    mode
+        λ, 1/s; of a complex pair the one with positive imaginary part.
+    states
+        Indices of the states of the components in which λ is fixed.
+    cut
+        The inputs (vehicles) D of (1) in those components; all others there are E.
+    remedies
+        Sets of links each of which, added to the pattern, frees the mode; empty if no links do, because λ is not
+        controllable or not observable with all inputs and outputs together.
+    """
+
+    mode: complex
+    states: tuple[int, ...]
+    cut: tuple[int, ...]
+    remedies: tuple[tuple[Link, ...], ...]
+
+    @property
+    def unstable(self) -> bool:
+        """Whether λ is in the closed right half plane, 1e-9 of rounding included."""
+        return self.mode.real > -1e-9 * max(1.0, abs(self.mode))
+
+
+@dataclass(frozen=True, eq=False)
+class _Component:
+    """One diagonal block of the closed loop: the inputs that act on it and, for each, the rows of C it uses."""
+
+    states: NDArray[np.intp]
+    A: FloatArray
+    B: tuple[FloatArray, ...]
+    C: FloatArray
+    inputs: tuple[int, ...]
+    rows: tuple[NDArray[np.bool_], ...]
+
+
+def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
+    """Every mode that no gain with the pattern moves, in ascending order of real part.
+
+    Parameters
+    ----------
+    plant, pattern
+        The position of a formation's leader is not a state of its error model and so is no fixed mode here.
+    seed
+        Of the random gains.
+
+    Raises
+    ------
+    BadModelError
+        If plant and pattern do not fit.
+    DisagreementError
+        If the rank test and the random gains contradict each other: λ is fixed to rounding, or nearly so.
+
+    Examples
+    --------
+    A leader that may not use its own velocity error keeps its integrator, unless a link is added:
+
+    >>> from gains.formation.fixed_modes import fixed_modes
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import formation_plant, leader_follower, without_links
+    >>> pair = FormationModel((-1, 0), axes=1)
+    >>> [found] = fixed_modes(formation_plant(pair), without_links(leader_follower(pair), [(0, 0)]))
+    >>> abs(found.mode) < 1e-9, found.states, found.remedies
+    (True, (0,), (((0, 0),), ((0, 1),)))
+    """
+    check_fits(plant, pattern)
+    gains = _random_gains(plant, pattern, seed)
+    known: dict[bytes, list[tuple[complex, frozenset[int]]]] = {}
+    found: dict[complex, tuple[set[int], set[int]]] = {}
+    for component in _components(plant, pattern):
+        key = _fingerprint(component)
+        if key not in known:
+            known[key] = _fixed_in(component, [plant.B @ gain @ plant.C for gain in gains])
+        for mode, cut in known[key]:
+            states, inputs = found.setdefault(mode, (set(), set()))
+            states.update(component.states.tolist())
+            inputs.update(component.inputs[k] for k in cut)
+    return tuple(
+        FixedMode(mode, tuple(sorted(states)), tuple(sorted(cut)), _remedies(plant, pattern, mode, gains[0]))
+        for mode, (states, cut) in sorted(found.items(), key=lambda item: (item[0].real, item[0].imag))
+    )
+
+
+def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
+    """The fixed modes, all stable.
+
+    Without unstable fixed modes dynamic controllers with the pattern stabilise the plant; that a static gain does is
+    not implied. Arguments and further exceptions as of `fixed_modes`.
+
+    Raises
+    ------
+    InfeasibleError
+        If a fixed mode is unstable; the message names the links of which one or all have to be added.
+
+    Examples
+    --------
+    The leader-follower pattern leaves no fixed mode:
+
+    >>> from gains.formation.fixed_modes import check_stabilisable
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import formation_plant, leader_follower
+    >>> pair = FormationModel((-1, 0), axes=1)
+    >>> check_stabilisable(formation_plant(pair), leader_follower(pair))
+    ()
+    """
+    modes = fixed_modes(plant, pattern, seed=seed)
+    unstable = [mode for mode in modes if mode.unstable]
+    if unstable:
+        worst = max(unstable, key=lambda mode: mode.mode.real)
+        raise InfeasibleError(
+            f"no gain with this pattern moves the mode {_number(worst.mode)} 1/s (states {list(worst.states)}): "
+            f"{_advice(worst.remedies)}"
+        )
+    return modes
+
+
+def _components(plant: Plant, pattern: Pattern) -> list[_Component]:
+    feedback = (plant.B != 0.0).astype(float) @ pattern.mask.astype(float) @ (plant.C != 0.0).astype(float)
+    found: list[_Component] = []
+    for states in strongly_connected_blocks(plant.A, feedback):
+        C = plant.C[:, states]
+        seen = (C != 0.0).any(axis=1)
+        inputs = [
+            i for i in range(len(pattern.input_sizes)) if plant.B[np.ix_(states, _range(pattern.input_slice(i)))].any()
+        ]
+        rows = [np.repeat(pattern.blocks[i], pattern.output_sizes) & seen for i in inputs]
+        found.append(
+            _Component(
+                states=states,
+                A=plant.A[np.ix_(states, states)],
+                B=tuple(plant.B[np.ix_(states, _range(pattern.input_slice(i)))] for i in inputs),
+                C=C,
+                inputs=tuple(inputs),
+                rows=tuple(rows),
+            )
+        )
+    return found
+
+
+def _fingerprint(component: _Component) -> bytes:
+    """Equal for components that differ in the names of their states, inputs and outputs only."""
+    used = np.any(component.rows, axis=0) if component.rows else np.zeros(component.C.shape[0], dtype=bool)
+    parts = [component.A, *component.B, component.C[used], *(rows[used].astype(float) for rows in component.rows)]
+    return b"".join(repr(part.shape).encode() + (part + 0.0).tobytes() for part in parts)
+
+
+def _fixed_in(component: _Component, feedbacks: list[FloatArray]) -> list[tuple[complex, frozenset[int]]]:
+    """The fixed modes of one component, and the positions of the inputs of D among its own."""
+    at = np.ix_(component.states, component.states)
+    fixed: list[tuple[complex, frozenset[int]]] = []
+    for mode in _candidates(component.A):
+        stays = all(_is_eigenvalue(component.A + feedback[at], mode) for feedback in feedbacks)
+        rank, cut = _least_rank(component, mode)
+        if stays != (rank < component.states.size):
+            raise DisagreementError(
+                f"mode {_number(mode)} of the states {component.states.tolist()}: by rank ({rank} of "
+                f"{component.states.size}) it is {'' if rank < component.states.size else 'not '}fixed, random gains "
+                f"{'do not ' if stays else ''}move it; scale the plant so that its entries are of like size"
+            )
+        if stays:
+            fixed.append((mode, cut))
+    return fixed
+
+
+def _least_rank(component: _Component, mode: complex) -> tuple[int, frozenset[int]]:
+    """Least rank of (1) over all D, and the D."""
+    n = component.states.size
+    shifted = component.A - mode * np.eye(n)
+    left, singular, right = np.linalg.svd(shifted)
+    kept = int(np.count_nonzero(singular > _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
+    # eliminating the regular part of A − λI once leaves a small matrix for every D:
+    # rank (1) = rank(A − λI) + rank [[0, M B_D], [C_E N, −C_E (A − λI)⁺ B_D]]
+    inverse = (right[:kept].conj().T / singular[:kept]) @ left[:, :kept].conj().T
+    M, N = left[:, kept:].conj().T, right[kept:].conj().T
+    B = [block * (_size(shifted) / _size(block)) for block in component.B]
+    C = component.C * (_size(shifted) / _size(component.C))
+    moved, through = [M @ block for block in B], [-C @ inverse @ block for block in B]
+    seen = C @ N
+
+    def rank(cut: frozenset[int]) -> int:
+        others = [rows for k, rows in enumerate(component.rows) if k not in cut]
+        rows = np.any(others, axis=0) if others else np.zeros(C.shape[0], dtype=bool)
+        acting = sorted(cut)
+        below = np.hstack([seen[rows], *(through[k][rows] for k in acting)])
+        above = np.hstack([np.zeros((n - kept, n - kept)), *(moved[k] for k in acting)])
+        return kept + _rank(np.vstack([above, below]), _size(shifted))
+
+    size = len(component.inputs)
+    return least_exhaustive(rank, size) if size <= LARGEST_EXHAUSTIVE else least_submodular(rank, size)
+
+
+def _candidates(A: FloatArray) -> list[complex]:
+    """The eigenvalues of A, defective ones once, of complex pairs one."""
+    candidates: list[complex] = []
+    tolerance = _SAME_EIGENVALUE * max(float(np.linalg.norm(A, 2)), 1e-300)
+    for block in distinct_blocks(A):
+        left = np.linalg.eigvals(block.matrices[0]).astype(complex).tolist()
+        while left:
+            close = [mode for mode in left if abs(mode - left[0]) <= tolerance]
+            left = [mode for mode in left if abs(mode - left[0]) > tolerance]
+            mean = complex(np.mean(close))
+            mode = complex(mean.real + 0.0, 0.0 if abs(mean.imag) <= tolerance else mean.imag)
+            if mode.imag >= 0.0 and all(abs(mode - other) > tolerance for other in candidates):
+                candidates.append(mode)
+    return candidates
+
+
+def _is_eigenvalue(matrix: FloatArray, mode: complex) -> bool:
+    """By the least singular value: a defective eigenvalue itself is known to a root of the rounding only."""
+    singular = np.linalg.svd(matrix - mode * np.eye(matrix.shape[0]), compute_uv=False)
+    return float(singular[-1]) <= _RANK_TOLERANCE * float(np.linalg.norm(matrix, 2))
+
+
+def _random_gains(plant: Plant, pattern: Pattern, seed: int) -> list[FloatArray]:
+    """Gains with the pattern that move what can be moved about as far as the plant's own modes are apart."""
+    rng = np.random.default_rng(seed)
+    scale = _size(plant.A) / (_size(plant.B) * _size(plant.C))
+    mask = pattern.mask
+    # magnitudes between 0.5 and 1.5: an entry close to 0 would be a link that is hardly there
+    draws = [rng.uniform(0.5, 1.5, mask.shape) * rng.choice([-1.0, 1.0], mask.shape) for _ in range(_RANDOM_GAINS)]
+    return [scale * draw * mask for draw in draws]
+
+
+def _remedies(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -> tuple[tuple[Link, ...], ...]:
+    """Links that free the mode: every single one that does, else one set found link by link.
+
+    With M and N the left and right null spaces of A + B K C − λI for a random K, a full block K_ij raises the rank by
+    min(rank M'B_i, rank C_j N).
+    """
+    singles = _links_that_help(plant, pattern, mode, gain)
+    if not singles:
+        return ()
+    nullity, most = singles[0][1], max(freed for _, _, freed in singles)
+    if most == nullity:
+        return tuple((link,) for link, _, freed in singles if freed == nullity)
+    chosen: list[Link] = []
+    rng = np.random.default_rng(1)
+    gain = gain.copy()
+    while singles:
+        link = next(link for link, _, freed in singles if freed == max(freed for _, _, freed in singles))
+        chosen.append(link)
+        at = np.ix_(_range(pattern.input_slice(link[0])), _range(pattern.output_slice(link[1])))
+        gain[at] = float(np.abs(gain).max() or 1.0) * rng.uniform(0.5, 1.5, gain[at].shape)
+        if _nullity(plant.closed_loop(gain), mode) == 0:
+            return (tuple(chosen),)
+        singles = [entry for entry in _links_that_help(plant, pattern, mode, gain) if entry[0] not in chosen]
+    return ()
+
+
+def _links_that_help(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -> list[tuple[Link, int, int]]:
+    """(link, nullity, rank gained) for every link not in the pattern that gains any."""
+    shifted = plant.closed_loop(gain) - mode * np.eye(plant.states)
+    left, singular, right = np.linalg.svd(shifted)
+    nullity = int(np.count_nonzero(singular <= _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
+    if nullity == 0:
+        return []
+    M, N = left[:, -nullity:].conj().T, right[-nullity:].conj().T
+    moved = [_rank(M @ plant.B[:, pattern.input_slice(i)]) for i in range(len(pattern.input_sizes))]
+    seen = [_rank(plant.C[pattern.output_slice(j)] @ N) for j in range(len(pattern.output_sizes))]
+    missing = [(int(i), int(j)) for i, j in np.argwhere(~pattern.blocks)]
+    helpful = [((i, j), nullity, min(moved[i], seen[j])) for i, j in missing if min(moved[i], seen[j]) > 0]
+    return sorted(helpful, key=lambda entry: (abs(entry[0][0] - entry[0][1]), entry[0]))
+
+
+def _nullity(matrix: FloatArray, mode: complex) -> int:
+    singular = np.linalg.svd(matrix - mode * np.eye(matrix.shape[0]), compute_uv=False)
+    return int(np.count_nonzero(singular <= _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
+
+
+def _rank(matrix: FloatArray | ComplexArray, scale: float = 1.0) -> int:
+    """Rank of a product with orthonormal null vectors, whose entries are rounding or of the order of the scale."""
+    if matrix.size == 0:
+        return 0
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    return int(np.count_nonzero(singular > _RANK_TOLERANCE * max(scale, float(singular[0]))))
+
+
+def _size(matrix: FloatArray | ComplexArray) -> float:
+    """Largest entry, or 1 of a matrix that has none: a scale that can be divided by."""
+    largest = float(np.abs(matrix).max()) if matrix.size else 0.0
+    return largest if largest > 0.0 else 1.0
+
+
+def _range(place: slice) -> NDArray[np.intp]:
+    return np.arange(place.start, place.stop)
+
+
+def _advice(remedies: tuple[tuple[Link, ...], ...]) -> str:
+    if not remedies:
+        return "it is not controllable, or not observable, with all inputs and outputs; no link helps"
+    named = [" and ".join(str(link) for link in links) for links in remedies[:6]]
+    more = f" or one of {len(remedies) - 6} more" if len(remedies) > 6 else ""
+    return f"add the link {' or '.join(named)}{more} (i, j): the input of vehicle i uses the output of vehicle j"
+
+
+def _number(mode: complex) -> str:
+    return f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode.real:.6g} ± {abs(mode.imag):.6g}j"

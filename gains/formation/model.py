@@ -1,0 +1,207 @@
+"""The error model of a leader-follower formation, for any chain or tree of vehicles.
+
+Source: P. R. Sahoo, "Decentralized Control Design Approaches for Formation Control of Unmanned Aerial Vehicles",
+M.Tech thesis, NIT Rourkela, 2012, eqs. (2.10)-(2.12), written there for a chain of three vehicles.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+
+LEADER = -1
+
+
+@dataclass(frozen=True)
+class FormationModel:
+    """Linear error model e' = A e + B u of vehicles that each follow the vehicle in front.
+
+    Vehicle 0 is the leader; e_0^v = Z_0^v − v_d is its velocity error, its position is not controlled. For a follower i
+    behind vehicle j, with desired spacing d_i and positions and velocities Z^p, Z^v (thesis 2.10, 2.11)::
+
+        e_i^p = Z_j^p − Z_i^p − d_i     spacing error,  e_i^p' = e_j^v − e_i^v
+        e_i^v = Z_i^v − v_d             velocity error, e_i^v' = u_i
+
+    The state is e = (e_0^v, e_1^p, e_1^v, e_2^p, e_2^v, ...), the input u = (u_0, u_1, ...), each entry with `axes`
+    components.
+
+    Parameters
+    ----------
+    predecessors
+        For each vehicle the index of the one it follows, −1 for the leader. Any sequence or integer array. A vehicle
+        comes after the one it follows, so the leader comes first.
+    axes
+        Number of controlled axes, 2 for north and east.
+
+    Raises
+    ------
+    BadModelError
+        If the sequence is empty, is not of whole numbers, has no leader or more than one, or names a vehicle that does
+        not come earlier.
+
+    Examples
+    --------
+    A leader and two followers in a chain. With K1 = −1, K3 = 1 per axis a follower has the loop
+    s² + (s + 1) e^{−sτ} = 0 and a delay margin of 0.711119 s:
+
+    >>> import numpy as np
+    >>> from gains.delay.constant import delay_margin
+    >>> from gains.formation.model import FormationModel
+    >>> chain = FormationModel((-1, 0, 1))
+    >>> chain.states, chain.inputs, chain.depth
+    (10, 6, 2)
+    >>> round(delay_margin(*chain.ground_loop(-np.eye(2), 0 * np.eye(2), np.eye(2))), 6)
+    0.711119
+    """
+
+    predecessors: tuple[int, ...]
+    axes: int = 2
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "predecessors", _checked_predecessors(self.predecessors))
+        if self.axes < 1:
+            raise BadModelError(f"axes = {self.axes}; wanted 1 or more (2 for north and east)")
+
+    @property
+    def vehicles(self) -> int:
+        """Number of vehicles, the leader among them."""
+        return len(self.predecessors)
+
+    @property
+    def followers(self) -> range:
+        """Indices of all vehicles but the leader."""
+        return range(1, self.vehicles)
+
+    @property
+    def states(self) -> int:
+        """Length of the error vector e."""
+        return self.axes * (2 * self.vehicles - 1)
+
+    @property
+    def inputs(self) -> int:
+        """Length of the input vector u."""
+        return self.axes * self.vehicles
+
+    @property
+    def depth(self) -> int:
+        """Number of followers on the longest way from the leader to a last vehicle."""
+        depths = [0]
+        for i in self.followers:
+            depths.append(depths[self.predecessors[i]] + 1)
+        return max(depths)
+
+    def velocity_slice(self, vehicle: int) -> slice:
+        """Place of e_i^v in the state."""
+        start = 2 * self.axes * self._known(vehicle)
+        return slice(start, start + self.axes)
+
+    def spacing_slice(self, vehicle: int) -> slice:
+        """Place of e_i^p in the state; the leader has none."""
+        if self._known(vehicle) == 0:
+            raise BadModelError("vehicle 0 is the leader and has no spacing error; wanted a follower")
+        start = self.axes * (2 * vehicle - 1)
+        return slice(start, start + self.axes)
+
+    def output_slice(self, vehicle: int) -> slice:
+        """Place of all errors of a vehicle in the state: e_i^p and e_i^v, for the leader e_0^v."""
+        start = 0 if self._known(vehicle) == 0 else self.spacing_slice(vehicle).start
+        return slice(start, self.velocity_slice(vehicle).stop)
+
+    def input_slice(self, vehicle: int) -> slice:
+        """Place of u_i in the input."""
+        start = self.axes * self._known(vehicle)
+        return slice(start, start + self.axes)
+
+    @property
+    def A(self) -> FloatArray:  # noqa: N802 - the source's letter
+        """State matrix of (2.12), shape (states, states): e_i^p' = e_j^v − e_i^v, velocity errors driven by u only."""
+        A = np.zeros((self.states, self.states))
+        identity = np.eye(self.axes)
+        for i in self.followers:
+            A[self.spacing_slice(i), self.velocity_slice(self.predecessors[i])] = identity
+            A[self.spacing_slice(i), self.velocity_slice(i)] = -identity
+        return A
+
+    @property
+    def B(self) -> FloatArray:  # noqa: N802 - the source's letter
+        """Input matrix of (2.12), shape (states, inputs): u_i is the acceleration of vehicle i."""
+        B = np.zeros((self.states, self.inputs))
+        for i in range(self.vehicles):
+            B[self.velocity_slice(i), self.input_slice(i)] = np.eye(self.axes)
+        return B
+
+    def overlapping_gain(self, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
+        """Gain K of u = K e with the leader-follower pattern (3.19), shape (inputs, states).
+
+        ::
+
+            u_0 = K1 e_0^v
+            u_i = K1 e_i^v + K2 e_j^v + K3 e_i^p     for a follower i behind j
+
+        K1 is negative and K3 positive (definite) in a stable loop, because e_i^p grows as vehicle i falls behind.
+
+        Parameters
+        ----------
+        K1, K2, K3
+            Gains on the own velocity error (1/s), the velocity error of the vehicle in front (1/s) and the spacing
+            error (1/s²), each of shape (axes, axes).
+
+        Raises
+        ------
+        BadModelError
+            If a gain is not finite or not of that shape.
+        """
+        own, front, spacing = (
+            checked_gain(name, gain, self.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
+        )
+        K = np.zeros((self.inputs, self.states))
+        for i in range(self.vehicles):
+            K[self.input_slice(i), self.velocity_slice(i)] = own
+        for i in self.followers:
+            K[self.input_slice(i), self.velocity_slice(self.predecessors[i])] = front
+            K[self.input_slice(i), self.spacing_slice(i)] = spacing
+        return K
+
+    def ground_loop(self, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return (A0, A1) of e'(t) = A0 e(t) + A1 e(t − τ) when a ground station closes every loop.
+
+        All feedback is late: A0 = A, A1 = B K, both (states, states). Arguments as of `overlapping_gain`.
+        """
+        return self.A, self.B @ self.overlapping_gain(K1, K2, K3)
+
+    def _known(self, vehicle: int) -> int:
+        if not 0 <= vehicle < self.vehicles:
+            raise BadModelError(f"vehicle {vehicle} is not in the formation; wanted 0 to {self.vehicles - 1}")
+        return vehicle
+
+
+def checked_gain(name: str, gain: ArrayLike, axes: int) -> FloatArray:
+    """Return the gain as a finite float array of shape (axes, axes), or raise BadModelError naming it."""
+    try:
+        array = np.array(gain, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise BadModelError(f"{name} = {gain!r} is not a matrix of numbers") from error
+    if array.shape != (axes, axes):
+        raise BadModelError(f"{name} has shape {array.shape}; wanted ({axes}, {axes})")
+    if not np.isfinite(array).all():
+        raise BadModelError(f"{name} = {array.tolist()} is not finite")
+    return array
+
+
+def _checked_predecessors(predecessors: ArrayLike) -> tuple[int, ...]:
+    array = np.array(predecessors)
+    if array.ndim != 1 or array.size == 0:
+        raise BadModelError(f"predecessors has shape {array.shape}; wanted one number for each vehicle")
+    if not np.issubdtype(array.dtype, np.integer):
+        raise BadModelError(f"predecessors = {array.tolist()}; wanted whole numbers, -1 for the leader")
+    if array[0] != LEADER:
+        raise BadModelError(f"vehicle 0 follows vehicle {array[0]}; wanted the leader (-1) to come first")
+    for i, j in enumerate(array.tolist()[1:], start=1):
+        if j == LEADER:
+            raise BadModelError(f"vehicle {i} is a second leader (-1); wanted exactly one, and it is vehicle 0")
+        if not 0 <= j < i:
+            raise BadModelError(f"vehicle {i} follows vehicle {j}; wanted one that comes before it, 0 to {i - 1}")
+    return tuple(int(j) for j in array)

@@ -1,0 +1,319 @@
+"""Who may use whose output: information patterns of a decentralised static feedback u = K y, y = C x.
+
+A pattern is a binary block matrix; its block (i, j) is 1 where the output of vehicle j may be used in the input of
+vehicle i. The gain has any numbers in these blocks and zeros elsewhere. A leader-follower tree, bidirectional coupling
+and vehicles with several predecessors are all patterns.
+
+Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.6), and section 5, eqs. (5.1), (5.2).
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import BoolArray, FloatArray
+from gains.core.errors import BadModelError
+from gains.core.structure import real_matrix, square_matrices
+from gains.formation.model import FormationModel
+
+Link = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """Linear plant x' = A x + B u, y = C x.
+
+    Attributes
+    ----------
+    A, B
+        Shapes (n, n) and (n, inputs).
+    C
+        Shape (outputs, n); the identity if not given.
+
+    Raises
+    ------
+    BadModelError
+        If a matrix is not finite and real or the shapes do not fit.
+
+    Examples
+    --------
+    Two integrators in a row of which the position is measured:
+
+    >>> from gains.formation.pattern import Plant
+    >>> plant = Plant([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
+    >>> plant.closed_loop([[-4]]).tolist()
+    [[0.0, 1.0], [-4.0, 0.0]]
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+
+    def __init__(self, A: ArrayLike, B: ArrayLike, C: ArrayLike | None = None) -> None:
+        [state] = square_matrices(A=A)
+        control = real_matrix("B", B)
+        output = np.eye(state.shape[0]) if C is None else real_matrix("C", C)
+        if control.shape[0] != state.shape[0]:
+            raise BadModelError(f"B has shape {control.shape}; {state.shape[0]} rows are wanted, as A")
+        if output.shape[1] != state.shape[0]:
+            raise BadModelError(f"C has shape {output.shape}; {state.shape[0]} columns are wanted, as A")
+        for name, matrix in (("A", state), ("B", control), ("C", output)):
+            object.__setattr__(self, name, matrix)
+
+    @property
+    def states(self) -> int:
+        """Length n of x."""
+        return self.A.shape[0]
+
+    def closed_loop(self, K: FloatArray) -> FloatArray:
+        """A + B K C, shape (n, n)."""
+        return self.A + self.B @ K @ self.C
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Binary block matrix of the gain K: which output each input may use.
+
+    Attributes
+    ----------
+    blocks
+        Shape (vehicles with an input, vehicles with an output); True at (i, j) if y_j may be used in u_i.
+    input_sizes, output_sizes
+        Length of every u_i and y_j; they may differ from vehicle to vehicle.
+
+    Raises
+    ------
+    BadModelError
+        If an entry is not 0 or 1, a size is not a positive whole number, or shape and sizes do not fit.
+
+    Examples
+    --------
+    u_0 uses y_0, u_1 uses both outputs; y_1 has two entries:
+
+    >>> from gains.formation.pattern import Pattern
+    >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 2))
+    >>> pattern.links, pattern.mask.astype(int).tolist()
+    (((0, 0), (1, 0), (1, 1)), [[1, 0, 0], [1, 1, 1]])
+    """
+
+    blocks: BoolArray
+    input_sizes: tuple[int, ...]
+    output_sizes: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        blocks = _checked_blocks(self.blocks)
+        for name, wanted in zip(("input_sizes", "output_sizes"), blocks.shape, strict=True):
+            sizes = tuple(getattr(self, name))
+            if len(sizes) != wanted:
+                raise BadModelError(f"{name} = {sizes} has {len(sizes)} entries; {wanted} are wanted, as the blocks")
+            if any(size != int(size) or size < 1 for size in sizes):
+                raise BadModelError(f"{name} = {sizes}; positive whole numbers are wanted")
+            object.__setattr__(self, name, tuple(int(size) for size in sizes))
+        object.__setattr__(self, "blocks", blocks)
+
+    @property
+    def links(self) -> tuple[Link, ...]:
+        """Every (i, j) such that u_i may use y_j, row by row."""
+        return tuple((int(i), int(j)) for i, j in np.argwhere(self.blocks))
+
+    @property
+    def mask(self) -> BoolArray:
+        """Entries of K that may differ from zero, shape (inputs, outputs)."""
+        return np.repeat(np.repeat(self.blocks, self.input_sizes, axis=0), self.output_sizes, axis=1)
+
+    @property
+    def inputs(self) -> int:
+        """Length of u."""
+        return sum(self.input_sizes)
+
+    @property
+    def outputs(self) -> int:
+        """Length of y."""
+        return sum(self.output_sizes)
+
+    def input_slice(self, i: int) -> slice:
+        """Place of u_i in u."""
+        return _place(self.input_sizes, i)
+
+    def output_slice(self, j: int) -> slice:
+        """Place of y_j in y."""
+        return _place(self.output_sizes, j)
+
+
+def leader_follower(formation: FormationModel) -> Pattern:
+    """The pattern (4.6): every vehicle uses its own output and that of the vehicle in front.
+
+    The output of the leader is its velocity error, of a follower its spacing and velocity errors: C = I.
+
+    Examples
+    --------
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import leader_follower
+    >>> leader_follower(FormationModel((-1, 0, 1))).links
+    ((0, 0), (1, 0), (1, 1), (2, 1), (2, 2))
+    """
+    blocks = np.eye(formation.vehicles, dtype=bool)
+    for i in formation.followers:
+        blocks[i, formation.predecessors[i]] = True
+    return Pattern(blocks, *_formation_sizes(formation))
+
+
+def bidirectional(formation: FormationModel) -> Pattern:
+    """Every vehicle uses its own output, that of the vehicle in front and those of the vehicles behind it.
+
+    For a chain of three this is the pattern of section 5: vehicle 2 uses 1, 2, 3, vehicles 1 and 3 use 2.
+
+    Examples
+    --------
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import bidirectional
+    >>> bidirectional(FormationModel((-1, 0, 1))).blocks.astype(int).tolist()
+    [[1, 1, 0], [1, 1, 1], [0, 1, 1]]
+    """
+    pattern = leader_follower(formation)
+    return replace(pattern, blocks=pattern.blocks | pattern.blocks.T)
+
+
+def all_to_all(formation: FormationModel) -> Pattern:
+    """Every vehicle uses all outputs: the centralised controller.
+
+    Examples
+    --------
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import all_to_all
+    >>> all_to_all(FormationModel((-1, 0))).links
+    ((0, 0), (0, 1), (1, 0), (1, 1))
+    """
+    return Pattern(np.ones((formation.vehicles, formation.vehicles), dtype=bool), *_formation_sizes(formation))
+
+
+def with_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
+    """The pattern in which, for every (i, j) given, u_i may use y_j as well.
+
+    Raises
+    ------
+    BadModelError
+        If a link names a vehicle that is not in the pattern.
+
+    Examples
+    --------
+    Vehicle 2 sees the leader as well:
+
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import leader_follower, with_links
+    >>> with_links(leader_follower(FormationModel((-1, 0, 1))), [(2, 0)]).blocks.astype(int).tolist()
+    [[1, 0, 0], [1, 1, 0], [1, 1, 1]]
+    """
+    return replace(pattern, blocks=_set(pattern, links, True))
+
+
+def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
+    """The pattern in which, for every (i, j) given, u_i may not use y_j. Exceptions as of `with_links`.
+
+    Examples
+    --------
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import leader_follower, without_links
+    >>> without_links(leader_follower(FormationModel((-1, 0, 1))), [(2, 1)]).links
+    ((0, 0), (1, 0), (1, 1), (2, 2))
+    """
+    return replace(pattern, blocks=_set(pattern, links, False))
+
+
+def formation_plant(formation: FormationModel, C: ArrayLike | None = None) -> Plant:
+    """The error model of the formation with outputs y = C e, C of shape (outputs, states); C = I if not given.
+
+    Examples
+    --------
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.formation.pattern import formation_plant
+    >>> plant = formation_plant(FormationModel((-1, 0, 1)))
+    >>> plant.A.shape, plant.B.shape, plant.C.shape
+    ((10, 10), (10, 6), (10, 10))
+    """
+    return Plant(formation.A, formation.B, C)
+
+
+def split_own(pattern: Pattern, K: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """K as K_own + K_others: the blocks (i, i) and the rest, (5.1).
+
+    With own information at once and that of others late by τ the loop is, (5.2)::
+
+        x'(t) = (A + B K_own C) x(t) + B K_others C x(t − τ)
+
+    Raises
+    ------
+    BadModelError
+        If K does not have the pattern.
+
+    Examples
+    --------
+    >>> from gains.formation.pattern import Pattern, split_own
+    >>> own, others = split_own(Pattern([[1, 1], [1, 1]], (1, 1), (1, 1)), [[-2, 1], [1, -2]])
+    >>> own.tolist(), others.tolist()
+    ([[-2.0, 0.0], [0.0, -2.0]], [[0.0, 1.0], [1.0, 0.0]])
+    """
+    gain = checked_pattern_gain(pattern, K)
+    own = replace(pattern, blocks=np.eye(*pattern.blocks.shape, dtype=bool)).mask
+    return np.where(own, gain, 0.0), np.where(own, 0.0, gain)
+
+
+def checked_pattern_gain(pattern: Pattern, K: ArrayLike) -> FloatArray:
+    """K as a finite array of the pattern's shape and with zeros where the pattern has none, or BadModelError."""
+    gain = real_matrix("K", K)
+    mask = pattern.mask
+    if gain.shape != mask.shape:
+        raise BadModelError(f"K has shape {gain.shape}; {mask.shape} is wanted, as the pattern")
+    foreign = np.argwhere((gain != 0.0) & ~mask)
+    if foreign.size:
+        row, column = (int(k) for k in foreign[0])
+        i, j = _block_of(pattern.input_sizes, row), _block_of(pattern.output_sizes, column)
+        raise BadModelError(
+            f"K[{row}, {column}] = {gain[row, column]}, in block ({i}, {j}); the pattern has no link ({i}, {j}): "
+            "0 is wanted there, or with_links"
+        )
+    return gain
+
+
+def check_fits(plant: Plant, pattern: Pattern) -> None:
+    """Raise BadModelError unless the inputs and outputs of plant and pattern are equally many."""
+    if (plant.B.shape[1], plant.C.shape[0]) != (pattern.inputs, pattern.outputs):
+        raise BadModelError(
+            f"the pattern has {pattern.inputs} inputs and {pattern.outputs} outputs; {plant.B.shape[1]} and "
+            f"{plant.C.shape[0]} are wanted, as the plant"
+        )
+
+
+def _formation_sizes(formation: FormationModel) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    n, vehicles = formation.axes, formation.vehicles
+    return (n,) * vehicles, (n,) + (2 * n,) * (vehicles - 1)
+
+
+def _checked_blocks(blocks: ArrayLike) -> BoolArray:
+    matrix = real_matrix("blocks", blocks)
+    if not np.isin(matrix, (0.0, 1.0)).all():
+        raise BadModelError("blocks has entries other than 0 and 1; a binary matrix is wanted")
+    return matrix.astype(bool)
+
+
+def _set(pattern: Pattern, links: Iterable[Link], value: bool) -> BoolArray:
+    blocks = pattern.blocks.copy()
+    for i, j in links:
+        if not (0 <= i < blocks.shape[0] and 0 <= j < blocks.shape[1]):
+            raise BadModelError(
+                f"link ({i}, {j}) is not in the pattern; an input 0 to {blocks.shape[0] - 1} and an output 0 to "
+                f"{blocks.shape[1] - 1} are wanted"
+            )
+        blocks[i, j] = value
+    return blocks
+
+
+def _place(sizes: tuple[int, ...], k: int) -> slice:
+    start = sum(sizes[:k])
+    return slice(start, start + sizes[k])
+
+
+def _block_of(sizes: tuple[int, ...], index: int) -> int:
+    return int(np.searchsorted(np.cumsum(sizes), index, side="right"))

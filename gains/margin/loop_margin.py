@@ -1,0 +1,306 @@
+"""The delay margin of any linear loop that `gains.margin.model_file` describes: one record, with what confirms it.
+
+Which analysis answers depends on the model: `gains.delay.constant` for one late part, `gains.delay.commensurate` for
+multiples of the unknown, `gains.delay.mixed` with known delays beside it, `gains.sampled.constant` for a held loop with
+a known period, and `gains.sampled.period_windows` if the period is the unknown. `gains.margin.opinions` confirms what
+it can.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import ceil, floor, gcd, inf, log10, pi
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError, DisagreementError
+from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
+from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
+from gains.delay.crossing_error import DelayedTerm, crossing_error
+from gains.margin.model_file import DelayModel, HeldModel
+from gains.margin.opinions import second_opinions
+
+# multiples of the unknown up to this many times their common divisor
+_MOST_STEPS = 200
+# digits that are printed at most
+_DIGITS = 6
+# errors are estimated for the first crossings only: there may be thousands
+_ERRORS_OF = 100
+# the spectral radius is looked at this far beside the margin of a held loop, relative to it
+_BESIDE = 1e-4
+# and only of one-period maps up to this size, which take 0.2 s
+_LARGEST_MAP = 300
+# backward error of an eigenvalue of such a map, in units of n eps and its norm
+_BACKWARD = 10.0
+
+
+@dataclass(frozen=True)
+class MarginCrossing:
+    """Roots on the imaginary axis, or on the unit circle of a sampled loop, at one value of the unknown.
+
+    `delay_s` is that value, known to `delay_error_s` (nan where it was not estimated), and `direction` as of
+    `gains.delay.constant.Crossing`. `roots` and `repeats_every_s` are None where they are not told: of sampled loops,
+    and of a real root, which passes zero once.
+    """
+
+    omega_rad_s: float
+    delay_s: float
+    direction: int
+    roots: int | None
+    repeats_every_s: float | None
+    delay_error_s: float
+
+
+@dataclass(frozen=True)
+class LoopMargin:
+    """What is known of a loop for all values of its `unknown`: a delay, or the sampling period.
+
+    Attributes
+    ----------
+    unknown
+        Its name; "period" for the sampling period.
+    stable_intervals_s
+        The windows of stability, inf without an end, complete up to `complete_to_s`.
+    delay_margin_s, delay_margin_error_s
+        The end of the window that begins at 0, or 0, and its estimated error.
+    unstable_roots_at_zero_delay, roots_fixed_at_zero
+        Roots right of the axis with the unknown at zero; roots at 0 that are left out of everything else.
+    checked_by
+        The names of the methods that confirmed the windows.
+    """
+
+    unknown: str
+    stable_intervals_s: tuple[tuple[float, float], ...]
+    delay_margin_s: float
+    delay_margin_error_s: float
+    crossings: tuple[MarginCrossing, ...]
+    unstable_roots_at_zero_delay: int
+    roots_fixed_at_zero: int
+    complete_to_s: float
+    checked_by: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class LoopAtGivenDelays:
+    """A loop whose delays are all numbers: its rightmost root (1/s), and its unstable roots without any delay."""
+
+    rightmost_root: complex
+    unstable_roots_at_zero_delay: int
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether all roots are left of the imaginary axis."""
+        return self.rightmost_root.real < 0.0
+
+
+def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays:
+    """What the delays of a model may be.
+
+    Raises
+    ------
+    BadModelError
+        The model cannot be analysed; the message names what was read and what was wanted.
+    DisagreementError
+        Independent methods gave different answers.
+
+    Examples
+    --------
+    >>> from gains.margin.loop_margin import loop_margin
+    >>> from gains.margin.model_file import parse_model
+    >>> found = loop_margin(parse_model('{"A0": [[0]], "A1": [[-1]]}'))
+    >>> round(found.delay_margin_s, 6), found.checked_by
+    (1.570796, ('sweep', 'rightmost root'))
+    """
+    if isinstance(model, HeldModel):
+        return _with_unknown_period(model) if model.period_s is None else _with_known_period(model, model.period_s)
+    return _with_unknown_delay(model) if model.unknown else _at_given_delays(model)
+
+
+def as_known(value: float, error: float) -> str:
+    """A number with as many digits, six at most, as its error leaves: the last one is off by one at most.
+
+    Examples
+    --------
+    >>> from gains.margin.loop_margin import as_known
+    >>> as_known(0.8152534, 1e-12), as_known(0.8152534, 8e-5), as_known(0.8152534, 0.4)
+    ('0.815253', '0.815', '0.8')
+    """
+    if not error > 0.0 or value == 0.0:
+        return f"{value:.{_DIGITS}g}"
+    # a unit of the last digit is at least twice the error: rounding to it takes the other half
+    digits = floor(log10(abs(value))) + 1 - ceil(log10(2.0 * error))
+    return f"{value:.{min(max(digits, 1), _DIGITS)}g}"
+
+
+def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
+    from gains.delay.rightmost import rightmost_root
+
+    root = rightmost_root([(term.matrix, term.fixed_s) for term in model.terms])
+    total = sum((term.matrix for term in model.terms), np.zeros_like(model.terms[0].matrix))
+    return LoopAtGivenDelays(root, int(np.count_nonzero(np.linalg.eigvals(total).real > 0.0)))
+
+
+def _with_unknown_delay(model: DelayModel) -> LoopMargin:
+    matrices, taken_out = without_equilibria(*(term.matrix for term in model.terms))
+    unit = _common_divisor([term.multiple for term in model.terms])
+    steps = [int(term.multiple / unit) for term in model.terms]
+    if max(steps) > _MOST_STEPS:
+        raise BadModelError(
+            f"terms: read delays up to {max(steps)} times their common divisor {unit}*{model.unknown}, "
+            f"wanted at most {_MOST_STEPS} times"
+        )
+    known_s = [term.fixed_s for term in model.terms]
+    terms = [DelayedTerm(*parts) for parts in zip(matrices, known_s, steps, strict=True)]
+    analysis = _analysed(terms)
+    opinions = second_opinions(analysis, terms)
+    # the analysis is in the common divisor of the delays; the unknown is that divided by `unit`
+    scale = 1.0 / float(unit)
+    fixed = taken_out + analysis.roots_fixed_at_zero
+    at_zero = () if analysis.stable_intervals_s or fixed else _singular_note(matrices)
+    return LoopMargin(
+        unknown=model.unknown,
+        stable_intervals_s=tuple((start_s * scale, end_s * scale) for start_s, end_s in analysis.stable_intervals_s),
+        delay_margin_s=analysis.delay_margin_s * scale,
+        delay_margin_error_s=opinions.margin_error_s * scale,
+        crossings=tuple(
+            _scaled(c, crossing_error(terms, c.omega_rad_s, c.delay_s)[1] if i < _ERRORS_OF else np.nan, scale)
+            for i, c in enumerate(analysis.crossings)
+        ),
+        unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_delay,
+        roots_fixed_at_zero=fixed,
+        complete_to_s=analysis.complete_to_s * scale,
+        checked_by=opinions.checked_by,
+        notes=(_fixed_note(fixed),) if fixed else at_zero,
+    )
+
+
+def _analysed(terms: Sequence[DelayedTerm]) -> DelayAnalysis:
+    """The windows in the common divisor of the delays."""
+    from gains.delay.commensurate import analyse_commensurate
+    from gains.delay.mixed import MixedTerm, analyse_mixed
+
+    if any(term.known_s for term in terms):
+        mixed = [MixedTerm(term.matrix, term.known_s, term.multiple) for term in terms]
+        return analyse_mixed(mixed, leave_out_zero=True)
+    late = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
+    for term in terms:
+        late[term.multiple] = late[term.multiple] + term.matrix
+    if len(late) == 2:
+        return analyse_delay(late[0], late[1], leave_out_zero=True)
+    return analyse_commensurate(late, leave_out_zero=True)
+
+
+def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
+    omega = crossing.omega_rad_s
+    repeats_every_s = 2.0 * pi / omega * scale if omega > 0.0 else None
+    delay_s = crossing.delay_s * scale
+    return MarginCrossing(omega, delay_s, crossing.direction, crossing.roots, repeats_every_s, error_s * scale)
+
+
+def _with_unknown_period(model: HeldModel) -> LoopMargin:
+    from gains.sampled.constant import period_map
+    from gains.sampled.period_windows import analyse_period
+
+    def error_s(period_s: float) -> float:
+        return _map_error(lambda at_s: period_map(model.A, model.B, model.K, period_s=at_s, delay_s=0.0), period_s)
+
+    analysis = analyse_period(model.A, model.B, model.K)
+    crossings = tuple(
+        MarginCrossing(c.omega_rad_s, c.period_s, c.direction, None, None, error_s(c.period_s) if i < _ERRORS_OF else 0)
+        for i, c in enumerate(analysis.crossings)
+    )
+    return LoopMargin(
+        unknown="period",
+        stable_intervals_s=analysis.stable_intervals_s,
+        delay_margin_s=analysis.limit_s,
+        delay_margin_error_s=max((c.delay_error_s for c in crossings if c.delay_s == analysis.limit_s), default=0.0),
+        crossings=crossings,
+        unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_period,
+        roots_fixed_at_zero=0,
+        complete_to_s=analysis.complete_to_s,
+        checked_by=(),
+        notes=("the unknown is the sampling period: u = K x, sampled and held",),
+    )
+
+
+def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
+    """The margin of the held loop as it is flown; windows beyond the first are not looked for."""
+    from gains.sampled.constant import period_map, sampled_delay_margin, spectral_radius
+
+    loop = (model.A, model.B, model.K)
+    margin_s = sampled_delay_margin(*loop, period_s=period_s)
+    crossings: tuple[MarginCrossing, ...] = ()
+    checks: tuple[str, ...] = ()
+    if 0.0 < margin_s < inf and len(model.A) + model.B.shape[1] * (margin_s / period_s + 2.0) <= _LARGEST_MAP:
+        for delay_s in ((1.0 - _BESIDE) * margin_s, (1.0 + _BESIDE) * margin_s):
+            radius = spectral_radius(*loop, period_s=period_s, delay_s=delay_s)
+            if (radius < 1.0) != (delay_s < margin_s):
+                raise DisagreementError(
+                    f"the sampled delay margin is {margin_s} s at a period of {period_s} s, but the spectral radius of "
+                    f"the one-period map at {delay_s} s is {radius}"
+                )
+        checks = ("spectral radius",)
+
+        def map_at(delay_s: float) -> FloatArray:
+            return period_map(*loop, period_s=period_s, delay_s=delay_s)
+
+        eigenvalues = np.linalg.eigvals(map_at(margin_s))
+        omega = abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))]))) / period_s
+        crossings = (MarginCrossing(omega, margin_s, 1, None, None, _map_error(map_at, margin_s)),)
+    at_once = np.linalg.eigvals(period_map(*loop, period_s=period_s, delay_s=0.0))
+    beyond = "" if margin_s == inf else "; longer delays than its margin were not looked at"
+    return LoopMargin(
+        unknown="tau",
+        stable_intervals_s=((0.0, margin_s),) if margin_s > 0.0 else (),
+        delay_margin_s=margin_s,
+        delay_margin_error_s=max((crossing.delay_error_s for crossing in crossings), default=0.0),
+        crossings=crossings,
+        unstable_roots_at_zero_delay=int(np.count_nonzero(np.abs(at_once) > 1.0)),
+        roots_fixed_at_zero=0,
+        complete_to_s=margin_s,
+        checked_by=checks,
+        notes=(f"u = K x, sampled and held every {period_s:g} s, acts tau late{beyond}",),
+    )
+
+
+def _map_error(map_at: Callable[[float], FloatArray], at_s: float) -> float:
+    """Error (s) of the instant at which the spectral radius of a one-period map passes one, by rounding."""
+    size = len(map_at(at_s))
+    if size > _LARGEST_MAP:
+        return np.nan
+    step_s = _BESIDE * at_s
+    radii = [float(np.abs(np.linalg.eigvals(map_at(at_s + way * step_s))).max()) for way in (-1.0, 1.0)]
+    slope = abs(radii[1] - radii[0]) / (2.0 * step_s)
+    matrix = map_at(at_s)
+    eigenvalues, vectors = np.linalg.eig(matrix)
+    epsilon = _BACKWARD * size * float(np.finfo(np.float64).eps) * float(np.linalg.norm(matrix))
+    # left and right vectors of the largest eigenvalue: their angle is its condition
+    k = int(np.argmax(np.abs(eigenvalues)))
+    left = np.linalg.svd(matrix - eigenvalues[k] * np.eye(size))[0][:, -1]
+    angle = abs(complex(left.conj() @ vectors[:, k]))
+    moved = min(epsilon / max(angle, 1e-300), epsilon ** (1.0 / max(size, 2)))
+    return min(moved / slope if slope > 0.0 else inf, at_s)
+
+
+def _common_divisor(multiples: list[Fraction]) -> Fraction:
+    """The largest fraction of which all multiples are whole multiples; 1 if all are zero."""
+    present = [multiple for multiple in multiples if multiple != 0]
+    if not present:
+        return Fraction(1)
+    denominator = np.lcm.reduce([multiple.denominator for multiple in present], dtype=object)
+    return Fraction(gcd(*(int(multiple * denominator) for multiple in present)), int(denominator))
+
+
+def _fixed_note(count: int) -> str:
+    what = "1 root stays" if count == 1 else f"{count} roots stay"
+    why = "an equilibrium, as the common value of a consensus"
+    return f"{what} at 0 at every delay ({why}); all else is said of the others"
+
+
+def _singular_note(matrices: tuple[FloatArray, ...]) -> tuple[str, ...]:
+    for block in distinct_blocks(*matrices):
+        if is_singular_for_any_delay(balanced(*block.matrices)):
+            return ("a root stays at 0 at every delay, so the loop is asymptotically stable at none",)
+    return ()

@@ -1,0 +1,224 @@
+"""Second opinions on an analysis of one unknown delay, and how many of its digits are known.
+
+The exact analysis is compared with a sweep along the unit circle (`gains.delay.commensurate.circle_sweep_margin`) and
+the rightmost root beside the ends of the windows, or, where a root at zero is left out, with a count of the roots by
+the argument principle. None of them shares algebra with it. What differs by more than rounding explains is an error.
+
+All methods in double precision blur a root in the same way, however well they agree: an m-fold eigenvalue is known to
+eps^(1/m). So the error of a crossing is estimated from its own sensitivity, see `crossing_error`.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import isfinite, nan
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError, DisagreementError
+from gains.core.structure import balanced, distinct_blocks, square_matrices
+from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
+from gains.delay.crossing_error import DelayedTerm, crossing_error
+
+# a sweep of blocks of n states costs some n^3: these are 0.2 s, and 0.08 s one of 12 states
+_SWEEP_BUDGET = 14_000
+# states times points of a discretised spectrum: 30 ms
+_SPECTRUM_BUDGET = 200
+# turns of the longest delay up to the highest frequency, for a count of roots: 0.1 s
+_COUNT_BUDGET = 1000.0
+# the spectrum is looked at this far inside and outside a window, relative to its end
+_BESIDE = 1e-4
+# where the loop is looked at below a margin that is asked for thoroughly, as fractions of it
+_FRACTIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
+# two methods differ by less than this, relative, or than a few times the error of the crossing; a missed crossing is
+# off by far more
+_AGREEMENT, _ERRORS = 1e-6, 4.0
+# a rightmost root this close to the axis, relative to the norm, is not evidence for either side
+_UNDECIDED = 1e-9
+# least singular value of a characteristic matrix with rows of unit length, at a root
+_TOUCH = 1e-7
+
+
+@dataclass(frozen=True)
+class Opinions:
+    """The names of the methods that confirmed an analysis, and the estimated error (s) of its margin: 0 if it is 0 or
+    without limit."""
+
+    checked_by: tuple[str, ...]
+    margin_error_s: float
+
+
+def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
+    """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root at delays below and above
+    it.
+
+    Slower by a factor of a hundred; for a design that is to be flown, not for the inside of an optimisation.
+
+    Parameters
+    ----------
+    A0, A1
+        Real matrices (n, n), 1/s.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size.
+    DisagreementError
+        The methods differ; the message says what each one found.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau) is stable up to tau = pi / 2:
+
+    >>> from gains.margin.opinions import checked_delay_margin
+    >>> round(checked_delay_margin([[0]], [[-1]]), 6)
+    1.570796
+    """
+    now, late = square_matrices(A0=A0, A1=A1)
+    analysis = analyse_delay(now, late, horizon_s=1e-300)
+    second_opinions(analysis, [DelayedTerm(now, 0.0, 0), DelayedTerm(late, 0.0, 1)], thorough=True)
+    return analysis.delay_margin_s
+
+
+def second_opinions(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], *, thorough: bool = False) -> Opinions:
+    """Confirm an analysis of x'(t) = sum of the terms, as far as that takes a fraction of a second.
+
+    Parameters
+    ----------
+    thorough
+        Look at more delays, and however long it takes.
+
+    Raises
+    ------
+    DisagreementError
+        A method contradicts the analysis; the message says what each one found.
+    """
+    error_s = margin_error_s(analysis, terms)
+    checks: list[str] = []
+    swept_s = _swept_margin(analysis, terms, thorough)
+    if swept_s is not None and _agrees(analysis, swept_s, error_s, terms):
+        checks.append("sweep")
+        if isfinite(swept_s):
+            error_s = max(error_s, abs(analysis.delay_margin_s - swept_s))
+    if _confirmed_beside_windows(analysis, terms, error_s, thorough):
+        checks.append("root count" if analysis.roots_fixed_at_zero else "rightmost root")
+    return Opinions(tuple(checks), error_s)
+
+
+def margin_error_s(analysis: DelayAnalysis, terms: Sequence[DelayedTerm]) -> float:
+    """The estimated error (s) of the margin: that of the crossing at which it ends."""
+    margin_s = analysis.delay_margin_s
+    if margin_s == 0.0 or not isfinite(margin_s):
+        return 0.0
+    ends = [crossing for crossing in analysis.crossings if crossing.delay_s == margin_s]
+    return max((crossing_error(terms, c.omega_rad_s, c.delay_s)[1] for c in ends), default=0.0)
+
+
+def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thorough: bool) -> float | None:
+    """The margin that the sweep finds, None where it has nothing to say or would take long."""
+    from gains.delay.commensurate import circle_sweep_margin
+
+    # a loop with roots on the axis at zero delay has no margin to a sweep, which judges zero delay by itself
+    on_axis = analysis.roots_fixed_at_zero > 0 or any(crossing.delay_s == 0.0 for crossing in analysis.crossings)
+    if on_axis or any(term.known_s for term in terms):
+        return None
+    matrices = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
+    for term in terms:
+        matrices[term.multiple] = matrices[term.multiple] + term.matrix
+    sizes = [len(block.indices) for block in distinct_blocks(*matrices)]
+    if not thorough and sum(size**3 for size in sizes) > _SWEEP_BUDGET:
+        return None
+    return circle_sweep_margin(matrices)
+
+
+def _agrees(analysis: DelayAnalysis, swept_s: float, error_s: float, terms: Sequence[DelayedTerm]) -> bool:
+    """True if the sweep found the same margin, False if it missed a root that is on the axis there; else an error."""
+    margin_s = analysis.delay_margin_s
+    if margin_s == swept_s or abs(margin_s - swept_s) <= max(_AGREEMENT * margin_s, _ERRORS * error_s):
+        return True
+    # a mere touch, or a motion that is slow beside others, is easily missed by a search
+    if margin_s < swept_s and any(_is_root(terms, c) for c in analysis.crossings if c.delay_s == margin_s):
+        return False
+    raise DisagreementError(f"the exact delay margin is {margin_s} s, the sweep says {swept_s} s")
+
+
+def _is_root(terms: Sequence[DelayedTerm], crossing: Crossing) -> bool:
+    """Whether the characteristic matrix is singular at the crossing, to rounding."""
+    parts = balanced(*(term.matrix for term in terms))
+    turns = np.exp([-1j * crossing.omega_rad_s * term.delay_s(crossing.delay_s) for term in terms])
+    matrix = 1j * crossing.omega_rad_s * np.eye(len(parts[0])) - np.tensordot(turns, np.array(parts), axes=1)
+    rows = np.maximum(np.linalg.norm(matrix, axis=1), 1e-300)
+    return bool(np.linalg.svd(matrix / rows[:, np.newaxis], compute_uv=False)[-1] < _TOUCH)
+
+
+def _confirmed_beside_windows(
+    analysis: DelayAnalysis, terms: Sequence[DelayedTerm], error_s: float, thorough: bool
+) -> bool:
+    """Compare the windows with the spectrum inside and beside them; False if no delay could be looked at."""
+    rate = sum(float(np.linalg.norm(term.matrix)) for term in terms)
+    looked_at = 0
+    for tau_s, stable in _delays_to_look_at(analysis, rate, error_s, thorough):
+        pairs = [(term.matrix, term.delay_s(tau_s)) for term in terms]
+        growth = _growth(pairs, rate, thorough, leave_out_zero=analysis.roots_fixed_at_zero > 0)
+        looked_at += 0 if np.isnan(growth) else 1
+        if (growth < 0.0) != stable and abs(growth) > _UNDECIDED * rate:
+            raise DisagreementError(
+                f"the loop should be {'stable' if stable else 'unstable'} at {tau_s} s, but the real part of its "
+                f"rightmost root there is {growth} 1/s; windows {analysis.stable_intervals_s}"
+            )
+    return looked_at > 0
+
+
+def _growth(pairs: Sequence[tuple[FloatArray, float]], rate: float, thorough: bool, *, leave_out_zero: bool) -> float:
+    """Real part (1/s) of the rightmost root, or, with a root at zero left out, a number of its sign.
+
+    nan where it would take long, and where it is too close to tell.
+    """
+    longest_s = max(delay_s for _, delay_s in pairs)
+    if leave_out_zero:
+        from gains.delay.mixed import count_unstable_roots
+
+        if rate * longest_s > _COUNT_BUDGET:
+            return nan
+        try:
+            return rate if count_unstable_roots(pairs, leave_out_zero=True) > 0 else -rate
+        except DisagreementError:
+            return nan
+    from gains.delay.rightmost import rightmost_root
+
+    largest = max(len(block.indices) for block in distinct_blocks(*(matrix for matrix, _ in pairs)))
+    if not thorough and largest * (12.0 + rate * longest_s / 2.0) > _SPECTRUM_BUDGET:
+        return nan
+    try:
+        return rightmost_root(pairs).real
+    except BadModelError:
+        # a delay so long that its discretisation would not fit
+        return nan
+
+
+def _delays_to_look_at(
+    analysis: DelayAnalysis, rate: float, error_s: float, thorough: bool
+) -> Iterator[tuple[float, bool]]:
+    """A few delays with the verdict that the windows imply: beside the ends of the first windows, and inside."""
+    windows = analysis.stable_intervals_s
+    if not windows:
+        # a root on the axis may be taken for one on either side of it: the count must be of roots off the axis
+        if analysis.unstable_roots_at_zero_delay > 0 and rate > 0.0:
+            yield 0.0, False
+        return
+    for start_s, end_s in windows[:2]:
+        if not isfinite(end_s):
+            yield start_s * (1.0 + _BESIDE) if start_s > 0.0 else 1.0 / rate, True
+            continue
+        beside_s = max(_BESIDE * end_s, _ERRORS * error_s)
+        inside_s = min(beside_s, 0.1 * (end_s - start_s))
+        yield end_s - inside_s, True
+        if thorough:
+            yield from ((start_s + fraction * (end_s - start_s), True) for fraction in _FRACTIONS)
+        following = [start for start, _ in windows if start > start_s]
+        # windows may touch: at a double root that only touches the axis
+        if not following or following[0] > end_s + 2.0 * beside_s:
+            yield end_s + beside_s, False
+        if start_s > 0.0:
+            yield start_s + inside_s, True

@@ -1,0 +1,192 @@
+"""How a formation behaves inside its delay margin: block by block, with and without delay, and down the chain.
+
+A leader-follower tree is block triangular: whatever its size, its roots are those of the leader's block and of one
+follower's block, and errors pass from vehicle to vehicle by one transfer function.
+
+Source: Sahoo 2012 (see `gains.formation.model`), eq. (2.11) with the gains (3.26).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gains.core.arrays import FloatArray
+from gains.delay.constant import analyse_delay
+from gains.delay.rightmost import rightmost_root
+from gains.performance.robust import subsystem_loop
+from gains.performance.string_stability import Response, response_peak
+
+Gains = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True)
+class BlockMargin:
+    """Continuous delay margin of one diagonal block of the loop and the frequency at which it is lost."""
+
+    delay_margin_s: float
+    crossing_rad_s: float
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """How the loop behaves inside its margin: what α and the margin do not say.
+
+    Attributes
+    ----------
+    decay_rate_1_s, damping
+        −Re of the rightmost root of the whole formation, and the least damping ratio −Re s / |s|, without delay.
+    decay_rate_delayed_1_s, damping_delayed
+        Decay rate, and damping ratio of the follower's rightmost root, at the delay `delay_s`.
+    string_peak, string_peak_delayed
+        Largest growth of a spacing error from one vehicle to the next, over all frequencies, without delay and at
+        `delay_s`; down a chain of n followers errors grow by its (n − 1)th power at most.
+    delay_s
+        The constant delay of the figures with delay; `gains.design.design` takes half the sampled margin, plus half a
+        period for the hold.
+    """
+
+    decay_rate_1_s: float
+    damping: float
+    decay_rate_delayed_1_s: float
+    damping_delayed: float
+    string_peak: float
+    string_peak_delayed: float
+    delay_s: float
+
+
+def leader_block(gains: Gains) -> tuple[FloatArray, FloatArray]:
+    """(A0, A1) of e_0^v: e_0^v' = K1 e_0^v, late. `gains` are K1, K2, K3, each of shape (axes, axes).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.performance.behaviour import leader_block
+    >>> A0, A1 = leader_block((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
+    >>> A0.tolist(), A1.tolist()
+    ([[0.0]], [[-1.0]])
+    """
+    return np.zeros_like(gains[0]), gains[0]
+
+
+def follower_block(gains: Gains) -> tuple[FloatArray, FloatArray]:
+    """(A0, A1) of (e_i^p, e_i^v): e_i^p' = −e_i^v, e_i^v' = K3 e_i^p + K1 e_i^v, the latter late.
+
+    `gains` are K1, K2, K3, each of shape (axes, axes); K2 couples blocks and is in none.
+
+    Examples
+    --------
+    e^p' = -e^v at once, e^v' = e^p - e^v late:
+
+    >>> import numpy as np
+    >>> from gains.performance.behaviour import follower_block
+    >>> A0, A1 = follower_block((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
+    >>> (A0 + A1).tolist()
+    [[0.0, -1.0], [1.0, -1.0]]
+    """
+    own, _, spacing = gains
+    zero, identity = np.zeros_like(own), np.eye(own.shape[0])
+    return np.block([[zero, -identity], [zero, zero]]), np.block([[zero, zero], [spacing, own]])
+
+
+def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
+    """Margin of x'(t) = A0 x(t) + A1 x(t − τ) and the crossing at its end. Arguments as of
+    `gains.delay.constant.analyse_delay`.
+
+    The frequency is NaN if there is no crossing.
+
+    Examples
+    --------
+    s² + (s + 1) e^{−sτ} has roots on the axis at ω² = (1 + √5) / 2 and τ = atan(ω) / ω:
+
+    >>> from gains.performance.behaviour import block_margin
+    >>> found = block_margin([[0, -1], [0, 0]], [[0, 0], [1, -1]])
+    >>> round(found.delay_margin_s, 6), round(found.crossing_rad_s, 6)
+    (0.711119, 1.27202)
+    """
+    analysis = analyse_delay(A0, A1, horizon_s=1e-300)
+    first = min(analysis.crossings, key=lambda crossing: abs(crossing.delay_s - analysis.delay_margin_s), default=None)
+    return BlockMargin(analysis.delay_margin_s, first.omega_rad_s if first else float("nan"))
+
+
+def behaviour(gains: Gains, delay_s: float) -> Behaviour:
+    """Behaviour of a formation whose leader and followers have the gains K1, K2, K3, each of shape (axes, axes).
+
+    Parameters
+    ----------
+    delay_s
+        Constant delay of all feedback for the figures with delay.
+
+    Examples
+    --------
+    The leader's root is −1, the follower's s² + s + 1 has damping 1/2:
+
+    >>> import numpy as np
+    >>> from gains.performance.behaviour import behaviour
+    >>> found = behaviour((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), delay_s=0.3)
+    >>> round(found.decay_rate_1_s, 6), round(found.damping, 6)
+    (0.5, 0.5)
+    """
+    roots = np.linalg.eigvals(subsystem_loop(*gains))
+    late = [rightmost_root([(A0, 0.0), (A1, delay_s)]) for A0, A1 in (leader_block(gains), follower_block(gains))]
+    return Behaviour(
+        decay_rate_1_s=float(-roots.real.max()),
+        damping=min(_damping(root) for root in roots.tolist()),
+        decay_rate_delayed_1_s=float(-max(root.real for root in late)),
+        damping_delayed=_damping(late[1]),
+        string_peak=string_peak(gains, 0.0),
+        string_peak_delayed=string_peak(gains, delay_s),
+        delay_s=delay_s,
+    )
+
+
+def _damping(root: complex) -> float:
+    """Damping ratio −Re s / |s|; 0 for a root at zero, which nothing brings back."""
+    return -root.real / abs(root) if root else 0.0
+
+
+def string_peak(
+    gains: Gains, delay_s: float, *, front_delay_s: float | None = None, answer: Response = np.ones_like
+) -> float:
+    """Return the largest singular value of Γ(jω) over ω, at least |Γ(0)| = 1, as `gains.performance.string_stability`
+    finds it.
+
+    Γ takes the velocity error of the vehicle in front to the own one, and for gains that act on every axis alike also
+    the spacing error in front to the own one. With own feedback delayed by a and that of the vehicle in front by b::
+
+        Γ(s) = (s² I − (s K1 − K3) h e^{−sa})^{-1} (s K2 e^{−sb} + K3 e^{−sa}) h
+
+    Parameters
+    ----------
+    delay_s, front_delay_s
+        a and b; b = a if not given, as when a ground station closes every loop.
+    answer
+        h(jω), from wanted to real acceleration: frequencies (k,) to values (k,). One if not given.
+
+    Examples
+    --------
+    |1 / (s² + s + 1)| peaks at 2 / √3:
+
+    >>> import numpy as np
+    >>> from gains.performance.behaviour import string_peak
+    >>> round(string_peak((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), 0.0), 4)
+    1.1547
+    """
+    identity = np.eye(gains[0].shape[0])
+    own, front, spacing = gains
+    if all(np.array_equal(gain, gain[0, 0] * identity) for gain in gains):  # one axis says it for all
+        own, front, spacing, identity = own[:1, :1], front[:1, :1], spacing[:1, :1], identity[:1, :1]
+    behind_s = delay_s if front_delay_s is None else front_delay_s
+
+    def growth(omega: FloatArray) -> NDArray[Any]:
+        s, h = 1j * omega, answer(omega)
+        at_once, late = ((h * np.exp(-s * delay))[:, None, None] for delay in (delay_s, behind_s))
+        s = s[:, None, None]
+        loop, entry = s**2 * identity - (s * own - spacing) * at_once, s * front * late + spacing * at_once
+        if len(identity) == 1:
+            return (entry / loop)[:, 0, 0]
+        return np.linalg.norm(np.linalg.solve(loop, entry), ord=2, axis=(1, 2))
+
+    near = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)))
+    return response_peak(growth, near_rad_s=near or 1.0)[0]

@@ -1,0 +1,153 @@
+"""The formation loop with vehicles that follow a command late and softly, as an autopilot does, and its delay margin.
+
+A vehicle takes an acceleration u and the velocity v_s that goes with it, v_s' = u. Its acceleration a follows
+
+    lag a' = u + g (v_s - v) - a,   v' = a,
+
+so a / u = (s + g) / (lag s² + s + g), which is 1 / (lag s + 1) for g = 0. In place of v_s the state holds the velocity
+still owed, d = v_s - v, d' = u - a. With A, B of this and u = K e the margin is that of `gains.delay.constant` and
+`gains.sampled.multirate`: one delay, exact.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+from gains.delay.constant import delay_margin
+from gains.formation.model import FormationModel
+from gains.sampled.multirate import Timing, multirate_delay_margin
+
+_MARGIN_RESOLUTION = 1e-9
+
+
+@dataclass(frozen=True)
+class Response:
+    """How one vehicle answers: `lag_s` > 0 from wanted to real acceleration, velocity gain g >= 0 in 1/s.
+
+    Raises
+    ------
+    BadModelError
+        If the lag is below 1e-6 s, the gain negative, or either not finite.
+
+    Examples
+    --------
+    An autopilot with a lag of 0.2 s that also corrects the velocity:
+
+    >>> from gains.performance.response import Response
+    >>> Response(lag_s=0.2, velocity_gain_1_s=1.5)
+    Response(lag_s=0.2, velocity_gain_1_s=1.5)
+    """
+
+    lag_s: float
+    velocity_gain_1_s: float
+
+    def __post_init__(self) -> None:
+        for name, least in (("lag_s", 1e-6), ("velocity_gain_1_s", 0.0)):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= least):
+                raise BadModelError(f"{name} = {value}; wanted a number of at least {least:g}")
+
+    def transfer(self, omega: FloatArray) -> NDArray[np.complex128]:
+        """a / u at jω, from wanted to real acceleration: (s + g) / (lag s² + s + g)."""
+        s, g = 1j * omega, self.velocity_gain_1_s
+        return (s + g) / (self.lag_s * s**2 + s + g)
+
+
+def formation_loop(
+    model: FormationModel, K: FloatArray, responses: Sequence[Response]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(A, B, K) of the formation u = K e whose vehicles answer so, one response for each in the model's order.
+
+    The state is e of `gains.formation.model`, followed by a and d of each vehicle; a vehicle with g = 0 has no d.
+
+    Parameters
+    ----------
+    K
+        Gain of u = K e, shape (inputs, states) of the model.
+
+    Raises
+    ------
+    BadModelError
+        If K is of another shape or there is not one response for each vehicle.
+
+    Examples
+    --------
+    A leader by itself, of one axis: e' = a, 0.5 a' = u − a, u = −e.
+
+    >>> import numpy as np
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.performance.response import Response, formation_loop
+    >>> A, B, K = formation_loop(FormationModel((-1,), axes=1), np.array([[-1.0]]), [Response(0.5, 0.0)])
+    >>> (A + B @ K).tolist()
+    [[0.0, 1.0], [-2.0, -2.0]]
+    """
+    if len(responses) != model.vehicles:
+        raise BadModelError(f"there are {len(responses)} responses; wanted one for each of {model.vehicles} vehicles")
+    if K.shape != (model.inputs, model.states):
+        raise BadModelError(f"K has shape {K.shape}; wanted {(model.inputs, model.states)}")
+    axes = model.axes
+    n = model.states + axes * sum(2 if response.velocity_gain_1_s > 0.0 else 1 for response in responses)
+    A, B = np.zeros((n, n)), np.zeros((n, model.inputs))
+    A[: model.states, : model.states] = model.A
+    identity, at = np.eye(axes), model.states
+    for vehicle, response in enumerate(responses):
+        rate, gain = 1.0 / response.lag_s, response.velocity_gain_1_s
+        own, command = slice(at, at + axes), model.input_slice(vehicle)
+        A[model.velocity_slice(vehicle), own] = identity
+        A[own, own] = -rate * identity
+        B[own, command] = rate * identity
+        at += axes
+        if gain > 0.0:
+            owed = slice(at, at + axes)
+            A[own, owed] = gain * rate * identity
+            A[owed, own] = -identity
+            B[owed, command] = identity
+            at += axes
+    return A, B, np.hstack([K, np.zeros((model.inputs, n - model.states))])
+
+
+def sampled_margin(
+    model: FormationModel, K: FloatArray, responses: Sequence[Response] | None, *, timing: Timing
+) -> float:
+    """The least loop delay (s) at which the sampled and held loop of these vehicles loses stability.
+
+    Without responses they answer at once. Arguments and exceptions as of `formation_loop` and
+    `gains.sampled.multirate.multirate_delay_margin`.
+
+    Examples
+    --------
+    The leader of `continuous_margin`, sampled: 1.1506 s less half a period or so.
+
+    >>> import numpy as np
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.sampled.multirate import Timing
+    >>> from gains.performance.response import Response, sampled_margin
+    >>> leader, K = FormationModel((-1,), axes=1), np.array([[-1.0]])
+    >>> round(sampled_margin(leader, K, [Response(1.0, 0.0)], timing=Timing(0.02, 0.02)), 3)
+    1.141
+    """
+    loop = (model.A, model.B, K) if responses is None else formation_loop(model, K, responses)
+    return float(multirate_delay_margin(*loop, timing))
+
+
+def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response]) -> float:
+    """The least delay (s) at which the continuous loop of these vehicles loses stability.
+
+    Arguments and exceptions as of `formation_loop` and `gains.delay.constant.delay_margin`.
+
+    Examples
+    --------
+    A leader with s (s + 1) + e^{−sτ} = 0: ω² (1 + ω²) = 1 and τ = (π/2 − atan ω) / ω.
+
+    >>> import numpy as np
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.performance.response import Response, continuous_margin
+    >>> round(continuous_margin(FormationModel((-1,), axes=1), np.array([[-1.0]]), [Response(1.0, 0.0)]), 4)
+    1.1506
+    """
+    A, B, K_all = formation_loop(model, K, responses)
+    return float(delay_margin(A, B @ K_all))

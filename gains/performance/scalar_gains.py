@@ -1,0 +1,298 @@
+"""One follower with gains that are numbers: its delay margin, growth of errors, robustness and decay, by formula.
+
+The gains act on every axis alike, u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p, and all feedback is late. The delay margin
+depends on (k1, k3) alone and the gains of a given margin form a curve with an explicit equation (`gains_of_margin`).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+
+Factor = NDArray[np.complexfloating[Any, Any]] | float
+
+# Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three of
+# those, and a parabola through the last, bring σ_min to about 1e-10 of itself.
+_FREQUENCIES, _FREQUENCIES_CLOSER, _CLOSER_LOOKS = 40, 9, 3
+
+
+@dataclass(frozen=True)
+class ScalarGains:
+    """Gains of u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p (1/s, 1/s, 1/s²) and the α they have.
+
+    Examples
+    --------
+    >>> from gains.performance.scalar_gains import ScalarGains
+    >>> ScalarGains(k1=3.0, k2=2.0, k3=2.0, alpha=0.532).k1
+    3.0
+    """
+
+    k1: float
+    k2: float
+    k3: float
+    alpha: float
+
+
+def gains_of_margin(share: FloatArray, delay_margin_s: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return the (k1, k3) whose follower loop has a root on the stability limit at exactly the given delay.
+
+    Continuous loop (period 0): s² + (k1 s + k3) e^{−sτ} = 0 at s = jω is linear in the gains and gives
+    k1 = ω sin ωτ, k3 = ω² cos ωτ, with 0 < ωτ < π/2. Inverse of the closed form of the source's loop with all
+    feedback late, τ = atan(k1 ω / k3) / ω, ω² = (k1² + √(k1⁴ + 4 k3²)) / 2.
+
+    Sampled loop with period T and zero-order hold: with τ = (l + f) T, 0 ≤ f < 1, the command computed from the sample
+    at t_k acts from t_k + τ. Over one period the velocity and spacing answer u with
+
+        G_v(z) = T z^{−l−1} (f + (1 − f) z) / (z − 1)
+        G_p(z) = −(T G_v + T² z^{−l−1} (f − f²/2 + (1 − f)² z / 2)) / (z − 1)
+
+    and 1 = −k1 G_v + k3 G_p at z = e^{jωT} is again linear in the gains.
+
+    Parameters
+    ----------
+    share
+        ω (τ + T/2) / (π/2), of any shape, in (0, 1.3).
+    delay_margin_s, period_s
+        τ, of any shape that fits that of `share`, and T; T = 0 for the continuous loop.
+
+    Returns
+    -------
+    tuple
+        k1 and k3. Only those with k1 > 0, k3 > 0 and, sampled, k1 T < 2 (stable without delay)
+        are gains of that margin.
+
+    Examples
+    --------
+    A crossing at ω = π/4 with a margin of 1 s:
+
+    >>> import numpy as np
+    >>> from gains.delay.constant import delay_margin
+    >>> from gains.performance.scalar_gains import gains_of_margin
+    >>> k1, k3 = gains_of_margin(np.array(0.5), np.array(1.0), 0.0)
+    >>> round(delay_margin([[0, -1], [0, 0]], [[0, 0], [k3, -k1]]), 6)
+    1.0
+    """
+    if period_s == 0:
+        angle = share * np.pi / 2
+        return angle * np.sin(angle) / delay_margin_s, angle**2 * np.cos(angle) / delay_margin_s**2
+    # A delay given as a multiple of the period must not lose a period to rounding.
+    periods = np.floor(delay_margin_s / period_s + 1e-12)
+    part = np.maximum(0.0, delay_margin_s / period_s - periods)
+    z = np.exp(1j * share * (np.pi / 2) / (delay_margin_s / period_s + 0.5))
+    late = z ** (-periods - 1)
+    velocity = period_s * late * (part + (1 - part) * z) / (z - 1)
+    within = period_s**2 * late * (part - part**2 / 2 + (1 - part) ** 2 / 2 * z)
+    spacing = -(period_s * velocity + within) / (z - 1)
+    # Real and imaginary part of 1 = −k1 G_v + k3 G_p by Cramer's rule.
+    determinant = velocity.imag * spacing.real - velocity.real * spacing.imag
+    return spacing.imag / determinant, velocity.imag / determinant
+
+
+def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string_peak_max: float) -> FloatArray:
+    """Return the largest |k2| with which spacing errors grow by at most `string_peak_max` from vehicle to vehicle.
+
+    The spacing error of a vehicle follows that of the vehicle in front with
+    Γ(s) = (k2 s + k3) e^{−sτ} / (s² + (k1 s + k3) e^{−sτ}). |Γ(jω)| ≤ L for all ω is
+
+        k2² ≤ L² (ω² − 2 (k3 cos ωτ + k1 ω sin ωτ) + k1²) + (L² − 1) k3² / ω²     for all ω > 0,
+
+    without delay and with L = 1: k2² ≤ k1² − 2 k3.
+
+    Returns
+    -------
+    array
+        Of the shape of `k1`; NaN where no k2 will do.
+
+    Examples
+    --------
+    Without delay √(k1² − 2 k3):
+
+    >>> import numpy as np
+    >>> from gains.performance.scalar_gains import front_gain_limit
+    >>> front_gain_limit(np.array([2.0]), np.array([1.0]), np.array([0.0]), 1.0).round(6).tolist()
+    [1.414214]
+    """
+    # Above ω = 2 k1 + √(2 k3) the bound grows with ω for every delay: ω² outgrows 2 (k3 + k1 ω).
+    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
+    at_rest = k1**2 - 2 * k3 if string_peak_max == 1 else np.full_like(k1, np.inf)
+    k1, k3, delay_s = k1[..., None], k3[..., None], delay_s[..., None]
+
+    def bound(omega: FloatArray) -> FloatArray:
+        lag = omega * delay_s
+        flat = omega**2 - 2 * (k3 * np.cos(lag) + k1 * omega * np.sin(lag)) + k1**2
+        return string_peak_max**2 * flat + (string_peak_max**2 - 1) * (k3 / omega) ** 2
+
+    omega = np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape[:-1], 96))
+    square, at = _with_least_inside(bound(omega))
+    for _ in range(_CLOSER_LOOKS):
+        omega = _between_neighbours(omega, at)
+        square, at = _with_least_inside(bound(omega))
+    least = np.minimum(square.min(axis=-1), at_rest)
+    return np.sqrt(np.where(least >= 0, least, np.nan))
+
+
+def onboard_front_gain_limit(k1: FloatArray, k3: FloatArray, string_peak_max: float) -> FloatArray:
+    """Return the largest |k2| with which spacing errors grow by at most `string_peak_max` at every delay, on board.
+
+    A vehicle feeds back its own errors at once, and only the velocity of the vehicle in front is late:
+
+        Γ(s) = (k3 + k2 s e^{−sτ}) / (s² + k1 s + k3)
+
+    |Γ| ≤ L for every delay is k3 + |k2| ω ≤ L |D(jω)| for every frequency. With L = 1 that leaves k2 = 0, if
+    k1² ≥ 2 k3 at all: at low frequencies k2² + 2 k3 + 2 k2 k3 τ ≤ k1² is wanted.
+
+    Returns
+    -------
+    array
+        Of the shape of `k1`; NaN where no k2 will do.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.performance.scalar_gains import onboard_front_gain_limit
+    >>> onboard_front_gain_limit(np.array([2.0, 1.0]), np.array([1.0, 1.0]), 1.0).tolist()
+    [0.0, nan]
+    """
+    if string_peak_max == 1.0:
+        return np.where(k1**2 >= 2 * k3, 0.0, np.nan)
+    k1, k3 = k1[..., None], k3[..., None]
+
+    def bound(omega: FloatArray) -> FloatArray:
+        size = np.sqrt((k3 - omega**2) ** 2 + (k1 * omega) ** 2)
+        return (string_peak_max * size - k3) / omega
+
+    # 0 at rest is +∞ of the bound, and above 2 k1 + √(2 k3) it grows
+    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
+    omega = np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape[:-1], 96))
+    limit, at = _with_least_inside(bound(omega))
+    for _ in range(_CLOSER_LOOKS):
+        omega = _between_neighbours(omega, at)
+        limit, at = _with_least_inside(bound(omega))
+    least = limit.min(axis=-1)
+    return np.where(least >= 0, least, np.nan)
+
+
+def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: FloatArray) -> FloatArray:
+    """Return σ_min(jωI − A_cl) of the follower subsystem (3.25, 3.26) for each gain and frequency (broadcast).
+
+    σ_min² is the least root of λ³ − c2 λ² + c1 λ − c0, whose coefficients are the sums of the squared 1×1, 2×2 and 3×3
+    minors of jωI − A_cl. Newton's iteration from λ = 0 rises to it without overshoot, because all roots are real.
+
+    Examples
+    --------
+    The same as of `gains.performance.robust.subsystem_loop` with K1 = −k1, K2 = k2, K3 = k3:
+
+    >>> import numpy as np
+    >>> from gains.performance.robust import subsystem_loop
+    >>> from gains.performance.scalar_gains import least_singular_value
+    >>> least = np.linalg.svd(1j * np.eye(3) - subsystem_loop(-3, 2, 2), compute_uv=False)[-1]
+    >>> found = least_singular_value(np.array(3.0), np.array(2.0), np.array(2.0), np.array(1.0))
+    >>> round(float(found), 6) == round(float(least), 6)
+    True
+    """
+    x, a2 = omega**2, k1**2
+    own = x + a2
+    loop = (k3 - x) ** 2 + a2 * x
+    c2 = 3 * x + 2 * a2 + 2 + k2**2 + k3**2
+    c1 = loop + (k2 - k1) ** 2 + x + k3**2 + k2**2 * x + own * (own + k3**2 + 1 + x)
+    return _least_root(c2, c1, own * loop)
+
+
+def delayed_singular_value(gains: ScalarGains, omega: FloatArray, own: Factor, front: Factor) -> FloatArray:
+    """Return σ_min of the characteristic matrix of the subsystem with late feedback, at each frequency.
+
+    With the complex factors d on a vehicle's own errors and f on the velocity error of the vehicle in front, e^{−jωτ}
+    for a delay τ, times what the vehicle makes of a command, the matrix is::
+
+        [[jω + k1 d, 0, 0], [−1, jω, 1], [−k2 f, −k3 d, jω + k1 d]]
+
+    σ_min² is found as in `least_singular_value`, which is the case d = f = 1, in half the time.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.performance.scalar_gains import ScalarGains, delayed_singular_value, least_singular_value
+    >>> at_once = delayed_singular_value(ScalarGains(3.0, 2.0, 2.0, 0.0), np.array(1.0), 1.0, 1.0)
+    >>> bool(abs(at_once - least_singular_value(3.0, 2.0, 2.0, np.array(1.0))) < 1e-12)
+    True
+    """
+    jw = 1j * omega
+    leader, spacing, ahead = jw + gains.k1 * own, gains.k3 * own, gains.k2 * front
+    x, a2, g2, h2 = omega**2, _squared(leader), _squared(ahead), _squared(spacing)
+    loop = _squared(jw * leader + spacing)
+    c2 = 2 * a2 + x + 2 + g2 + h2
+    c1 = loop + _squared(ahead - leader) + _squared(spacing + jw * ahead) + a2 * (x + 1 + h2 + a2)
+    return _least_root(c2, c1, a2 * loop)
+
+
+def _squared(value: Factor) -> FloatArray:
+    return np.abs(value) ** 2
+
+
+def _least_root(c2: FloatArray, c1: FloatArray, c0: FloatArray) -> FloatArray:
+    """Root of the least root of λ³ − c2 λ² + c1 λ − c0, whose roots are real and positive."""
+    root = c0 / c1
+    for _ in range(5):
+        root = root + (c0 - root * (c1 - root * (c2 - root))) / (c1 - root * (2 * c2 - 3 * root))
+    return np.sqrt(root)
+
+
+def alpha_of(k1: FloatArray, k2: FloatArray, k3: FloatArray) -> FloatArray:
+    """Return α for W = I, the least of σ_min(jωI − A_cl) over ω, for each of the gains (broadcast).
+
+    Examples
+    --------
+    The same as `gains.performance.robust.robustness`, for many gains at a time:
+
+    >>> import numpy as np
+    >>> from gains.performance.robust import robustness
+    >>> from gains.performance.scalar_gains import alpha_of
+    >>> alpha_of(np.array([3.0, 2.0]), np.array([2.0, 1.0]), np.array([2.0, 1.0])).round(6).tolist()
+    [0.532094, 0.39909]
+    >>> round(robustness(-3, 2, 2), 6), round(robustness(-2, 1, 1), 6)
+    (0.532094, 0.39909)
+    """
+    k1, k2, k3 = (gain[..., None] for gain in np.broadcast_arrays(k1, k2, k3))
+    slow, fast = min(1.0, np.sqrt(k3.min()), k1.min()), max(1.0, np.sqrt(k3.max()), k1.max())
+    omega = np.broadcast_to(
+        np.concatenate([[0.0], np.geomspace(slow / 10, 3 * fast, _FREQUENCIES)]), (*k1.shape[:-1], _FREQUENCIES + 1)
+    )
+    sigma, at = _with_least_inside(least_singular_value(k1, k2, k3, omega))
+    for _ in range(_CLOSER_LOOKS):
+        omega = _between_neighbours(omega, at)
+        sigma, at = _with_least_inside(least_singular_value(k1, k2, k3, omega))
+    before, middle, after = (np.take_along_axis(sigma, at + step, -1)[..., 0] for step in (-1, 0, 1))
+    bend, slope = before - 2 * middle + after, (after - before) / 2
+    vertex = middle - np.where(bend > 0, slope**2 / (2 * np.where(bend > 0, bend, 1.0)), 0.0)
+    # At an end of the range (ω = 0) the parabola is not between its points and the least sample counts.
+    inside = (bend > 0) & (np.abs(slope) <= bend)
+    return np.where(inside, vertex, sigma.min(axis=-1))
+
+
+def decay_rate_of(k1: FloatArray, k3: FloatArray) -> FloatArray:
+    """Return the decay rate (1/s) without delay of s² + k1 s + k3; that of the leader, s + k1, is no less.
+
+    Examples
+    --------
+    s² + 2 s + 1 = (s + 1)²:
+
+    >>> import numpy as np
+    >>> from gains.performance.scalar_gains import decay_rate_of
+    >>> float(decay_rate_of(np.array(2.0), np.array(1.0)))
+    1.0
+    """
+    return k1 / 2 - np.sqrt(np.maximum(k1**2 / 4 - k3, 0.0))
+
+
+def _with_least_inside(values: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+    """The values and, along their last axis, the index of the least one, moved off the ends."""
+    return values, np.clip(np.argmin(values, axis=-1, keepdims=True), 1, values.shape[-1] - 2)
+
+
+def _between_neighbours(omega: FloatArray, at: NDArray[np.intp]) -> FloatArray:
+    """Finer frequencies between the neighbours of those at the index, along the last axis."""
+    low, high = np.take_along_axis(omega, at - 1, -1), np.take_along_axis(omega, at + 1, -1)
+    return low + (high - low) * np.linspace(0, 1, _FREQUENCIES_CLOSER)

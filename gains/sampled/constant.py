@@ -1,0 +1,169 @@
+"""The loop that is really flown: sampled, late and held.
+
+The plant x' = A x + B u is sampled at t_k = k T. The command u_k = K x(t_k) acts from t_k + tau until t_k + tau + T,
+when the next one replaces it (zero-order hold). tau >= 0 is the whole loop delay: transport up, waiting, computing and
+transport down. With tau = q T + e, 0 <= e < T, the state at the next sample is
+
+    x_{k+1} = Phi x_k + G0 u_{k-q} + G1 u_{k-q-1},
+    Phi = e^{A T},  G0 = int_0^{T-e} e^{A s} ds B,  G1 = int_{T-e}^{T} e^{A s} ds B,
+
+the modified z-transform in state space. The loop is stable exactly when the spectral radius of this one-period map is
+below one. The margin over tau is computed in `gains.sampled.crossings`; for small T it is the continuous margin less
+T / 2, up to terms in T^2.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+from gains.core.structure import balanced, distinct_blocks, real_matrix, square_matrices
+from gains.sampled.crossings import block_delay_margin
+from gains.sampled.loop import HeldPlant, block_radius, held_blocks, lifted_map
+from gains.sampled.period import block_period_limit
+
+
+def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> FloatArray:
+    """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one period on; s as small as the delay allows.
+
+    s is q for a delay of exactly q periods, else q + 1; the matrix is square of size n + s p for p inputs.
+
+    Parameters
+    ----------
+    A, B, K
+        Real matrices (n, n), (n, p), (p, n); the feedback is u = +K x.
+    period_s, delay_s
+        T > 0 and tau >= 0 (s).
+
+    Raises
+    ------
+    BadModelError
+        Naming the argument, what was read and what was wanted.
+
+    Examples
+    --------
+    x' = u, u = -x with T = 1 s and tau = 0.25 s: x_{k+1} = x_k + 0.75 u_k + 0.25 u_{k-1}.
+
+    >>> from gains.sampled.constant import period_map
+    >>> period_map([[0]], [[1]], [[-1]], period_s=1.0, delay_s=0.25).round(6).tolist()
+    [[0.25, 0.25], [-1.0, 0.0]]
+    """
+    plant = HeldPlant(*checked_loop(A, B, K), _checked_period(period_s))
+    return lifted_map(plant, _checked_delay(delay_s))
+
+
+def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> float:
+    """Factor by which the slowest motion shrinks (< 1) or grows (> 1) in one period. Arguments as of `period_map`.
+
+    Strongly connected blocks are taken one by one: identical followers do not spoil each other's eigenvalues.
+
+    Examples
+    --------
+    x' = u, u = -x without delay: x_{k+1} = (1 - T) x_k.
+
+    >>> from gains.sampled.constant import spectral_radius
+    >>> round(spectral_radius([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.0), 6)
+    0.5
+    """
+    plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
+    return max(block_radius(plant, _checked_delay(delay_s)) for plant in plants)
+
+
+def growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> float:
+    """Exponential rate (1/s) of the slowest motion, ln(spectral radius) / T: negative when stable.
+
+    -inf, or very negative by rounding, for a loop at rest after finitely many periods (deadbeat). Arguments as of
+    `period_map`.
+
+    Examples
+    --------
+    x' = u, u = -x without delay: ln(1 - T) / T.
+
+    >>> from gains.sampled.constant import growth_rate
+    >>> round(growth_rate([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.0), 6)
+    -1.386294
+    """
+    radius = spectral_radius(A, B, K, period_s=period_s, delay_s=delay_s)
+    return float(np.log(radius)) / period_s if radius > 0.0 else -np.inf
+
+
+def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float) -> float:
+    """The least delay tau (s) at which the sampled and held loop loses stability.
+
+    0 if it is unstable at tau = 0, `inf` if it is stable at every delay. Accurate to about 1e-12 relative, and checked
+    against the spectral radius of the one-period map below and above.
+
+    Parameters
+    ----------
+    A, B, K
+        Real matrices (n, n), (n, p), (p, n); the feedback is u = +K x.
+    period_s
+        Period T (s) of telemetry and control.
+
+    Raises
+    ------
+    BadModelError
+        Naming the argument, what was read and what was wanted.
+    DisagreementError
+        The eigenvalues of the one-period map contradict the crossings found.
+
+    Examples
+    --------
+    x' = u, u = -x with a period of 1 s takes a delay of 1 s; with a short one pi / 2 - T / 2 or so:
+
+    >>> from gains.sampled.constant import sampled_delay_margin
+    >>> [round(sampled_delay_margin([[0]], [[1]], [[-1]], period_s=period_s), 3) for period_s in (1.0, 0.02)]
+    [1.0, 1.561]
+    """
+    plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
+    return float(min(block_delay_margin(plant) for plant in plants))
+
+
+def sampling_period_limit(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> float:
+    """The least period T (s) at which the sampled and held loop without further delay loses stability.
+
+    0 if A + B K is not Hurwitz (no period is short enough), `inf` if every period is. Found by a march through T that
+    resolves every motion of the plant and of the loop, with peaks of the spectral radius below one refined.
+    Arguments as of `period_map`.
+
+    Raises
+    ------
+    BadModelError
+        Naming the argument, what was read and what was wanted.
+    GainsError
+        The march, some ten thousand periods long, ends without a limit.
+
+    Examples
+    --------
+    x' = u, u = -x: x_{k+1} = (1 - T) x_k is stable up to T = 2.
+
+    >>> from gains.sampled.constant import sampling_period_limit
+    >>> round(sampling_period_limit([[0]], [[1]], [[-1]]), 6)
+    2.0
+    """
+    plant, entry, feedback = checked_loop(A, B, K)
+    blocks = distinct_blocks(plant, entry @ feedback)
+    return min(block_period_limit(*balanced(*block.matrices)) for block in blocks)
+
+
+def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A (n, n), B (n, p), K (p, n) as finite real matrices; BadModelError names what does not fit."""
+    [plant] = square_matrices(A=A)
+    entry, feedback = real_matrix("B", B), real_matrix("K", K)
+    if entry.shape[0] != plant.shape[0]:
+        raise BadModelError(f"B has shape {entry.shape}; {plant.shape[0]} rows are wanted, as A")
+    if feedback.shape != entry.shape[::-1]:
+        raise BadModelError(f"K has shape {feedback.shape}; {entry.shape[::-1]} is wanted, the transpose of B's")
+    return plant, entry, feedback
+
+
+def _checked_period(period_s: float) -> float:
+    if not (np.isfinite(period_s) and period_s > 0.0):
+        raise BadModelError(f"period_s is {period_s}; a positive number of seconds is wanted")
+    return float(period_s)
+
+
+def _checked_delay(delay_s: float) -> float:
+    if not (np.isfinite(delay_s) and delay_s >= 0.0):
+        raise BadModelError(f"delay_s is {delay_s}; a number of seconds >= 0 is wanted")
+    return float(delay_s)

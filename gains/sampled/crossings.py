@@ -1,0 +1,271 @@
+"""The largest loop delay that one block of the sampled and held loop of `gains.sampled.constant` takes.
+
+With z = e^{j phi}, phi = omega T, an eigenvalue of the one-period map is on the unit circle at the delay
+tau = (q + m) T, q whole and 0 <= m < 1, exactly when z^{q+1} is an eigenvalue of the r x r loop
+
+    H_m(z) = K (z I - Phi)^{-1} (G0(m) z + G1(m)).
+
+The moduli of the eigenvalues of H_m do not depend on q: for each m there are finitely many angles phi at which one of
+them is one, whatever the delay. These angles, and with them the delays at which a crossing is possible, change little
+over one period, so the angles at a few m lead to every crossing; no march through the delays is needed. For one input
+the angles are eigenvalues of a Hamiltonian matrix and none is missed; otherwise they come from a refined sweep.
+"""
+
+from math import ceil, floor, inf, pi
+
+import numpy as np
+
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.bracketing import bracketed_roots
+from gains.core.errors import DisagreementError
+from gains.delay.crossings import separating_points
+from gains.delay.loci import Loci, delay_loci, solved_beside_poles, unit_crossings
+from gains.delay.sweep import near_unit_extrema, sweep_frequencies
+from gains.sampled.loop import SampledPlant, block_radius, split_delay
+
+# least number of fractions m of a period at which the angles are computed; more when much happens in one period
+_FRACTIONS = 8
+_REFINEMENTS = (1, 4, 16)
+# the check by the eigenvalues of the one-period map is left out for maps larger than this: 20 ms and more each
+_LARGEST_CHECK = 120
+# where the check is made, as fractions of the margin: the radius moves by a part in 10^6 or so, its error is 10^-12
+_BELOW, _ABOVE = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0 - 1e-6), 1.0 + 1e-6
+# |H(-1)| below this at all fractions of a period cannot reach one in between
+_FAR_FROM_ONE = 0.5
+
+
+def block_delay_margin(plant: SampledPlant) -> float:
+    """The least delay tau (s) at which the block loses stability; 0 when unstable at once, `inf` when never.
+
+    Raises
+    ------
+    DisagreementError
+        The eigenvalues of the one-period map contradict the crossings found.
+    """
+    if block_radius(plant, 0.0) >= 1.0:
+        return 0.0
+    if plant.B.shape[1] == 0:
+        return inf
+    contradiction = ""
+    # at periods near the limit of the loop, angles may appear and vanish between two fractions: look closer then
+    for refinement in _REFINEMENTS:
+        off_axis_s = _least_delay_off_the_real_axis(plant, refinement)
+        margin_s = min(off_axis_s, _least_delay_at_minus_one(plant, refinement))
+        contradiction = _contradiction(plant, margin_s)
+        if not contradiction:
+            return margin_s
+    raise DisagreementError(contradiction)
+
+
+def _least_delay_off_the_real_axis(plant: SampledPlant, refinement: int) -> float:
+    """The least tau >= 0 with an eigenvalue of the one-period map on the unit circle, +-1 excepted."""
+    best_s = inf
+    for delay_s, angle in sorted(_starts(plant, refinement)):
+        if delay_s > best_s + 2.0 * plant.period_s:
+            break
+        refined_s = _newton(plant, delay_s, angle)
+        if 0.0 <= refined_s < best_s:
+            best_s = refined_s
+    return best_s
+
+
+def _starts(plant: SampledPlant, refinement: int) -> list[tuple[float, float]]:
+    """Delays (s) and angles near every possible first crossing.
+
+    At a fraction m a crossing of the angle phi and the locus e^{j theta} belongs to q = theta / phi - 1, which must be
+    whole: where it passes a whole number between two neighbouring m, there is a crossing.
+    """
+    size = float(np.linalg.norm(plant.A) + np.linalg.norm(plant.B @ plant.K)) * plant.period_s
+    count = refinement * int(np.clip(_FRACTIONS * size, _FRACTIONS, 4 * _FRACTIONS))
+    fractions = np.arange(count + 1) / count
+    found = [_unit_angles(plant, float(m)) for m in fractions]
+    starts: list[tuple[float, float]] = []
+    for i in range(count):
+        m, step = float(fractions[i]), 1.0 / count
+        if len(found[i]) == len(found[i + 1]):
+            for (angle, locus), (next_angle, next_locus) in zip(found[i], found[i + 1], strict=True):
+                theta, turn = float(np.angle(locus)) % (2.0 * pi), float(np.angle(next_locus / locus))
+                for extra in (-2.0 * pi, 0.0, 2.0 * pi):
+                    q, next_q = (theta + extra) / angle - 1.0, (theta + extra + turn) / next_angle - 1.0
+                    starts += _between(plant, (q, next_q), (angle, next_angle), m, step)
+        else:
+            # angles appear or vanish within this step: every one at either end is tried
+            for end, list_of_end in ((m, found[i]), (m + step, found[i + 1])):
+                for angle, locus in list_of_end:
+                    for extra in (0.0, 2.0 * pi):
+                        q = round((float(np.angle(locus)) % (2.0 * pi) + extra) / angle - 1.0)
+                        starts += [((q + end) * plant.period_s, angle)] if q >= 0 else []
+    return starts
+
+
+def _between(
+    plant: SampledPlant, q: tuple[float, float], angle: tuple[float, float], m: float, step: float
+) -> list[tuple[float, float]]:
+    """Linear interpolation of the delay and angle where q passes a whole number >= 0 between m and m + step."""
+    change = q[1] - q[0]
+    # a quarter of the step to either side for what is not linear
+    slack = 0.25 * abs(change) + 1e-9
+    starts: list[tuple[float, float]] = []
+    for whole in range(max(0, ceil(min(q) - slack)), floor(max(q) + slack) + 1):
+        part = min(max((whole - q[0]) / change, 0.0), 1.0) if change != 0.0 else 0.5
+        starts.append(((whole + m + part * step) * plant.period_s, angle[0] + part * (angle[1] - angle[0])))
+    return starts
+
+
+def _unit_angles(plant: SampledPlant, m: float) -> list[tuple[float, complex]]:
+    """Angles 0 < phi < pi at which H_m(e^{j phi}) has an eigenvalue of modulus one, each with this eigenvalue.
+
+    By Tustin's map z = (1 + w T/2) / (1 - w T/2) the unit circle becomes the imaginary axis w = j Omega,
+    phi = 2 atan(Omega T / 2), and H_m(z) = D + K (w I - F)^{-1} G, well scaled for any period.
+    """
+    F, G, D = _tustin(plant, m)
+    if plant.B.shape[1] == 1:
+        loci = _scalar_loci(F, G, plant.K, float(D[0, 0]))
+        points = _hamiltonian_points(F, G, plant.K, float(D[0, 0]), plant.period_s)
+    else:
+        loci = _matrix_loci(F, G, plant.K, D)
+        points = _sweep_points(plant, loci)
+    return [
+        (2.0 * float(np.arctan(crossing.omega * plant.period_s / 2.0)), crossing.locus)
+        for crossing in unit_crossings(loci, points)
+    ]
+
+
+def _tustin(plant: SampledPlant, m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """F (n, n), G (n, r), D (r, r) of H_m in the variable w."""
+    period_s = plant.period_s
+    Phi, hold = plant.transition(np.array([period_s, period_s * (1.0 - m)]))
+    newer, older = hold[1], hold[0] - hold[1]
+    identity = np.eye(plant.A.shape[0])
+    # K [(Phi' + w Phi'')]^-1 (G0 + G1 + w (G0 - G1)) with Phi' = I - Phi, Phi'' = I + Phi, w in units of 2 / T
+    solved = np.linalg.solve(identity + Phi[0], np.hstack([Phi[0] - identity, newer + older, newer - older]))
+    n, inputs = plant.B.shape
+    F, both, difference = solved[:, :n], solved[:, n : n + inputs], solved[:, n + inputs :]
+    rate = 2.0 / period_s
+    return rate * F, rate * (both + F @ difference), plant.K @ difference
+
+
+def _scalar_loci(F: FloatArray, G: FloatArray, K: FloatArray, D: float) -> Loci:
+    strictly_proper = delay_loci(F, G, K)
+
+    def loci(omega: FloatArray) -> ComplexArray:
+        return strictly_proper(omega) + D
+
+    return loci
+
+
+def _matrix_loci(F: FloatArray, G: FloatArray, K: FloatArray, D: FloatArray) -> Loci:
+    identity = np.eye(F.shape[0])
+
+    def loci(omega: FloatArray) -> ComplexArray:
+        states = solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - F, G)
+        return np.linalg.eigvals(D + K @ states).astype(np.complex128)
+
+    return loci
+
+
+def _hamiltonian_points(F: FloatArray, G: FloatArray, K: FloatArray, D: float, period_s: float) -> FloatArray:
+    """Frequencies that separate all solutions of |D + K (jw I - F)^-1 G| = 1: eigenvalues of a Hamiltonian matrix.
+
+    The matrix whose imaginary eigenvalues decide whether an H-infinity norm exceeds one.
+    """
+    # |D| = 1 is a crossing at z = -1, found elsewhere; here it only sends one solution to infinity
+    rest = 1.0 - D * D if abs(1.0 - D * D) > 1e-12 else 1e-12
+    corner = F + G @ K * (D / rest)
+    roots = np.linalg.eigvals(np.block([[corner, G @ G.T / rest], [-K.T @ K / rest, -corner.T]])).astype(np.complex128)
+    near_axis = np.abs(roots.real) <= 1e-3 * (np.abs(roots) + float(np.linalg.norm(F)))
+    highest = 1e5 / period_s
+    omega = np.sort(roots.imag[near_axis & (roots.imag > 0.0) & (roots.imag < highest)])
+    return separating_points(omega, highest)
+
+
+def _sweep_points(plant: SampledPlant, loci: Loci) -> FloatArray:
+    """Frequencies dense enough to see every crossing, extrema near one included."""
+    angle = sweep_frequencies(plant.A, plant.B @ plant.K) * plant.period_s
+    angle = np.union1d(angle[angle < pi * 0.99], np.linspace(0.01, pi - 1e-4, 200))
+    omega = np.tan(angle / 2.0) * 2.0 / plant.period_s
+    return np.union1d(omega, near_unit_extrema(loci, omega))
+
+
+def _newton(plant: SampledPlant, delay_s: float, angle: float) -> float:
+    """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by.
+
+    Newton's method for u*M(phi, tau)v = 0 with the singular vectors of the least singular value of
+    M = z^{q+1} (z I - Phi) - (G0 z + G1) K, whose derivative by tau is (z - 1) e^{A (T - e)} B K.
+    """
+    n, period_s = plant.A.shape[0], plant.period_s
+    identity = np.eye(n)
+    start_s, previous = delay_s, inf
+    for _ in range(30):
+        whole, rest_s = split_delay(max(delay_s, 0.0), period_s) if delay_s >= 0.0 else (-1, delay_s + period_s)
+        states, hold = plant.transition(np.array([period_s, period_s - rest_s]))
+        Phi, newer, older = states[0], hold[1] @ plant.K, (hold[0] - hold[1]) @ plant.K
+        z = np.exp(1j * angle)
+        turned = z ** (whole + 1)
+        U, singular, Vh = np.linalg.svd(turned * (z * identity - Phi) - newer * z - older)
+        u, v = U[:, -1].conj(), Vh[-1].conj()
+        by_z = (whole + 1) * turned / z * (z * identity - Phi) + turned * identity - newer
+        by_angle = 1j * z * complex(u @ by_z @ v)
+        by_delay = (z - 1.0) * complex(u @ states[1] @ plant.B @ (plant.K @ v))
+        determinant = by_angle.real * by_delay.imag - by_angle.imag * by_delay.real
+        if determinant == 0.0:
+            return np.nan
+        step_angle = -float(singular[-1]) * by_delay.imag / determinant
+        step_s = float(singular[-1]) * by_angle.imag / determinant
+        angle, delay_s = angle + step_angle, delay_s + step_s
+        if not (0.0 < angle < pi and abs(delay_s - start_s) < 2.0 * period_s and delay_s > -period_s):
+            return np.nan
+        size = abs(step_angle) / angle + abs(step_s) / period_s
+        # rounding stops the steps from shrinking near 1e-13; larger steps that do not shrink lead nowhere
+        if size < 1e-14 or (size < 1e-9 and size >= 0.5 * previous):
+            return delay_s
+        previous = size
+    return np.nan
+
+
+def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
+    """The least tau > 0 with an eigenvalue of the one-period map at z = -1.
+
+    There H_m is real, H_m(-1) = K (I + Phi)^-1 (G0 - G1), and must have the eigenvalue (-1)^{q+1}: one equation for m.
+    """
+    fractions = np.linspace(0.0, 1.0, 8 * refinement * _FRACTIONS + 1)
+    loops = _loops_at_minus_one(plant, fractions)
+    if float(np.linalg.norm(loops, axis=(1, 2)).max()) < _FAR_FROM_ONE:
+        return inf
+    best_s = inf
+    identity = np.eye(plant.B.shape[1])
+    for whole, sign in ((0, -1.0), (1, 1.0)):
+
+        def determinant(m: FloatArray, sign: float = sign) -> FloatArray:
+            return np.linalg.det(identity - sign * _loops_at_minus_one(plant, m))
+
+        values = determinant(fractions)
+        at = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
+        if at.size > 0:
+            m = bracketed_roots(determinant, fractions[at], fractions[at + 1], values[at], values[at + 1])
+            best_s = min(best_s, (whole + float(m.min())) * plant.period_s)
+    return best_s
+
+
+def _loops_at_minus_one(plant: SampledPlant, m: FloatArray) -> FloatArray:
+    """H_m(-1), shape (k, r, r), for k fractions of a period."""
+    states, hold = plant.transition(np.concatenate([[1.0], 1.0 - m]) * plant.period_s)
+    return plant.K @ np.linalg.solve(np.eye(plant.A.shape[0]) + states[0], 2.0 * hold[1:] - hold[0])
+
+
+def _contradiction(plant: SampledPlant, margin_s: float) -> str:
+    """What the spectral radius of the one-period map below and above the margin says against it; nothing if empty."""
+    known_s = margin_s if margin_s < inf else 5.0 * plant.period_s
+    if plant.A.shape[0] + plant.B.shape[1] * (known_s / plant.period_s + 2.0) > _LARGEST_CHECK:
+        return ""
+    checks = [(fraction * known_s, True) for fraction in _BELOW]
+    if margin_s < inf:
+        checks.append((_ABOVE * known_s, False))
+    for delay_s, stable in checks:
+        radius = block_radius(plant, delay_s)
+        if (radius < 1.0) != stable:
+            return (
+                f"the sampled delay margin is {margin_s} s at a period of {plant.period_s} s, but the spectral radius "
+                f"of the one-period map at {delay_s} s is {radius}"
+            )
+    return ""

@@ -1,0 +1,122 @@
+"""The sampled and held loop in matrices: one block, its hold integrals and its one-period map."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.structure import balanced, distinct_blocks
+from gains.delay.loci import factor_rank
+
+# a delay this close to a whole number of periods (in periods) is that number: (3 * 0.02) / 0.02 is not exactly 3
+_WHOLE = 1e-12
+
+
+class SampledPlant(Protocol):
+    """What is under a held command: one block, linear, and the same in every period."""
+
+    @property
+    def A(self) -> FloatArray: ...  # noqa: N802 - the source's letter
+
+    @property
+    def B(self) -> FloatArray: ...  # noqa: N802 - the source's letter
+
+    @property
+    def K(self) -> FloatArray: ...  # noqa: N802 - the source's letter
+
+    @property
+    def period_s(self) -> float: ...
+
+    def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the last `duration_s` (k,) of a period do to the state at their beginning, (k, n, n), and with an input
+        held over them, (k, n, r)."""
+        ...
+
+
+@dataclass(frozen=True)
+class HeldPlant:
+    """One strongly connected block of the loop: A (n, n), B (n, r), K (r, n) of full rank r, and the period in s."""
+
+    A: FloatArray
+    B: FloatArray
+    K: FloatArray
+    period_s: float
+
+    def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """e^{A t} (k, n, n) and int_0^t e^{A s} ds B (k, n, r) for k durations t."""
+        n, inputs = self.B.shape
+        generator = np.zeros((n + inputs, n + inputs))
+        generator[:n, :n], generator[:n, n:] = self.A, self.B
+        exponentials = matrix_exponentials(duration_s[:, np.newaxis, np.newaxis] * generator)
+        return exponentials[:, :n, :n], exponentials[:, :n, n:]
+
+    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """The same from each of the instants to the next."""
+        return self.transition(np.diff(instants))
+
+
+def matrix_exponentials(exponents: FloatArray) -> FloatArray:
+    """e^X for a stack of matrices (k, n, n), by a Taylor polynomial, scaling and squaring.
+
+    SciPy's `expm` takes a stack matrix by matrix, 60 us each; the margins need hundreds of small ones.
+    """
+    norm = float(np.abs(exponents).sum(axis=-1).max(initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(norm / 0.5)))) if norm > 0.0 else 0
+    scaled = exponents / 2.0**squarings
+    identity = np.eye(exponents.shape[-1])
+    result = identity + scaled / 14.0
+    # Horner; the first term left out is 0.5^15 / 15! < 2e-17
+    for degree in range(13, 0, -1):
+        result = identity + scaled @ result / degree
+    for _ in range(squarings):
+        result = result @ result
+    return result
+
+
+def held_blocks(A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float) -> list[HeldPlant]:
+    """The distinct strongly connected blocks of the loop, in balanced coordinates, with B K of each in full rank."""
+    plants: list[HeldPlant] = []
+    for block in distinct_blocks(A, B @ K):
+        A_block, BK_block = balanced(*block.matrices)
+        plants.append(HeldPlant(A_block, *factor_rank(BK_block), period_s))
+    return plants
+
+
+def block_radius(plant: SampledPlant, delay_s: float) -> float:
+    """Spectral radius of the one-period map of one block."""
+    return float(np.abs(np.linalg.eigvals(lifted_map(plant, delay_s))).max())
+
+
+def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
+    """q and e (s) with tau = q T + e, 0 <= e < T."""
+    periods = delay_s / period_s
+    whole = round(periods)
+    if abs(periods - whole) <= _WHOLE * max(1.0, periods):
+        return whole, 0.0
+    whole = int(np.floor(periods))
+    return whole, min(max(delay_s - whole * period_s, 0.0), period_s)
+
+
+def lifted_map(plant: SampledPlant, delay_s: float) -> FloatArray:
+    """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one period on, see `gains.sampled.constant.period_map`."""
+    whole, rest_s = split_delay(delay_s, plant.period_s)
+    Phi, G = plant.transition(np.array([plant.period_s, plant.period_s - rest_s]))
+    newer = G[1]
+    older = G[0] - G[1]
+    n, inputs = plant.B.shape
+    kept = whole + (1 if rest_s > 0.0 else 0)
+    lifted = np.zeros((n + kept * inputs, n + kept * inputs))
+    lifted[:n, :n] = Phi[0]
+    # column block s holds u_{k-s}; u_k itself is K x_k
+    for age, gain in ((whole, newer), (whole + 1, older)):
+        if age == 0:
+            lifted[:n, :n] += gain @ plant.K
+        elif age <= kept:
+            start = n + (age - 1) * inputs
+            lifted[:n, start : start + inputs] += gain
+    if kept > 0:
+        lifted[n : n + inputs, :n] = plant.K
+        lifted[n + inputs :, n : lifted.shape[1] - inputs] = np.eye((kept - 1) * inputs)
+    return lifted

@@ -1,0 +1,328 @@
+"""Telemetry at one rate, control at another: when samples are used, and the loop of `gains.sampled.constant` with that.
+
+The vehicle samples its state every `telemetry_s`, the station computes a command every `control_s` from the newest
+sample that has arrived. Only the slower of the two counts: a command from a sample that was used before repeats what is
+held already, and a sample that a newer one overtakes is never used. So over a common period T of both, n commands act,
+n being the number of periods of the slower one in T:
+
+* The slower period is a whole multiple of the faster one, n = 1: every command is late by the same, and the loop is
+  that of `gains.sampled.constant` with the slower period.
+* It is not: a command's loop delay is the least one plus 0, g, 2 g, ... (n - 1) g in an order that the rates fix,
+  g being the faster period / n. A phase between vehicle and station, and how the delay is split between the ways up
+  and down, only turn this order round. So the least loop delay says it all, and so does the mean one, which is by
+  (n - 1) g / 2 longer and changes less from rate to rate: *loop delay* here is the mean of those of the commands that
+  are the first from their sample.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from math import ceil, floor, inf, isfinite
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import FloatArray
+from gains.core.bracketing import met_end
+from gains.core.errors import BadModelError
+from gains.delay.constant import delay_margin
+from gains.sampled.constant import checked_loop, growth_rate, sampled_delay_margin
+from gains.sampled.loop import held_blocks
+
+# instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
+_SAME_INSTANT = 1e-11
+# Periods of the slower one in a common period at most. Rates that have no such period take those nearest to them that
+# have one: over so many the phase of real ones creeps by less than a clock drifts within seconds.
+_MOST_COMMANDS = 20
+# delays looked at in the time of the slower period, in which no motion that it shows turns by more than half a circle,
+# or in that of the continuous margin
+_LOOKS, _LOOKS_MARGIN = 6, 40
+# the margin is searched up to this many continuous margins, and slower periods more
+_SEARCHED_MARGINS, _SEARCHED_PERIODS = 3.0, 10.0
+# the radius at a margin is this far below one at most
+_RESOLUTION = 1e-13
+# a local maximum of the radius is refined when its sample is above this
+_NEAR_ONE = 0.99
+_GOLDEN = (3.0 - 5.0**0.5) / 2.0
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Periods (s) of control and telemetry, and what follows from them.
+
+    Raises
+    ------
+    BadModelError
+        A period that is not positive and finite.
+
+    Examples
+    --------
+    Control at 50 Hz, telemetry at 20 Hz: samples at 0 and 50 ms are first used at 0 and 60 ms.
+
+    >>> from gains.sampled.multirate import Timing
+    >>> timing = Timing(control_s=0.02, telemetry_s=0.05)
+    >>> timing.held_s, timing.commands, timing.common_s, timing.spread_s
+    (0.05, 2, 0.1, 0.005)
+    """
+
+    control_s: float
+    telemetry_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("control_s", "telemetry_s"):
+            if not (isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise BadModelError(f"{name} is {getattr(self, name)}; a positive number of seconds is wanted")
+
+    @property
+    def held_s(self) -> float:
+        """The slower period: how long a command from a new sample is held, in the mean."""
+        return max(self.control_s, self.telemetry_s)
+
+    @property
+    def commands(self) -> int:
+        """n: commands from new samples in a common period."""
+        return self._ratio.denominator
+
+    @property
+    def common_s(self) -> float:
+        """T: the common period of both."""
+        return self.commands * self.held_s
+
+    @property
+    def faster_s(self) -> float:
+        """The faster period, as a part of T."""
+        return self.common_s / self._ratio.numerator
+
+    @property
+    def step_s(self) -> float:
+        """g: by multiples of this the loop delays of commands differ; the faster period where n = 1."""
+        return self.faster_s / self.commands
+
+    @property
+    def spread_s(self) -> float:
+        """By how much the mean loop delay of a common period is longer than the least one."""
+        return (self.faster_s - self.step_s) / 2.0
+
+    @property
+    def _ratio(self) -> Fraction:
+        """Slower over faster period."""
+        return Fraction(self.held_s / min(self.control_s, self.telemetry_s)).limit_denominator(_MOST_COMMANDS)
+
+    def commands_from(self, first: int, last: int) -> list[tuple[float, float]]:
+        """(Instant of its sample, instant at which it is computed) of the commands first to last, without any delay.
+
+        Command 0 is computed from a sample that arrives just then, at 0.
+        """
+        slower_s, faster_s = self.held_s, self.faster_s
+        near = _SAME_INSTANT * self.commands
+        numbers = range(first, last + 1)
+        if self.telemetry_s >= self.control_s:
+            return [(i * slower_s, ceil(i * slower_s / faster_s - near) * faster_s) for i in numbers]
+        return [(floor(i * slower_s / faster_s + near) * faster_s, i * slower_s) for i in numbers]
+
+
+class LiftedPlant(Protocol):
+    """What is under held commands: linear, and the same in every common period.
+
+    Examples
+    --------
+    x' = u from 0 to 0.3 s and on to 0.5 s:
+
+    >>> import numpy as np
+    >>> from gains.sampled.multirate import LiftedPlant
+    >>> from gains.sampled.loop import HeldPlant
+    >>> plant: LiftedPlant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
+    >>> [part.ravel().round(6).tolist() for part in plant.between([0.0, 0.3, 0.5])]
+    [[1.0, 1.0], [0.3, 0.2]]
+    """
+
+    @property
+    def K(self) -> FloatArray: ...  # noqa: N802 - the source's letter
+
+    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """From each instant to the next: maps of the state (k, n, n), and of an input held since then (k, n, r)."""
+        ...
+
+
+def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing, *, delay_s: float) -> float:
+    """Exponential rate (1/s) of the slowest motion at a (mean) loop delay: negative when stable.
+
+    Parameters
+    ----------
+    A, B, K
+        Real matrices (n, n), (n, p), (p, n); the feedback is u = +K x.
+    delay_s
+        Loop delay; one below the least that these rates can have counts as that.
+
+    Raises
+    ------
+    BadModelError
+        Naming the argument, what was read and what was wanted.
+
+    Examples
+    --------
+    x' = u, u = -x with a sample every 0.5 s and two commands from it, which are the same: x_{k+1} = (1 - T) x_k.
+
+    >>> from math import exp
+    >>> from gains.sampled.multirate import Timing, multirate_growth_rate
+    >>> round(exp(0.5 * multirate_growth_rate([[0]], [[1]], [[-1]], Timing(0.25, 0.5), delay_s=0.0)), 6)
+    0.5
+    """
+    if timing.commands == 1:
+        return growth_rate(A, B, K, period_s=timing.held_s, delay_s=delay_s)
+    plants = held_blocks(*checked_loop(A, B, K), period_s=timing.common_s)
+    return lifted_growth(plants, timing, delay_s=delay_s)
+
+
+def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
+    """The least (mean) loop delay (s) at which the loop loses stability; 0 if at once, `inf` if none is found.
+
+    Where the slower period is a multiple of the faster one it is that of `gains.sampled.constant`, exact. Else the
+    least loop delay is raised in small steps, peaks refined: a search, not a proof, up to three
+    times the margin of the continuous loop and ten of the slower periods. Arguments as of `multirate_growth_rate`.
+
+    Raises
+    ------
+    BadModelError
+        Naming the argument, what was read and what was wanted.
+    DisagreementError
+        See `gains.sampled.constant.sampled_delay_margin`.
+
+    Examples
+    --------
+    x' = u, u = -x: with a period of 1 s it takes a delay of 1 s, whichever of the two rates has it.
+
+    >>> from gains.sampled.multirate import Timing, multirate_delay_margin
+    >>> [round(multirate_delay_margin([[0]], [[1]], [[-1]], Timing(*s)), 6) for s in ((1.0, 0.2), (0.2, 1.0))]
+    [1.0, 1.0]
+    """
+    if timing.commands == 1:
+        return sampled_delay_margin(A, B, K, period_s=timing.held_s)
+    plant, entry, feedback = checked_loop(A, B, K)
+    continuous_s = delay_margin(plant, entry @ feedback)
+    return lifted_margin(held_blocks(plant, entry, feedback, period_s=timing.common_s), timing, near_s=continuous_s)
+
+
+def multirate_map(plant: LiftedPlant, timing: Timing, *, delay_s: float) -> FloatArray:
+    """The matrix that takes (x, K x(sample -1), K x(sample -2), ...) one common period on.
+
+    Examples
+    --------
+    x' = u, u = -x, a sample and a command every 0.5 s that acts 0.25 s later:
+
+    >>> import numpy as np
+    >>> from gains.sampled.multirate import Timing, multirate_map
+    >>> from gains.sampled.loop import HeldPlant
+    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
+    >>> multirate_map(plant, Timing(0.5, 0.5), delay_s=0.25).round(6).tolist()
+    [[0.75, 0.25], [-1.0, 0.0]]
+    """
+    inputs, n = plant.K.shape
+    common_s, count, least_s = timing.common_s, timing.commands, max(0.0, delay_s - timing.spread_s)
+    earlier = count * (ceil(least_s / common_s) + 2)
+    known = list(enumerate(timing.commands_from(-earlier, count - 1), start=-earlier))
+    close_s = _SAME_INSTANT * common_s
+    acting = [(computed_s + least_s, i) for i, (_, computed_s) in known]
+    oldest = max(i for acts_s, i in acting if acts_s <= close_s)
+    kept = max(0, -oldest)
+    start = np.eye(n + kept * inputs)
+    x = start[:n]
+    samples = {-age: start[n + (age - 1) * inputs : n + age * inputs] for age in range(1, kept + 1)}
+    sampled = [(taken_s, i) for i, (taken_s, _) in known if i >= 0]
+    inside = [acts_s for acts_s, i in acting if i > oldest and acts_s < common_s - close_s]
+    instants = _merged([0.0, *inside, *(taken_s for taken_s, _ in sampled), common_s], close_s)
+    for instant, Phi, hold in zip(instants, *plant.between(instants), strict=False):
+        samples |= {i: plant.K @ x for taken_s, i in sampled if abs(taken_s - instant) <= close_s}
+        command = max(i for acts_s, i in acting if acts_s <= instant + close_s)
+        x = Phi @ x + hold @ samples[command]
+    return np.vstack([x, *(samples[count - age] for age in range(1, kept + 1))])
+
+
+def lifted_growth(plants: Sequence[LiftedPlant], timing: Timing, *, delay_s: float) -> float:
+    """As `multirate_growth_rate`, of the blocks of a loop whose plants run in a common period.
+
+    Examples
+    --------
+    x' = u, u = -x, sampled every 0.5 s: x_{k+1} = 0.5 x_k.
+
+    >>> import numpy as np
+    >>> from gains.sampled.multirate import Timing, lifted_growth
+    >>> from gains.sampled.loop import HeldPlant
+    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
+    >>> round(lifted_growth([plant], Timing(0.5, 0.5), delay_s=0.0), 6)
+    -1.386294
+    """
+    radius = max(_radius(plant, timing, delay_s) for plant in plants)
+    return float(np.log(radius)) / timing.common_s if radius > 0.0 else -inf
+
+
+def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: float) -> float:
+    """As `multirate_delay_margin`, likewise; `near_s` is the margin of the continuous loop.
+
+    Examples
+    --------
+    x' = u, u = -x, sampled every second:
+
+    >>> import numpy as np
+    >>> from gains.sampled.multirate import Timing, lifted_margin
+    >>> from gains.sampled.loop import HeldPlant
+    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=1.0)
+    >>> round(lifted_margin([plant], Timing(1.0, 1.0), near_s=np.pi / 2), 6)
+    1.0
+    """
+    known_s = near_s if isfinite(near_s) else 0.0
+    last_s = _SEARCHED_MARGINS * known_s + _SEARCHED_PERIODS * timing.held_s
+    step_s = max(timing.held_s / _LOOKS, known_s / _LOOKS_MARGIN)
+    looks = (timing.spread_s + np.arange(0.0, last_s, step_s)).tolist()
+    margins_s: list[float] = []
+    for plant in plants:
+        # without feedback one look tells
+        found_s = _first_unstable(partial(_radius, plant, timing), looks if plant.K.any() else looks[:1])
+        margins_s.append(found_s)
+    return min(margins_s)
+
+
+def _radius(plant: LiftedPlant, timing: Timing, delay_s: float) -> float:
+    return float(np.abs(np.linalg.eigvals(multirate_map(plant, timing, delay_s=delay_s))).max())
+
+
+def _merged(instants: list[float], close_s: float) -> list[float]:
+    """Ascending instants, those within rounding of each other once."""
+    merged: list[float] = []
+    for instant in sorted(instants):
+        if not merged or instant - merged[-1] > close_s:
+            merged.append(instant)
+    return merged
+
+
+def _first_unstable(radius: Callable[[float], float], looks: list[float]) -> float:
+    """The least delay at which the radius reaches one: 0 if at the first look, `inf` if at none."""
+    radii: list[float] = []
+    for i, look in enumerate(looks):
+        radii.append(radius(look))
+        if radii[i] >= 1.0:
+            return _edge(radius, looks[i - 1], look) if i > 0 else 0.0
+        # a peak between two looks
+        if i > 1 and radii[i - 1] > _NEAR_ONE and radii[i - 2] < radii[i - 1] > radii[i]:
+            peak_s = _peak(radius, looks[i - 2], look)
+            if radius(peak_s) >= 1.0:
+                return _edge(radius, looks[i - 2], peak_s)
+    return inf
+
+
+def _edge(radius: Callable[[float], float], stable_s: float, unstable_s: float) -> float:
+    def excess(delay_s: float) -> float:
+        return 1.0 - radius(delay_s)
+
+    met, missed = ((delay_s, excess(delay_s)) for delay_s in (stable_s, unstable_s))
+    return met_end(excess, met, missed, resolution=_RESOLUTION)
+
+
+def _peak(radius: Callable[[float], float], begin_s: float, end_s: float) -> float:
+    """Place of the local maximum within a bracket, by golden section."""
+    for _ in range(30):
+        third, two_thirds = begin_s + _GOLDEN * (end_s - begin_s), end_s - _GOLDEN * (end_s - begin_s)
+        begin_s, end_s = (begin_s, two_thirds) if radius(third) > radius(two_thirds) else (third, end_s)
+    return (begin_s + end_s) / 2.0

@@ -1,0 +1,314 @@
+"""The onboard loop as it is flown: own errors fed back at the vehicle, those of others by a station, late.
+
+Every vehicle uses its own errors at once, those of others tau late (Sahoo 2012, eqs. 5.1, 5.2)::
+
+    x'(t) = (A + B K_own) x(t) + B K_others x(t - tau)
+
+As it is flown nothing of it is continuous. With the control period T of the station:
+
+* The vehicle computes its own part of the command `steps` times in T and holds it. Its velocity error it knows at that
+  instant. Its spacing error it knows from its sensor, which looks at every `steps_per_sample`-th step; between two
+  looks the spacing is carried on with the relative velocity that the sensor saw.
+* The station computes its part from states that all vehicles sampled at one instant t_k = k T, with the first of the
+  vehicles' steps. It acts from t_k + tau on, at that very instant, and is held for T. With telemetry at another rate
+  than control T is the slower period, or the common one as `gains.sampled.multirate` has it.
+
+So over one period T the local loop is a linear map of the state alone, and what is late enters it as the command of a
+held loop enters a plant: everything that `gains.sampled.crossings` says of such loops holds for this one too. The
+vehicles' steps are taken to be in step with each other; clocks that are apart by less than a step change the margin in
+the second order of the step.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from math import ceil, inf
+
+import numpy as np
+
+from gains.core.arrays import FloatArray, IntArray
+from gains.core.errors import BadModelError
+from gains.core.structure import balanced, distinct_blocks
+from gains.delay.constant import delay_margin
+from gains.delay.loci import factor_rank
+from gains.formation.model import FormationModel
+from gains.sampled.crossings import block_delay_margin
+from gains.sampled.loop import HeldPlant, block_radius, matrix_exponentials
+from gains.sampled.multirate import Timing, lifted_growth, lifted_margin
+
+# an instant this close to a step (in steps) is that of the step
+_SAME_INSTANT = 1e-9
+
+
+@dataclass(frozen=True)
+class OnboardTiming:
+    """How often things happen.
+
+    Attributes
+    ----------
+    control_s
+        Period (s) of what the station computes.
+    steps
+        Steps of the vehicle's own loop in a control period.
+    steps_per_sample
+        The sensor looks at one of so many steps; a divisor of `steps`.
+    telemetry_s
+        Period (s) of telemetry; that of the control if None.
+
+    Examples
+    --------
+    A station at 10 Hz, vehicles at 50 Hz:
+
+    >>> from gains.sampled.onboard import OnboardTiming
+    >>> OnboardTiming(control_s=0.1, steps=5)
+    OnboardTiming(control_s=0.1, steps=5, steps_per_sample=1, telemetry_s=None)
+    """
+
+    control_s: float
+    steps: int = 1
+    steps_per_sample: int = 1
+    telemetry_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.control_s < inf:
+            raise BadModelError(f"control_s is {self.control_s}; a positive number of seconds is wanted")
+        if self.steps < 1 or self.steps_per_sample < 1 or self.steps % self.steps_per_sample:
+            raise BadModelError(
+                f"steps is {self.steps} and steps_per_sample {self.steps_per_sample}; positive whole numbers are "
+                "wanted, the second a divisor of the first"
+            )
+
+    @property
+    def rates(self) -> Timing:
+        """When states are used."""
+        return Timing(self.control_s, self.control_s if self.telemetry_s is None else self.telemetry_s)
+
+    @property
+    def common(self) -> "OnboardTiming":
+        """The same over the common period of control and telemetry, as the period of both."""
+        common_s = self.rates.common_s
+        times = round(common_s / self.control_s)
+        return OnboardTiming(common_s, self.steps * times, self.steps_per_sample)
+
+
+@dataclass(frozen=True, eq=False)
+class OnboardLoop:
+    """Matrices (n, n) of x' = A x + sensed x + known x + late x(t - tau), and when their parts act.
+
+    `sensed` is B K_own on the spacing errors, `known` on the velocity errors, `late` is B K_others.
+    """
+
+    A: FloatArray
+    sensed: FloatArray
+    known: FloatArray
+    late: FloatArray
+    timing: OnboardTiming
+
+    def part(self, states: IntArray) -> "OnboardLoop":
+        """The loop of some of the states, those of vehicles that act on each other."""
+        at = np.ix_(states, states)
+        return OnboardLoop(self.A[at], self.sensed[at], self.known[at], self.late[at], self.timing)
+
+    def continuous_margin_s(self) -> float:
+        """The least delay tau at which (5.2) loses stability."""
+        return delay_margin(self.A + self.sensed + self.known, self.late)
+
+    def sampled_margin_s(self) -> float:
+        """The least delay tau at which the loop as flown loses stability; 0 if at once, `inf` if never.
+
+        Raises
+        ------
+        gains.core.errors.DisagreementError
+            See `gains.sampled.constant.sampled_delay_margin`.
+        """
+        plants, rates = self.plants(), self.timing.rates
+        if rates.commands == 1:
+            return min(block_delay_margin(plant) for plant in plants)
+        return lifted_margin([SteppedPlant(plant) for plant in plants], rates, near_s=self.continuous_margin_s())
+
+    def growth_1_s(self, delay_s: float) -> float:
+        """Exponential rate of the slowest motion of the loop as flown: negative when stable."""
+        plants, rates = self.plants(), self.timing.rates
+        if rates.commands > 1:
+            return lifted_growth([SteppedPlant(plant) for plant in plants], rates, delay_s=delay_s)
+        radius = max(block_radius(plant, delay_s) for plant in plants)
+        return float(np.log(radius)) / rates.held_s if radius > 0.0 else -inf
+
+    def continuous_at_once(self) -> list[tuple[FloatArray, float]]:
+        """What is not late in the continuous model, each term with its delay (s): a hold counts as half a step."""
+        return [(self.A, 0.0), (self.sensed + self.known, self.timing.control_s / self.timing.steps / 2.0)]
+
+    def plants(self) -> "list[LocalPlant]":
+        """The blocks that have late terms of their own or none, one of each kind."""
+        plants: list[LocalPlant] = []
+        for block in distinct_blocks(self.A, self.sensed, self.known, self.late):
+            A, sensed, known, late = balanced(*block.matrices)
+            plants.append(LocalPlant(A, sensed, known, late, self.timing.common))
+        return plants
+
+
+@dataclass(frozen=True, eq=False)
+class LocalPlant:
+    """One block with its local loop closed, as a `gains.sampled.loop.SampledPlant`: only what is late is missing."""
+
+    free: FloatArray
+    sensed: FloatArray
+    known: FloatArray
+    late: FloatArray
+    timing: OnboardTiming
+
+    @property
+    def period_s(self) -> float:
+        return self.timing.control_s
+
+    @property
+    def A(self) -> FloatArray:  # noqa: N802 - the source's letter
+        """A + B K_own: what the sampled local loop comes close to."""
+        return self.free + self.sensed + self.known
+
+    @property
+    def B(self) -> FloatArray:  # noqa: N802 - the source's letter
+        return self._factors[0]
+
+    @property
+    def K(self) -> FloatArray:  # noqa: N802 - the source's letter
+        return self._factors[1]
+
+    @cached_property
+    def _factors(self) -> tuple[FloatArray, FloatArray]:
+        return factor_rank(self.late)
+
+    def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The state at a period's end, of that `duration_s` earlier and of an input held since then.
+
+        Shapes (k, n, n) and (k, n, r) for k durations up to the period. The steps still to come answer to both. For a
+        whole period the first is the map of the local loop from its first step on, sensor and all.
+        """
+        step_s = self.period_s / self.timing.steps
+        begin = (self.period_s - duration_s) / step_s
+        following = np.ceil(begin - _SAME_INSTANT).astype(np.int64)
+        rest_s = np.maximum(following - begin, 0.0) * step_s
+        flow, held = HeldPlant(self.free, self.B, self.K, self.period_s).transition(rest_s)
+        from_step, from_input = self._ends
+        return from_step[following] @ flow, from_input[following] + from_step[following] @ held
+
+    @cached_property
+    def _ends(self) -> tuple[FloatArray, FloatArray]:
+        """The state at the period's end, of the state just before each step and of an input held from then on.
+
+        The last entries are those of the end itself. The state is all there is to remember before each step: what the
+        sensor saw at an earlier one is no answer to what comes in after that.
+        """
+        n, steps = len(self.free), self.timing.steps
+        step_s = self.period_s / steps
+        generator = np.zeros((2 * n, 2 * n))
+        generator[:n, :n], generator[:n, n:] = self.free, np.eye(n)
+        [exponential] = matrix_exponentials(step_s * generator[np.newaxis])
+        Phi, Gamma = exponential[:n, :n], exponential[:n, n:]
+        on_state, on_input = [np.eye(n)], [np.zeros_like(self.B)]
+        from_both = np.hstack([np.eye(n), np.zeros((n, n))])  # of the state and of what the sensor saw last
+        for step in reversed(range(steps)):
+            age_s = step % self.timing.steps_per_sample * step_s
+            seen = Gamma @ self.sensed @ (np.eye(n) + age_s * self.free)
+            on_input.append(on_input[-1] + on_state[-1] @ Gamma @ self.B)
+            flown = Phi + Gamma @ self.known
+            none, same = np.zeros((n, n)), np.eye(n)
+            looks = step % self.timing.steps_per_sample == 0
+            one_step = [[flown + seen, none], [same, none]] if looks else [[flown, seen], [none, same]]
+            from_both = from_both @ np.block(one_step)
+            on_state.append(from_both[:, :n])
+        return np.array(on_state[::-1]), np.array(on_input[::-1])
+
+
+@dataclass(frozen=True, eq=False)
+class SteppedPlant:
+    """A local plant that can be looked at between its steps too, as a `gains.sampled.multirate.LiftedPlant`.
+
+    Its state is that of the block, what the sensor saw of it last, and what the vehicle itself adds to x'.
+    """
+
+    local: LocalPlant
+
+    @property
+    def K(self) -> FloatArray:  # noqa: N802 - the source's letter
+        K = self.local.K
+        return np.hstack([K, np.zeros((len(K), 2 * K.shape[1]))])
+
+    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """From each of the instants of a period to the next: maps of the state, and of an input held since then."""
+        local, step_s = self.local, self.local.period_s / self.local.timing.steps
+        n, inputs = local.B.shape
+        generator = np.zeros((3 * n + inputs, 3 * n + inputs))
+        generator[:n, :n], generator[:n, 2 * n : 3 * n], generator[:n, 3 * n :] = local.free, np.eye(n), local.B
+        maps: list[FloatArray] = []
+        for begin_s, end_s in pairwise(instants):
+            first, last = (ceil(instant / step_s - _SAME_INSTANT) for instant in (begin_s, end_s))
+            stops = np.array([begin_s, *(step_s * k for k in range(first, last)), end_s])
+            whole = np.eye(3 * n + inputs)
+            for k, flow in enumerate(matrix_exponentials(np.diff(stops)[:, np.newaxis, np.newaxis] * generator)):
+                whole = flow @ (whole if k == 0 else self._step(first + k - 1) @ whole)
+            maps.append(whole)
+        every = np.array(maps)
+        return every[:, : 3 * n, : 3 * n], every[:, : 3 * n, 3 * n :]
+
+    def _step(self, number: int) -> FloatArray:
+        """What a step of the vehicle's loop does to the state and the input held."""
+        local, timing = self.local, self.local.timing
+        n, inputs = local.B.shape
+        age_steps = number % timing.steps_per_sample
+        look = np.eye(3 * n + inputs)
+        if age_steps == 0:
+            look[n : 2 * n, :n], look[n : 2 * n, n : 2 * n] = np.eye(n), 0.0
+        carried = np.eye(n) + age_steps * local.period_s / timing.steps * local.free
+        compute = np.eye(3 * n + inputs)
+        compute[2 * n : 3 * n, : 3 * n] = np.hstack([local.known, local.sensed @ carried, np.zeros((n, n))])
+        return compute @ look
+
+
+def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) -> OnboardLoop:
+    """The onboard loop of a formation with the gain K (inputs, states) of u = K e.
+
+    The own part K_own are its blocks (i, i), by which vehicle i uses its own errors; the rest is K_others.
+
+    Examples
+    --------
+    A follower uses what is its own at once, and its leader needs nobody: no delay destabilises the pair.
+
+    >>> import numpy as np
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.sampled.onboard import OnboardTiming, onboard_loop
+    >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
+    >>> loop = onboard_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
+    >>> loop.late.tolist(), loop.continuous_margin_s(), loop.sampled_margin_s()
+    ([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], inf, inf)
+    """
+    B, own = model.B, own_part(model, K)
+    spacing = np.zeros(model.states, dtype=bool)
+    for i in model.followers:
+        spacing[model.spacing_slice(i)] = True
+    return OnboardLoop(
+        A=model.A,
+        sensed=B @ np.where(spacing, own, 0.0),
+        known=B @ np.where(spacing, 0.0, own),
+        late=B @ (K - own),
+        timing=timing,
+    )
+
+
+def own_part(model: FormationModel, K: FloatArray) -> FloatArray:
+    """K with its blocks (i, i) only.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.sampled.onboard import own_part
+    >>> own_part(FormationModel((-1, 0), axes=1), np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])).tolist()
+    [[-1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]
+    """
+    own = np.zeros_like(K)
+    for i in range(model.vehicles):
+        block = model.input_slice(i), model.output_slice(i)
+        own[block] = K[block]
+    return own

@@ -1,0 +1,1 @@
+"""Bounds that hold for delays that vary in time."""

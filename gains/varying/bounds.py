@@ -1,0 +1,311 @@
+"""Delays that vary: how large may tau(t) become in x'(t) = A0 x(t) + A1 x(t - tau(t))?
+
+No exact bound is known. Each function here gives a lower bound that is proved: the loop is stable for every delay of
+the stated kind below it, and it never exceeds the margin for constant delays.
+
+* |tau'| <= mu, 0 <= tau(t) <= h: a Lyapunov-Krasovskii functional and Wirtinger's inequality. A. Seuret and
+  F. Gouaisbaut, "Wirtinger-based integral inequality: application to time-delay systems", Automatica 49(9), 2013,
+  whose published bounds this reproduces.
+* constant delays, for comparison: the hierarchy of A. Seuret and F. Gouaisbaut, "Hierarchy of LMI conditions for the
+  stability analysis of time-delay systems", Systems & Control Letters 81, 2015, which converges to the exact margin.
+* any variation at all: small gain on v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain from
+  x' is at most h.
+
+Every Lyapunov functional found is checked by the eigenvalues of its matrices, see `gains.varying.lmi`.
+"""
+
+from collections.abc import Callable, Sequence
+from math import inf
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+from gains.core.structure import balanced, distinct_blocks, square_matrices
+from gains.delay.constant import delay_margin
+from gains.delay.loci import factor_rank
+from gains.varying.lmi import Unknown, positive_definite_solution
+
+# bisection stops at this relative accuracy
+_ACCURACY = 1e-4
+# no bound beyond this many time constants 1 / (||A0|| + ||A1||) is looked for
+_LONGEST = 1e3
+# states of one block; the unknowns grow with the square and the work with the sixth power
+_LARGEST_BLOCK = 8
+_MOST_ORDERS = 6
+
+
+def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
+    """A delay h (s) such that the loop is stable for every tau(t) in [0, h] with |tau'(t)| <= `rate`.
+
+    `rate` inf admits any variation, jumps included; the better of the functional without use of the rate and the small
+    gain is returned. `inf` when one functional proves stability whatever the length of the delay; 0 when the loop is
+    unstable without delay. The bound is the end of a bisection, so a functional for every delay below it is implied by
+    the one found at it. Finite bounds are not looked for beyond 1000 / (||A0|| + ||A1||).
+
+    Parameters
+    ----------
+    A0, A1
+        Real matrices (n, n), 1/s; up to 8 states in a strongly connected block.
+    rate
+        mu >= 0.
+
+    Raises
+    ------
+    BadModelError
+        Matrices that do not fit, a rate that is negative or not a number, or a block too large.
+
+    Examples
+    --------
+    A loop of the paper of 2013: 6.059 s for a constant delay, where the exact margin is 6.1726 s.
+
+    >>> from gains.varying.bounds import varying_delay_bound
+    >>> round(varying_delay_bound([[-2, 0], [0, -0.9]], [[-1, 0], [-1, -1]], rate=0.0), 2)
+    6.06
+    """
+    if not rate >= 0.0:
+        raise BadModelError(f"rate is {rate}; a number >= 0 is wanted, inf for any variation")
+    return min(_varying_bound_of_block(now, late, rate) / unit for now, late, unit in _checked_blocks(A0, A1))
+
+
+def hierarchy_bound(A0: ArrayLike, A1: ArrayLike, *, order: int) -> float:
+    """The largest constant delay (s), up to the exact margin, that the Legendre functional of this order proves.
+
+    Order 0 is Jensen's inequality, 1 Wirtinger's; the bounds grow with the order. Each proves stability at the delay
+    itself; for all shorter delays that is the exact margin's to say, which is the limit of the bisection. Never more
+    than 1000 / (||A0|| + ||A1||), also for a loop that is stable at every delay.
+
+    Parameters
+    ----------
+    A0, A1
+        As of `varying_delay_bound`.
+    order
+        N from 0 to 6.
+
+    Raises
+    ------
+    BadModelError
+        Matrices that do not fit, a block too large, or an order that is not from 0 to 6.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau): Jensen's inequality proves sqrt(2), the exact margin is pi / 2.
+
+    >>> from gains.varying.bounds import hierarchy_bound
+    >>> [round(hierarchy_bound([[0]], [[-1]], order=order), 3) for order in (0, 2)]
+    [1.414, 1.571]
+    """
+    if not 0 <= order <= _MOST_ORDERS:
+        raise BadModelError(f"order is {order}; a whole number from 0 to {_MOST_ORDERS} is wanted")
+
+    def bound(now: FloatArray, late: FloatArray) -> float:
+        def proved(delay_s: float) -> bool:
+            return _legendre_functional_exists(now, late, delay_s, order)
+
+        return _bisected(proved, _upper_end(now, late))
+
+    return min(bound(now, late) / unit for now, late, unit in _checked_blocks(A0, A1))
+
+
+def small_gain_bound(A0: ArrayLike, A1: ArrayLike) -> float:
+    """A delay h (s) such that the loop is stable for every tau(t) in [0, h], however it varies.
+
+    h = 1 / min over D of max over omega of ||D C j omega (j omega I - A0 - A1)^{-1} B D^{-1}||, A1 = B C of full rank;
+    D is a full matrix because the delay acts on all signals alike. The minimum is found, and proved, by the bounded
+    real lemma with the unknown P = D'D. 0 when the loop is unstable without delay, `inf` without a delayed part.
+
+    Parameters
+    ----------
+    A0, A1
+        As of `varying_delay_bound`.
+
+    Raises
+    ------
+    BadModelError
+        Matrices that do not fit, or a block too large.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau(t)): the largest |j omega / (j omega + 1)| is 1.
+
+    >>> from gains.varying.bounds import small_gain_bound
+    >>> round(small_gain_bound([[0]], [[-1]]), 3)
+    1.0
+    """
+    return min(_small_gain_of_block(now, late) / unit for now, late, unit in _checked_blocks(A0, A1))
+
+
+def _checked_blocks(A0: ArrayLike, A1: ArrayLike) -> list[tuple[FloatArray, FloatArray, float]]:
+    """The distinct blocks in their own unit of time, the third entry (1/s): the solver then sees numbers near one."""
+    blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
+    largest = max(len(block.indices) for block in blocks)
+    if largest > _LARGEST_BLOCK:
+        raise BadModelError(
+            f"the loop has a strongly connected block of {largest} states; at most {_LARGEST_BLOCK} are wanted"
+        )
+    scaled: list[tuple[FloatArray, FloatArray, float]] = []
+    for block in blocks:
+        now, late = balanced(*block.matrices)
+        unit = float(np.linalg.norm(now) + np.linalg.norm(late)) or 1.0
+        scaled.append((now / unit, late / unit, unit))
+    return scaled
+
+
+def _upper_end(now: FloatArray, late: FloatArray) -> float:
+    """Where a bisection begins: the exact margin for constant delays, or a thousand time constants."""
+    return min(delay_margin(now, late), _LONGEST)
+
+
+def _bisected(proved: Callable[[float], bool], upper: float) -> float:
+    """The largest number up to `upper`, to a part in 10^4, at which `proved` holds; 0 if at none."""
+    if upper <= 0.0:
+        return 0.0
+    if proved(upper):
+        return upper
+    lower, step = 0.0, upper
+    while lower == 0.0 and step > 1e-6 * upper:
+        step /= 2.0
+        lower = step if proved(step) else 0.0
+    higher = min(2.0 * lower, upper)
+    while lower > 0.0 and higher - lower > _ACCURACY * lower:
+        middle = (lower + higher) / 2.0
+        lower, higher = (middle, higher) if proved(middle) else (lower, middle)
+    return lower
+
+
+def _varying_bound_of_block(now: FloatArray, late: FloatArray, rate: float) -> float:
+    if not late.any():
+        return delay_margin(now, late)
+    upper = _upper_end(now, late)
+    if upper > 0.0 and _is_independent_of_length(now, late, rate):
+        return inf
+
+    def proved(delay_s: float) -> bool:
+        return _varying_functional_exists(now, late, delay_s, rate)
+
+    bound_s = _bisected(proved, upper)
+    return max(bound_s, _small_gain_of_block(now, late)) if rate == inf else bound_s
+
+
+def _he(matrix: FloatArray) -> FloatArray:
+    return matrix + matrix.T
+
+
+def _is_independent_of_length(now: FloatArray, late: FloatArray, rate: float) -> bool:
+    """V = x'Px + int over the delay of x'Qx proves stability for |tau'| <= rate < 1, whatever the length.
+
+    -[[A0'P + P A0 + Q, P A1], [A1'P, -(1 - mu) Q]] > 0.
+    """
+    if rate >= 1.0:
+        return False
+    n = now.shape[0]
+
+    def inequalities(unknowns: Sequence[FloatArray]) -> Sequence[FloatArray]:
+        P, Q = unknowns
+        corner = P @ late
+        return [-np.block([[_he(P @ now) + Q, corner], [corner.T, -(1.0 - rate) * Q]]), P, Q]
+
+    return positive_definite_solution([Unknown(n), Unknown(n)], inequalities) is not None
+
+
+def _varying_functional_exists(now: FloatArray, late: FloatArray, h: float, rate: float) -> bool:
+    """The inequalities of Seuret and Gouaisbaut 2013 for 0 <= tau <= h, |tau'| <= rate.
+
+    V = z'Pz + int_{t-tau}^t x'Qx + int_{t-h}^t x'Sx + h int int x''R x', z = (x, int_{t-tau}^t x, int_{t-h}^{t-tau} x),
+    and for a rate of inf Q = 0 and z = (x, int_{t-h}^t x), so that tau' does not appear. Its derivative is a quadratic
+    form in (x(t), x(t-tau), x(t-h), and the means of x over the two parts), affine in tau and tau': the corners of
+    their range suffice. The two integrals of R are joined by the reciprocally convex X.
+    """
+    n = now.shape[0]
+    x, x_tau, x_h, mean_1, mean_2 = (np.eye(5 * n)[k * n : (k + 1) * n] for k in range(5))
+    speed = now @ x + late @ x_tau
+    near = np.vstack([x - x_tau, x + x_tau - 2.0 * mean_1])
+    far = np.vstack([x_tau - x_h, x_tau + x_h - 2.0 * mean_2])
+    both = np.vstack([near, far])
+    any_rate = rate == inf
+    rates = (0.0,) if any_rate or rate == 0.0 else (-rate, rate)
+
+    def inequalities(unknowns: Sequence[FloatArray]) -> Sequence[FloatArray]:
+        P, S, R, X = unknowns[:4]
+        # Jensen's and Wirtinger's parts of the integral of R
+        weight = np.kron(np.diag([1.0, 3.0]), R)
+        joint = np.block([[weight, X], [X.T, weight]])
+        results: list[FloatArray] = [P, S, R, joint.astype(np.float64)]
+        if not any_rate:
+            results.append(unknowns[4])
+        for tau in (0.0, h):
+            for slope in rates:
+                state = np.vstack([x, tau * mean_1, (h - tau) * mean_2])
+                change = np.vstack([speed, x - (1.0 - slope) * x_tau, (1.0 - slope) * x_tau - x_h])
+                if any_rate:
+                    state = np.vstack([x, tau * mean_1 + (h - tau) * mean_2])
+                    change = np.vstack([speed, x - x_h])
+                derivative = _he(state.T @ P @ change) + x.T @ S @ x - x_h.T @ S @ x_h
+                derivative += h * h * speed.T @ R @ speed - both.T @ joint @ both
+                if not any_rate:
+                    Q = unknowns[4]
+                    derivative += x.T @ Q @ x - (1.0 - slope) * x_tau.T @ Q @ x_tau
+                results.append(-derivative)
+        return results
+
+    shapes = [Unknown((2 if any_rate else 3) * n), Unknown(n), Unknown(n), Unknown(2 * n, 2 * n)]
+    return positive_definite_solution(shapes if any_rate else [*shapes, Unknown(n)], inequalities) is not None
+
+
+def _legendre_functional_exists(now: FloatArray, late: FloatArray, h: float, order: int) -> bool:
+    """The inequalities of Seuret and Gouaisbaut 2015 at the constant delay h, with `order` Legendre polynomials L_k.
+
+    V = z'Pz + int x'Sx + h int int x''R x', z = (x, int L_0 x, ..., int L_{N-1} x) over [t-h, t], the quadratic form
+    being in (x(t), x(t-h), int L_k x / h).
+    """
+    n = now.shape[0]
+    size = (order + 2) * n
+    parts = [np.eye(size)[k * n : (k + 1) * n] for k in range(order + 2)]
+    x, x_h, means = parts[0], parts[1], parts[2:]
+    speed = now @ x + late @ x_h
+    # L_k(0) x - L_k(-h) x_h - int L_k' x = h / (2k + 1) times the k-th Legendre coefficient of x'
+    slopes = [
+        x
+        - (-1.0) ** k * x_h
+        - sum((((2 * i + 1) * (1.0 - (-1.0) ** (k + i))) * means[i] for i in range(min(k, order))), np.zeros((n, size)))
+        for k in range(order + 1)
+    ]
+    state = np.vstack([x, *(h * mean for mean in means)])
+    change = np.vstack([speed, *slopes[:order]])
+
+    def inequalities(unknowns: Sequence[FloatArray]) -> Sequence[FloatArray]:
+        P, S, R = unknowns
+        positive = P.copy()
+        for k in range(order):
+            place = slice((k + 1) * n, (k + 2) * n)
+            positive[place, place] += (2 * k + 1) / h * S
+        derivative = _he(state.T @ P @ change) + x.T @ S @ x - x_h.T @ S @ x_h + h * h * speed.T @ R @ speed
+        for k, slope in enumerate(slopes):
+            derivative -= (2 * k + 1) * slope.T @ R @ slope
+        return [positive, S, R, -derivative]
+
+    return positive_definite_solution([Unknown((order + 1) * n), Unknown(n), Unknown(n)], inequalities) is not None
+
+
+def _small_gain_of_block(now: FloatArray, late: FloatArray) -> float:
+    total = now + late
+    if float(np.linalg.eigvals(total).real.max()) >= 0.0:
+        return 0.0
+    B, C = factor_rank(late)
+    if B.shape[1] == 0:
+        return inf
+    n, r = B.shape
+    outputs = C @ np.hstack([total, B])
+
+    def proved(h: float) -> bool:
+        """Bounded real lemma for sqrt(P) C s (sI - A)^{-1} B sqrt(P)^{-1} with the bound 1/h."""
+
+        def inequalities(unknowns: Sequence[FloatArray]) -> Sequence[FloatArray]:
+            X, P = unknowns
+            storage = np.block([[_he(X @ total), X @ B], [B.T @ X, -P]])
+            return [-(storage + h * h * outputs.T @ P @ outputs), P]
+
+        return positive_definite_solution([Unknown(n), Unknown(r)], inequalities) is not None
+
+    return _bisected(proved, _upper_end(now, late))

@@ -1,0 +1,280 @@
+"""Which stability bound covers the delay that a link really has: constant, slowly varying, or jumping about.
+
+The margin for constant delays is exact but says nothing about a delay that varies; the bounds for varying delays are
+proved but lower. Given an observed delay (mean, spread, rate of change) the bounds are tried from the least to the
+most demanding one, and the first that covers the observation is reported, with the others for comparison.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, sqrt
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.errors import BadModelError
+from gains.core.structure import balanced, distinct_blocks, square_matrices
+from gains.delay.constant import analyse_delay
+from gains.delay.crossings import highest_frequency
+from gains.delay.loci import factor_rank
+from gains.varying.bounds import varying_delay_bound
+from gains.varying.lmi import Unknown, positive_definite_solution
+
+Cover = Literal["constant", "rate", "spread", "any", "none"]
+
+# frequencies at which the scaling is chosen, and at which the gain is then read
+_FREQUENCIES_SCALING, _FREQUENCIES_GAIN = 60, 4000
+# bisection of the gain that a scaling can reach; the gain is read again afterwards, so this costs quality only
+_HALVINGS = 12
+# the gain is read on a grid: its peak may lie this much above, relative to it
+_GRID_ERROR = 1e-3
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """An observed effective delay: `mean_s`, the largest distance `spread_s` from it, and the largest |d delay / dt|.
+
+    `rate` (s/s) is inf for a delay that jumps from message to message, as delays of queued datagrams do; a sampled and
+    held loop has a sawtooth of rate 1 and jumps. Values out of range are reported by the functions that take it.
+
+    Examples
+    --------
+    A delay of 80 to 120 ms that jumps from message to message:
+
+    >>> from math import inf
+    >>> from gains.varying.jitter import Jitter
+    >>> Jitter(mean_s=0.1, spread_s=0.02, rate=inf)
+    Jitter(mean_s=0.1, spread_s=0.02, rate=inf)
+    """
+
+    mean_s: float
+    spread_s: float
+    rate: float
+
+
+@dataclass(frozen=True)
+class CoveringBound:
+    """Which bound proves the loop stable under an observed jitter.
+
+    Attributes
+    ----------
+    cover
+        "constant": the delay does not vary and lies in a window of the exact analysis. "rate": bounded rate of change,
+        delays from 0 up to `bound_s`. "spread": any variation within `bound_s` - mean of the mean. "any": any
+        variation from 0 up to `bound_s`. "none": no bound covers it; the loop may be stable all the same.
+    bound_s
+        The largest delay that bound admits, nan for "none".
+    largest_s
+        The largest delay observed, mean + spread.
+    constant_margin_s, rate_bound_s, spread_bound_s, any_bound_s
+        What each bound admits as largest delay; 0 where a bound does not apply: a rate that
+        is inf, a mean delay that is unstable itself.
+    """
+
+    cover: Cover
+    bound_s: float
+    largest_s: float
+    constant_margin_s: float
+    rate_bound_s: float
+    spread_bound_s: float
+    any_bound_s: float
+
+    @property
+    def is_covered(self) -> bool:
+        """Whether some bound proves the loop stable under the jitter."""
+        return self.cover != "none"
+
+
+def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBound:
+    """The least demanding bound that proves x'(t) = A0 x(t) + A1 x(t - tau(t)) stable under `jitter`.
+
+    Parameters
+    ----------
+    A0, A1
+        Real matrices (n, n), 1/s; up to 8 states in a strongly connected block.
+
+    Raises
+    ------
+    BadModelError
+        Matrices that do not fit, a block too large, or a jitter that is negative, not a number, or has a spread above
+        the mean.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau(t)): a constant delay may come near pi / 2, one that jumps may not.
+
+    >>> from math import inf
+    >>> from gains.varying.jitter import Jitter, bound_covering
+    >>> [bound_covering([[0]], [[-1]], Jitter(1.4, spread_s, inf)).cover for spread_s in (0.0, 0.15)]
+    ['constant', 'none']
+    """
+    _check(jitter)
+    analysis = analyse_delay(A0, A1)
+    largest_s = jitter.mean_s + jitter.spread_s
+    spread_s = (
+        _spread_admitted(A0, A1, jitter.mean_s, jitter.rate)
+        if _is_inside(analysis.stable_intervals_s, jitter.mean_s)
+        else -1.0
+    )
+    any_s = varying_delay_bound(A0, A1, rate=inf)
+    bounds: dict[Cover, float] = {
+        "rate": varying_delay_bound(A0, A1, rate=jitter.rate) if isfinite(jitter.rate) else 0.0,
+        "spread": jitter.mean_s + min(spread_s, jitter.mean_s) if spread_s >= 0.0 else 0.0,
+        "any": any_s,
+    }
+    cover, bound_s = _first(jitter, bounds, analysis.stable_intervals_s)
+    return CoveringBound(
+        cover=cover,
+        bound_s=bound_s,
+        largest_s=largest_s,
+        constant_margin_s=analysis.delay_margin_s,
+        rate_bound_s=bounds["rate"],
+        spread_bound_s=bounds["spread"],
+        any_bound_s=any_s,
+    )
+
+
+def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = inf) -> float:
+    """The spread (s) that the loop takes on both sides of a constant delay, however the delay varies within it.
+
+    With v(t) = C (x(t - mean) - x(t - tau(t))), A1 = B C, the loop is G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B
+    closed by the integral of C x' over the interval I(t) between t - mean and t - tau(t). If the gain of that integral
+    is at most g times the spread, the loop is stable for a spread below 1 / (g max over omega of
+    ||D G(j omega) D^{-1}||), for any D. The mean is the most that is returned, and 0 if the loop is unstable at the
+    mean delay. The maximum is read from a fine grid, with a part in a thousand allowed for what lies between: a
+    search, not a proof.
+
+    g^2 = 7 / 4 for any variation. Let T be the integral and r the spread. The kernel of T T' is |I(t) n I(t')| but for
+    the sign, so by Schur's test g^2 r^2 is at most the largest integral of this overlap over t'. Intervals longer than
+    they are, of length r, only add to it. Put t - mean = 0 and I(t) = [0, r]. The interval that begins or ends at t'
+    overlaps it by at most r - |t'| for t' in [-r, 0], by the larger of t' and r - t' in [0, r], and by 2 r - t' in
+    [r, 2 r]: r^2 (1 / 2 + 3 / 4 + 1 / 2).
+
+    g = 1 where tau' <= 1, upwards only: t - tau(t) never falls, so no state is ever overtaken by an older one. By
+    Cauchy's inequality g^2 r^2 is at most the largest integral, over those t with s in I(t), of |tau(t) - mean|. With
+    u = t - mean - s these are t with u > 0 > s' or u < 0 < s', where s' = t - tau(t) - s. As s' does not fall with t,
+    one of the two kinds is empty for each s, and the other lasts for at most r.
+
+    E. Shustin and E. Fridman, "An improved stability method for linear systems with fast-varying delays", IFAC ROCOND
+    2006, bound the same integral for every rate between these two as well (seen: its abstract).
+
+    Parameters
+    ----------
+    A0, A1
+        Real matrices (n, n), 1/s.
+    rate
+        The largest tau'(t), or inf if the delay may jump upwards. Jumps downwards are free: the sawtooth of a loop that
+        samples and holds has the rate 1.
+
+    Raises
+    ------
+    BadModelError
+        Matrices that do not fit, a mean that is negative or not finite, or a rate that is negative.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
+
+    >>> from math import inf
+    >>> from gains.varying.jitter import spread_bound
+    >>> [round(spread_bound([[0]], [[-1]], mean_s=0.5, rate=rate), 2) for rate in (1.0, inf)]
+    [0.5, 0.47]
+    """
+    _check(Jitter(mean_s, 0.0, rate))
+    if not _is_inside(analyse_delay(A0, A1).stable_intervals_s, mean_s):
+        return 0.0
+    return min(_spread_admitted(A0, A1, mean_s, rate), mean_s)
+
+
+def _check(jitter: Jitter) -> None:
+    if not (isfinite(jitter.mean_s) and jitter.mean_s >= 0.0):
+        raise BadModelError(f"mean_s is {jitter.mean_s}; a number of seconds >= 0 is wanted")
+    if not 0.0 <= jitter.spread_s <= jitter.mean_s:
+        raise BadModelError(f"spread_s is {jitter.spread_s}; 0 to the mean delay of {jitter.mean_s} s is wanted")
+    if not jitter.rate >= 0.0:
+        raise BadModelError(f"rate is {jitter.rate}; a number >= 0 is wanted, inf for jumps")
+
+
+def _is_inside(windows: tuple[tuple[float, float], ...], delay_s: float) -> bool:
+    return any(start_s < delay_s < end_s or start_s == delay_s == 0.0 for start_s, end_s in windows)
+
+
+def _first(jitter: Jitter, bounds: dict[Cover, float], windows: tuple[tuple[float, float], ...]) -> tuple[Cover, float]:
+    """The first cover, in the order of `bounds`, and the delay it admits."""
+    if jitter.spread_s == 0.0:
+        for start_s, end_s in windows:
+            if _is_inside(((start_s, end_s),), jitter.mean_s):
+                return "constant", end_s
+        return "none", float("nan")
+    largest_s = jitter.mean_s + jitter.spread_s
+    for cover, bound_s in bounds.items():
+        if largest_s <= bound_s:
+            return cover, bound_s
+    return "none", float("nan")
+
+
+def _spread_admitted(A0: ArrayLike, A1: ArrayLike, mean_s: float, rate: float) -> float:
+    gain = 1.0 if rate <= 1.0 else sqrt(7.0 / 4.0)
+    blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
+    return min(_spread_of_block(balanced(*block.matrices), mean_s) for block in blocks) / gain
+
+
+def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float) -> float:
+    """The reciprocal of the largest gain of the loop about the mean delay."""
+    now, late = matrices
+    B, C = factor_rank(late)
+    r = B.shape[1]
+    if r == 0:
+        return inf
+    highest = highest_frequency(now, late)
+    coarse = highest * np.logspace(-3.0, 2.0, _FREQUENCIES_SCALING)
+    D = _scaling(_loop_gains(now, late, B, C, mean_s, coarse)) if r > 1 else np.eye(1)
+    fine = np.concatenate(
+        [highest * np.logspace(-4.0, 3.0, _FREQUENCIES_GAIN), np.linspace(0.0, highest, _FREQUENCIES_GAIN)]
+    )
+    loops = np.concatenate([_loop_gains(now, late, B, C, mean_s, fine), (C @ B)[np.newaxis]])
+    scaled = D @ loops @ np.linalg.inv(D)
+    largest = float(np.linalg.norm(scaled, ord=2, axis=(1, 2)).max())
+    return 1.0 / (largest * (1.0 + _GRID_ERROR))
+
+
+def _loop_gains(
+    now: FloatArray, late: FloatArray, B: FloatArray, C: FloatArray, mean_s: float, omega: FloatArray
+) -> ComplexArray:
+    s = 1j * omega[:, np.newaxis, np.newaxis]
+    characteristic = s * np.eye(now.shape[0]) - now - late * np.exp(-s * mean_s)
+    return C @ np.linalg.solve(characteristic, s * B)
+
+
+def _scaling(loops: ComplexArray) -> FloatArray:
+    """D that makes the largest ||D G D^{-1}|| over the given loops nearly as small as possible."""
+    r = loops.shape[1]
+    # a complex Hermitian matrix is positive definite when the real one of twice the size is
+    real = np.concatenate(
+        [np.concatenate([loops.real, -loops.imag], axis=2), np.concatenate([loops.imag, loops.real], axis=2)], axis=1
+    )
+    upper = float(np.linalg.norm(loops, ord=2, axis=(1, 2)).max())
+    lower = float(np.abs(np.linalg.eigvals(loops)).max())
+    best = np.eye(r)
+    for _ in range(_HALVINGS):
+        gain = (lower + upper) / 2.0
+        P = _scaling_for(real, gain)
+        if P is None:
+            lower = gain
+        else:
+            upper, best = gain, np.linalg.cholesky(P).T.astype(np.float64)
+    return best
+
+
+def _scaling_for(real: FloatArray, gain: float) -> FloatArray | None:
+    """P > 0 with G*PG < gain^2 P for all loops in their real form (k, 2r, 2r), if there is one."""
+    both = np.eye(2)
+
+    def inequalities(unknowns: Sequence[FloatArray]) -> list[FloatArray]:
+        twice = np.kron(both, unknowns[0])
+        return [unknowns[0], *(gain * gain * twice - real.swapaxes(1, 2) @ twice @ real)]
+
+    found = positive_definite_solution([Unknown(real.shape[1] // 2)], inequalities)
+    return None if found is None else found[0]

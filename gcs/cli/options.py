@@ -1,0 +1,115 @@
+"""What a user gives to a command, and the one line that says what is wrong with it."""
+
+from ipaddress import ip_address
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gcs.errors import InputError
+
+if TYPE_CHECKING:
+    from gcs.drive.guard import Guard
+    from gcs.drive.mirror import Mirror
+    from gcs.drive.udp import StationSocket
+
+KeyFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="sign, and take only what is signed with this key (see gcs key)")
+]
+
+
+def within(option: str, value: float, least: float, most: float, unit: str = "") -> None:
+    """Refuse a number that is not in a range, NaN among them."""
+    if not least <= value <= most:
+        raise InputError(f"{option}: read {value:g}, wanted {unit or 'a number'} from {least:g} to {most:g}")
+
+
+def refuse(file: Path, *findings: str | None) -> None:
+    """Refuse a scenario for the first thing found in it, if there is one."""
+    for finding in findings:
+        if finding is not None:
+            raise InputError(f"{file}: {finding}")
+
+
+def out_folder(out: Path, wanted: str = "a new or empty folder") -> Path:
+    """The new or empty folder that --out names, made if need be."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        used = any(out.iterdir())
+    except OSError as error:
+        raise InputError(f"--out: {out}: {error.strerror}, wanted a folder that can be written") from None
+    if used:
+        raise InputError(f"--out: {out} is not empty, wanted {wanted}")
+    return out
+
+
+def out_file(option: str, file: Path) -> None:
+    """Refuse a file that cannot be written, before the work whose result goes there; its folder is made."""
+    try:
+        new = not file.exists()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.open("ab").close()
+        if new:
+            file.unlink()
+    except OSError as error:
+        raise InputError(f"{option}: {file}: {error.strerror}, wanted a file that can be written") from None
+
+
+def address(option: str, text: str) -> tuple[str, int]:
+    """HOST:PORT as given to an option."""
+    host, _, port = text.rpartition(":")
+    try:
+        known = bool(host.encode("idna")) and port.isdecimal() and len(port) <= 5 and int(port) <= 65535
+    except UnicodeError:
+        known = False
+    if not known:
+        raise InputError(f"{option}: read {text!r}, wanted HOST:PORT, as 127.0.0.1:14550")
+    return host, int(port)
+
+
+def listening(option: str, text: str) -> "StationSocket":
+    """A socket that listens at the HOST:PORT given to an option."""
+    from gcs.drive.udp import StationSocket
+
+    host, port = address(option, text)
+    try:
+        return StationSocket(host, port)
+    except OSError as error:
+        raise InputError(f"{option}: {text}: {error.strerror}; wanted a free UDP port of this machine") from None
+
+
+def warn_if_open(link: "StationSocket", *, signed: bool) -> None:
+    """One line where others than this machine can reach a socket without a key."""
+    host, port = link.address
+    if not signed and not ip_address(host).is_loopback:
+        text = "others can reach it and nothing is signed; gcs key FILE makes a key for --key"
+        typer.echo(f"warning: {host}:{port} is open: {text}", err=True)
+
+
+def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
+    """What signs and verifies with the key in a file, if one was given."""
+    if key is None:
+        return None
+    from gcs.drive.guard import open_guard
+    from gcs.drive.udp import realtime_offset_ns
+
+    return open_guard(key, epoch_ns=realtime_offset_ns(), role=role)
+
+
+def mirroring(text: str, link: "StationSocket", guard: "Guard | None", *, commands: bool) -> "Mirror":
+    """The mirror that --mirror HOST:PORT asks for; `link` is where this station itself listens."""
+    from gcs.drive.mirror import Mirror
+
+    host, port = address("--mirror", text)
+    if port == 0:
+        raise InputError(f"--mirror: read {text}, wanted the port of a ground station")
+    try:
+        mirror = Mirror(host, port, commands=commands, signed=guard and guard.mirror_link)
+    except OSError as error:
+        raise InputError(f"--mirror: {text}: {error.strerror}; wanted the address of a ground station") from None
+    (to_host, to_port), (own_host, own_port) = mirror.address, link.address
+    here = to_host == own_host or (ip_address(own_host).is_unspecified and ip_address(to_host).is_loopback)
+    if here and to_port == own_port:
+        mirror.close()
+        raise InputError(f"--mirror: read {text}, which is this station's own, wanted that of another ground station")
+    return mirror

@@ -1,0 +1,298 @@
+"""`gcs stress`: fly the formation at many link delays, and see whether it breaks where the margin says.
+
+The command's options are here, light to import; the work is in `study` (what is flown), `campaign` (how it is flown and
+stored), `result` (what was found) and `report` (what is shown), all of this package.
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Generator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from gcs.cli.loop_option import Loop, LoopOption, load_with_loop
+from gcs.cli.options import out_file, out_folder, refuse
+from gcs.errors import InputError
+from gcs.interrupts import raised
+from gcs.output import outlive_readers
+
+if TYPE_CHECKING:
+    from gcs.stress.campaign import Fly
+    from gcs.stress.study import Onset, Study
+    from gcs.stress.trial import Outcome
+
+RESULT_FILE = "stress.json"
+SCENARIO_FILE = "scenario.toml"
+_FAILED, _INTERRUPTED = 1, 130
+
+
+@dataclass(frozen=True)
+class StressOptions:
+    """What the user asked for, as `stress` documents it."""
+
+    scenario_file: Path
+    loop: Loop | None
+    axes: tuple[tuple[str, str], ...]
+    onset: bool
+    tolerance: float
+    seeds: int
+    workers: int
+    dask: str
+    resume: bool
+    real_time: bool
+    assert_onset: float | None
+
+
+def stress(
+    scenario_file: Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file")],
+    delay: Annotated[
+        str,
+        typer.Option(
+            metavar="FROM:TO:N",
+            help="total link delay in s, up + down (the loop delay is this and the waiting for the control tick)",
+        ),
+    ] = "",
+    delay_of: Annotated[
+        list[str] | None, typer.Option(metavar="ID=FROM:TO:N", help="total link delay in s of one vehicle; repeatable")
+    ] = None,
+    jitter: Annotated[
+        str, typer.Option(metavar="FROM:TO:N", help="jitter each way in s: half width, or scale of the link's own kind")
+    ] = "",
+    loss: Annotated[str, typer.Option(metavar="FROM:TO:N", help="part of the datagrams lost, each way")] = "",
+    rate: Annotated[
+        str, typer.Option(metavar="FROM:TO:N", help="control rate in Hz, with the gains designed for the scenario's")
+    ] = "",
+    loop: LoopOption = None,
+    onset: Annotated[bool, typer.Option("--onset", help="find the delay at which it breaks")] = False,
+    tolerance: Annotated[
+        float, typer.Option(metavar="PART", help="half width of the last round of flights around the onset")
+    ] = 0.02,
+    seeds: Annotated[int, typer.Option(metavar="N", help="flights at each point, each with a seed of its own")] = 1,
+    workers: Annotated[
+        int, typer.Option(metavar="N", show_default=False, help="processes; default all processors, 1 in real time")
+    ] = 0,
+    dask: Annotated[str, typer.Option(metavar="ADDRESS", help="fly on the workers of this Dask scheduler")] = "",
+    resume: Annotated[bool, typer.Option("--resume", help="go on with the campaign in --out")] = False,
+    trial: Annotated[
+        str, typer.Option(metavar="ID", help="fly one trial of the campaign in --out again, with a recording")
+    ] = "",
+    real_time: Annotated[bool, typer.Option("--real-time", help="over UDP, in processes, on the real clock")] = False,
+    assert_onset: Annotated[
+        float | None, typer.Option(metavar="PART", help="exit 1 if onset and margin differ by more; implies --onset")
+    ] = None,
+    junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/<scenario>-stress-<time>")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
+) -> None:
+    """Turn the link delay up until the formation breaks, and compare with the margin.
+
+    An axis (--delay, --delay-of, --jitter, --loss, --rate) is FROM:TO:N, N values with the ends, or a list as
+    0.1,0.2,0.4. One axis is a sweep, two make a map.
+
+    Exit code 1 if --assert-onset is missed, a trial failed, or one flown again is not the same.
+    """
+    named = [("delay", delay), *(("delay_of", text) for text in delay_of or ())]
+    named += [("jitter", jitter), ("loss", loss), ("rate", rate)]
+    options = StressOptions(
+        scenario_file=scenario_file,
+        loop=loop,
+        axes=tuple((name, text) for name, text in named if text),
+        onset=onset or assert_onset is not None,
+        tolerance=tolerance,
+        seeds=seeds,
+        workers=workers,
+        dask=dask,
+        resume=resume,
+        real_time=real_time,
+        assert_onset=assert_onset,
+    )
+    _check(options, out, trial)
+    outlive_readers()
+    if junit is not None:
+        out_file("--junit", junit)
+    from gcs.stress.campaign import CampaignError
+
+    try:
+        if trial:
+            assert out is not None
+            raise typer.Exit(_fly_again(options, out, trial, as_json=as_json))
+        result, folder = _campaign(options, out, shown=not as_json)
+    except CampaignError as error:
+        raise InputError(str(error)) from None
+    if junit is not None:
+        from gcs.cli.stress_output import write_junit
+
+        write_junit(result, junit)
+    if as_json:
+        typer.echo(json.dumps(result, indent=2))
+    else:
+        from gcs.cli.stress_output import print_result
+
+        print_result(result, folder)
+    raise typer.Exit(0 if result["passed"] else _FAILED)
+
+
+def _check(options: StressOptions, out: Path | None, trial: str) -> None:
+    """What no single option can show."""
+    if (trial or options.resume) and (out is None or not out.is_dir()):
+        flag = "--trial" if trial else "--resume"
+        raise InputError(f"--out: read {out}, wanted the folder of a campaign, as {flag} is given")
+    if not (trial or options.onset or options.axes):
+        raise InputError("nothing to fly; wanted --onset, or an axis as --delay 0:0.6:13")
+    if len(options.axes) > 2:
+        raise InputError(f"read {len(options.axes)} axes, wanted one (a sweep) or two (a map)")
+    if options.seeds < 1 or options.workers < 0:
+        raise InputError("--seeds and --workers: wanted whole numbers from 1")
+    for name, value in (("--tolerance", options.tolerance), ("--assert-onset", options.assert_onset)):
+        if value is not None and not 0.0 < value < 1.0:
+            raise InputError(f"{name}: read {value:g}, wanted a part between 0 and 1, as 0.02")
+
+
+def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple[dict[str, Any], Path]:
+    """Fly what was asked for; the result as plain types, and the folder it is in."""
+    from gcs.drive.fly import new_folder
+    from gcs.runs.record import write_whole
+    from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
+    from gcs.stress.report import write_report
+    from gcs.stress.result import result_of
+    from gcs.stress.study import NoOnset, find_onset
+    from scenarios.files import dump
+
+    study, design = _study(options)
+    scenario = dump(study.plan.scenario)
+    if options.resume:
+        assert out is not None
+        check_campaign(out, "--resume", scenario)
+    axes = _axes(options, study)
+    onset: Onset | None = None
+    no_onset: NoOnset | None = None
+    with raised(), contextlib.ExitStack() as stack:
+        fly = stack.enter_context(_workers(options))
+        if out is None:
+            folder = new_folder(f"{study.plan.scenario.name}-stress")
+        else:
+            folder = out if options.resume else out_folder(out, "a new or empty folder, or --resume")
+        write_whole(folder / SCENARIO_FILE, scenario.encode())
+        store = stack.enter_context(contextlib.closing(Store(folder)))
+        progress = stack.enter_context(_progress(shown))
+        try:
+            sweep: list[Outcome] = []
+            if axes:
+                trials = study.sweep(axes, seeds=options.seeds)
+                sweep = run_campaign(trials, store, fly, ended=progress("flights", len(trials)))
+            if options.onset:
+                ended = progress("onset", None)
+                try:
+                    onset = find_onset(
+                        study, lambda trials: run_campaign(trials, store, fly, ended=ended), tolerance=options.tolerance
+                    )
+                except NoOnset as reason:
+                    no_onset = reason
+        except KeyboardInterrupt:
+            typer.echo(store.resume, err=True)
+            raise
+        outcomes = list(store.outcomes.values())
+        write_parquet(outcomes, folder)
+    allowed = options.assert_onset
+    result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, no_onset=no_onset, allowed=allowed)
+    write_whole(folder / RESULT_FILE, json.dumps(result, indent=2, allow_nan=False).encode())
+    write_report(folder, result, study=study, axes=axes, sweep=sweep, onset=onset)
+    return result, folder
+
+
+def _study(options: StressOptions) -> "tuple[Study, dict[str, Any]]":
+    from gcs.drive.preflight import bad_start, unstable_loop
+    from gcs.plan.planner import flight_plan
+    from gcs.stress.study import Study
+
+    scenario = load_with_loop(options.scenario_file, options.loop)
+    if scenario.dynamics == "autopilot":
+        wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
+        raise InputError(f"{options.scenario_file}: dynamics: read 'autopilot', wanted {wanted}")
+    # the slower gains of the schedule are not flown here, and need not be designed
+    scheduled = scenario.model_copy(
+        update={"monitor": scenario.monitor.model_copy(update={"time_scales": (1.0,), "act": False})}
+    )
+    refuse(options.scenario_file, bad_start(scenario))
+    design, plan = flight_plan(scheduled)
+    refuse(options.scenario_file, unstable_loop(plan))
+    return Study(plan, real_time=options.real_time), design
+
+
+def _axes(options: StressOptions, study: "Study") -> "list[Any]":
+    from gcs.stress.axes import AxisError, parse_axis, parse_vehicle_axis
+
+    axes: list[Any] = []
+    for name, text in options.axes:
+        try:
+            of_vehicle = name == "delay_of"
+            axes.append(
+                parse_vehicle_axis(text, study.plan.formation.system_ids) if of_vehicle else parse_axis(name, text)
+            )
+        except AxisError as error:
+            raise InputError(f"--{name.replace('_', '-')}: {error}") from None
+    return axes
+
+
+@contextlib.contextmanager
+def _workers(options: StressOptions) -> "Generator[Fly]":
+    from gcs.stress.campaign import dask_workers, local_workers
+
+    # flights in real time disturb each other: one at a time unless the user knows better
+    count = options.workers or (1 if options.real_time else len(os.sched_getaffinity(0)))
+    with dask_workers(options.dask) if options.dask else local_workers(count) as fly:
+        yield fly
+
+
+@contextlib.contextmanager
+def _progress(shown: bool) -> Generator[Any]:
+    """While entered, gives a function (name, total or None) -> callback that advances a bar on the terminal."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from gcs.views.console import plain_console
+
+    console = plain_console(stderr=True, soft_wrap=False)
+    columns = (
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as bar:
+
+        def begin(name: str, total: int | None) -> Any:
+            task = bar.add_task(name, total=total)
+            count = 0
+
+            def ended(_: "Outcome", left: int) -> None:
+                nonlocal count
+                count += 1
+                done = count if total is None else total - left
+                bar.update(task, completed=done, total=count + left if total is None else total)
+
+            return ended
+
+        yield begin
+
+
+def _fly_again(options: StressOptions, folder: Path, wanted: str, *, as_json: bool) -> int:
+    """Fly a stored trial again, say how it went, and give the exit code."""
+    from gcs.cli.stress_output import print_replay
+    from gcs.stress.refly import replayed
+
+    study, _ = _study(options)
+    replay = replayed(study, folder, wanted, real_time=options.real_time)
+    if as_json:
+        typer.echo(replay.outcome.to_json())
+    else:
+        print_replay(replay)
+    return _FAILED if replay.outcome.error is not None or replay.differs else 0

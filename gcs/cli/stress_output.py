@@ -1,0 +1,155 @@
+"""What a campaign says on the terminal, and to CI in JUnit XML."""
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from gcs.stress.axes import place_text
+from gcs.stress.refly import Replay
+from gcs.stress.report import MOST_ROWS, REPORT_FILE, replay_command
+from gcs.views.console import plain_console
+from gcs.views.page import milliseconds_text as _ms
+from gcs.views.report import UNKNOWN
+from gcs.views.report import number_text as _number
+
+_FILE_WIDTH = 120
+_ID = 8
+"""Characters of an id that are shown; `--trial` takes the beginning of one."""
+
+
+def print_result(result: dict[str, Any], folder: Path) -> None:
+    """The onset beside the margin, the sweep, and where the files are."""
+    console = plain_console()
+    if not console.is_terminal:
+        console.width = _FILE_WIDTH
+    onset = result["onset"]
+    margin_s = result["delay_margin_s"]
+    console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
+    console.print(f"trials   {result['trials']}: {_kinds(result['trials_of_kind'])}")
+    if onset is not None:
+        frequency = onset["frequency_rad_s"]
+        breaks = "" if frequency is None else f"; breaks at {frequency:.2f} rad/s"
+        console.print(
+            f"onset    {_ms(onset['loop_delay_s'])} ± {1e3 * onset['error_s']:.2f} ms in flight, "
+            f"{onset['difference']:+.3%} from the sampled margin of this loop, {_ms(onset['predicted_s'])}; "
+            f"the continuous model's less half a period for the hold, {_ms(onset['predicted_continuous_s'])}"
+        )
+        console.print(
+            f"         {_ms(onset['link_delay_s'])} of link delay, up + down: vehicle {onset['critical']} waits "
+            f"{_ms(onset['waiting_s'])} for the control tick{breaks}"
+        )
+    if result["onset_missing"]:
+        found = "none, as predicted" if result["onset_missing_as_predicted"] else "not found"
+        console.print(f"onset    {found}: {result['onset_missing']}")
+    if result["curve_error"] is not None:
+        console.print(
+            f"curve    measured and predicted growth differ by at most {result['curve_error']:.3%} of the range"
+        )
+    if result["past_limits"]:
+        console.print(
+            f"limits   the links alone push vehicles past [limits] in {result['past_limits']} probes, which are flown "
+            "without; where limits bind, errors last that the loop alone would bring down",
+            markup=False,
+        )
+    _print_noise(console, result["noise"])
+    points = [point for point in result["points"] if point["kind"] == "probe"] or result["points"]
+    if points:
+        console.print(_table(points))
+    for failed in result["trials_failed"]:
+        last = failed["error"].strip().splitlines()[-1]
+        console.print(f"failed   {failed['id']}, seed {failed['seed']}, {place_text(failed['coordinates'])}: {last}")
+    console.print(f"files    {folder}: {REPORT_FILE}, stress.json, trials.jsonl, trials.parquet")
+    if result["worst"]:
+        console.print(f"again    {replay_command(folder, result['worst'][0])}")
+    if result["failure"]:
+        console.print(Text.assemble(("failed", "bold red"), f"   {result['failure']}"))
+
+
+def _kinds(trials_of_kind: dict[str, int]) -> str:
+    """How many trials of each kind."""
+    words = {"probe": "probes with small errors", "own": "flights from the scenario's initial states"}
+    return ", ".join(f"{trials_of_kind[kind]} {text}" for kind, text in words.items() if kind in trials_of_kind)
+
+
+def _print_noise(console: Console, noise: dict[str, Any] | None) -> None:
+    """What the machine did to flights in real time."""
+    if noise is None or "lateness_s_p50" not in noise:
+        return
+    late, latest, steal = noise["lateness_s_p50"], noise["lateness_s_p99"], noise["steal_share"]
+    console.print(
+        f"noise    set-points {_ms(late['median'])} late at the median, {_ms(latest['median'])} at the 99th percentile "
+        f"(at worst {_ms(latest['max'])}); the host took {steal['median']:.1%} of the processors, others and flights "
+        f"used {noise['busy_share']['median']:.0%}"
+    )
+
+
+def _table(points: list[dict[str, Any]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    names = list(points[0]["coordinates"])
+    for name in ("trial", *names, "loop, ms", "growth, 1/s", "±", "model", "verdict"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for point in points[:MOST_ROWS]:
+        table.add_row(
+            point["id"][:_ID],
+            *(f"{point['coordinates'][name]:g}" for name in names),
+            _ms(point["loop_delay_s"], unit=""),
+            _number(point["growth_1_s"]),
+            _number(point["growth_error_1_s"], "0.1g"),
+            _number(point["predicted_growth_1_s"]),
+            point["verdict"] or UNKNOWN,
+        )
+    return table
+
+
+def print_replay(replay: Replay) -> None:
+    """One trial that was flown again."""
+    console, outcome = plain_console(), replay.outcome
+    console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {place_text(outcome.coordinates)}")
+    console.print(f"verdict  {outcome.verdict}: {outcome.reason}")
+    if outcome.growth_1_s is not None:
+        of = f" of vehicle {outcome.probed}" if outcome.probed is not None else ""
+        console.print(
+            f"growth   {_number(outcome.growth_1_s)} ± {_number(outcome.growth_error_1_s, '0.1g')} 1/s{of}, "
+            f"predicted {_number(outcome.predicted_growth_1_s)} at {_ms(outcome.loop_delay_s)}"
+        )
+    if outcome.real_time:
+        console.print("again    in real time, where no two flights are the same")
+    elif replay.differs:
+        console.print(f"again    not as it was flown first: {', '.join(replay.differs)}")
+    else:
+        console.print(f"again    the same to the last bit, tick log {outcome.ticks_sha256}")
+    for run in replay.runs:
+        console.print(f"look     gcs view {run}")
+    if outcome.error is not None:
+        console.print(outcome.error)
+
+
+def write_junit(result: dict[str, Any], file: Path) -> None:
+    """Test cases for CI: that onset and margin agree, and that every trial could be flown."""
+    failed = {entry["id"]: entry for entry in result["trials_failed"]}
+    name = f"gcs stress {result['scenario']}"
+    count = 1 + len(failed)
+    suite = ElementTree.Element(
+        "testsuite",
+        name=name,
+        tests=str(count),
+        failures=str(int(bool(result["failure"]))),
+        errors=str(len(failed)),
+        skipped=str(int(not result["failure"] and result["assert_onset"] is None)),
+        time=str(result["flight_time_s"]),
+    )
+    case = ElementTree.SubElement(suite, "testcase", classname=name, name="the onset is where the margin says")
+    if result["failure"]:
+        ElementTree.SubElement(case, "failure", message=result["failure"])
+    elif result["assert_onset"] is None:
+        ElementTree.SubElement(case, "skipped", message="--assert-onset was not given")
+    for trial_id, entry in failed.items():
+        case = ElementTree.SubElement(suite, "testcase", classname=name, name=f"trial {trial_id}")
+        error = ElementTree.SubElement(case, "error", message=entry["error"].strip().splitlines()[-1])
+        error.text = entry["error"]
+    ElementTree.ElementTree(suite).write(file, encoding="utf-8", xml_declaration=True)

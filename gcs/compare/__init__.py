@@ -1,1 +1,0 @@
-"""`gcs compare`: the design routes side by side."""

@@ -1,0 +1,215 @@
+"""The control law u = K e of the whole formation, computed from states reported at different instants.
+
+For the leader-follower pattern u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, and u_1 = K1 e_1^v for the leader (thesis eqs.
+2.10 and 3.25); any other gain matrix K is flown by the same code.
+
+All errors that enter u_i are formed at one instant: that of vehicle i's newest state, to which the states of the others
+are brought. So the loop around vehicle i is late by vehicle i's own link only, and a slow link ahead of it cannot take
+its margin.
+"""
+
+from collections.abc import Sequence
+from math import nan
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
+from gcs.control.history import Report, State, StateHistory
+from gcs.plan.formation import Formation
+
+Gain = tuple[float, float, float, float, float, float, float, float]
+"""A block G (2, 4), row by row: command (north, east) from position and velocity (north, east)."""
+
+
+class Term(NamedTuple):
+    """What one vehicle's state adds to another's command."""
+
+    source: int
+    """The vehicle k whose state is used."""
+    offset_ne_m: tuple[float, float]
+    """Its wanted position relative to the commanded vehicle."""
+    gains: tuple[Gain, ...]
+    """The block of each set of the gain schedule."""
+
+
+class VehicleLaw(NamedTuple):
+    """u_i = sum over its terms of G_ik (x_k - x*_k), x_k = (position, velocity), x*_k = (place in formation, v_d).
+
+    Positions are taken against the vehicle's own, so its own term has velocity only.
+    """
+
+    terms: tuple[Term, ...]
+    ahead: int
+    """The vehicle that spacing is kept to, one of the terms; -1 if there is none."""
+
+
+FeedbackLaw = tuple[VehicleLaw | None, ...]
+"""The law of each vehicle; None if it is lost."""
+
+
+def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequence[bool]) -> FeedbackLaw:
+    """The law of a schedule of gain matrices K, flown around lost vehicles.
+
+    Each K is (inputs, states) in the order of `gains.formation.model.FormationModel`.
+
+    The nearest vehicle ahead that is left stands in for a lost one: spacing is kept to it, two spacings away, and its
+    velocity error is used. What nobody ahead can stand in for, and the spacing error of a lost vehicle itself, drops
+    out. A vehicle with nobody left ahead keeps the nominal velocity, as the leader does.
+    """
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    stand_in: list[int] = []
+    for row, ahead in enumerate(formation.predecessor.tolist()):
+        stand_in.append(row if not lost[row] else stand_in[ahead] if ahead >= 0 else -1)
+    K = np.stack(gains)
+    in_front = [stand_in[ahead] if ahead >= 0 else -1 for ahead in formation.predecessor.tolist()]
+    blocks: dict[tuple[int, int], FloatArray] = {}
+
+    def block(i: int, k: int) -> FloatArray:
+        return blocks.setdefault((i, k), np.zeros((len(gains), 2, 4)))
+
+    for i in (row for row, gone in enumerate(lost) if not gone):
+        block(i, i)
+        if in_front[i] >= 0:
+            block(i, in_front[i])
+        rows = K[:, model.input_slice(i)]
+        used = {(column + 2) // 4 for column in np.flatnonzero(rows.any(axis=(0, 1))).tolist()}
+        for j in sorted(used):
+            on_velocity = rows[:, :, model.velocity_slice(j)]
+            if on_velocity.any() and stand_in[j] >= 0:
+                block(i, stand_in[j])[:, :, 2:] += on_velocity
+            on_spacing = rows[:, :, model.spacing_slice(j)] if j > 0 else on_velocity[:, :, :0]
+            if on_spacing.any() and not lost[j] and in_front[j] >= 0:
+                # e_j^p = Z_ahead - Z_j - d
+                block(i, in_front[j])[:, :, :2] += on_spacing
+                block(i, j)[:, :, :2] -= on_spacing
+    place = formation.place_ne_m()
+
+    def offset(i: int, k: int) -> tuple[float, float]:
+        north, east = (place[k] - place[i]).tolist()
+        return north, east
+
+    def law(i: int) -> VehicleLaw:
+        sources = sorted(k for to, k in blocks if to == i)
+        terms = tuple(Term(k, offset(i, k), tuple(tuple(G.ravel().tolist()) for G in blocks[i, k])) for k in sources)
+        return VehicleLaw(terms, in_front[i])
+
+    return tuple(None if lost[i] else law(i) for i in range(len(in_front)))
+
+
+class Blend(NamedTuple):
+    """The gains one vehicle is flown with: `share` (0 to 1) of the set flown, the rest of the former one."""
+
+    flown: int = 0
+    former: int = 0
+    share: float = 1.0
+
+
+class VehicleControl(NamedTuple):
+    """What the law saw of one vehicle and wants of it, north and east; NaN where unknown or lost."""
+
+    sample_ns: int
+    """Instant of its newest state, station clock; 0 while there is none."""
+    state: State
+    spacing_error_m: tuple[float, float]
+    velocity_error_m_s: tuple[float, float]
+    command_m_s2: tuple[float, float]
+    used_ns: int
+    """Instant of the errors that the command was computed from: in the ground loop `sample_ns`."""
+
+
+_UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan, nan), 0)
+
+
+def formation_control(
+    history: StateHistory,
+    law: FeedbackLaw,
+    blends: Sequence[Blend],
+    *,
+    nominal_velocity_m_s: tuple[float, float],
+    opening: float = 1.0,
+) -> list[VehicleControl]:
+    """Errors and commands of every vehicle from the newest reported states.
+
+    `blends` says with which gains each vehicle is flown. `opening` is a factor on the formation's spacing. A vehicle
+    whose law uses an unknown state has a NaN command; nothing is to be sent for it. No limit is applied here.
+    """
+    controls: list[VehicleControl] = []
+    for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
+        newest = history.newest(row)
+        if newest is None:
+            controls.append(_UNKNOWN)
+            continue
+        sample_ns, state = newest
+        spacing_error = command = nan, nan
+        if own is not None:
+            spacing_error, command = _followed(history, own, newest, blend, nominal_velocity_m_s, opening)
+        velocity_error = state[2] - nominal_velocity_m_s[0], state[3] - nominal_velocity_m_s[1]
+        controls.append(VehicleControl(sample_ns, state, spacing_error, velocity_error, command, sample_ns))
+    return controls
+
+
+def command_at(
+    history: StateHistory,
+    law: VehicleLaw,
+    row: int,
+    instant_ns: int,
+    blend: Blend,
+    nominal_velocity_m_s: tuple[float, float],
+    opening: float,
+) -> tuple[float, float]:
+    """The command of one vehicle from the errors at an instant."""
+    state = history.at(row, instant_ns) or _UNKNOWN.state
+    _, command = _followed(history, law, (instant_ns, state), blend, nominal_velocity_m_s, opening)
+    return command
+
+
+def _followed(
+    history: StateHistory,
+    law: VehicleLaw,
+    newest: Report,
+    blend: Blend,
+    nominal_velocity_m_s: tuple[float, float],
+    opening: float,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Spacing error and command of one vehicle: the sum of G_ik (x_k - x*_k) at the instant of its given state."""
+    sample_ns, (north, east, _, _) = newest
+    nominal_north, nominal_east = nominal_velocity_m_s
+    command_north = command_east = 0.0
+    spacing_error = nan, nan
+    flown, former, share = blend
+    for source, (offset_north, offset_east), gains in law.terms:
+        other = history.at(source, sample_ns) or _UNKNOWN.state
+        # Positions are taken against the vehicle's own: sums of large numbers would lose digits.
+        x, y = other[0] - north - opening * offset_north, other[1] - east - opening * offset_east
+        v_north, v_east = other[2] - nominal_north, other[3] - nominal_east
+        g = gains[flown] if share >= 1.0 else _blended(gains[flown], gains[former], share)
+        command_north += g[0] * x + g[1] * y + g[2] * v_north + g[3] * v_east
+        command_east += g[4] * x + g[5] * y + g[6] * v_north + g[7] * v_east
+        if source == law.ahead:
+            spacing_error = x, y
+    return spacing_error, (command_north, command_east)
+
+
+def _blended(new: Gain, old: Gain, share: float) -> Gain:
+    a, b, c, d, e, f, g, h = (share * one + (1.0 - share) * other for one, other in zip(new, old, strict=True))
+    return a, b, c, d, e, f, g, h
+
+
+def distances_m(controls: Sequence[VehicleControl], now_ns: int) -> FloatArray:
+    """Distances (n, n) between vehicles in m, NaN where unknown and to itself.
+
+    Positions are brought to `now_ns` along the reported velocities.
+    """
+    positions: list[complex] = []
+    for sample_ns, (north, east, v_north, v_east), *_ in controls:
+        age_s = (now_ns - sample_ns) * 1e-9
+        positions.append(complex(north + v_north * age_s, east + v_east * age_s))
+    position: NDArray[np.complex128] = np.array(positions)
+    away = position[:, None] - position
+    to_north, to_east = away.real, away.imag
+    distance = np.sqrt(to_north * to_north + to_east * to_east)  # not abs(away), which rounds as each processor can
+    distance.flat[:: len(positions) + 1] = nan  # to itself
+    return distance

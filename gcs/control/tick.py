@@ -1,0 +1,86 @@
+"""The tick record: one row per vehicle and control tick, the contract between control, recording, reports and tests."""
+
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+CLOCK_JUMPED = "its clock jumped"
+"""Text of the event."""
+GAIN_SET = "gain set "
+"""How a STATUSTEXT begins that tells the gain set a vehicle is flown with from now on, after the vehicle's name."""
+TickArray = NDArray[Any]
+"""A structured array of dtype TICK: one row for each vehicle."""
+
+
+class Mode(IntEnum):
+    """What the station thinks of one vehicle."""
+
+    WAITING = 0  # not heard, or not yet ready to fly
+    NOMINAL = 1  # flying, loop delay well below the margin
+    CAUTION = 2  # flying, little headroom left
+    CRITICAL = 3  # flying, next to no headroom left: the station acts
+    FAILSAFE = 4  # heard, but it does not take set-points: it holds its velocity
+    LOST = 5  # not heard
+    RECOVERING = 6  # flying, its gains on the way back to faster ones
+
+
+SEVERITY = {
+    Mode.WAITING: 6,
+    Mode.NOMINAL: 6,
+    Mode.RECOVERING: 5,
+    Mode.CAUTION: 4,
+    Mode.LOST: 3,
+    Mode.CRITICAL: 2,
+    Mode.FAILSAFE: 1,
+}
+"""How serious a change to the mode is, as MAV_SEVERITY: 6 info, 5 notice, 4 warning, 3 error, 2 critical, 1 alert."""
+TICK = np.dtype(
+    [
+        ("tick", "<i8"),  # counts control ticks, from 0; a number left out is a tick that was skipped
+        ("time_s", "<f8"),  # scenario time; below 0 before the formation is flown
+        ("due_ns", "<i8"),  # when the tick was due, station clock
+        ("sent_ns", "<i8"),  # when its set-points had been handed to the kernel, station clock
+        ("key_ms", "<u4"),  # time_boot_ms of its set-points: joins this log with the vehicles' own
+        ("system_id", "u1"),  # the vehicle that the row is about
+        ("mode", "u1"),  # its mode, as a number
+        ("gain_set", "u1"),  # place in the gain schedule, 0 the fastest
+        ("commanded", "?"),  # a set-point was sent to this vehicle
+        ("sample_boot_ms", "<u4"),  # time_boot_ms of the newest state used
+        ("sample_ns", "<i8"),  # the same instant on the station's clock, as estimated
+        ("telemetry_age_s", "<f8"),  # sent_ns - sample_ns; NaN while the vehicle's clock is unknown
+        ("north_m", "<f8"),  # newest state, local NED
+        ("east_m", "<f8"),
+        ("down_m", "<f8"),
+        ("velocity_north_m_s", "<f8"),
+        ("velocity_east_m_s", "<f8"),
+        ("velocity_down_m_s", "<f8"),
+        ("spacing_error_north_m", "<f8"),  # e^p at the instant of the newest state; NaN for the leader
+        ("spacing_error_east_m", "<f8"),
+        ("velocity_error_north_m_s", "<f8"),  # e^v
+        ("velocity_error_east_m_s", "<f8"),
+        ("command_north_m_s2", "<f8"),  # set-point, acceleration; NaN when none was sent
+        ("command_east_m_s2", "<f8"),
+        ("nearest_m", "<f8"),  # distance to the nearest other vehicle, at the tick's instant; NaN while unknown
+        ("queue_s", "<f8"),  # from the kernel's receive stamp of the newest state to its use by a step
+        ("up_delay_s", "<f8"),  # one-way delay of the newest state: from sample_ns to the kernel's receive stamp
+        (
+            "sample_bound_s",
+            "<f8",
+        ),  # most that sample_ns, telemetry_age_s and up_delay_s can be wrong (gcs/link/clocks.py)
+        ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
+        ("down_bound_s", "<f8"),  # most that it can be wrong
+        ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s - repeated_s; ground loop: of the newest
+        ("repeated_s", "<f8"),  # how long the set-point has repeated an earlier one, as far as telemetry is slower
+        ("delay_margin_s", "<f8"),  # of the gains flown, as known at the time; infinite if no delay is too long
+        ("headroom", "<f8"),  # 1 - loop delay / margin
+        ("rtt_s", "<f8"),  # a TIMESYNC round trip that has ended and is in no earlier row; NaN if there is none
+        ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock, at sent_ns
+        ("clock_offset_bound_s", "<f8"),  # most that it can be wrong
+        ("received", "<u4"),  # frames from this vehicle so far, and those lost, late, twice
+        ("lost", "<u4"),
+        ("late", "<u4"),
+        ("duplicate", "<u4"),
+    ]
+)

@@ -1,0 +1,94 @@
+"""A plan flown to its end, and its log: in virtual time, or as `gcs fly` flies it."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcs.control.tick import TickArray
+from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
+from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.effective_delay import truth_of
+from gcs.runs.grade import Truth
+from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.station.station import Station
+from scenarios import files as scenario_files
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """A flight's log, whichever clock it was flown on.
+
+    `truth` holds when states were sampled and set-points acted, as the vehicles know it; None if in virtual time nobody
+    asked for it.
+    `steal_share` and `busy_share` are the parts of the processor time that the host took away and that anyone used; in
+    real time only.
+    """
+
+    ticks: TickArray
+    events: list[dict[str, Any]]
+    truth: Truth | None = None
+    steal_share: float | None = None
+    busy_share: float | None = None
+
+
+def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, with_truth: bool = False) -> Flight:
+    """Fly a plan; with a folder, which is made, its files are left there but for the summary. In real time the truth is
+    always known."""
+    if not real_time:
+        return fly_virtual(plan, folder, with_truth=with_truth)
+    from gcs.drive.realtime_flight import fly_real_time  # processes and sockets: not for flights in virtual time
+
+    ticks, events, truth, spent = fly_real_time(plan, margins_of(plan), folder)
+    return Flight(ticks, events, truth, steal_share=spent.steal, busy_share=spent.busy)
+
+
+def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:
+    """Fly a plan in virtual time."""
+    station, records = Station(plan, start_ns=START_NS), list[tuple[int, ...]]()
+    writer = prepared_folder(plan, folder) if folder is not None else None
+    rows: list[TickArray] = []
+    vehicles = vehicles_of(plan, record=records.append if with_truth else None)
+    for tick in fly_lockstep(plan, station=station, vehicles=vehicles):
+        rows.append(tick)
+        if writer is not None:
+            writer.tick(tick)
+            writer.frames(station.frames)
+    events: list[dict[str, Any]] = [event._asdict() for event in station.events]
+    events.append({"time_s": float(rows[-1]["time_s"][0]), "kind": "end", "text": station.end_reason})
+    if writer is not None:
+        for event in events:
+            writer.event(**event)
+        writer.close()
+    return Flight(np.concatenate(rows), events, truth_of(records) if with_truth else None)
+
+
+def margins_of(plan: FlightPlan) -> dict[str, Any]:
+    """The part of a design that a run's files need; what the continuous model says is in the campaign's report."""
+    return {"delay_margin_s": plan.delay_margin_s, "delay_margin_continuous_s": None}
+
+
+def prepared_folder(plan: FlightPlan, folder: Path) -> RunWriter:
+    """A new run folder with its scenario and margins, and the writer of its logs."""
+    folder.mkdir(parents=True)
+    (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
+    (folder / DESIGN_FILE).write_text(json.dumps(margins_of(plan), indent=2), encoding="utf-8")
+    return RunWriter(folder)
+
+
+def median_delays_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, float]:
+    """Median of each vehicle's measured loop delay; 0 for one that was never commanded."""
+    delays: dict[int, float] = {}
+    for system_id in system_ids:
+        own = ticks["loop_delay_s"][(ticks["system_id"] == system_id) & ticks["commanded"]]
+        known = own[np.isfinite(own)]
+        delays[system_id] = float(np.median(known)) if known.size else 0.0
+    return delays
+
+
+def first_uses(ticks: TickArray) -> TickArray:
+    """The rows in which a state of a vehicle was used for the first time: all, unless telemetry is slower or lost."""
+    _, first = np.unique(ticks[["system_id", "sample_boot_ms"]], return_index=True)
+    return ticks[np.sort(first)]

@@ -1,0 +1,63 @@
+"""Signing at the station's socket: verified datagrams in, signed ones out. Stations know nothing of it."""
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from gcs.link import mavlink
+from gcs.link.datagram import Datagram, Outgoing
+from gcs.station.station import ANOTHER_ADDRESS
+from scenarios.signing.keys import Key, read_key
+from scenarios.signing.link import SignedLink
+from scenarios.signing.stamps import Stamps, open_stamps
+
+LINK_ID, MIRROR_LINK_ID = 0, 1
+"""Of the socket over which a station speaks to its vehicles, and of the one to another station."""
+
+
+class Guard:
+    """What the station sends is signed; what it receives is verified, and unsigned when it is passed on."""
+
+    def __init__(self, key: Key, *, epoch_ns: int, stamps: Stamps) -> None:
+        self._link, self.mirror_link = (
+            SignedLink(key, link_id=link_id, crc_extra=mavlink.CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps)
+            for link_id in (LINK_ID, MIRROR_LINK_ID)
+        )
+
+    def received(
+        self,
+        datagrams: list[Datagram],
+        now_ns: int,
+        refused: Counter[str],
+        is_another: Callable[[int, Datagram], bool] | None = None,
+    ) -> list[Datagram]:
+        """The datagrams with what could be verified of them; what is refused is counted by reason.
+
+        `is_another` says of a system id whether a datagram is not from where that system speaks, see `Station`.
+        """
+        verified: list[Datagram] = []
+        for datagram in datagrams:
+
+            def unwanted(system_id: int, datagram: Datagram = datagram) -> str:
+                return ANOTHER_ADDRESS if is_another is not None and is_another(system_id, datagram) else ""
+
+            good = self._link.verify(datagram.data, now_ns, refused, unwanted)
+            if good:
+                verified.append(Datagram(good, *datagram[1:]))
+        return verified
+
+    def sent(self, outgoing: list[Outgoing], now_ns: int) -> list[Outgoing]:
+        """The datagrams with their signatures."""
+        return [Outgoing(self._link.sign(data, now_ns), address) for data, address in outgoing]
+
+
+def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:
+    """The guard with the key in a file; the timestamps it has heard are kept beside it, for each role apart.
+
+    Raises
+    ------
+    KeyFileError
+        If one of the files cannot be used.
+    """
+    key = read_key(key_file)
+    return Guard(key, epoch_ns=epoch_ns, stamps=open_stamps(key_file.with_name(f"{key_file.name}.{role}")))

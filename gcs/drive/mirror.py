@@ -1,0 +1,114 @@
+"""The stream of a flight for another ground station: what vehicles send and what the station sends, as raw MAVLink.
+
+It is read-only: what the other station sends is counted and left, unless it is asked for. Nothing waits for the other
+station; that nobody listens is counted.
+"""
+
+import contextlib
+import socket
+from collections import Counter
+from collections.abc import Iterable
+from types import TracebackType
+from typing import Self
+
+from gcs.link import mavlink
+from gcs.link.datagram import Address, Outgoing
+from gcs.link.kinds import SET_MESSAGE_INTERVAL
+from gcs.link.vehicle import RemoteVehicle
+from scenarios.signing.link import SignedLink
+
+_LARGEST_DATAGRAM = 2048
+_STREAMS_WITH_POSITION = (0, 6)
+"""MAV_DATA_STREAM: all, position."""
+_DATAGRAMS_A_STEP = 64
+"""Of the other station; what is more waits, and is dropped by the kernel when its buffer is full."""
+
+
+class Mirror:
+    """A socket connected to another ground station; with `commands`, what that sends goes on to the vehicles.
+
+    On a signed link what goes there is signed, and what comes from there is heard only if it is.
+
+    Raises OSError if the address cannot be used.
+    """
+
+    def __init__(self, host: str, port: int, *, commands: bool, signed: SignedLink | None = None) -> None:
+        self.counters: Counter[str] = Counter()
+        self._commands = commands
+        self._signed = signed
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.connect((host, port))
+        except OSError:
+            self._socket.close()
+            raise
+        self.address: Address = (self._socket.getpeername()[0], port)
+        self._socket.setblocking(False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Send nothing more."""
+        self._socket.close()
+
+    def forward(self, frames: Iterable[bytes], now_ns: int) -> None:
+        """Send frames on, each as it is, or signed again for this link."""
+        for frame in frames:
+            try:
+                # What is signed is MAVLink 2.
+                self._socket.send(frame if self._signed is None else self._signed.sign(frame, now_ns))
+                self.counters["forwarded"] += 1
+            except OSError:  # nobody listens there, which an earlier datagram told, or the buffer is full
+                self.counters["not forwarded"] += 1
+
+    def passed_on(self, vehicles: list[RemoteVehicle], now_ns: int) -> list[Outgoing]:
+        """What the other station has sent since and may go on: to the vehicle it is for, or to all.
+
+        Only to vehicles that are flown already: one that had not been commanded before would take the other station
+        for its own. Not what would make the telemetry slower that the formation is flown with: displays ask for a few
+        positions a second when they connect.
+        """
+        own = {vehicle.system_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
+        outgoing: list[Outgoing] = []
+        for frame in self._received(now_ns):
+            name = mavlink.message_name(frame.msg_id)
+            target = mavlink.target_system(frame)
+            addresses = [address for system_id, address in own.items() if target in (0, system_id) and address]
+            if not self._commands:
+                self.counters[f"refused {name}"] += 1
+            elif frame.system_id in own or not addresses:
+                self.counters[f"refused {name} of or for a system that is not flown"] += 1
+            elif _sets_our_rate(frame):
+                self.counters[f"refused {name} about the rate of the telemetry that is flown with"] += 1
+            else:
+                self.counters[f"passed on {name}"] += 1
+                outgoing += [Outgoing(frame.data, address) for address in addresses]
+        return outgoing
+
+    def _received(self, now_ns: int) -> list[mavlink.Frame]:
+        frames: list[mavlink.Frame] = []
+        with contextlib.suppress(BlockingIOError):
+            for _ in range(_DATAGRAMS_A_STEP):
+                with contextlib.suppress(ConnectionError):  # the answer to something that was forwarded
+                    data = self._socket.recv(_LARGEST_DATAGRAM)
+                    refused: Counter[str] = Counter()
+                    if self._signed is not None:
+                        data = self._signed.verify(data, now_ns, refused)
+                    frames += mavlink.decode_either(data, refused)
+                    self.counters.update({f"refused: {reason}": count for reason, count in refused.items()})
+        return frames
+
+
+def _sets_our_rate(frame: mavlink.Frame) -> bool:
+    """Whether a frame asks for LOCAL_POSITION_NED at a rate, alone or with a stream of messages."""
+    name = mavlink.message_name(frame.msg_id)
+    if name not in ("REQUEST_DATA_STREAM", "COMMAND_LONG", "COMMAND_INT"):
+        return False
+    fields = dict(zip(mavlink.field_names(frame.msg_id), frame.fields, strict=True))
+    if name == "REQUEST_DATA_STREAM":
+        return fields["req_stream_id"] in _STREAMS_WITH_POSITION
+    return fields["command"] == SET_MESSAGE_INTERVAL and fields["param1"] == mavlink.LOCAL_POSITION_NED

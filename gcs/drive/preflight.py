@@ -1,0 +1,114 @@
+"""Before take-off: what makes a flight end badly whatever happens in it, found in the scenario and its plan.
+
+Each finding is one line: the key of the scenario, what was read there and what was wanted. None: there is nothing.
+"""
+
+from dataclasses import replace
+from itertools import combinations
+from math import hypot
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.structure import strongly_connected_blocks
+from gains.performance.response import formation_loop
+from gains.sampled.constant import growth_rate
+from gains.sampled.onboard import onboard_loop
+from gcs.link.clocks import REQUEST_LIFETIME_NS
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.onboard import timing_of
+from scenarios.schema import NS_PER_S, Scenario
+
+
+def unstable_loop(plan: FlightPlan) -> str | None:
+    """The root of the loop that grows even without delay; None if the loop has a delay margin.
+
+    It is a root of the continuous loop, or, where only sampling destabilises it, the growth rate of the sampled one.
+    """
+    if plan.delay_margin_s > 0.0:
+        return None
+    control = plan.scenario.control
+    key = "control.blocks" if control.blocks else "control.gains" if control.gains is not None else "control"
+    root, system_ids = _rightmost_root(plan)
+    who = f"vehicle{'s' * (len(system_ids) > 1)} {' '.join(map(str, system_ids))}"
+    if root.real >= -1e-12 * abs(root):
+        at = f"{root.real:+.4g}" + (f" ± {abs(root.imag):.4g}j" if root.imag else "")
+        read = f"a loop that is unstable without any delay: root {at} 1/s, {who}"
+    else:
+        rate_1_s = _sampled_growth_1_s(plan)
+        read = f"a loop that only sampling makes unstable: it grows at {rate_1_s:+.4g} 1/s without any delay"
+    return f"{key}: read {read}; wanted a stable loop (--allow-unstable of gcs design and gcs fly)"
+
+
+def without_actions(plan: FlightPlan) -> FlightPlan:
+    """The plan with a monitor that does nothing: there is no margin that its actions could keep."""
+    monitor = plan.scenario.monitor.model_copy(update={"act": False})
+    return replace(plan, scenario=plan.scenario.model_copy(update={"monitor": monitor}))
+
+
+def _rightmost_root(plan: FlightPlan) -> tuple[complex, list[int]]:
+    """The rightmost root without delay of the continuous loop, and the vehicles of the coupled loop that has it."""
+    model, ids = plan.model, plan.formation.system_ids
+    A, B, K = _matrices(plan)
+    closed = A + B @ K
+    found: list[tuple[complex, list[int]]] = []
+    for block in strongly_connected_blocks(closed):
+        roots = np.linalg.eigvals(closed[np.ix_(block, block)])
+        own = set(block.tolist())
+        members = [ids[i] for i in range(model.vehicles) if own & set(range(model.states)[model.output_slice(i)])]
+        found.append((complex(roots[np.argmax(roots.real)]), members))
+    return max(found, key=lambda entry: entry[0].real)
+
+
+def _sampled_growth_1_s(plan: FlightPlan) -> float:
+    timing = timing_of(plan.scenario)
+    if timing is not None:
+        return onboard_loop(plan.model, plan.gain, timing).growth_1_s(0.0)
+    return growth_rate(*_matrices(plan), period_s=1.0 / plan.scenario.rates.control_hz, delay_s=0.0)
+
+
+def _matrices(plan: FlightPlan) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A, B and K of the loop flown, with the vehicles' responses if they are known."""
+    if plan.responses is None:
+        return plan.model.A, plan.model.B, plan.gain
+    return formation_loop(plan.model, plan.gain, plan.responses.in_order(plan.formation.system_ids))
+
+
+def bad_start(scenario: Scenario) -> str | None:
+    """Initial states that break a safety limit at the first tick: a collision, or a spacing error beyond its limit."""
+    safety, vehicles = scenario.safety, scenario.leader_first()
+    for one, two in combinations(vehicles, 2):
+        apart_m = hypot(*(a - b for a, b in zip(one.position_ne_m, two.position_ne_m, strict=True)))
+        if apart_m < safety.collision_distance_m:
+            read = f"vehicles {one.system_id} and {two.system_id} {apart_m:g} m apart"
+            wanted = f"at least safety.collision_distance_m = {safety.collision_distance_m:g} m between any two"
+            return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
+    place = {vehicle.system_id: vehicle.position_ne_m for vehicle in vehicles}
+    for vehicle in vehicles:
+        if vehicle.follows is None or vehicle.offset_ne_m is None:
+            continue
+        ahead = place[vehicle.follows]
+        error_m = hypot(*(a + o - p for a, o, p in zip(ahead, vehicle.offset_ne_m, vehicle.position_ne_m, strict=True)))
+        if error_m > safety.spacing_error_limit_m:
+            read = f"vehicle {vehicle.system_id} with a spacing error of {error_m:g} m"
+            wanted = f"at most safety.spacing_error_limit_m = {safety.spacing_error_limit_m:g} m"
+            return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
+    return None
+
+
+def endless_link(scenario: Scenario) -> str | None:
+    """A link too slow for the flight to begin, or for any command in it to rest on a state of it.
+
+    A TIMESYNC reply that is later than the lifetime of its request says nothing, so no clock would ever be known.
+    """
+    lifetime_s = REQUEST_LIFETIME_NS / NS_PER_S
+    for vehicle in scenario.leader_first():
+        links = scenario.link_of(vehicle.system_id)
+        first_s = sum(link.delay_points[0].delay_s if link.delay_points else link.delay_s for link in links)
+        least_s = sum(min((point.delay_s for point in link.delay_points), default=link.delay_s) for link in links)
+        read = f"links: read a round trip of {{:g}} s to vehicle {vehicle.system_id}, wanted less than"
+        if first_s >= lifetime_s:
+            return f"{read.format(first_s)} the {lifetime_s:g} s for which an answer is waited for"
+        if least_s >= scenario.duration_s:
+            return f"{read.format(least_s)} duration_s = {scenario.duration_s:g} s"
+    return None

@@ -1,0 +1,150 @@
+"""Vehicles that are there before the flight: whose experiment they fly, taking them over, and their end.
+
+Simulated vehicles whose station was killed fly on for a while. They may be taken over, but only by a flight of the very
+same scenario, links and seed: on any others its verdict would be about something else. Each says what it flies in the
+extended parameter SCENARIO, which other ground stations never see as they do not ask for it.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+
+from gcs.control.phases import longest_round_trip_s
+from gcs.drive.guard import Guard
+from gcs.drive.udp import StationSocket, clock_ns
+from gcs.errors import InputError
+from gcs.link import mavlink
+from gcs.link.datagram import Address, Outgoing
+from scenarios.files import fingerprint
+from scenarios.schema import NS_PER_S, Scenario
+
+TAKEN_OVER = "taken over: they were there already"
+CONNECTED = "not started here (--connect)"
+_SCENARIO = "SCENARIO"
+_SHUTDOWN, _KEEP, _SHUT_DOWN = 246, 0.0, 2.0
+"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and what its first parameter asks for: nothing, which is a command all the same and
+so begins an orphan's time to live anew, and the end."""
+_HEARTBEAT_PERIOD_S = 1.2
+"""Vehicles that already fly have been heard within this time."""
+_ASK_AGAIN_NS = NS_PER_S // 4
+_LEAST_PATIENCE_S = 3.0
+_ROUND_TRIPS = 4.0
+"""How many round trips of the links, and how long at least, answers are waited for."""
+
+Make = Callable[[int], tuple[int, tuple[object, ...]]]
+"""The message (id and fields) for a vehicle."""
+Answer = Callable[[mavlink.Frame], str]
+"""What a frame answers, "" if nothing."""
+
+
+class Presence:
+    """The vehicles of a scenario that send to a station's socket before its flight."""
+
+    def __init__(self, link: StationSocket, scenario: Scenario, guard: Guard | None) -> None:
+        self._link = link
+        self._scenario = scenario
+        self._guard = guard
+        self._wanted = {vehicle.system_id for vehicle in scenario.vehicles}
+        self._addresses: dict[int, Address] = {}
+        self._sequence = 0
+
+    def taken_over(self) -> list[int]:
+        """The system ids of the vehicles that are there and are to be flown, none if there are none.
+
+        Raises
+        ------
+        InputError
+            If vehicles are there that fly another scenario, or do not say which.
+        """
+        self._listen(self._link.bound_ns + round(_HEARTBEAT_PERIOD_S * NS_PER_S))
+        there = sorted(self._addresses)
+        said = self._converse(
+            there,
+            lambda system_id: (
+                mavlink.PARAM_EXT_REQUEST_READ,
+                mavlink.param_ext_request_read(_SCENARIO, target_system=system_id),
+            ),
+            _scenario_of,
+        )
+        for system_id in there:
+            if (text := said.get(system_id, "")).split(" ")[0] != fingerprint(self._scenario):
+                raise InputError(self._refusal(there, self._flown(text)))
+        if self._command(there, _KEEP) != there:
+            raise InputError(self._refusal(there, "do not obey"))
+        return there
+
+    def shut_down(self) -> None:
+        """End the processes of the vehicles that were taken over; a vehicle whose station lives does not obey."""
+        self._command(sorted(self._addresses), _SHUT_DOWN)
+
+    def _command(self, system_ids: list[int], wanted: float) -> list[int]:
+        """Those that have answered the one command sent here."""
+        said = self._converse(
+            system_ids,
+            lambda system_id: (
+                mavlink.COMMAND_LONG,
+                mavlink.command_long(_SHUTDOWN, target_system=system_id, parameters=(wanted,)),
+            ),
+            lambda frame: "done" if frame.msg_id == mavlink.COMMAND_ACK and frame.fields[0] == _SHUTDOWN else "",
+        )
+        return sorted(said)
+
+    def _converse(self, system_ids: Iterable[int], make: Make, answer: Answer) -> dict[int, str]:
+        """What each vehicle answers to a message, which is sent to it until it does or patience ends."""
+        said: dict[int, str] = {}
+        left = set(system_ids)
+        patience_s = max(_LEAST_PATIENCE_S, _ROUND_TRIPS * longest_round_trip_s(self._scenario))
+        end_ns = clock_ns() + round(patience_s * NS_PER_S)
+        while left and (now_ns := clock_ns()) < end_ns:
+            outgoing: list[Outgoing] = []
+            for system_id in sorted(left):
+                self._sequence += 1
+                frame = mavlink.encode(*make(system_id), sequence=self._sequence)
+                outgoing.append(Outgoing(frame, self._addresses[system_id]))
+            self._link.send(outgoing if self._guard is None else self._guard.sent(outgoing, now_ns))
+            for frame in self._listen(now_ns + _ASK_AGAIN_NS):
+                if frame.system_id in left and (text := answer(frame)):
+                    said[frame.system_id] = text
+                    left.discard(frame.system_id)
+        return said
+
+    def _listen(self, until_ns: int) -> list[mavlink.Frame]:
+        """The frames that come until then from vehicles of the scenario, whose addresses are noted."""
+        frames: list[mavlink.Frame] = []
+        now_ns = 0
+        while now_ns < until_ns:
+            self._link.wait(until_ns)
+            now_ns = clock_ns()  # before the socket is read: what came by then is among what is received
+            datagrams = self._link.receive()
+            if self._guard is not None:
+                datagrams = self._guard.received(datagrams, now_ns, Counter())
+            for datagram in datagrams:
+                for frame in mavlink.decode_either(datagram.data, Counter()):
+                    if frame.system_id in self._wanted:
+                        self._addresses[frame.system_id] = datagram.address
+                        frames.append(frame)
+        return frames
+
+    def _flown(self, text: str) -> str:
+        """What vehicles fly that have said this."""
+        _, _, name = text.partition(" ")
+        if not name:
+            return "do not say which scenario they fly"
+        same = name == self._scenario.name
+        return f"fly {name} with other links, another seed or other settings" if same else f"fly {name}"
+
+    def _refusal(self, there: list[int], flown: str) -> str:
+        """One line: who is there, what they do, and what can be done."""
+        host, port = self._link.address
+        who = f"vehicle{'s' * (len(there) > 1)} {' '.join(map(str, there))}"
+        return (
+            f"{who} at {host}:{port} {flown}, wanted vehicles of this very scenario or none: wait (those of a killed "
+            f"station end within a minute), use --listen with another port, or fly them with --connect {host}:{port}"
+        )
+
+
+def _scenario_of(frame: mavlink.Frame) -> str:
+    """What a vehicle says of its experiment: the fingerprint and the name of the scenario."""
+    if frame.msg_id != mavlink.PARAM_EXT_VALUE:
+        return ""
+    name, value = (field.partition(b"\0")[0].decode("ascii", "replace") for field in frame.fields[2:4])
+    return value if name == _SCENARIO else ""

@@ -1,0 +1,187 @@
+"""The station's real-time driver: one UDP socket, the monotonic clock, one select loop.
+
+The only file of the station that reads a clock or touches a socket. Kernel receive stamps (SO_TIMESTAMPNS) say when a
+datagram arrived, so a busy station does not lengthen the delays that it measures.
+"""
+
+import ctypes
+import gc
+import select
+import socket
+import struct
+import time  # noqa: TID251 - this is a driver
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from gcs.control.phases import Phase
+from gcs.drive.guard import Guard
+from gcs.drive.mirror import Mirror
+from gcs.link import mavlink
+from gcs.link.datagram import Address, Datagram, Outgoing
+from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.record import MIRROR, RunWriter
+from gcs.runs.refusals import REFUSED, Refusals, in_words
+from gcs.station.station import Station
+
+_SO_TIMESTAMPNS = 35
+_TIMESPEC = struct.Struct("qq")
+_ANCILLARY_BYTES = 64
+_LARGEST_DATAGRAM = 2048
+_DATAGRAMS_A_STEP = 4096
+_PR_SET_TIMERSLACK = 29
+
+
+def clock_ns() -> int:
+    """The station's clock."""
+    return time.monotonic_ns()
+
+
+def realtime_offset_ns() -> int:
+    """What to add to the station's clock to get ns since 1970: from the quickest of three readings of both clocks, as
+    the processor can be taken away between them."""
+    readings: list[tuple[int, int]] = []
+    for _ in range(3):
+        before_ns, real_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        readings.append((after_ns - before_ns, real_ns - (before_ns + after_ns) // 2))
+    return min(readings)[1]
+
+
+class StationSocket:
+    """One bound UDP socket with kernel receive stamps.
+
+    Raises OSError if the address cannot be bound.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+            self._socket.bind((host, port))
+        except OSError:
+            self._socket.close()
+            raise
+        self._socket.setblocking(False)
+        self.bound_ns = self._emptied_ns = clock_ns()
+        self.send_errors = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._socket.close()
+
+    @property
+    def address(self) -> Address:
+        host, port = self._socket.getsockname()
+        return host, port
+
+    def wait(self, until_ns: int) -> None:
+        """Return when a datagram is there or the time has come."""
+        left_s = max(0, until_ns - clock_ns()) * 1e-9
+        select.select([self._socket], [], [], left_s)
+
+    def receive(self) -> list[Datagram]:
+        """All datagrams that wait, oldest first, with their arrival on the station's clock."""
+        datagrams: list[Datagram] = []
+        begin_ns, to_monotonic_ns = clock_ns(), -realtime_offset_ns()
+        oldest_ns = self._emptied_ns
+        for _ in range(_DATAGRAMS_A_STEP):
+            try:
+                data, ancillary, _, address = self._socket.recvmsg(_LARGEST_DATAGRAM, _ANCILLARY_BYTES)
+            except BlockingIOError:
+                self._emptied_ns = begin_ns
+                break
+            except ConnectionError:  # an earlier datagram met a closed port: the vehicle will count as silent
+                self.send_errors += 1
+                continue
+            seconds, nanoseconds = _TIMESPEC.unpack(ancillary[0][2])
+            read_ns = clock_ns()
+            # If the wall clock is set, stamps jump; but nothing came before the socket was last empty.
+            received_ns = seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns
+            received_ns = min(max(received_ns, oldest_ns), read_ns)
+            datagrams.append(Datagram(data, address, received_ns, read_ns - received_ns))
+        return datagrams
+
+    def send(self, outgoing: list[Outgoing]) -> None:
+        for data, address in outgoing:
+            try:
+                self._socket.sendto(data, address)
+            except OSError:  # a full buffer or a closed port is loss, which the link statistics show
+                self.send_errors += 1
+
+
+def prepare_real_time() -> None:
+    """Make this process wake on time: least timer slack, and no garbage collection of what exists by now."""
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    gc.collect()
+    gc.freeze()
+
+
+def drive(
+    station: Station,
+    link: StationSocket,
+    writer: RunWriter,
+    stop_reason: Callable[[], str],
+    new_plan: Callable[[FlightPlan], None],
+    guard: Guard | None = None,
+    mirror: Mirror | None = None,
+) -> None:
+    """Run the station in real time until its flight has ended.
+
+    `stop_reason` is asked at every tick; a text other than "" ends the flight for that reason. `new_plan` is told when
+    the station has found more out about what it flies. With a guard, what is sent and received is signed. A mirror
+    gets every frame taken in and sent, and may have some for the vehicles.
+    """
+    plan = station.plan
+    log: list[tuple[bytes, int]] = []
+    """Frames since the last tick, in the order in which they were taken in and sent, with their times."""
+    refusals = Refusals()
+
+    def log_refusals(now_ns: int, *, last: bool = False) -> None:
+        if counts := refusals.news(station.counters, last=last):
+            text = in_words(counts) if last else ", ".join(counts)
+            writer.event(time_s=station.scenario_time_s(now_ns), kind=REFUSED, text=text, counts=counts)
+
+    while station.phase is not Phase.ENDED:
+        link.wait(station.next_event_ns)
+        datagrams = link.receive()
+        now_ns = clock_ns()
+        if guard is not None:
+            datagrams = guard.received(datagrams, now_ns, station.counters, station.is_another)
+        outgoing, tick = station.step(datagrams, now_ns)
+        link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
+        sent_ns = clock_ns()
+        if mirror is not None:
+            mirror.forward([frame for frame, _ in station.frames] + [data for data, _ in outgoing], now_ns)
+            passed_on = mirror.passed_on(station.vehicles, now_ns)
+            link.send(passed_on if guard is None else guard.sent(passed_on, now_ns))
+        log += station.frames
+        # A round trip counts from the step that asked, a set-point's age from when it was handed over.
+        log += [(data, sent_ns if mavlink.is_set_point(data) else now_ns) for data, _ in outgoing]
+        station.frames.clear()
+        if tick is None:
+            continue
+        writer.tick(station.complete(tick, sent_ns))
+        _log(station, writer, log)
+        log_refusals(now_ns)
+        if station.plan is not plan:
+            plan = station.plan
+            new_plan(plan)
+        if reason := stop_reason():
+            station.request_stop(reason)
+    log_refusals(clock_ns(), last=True)
+    if mirror is not None:
+        time_s, counts = station.scenario_time_s(clock_ns()), dict(mirror.counters)
+        writer.event(time_s=time_s, kind=MIRROR, text=in_words(counts), counts=counts)
+
+
+def _log(station: Station, writer: RunWriter, frames: list[tuple[bytes, int]]) -> None:
+    """Write the frames and the events since the last tick."""
+    offset_ns = realtime_offset_ns()
+    writer.frames([(frame, time_ns + offset_ns) for frame, time_ns in frames])
+    frames.clear()
+    for event in station.events:
+        writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
+    station.events.clear()

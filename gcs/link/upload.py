@@ -1,0 +1,96 @@
+"""Parameters for one vehicle: uploaded, read back, compared, before it may be armed.
+
+PARAM_SET is answered by PARAM_VALUE, the value that then holds. When every one has been answered, each is asked for
+again with PARAM_REQUEST_READ. What is not answered is sent again; many are under way at once, as links may be slow.
+"""
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from gcs.link import mavlink
+
+PATIENCE_NS = 1_000_000_000
+"""An answer is waited for at least this long, and at least three round trips."""
+ATTEMPTS = 3
+"""How often a vehicle may answer with another value than it was told: the first may have been on its way already."""
+_LONG_AGO_NS = -(1 << 62)
+_FLOAT = struct.Struct("<f")
+
+
+class _Stage(IntEnum):
+    TO_SET = 0
+    TO_READ = 1
+    COMPARED = 2
+
+
+@dataclass
+class _Item:
+    value: float
+    """As float32, as it travels."""
+    stage: _Stage = _Stage.TO_SET
+    sent_ns: int = _LONG_AGO_NS
+    wrong: int = 0
+
+
+class Upload:
+    """The parameters one vehicle is to have; `next` and `take` bring it there."""
+
+    def __init__(self, wanted: dict[str, float]) -> None:
+        self._items = {name: _Item(float32(value)) for name, value in wanted.items()}
+        self.done = False
+        """Whether every parameter has been read back and is right."""
+        self.refusal = ""
+        """Why the vehicle must not be armed; empty if nothing speaks against it."""
+
+    @property
+    def missing(self) -> str:
+        """What keeps it from being done, in words."""
+        for name, item in self._items.items():
+            if item.stage is not _Stage.COMPARED:
+                return self.refusal or f"does not answer to parameter {name}"
+        return ""
+
+    def begin_anew(self) -> None:
+        """The vehicle seems to have started anew, and to have forgotten what it was told."""
+        self.done = False
+        for item in self._items.values():
+            item.stage, item.sent_ns = _Stage.TO_SET, _LONG_AGO_NS
+
+    def next(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
+        """Message id and fields of the next frame to be sent, if one is due: all are set before one is read back."""
+        if self.done or self.refusal:
+            return None
+        stage = min(item.stage for item in self._items.values())
+        patience_ns = max(PATIENCE_NS, 3 * rtt_ns)
+        for name, item in self._items.items():
+            if item.stage is stage is not _Stage.COMPARED and now_ns - item.sent_ns >= patience_ns:
+                item.sent_ns = now_ns
+                if stage is _Stage.TO_SET:
+                    return mavlink.PARAM_SET, mavlink.param_set(name, item.value, target_system=target_system)
+                return mavlink.PARAM_REQUEST_READ, mavlink.param_request_read(name, target_system=target_system)
+        return None
+
+    def take(self, fields: tuple[Any, ...]) -> None:
+        """Take in a PARAM_VALUE."""
+        value, _, _, field, _ = fields
+        name = field.partition(b"\0")[0].decode("ascii", "replace")
+        item = self._items.get(name)
+        if item is None or item.sent_ns == _LONG_AGO_NS or item.stage is _Stage.COMPARED:
+            return
+        item.sent_ns = _LONG_AGO_NS  # what comes next is due at once
+        if value == item.value:
+            item.stage = _Stage(item.stage + 1)
+            self.done = all(other.stage is _Stage.COMPARED for other in self._items.values())
+            return
+        item.wrong += 1
+        item.stage = _Stage.TO_SET
+        if item.wrong >= ATTEMPTS:
+            self.refusal = f"parameter {name} reads {value:.9g} after {item.value:.9g} was set: it is not armed"
+
+
+def float32(value: float) -> float:
+    """The number as it arrives in a MAVLink float."""
+    rounded: float = _FLOAT.unpack(_FLOAT.pack(value))[0]
+    return rounded

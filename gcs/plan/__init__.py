@@ -1,0 +1,1 @@
+"""From a scenario to what is flown: formation, design and flight plan."""

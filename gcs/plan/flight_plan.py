@@ -1,0 +1,61 @@
+"""The flight plan: formation, gains and their delay margins, as the station flies them."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
+from gains.sampled.multirate import Timing
+from gcs.plan.formation import Formation
+from gcs.plan.responses import Responses
+from scenarios.schema import Scenario
+
+
+@dataclass(frozen=True)
+class FlightPlan:
+    """What the station flies: the formation, the gains and the margin they have."""
+
+    scenario: Scenario
+    formation: Formation
+    gain: FloatArray
+    """K of u = K e, rows and columns in the order of `gains.formation.model.FormationModel`."""
+    delay_margin_s: float
+    slower: tuple[tuple[FloatArray, float], ...] = ()
+    """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
+    separable: bool = True
+    """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
+    responses: Responses | None = None
+    """How the vehicles answer; None if at once, or not yet known."""
+    around_loss: tuple[FloatArray, ...] = ()
+    """In place of `gains` while a vehicle is lost; empty if they serve. A leader-follower tree stays stable when the
+    nearest vehicle ahead stands in for a lost one; gains on another pattern may not without all of their terms, so
+    they are left for the inclusion gains of the same delay margin. The step in the commands is accepted."""
+
+    @cached_property
+    def gains(self) -> tuple[FloatArray, ...]:
+        """The gain schedule, fastest first."""
+        return (self.gain, *(gain for gain, _ in self.slower))
+
+    @cached_property
+    def margins_s(self) -> tuple[float, ...]:
+        """The delay margins of the gain schedule."""
+        return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
+
+    @cached_property
+    def model(self) -> FormationModel:
+        return FormationModel(tuple(self.formation.predecessor.tolist()))
+
+    @property
+    def timing(self) -> Timing:
+        """How often the station hears and commands."""
+        return loop_timing(self.scenario)
+
+    def with_margins(self, margins_s: tuple[float, ...], responses: Responses | None) -> "FlightPlan":
+        """The same gains with the margins that they have on vehicles that answer so."""
+        slower = tuple((gain, s) for (gain, _), s in zip(self.slower, margins_s[1:], strict=True))
+        return replace(self, delay_margin_s=margins_s[0], slower=slower, responses=responses)
+
+
+def loop_timing(scenario: Scenario) -> Timing:
+    """The periods at which states and commands of a scenario are sent."""
+    return Timing(1.0 / scenario.rates.control_hz, 1.0 / scenario.rates.telemetry_hz)

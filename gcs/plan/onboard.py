@@ -1,0 +1,97 @@
+"""Planning with loop "onboard": what vehicles feed back by themselves, and what is left to the station.
+
+u_i(t) = K_ii e_i(t) + sum over j of K_ij e_j(t - tau) (thesis eq. 5.1). The vehicle computes the first term from its
+own velocity and its own sensor for the vehicle ahead; its gains are the parameters that `own_parameters` names. The
+station computes the second and sends it as the acceleration of SET_POSITION_TARGET_LOCAL_NED, a feed-forward as
+autopilots understand it, with the formation's velocity v_d as the velocity.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.requirement import plain
+from gains.formation.model import FormationModel
+from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import Formation
+from scenarios.schema import Scenario
+
+AXES = "NE"
+
+
+def timing_of(scenario: Scenario) -> OnboardTiming | None:
+    """The timing of the onboard loop, None if the station closes every loop."""
+    if scenario.control.loop != "onboard":
+        return None
+    own, control_hz = scenario.onboard, scenario.rates.control_hz
+    return OnboardTiming(
+        1.0 / control_hz,
+        steps=round(own.rate_hz / control_hz),
+        steps_per_sample=round(own.rate_hz / own.sensor_hz),
+        telemetry_s=1.0 / scenario.rates.telemetry_hz,
+    )
+
+
+def onboard_plan(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, Any], FlightPlan]:
+    """Design and plan of a ground loop, made those of the onboard loop with the same gains.
+
+    Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. The
+    slower entries of the schedule leave the vehicles' own gains as they are and take a smaller share of what is
+    streamed: with none of it the formation is stable at every delay. That is what is flown around a lost vehicle, if
+    vehicles act on each other both ways.
+    """
+    timing = timing_of(plan.scenario)
+    assert timing is not None
+    own = own_part(plan.model, plan.gain).astype(np.float32).astype(np.float64)
+    others = plan.gain - own_part(plan.model, plan.gain)
+    shares = [1.0 / scale for scale in plan.scenario.monitor.time_scales]
+    gains = [own + share * others for share in shares]
+    loops = [onboard_loop(plan.model, gain, timing) for gain in gains]
+    sampled_s = [loop.sampled_margin_s() for loop in loops]
+    margins = [
+        {"delay_margin_s": plain(margin_s), "delay_margin_continuous_s": plain(loop.continuous_margin_s())}
+        for loop, margin_s in zip(loops, sampled_s, strict=True)
+    ]
+    onboard = {
+        "rate_hz": plan.scenario.onboard.rate_hz,
+        "sensor_hz": plan.scenario.onboard.sensor_hz,
+        "ground_delay_margin_s": design["delay_margin_s"],
+        "ground_delay_margin_continuous_s": design["delay_margin_continuous_s"],
+    }
+    schedule = [{"streamed_share": share} | margin for share, margin in zip(shares, margins, strict=True)]
+    flown = replace(
+        plan,
+        gain=gains[0],
+        delay_margin_s=sampled_s[0],
+        slower=tuple(zip(gains[1:], sampled_s[1:], strict=True)),
+        around_loss=() if plan.separable else (own,) * len(gains),
+    )
+    return design | margins[0] | {"loop": "onboard", "onboard": onboard, "schedule": schedule}, flown
+
+
+def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, float]:
+    """Names and values of the parameters with which a vehicle flies its own loop.
+
+    FORM_AHEAD is the system id of the vehicle ahead, 0 for the leader, FORM_OFF_N and _E the wanted position relative
+    to it; FORM_KP_xy and FORM_KV_xy are the gains from spacing and velocity error in y to acceleration in x. FORM_LOOP,
+    the last, switches the loop on.
+    """
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    ahead = int(formation.predecessor[row])
+    rows, north_east = model.input_slice(row), enumerate(formation.offset_ne_m[row].tolist())
+    on_spacing = K[rows, model.spacing_slice(row)] if ahead >= 0 else np.zeros((2, 2))
+    on_velocity = K[rows, model.velocity_slice(row)]
+    return {
+        "FORM_AHEAD": float(formation.system_ids[ahead]) if ahead >= 0 else 0.0,
+        **{f"FORM_OFF_{AXES[k]}": offset_m for k, offset_m in north_east},
+        **{
+            f"FORM_{kind}_{AXES[i]}{AXES[j]}": float(block[i, j])
+            for kind, block in (("KP", on_spacing), ("KV", on_velocity))
+            for i in range(2)
+            for j in range(2)
+        },
+        "FORM_LOOP": 1.0,
+    }

@@ -1,0 +1,233 @@
+"""From a scenario to what is flown: formation, gains, margins."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.requirement import Requirement, plain
+from gains.core.structure import strongly_connected_blocks
+from gains.design.design import Design, design, evaluate_gains
+from gains.design.graph import evaluate_graph_gain, time_scaled
+from gains.design.required import requirement_with
+from gains.formation.model import FormationModel
+from gains.formation.pattern import Pattern, leader_follower, with_links, without_links
+from gains.performance.behaviour import string_peak
+from gains.performance.response import Response, continuous_margin, sampled_margin
+from gcs.plan.at_delay import with_figures_at_delay
+from gcs.plan.flight_plan import FlightPlan, loop_timing
+from gcs.plan.formation import Formation, plan_formation
+from gcs.plan.onboard import onboard_plan
+from gcs.plan.responses import Responses, given_responses, margins_with
+from scenarios.schema import Scenario
+
+NOT_YET_KNOWN = "not yet known"
+_MARGINS_AROUND_LOSS_S = 0.1, 30.0
+"""Least and largest delay margin of the gains flown around a lost vehicle."""
+
+_MORE = 1.1
+"""What the rates take of a margin asked for is asked for so many times more: it is a small part of the margin."""
+
+
+def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
+    """The design as plain types (what design.json holds), and the plan to fly it.
+
+    Raises
+    ------
+    gains.core.errors.GainsError
+        If the scenario's requirement cannot be met.
+    """
+    formation = plan_formation(scenario)
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    if scenario.control.method != "inclusion" or scenario.control.blocks:
+        return _flown_loop(*_graph_plan(scenario, formation, model))
+    responses = given_responses(scenario)
+    found = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
+    schedule = _schedule(scenario, model, found)
+    plan = FlightPlan(
+        scenario=scenario,
+        formation=formation,
+        gain=model.overlapping_gain(found.K1, found.K2, found.K3),
+        delay_margin_s=found.delay_margin_s,
+        slower=tuple((model.overlapping_gain(s.K1, s.K2, s.K3), s.delay_margin_s) for _, s in schedule),
+    )
+    whole = found.to_dict() | {"schedule": [_entry(1.0, found), *(_entry(*slower) for slower in schedule)]}
+    return _flown_loop(*_with_responses(whole, plan, responses))
+
+
+def _flown_loop(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, Any], FlightPlan]:
+    """Design and plan of a ground loop, made those of the scenario's loop, with the figures at its delay."""
+    if plan.scenario.control.loop == "onboard":
+        design, plan = onboard_plan(design, plan)
+    return with_figures_at_delay(design, plan.scenario), plan
+
+
+def _with_responses(
+    whole: dict[str, Any], plan: FlightPlan, responses: Responses | None
+) -> tuple[dict[str, Any], FlightPlan]:
+    """Design and plan with the margins of given responses."""
+    if responses is None:
+        unknown = {"response": {"source": NOT_YET_KNOWN}} if plan.scenario.dynamics == "autopilot" else {}
+        if plan.timing.commands == 1:  # what the design was found with
+            return whole | unknown, plan
+        plan = plan.with_margins(margins_with(plan.model, plan.gains, None, plan.timing), None)
+        margins = [{"delay_margin_s": plain(margin_s)} for margin_s in plan.margins_s]
+        schedule = [entry | margin for entry, margin in zip(whole["schedule"], margins, strict=True)]
+        return whole | margins[0] | {"schedule": schedule} | unknown, plan
+    of = responses.in_order(plan.formation.system_ids)
+    plan = plan.with_margins(margins_with(plan.model, plan.gains, of, plan.timing), responses)
+    return described(whole, plan), plan
+
+
+def described(design: dict[str, Any], plan: FlightPlan) -> dict[str, Any]:
+    """The design with the vehicles' responses in it: its margins become those with them.
+
+    `delay_margin_at_once_s` is the margin that the same gains have on vehicles that answer at once.
+    """
+    assert plan.responses is not None
+    every = plan.responses.in_order(plan.formation.system_ids)
+    margins = [
+        {"delay_margin_s": sampled_s, "delay_margin_continuous_s": continuous_margin(plan.model, K, every)}
+        for K, sampled_s in zip(plan.gains, plan.margins_s, strict=True)
+    ]
+    blocks = [np.array(design[name]) for name in ("K1_1_s", "K2_1_s", "K3_1_s2") if name in design]
+    schedule = [entry | margin for entry, margin in zip(design["schedule"], margins, strict=True)]
+    response: dict[str, Any] = {
+        "source": plan.responses.source,
+        "model": "lag a' = u + g (v_s - v) - a, v_s' = u",
+        "vehicles": [
+            {"system_id": system_id, "lag_s": found.lag_s, "velocity_gain_1_s": found.velocity_gain_1_s}
+            for system_id, found in sorted(plan.responses.of.items())
+        ],
+        "delay_margin_at_once_s": design["delay_margin_s"],
+    }
+    if len(blocks) == 3:  # the same for each vehicle, as on a leader-follower tree only
+        own, front, spacing = blocks
+        peaks = [string_peak((own, front, spacing), 0.0, answer=answer.transfer) for answer in set(every)]
+        response["string_peak"] = max(peaks)
+    return with_figures_at_delay(design | margins[0] | {"schedule": schedule, "response": response}, plan.scenario)
+
+
+def _schedule(scenario: Scenario, model: FormationModel, found: Design) -> list[tuple[float, Design]]:
+    """The design slowed down by the scenario's factors.
+
+    With K1 / s, K2 / s and K3 / s² the loop does the same things s times slower, so its delay margin is s times larger.
+    """
+    period_s = loop_timing(scenario).held_s
+    return [
+        (s, evaluate_gains(model, found.K1 / s, found.K2 / s, found.K3 / s**2, period_s=period_s))
+        for s in scenario.monitor.time_scales[1:]
+    ]
+
+
+def _entry(time_scale: float, design: Design) -> dict[str, Any]:
+    names = ("K1_1_s", "K2_1_s", "K3_1_s2", "alpha", "delay_margin_s", "delay_margin_continuous_s")
+    whole = design.to_dict()
+    return {"time_scale": time_scale} | {name: whole[name] for name in names}
+
+
+def _design(scenario: Scenario, model: FormationModel, response: Response | None) -> Design:
+    control, timing = scenario.control, loop_timing(scenario)
+    if control.gains is not None:
+        own, front, spacing = (gain * np.eye(2) for gain in (control.gains.K1, control.gains.K2, control.gains.K3))
+        return evaluate_gains(model, own, front, spacing, period_s=timing.held_s)
+    requirement = requirement_with(_requirement(scenario), response, timing=timing)
+    return design(model, requirement, period_s=timing.held_s)
+
+
+def _requirement(scenario: Scenario) -> Requirement:
+    control = scenario.control
+    return Requirement(
+        delay_margin_s=control.delay_margin_s,
+        alpha=control.alpha,
+        decay_rate_1_s=control.decay_rate_1_s,
+        string_peak_max=control.string_peak_max,
+        loop=control.loop,
+    )
+
+
+def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel) -> tuple[dict[str, Any], FlightPlan]:
+    """Design and plan on an information pattern, designed or given block by block."""
+    control, timing = scenario.control, loop_timing(scenario)
+    period_s = timing.held_s
+    pattern = _pattern(scenario, formation, model)
+    if control.blocks:
+        found = evaluate_graph_gain(model, pattern, _given_gain(scenario, formation, model), period_s=period_s)
+    else:
+        assert control.method != "inclusion"
+        wanted = _requirement(scenario)
+        found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
+        short_s = (wanted.delay_margin_s or 0.0) - sampled_margin(model, found.K, None, timing=timing)
+        if timing.commands > 1 and short_s > 0.0:
+            wanted = replace(wanted, delay_margin_s=(wanted.delay_margin_s or 0.0) + _MORE * short_s)
+            found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
+    scales = scenario.monitor.time_scales
+    gains = [time_scaled(model, found.K, scale) for scale in scales]
+    slower = [evaluate_graph_gain(model, pattern, gain, period_s=period_s) for gain in gains[1:]]
+    plan = FlightPlan(
+        scenario=scenario,
+        formation=formation,
+        gain=found.K,
+        delay_margin_s=found.delay_margin_s,
+        slower=tuple((entry.K, entry.delay_margin_s) for entry in slower),
+        separable=len(_loops(model, found.K)) == model.vehicles,
+        around_loss=() if control.loop == "onboard" else _around_loss(model, found.delay_margin_s, scales, period_s),
+    )
+    names = ("alpha", "decay_rate_1_s", "delay_margin_s", "delay_margin_continuous_s")
+    schedule = [
+        {"time_scale": scale, "blocks": _blocks(entry.K, formation, model, pattern)}
+        | {name: entry.to_dict()[name] for name in names}
+        for scale, entry in zip(scales, [found, *slower], strict=True)
+    ]
+    ids = formation.system_ids
+    result = found.to_dict() | {
+        "links": [[ids[i], ids[j]] for i, j in found.links],
+        "blocks": schedule[0]["blocks"],
+        "schedule": schedule,
+    }
+    return _with_responses(result, plan, given_responses(scenario))
+
+
+def _pattern(scenario: Scenario, formation: Formation, model: FormationModel) -> Pattern:
+    """Who may use whose errors."""
+    row = {system_id: k for k, system_id in enumerate(formation.system_ids)}
+    tree = leader_follower(model)
+    if scenario.control.blocks:
+        none = without_links(tree, tree.links)
+        return with_links(none, [(row[block.vehicle], row[block.of]) for block in scenario.control.blocks])
+    return with_links(tree, [(row[v.system_id], row[heard]) for v in scenario.vehicles for heard in v.hears])
+
+
+def _given_gain(scenario: Scenario, formation: Formation, model: FormationModel) -> FloatArray:
+    row = {system_id: k for k, system_id in enumerate(formation.system_ids)}
+    K = np.zeros((model.inputs, model.states))
+    for block in scenario.control.blocks:
+        K[model.input_slice(row[block.vehicle]), model.output_slice(row[block.of])] = block.gain
+    return K
+
+
+def _blocks(K: FloatArray, formation: Formation, model: FormationModel, pattern: Pattern) -> list[dict[str, Any]]:
+    """The gain matrix block by block, as a scenario gives it."""
+    ids = formation.system_ids
+    return [
+        {"vehicle": ids[i], "of": ids[j], "gain": K[model.input_slice(i), model.output_slice(j)].tolist()}
+        for i, j in pattern.links
+    ]
+
+
+def _loops(model: FormationModel, K: FloatArray) -> list[Any]:
+    """Groups of vehicles that act on each other."""
+    outputs = [model.output_slice(i) for i in range(model.vehicles)]
+    pattern = np.abs(model.A) + np.abs(model.B @ K)
+    return strongly_connected_blocks(np.array([[pattern[own, other].sum() for other in outputs] for own in outputs]))
+
+
+def _around_loss(
+    model: FormationModel, delay_margin_s: float, scales: tuple[float, ...], period_s: float
+) -> tuple[FloatArray, ...]:
+    """Inclusion gains of the same delay margin, as far as they can have it, slowed down by each factor."""
+    margin_s = min(max(delay_margin_s, _MARGINS_AROUND_LOSS_S[0]), _MARGINS_AROUND_LOSS_S[1])
+    found = design(model, Requirement(delay_margin_s=margin_s, string_peak_max=1.0), period_s=period_s)
+    K = model.overlapping_gain(found.K1, found.K2, found.K3)
+    return tuple(time_scaled(model, K, scale) for scale in scales)

@@ -1,0 +1,158 @@
+"""The files of a run's folder, each with its one reader: what is damaged, or of another kind, is told in one line.
+
+Raised everywhere here: gcs.errors.InputError.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gcs.errors import InputError
+from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE
+from gcs.control.tick import TICK, Mode, TickArray
+from scenarios import files as scenario_files
+from scenarios.schema import Scenario
+
+_Margin = Annotated[float, Field(ge=0)] | None
+"""In s; None or infinite where there is no limit."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(strict=True, extra="allow")
+
+
+class _GainSet(_Part):
+    delay_margin_s: _Margin
+
+
+class _Design(_GainSet):
+    delay_margin_continuous_s: _Margin = None
+    schedule: list[_GainSet] = []
+
+
+class _Delays(_Part):
+    p50: float | None
+    p99: float | None
+    max: float | None
+
+
+class _Summary(_Part):
+    verdict: str
+    loop: Literal["ground", "onboard"]
+    delay_margin_s: _Margin
+    loop_delay_s: _Delays
+    headroom_min: float | None
+
+
+class _Event(_Part):
+    time_s: float
+    kind: str
+    system_id: int | None
+    text: str
+    counts: dict[str, int] = {}
+
+
+def read_scenario(folder: Path) -> Scenario:
+    """The scenario of a run as flown; raises also scenarios.files.ScenarioError."""
+    if not (folder / SCENARIO_FILE).exists():
+        raise InputError(f"{folder}: read no {SCENARIO_FILE}, wanted the folder of a run")
+    return scenario_files.load(folder / SCENARIO_FILE)
+
+
+def read_design(file: Path) -> dict[str, Any]:
+    """A design.json, of which only the margins have to be there."""
+    return _checked(file, _Design, f"the {DESIGN_FILE} of a run")
+
+
+def read_summary(file: Path) -> dict[str, Any]:
+    """A summary.json."""
+    return _checked(file, _Summary, "the summary of a run")
+
+
+def read_ticks(folder: Path) -> TickArray:
+    """All tick rows of a run, finished or not."""
+    part, parquet = folder / TICKS_FILE, folder / PARQUET_FILE
+    if not part.exists() and not parquet.exists():
+        raise InputError(f"{folder}: read neither {TICKS_FILE} nor {PARQUET_FILE}, wanted the folder of a run")
+    ticks = RunTail(folder).ticks() if part.exists() else _from_parquet(parquet)
+    if not (np.isfinite(ticks["time_s"]).all() and (ticks["mode"] <= max(Mode)).all()):
+        raise InputError(f"{part if part.exists() else parquet}: read rows that are damaged, wanted the ticks of a run")
+    return ticks
+
+
+_ADDED = {"delay_margin_s": np.nan, "repeated_s": 0.0}
+"""Columns that older runs lack, and what is read for them."""
+
+
+def _from_parquet(file: Path) -> TickArray:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(file)
+        ticks = np.empty(table.num_rows, TICK)
+        for name in TICK.names or ():
+            added = name in _ADDED and name not in table.column_names
+            ticks[name] = _ADDED[name] if added else table[name].to_numpy()
+    except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
+        raise InputError(f"{file}: {str(error).strip()}, wanted the ticks of a run") from None
+    return ticks
+
+
+def _checked(file: Path, kind: type[BaseModel], wanted: str) -> dict[str, Any]:
+    """The JSON of a file as plain types, if it is of a kind."""
+    try:
+        return kind.model_validate_json(file.read_bytes()).model_dump()
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror}, wanted {wanted}") from None
+    except ValidationError as errors:
+        raise InputError(f"{file}: {_first(errors)}; wanted {wanted}") from None
+
+
+def _first(errors: ValidationError) -> str:
+    """The first of pydantic's findings: key, what was read, what should be there."""
+    first = errors.errors()[0]
+    key = ".".join(map(str, first["loc"]))
+    if first["type"] in ("json_invalid", "missing"):
+        return f"{key}: missing" if key else first["msg"]
+    read = " ".join(repr(first["input"]).split())
+    message = first["msg"].replace("Input should be", "should be")
+    return f"{key + ': ' if key else ''}read {read if len(read) <= 60 else read[:57] + '...'}, {message}"
+
+
+class RunTail:
+    """Reads what has been added to a run's ticks and events since the last call; the run may still be growing."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._ticks_read = 0
+        self._events_read = 0
+
+    def ticks(self) -> TickArray:
+        """New rows, in the order they were written; a half-written one is left for the next call."""
+        data, count = self._new(TICKS_FILE, self._ticks_read, TICK.itemsize)
+        self._ticks_read += count
+        return np.frombuffer(data[:count], dtype=TICK)
+
+    def events(self) -> list[dict[str, Any]]:
+        """New events: time_s, kind, system_id (or None), text."""
+        data, _ = self._new(EVENTS_FILE, self._events_read, 1)
+        whole = data[: data.rfind(b"\n") + 1]
+        self._events_read += len(whole)
+        try:
+            return [_Event.model_validate_json(line).model_dump(exclude_unset=True) for line in whole.splitlines()]
+        except ValidationError as errors:
+            raise InputError(f"{self._folder / EVENTS_FILE}: {_first(errors)}; wanted the events of a run") from None
+
+    def _new(self, name: str, start: int, unit: int) -> tuple[bytes, int]:
+        try:
+            with (self._folder / name).open("rb") as file:
+                file.seek(start)
+                data = file.read()
+        except FileNotFoundError:
+            return b"", 0
+        except OSError as error:
+            raise InputError(f"{self._folder / name}: {error.strerror}, wanted a file of a run") from None
+        return data, len(data) - len(data) % unit

@@ -1,0 +1,174 @@
+"""`gcs grade`: what a flight measured of its links, against the truth that vehicles and emulated links wrote down.
+
+A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
+loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
+acts; both are in the truth by the time_boot_ms that the messages bear.
+"""
+
+import itertools
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gcs.errors import InputError
+from gcs.runs.record import TRUTH_FILE
+from gcs.runs.files import read_ticks
+from gcs.control.tick import TickArray
+from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
+
+Truth = NDArray[np.void]
+"""Records as sim_vehicles.links.truth.DTYPE lays them out."""
+
+_TIMESYNC = 111
+
+
+def grade(folder: Path) -> dict[str, Any]:
+    """Grade a run: the loop delays and round trips it measured, and how punctual its emulated links were.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a run, or has no truth log.
+    """
+    try:
+        truth = read_truth(folder / TRUTH_FILE)
+    except FileNotFoundError:
+        wanted = "the folder of a run whose vehicles the station started"
+        raise InputError(f"{folder}: read no {TRUTH_FILE}, wanted {wanted}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{error}, wanted the truth log of a run's vehicles") from None
+    ticks = read_ticks(folder)
+    flown = ticks[ticks["time_s"] >= 0.0]
+    system_ids = np.unique(ticks["system_id"]).tolist()
+    trip_errors_s = np.concatenate([_trip_errors_s(ticks, truth, system_id) for system_id in system_ids])
+    left = truth[(truth["kind"] == LINK_UP) & (truth["fate"] & DROPPED == 0)]
+    late_s = (left["time_ns"] - left["due_ns"]) * 1e-9
+    return {
+        "vehicles": len(system_ids),
+        "loop_delay": graded(flown["loop_delay_s"] + flown["repeated_s"], true_loop_delays_s(flown, truth)),
+        "rtt": graded(trip_errors_s, np.zeros(len(trip_errors_s))),
+        "link_delay": graded(late_s, np.zeros(len(late_s))),
+    }
+
+
+def print_grade(result: dict[str, Any]) -> None:
+    """One line for each quantity."""
+    kinds = {
+        "loop_delay": "loop delay, measured",
+        "rtt": "round trip, measured",
+        "link_delay": "link delay, applied upwards",
+    }
+    print(f"errors against the truth, {result['vehicles']} vehicles, ms")
+    for name, title in kinds.items():
+        own = result[name]
+        figures = [_ms(own[f"error_{part}_s"]) for part in ("p50", "p99", "max")]
+        print(f"{title:<28} p50 {figures[0]}  p99 {figures[1]}  max {figures[2]}  of {own['samples']}")
+
+
+def _ms(value_s: float | None) -> str:
+    return "–" if value_s is None else f"{1e3 * value_s:.3f}"
+
+
+def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:
+    """Each measured round trip against that of the nearest reply which had left before the tick that logs it.
+
+    Both are in order of time, and each reply is one round trip at most; of several that came between two ticks the
+    later ones are in the ticks after.
+    """
+    rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
+    due_ns, trip_s = true_round_trips(truth, system_id)
+    left = np.searchsorted(due_ns, rows["sent_ns"])
+    errors_s: list[float] = []
+    taken = 0
+    for measured_s, end in zip(rows["rtt_s"].tolist(), left.tolist(), strict=True):
+        if taken < end:
+            off_s = measured_s - trip_s[taken:end]
+            nearest = int(np.abs(off_s).argmin())
+            errors_s.append(float(off_s[nearest]))
+            taken += nearest + 1
+    return np.array(errors_s)
+
+
+def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """TIMESYNC requests that the vehicle answered at once: when each reply was due (ns), and its round trip (s)."""
+    own = truth[(truth["system_id"] == system_id) & (truth["key"] == _TIMESYNC) & (truth["fate"] & DROPPED == 0)]
+    asked, answered = own[own["kind"] == LINK_DOWN], own[own["kind"] == LINK_UP]
+    # Where none may overtake, several come at one instant and are answered in their order. Not all are requests: where
+    # the station's answer to the vehicle is among them, it is not known which is which.
+    sent_ns: dict[int, list[int]] = defaultdict(list)
+    left_ns: dict[int, list[int]] = defaultdict(list)
+    for entered_ns, due_ns in sorted(asked[["entered_ns", "due_ns"]].tolist()):
+        sent_ns[due_ns].append(entered_ns)
+    for entered_ns, due_ns in sorted(answered[["entered_ns", "due_ns"]].tolist()):
+        left_ns[entered_ns].append(due_ns)
+    replies: list[tuple[int, int]] = []
+    for at_ns, dues_ns in left_ns.items():
+        if len(sent_ns[at_ns]) in (1, len(dues_ns)):  # of one request there may be two replies, the second a copy
+            replies += zip(dues_ns, itertools.cycle(sent_ns[at_ns]), strict=False)
+    replies.sort()
+    due = np.array([due_ns for due_ns, _ in replies], dtype=np.int64)
+    return due, np.array([(due_ns - asked_ns) * 1e-9 for due_ns, asked_ns in replies])
+
+
+def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
+    """The true age (s) of the state behind each row's set-point when that acted; NaN where it never did, or no state is
+    known.
+
+    `ticks` are whole: a row for every vehicle.
+    """
+    sampled, acted = (instants(truth, kind) for kind in (SAMPLED, ACTED))
+    out = np.full(len(ticks), np.nan)
+    used = _rows_used(ticks)
+    for k in np.flatnonzero(ticks["commanded"]):
+        row, source = ticks[k], ticks[used[k]]
+        since_ns = sampled.get((int(source["system_id"]), int(source["sample_boot_ms"])))
+        until_ns = acted.get((int(row["system_id"]), int(row["key_ms"])))
+        if since_ns is not None and until_ns is not None:
+            out[k] = (until_ns - since_ns) * 1e-9
+    return out
+
+
+def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
+    """For each row that of the same tick whose state its loop delay counts from.
+
+    In the ground loop its own; in the onboard loop that of the oldest state that was needed, known by its age.
+    """
+    vehicles = len(np.unique(ticks["system_id"]))
+    age_s = ticks["telemetry_age_s"].reshape(-1, vehicles)
+    used_s = (ticks["loop_delay_s"] + ticks["repeated_s"] - ticks["down_delay_s"]).reshape(-1, vehicles)
+    apart_s = np.abs(age_s[:, np.newaxis, :] - used_s[:, :, np.newaxis])
+    own = np.arange(vehicles)
+    apart_s[:, own, own] -= 1e-9  # its own, where another one is as old
+    nearest = np.argmin(np.where(np.isnan(apart_s), np.inf, apart_s), axis=2)
+    return (np.arange(len(age_s))[:, np.newaxis] * vehicles + nearest).ravel()
+
+
+def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
+    """(System id, time_boot_ms) to the first instant with that key."""
+    own = truth[truth["kind"] == kind]
+    found: dict[tuple[int, int], int] = {}
+    for system_id, key, time_ns in zip(
+        own["system_id"].tolist(), own["key"].tolist(), own["time_ns"].tolist(), strict=True
+    ):
+        found.setdefault((system_id, key), time_ns)
+    return found
+
+
+def graded(measured_s: FloatArray, true_s: FloatArray) -> dict[str, Any]:
+    """How far measurements are from the truth; with no sample, the figures are None and not 0."""
+    both = np.isfinite(measured_s) & np.isfinite(true_s)
+    error_s = np.abs(measured_s - true_s)[both]
+    if not error_s.size:
+        return {"status": "unknown", "samples": 0, "error_p50_s": None, "error_p99_s": None, "error_max_s": None}
+    p50, p99 = np.percentile(error_s, [50, 99]).tolist()
+    return {
+        "status": "measured",
+        "samples": int(error_s.size),
+        "error_p50_s": p50,
+        "error_p99_s": p99,
+        "error_max_s": float(error_s.max()),
+    }

@@ -1,0 +1,144 @@
+"""What a run leaves behind while it flies: the tick record, the events, the telemetry log.
+
+All three are append-only files written with one system call a tick, so a killed process loses nothing that it had
+logged, and others (the live table, the Rerun recording) follow the flight by reading files: the control loop
+never waits for them.
+"""
+
+import contextlib
+import json
+import os
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcs.control.tick import TickArray
+
+SCENARIO_FILE = "scenario.toml"
+DESIGN_FILE = "design.json"
+TICKS_FILE = "ticks.part"
+"""The growing tick log; it becomes PARQUET_FILE when the run is finished."""
+PARQUET_FILE = "ticks.parquet"
+EVENTS_FILE = "events.jsonl"
+TLOG_FILE = "flight.tlog"
+TRUTH_FILE = "truth.bin"
+"""When the simulated vehicles sampled their states and when set-points acted, as they know it."""
+MIRROR = "mirror"
+"""Kind of the event that counts what a mirrored station sent."""
+RECORDING_FILE = "flight.rrd"
+SUMMARY_FILE = "summary.json"
+NEW_DESIGN = "design"
+"""Kind of the event that DESIGN_FILE has been written anew."""
+END = "end"
+"""Kind of the last event of a flight."""
+FLEET = "fleet"
+"""Kind of the event that says where the vehicles are from, if the flight did not start them."""
+STARTED = "started by the station"
+"""Where those of other flights are from."""
+LOG_ENDED = "log"
+"""Kind of the event that a file could not be written from then on: its name and the reason."""
+_MOST_WAITING = 1000
+READY_FILE = ".observer-ready"
+"""There while an observer follows the run."""
+
+
+class RunWriter:
+    """Appends ticks, events and MAVLink frames to the files of one run folder.
+
+    Nothing here raises because a disk is full: the flight goes on without the log. A log of ticks or frames that could
+    not be written ends there, after its last whole record and without a gap; the event LOG_ENDED says so. Events are
+    few, and are kept until they can be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._ticks, self._events, self._tlog = (
+            RecordLog(folder / name) for name in (TICKS_FILE, EVENTS_FILE, TLOG_FILE)
+        )
+        self._ended: set[str] = set()
+        self._waiting: list[bytes] = []
+        """Events that could not be written yet."""
+        self._time_s = -np.inf
+        """Of the newest tick."""
+
+    def tick(self, rows: TickArray) -> None:
+        self._time_s = float(rows["time_s"][0])
+        self._add(TICKS_FILE, self._ticks, rows.tobytes())
+
+    def event(
+        self,
+        *,
+        time_s: float,
+        kind: str,
+        text: str,
+        system_id: int | None = None,
+        counts: dict[str, int] | None = None,
+    ) -> None:
+        line: dict[str, Any] = {"time_s": round(time_s, 6), "kind": kind, "system_id": system_id, "text": text}
+        if counts is not None:
+            line["counts"] = counts
+        if len(self._waiting) < _MOST_WAITING or kind == END:
+            self._waiting.append((json.dumps(line) + "\n").encode())
+        with contextlib.suppress(OSError):
+            self._events.add(b"".join(self._waiting))
+            self._waiting.clear()
+
+    def frames(self, frames: Iterable[tuple[bytes, int]]) -> None:
+        """Log frames, each with its time in ns since 1970, in the .tlog layout: big-endian µs, then the frame."""
+        entries = b"".join(struct.pack(">Q", time_ns // 1000) + frame for frame, time_ns in frames)
+        if entries:
+            self._add(TLOG_FILE, self._tlog, entries)
+
+    def ended(self, name: str, error: OSError) -> None:
+        """Note that a file of the run could not be written, and is not from now on."""
+        self._ended.add(name)
+        self.event(time_s=self._time_s, kind=LOG_ENDED, text=f"{name}: {error.strerror}")
+
+    def close(self) -> list[dict[str, Any]]:
+        """Close the files; gives the events that could not be written."""
+        for log in (self._ticks, self._events, self._tlog):
+            log.close()
+        return [json.loads(line) for line in self._waiting]
+
+    def _add(self, name: str, log: "RecordLog", data: bytes) -> None:
+        if name in self._ended:
+            return
+        try:
+            log.add(data)
+        except OSError as error:
+            self.ended(name, error)
+
+
+class RecordLog:
+    """A file that grows by whole records: what a failed write has left of one is cut off."""
+
+    def __init__(self, file: Path) -> None:
+        self.descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        self._size = os.fstat(self.descriptor).st_size
+
+    def add(self, record: bytes) -> None:
+        """Append a record, or nothing; raises OSError."""
+        try:
+            left = record
+            while left:
+                left = left[os.write(self.descriptor, left) :]
+        except OSError:
+            os.ftruncate(self.descriptor, self._size)
+            raise
+        self._size += len(record)
+
+    def close(self) -> None:
+        os.close(self.descriptor)
+
+
+def write_whole(file: Path, data: bytes) -> None:
+    """Write a file in one step, for those who read it meanwhile; one that is there stays if that fails."""
+    part = file.with_name(file.name + ".new")
+    try:
+        part.write_bytes(data)
+        part.replace(file)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,306 @@
+"""From a run's logs to its verdict: ticks.parquet and summary.json.
+
+Works from the files alone, so a run whose station was killed is finished by the same code as one that ended well.
+"""
+
+import json
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs.plan.at_delay import figures_at
+from gcs.errors import InputError
+from gcs.runs.record import (DESIGN_FILE, END, EVENTS_FILE, FLEET, LOG_ENDED, MIRROR, PARQUET_FILE, RECORDING_FILE, SCENARIO_FILE, STARTED, SUMMARY_FILE, TICKS_FILE, TRUTH_FILE, write_whole)
+from gcs.runs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
+from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
+from gcs.control.tick import CLOCK_JUMPED, TICK, Mode, TickArray
+from scenarios.schema import Scenario
+
+_SKEW_SPAN_S = 1.0
+"""A clock's rate is not told from less than this."""
+SILENT_END = "interrupted: the station ended without a word"
+
+
+def finish(folder: Path, *, unwritten: list[dict[str, Any]] | None = None) -> dict[str, Any]:
+    """Write ticks.parquet and summary.json of a run that has ended, and return the summary.
+
+    `unwritten` is given at the end of a flight: its events that could not be written. What cannot be written now is
+    then named in the summary, as `not_logged`, and the log of ticks stays as it is.
+
+    Raises
+    ------
+    InputError
+        If the folder is not a run, or a file of it is damaged.
+    OSError
+        If a file cannot be written, unless `unwritten` is given.
+    """
+    scenario = read_scenario(folder)
+    design = read_design(folder / DESIGN_FILE)
+    ticks = read_ticks(folder)
+    if strangers := set(ticks["system_id"].tolist()) - {vehicle.system_id for vehicle in scenario.vehicles}:
+        raise InputError(
+            f"{folder}: read ticks of vehicles {sorted(strangers)}, wanted those of its {SCENARIO_FILE} only"
+        )
+    summary = summarise(scenario, design, ticks, RunTail(folder).events() + (unwritten or []))
+    not_logged: list[str] = summary["not_logged"]
+    if unwritten:
+        not_logged.append(f"{EVENTS_FILE}: the last {len(unwritten)}")
+    if unwritten is not None and not (folder / RECORDING_FILE).exists():
+        not_logged.append(f"{RECORDING_FILE}: see gcs recover")
+    if lost := (counted_by_vehicles(folder) or {}).get("truth_lost"):
+        not_logged.append(f"{TRUTH_FILE}: {lost} records")
+
+    def write(name: str, how: Callable[[], None]) -> None:
+        try:
+            how()
+        except OSError as error:
+            if unwritten is None:
+                raise
+            not_logged.append(f"{name}: {error.strerror or error}")
+
+    write(PARQUET_FILE, lambda: _write_parquet(folder, ticks))
+    summary["refused_by_vehicles"] = refused_by_vehicles(folder)
+    there = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
+    summary["files"] = sorted(there | {SUMMARY_FILE})
+    text = json.dumps(summary, indent=2, allow_nan=False).encode()
+    write(SUMMARY_FILE, lambda: write_whole(folder / SUMMARY_FILE, text))
+    summary["files"] = [name for name in summary["files"] if (folder / name).exists()]
+    return summary
+
+
+def _write_parquet(folder: Path, ticks: TickArray) -> None:
+    """Turn the growing log into Parquet; the log goes only when the Parquet file is whole."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pa.table({name: np.ascontiguousarray(ticks[name]) for name in TICK.names or ()})
+    part = folder / (PARQUET_FILE + ".new")
+    try:
+        pq.write_table(table, part, compression="zstd")
+        part.replace(folder / PARQUET_FILE)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+    (folder / TICKS_FILE).unlink(missing_ok=True)
+
+
+def summarise(
+    scenario: Scenario, design: dict[str, Any], ticks: TickArray, events: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """The summary of a run, as plain types; an unknown is None."""
+    commanded = ticks["tick"][ticks["commanded"]]
+    flown = ticks[(ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1))]
+    said = {kind: [event["text"] for event in events if event["kind"] == kind] for kind in (END, FLEET)}
+    ends = said[END]
+    not_logged = [f"{e['text']}, from {e['time_s']:.2f} s on" for e in events if e["kind"] == LOG_ENDED]
+    reason = ends[-1] if ends else SILENT_END
+    followers = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
+    errors = {system_id: _error(flown, system_id) for system_id in followers}
+    settled = _settling_time_s(errors, followers, scenario.safety.settled_fraction)
+    if not followers:
+        settled = _settled_velocity_s(scenario, flown)
+    jumps: dict[int, list[float]] = defaultdict(list)
+    for event in events:
+        if event["text"] == CLOCK_JUMPED:
+            jumps[event["system_id"]].append(event["time_s"])
+    loop_delay = flown["loop_delay_s"][flown["commanded"]]
+    headroom = flown["headroom"][flown["commanded"]]
+    return {
+        "scenario": scenario.name,
+        "verdict": verdict(reason, settled, logged=not any(text.startswith(TICKS_FILE) for text in not_logged)),
+        "reason": reason,
+        "fleet": said[FLEET][-1] if said[FLEET] else STARTED,
+        "not_logged": not_logged,
+        "loop": scenario.control.loop,
+        "delay_margin_s": _number(design["delay_margin_s"]),
+        "delay_margin_continuous_s": _number(design["delay_margin_continuous_s"]),
+        "response": design.get("response"),
+        "loop_delay_s": _spread(loop_delay),
+        "at_loop_delay": figures_at(design, _slowest_median_s(flown)),
+        "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
+        "settling_time_s": settled,
+        "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,
+        "duration_s": _number(flown["time_s"].max()) if flown.size else 0.0,
+        "vehicles": [
+            _vehicle(ticks, flown, v.system_id, errors.get(v.system_id), jumps_s=jumps[v.system_id])
+            for v in scenario.vehicles
+        ],
+        "control": _control(scenario, flown),
+        "refused": counts_of(events),
+        "mirror": counts_of(events, MIRROR),
+        "mode_changes": [e for e in events if e["kind"] == "mode" and e["time_s"] >= 0],
+        "files": [],
+    }
+
+
+def _slowest_median_s(flown: TickArray) -> float | None:
+    """The largest of the vehicles' median loop delays."""
+    medians: list[float] = []
+    for system_id in np.unique(flown["system_id"]):
+        own = flown["loop_delay_s"][(flown["system_id"] == system_id) & flown["commanded"]]
+        if (known := own[np.isfinite(own)]).size:
+            medians.append(float(np.median(known)))
+    return _number(max(medians, default=None))
+
+
+Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Times (s) and the norm of the spacing error (m) of one follower."""
+
+
+def verdict(reason: str, settling_time_s: float | None, *, logged: bool = True) -> str:
+    """ "stable", "unstable", "aborted" or "unknown".
+
+    Stable: flown to the end of its duration, and every spacing error had settled by then. Unstable: a limit was broken,
+    or a spacing error had not settled, be it that it grows, circles in a limit cycle or shrinks too slowly for the
+    scenario's duration. Aborted: ended early for any other reason. Unknown: flown to the end, but not all of it is in
+    the log of ticks.
+    """
+    if reason.startswith("broken"):
+        return "unstable"
+    if not reason.startswith("completed"):
+        return "aborted"
+    if not logged:
+        return "unknown"
+    return "unstable" if settling_time_s is None else "stable"
+
+
+def _error(flown: TickArray, system_id: int) -> Errors:
+    rows = flown[flown["system_id"] == system_id]
+    error = np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
+    known = np.isfinite(error)
+    return rows["time_s"][known], error[known]
+
+
+def _settling_time_s(errors: dict[int, Errors], spacing_m: dict[int, float], fraction: float) -> float | None:
+    """When the last follower came within its band for good; None if one has not."""
+    latest = 0.0
+    for system_id, (time_s, error_m) in errors.items():
+        outside = np.flatnonzero(error_m > fraction * spacing_m[system_id])
+        if not time_s.size or (outside.size and outside[-1] == time_s.size - 1):
+            return None
+        if outside.size:
+            latest = max(latest, float(time_s[outside[-1] + 1]))
+    return round(latest, 6)
+
+
+def _settled_velocity_s(scenario: Scenario, flown: TickArray) -> float | None:
+    """When a vehicle without followers came to its nominal velocity for good, within the same part of its speed."""
+    speed_m_s = float(np.hypot(*scenario.nominal_velocity[-1].velocity_ne_m_s))
+    error_m_s = np.hypot(flown["velocity_error_north_m_s"], flown["velocity_error_east_m_s"])
+    known = np.isfinite(error_m_s)
+    [leader] = scenario.vehicles
+    errors = {leader.system_id: (flown["time_s"][known], error_m_s[known])}
+    return _settling_time_s(errors, {leader.system_id: max(speed_m_s, 1.0)}, scenario.safety.settled_fraction)
+
+
+def _vehicle(
+    ticks: TickArray, flown: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float]
+) -> dict[str, Any]:
+    rows = ticks[ticks["system_id"] == system_id]
+    rtt = rows["rtt_s"]
+    own = flown[flown["system_id"] == system_id]
+    error_m = error[1] if error is not None and error[1].size else None
+    counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
+    return {
+        "system_id": system_id,
+        "spacing_error_final_m": None if error_m is None else _number(error_m[-1]),
+        "spacing_error_max_m": None if error_m is None else _number(error_m.max()),
+        "rtt_s": spread_with_status(rtt),
+        "loop_delay_s": spread_with_status(own["loop_delay_s"][own["commanded"]]),
+        "delay_margin_s": _margins(own["delay_margin_s"][own["commanded"]]),
+        "up_delay_s": _one_way(own["up_delay_s"], own["sample_bound_s"], own["commanded"]),
+        "down_delay_s": _one_way(own["down_delay_s"], own["down_bound_s"], own["commanded"]),
+        "telemetry_age_s": spread_with_status(own["telemetry_age_s"][own["commanded"]]),
+        "station_queue_s": spread_with_status(own["queue_s"][own["commanded"]]),
+        "clock": _clock(own, int(np.isfinite(rtt).sum()), jumps_s) | {"jumps": len(jumps_s)},
+        "mode_final": _mode_final(rows),
+        **counted,
+    }
+
+
+def _margins(flown_s: NDArray[np.float64]) -> dict[str, float | None]:
+    """The least and the largest delay margin of the gains that a vehicle was flown with."""
+    if not flown_s.size:
+        return {"min": None, "max": None}
+    return {"min": _number(flown_s.min()), "max": _number(flown_s.max())}
+
+
+def _mode_final(rows: TickArray) -> str | None:
+    """The last mode that was not WAITING, in which every vehicle is once it is told to hold at the end."""
+    flown = rows[rows["mode"] != Mode.WAITING]
+    return Mode(int((flown if flown.size else rows)["mode"][-1])).name if rows.size else None
+
+
+def spread_with_status(values: NDArray[np.float64]) -> dict[str, Any]:
+    """The spread of an estimate with its status and the number of its samples."""
+    samples = int(np.isfinite(values).sum())
+    return _spread(values) | {"samples": samples, "status": "measured" if samples else "unknown"}
+
+
+def _one_way(
+    delay_s: NDArray[np.float64], bound_s: NDArray[np.float64], commanded: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """The spread of a one-way delay, and the largest bound of the error that the vehicle's clock brings into it."""
+    known = commanded & np.isfinite(delay_s) & np.isfinite(bound_s)
+    return spread_with_status(delay_s[commanded]) | {"bound_s": _number(bound_s[known].max()) if known.any() else None}
+
+
+def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> dict[str, Any]:
+    """The vehicle's boot clock against the station's: offset as last estimated, skew since the last jump, and bounds.
+
+    The skew is that of the straight line between the first and the last offset, each wrong by its bound at most.
+    """
+    known = own[np.isfinite(own["clock_offset_s"])]
+    if not known.size:
+        return {"status": "unknown", "samples": 0} | dict.fromkeys(
+            ("offset_s", "bound_s", "skew_ppm", "skew_bound_ppm")
+        )
+    offset_s, bound_s = known["clock_offset_s"], known["clock_offset_bound_s"]
+    steady = np.flatnonzero(known["time_s"] > max(jumps_s, default=-np.inf))
+    skew_ppm = skew_bound_ppm = None
+    if steady.size:
+        first = steady[0]
+        span_s = (known["due_ns"][-1] - known["due_ns"][first]) * 1e-9
+        if span_s > _SKEW_SPAN_S:
+            skew_ppm = _number(1e6 * (offset_s[-1] - offset_s[first]) / span_s)
+            skew_bound_ppm = _number(1e6 * (bound_s[-1] + bound_s[first]) / span_s)
+    return {
+        "status": "measured",
+        "samples": exchanges,
+        "offset_s": _number(offset_s[-1]),
+        "bound_s": _number(bound_s[-1]),
+        "skew_ppm": skew_ppm,
+        "skew_bound_ppm": skew_bound_ppm,
+    }
+
+
+def _control(scenario: Scenario, flown: TickArray) -> dict[str, Any]:
+    """Ticks flown, and deadline misses: set-points sent later than half a period after they were due, or not at all."""
+    period_s = 1.0 / scenario.rates.control_hz
+    ticks, first = np.unique(flown["tick"], return_index=True)
+    late_s = (flown["sent_ns"][first] - flown["due_ns"][first]) * 1e-9
+    skipped = int(ticks[-1] - ticks[0] + 1 - ticks.size) if ticks.size else 0
+    return {
+        "rate_hz": scenario.rates.control_hz,
+        "ticks": int(ticks.size),
+        "deadline_misses": skipped + int((late_s > period_s / 2).sum()),
+        "lateness_s": _spread(late_s),
+    }
+
+
+def _spread(values: NDArray[np.float64]) -> dict[str, float | None]:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return {"p50": None, "p95": None, "p99": None, "max": None}
+    p50, p95, p99 = np.percentile(known, [50, 95, 99])
+    return {"p50": _number(p50), "p95": _number(p95), "p99": _number(p99), "max": _number(known.max())}
+
+
+def _number(value: Any) -> float | None:
+    """A finite float, or None: JSON has no infinity, and an unbounded margin has no number."""
+    number = float(value) if value is not None else np.nan
+    return round(number, 9) if np.isfinite(number) else None

@@ -1,0 +1,1 @@
+"""The station as a pure machine: `station.step()`, the monitor, and when a flight ends."""

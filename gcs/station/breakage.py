@@ -1,0 +1,111 @@
+"""When a flight is ended because the formation is broken: a collision, or a spacing error past the limit.
+
+A vehicle that comes back, from its pilot, from its failsafe or from silence, may be far from its place, and so is every
+vehicle behind it from the place that it now gives them. Their errors say nothing of the loop until they have had the
+time to come back.
+"""
+
+from collections.abc import Sequence
+from math import hypot, inf, isfinite, isnan, log, nan, sqrt
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gcs.control.law import VehicleControl
+from gcs.control.tick import Mode
+from gcs.plan.flight_plan import FlightPlan
+from gcs.station.monitor import VehicleState
+
+_TIME_CONSTANTS = 3.0
+"""After so many an error has decayed to a twentieth."""
+_AWAY = (Mode.LOST, Mode.FAILSAFE)
+
+
+class Breakage:
+    """Judges every tick of a flight, and remembers who is on the way back."""
+
+    def __init__(self, plan: FlightPlan) -> None:
+        n = len(plan.formation.system_ids)
+        self._plan = plan
+        self._safety = plan.scenario.safety
+        self._decay_1_s = slowest_decay_1_s(plan)
+        self._away = [False] * n
+        self._judged_from_s = [-inf] * n
+        self._behind: list[list[int]] = [[row] for row in range(n)]
+        """Each vehicle with all that follow it, directly or not."""
+        for row in range(n - 1, 0, -1):
+            self._behind[int(plan.formation.predecessor[row])] += self._behind[row]
+
+    def judge(
+        self,
+        controls: Sequence[VehicleControl],
+        states: Sequence[VehicleState],
+        absent: Sequence[str],
+        distance_m: FloatArray,
+        nearest_m: Sequence[float],
+        time_s: float,
+    ) -> str:
+        """Why the flight has to end at this tick; empty if it may go on."""
+        ids = self._plan.formation.system_ids
+        closest_m = min((distance for distance in nearest_m if not isnan(distance)), default=nan)
+        if closest_m < self._safety.collision_distance_m:
+            one, two = (ids[row] for row in divmod(int(np.nanargmin(distance_m)), len(controls)))
+            return f"broken: vehicles {one} and {two} have collided, {closest_m:.1f} m apart"
+        for row, (state, why) in enumerate(zip(states, absent, strict=True)):
+            if why or state.released or state.mode in _AWAY:
+                self._away[row] = True
+            elif self._away[row]:
+                self._come_back(row, controls, time_s)
+        limit_m = self._safety.spacing_error_limit_m
+        for row, control in enumerate(controls):
+            error_m = hypot(*control.spacing_error_m)
+            if error_m > limit_m and not self._away[row] and time_s >= self._judged_from_s[row]:
+                return f"broken: spacing error of vehicle {ids[row]} is {error_m:.0f} m, limit {limit_m:g} m"
+        return ""
+
+    def _come_back(self, row: int, controls: Sequence[VehicleControl], time_s: float) -> None:
+        """Give a vehicle and all behind it their time, once it is known how far they have to go."""
+        distances_m = [self._way_m(controls[other]) for other in self._behind[row]]
+        if not isfinite(distances_m[0]):
+            return
+        self._away[row] = False
+        way_m = max(distance for distance in distances_m if isfinite(distance))
+        speed_m_s = hypot(*self._plan.scenario.nominal_velocity_at(time_s))
+        until_s = time_s + recovery_time_s(self._plan, self._decay_1_s, way_m, speed_m_s)
+        for other in self._behind[row]:
+            self._judged_from_s[other] = max(self._judged_from_s[other], until_s)
+
+    def _way_m(self, control: VehicleControl) -> float:
+        """The spacing error, and how far the velocity error carries until it has decayed; NaN while unknown."""
+        spacing_m = hypot(*control.spacing_error_m)
+        carried_m = hypot(*control.velocity_error_m_s) / self._decay_1_s if self._decay_1_s > 0 else 0.0
+        return carried_m + (0.0 if isnan(spacing_m) else spacing_m)  # the leader has no spacing error
+
+
+def slowest_decay_1_s(plan: FlightPlan) -> float:
+    """Decay rate, without delay, of the slowest gains of the schedule: those that a vehicle comes back with."""
+    model = plan.model
+    closed_loop = model.A + model.B @ plan.gains[-1]
+    loops = [closed_loop]
+    if plan.separable:
+        own = [model.output_slice(row) for row in range(model.vehicles)]
+        loops = [closed_loop[rows, rows] for rows in own]
+    return -max(float(np.linalg.eigvals(loop).real.max()) for loop in loops)
+
+
+def recovery_time_s(plan: FlightPlan, decay_1_s: float, way_m: float, speed_m_s: float) -> float:
+    """How long a vehicle may take to come back over a distance, before its spacing error is judged.
+
+    Three time constants of the slowest gains, and as many more as it takes from there to the spacing error limit. With
+    limits of acceleration and speed also twice the time in which these alone cover the distance: to speed up and to
+    slow down again, and to fly it with what the formation's own speed leaves. None for gains that do not decay.
+    """
+    if decay_1_s <= 0:
+        return 0.0
+    limits = plan.scenario.limits
+    time_s = (_TIME_CONSTANTS + log(max(1.0, way_m / plan.scenario.safety.spacing_error_limit_m))) / decay_1_s
+    if limits.acceleration_max_m_s2 is not None:
+        time_s += 2.0 * 2.0 * sqrt(way_m / limits.acceleration_max_m_s2)
+    if limits.speed_max_m_s is not None and limits.speed_max_m_s > speed_m_s:
+        time_s += 2.0 * way_m / (limits.speed_max_m_s - speed_m_s)
+    return time_s

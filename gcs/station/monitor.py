@@ -1,0 +1,273 @@
+"""The monitor: from measured loop delays to modes, and what is done before the margin is reached.
+
+`monitored` is the whole decision for one vehicle, as a pure function. A change of gains is blended in over time, so
+that commands do not jump.
+
+What is done, in this order, as headroom goes:
+
+1. CRITICAL: the vehicle's gains change to the next slower set of the schedule, which has a larger margin.
+2. Slowest set and still CRITICAL: the whole formation is opened to `open_factor` times its spacing.
+3. Slowest set and no headroom: vehicles are released to their failsafe, those farthest down the tree first.
+
+As the link returns it is undone in the reverse order.
+"""
+
+from dataclasses import dataclass, replace
+from math import isnan, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from gcs.control.law import Blend
+from gcs.control.tick import Mode
+from scenarios.schema import Monitor
+
+
+@dataclass(frozen=True)
+class VehicleState:
+    """What the monitor remembers of one vehicle. Times are scenario times in s."""
+
+    mode: Mode = Mode.WAITING
+    gain_set: int = 0
+    """Place in the schedule, 0 the fastest."""
+    former_set: int = 0
+    """The set flown before the last change; blended out until `changed_s` + blend_s."""
+    changed_s: float = -1e9
+    pressed_s: float | None = None
+    """Since when headroom has called for the slower side."""
+    eased_s: float | None = None
+    """Since when headroom has allowed the faster side."""
+    released: bool = False
+
+
+class Observation(NamedTuple):
+    """What is known of one vehicle at a tick. `loop_delay_s` may be NaN (unknown)."""
+
+    time_s: float
+    flying: bool
+    silent: bool
+    guided: bool
+    failsafe: bool
+    loop_delay_s: float
+
+
+def headroom(loop_delay_s: float, delay_margin_s: float) -> float:
+    """1 - loop delay / margin; NaN while the loop delay is unknown, minus infinity if there is no margin."""
+    return 1.0 - loop_delay_s / delay_margin_s if delay_margin_s > 0 else float("-inf")
+
+
+def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> VehicleState:
+    """The state after one tick.
+
+    h is the headroom against the margin of the set flown, h+ that against the next faster set; hold and ease are
+    `policy.hold_s` and `policy.ease_s`; a condition "for hold" has lasted that long. First row that fits:
+
+    ==================  ====================================================  ============================
+    from                when                                                  to
+    ==================  ====================================================  ============================
+    any                 formation not flown, vehicle in failsafe              FAILSAFE
+    any                 formation not flown                                   WAITING
+    any                 silent                                                LOST
+    any                 not guided                                            FAILSAFE
+    LOST, FAILSAFE      heard and guided again                                RECOVERING, slowest set
+    WAITING             guided                                                NOMINAL, fastest set
+    any                 h < critical for hold, slower set there               CRITICAL, next slower set
+    any                 h < critical for hold, slowest set                    CRITICAL
+    CRITICAL            h < 0 for hold, slowest set                           FAILSAFE, released
+    any, released       h > caution + hysteresis for ease                     FAILSAFE, no longer released
+    any, released       otherwise                                             FAILSAFE
+    any, slower set     h+ > caution + hysteresis for ease                    RECOVERING, next faster set
+    CRITICAL            h > critical + hysteresis for hold                    CAUTION
+    NOMINAL             h < caution                                           CAUTION
+    CAUTION             h > caution + hysteresis for hold, fastest set        NOMINAL
+    RECOVERING          gains blended in: fastest set / slower set            NOMINAL / CAUTION
+    ==================  ====================================================  ============================
+
+    While gains are being blended no other change of gains is made. With `policy.act` off the modes are the same, but
+    the set stays the fastest and nothing is released.
+    """
+    if not seen.flying:
+        return replace(VehicleState(), mode=Mode.FAILSAFE if seen.failsafe else Mode.WAITING)
+    if seen.silent:
+        return replace(state, mode=Mode.LOST, pressed_s=None, eased_s=None)
+    slowest = len(margins_s) - 1 if policy.act else 0
+    if not seen.guided and not state.released:
+        return replace(state, mode=Mode.FAILSAFE, pressed_s=None, eased_s=None)
+    if state.mode in (Mode.LOST, Mode.FAILSAFE) and not state.released:
+        return _changed(replace(state, mode=Mode.RECOVERING), slowest, seen.time_s)
+    if state.mode is Mode.WAITING:
+        return replace(state, mode=Mode.NOMINAL)
+    calm = _is_calm(state, seen, margins_s, policy)
+    return state if calm else _by_headroom(state, seen, margins_s, slowest, policy)
+
+
+def _is_calm(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> bool:
+    """NOMINAL with enough headroom, or with an unknown one, and nothing being counted: most ticks of most flights."""
+    nominal = state.mode is Mode.NOMINAL and state.pressed_s is None and state.eased_s is None
+    return nominal and not headroom(seen.loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
+
+
+def _by_headroom(
+    state: VehicleState, seen: Observation, margins_s: tuple[float, ...], slowest: int, policy: Monitor
+) -> VehicleState:
+    """The rows of the table that depend on headroom."""
+    now_s = seen.time_s
+    own = headroom(seen.loop_delay_s, margins_s[state.gain_set])
+    faster = headroom(seen.loop_delay_s, margins_s[max(state.gain_set - 1, 0)])
+    if state.released:
+        faster = own  # what it has to come back to is the slowest set
+    last_resort = state.gain_set == slowest and state.mode is Mode.CRITICAL and not state.released
+    limit = 0.0 if last_resort else policy.critical_headroom
+    pressed_s = _since(state.pressed_s, own < limit, now_s)
+    eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)
+    if (pressed_s, eased_s) != (state.pressed_s, state.eased_s):  # a copy costs more than all the rest
+        state = replace(state, pressed_s=pressed_s, eased_s=eased_s)
+    blending = now_s < state.changed_s + policy.blend_s
+    if not blending and _lasted(state.pressed_s, policy.hold_s, now_s) and not state.released:
+        pressed = replace(state, mode=Mode.CRITICAL, pressed_s=None, eased_s=None)
+        if state.gain_set < slowest:
+            return _changed(pressed, state.gain_set + 1, now_s)
+        if policy.act and last_resort:
+            return replace(pressed, mode=Mode.FAILSAFE, released=True)
+        return pressed
+    if not blending and _lasted(state.eased_s, policy.ease_s, now_s):
+        if state.released:
+            return replace(state, released=False, mode=Mode.FAILSAFE, eased_s=None)
+        if state.gain_set > 0:
+            return _changed(replace(state, mode=Mode.RECOVERING, eased_s=None), state.gain_set - 1, now_s)
+    mode = _calm_mode(state, own, blending=blending, policy=policy, now_s=now_s)
+    return state if mode is state.mode else replace(state, mode=mode)
+
+
+def _calm_mode(state: VehicleState, own: float, *, blending: bool, policy: Monitor, now_s: float) -> Mode:
+    """The mode when the gains stay as they are."""
+    if state.released:
+        return Mode.FAILSAFE
+    fastest = state.gain_set == 0
+    match state.mode:
+        case Mode.CRITICAL if own > policy.critical_headroom + policy.hysteresis and not blending:
+            return Mode.CAUTION
+        case Mode.NOMINAL if own < policy.caution_headroom:
+            return Mode.CAUTION
+        case Mode.CAUTION if fastest and _lasted(state.eased_s, policy.hold_s, now_s):
+            return Mode.NOMINAL
+        case Mode.RECOVERING if not blending:
+            return Mode.NOMINAL if fastest else Mode.CAUTION
+        case _:
+            return state.mode
+
+
+def _changed(state: VehicleState, gain_set: int, now_s: float) -> VehicleState:
+    if gain_set == state.gain_set:
+        return state
+    return replace(state, former_set=state.gain_set, gain_set=gain_set, changed_s=now_s)
+
+
+def _since(since_s: float | None, holds: bool, now_s: float) -> float | None:
+    if not holds:
+        return None
+    return now_s if since_s is None else since_s
+
+
+def _lasted(since_s: float | None, wanted_s: float, now_s: float) -> bool:
+    return since_s is not None and now_s - since_s >= wanted_s
+
+
+class FleetView(NamedTuple):
+    """What the station knows of all vehicles at a tick, in the order of the formation."""
+
+    time_s: float
+    flying: bool
+    silent: list[bool]
+    guided: list[bool]
+    failsafe: list[bool]
+    loop_delay_s: list[float]
+    """NaN where unknown."""
+
+
+class FormationMonitor:
+    """The monitor of a whole formation: one state for each vehicle, and how far the formation is opened.
+
+    `separable` says that every vehicle's loop has a margin of its own, as in a leader-follower tree; otherwise the
+    worst loop delay counts for all, and all change gains together.
+    """
+
+    def __init__(
+        self, vehicles: int, margins_s: tuple[float, ...], policy: Monitor, *, separable: bool, period_s: float
+    ) -> None:
+        self.states = [VehicleState() for _ in range(vehicles)]
+        self.margins_s = margins_s
+        self.opening = 1.0
+        """Factor on the formation's spacing."""
+        self._policy = policy
+        self._separable = separable
+        self._period_s = period_s
+        self._delays_s = np.full((max(1, round(policy.window_s / period_s)), vehicles), np.nan)
+        self._judged = 0
+        """Ticks of this flight so far."""
+        self._settled = [Blend(gain_set, gain_set, 1.0) for gain_set in range(len(margins_s))]
+
+    def update(self, view: FleetView) -> list[tuple[int, VehicleState, VehicleState]]:
+        """Judge a tick; returns the vehicles whose mode, gain set or release changed, with both states."""
+        if view.flying:
+            self._delays_s[self._judged % len(self._delays_s)] = view.loop_delay_s
+            self._judged += 1
+        else:
+            self._judged = 0  # before the flight telemetry is slow, which says nothing of the loop that is not closed
+        delays_s = self._judged_delay_s()
+        changes: list[tuple[int, VehicleState, VehicleState]] = []
+        states: list[VehicleState] = []
+        for row, before in enumerate(self.states):
+            seen = Observation(
+                view.time_s, view.flying, view.silent[row], view.guided[row], view.failsafe[row], delays_s[row]
+            )
+            after = monitored(before, seen, self.margins_s, self._policy)
+            if after is not before:
+                if after.released and not before.released and row != self._next_to_release():
+                    after = replace(after, mode=Mode.CRITICAL, released=False)  # somebody behind goes first
+                if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
+                    changes.append((row, before, after))
+            states.append(after)
+        self.states = states
+        self._open(view.time_s, flying=view.flying)
+        return changes
+
+    def blends(self, time_s: float) -> list[Blend]:
+        """The gains that each vehicle is flown with."""
+        blend_s = self._policy.blend_s
+        return [
+            Blend(s.gain_set, s.former_set, min(1.0, max(0.0, (time_s - s.changed_s) / blend_s)))
+            if time_s - s.changed_s < blend_s
+            else self._settled[s.gain_set]
+            for s in self.states
+        ]
+
+    def _judged_delay_s(self) -> list[float]:
+        count = min(self._judged, len(self._delays_s))
+        if count == 0:
+            return [nan] * len(self.states)
+        # NaN sorts last: a vehicle with more than a tenth of unknown ticks has an unknown delay.
+        rank = min(count - 1, int(0.9 * count))
+        judged: list[float] = np.partition(self._delays_s[:count], rank, axis=0)[rank].tolist()
+        if self._separable:
+            return judged
+        return [nan if any(map(isnan, judged)) else max(judged)] * len(judged)
+
+    def _next_to_release(self) -> int:
+        """The vehicle that may be released now: the CRITICAL one farthest down the tree."""
+        for row in range(len(self.states) - 1, -1, -1):
+            state = self.states[row]
+            if not state.released and state.mode is Mode.CRITICAL:
+                return row
+        return -1
+
+    def _open(self, time_s: float, *, flying: bool) -> None:
+        """Open the formation, free of jumps, while somebody is CRITICAL or gone on the slowest gains."""
+        slowest, troubled = len(self.margins_s) - 1, (Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST)
+        settled_s = time_s - self._policy.blend_s  # just changed, the slowest gains have still to show what they can do
+        wide = self._policy.act and any(
+            s.gain_set == slowest and s.mode in troubled and s.changed_s < settled_s for s in self.states
+        )
+        goal = self._policy.open_factor if wide and flying else 1.0
+        step = (self._policy.open_factor - 1.0) * self._period_s / self._policy.open_s
+        self.opening += min(step, max(-step, goal - self.opening))

@@ -1,0 +1,429 @@
+"""The ground station as a pure machine: datagrams and the time in, datagrams and tick records out.
+
+One loop: receive, decide, command, record. No socket, clock or file is touched here; a driver feeds `step` in real time
+or in virtual time, with the same bytes.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable
+from math import isfinite, nan
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gcs.autopilot.copters import Copters
+from gcs.control.history import StateHistory
+from gcs.control.law import VehicleControl, distances_m, formation_control
+from gcs.control.limits import SetPointLimits
+from gcs.control.onboard_stream import Stream, law_of, set_point, upload_of
+from gcs.control.phases import Phase, next_phase, patience_s
+from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
+from gcs.link import mavlink
+from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.kinds import Goal
+from gcs.link.startup import Startup
+from gcs.link.vehicle import SILENCE_S, RemoteVehicle
+from gcs.plan.flight_plan import FlightPlan
+from gcs.station.absence import absences, end_reason, told
+from gcs.station.breakage import Breakage
+from gcs.station.monitor import FleetView, FormationMonitor
+from gcs.station.tick_rows import Repetitions, Reported, Tick, VehicleTick, tick_rows
+from scenarios.schema import NS_PER_S
+
+AUTOPILOT_COMPONENT = 1
+"""A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
+ANOTHER_ADDRESS = "known system id from another address"
+_HEARTBEAT_NS = NS_PER_S
+
+
+class Event(NamedTuple):
+    time_s: float
+    kind: str
+    text: str
+    system_id: int | None = None
+
+
+class Station:
+    """Flies one formation. `start_ns` is the time of the first control tick."""
+
+    def __init__(self, plan: FlightPlan, *, start_ns: int) -> None:
+        scenario = plan.scenario
+        rates = scenario.rates
+        autopilots = scenario.dynamics == "autopilot"
+        self.plan = plan
+        self.phase = Phase.CONNECTING
+        self.end_reason = ""
+        self.events: list[Event] = []
+        self.frames: list[tuple[bytes, int]] = []
+        """Frames received since the driver last took them, with their receive time."""
+        self.counters: Counter[str] = Counter()
+        self.vehicles = [
+            RemoteVehicle(
+                system_id,
+                telemetry_hz=rates.telemetry_hz,
+                report=self._reporter(system_id),
+                startup=Startup(altitude_m=scenario.altitude_m, telemetry_interval_us=round(1e6 / rates.telemetry_hz))
+                if autopilots
+                else None,
+                land=scenario.at_end == "land",
+                upload=upload_of(plan, system_id),
+            )
+            for system_id in plan.formation.system_ids
+        ]
+        n = len(self.vehicles)
+        self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
+        self._history = StateHistory(n)
+        self._law = law_of(plan, [False] * n)
+        self._stream = Stream(plan) if scenario.control.loop == "onboard" else None
+        self._breakage = Breakage(plan)
+        self._limits = SetPointLimits.of(scenario.limits)
+        self._control = formation_control if self._stream is None else self._stream.control
+        self._period_ns = round(NS_PER_S / rates.control_hz)
+        self._monitor = FormationMonitor(
+            n,
+            plan.margins_s,
+            plan.scenario.monitor,
+            separable=plan.separable,
+            period_s=self._period_ns / NS_PER_S,
+        )
+        self._copters = Copters(plan, self.vehicles, self._report) if autopilots else None
+        self.patience_s = patience_s(scenario)
+        self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
+        self._start_ns = start_ns
+        self._phase_since_ns = start_ns
+        self._flight_start_ns: int | None = None
+        self._next_tick_ns = start_ns
+        self._next_heartbeat_ns = start_ns
+        # Requests are spread over the interval, half a period off the ticks, so that they do not wait for set-points.
+        self._next_timesync_ns = start_ns + self._period_ns // 2
+        self._timesync_spacing_ns = max(1, self._timesync_ns // n)
+        self._timesync_row = 0
+        self._tick_count = 0
+        self._stop = ""
+        self._now_ns = start_ns
+        self._reported = [Reported()] * n
+        self._repetitions = Repetitions(rates, n)
+        self._telemetry_ns = [0] * n
+        self._fresh_rtt_s = [deque[float]() for _ in range(n)]
+        self._loop_delay_s = [nan] * n
+        self._absent = [""] * n
+
+    @property
+    def next_event_ns(self) -> int:
+        """When `step` next has something to do of its own accord."""
+        return min(self._next_tick_ns, self._next_heartbeat_ns, self._next_timesync_ns)
+
+    def request_stop(self, reason: str) -> None:
+        """End the flight at the next tick: the vehicles are told to hold, and seen to."""
+        self._stop = self._stop or reason
+
+    def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
+        """Take datagrams in and do what is due.
+
+        Returns
+        -------
+        datagrams to send, and the control tick if one was due. The driver passes it to `complete` once the datagrams
+        are sent.
+        """
+        self._now_ns = now_ns
+        outgoing: list[Outgoing] = []
+        for datagram in datagrams:
+            self._receive(datagram, outgoing)
+        tick = None
+        if now_ns >= self._next_tick_ns:
+            tick = self._tick(outgoing)
+        if now_ns >= self._next_heartbeat_ns:
+            self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
+            for vehicle in self.vehicles:
+                self._send(vehicle, mavlink.HEARTBEAT, mavlink.heartbeat(), outgoing)
+        while now_ns >= self._next_timesync_ns:
+            self._request_timesync(outgoing)
+        return outgoing, tick
+
+    def complete(self, tick: Tick, sent_ns: int) -> TickArray:
+        """The rows of a tick, now that it is known when its set-points were sent: ages, loop delays, headroom."""
+        rows, self._loop_delay_s = tick_rows(tick, sent_ns)
+        return rows
+
+    def scenario_time_s(self, now_ns: int) -> float:
+        """Time since the formation flight began; before that, time since the start minus the patience, below 0."""
+        if self._flight_start_ns is None:
+            return (now_ns - self._start_ns) / NS_PER_S - self.patience_s
+        return (now_ns - self._flight_start_ns) / NS_PER_S
+
+    def is_another(self, system_id: int, datagram: Datagram) -> bool:
+        """Whether a frame claims the system id of a vehicle that is known to speak from another address."""
+        row = self._row.get(system_id)
+        return row is not None and self.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
+
+    # -- receive ---------------------------------------------------------------------------------------------------
+
+    def _receive(self, datagram: Datagram, outgoing: list[Outgoing]) -> None:
+        if self._copters is not None and datagram.data[:1] == b"\xfe":
+            frames = mavlink.first_heartbeats(datagram.data)  # answered in MAVLink 2, it goes on with that
+        else:
+            frames = mavlink.decode(datagram.data, self.counters)
+        for frame in frames:
+            row = self._row.get(frame.system_id)
+            if row is None:
+                self.counters["unknown system id"] += 1
+                continue
+            vehicle = self.vehicles[row]
+            if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
+                self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
+                continue
+            if vehicle.address != datagram.address:
+                vehicle.address = datagram.address
+                self._report("vehicle", "found", vehicle.system_id)
+            vehicle.heard_ns = datagram.received_ns
+            vehicle.first_heard_ns = vehicle.first_heard_ns or datagram.received_ns
+            self.frames.append((frame.data, datagram.received_ns))
+            if frame.component_id != AUTOPILOT_COMPONENT:
+                self.counters["other component"] += 1
+                continue
+            if vehicle.is_replay(frame, datagram.received_ns):
+                continue
+            self._handle(row, vehicle, frame, datagram, outgoing)
+
+    def _handle(
+        self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]
+    ) -> None:
+        fields = frame.fields
+        match frame.msg_id:
+            case mavlink.LOCAL_POSITION_NED:
+                self._position(row, vehicle, frame, datagram, outgoing)
+            case mavlink.TIMESYNC:
+                tc1_ns, ts1_ns = fields
+                if tc1_ns == 0:
+                    reply = mavlink.timesync(tc1_ns=datagram.received_ns, ts1_ns=ts1_ns)
+                    self._send(vehicle, mavlink.TIMESYNC, reply, outgoing)
+                else:
+                    self._timesync_reply(row, vehicle, tc1_ns, ts1_ns, datagram.received_ns)
+            case mavlink.HEARTBEAT:
+                vehicle.heartbeat(fields, datagram.received_ns)
+            case mavlink.PARAM_VALUE if vehicle.upload is not None:
+                vehicle.upload.take(fields)
+            case mavlink.COMMAND_ACK:
+                vehicle.acknowledge(fields, datagram.received_ns)
+            case mavlink.STATUSTEXT:
+                text = fields[1].split(b"\0")[0].decode(errors="replace")
+                self.events.append(Event(self.scenario_time_s(self._now_ns), "statustext", text, vehicle.system_id))
+            case _:
+                pass
+        if vehicle.startup is not None:
+            vehicle.startup.take(frame.msg_id, fields)
+
+    def _position(
+        self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]
+    ) -> None:
+        boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
+        clock = vehicle.clock
+        sample_ns = clock.sampled_ns(boot_ms, datagram.received_ns, newest=vehicle.newest)
+        if sample_ns is None:
+            if not clock.exchange_due:
+                self._telemetry_ns[row] = datagram.received_ns  # it is heard, before the first exchange
+            elif self._now_ns - clock.asked_ns >= self._period_ns:
+                self._exchange(vehicle, outgoing)
+            return
+        origin_north, origin_east, origin_down = self._copters.frame_ned_m[row] if self._copters else (0.0, 0.0, 0.0)
+        if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
+            return
+        self._telemetry_ns[row] = datagram.received_ns  # only what is new: a replay does not make up for silence
+        bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
+        queue_s, received_ns = datagram.queued_ns * 1e-9, datagram.received_ns
+        self._reported[row] = Reported(boot_ms, down + origin_down, v_down, queue_s, received_ns, bound_s)
+
+    def _timesync_reply(self, row: int, vehicle: RemoteVehicle, tc1_ns: int, ts1_ns: int, received_ns: int) -> None:
+        jumps = vehicle.clock.jumps
+        rtt_ns = vehicle.clock.reply(tc1_ns=tc1_ns, ts1_ns=ts1_ns, received_ns=received_ns)
+        if rtt_ns is not None:
+            self._fresh_rtt_s[row].append(rtt_ns * 1e-9)
+        if vehicle.clock.jumps != jumps:
+            self._history.forget(row)
+            vehicle.forget_rates()
+            self.events.append(Event(self.scenario_time_s(self._now_ns), "vehicle", CLOCK_JUMPED, vehicle.system_id))
+
+    # -- the control tick ------------------------------------------------------------------------------------------
+
+    def _tick(self, outgoing: list[Outgoing]) -> Tick:
+        due_ns = self._next_tick_ns
+        behind = (self._now_ns - due_ns) // self._period_ns
+        self._next_tick_ns = due_ns + (behind + 1) * self._period_ns  # ticks that were slept through are left out
+        self._decide(due_ns, outgoing)
+        if self._copters is not None and self.phase is Phase.CONNECTING:
+            self._copters.locate(self._history)
+        flying = self.phase is Phase.FLYING
+        time_s = self.scenario_time_s(due_ns)
+        controls = self._control(
+            self._history,
+            self._law,
+            self._monitor.blends(time_s),
+            nominal_velocity_m_s=self.plan.scenario.nominal_velocity_at(time_s),
+            opening=self._monitor.opening,
+        )
+        controls = [c._replace(command_m_s2=self._limits.command(c.command_m_s2)) for c in controls]
+        distance_m = distances_m(controls, due_ns)
+        nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
+        if flying:
+            states = self._monitor.states
+            self.request_stop(self._breakage.judge(controls, states, self._absent, distance_m, nearest_m, time_s))
+        key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
+        seen: list[VehicleTick] = []
+        for row, (vehicle, control, monitored, nearest) in enumerate(
+            zip(self.vehicles, controls, self._monitor.states, nearest_m, strict=True)
+        ):
+            north, east = control.command_m_s2
+            commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
+            fields = self._set_point(row, control, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
+            if fields is not None:
+                fields = self._limits.set_point(fields)  # the last thing done to anything that leaves
+                self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
+            margin_s = self.plan.margins_s[monitored.gain_set]
+            fresh_s = self._fresh_rtt_s[row]
+            reported, rtt_s = self._reported[row], fresh_s.popleft() if fresh_s else nan
+            repeated_s = self._repetitions.repeated_s(row, control.used_ns, due_ns)
+            seen.append(
+                VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, margin_s, repeated_s)
+            )
+        for vehicle in self.vehicles:
+            frame = vehicle.converse(self._now_ns)
+            if frame is not None and vehicle.address is not None:
+                outgoing.append(Outgoing(frame, vehicle.address))
+        tick = Tick(self._tick_count, time_s, due_ns, key_ms, seen)
+        self._tick_count += 1 + behind
+        return tick
+
+    def _decide(self, due_ns: int, outgoing: list[Outgoing]) -> None:
+        """Modes, lost vehicles and the flight's phase."""
+        flying = self.phase is Phase.FLYING
+        silence_ns = SILENCE_S * NS_PER_S
+        silent = [self._now_ns - heard_ns > silence_ns for heard_ns in self._telemetry_ns]
+        absent = absences(self.vehicles, silent) if flying else [""] * len(silent)
+        if absent != self._absent:
+            for vehicle, now, was in zip(self.vehicles, absent, self._absent, strict=True):
+                if now != was and flying:
+                    self._report("vehicle", told(was, now), vehicle.system_id)
+            self._absent = absent
+            self._law = law_of(self.plan, [why != "" for why in absent])
+        view = FleetView(
+            time_s=self.scenario_time_s(due_ns),
+            flying=flying,
+            silent=silent,
+            guided=[vehicle.guided for vehicle in self.vehicles],
+            failsafe=[vehicle.critical for vehicle in self.vehicles],
+            loop_delay_s=self._loop_delay_s,
+        )
+        for row, before, after in self._monitor.update(view):
+            vehicle = self.vehicles[row]
+            if flying:
+                vehicle.goal = None if after.released else Goal.FLY
+            if after.mode is not before.mode:
+                self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
+                self._tell(vehicle, after.mode, after.mode.name, outgoing)
+            if after.released != before.released and flying:
+                text = "is released to its failsafe" if after.released else "is called back"
+                self._report("vehicle", text, vehicle.system_id)
+            if after.gain_set != before.gain_set and flying:
+                margin_s = self.plan.margins_s[after.gain_set]
+                self._report("gains", f"gain set {after.gain_set}, delay margin {margin_s:.3f} s", vehicle.system_id)
+                self._tell(vehicle, after.mode, f"{GAIN_SET}{after.gain_set}", outgoing)
+        self._next_phase(due_ns)
+
+    def _next_phase(self, due_ns: int) -> None:
+        waited_s = (due_ns - self._phase_since_ns) / NS_PER_S
+        if self.phase is Phase.CONNECTING:
+            self._lose_patience(due_ns, waited_s)
+        if self.phase is Phase.IDENTIFYING:
+            self._identify(due_ns)
+        if self.phase is Phase.FLYING and (waited_s >= self.plan.scenario.duration_s or all(self._absent)):
+            self.request_stop(end_reason(self.vehicles, self._absent))
+        phase = next_phase(
+            self.phase,
+            all_ready=self.phase is Phase.CONNECTING
+            and self._history.complete
+            and all(vehicle.ready for vehicle in self.vehicles),
+            stop=bool(self._stop),
+            all_holding=all(v.ended for v in self.vehicles if v.address is not None),
+            waited_s=waited_s,
+            identified=self._copters is None or self._copters.identified,
+        )
+        if phase is self.phase:
+            return
+        self.phase, self._phase_since_ns = phase, due_ns
+        if phase is Phase.FLYING:
+            self._flight_start_ns = due_ns
+        if phase is Phase.ENDING:
+            self.end_reason = self._stop
+            for vehicle in self.vehicles:
+                # A formation that broke is left to its own failsafe: what broke may be the link. That of an autopilot
+                # may be to fly on.
+                alone = self._stop.startswith("broken") and self._copters is None
+                vehicle.goal = None if alone else Goal.END
+        self._report("phase", str(phase))
+
+    def _lose_patience(self, due_ns: int, waited_s: float) -> None:
+        if self._copters is not None:
+            reason = self._copters.impatience(due_ns, self._start_ns)
+            if reason:
+                self.request_stop(reason)
+        elif any(vehicle.refused for vehicle in self.vehicles):
+            refusals = [f"vehicle {v.system_id}: {v.missing}" for v in self.vehicles if v.refused]
+            self.request_stop("refused: " + "; ".join(refusals))
+        elif waited_s > self.patience_s:
+            unready = "; ".join(f"vehicle {v.system_id} {v.missing}" for v in self.vehicles if not v.ready)
+            self.request_stop(f"not ready: {unready}")
+
+    def _identify(self, due_ns: int) -> None:
+        assert self._copters is not None
+        reason = self._copters.identify(due_ns, self._history)
+        if reason:
+            self.request_stop(reason)
+        self.plan = self._copters.plan
+        self._monitor.margins_s = self.plan.margins_s
+
+    def _set_point(
+        self, row: int, control: VehicleControl, *, commanded: bool, key_ms: int, due_ns: int
+    ) -> tuple[Any, ...] | None:
+        """Fields of the set-point that a vehicle is sent at this tick, if any."""
+        if self._copters is not None:
+            return self._copters.set_point(row, control, self.phase, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
+        if not commanded:
+            return None
+        if self._stream is not None:
+            velocity = self.plan.scenario.nominal_velocity_at(self.scenario_time_s(due_ns))
+            return set_point(self.vehicles[row], control, velocity, key_ms=key_ms)
+        north, east = control.command_m_s2
+        return mavlink.acceleration_set_point(
+            key_ms=key_ms, target_system=self.vehicles[row].system_id, north_m_s2=north, east_m_s2=east
+        )
+
+    # -- small things ----------------------------------------------------------------------------------------------
+
+    def _request_timesync(self, outgoing: list[Outgoing]) -> None:
+        vehicle = self.vehicles[self._timesync_row]
+        self._timesync_row = (self._timesync_row + 1) % len(self.vehicles)
+        self._next_timesync_ns += self._timesync_spacing_ns
+        if vehicle.address is not None:
+            self._exchange(vehicle, outgoing)
+
+    def _exchange(self, vehicle: RemoteVehicle, outgoing: list[Outgoing]) -> None:
+        ts1_ns = vehicle.clock.request(self._now_ns)
+        self._send(vehicle, mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=ts1_ns), outgoing)
+
+    def _send(self, vehicle: RemoteVehicle, msg_id: int, fields: tuple[object, ...], outgoing: list[Outgoing]) -> None:
+        if vehicle.address is not None:
+            outgoing.append(Outgoing(vehicle.encode(msg_id, fields), vehicle.address))
+
+    def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
+        """Say over the link what has changed: for others on it, and in the telemetry log."""
+        fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
+        self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
+
+    def _report(self, kind: str, text: str, system_id: int | None = None) -> None:
+        self.events.append(Event(self.scenario_time_s(self._now_ns), kind, text, system_id))
+
+    def _reporter(self, system_id: int) -> Callable[[str, str], None]:
+        def report(kind: str, text: str) -> None:
+            self._report(kind, text, system_id)
+
+        return report

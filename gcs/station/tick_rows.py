@@ -1,0 +1,113 @@
+"""Filling the rows of the tick record from what the station holds."""
+
+import struct
+from math import ceil, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from gcs.control.law import VehicleControl
+from gcs.control.tick import TICK, TickArray
+from gcs.link.vehicle import RemoteVehicle
+from gcs.station.monitor import VehicleState, headroom
+from scenarios.schema import NS_PER_S, Rates
+
+_CODES = {"<i8": "q", "<u4": "I", "<f8": "d", "|u1": "B", "|b1": "?"}
+_SAME_RATE = 1e-4
+"""Rates whose ratio is this close to a whole number are in this ratio."""
+_ROW = struct.Struct("<" + "".join(_CODES[np.dtype(TICK[name]).str] for name in TICK.names or ()))
+
+
+class Reported(NamedTuple):
+    """What came with a vehicle's newest state."""
+
+    boot_ms: int = 0
+    down_m: float = nan
+    velocity_down_m_s: float = nan
+    queue_s: float = nan
+    received_ns: int = 0
+    """The kernel's stamp."""
+    bound_s: float = nan
+    """Most that the instant at which it was sampled can be wrong."""
+
+
+class VehicleTick(NamedTuple):
+    """One vehicle at one control tick, all but when its set-point was sent."""
+
+    vehicle: RemoteVehicle
+    monitored: VehicleState
+    control: VehicleControl
+    reported: Reported
+    rtt_s: float
+    """The oldest round trip that has ended and is in no earlier tick; NaN if there is none."""
+    nearest_m: float
+    """NaN while unknown."""
+    commanded: bool
+    margin_s: float
+    """Delay margin of the gains flown."""
+    repeated_s: float
+    """How long ago the first command was computed from the state that this one is from, as far as telemetry that is
+    slower than control makes it. A repetition changes nothing, and the loop is no later for it."""
+
+
+class Tick(NamedTuple):
+    """One control tick of the formation."""
+
+    number: int
+    time_s: float
+    due_ns: int
+    key_ms: int
+    vehicles: list[VehicleTick]
+
+
+class Repetitions:
+    """How long each vehicle's set-points have repeated themselves for want of a newer state."""
+
+    def __init__(self, rates: Rates, vehicles: int) -> None:
+        ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
+        self._longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
+        self._first: list[tuple[int, int]] = [(0, 0)] * vehicles
+
+    def repeated_s(self, row: int, used_ns: int, due_ns: int) -> float:
+        """Since when, at a tick, the same state has been used, in s; no longer than telemetry at its rate makes it."""
+        if self._longest_ns == 0:
+            return 0.0
+        if self._first[row][0] != used_ns:
+            self._first[row] = used_ns, due_ns
+        return min(due_ns - self._first[row][1], self._longest_ns) * 1e-9
+
+
+def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
+    """The rows of a tick whose set-points were handed over at `sent_ns`, and the loop delay of each vehicle in s."""
+    packed: list[bytes] = []
+    delays_s: list[float] = []
+    for seen in tick.vehicles:
+        vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, margin_s, repeated_s = seen
+        clock, frames = vehicle.clock, vehicle.frames
+        estimate = clock.estimate
+        age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
+        up_s = (reported.received_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
+        down_s = down_bound_s = nan
+        if clock.down_ns is not None:
+            down_s, down_bound_s = clock.down_ns * 1e-9, clock.down_bound_ns * 1e-9
+        used_s = (sent_ns - control.used_ns) * 1e-9 if control.used_ns > 0 else nan
+        offset_s = bound_s = nan
+        if estimate.samples > 0:
+            offset_s, bound_s = estimate.offset_at_ns(sent_ns) * 1e-9, estimate.bound_at_ns(sent_ns) * 1e-9
+        loop_s = used_s + down_s - repeated_s
+        delays_s.append(loop_s)
+        packed.append(
+            _ROW.pack(
+                tick.number, tick.time_s, tick.due_ns, sent_ns, tick.key_ms, vehicle.system_id,
+                monitored.mode, monitored.gain_set, commanded,
+                reported.boot_ms, control.sample_ns, age_s,
+                *control.state[:2], reported.down_m, *control.state[2:], reported.velocity_down_m_s,
+                *control.spacing_error_m, *control.velocity_error_m_s,
+                *(control.command_m_s2 if commanded else (nan, nan)),
+                nearest_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
+                loop_s, repeated_s, margin_s, headroom(loop_s, margin_s) if margin_s > 0.0 else nan, rtt_s,
+                offset_s, bound_s,
+                frames.received, frames.lost, frames.late, frames.duplicate,
+            )
+        )  # fmt: skip
+    return np.frombuffer(bytearray().join(packed), TICK), delays_s

@@ -1,0 +1,76 @@
+"""One trial of a campaign flown again: the same to the last bit in virtual time, with files and a Rerun recording."""
+
+import contextlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gcs.runs.record import SCENARIO_FILE
+from gcs.runs.summary import finish
+from gcs.stress.campaign import CampaignError, Store, check_campaign
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import Study
+from gcs.stress.trial import Outcome, Trial
+from gcs.views.observer import record_run
+
+
+@dataclass(frozen=True)
+class Replay:
+    """`differs` names what is not as it was when the trial was first flown; empty in real time, where all may be."""
+
+    outcome: Outcome
+    runs: list[Path]
+    differs: list[str]
+
+
+def replayed(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Replay:
+    """Fly the one trial of a campaign's folder whose id begins with `wanted`.
+
+    Its runs are left in `flights` beside the campaign's table. With `real_time` it is flown over UDP, whatever it was.
+
+    Raises
+    ------
+    CampaignError
+        If it is not one trial, or was flown with another scenario.
+    """
+    stored = _stored(folder, wanted)
+    trial = _trial_of(study, stored, folder)
+    again = replace(trial, real_time=trial.real_time or real_time)
+    run = _free(folder / "flights", f"{stored.id}{'-real-time' if again.real_time else ''}")
+    outcome = fly_trial(again, run)
+    runs = [run] if (run / SCENARIO_FILE).exists() else sorted(run.iterdir()) if run.is_dir() else []
+    for flight in runs:
+        finish(flight)
+        record_run(flight)
+        finish(flight)  # again: it lists the files
+    return Replay(outcome, runs, [] if again.real_time else _differences(outcome, stored))
+
+
+def _stored(folder: Path, wanted: str) -> Outcome:
+    check_campaign(folder, "--trial")
+    with contextlib.closing(Store(folder)) as store:
+        found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
+    if len(found) != 1:
+        raise CampaignError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
+    return found[0]
+
+
+def _trial_of(study: Study, stored: Outcome, folder: Path) -> Trial:
+    study = replace(study, real_time=stored.real_time)
+    trial = study.trial(stored.kind, stored.coordinates, seed=stored.seed, probe=stored.probe)
+    if trial.id != stored.id:
+        raise CampaignError(
+            f"--trial: {stored.id} was flown with another scenario or design; wanted {folder / SCENARIO_FILE}"
+        )
+    return trial
+
+
+def _differences(outcome: Outcome, stored: Outcome) -> list[str]:
+    was, now = (vars(replace(one, elapsed_s=0.0, coordinates={}, error=None)) for one in (stored, outcome))
+    return [name for name in was if was[name] != now[name]]
+
+
+def _free(parent: Path, stem: str) -> Path:
+    """A name that is free; whoever fills it makes it."""
+    parent.mkdir(parents=True, exist_ok=True)
+    names = (stem if count == 1 else f"{stem}-{count}" for count in range(1, 1000))
+    return next(parent / name for name in names if not (parent / name).exists())

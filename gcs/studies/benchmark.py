@@ -1,0 +1,179 @@
+"""How fast flights are computed: virtual time against real time, and what the station takes of its control period."""
+
+import os
+import tempfile
+import time  # noqa: TID251 - the time it takes is what is measured; nothing flown depends on it
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import which
+from statistics import median
+from typing import Any
+
+from gcs.drive.lockstep import Sent, Vehicles, fly_lockstep, signed_ends, vehicles_of
+from gcs.interrupts import raised
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.station import station
+from scenarios.schema import FixedGains, Scenario, Vehicle
+from scenarios.signing.keys import KEY_BYTES, Key
+
+_COLUMN = 10
+"""Vehicles behind one another in a large formation; the columns follow one leader."""
+_SPACING_M = 100.0
+_WHOLE_CORE = 0.95
+"""Part of a core from which on a flight counts as not disturbed."""
+
+
+@dataclass
+class _Timed:
+    """Vehicles whose own computing time is added up."""
+
+    vehicles: Vehicles
+    taken_s: float = 0.0
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        begun_s = time.perf_counter()
+        sent = self.vehicles.step(received, now_ns)
+        self.taken_s += time.perf_counter() - begun_s
+        return sent
+
+
+def with_vehicles(scenario: Scenario, count: int) -> Scenario:
+    """The scenario with as many vehicles as wanted, in place, in columns behind one leader."""
+    velocity = scenario.nominal_velocity[0].velocity_ne_m_s
+    vehicles = [Vehicle(system_id=1, position_ne_m=(0.0, 0.0), velocity_ne_m_s=velocity)]
+    for k in range(count - 1):
+        column, place = divmod(k, _COLUMN)
+        aside = _SPACING_M * (column + 1)
+        vehicles.append(
+            Vehicle(
+                system_id=k + 2,
+                follows=1 if place == 0 else k + 1,
+                offset_ne_m=(-_SPACING_M, aside if place == 0 else 0.0),
+                position_ne_m=(-_SPACING_M * (place + 1), aside),
+                velocity_ne_m_s=velocity,
+            )
+        )
+    return scenario.model_copy(update={"vehicles": tuple(vehicles)})
+
+
+def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool = False) -> dict[str, Any]:
+    """Fly `seconds` of a scenario `repeat` times in virtual time; figures of the fastest and of the median flight.
+
+    With `signed` as many signed flights are flown in turn with the others, and `signed` says what they cost.
+    """
+    _, plan = flight_plan(_without_solver(scenario, seconds))
+    flights: list[dict[str, float]] = []
+    signed_flights: list[dict[str, float]] = []
+    for _ in range(repeat):
+        flights.append(_flight(plan))
+        if signed:
+            signed_flights.append(_flight(plan, key=Key(os.urandom(KEY_BYTES))))
+    fastest = min(flights, key=lambda flight: flight["s_per_tick"])
+    period_s = 1.0 / scenario.rates.control_hz
+    return {
+        "vehicles": len(scenario.vehicles),
+        "control_hz": scenario.rates.control_hz,
+        "compiled": not str(Path(station.__file__)).endswith(".py"),
+        "real_time_factor": period_s / fastest["s_per_tick"],
+        "real_time_factor_p50": period_s / median(flight["s_per_tick"] for flight in flights),
+        "core_share": fastest["core_share"],
+        "station_s_per_tick": fastest["station_s_per_tick"],
+        "station_share_of_period": fastest["station_s_per_tick"] / period_s,
+        "ticks": fastest["ticks"],
+        "flights": repeat,
+        "signed": _cost(signed_flights, flights) if signed else None,
+    }
+
+
+def _cost(signed: list[dict[str, float]], plain: list[dict[str, float]]) -> dict[str, float]:
+    """How many times as long a signed flight takes as one that is not, and its station: best and median."""
+    names = {"time_ratio": "s_per_tick", "station_time_ratio": "station_s_per_tick"}
+    return {
+        f"{ratio}{suffix}": pick(flight[name] for flight in signed) / pick(flight[name] for flight in plain)
+        for ratio, name in names.items()
+        for suffix, pick in (("", min), ("_p50", median))
+    }
+
+
+def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]:
+    """Fly `seconds` of a scenario over UDP: how punctual the station was, and its latencies against the truth."""
+    from gcs.drive.realtime_flight import fly_real_time
+    from gcs.runs.grade import grade
+    from gcs.runs.summary import finish
+
+    designed, plan = flight_plan(_without_solver(scenario, seconds))
+    with raised(), tempfile.TemporaryDirectory(prefix="bench-") as name:
+        folder = Path(name) / "run"
+        _, _, _, spent = fly_real_time(plan, designed, folder)
+        summary = finish(folder)
+        if summary["reason"].startswith("interrupted"):
+            raise KeyboardInterrupt
+        graded = grade(folder)
+    return {
+        "control": summary["control"],
+        "reason": summary["reason"],
+        "steal_share": spent.steal,
+        "load_average": os.getloadavg()[0],
+        **graded,
+    }
+
+
+def _without_solver(scenario: Scenario, seconds: float) -> Scenario:
+    gains = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
+    requirement = dict.fromkeys(("alpha", "delay_margin_s", "decay_rate_1_s"))
+    given = {"method": "inclusion", "gains": gains, "blocks": ()}
+    control = scenario.control.model_copy(update=requirement | given)
+    return scenario.model_copy(update={"duration_s": seconds, "control": control})
+
+
+def _flight(plan: FlightPlan, key: Key | None = None) -> dict[str, float]:
+    ends, guard = (vehicles_of(plan), None) if key is None else signed_ends(plan, key)
+    vehicles = _Timed(ends)
+    begun_s, used_s = time.perf_counter(), time.process_time()
+    ticks = sum(1 for _ in fly_lockstep(plan, vehicles=vehicles, guard=guard))
+    taken_s, used_s = time.perf_counter() - begun_s, time.process_time() - used_s
+    return {
+        "ticks": ticks,
+        "core_share": min(1.0, used_s / taken_s),
+        "s_per_tick": taken_s / ticks,
+        "station_s_per_tick": (taken_s - vehicles.taken_s) / ticks,
+    }
+
+
+def print_benchmark(result: dict[str, Any]) -> None:
+    how = "compiled" if result["compiled"] else "interpreted"
+    print(f"{result['vehicles']} vehicles at {result['control_hz']:g} Hz, one core, hot path {how}")
+    print(
+        f"virtual time    {result['real_time_factor']:.3g} times real time "
+        f"(best of {result['flights']}; median {result['real_time_factor_p50']:.3g})"
+    )
+    if result["core_share"] < _WHOLE_CORE:
+        whole = result["real_time_factor"] / result["core_share"]
+        print(f"                with {result['core_share']:.0%} of a core; {whole:.3g} times with all of it")
+    print(
+        f"station alone   {1e6 * result['station_s_per_tick']:.0f} µs a tick, "
+        f"{100 * result['station_share_of_period']:.1f} % of its period"
+    )
+    if (cost := result["signed"]) is not None:
+        print(
+            f"signed          takes {cost['time_ratio']:.2f} times as long (median {cost['time_ratio_p50']:.2f}), "
+            f"the station {cost['station_time_ratio']:.2f} times (median {cost['station_time_ratio_p50']:.2f})"
+        )
+    if not result["compiled"]:
+        first = "" if which(os.environ.get("CC", "cc")) else "install a C compiler, then "
+        print(f"twice as fast:  {first}python3 make.py compile")
+
+
+def print_real_time(result: dict[str, Any]) -> None:
+    """How punctual the station was, then the errors of what it measured."""
+    from gcs.runs.grade import print_grade
+
+    control = result["control"]
+    late = control["lateness_s"]
+    print(f"{result['reason']}; load {result['load_average']:.1f}, {result['steal_share']:.1%} taken by the host")
+    print(
+        f"set-points sent after they were due: p50 {1e3 * late['p50']:.3f} ms, p99 {1e3 * late['p99']:.3f} ms, "
+        f"{control['deadline_misses']} deadline misses of {control['ticks']} ticks"
+    )
+    print_grade(result)

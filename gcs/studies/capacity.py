@@ -1,0 +1,241 @@
+"""`gcs capacity`: how many vehicles, at which rate, a scenario's links carry before the margin is gone.
+
+Every rate is flown in virtual time with growing formations, over the scenario's own links and channels, until the loop
+delay takes the margin of the gains designed for that rate, or the formation no longer flies. What a link loses is drawn
+at random, so each formation is flown with several seeds, and holds if it does with all of them.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import GainsError
+from gcs.control.tick import TickArray
+from gcs.drive.lockstep import START_NS, LinkLosses, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.errors import InputError
+from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
+from gcs.studies.benchmark import with_vehicles
+from gcs.views.report import number_text
+from scenarios.schema import Scenario
+
+_START_ERROR_M = 2.0
+"""Every second vehicle begins so far aside of its place."""
+_DECAYED = 0.1
+"""A formation that is steered has brought its errors down to this share in the last third of a flight."""
+_FEWEST = 2
+
+
+@dataclass(frozen=True)
+class Load:
+    """One flight: a formation at a rate, and what became of its margin.
+
+    Attributes
+    ----------
+    headroom_p01
+        Least headroom, 1 − loop delay / margin, of all but the worst hundredth of the ticks.
+    station_bytes_s
+        MAVLink bytes that the station sends and receives, both together, in a second of flight.
+    lost_up, lost_down
+        Shares of the datagrams from and to the vehicles that the links lost, in truth.
+    error_end_m
+        Largest spacing error of all vehicles, at the median of the last third of the flight: a single set-point that is
+        lost moves it for seconds.
+    reason
+        How the flight ended.
+    holds
+        Errors came down to a tenth of what they were at the start, and 99 of 100 ticks had headroom.
+    """
+
+    rate_hz: float
+    vehicles: int
+    seed: int
+    delay_margin_s: float
+    loop_delay_p50_s: float | None
+    loop_delay_p99_s: float | None
+    headroom_p01: float | None
+    station_bytes_s: float
+    lost_up: float
+    lost_down: float
+    error_end_m: float
+    reason: str
+    holds: bool
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """The largest formation that one rate carries, and the next, that it does not; None where there is none."""
+
+    rate_hz: float
+    most: Load | None
+    next: Load | None
+    failed: str = ""
+
+
+@dataclass
+class _Counted:
+    """Vehicles behind links, with the bytes at the station's end counted."""
+
+    vehicles: Vehicles
+    bytes_both_ways: int = 0
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        arrived = self.vehicles.step(received, now_ns)
+        self.bytes_both_ways += sum(len(data) for sent in (received, arrived) for _, data, _ in sent)
+        return arrived
+
+
+def capacity(
+    scenario: Scenario, *, rates_hz: list[float], most: int, seeds: int = 3, seconds: float = 180.0
+) -> list[Capacity]:
+    """The capacity of each rate, up to `most` vehicles: doubled until one fails, then halved in between.
+
+    Each formation is flown with the scenario's seed and those that follow it. Near the margin errors go slowly, so that
+    the flights of `seconds` are long.
+
+    Raises
+    ------
+    InputError
+        If the scenario's gains are of its own formation only, or its vehicles take off first.
+    """
+    blocks = len(scenario.control.blocks)
+    if blocks:
+        raise InputError(
+            f"{scenario.name}: control.blocks: read {blocks} of them, wanted gains for any number of vehicles"
+        )
+    if scenario.dynamics != "double_integrator":
+        wanted = "double_integrator: gcs capacity does not fly vehicles that take off first"
+        raise InputError(f"{scenario.name}: dynamics: read {scenario.dynamics!r}, wanted {wanted}")
+    scenario = scenario.model_copy(update={"duration_s": seconds})
+    return [_capacity_of(scenario, rate_hz, most, seeds) for rate_hz in rates_hz]
+
+
+def _capacity_of(scenario: Scenario, rate_hz: float, most: int, seeds: int) -> Capacity:
+    best: Load | None = None
+    worst: Load | None = None
+    count = _FEWEST
+    try:
+        while worst is None or count not in (worst.vehicles, best.vehicles if best else _FEWEST - 1):
+            load = worst_load(scenario, rate_hz, count, seeds)
+            best, worst = (load, worst) if load.holds else (best, load)
+            low = best.vehicles if best else _FEWEST - 1
+            if worst is None and low == most:
+                break
+            count = min(2 * low, most) if worst is None else (low + worst.vehicles) // 2
+    except GainsError as error:
+        return Capacity(rate_hz, best, worst, failed=str(error))
+    return Capacity(rate_hz, best, worst)
+
+
+def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int) -> Load:
+    """The first flight that does not hold, or of those that do the one of least headroom."""
+    loads: list[Load] = []
+    for seed in range(scenario.seed, scenario.seed + seeds):
+        loads.append(fly_loaded(scenario.model_copy(update={"seed": seed}), rate_hz, vehicles))
+        if not loads[-1].holds:
+            return loads[-1]
+    return min(loads, key=lambda load: load.headroom_p01 or 0.0)
+
+
+def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
+    """Fly so many vehicles, with telemetry and control at the rate, and measure.
+
+    Raises
+    ------
+    GainsError
+        If no gains meet the scenario's requirement at this rate.
+    """
+    rates = scenario.rates.model_copy(update={"control_hz": rate_hz, "telemetry_hz": rate_hz})
+    calm = scenario.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
+    formed = with_vehicles(scenario.model_copy(update={"rates": rates, "monitor": calm}), vehicles)
+    _, plan = flight_plan(_displaced(formed))
+    losses = LinkLosses()
+    station, counted = Station(plan, start_ns=START_NS), _Counted(vehicles_of(plan, record=losses.record))
+    ticks = np.concatenate(list(fly_lockstep(plan, vehicles=counted, station=station)))
+    flown = ticks[ticks["time_s"] >= 0.0]
+    commanded = flown[flown["commanded"]]
+    headroom_p01 = _percentile(commanded["headroom"], 1)
+    completed = station.end_reason.startswith("completed")
+    error_end_m = _error_end_m(flown)
+    return Load(
+        rate_hz=rate_hz,
+        vehicles=vehicles,
+        seed=scenario.seed,
+        delay_margin_s=plan.delay_margin_s,
+        loop_delay_p50_s=_percentile(commanded["loop_delay_s"], 50),
+        loop_delay_p99_s=_percentile(commanded["loop_delay_s"], 99),
+        headroom_p01=headroom_p01,
+        station_bytes_s=counted.bytes_both_ways / float(ticks["time_s"][-1] - ticks["time_s"][0]),
+        lost_up=losses.share_up,
+        lost_down=losses.share_down,
+        error_end_m=error_end_m,
+        reason=f"off by {error_end_m:.2g} m" if completed else "limit broken",
+        holds=completed and error_end_m < _DECAYED * _START_ERROR_M and headroom_p01 is not None and headroom_p01 > 0.0,
+    )
+
+
+def _error_end_m(flown: TickArray) -> float:
+    last = flown[flown["time_s"] >= 2.0 / 3.0 * flown["time_s"][-1]]
+    error_m = np.nan_to_num(np.hypot(last["spacing_error_north_m"], last["spacing_error_east_m"]))
+    _, first = np.unique(last["tick"], return_index=True)
+    return float(np.median(np.maximum.reduceat(error_m, first)))
+
+
+def _percentile(values: FloatArray, percent: float) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.percentile(known, percent)) if known.size else None
+
+
+def _displaced(scenario: Scenario) -> Scenario:
+    vehicles = [
+        vehicle.model_copy(update={"position_ne_m": (north, east + _START_ERROR_M * (k % 2))})
+        for k, vehicle in enumerate(scenario.vehicles)
+        for north, east in [vehicle.position_ne_m]
+    ]
+    return scenario.model_copy(update={"vehicles": tuple(vehicles)})
+
+
+def to_dict(found: list[Capacity]) -> dict[str, Any]:
+    """For JSON."""
+    return {"capacities": [asdict(capacity) for capacity in found]}
+
+
+def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
+    """For each rate the largest formation that is carried, and the one that is not."""
+    from rich import box
+    from rich.table import Table
+
+    from gcs.views.console import plain_console
+
+    console = plain_console()
+    table = Table(box=box.SIMPLE_HEAD, title=f"{scenario.name}: what its links carry", title_justify="left")
+    for heading in ("Hz", "UAVs", "loop delay, ms\np50  p99", "margin\nms", "byte/s", "lost, %\nup  down", ""):
+        table.add_column(heading, justify="right", no_wrap=True, min_width=4)
+    for capacity in found:
+        for load in (capacity.most, capacity.next):
+            if load is not None:
+                table.add_row(*_row(load), style="" if load.holds else "dim")
+    console.print(table)
+    for capacity in found:
+        if capacity.failed:
+            console.print(f"{capacity.rate_hz:g} Hz: {capacity.failed}")
+        elif capacity.most is None:
+            console.print(f"{capacity.rate_hz:g} Hz: not even {_FEWEST} vehicles")
+
+
+def _row(load: Load) -> list[str]:
+    def ms(value: float | None) -> str:
+        return number_text(None if value is None else 1e3 * value, ".0f")
+
+    gone = load.headroom_p01 is None or load.headroom_p01 <= 0.0
+    return [
+        f"{load.rate_hz:g}",
+        str(load.vehicles),
+        f"{ms(load.loop_delay_p50_s)}  {ms(load.loop_delay_p99_s)}",
+        ms(load.delay_margin_s),
+        f"{load.station_bytes_s:.0f}",
+        f"{100.0 * load.lost_up:.1f}  {100.0 * load.lost_down:4.1f}",
+        "holds" if load.holds else "margin gone" if gone else load.reason,
+    ]

@@ -1,0 +1,267 @@
+"""`gcs compare`: the design routes side by side, computed and flown.
+
+Each route designs for the scenario's requirement, with the information that it may use, and flies the scenario in
+virtual time from its own initial states. Robustness and string peak are measured alike for all: on the whole formation.
+"""
+
+import json
+import time  # noqa: TID251 - how long a design takes is one of the figures; nothing flown depends on it
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import GainsError
+from gains.design.dk_iteration import LARGEST_STATES, abscissa
+from gains.formation.model import FormationModel
+from gains.performance.robust import disturbance_bound
+from gains.performance.string_stability import largest_magnitude
+from gcs.control.tick import TickArray
+from gcs.drive.flown import fly_virtual
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
+from gcs.views.report import UNKNOWN, number_text
+from scenarios.files import dump
+from scenarios.schema import Control, Scenario
+
+Method = Literal["inclusion", "graph-lqr", "graph-dk"]
+METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr", "graph-dk")
+REPORT_FILE, RESULT_FILE = "compare.html", "compare.json"
+
+
+@dataclass(frozen=True)
+class Route:
+    """One route's figures; None where there is none, with the reason in `failed`.
+
+    Attributes
+    ----------
+    overshoot
+        Largest spacing error against its initial direction, as a share of the initial error; the most of all vehicles.
+    effort_m2_s3
+        Integral of the squared commands of all vehicles over the flight.
+    alpha
+        1 / ‖(sI − A − BK)^{-1}‖∞ of the whole formation.
+    string_peak
+        Largest growth of a spacing error from one follower to the next behind it over all frequencies, for a
+        disturbance of the leader, without delay.
+    links, numbers_used
+        Pairs of vehicles of which one uses the other's state, and how many of its errors are used in all.
+    """
+
+    method: Method
+    failed: str = ""
+    design_s: float | None = None
+    verdict: str | None = None
+    settling_time_s: float | None = None
+    overshoot: float | None = None
+    effort_m2_s3: float | None = None
+    command_max_m_s2: float | None = None
+    spacing_error_max_m: float | None = None
+    alpha: float | None = None
+    delay_margin_s: float | None = None
+    delay_margin_continuous_s: float | None = None
+    decay_rate_1_s: float | None = None
+    string_peak: float | None = None
+    links: int | None = None
+    numbers_used: int | None = None
+
+
+Flights = dict[Method, TickArray]
+
+
+def compare(scenario: Scenario) -> tuple[list[Route], Flights]:
+    """Design and fly the scenario by every route."""
+    routes: list[Route] = []
+    flights: Flights = {}
+    for method in METHODS:
+        update = {"method": method, "gains": None, "blocks": ()}
+        control = Control.model_validate(scenario.control.model_dump() | update)
+        vehicles = scenario.vehicles
+        if method == "inclusion":  # it has no use for what is heard besides
+            vehicles = tuple(vehicle.model_copy(update={"hears": ()}) for vehicle in vehicles)
+        try:
+            if method == "graph-dk" and 2 * len(vehicles) - 1 > LARGEST_STATES:
+                raise GainsError(f"more than {LARGEST_STATES} states an axis")
+            route, ticks = _route(method, scenario.model_copy(update={"control": control, "vehicles": vehicles}))
+        except GainsError as error:
+            routes.append(Route(method, failed=str(error)))
+            continue
+        routes.append(route)
+        flights[method] = ticks
+    return routes, flights
+
+
+def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
+    calm = scenario.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
+    begun_s = time.perf_counter()
+    designed, plan = flight_plan(scenario.model_copy(update={"monitor": calm}))
+    design_s = time.perf_counter() - begun_s
+    flight = fly_virtual(plan)
+    summary = summarise(plan.scenario, designed, flight.ticks, flight.events)
+    flown = flight.ticks[(flight.ticks["time_s"] >= 0.0) & flight.ticks["commanded"]]
+    model, K = FormationModel(tuple(plan.formation.predecessor.tolist())), plan.gain
+    squared = flown["command_north_m_s2"] ** 2 + flown["command_east_m_s2"] ** 2
+    largest = [v["spacing_error_max_m"] for v in summary["vehicles"] if v["spacing_error_max_m"] is not None]
+    links, numbers = _information(model, K)
+    return (
+        Route(
+            method=method,
+            design_s=design_s,
+            verdict=summary["verdict"],
+            settling_time_s=summary["settling_time_s"],
+            overshoot=_overshoot(plan, flown),
+            effort_m2_s3=float(squared.sum() / scenario.rates.control_hz),
+            command_max_m_s2=float(np.sqrt(squared.max(initial=0.0))),
+            spacing_error_max_m=max(largest, default=None),
+            alpha=disturbance_bound(model.A + model.B @ K, np.eye(model.states)),
+            delay_margin_s=summary["delay_margin_s"],
+            delay_margin_continuous_s=summary["delay_margin_continuous_s"],
+            decay_rate_1_s=-abscissa(model.A + model.B @ K),
+            string_peak=string_peak(model, K),
+            links=links,
+            numbers_used=numbers,
+        ),
+        flight.ticks,
+    )
+
+
+def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
+    """How far spacing errors go to the other side, as a share of what they began with."""
+    shares: list[float] = []
+    for system_id in plan.formation.system_ids[1:]:
+        own = flown[flown["system_id"] == system_id]
+        error = np.stack([own["spacing_error_north_m"], own["spacing_error_east_m"]], axis=1)
+        error = error[np.isfinite(error).all(axis=1)]
+        first = float(np.linalg.norm(error[0])) if len(error) else 0.0
+        if first > 0.1:  # less than the noise of a start is no initial error
+            shares.append(max(0.0, float(-(error @ error[0]).min()) / first**2))
+    return max(shares, default=None)
+
+
+def _information(model: FormationModel, K: FloatArray) -> tuple[int, int]:
+    """Pairs (i, j), j's errors used by i, and how many of these errors per axis."""
+    links = numbers = 0
+    for i in range(model.vehicles):
+        for j in range(model.vehicles):
+            block = K[model.input_slice(i), model.output_slice(j)]
+            if i != j and block.any():
+                links += 1
+                numbers += int(np.count_nonzero(block.any(axis=0)))
+    return links, numbers
+
+
+def string_peak(model: FormationModel, K: FloatArray) -> float | None:
+    """Largest |E_i / E_j| over frequencies for a follower i behind a follower j, the leader's command disturbed.
+
+    None without two followers in a row. The same search as for a single follower, `gains.performance.string_stability`.
+    """
+    single = FormationModel(model.predecessors, axes=1)
+    narrow = K[:: model.axes, :: model.axes]
+    closed_loop = single.A + single.B @ narrow
+    pairs = [(i, single.predecessors[i]) for i in single.followers if single.predecessors[i] > 0]
+    if not pairs:
+        return None
+    behind, ahead = ([single.spacing_slice(pair[k]).start for pair in pairs] for k in (0, 1))
+
+    def growth(omega: FloatArray) -> FloatArray:
+        shifted = 1j * omega[:, None, None] * np.eye(single.states) - closed_loop
+        error = np.abs(np.linalg.solve(shifted, single.B[:, :1])[..., 0])
+        return (error[:, behind] / error[:, ahead]).max(axis=1)
+
+    return largest_magnitude(growth, near_rad_s=float(np.abs(np.linalg.eigvals(closed_loop)).max()))[0]
+
+
+def write_comparison(
+    folder: Path, scenario: Scenario, routes: list[Route], flights: Flights, grown: list[DesignCost]
+) -> None:
+    """compare.json, the figures, and the page compare.html."""
+    from gcs.studies.compare_figures import errors_figure, sizes_figure
+    from gcs.views.page import data_uri, rendered
+
+    (folder / "scenario.toml").write_text(dump(scenario), encoding="utf-8")
+    result = {
+        "scenario": scenario.name,
+        "routes": [asdict(route) for route in routes],
+        "sizes": [asdict(size) for size in grown],
+    }
+    (folder / RESULT_FILE).write_text(json.dumps(result, indent=2), encoding="utf-8")
+    figures = {"Spacing errors and commands in flight": errors_figure(folder / "flights.png", flights.items())}
+    if grown:
+        figures["Cost of a design against the number of vehicles"] = sizes_figure(folder / "sizes.png", grown)
+    page = rendered(
+        "compare.html.j2",
+        scenario=scenario,
+        rows=rows(routes),
+        methods=[route.method for route in routes],
+        failed=[route for route in routes if route.failed],
+        sizes=list(zip(grown, ratios(grown), strict=True)),
+        left_out=left_out(grown),
+        ratio=RATIO,
+        figures={title: data_uri(file) for title, file in figures.items()},
+    )
+    (folder / REPORT_FILE).write_text(page, encoding="utf-8")
+
+
+def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
+    """The table: what is compared, and each route's figure."""
+    kinds: list[tuple[str, str, str, float]] = [
+        ("verdict of the flight", "verdict", "", 1.0),
+        ("settling time, s", "settling_time_s", ".2f", 1.0),
+        ("overshoot, %", "overshoot", ".1f", 100.0),
+        ("control effort, m²/s³", "effort_m2_s3", ".0f", 1.0),
+        ("largest command, m/s²", "command_max_m_s2", ".1f", 1.0),
+        ("largest spacing error, m", "spacing_error_max_m", ".1f", 1.0),
+        ("delay margin, sampled, ms", "delay_margin_s", ".1f", 1e3),
+        ("delay margin, continuous, ms", "delay_margin_continuous_s", ".1f", 1e3),
+        ("alpha of the whole formation", "alpha", ".4f", 1.0),
+        ("decay without delay, 1/s", "decay_rate_1_s", ".3f", 1.0),
+        ("string peak", "string_peak", ".3f", 1.0),
+        ("links between vehicles", "links", "d", 1),
+        ("numbers used over them", "numbers_used", "d", 1),
+        ("design time, s", "design_s", ".2f", 1.0),
+    ]
+    table: list[tuple[str, list[str]]] = []
+    for title, name, form, factor in kinds:
+        values: list[Any] = [getattr(route, name) for route in routes]
+        texts = [
+            str(v or UNKNOWN) if not form else number_text(None if v is None else factor * v, form) for v in values
+        ]
+        if name.startswith("delay_margin"):  # of a route that was flown, none is no limit
+            texts = [
+                "no limit" if v is None and not r.failed else t for v, r, t in zip(values, routes, texts, strict=True)
+            ]
+        table.append((title, texts))
+    return table
+
+
+def print_comparison(scenario: Scenario, routes: list[Route], grown: list[DesignCost]) -> None:
+    """The tables on the terminal."""
+    from rich import box
+    from rich.table import Table
+
+    from gcs.views.console import plain_console
+
+    console = plain_console()
+    title = f"{scenario.name}: designed for what it asks for, flown over its links"
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="")
+    for heading in ("", *(route.method for route in routes)):
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    for title, texts in rows(routes):
+        table.add_row(title, *texts)
+    console.print(table)
+    for route in routes:
+        if route.failed:
+            console.print(f"{route.method}: {route.failed}")
+    if grown:
+        table = Table(box=box.SIMPLE_HEAD)
+        for heading in ("design of a chain", "vehicles", "free gains an axis", "time, s", RATIO):
+            table.add_column(heading, justify="right", no_wrap=not table.columns)
+        for size, ratio in zip(grown, ratios(grown), strict=True):
+            table.add_row(size.method, str(size.vehicles), str(size.free_gains), f"{size.design_s:.3f}", f"{ratio:.2f}")
+        console.print(table)
+        for line in left_out(grown):
+            console.print(line)

@@ -1,0 +1,133 @@
+"""What a design costs as the formation grows: time and free gains, of both routes and of centralised designs."""
+
+import time  # noqa: TID251 - the time it takes is what is measured; nothing flown depends on it
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from gains.core.requirement import Requirement
+from gains.design.centralised import centralised_lmi
+from gains.design.design import design
+from gains.design.dk_iteration import LARGEST_STATES
+from gains.design.lqr import Weights, centralised_lqr
+from gains.formation.model import FormationModel
+from gains.formation.pattern import bidirectional, formation_plant, leader_follower
+
+RATIO = "times inclusion of 5"
+_REFERENCE = ("inclusion", 5)
+_SIZES = (3, 5, 10, 20, 40, 80, 200)
+_LONGEST_S = 10.0
+"""A method that would take longer, should its time grow with the cube of the size, is not tried on more vehicles."""
+_DK_STATES = LARGEST_STATES // 2
+_REPEATED_BELOW_S = 1.0
+_REPEATS = 5
+_PERIOD_S = 0.02
+_WANTED = Requirement(delay_margin_s=0.3)
+_GAIN_BOUND = 30.0
+"""Of the centralised LMI, for both of its matrices."""
+
+
+@dataclass(frozen=True)
+class DesignCost:
+    """What a design costs for a chain of so many vehicles: time and the number of free gains of one axis."""
+
+    method: str
+    vehicles: int
+    design_s: float
+    free_gains: int
+
+
+def design_costs() -> list[DesignCost]:
+    """Costs for chains of growing length; times are medians of several designs where one is quick.
+
+    The decentralised routes meet a sampled margin of 0.3 s at 50 Hz and certify it. The centralised designs, each
+    solved once, are asked for no margin: the LQR is one Riccati equation, the LMI one semidefinite programme.
+    """
+    found: list[DesignCost] = []
+    _inclusion(3)  # what is imported at first use is not part of a design
+    methods: dict[str, Callable[[int], int]] = {
+        "inclusion": _inclusion,
+        "graph-lqr": lambda vehicles: _graph(vehicles, "graph-lqr", two_way=False),
+        "graph-lqr, bidirectional": lambda vehicles: _graph(vehicles, "graph-lqr", two_way=True),
+        "graph-dk": lambda vehicles: _graph(vehicles, "graph-dk", two_way=False),
+        "centralised LQR": _centralised_lqr,
+        "centralised LMI": _centralised_lmi,
+    }
+    for label, method in methods.items():
+        for vehicles, following in zip(_SIZES, (*_SIZES[1:], _SIZES[-1]), strict=True):
+            if _too_large(label, vehicles):
+                break
+            taken_s, free = _timed(method, vehicles)
+            found.append(DesignCost(label, vehicles, taken_s, free))
+            if taken_s * (following / vehicles) ** 3 > _LONGEST_S:
+                break
+    return found
+
+
+def ratios(costs: list[DesignCost]) -> list[float]:
+    """Time of each design over that of five vehicles by inclusion, in the same run; empty for no designs."""
+    reference_s = [cost.design_s for cost in costs if (cost.method, cost.vehicles) == _REFERENCE]
+    return [cost.design_s / reference_s[0] for cost in costs]
+
+
+def left_out(costs: list[DesignCost]) -> list[str]:
+    """For each method that was not tried on all sizes, one line that says from where on, and why."""
+    largest = {cost.method: cost.vehicles for cost in costs}
+    tried = {method: _SIZES.index(vehicles) + 1 for method, vehicles in largest.items()}
+    return [
+        f"{method}: not tried on {_SIZES[count]} vehicles and more; "
+        + (
+            f"more than {_DK_STATES} states an axis"
+            if _too_large(method, _SIZES[count])
+            else f"it may take over {_LONGEST_S:g} s"
+        )
+        for method, count in tried.items()
+        if count < len(_SIZES)
+    ]
+
+
+def _too_large(method: str, vehicles: int) -> bool:
+    return method == "graph-dk" and 2 * vehicles - 1 > _DK_STATES
+
+
+def _timed(method: Callable[[int], int], vehicles: int) -> tuple[float, int]:
+    taken_s: list[float] = []
+    while True:
+        begun_s = time.perf_counter()
+        free = method(vehicles)
+        taken_s.append(time.perf_counter() - begun_s)
+        if len(taken_s) == _REPEATS or taken_s[0] > _REPEATED_BELOW_S:
+            return median(taken_s), free
+
+
+def _chain(vehicles: int, axes: int = 2) -> FormationModel:
+    return FormationModel(tuple(range(-1, vehicles - 1)), axes=axes)
+
+
+def _inclusion(vehicles: int) -> int:
+    design(_chain(vehicles), _WANTED, period_s=_PERIOD_S)
+    return 3
+
+
+def _graph(vehicles: int, method: str, *, two_way: bool) -> int:
+    chain = _chain(vehicles)
+    pattern = bidirectional(chain) if two_way else leader_follower(chain)
+    if method == "graph-dk":
+        design(chain, _WANTED, method="graph-dk", pattern=pattern, period_s=_PERIOD_S)
+    else:
+        design(chain, _WANTED, method="graph-lqr", pattern=pattern, period_s=_PERIOD_S)
+    return int(pattern.mask.sum()) // chain.axes**2
+
+
+def _centralised_lqr(vehicles: int) -> int:
+    plant = formation_plant(_chain(vehicles))
+    K, _ = centralised_lqr(plant, Weights(np.eye(plant.states), np.eye(plant.B.shape[1])))
+    return K.size // 4
+
+
+def _centralised_lmi(vehicles: int) -> int:
+    # one axis: with two, that do not act on each other, the unknowns would be four times as many for the same gains
+    plant = formation_plant(_chain(vehicles, axes=1))
+    return centralised_lmi(plant, gain_bound=_GAIN_BOUND, lyapunov_bound=_GAIN_BOUND).K.size

@@ -1,0 +1,81 @@
+"""Statements of the source that a computation contradicts, beside those about its numbers in `gcs.studies.thesis`."""
+
+from itertools import product
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.delay.constant import delay_margin
+from gains.delay.sweep import frequency_sweep_margin
+from gains.formation.inclusion import Restriction, expand
+from gains.formation.model import FormationModel
+from gcs.studies.thesis_flights import printed_gains
+
+SINGLE = FormationModel((-1, 0, 1), axes=1)
+PUBLISHED_S = (0.185, 0.195)
+"""What rounds to the published 0.19 s."""
+
+
+def controllable_dimensions(restriction: Restriction) -> tuple[int, int]:
+    """Rank of [B, AB, A²B, ...] of the expanded chain of three, one axis, and that of [A, B].
+
+    All eigenvalues are zero, so that by Hautus' test the system is controllable if and only if the second is full.
+    """
+    expansion = expand(SINGLE, restriction)
+    A, B = expansion.A.toarray(), expansion.B.toarray()
+    powers = [B]
+    for _ in range(len(A) - 1):
+        powers.append(A @ powers[-1])
+    return int(np.linalg.matrix_rank(np.hstack(powers))), int(np.linalg.matrix_rank(np.hstack([A, B])))
+
+
+def s_procedure_counterexample() -> tuple[bool, bool, bool]:
+    """Of F = G = −1: whether F > 0 wherever G ≤ 0, whether some τ ≥ 0 has F − τG > 0, and F + τG > 0."""
+    F = G = -1.0
+    some = np.linspace(0.0, 100.0, 1001)
+    return not (G <= 0.0) or F > 0.0, bool((F - some * G > 0.0).any()), bool((F + some * G > 0.0).any())
+
+
+def pencil_moduli(own: float, late: float) -> tuple[float, float]:
+    """Least and largest |λ(jωI − A0, A1)| over frequencies up to 100 rad/s, of x' = own x + late x(t − τ)."""
+    moduli = np.abs((1j * np.linspace(0.0, 100.0, 100_001) - own) / late)
+    return float(moduli.min()), float(moduli.max())
+
+
+def first_crossing(own: float, late: float, sign: float) -> float:
+    """θ / ω at which λ(jω − A0, A1) = e^{sign jθ}, θ in [0, 2π), of x' = own x + late x(t − τ)."""
+    omega = float(np.sqrt(late**2 - own**2))
+    return float(np.mod(sign * np.angle((1j * omega - own) / late), 2.0 * np.pi)) / omega
+
+
+def subset_margins() -> FloatArray:
+    """Delay margins with every choice of which of the twelve scalar gains printed are late; 4,095 of them.
+
+    One axis: the blocks are multiples of the identity but for entries of 0.0053 at most.
+    """
+    K = printed_gains()[::2, ::2]
+    places = np.argwhere(np.abs(K) > 0.1)
+    assert len(places) == 12
+    margins: list[float] = []
+    for chosen in product((False, True), repeat=len(places)):
+        if any(chosen):
+            late = np.zeros_like(K)
+            for (i, j), take in zip(places.tolist(), chosen, strict=True):
+                late[i, j] = K[i, j] if take else 0.0
+            now, delayed = SINGLE.A + SINGLE.B @ (K - late), SINGLE.B @ late
+            try:
+                margins.append(delay_margin(now, delayed))
+            except np.linalg.LinAlgError:  # a resolvent that is singular on the axis
+                margins.append(frequency_sweep_margin(now, delayed))
+    return np.array(margins)
+
+
+def subset_margin_by_sweep(number: int) -> float:
+    """The margin of one of the subsets of `subset_margins` by the frequency sweep."""
+    K = printed_gains()[::2, ::2]
+    places = np.argwhere(np.abs(K) > 0.1)
+    chosen = [number + 1 >> k & 1 for k in reversed(range(len(places)))]
+    late = np.zeros_like(K)
+    for (i, j), take in zip(places.tolist(), chosen, strict=True):
+        late[i, j] = K[i, j] * take
+    return frequency_sweep_margin(SINGLE.A + SINGLE.B @ (K - late), SINGLE.B @ late)

@@ -1,0 +1,76 @@
+"""The flights behind the figures of the source: by our station, and of its chapter 5 by the nonlinear model."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+import scenarios
+from gains.core.arrays import FloatArray
+from gains.core.requirement import Requirement
+from gains.design.design import design
+from gains.formation.model import FormationModel
+from gcs.control.tick import TickArray
+from gcs.drive.flown import fly_virtual
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from gcs.studies.thesis_nonlinear import fly_with_late_neighbours
+from scenarios.files import load
+from scenarios.schema import Scenario
+
+PERIOD_S = 0.02
+ALPHA = 0.93
+SPEED_M_S = 91.44  # 300 ft/s
+DELAYS_S = (0.17, 0.9, 1.1)
+CHAIN = FormationModel((-1, 0, 1))
+
+
+@cache
+def printed_gains() -> FloatArray:
+    """K of section 5.2.2, with the slip "0.5003" mended, from scenarios/thesis_gains.toml."""
+    return flight_plan(_scenario("thesis_gains"))[1].gain
+
+
+def _scenario(name: str) -> Scenario:
+    return load(Path(scenarios.__file__).parent / f"{name}.toml")
+
+
+@cache
+def late_flight(delay_s: float) -> tuple[FloatArray, FloatArray]:
+    """Times and errors of the nonlinear flight with the printed gains; 20 s, with initial errors of our own choice."""
+    start = np.zeros(CHAIN.states)
+    start[CHAIN.velocity_slice(0)] = (2.0, -1.0)
+    start[CHAIN.spacing_slice(1)], start[CHAIN.spacing_slice(2)] = (10.0, 5.0), (-6.0, 8.0)
+    return fly_with_late_neighbours(
+        CHAIN, printed_gains(), start, delay_s=delay_s, speed_m_s=SPEED_M_S, duration_s=20.0
+    )
+
+
+def nonlinear_response(delay_s: float) -> tuple[float, float]:
+    """Growth rate (1/s) of the errors' envelope in the second half, and when they stay within 2 % of their largest."""
+    time_s, errors = late_flight(delay_s)
+    size = np.linalg.norm(errors, axis=1)
+    outside = np.flatnonzero(size > 0.02 * size.max())
+    settled_s = float(time_s[min(outside[-1] + 1, len(time_s) - 1)])
+    # largest of each second, while it is above rounding
+    whole = int(time_s[-1])
+    envelope = size[: whole * 1000].reshape(whole, 1000).max(axis=1)
+    kept = (envelope > 1e-9 * envelope.max()) & (np.arange(whole) >= whole // 4)
+    slope = np.polyfit(np.arange(whole)[kept] + 0.5, np.log(envelope[kept]), 1)[0]
+    return float(slope), settled_s
+
+
+def flown(name: str, method: str) -> tuple[TickArray, float | None]:
+    """A flight of one of the triangle's scenarios without link delay, by inclusion at α = 0.93 or by the D-K iteration
+    at the delay margin that this has; with its settling time."""
+    scenario = _scenario(name)
+    control = scenario.control.model_copy(update={"delay_margin_s": None, "alpha": ALPHA})
+    if method != "inclusion":
+        margin_s = design(CHAIN, Requirement(alpha=ALPHA), period_s=PERIOD_S).delay_margin_s
+        control = control.model_copy(update={"alpha": None, "delay_margin_s": margin_s, "method": method})
+    calm = scenario.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
+    scenario = scenario.with_link_delay(up_s=0.0, down_s=0.0)
+    designed, plan = flight_plan(scenario.model_copy(update={"control": control, "monitor": calm}))
+    flight = fly_virtual(replace(plan))
+    return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events)["settling_time_s"]

@@ -1,1 +1,0 @@
-"""`gcs thesis`: the source's figures and numbers, published and computed."""

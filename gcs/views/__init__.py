@@ -1,0 +1,1 @@
+"""What people look at: live table, Rerun recording, pictures, pages. `report` turns results into words."""

@@ -1,0 +1,150 @@
+"""The observer: a process of its own that follows a flight by reading the files it leaves.
+
+It draws the live table and writes the Rerun recording, so that the control process does neither and never waits.
+
+    python -m gcs.views.observer FOLDER --parent PID [--no-table]
+
+The file FOLDER/.observer-ready appears when everything slow to start has been started, and goes when the observer
+ends. It ends after the run's "end" event, on SIGTERM, or when its parent has gone and nothing new is written; in
+each case the recording is whole. SIGINT and SIGHUP are left to the parent, which decides how the flight ends.
+"""
+
+import argparse
+import os
+import signal
+import sys
+import time  # noqa: TID251 (this process is a driver: it runs at the pace of the flight it watches)
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcs.errors import InputError
+from gcs.output import outlive_readers
+from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
+from gcs.runs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE
+from gcs.runs.summary import finish
+from gcs.views.grid import WholeTicks
+from gcs.views.recording import Recording
+from gcs.views.table import Display, FlightState
+from scenarios.schema import Scenario
+
+POLL_S = 0.1
+TABLE_S = 0.24
+SEND_S = 1.0
+ROWS_AT_ONCE = 100_000
+ORPHAN_S = 1.0
+"""How long an observer without a parent waits for more."""
+
+
+@dataclass
+class Parent:
+    """Whether the process that started the observer still lives, and whether the observer was asked to stop."""
+
+    pid: int
+    stop: bool = False
+
+    def gone(self) -> bool:
+        return os.getppid() != self.pid
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="gcs.views.observer", description="follow a flight: live table and recording")
+    parser.add_argument("folder", type=Path, help="the run's folder")
+    parser.add_argument("--parent", type=int, required=True, metavar="PID", help="process id of the ground station")
+    parser.add_argument("--no-table", action="store_true", help="write the recording and print nothing")
+    arguments = parser.parse_args(argv)
+    parent = Parent(arguments.parent)
+
+    def stop(*_: object) -> None:
+        parent.stop = True
+
+    for decided_by_parent in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(decided_by_parent, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, stop)
+    outlive_readers()
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun would write over the table what is told in one line at the end
+    Recording.prepare()
+    os.nice(10)  # not before: the station waits until this is ready
+    ready = arguments.folder / READY_FILE
+    try:
+        ready.touch()
+        inputs = _inputs(arguments.folder, parent)
+        if inputs is not None:
+            observe(arguments.folder, *inputs, parent=parent, show_table=not arguments.no_table)
+        if inputs is not None and parent.gone():
+            finish(arguments.folder)  # the station was killed: its run is summed up here
+    except OSError as error:  # a full disk; the flight goes on
+        print(f"{arguments.folder}: {error.strerror or error}; wanted room for it, then gcs recover", file=sys.stderr)
+        return 1
+    finally:
+        ready.unlink(missing_ok=True)
+    return 0
+
+
+def observe(folder: Path, scenario: Scenario, design: dict[str, Any], *, parent: Parent, show_table: bool) -> None:
+    """Follow the run in `folder` until it ends or is left alone."""
+    tail = RunTail(folder)
+    whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])
+    state = FlightState(scenario, design)
+    with Recording(folder, scenario, design) as recording, Display(state, shown=show_table) as display:
+        news = table_due = send_due = time.monotonic()
+        ended = False
+        while not ended:
+            last_look = parent.stop or (parent.gone() and time.monotonic() - news > ORPHAN_S)
+            # Events before ticks: whatever was written before the "end" event is then read as well.
+            events = tail.events()
+            ticks = whole.add(tail.ticks())
+            ended = last_look or any(event["kind"] == "end" for event in events)
+            if ended:
+                ticks = np.concatenate([ticks, whole.rest()])
+            if any(event["kind"] == NEW_DESIGN for event in events):
+                design = read_design(folder / DESIGN_FILE)
+                state.redesigned(design)
+                recording.redesigned(design)
+            state.add(ticks, events)
+            recording.add(ticks, events)
+            display.events(events)
+            now = time.monotonic()
+            if ticks.size or events:
+                news = now
+            if now >= table_due or ended:
+                display.show(last=ended)
+                table_due = now + TABLE_S
+            if now >= send_due or ended:
+                recording.send()
+                send_due = now + SEND_S
+            if not ended:
+                time.sleep(POLL_S)
+
+
+def record_run(folder: Path) -> Path:
+    """Make flight.rrd anew from the other files of a run that has ended, and return its path."""
+    scenario, design = read_scenario(folder), read_design(folder / DESIGN_FILE)
+    rows = read_ticks(folder)
+    whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])
+    with Recording(folder, scenario, design) as recording:
+        recording.add(rows[:0], RunTail(folder).events())
+        for start in range(0, rows.size, ROWS_AT_ONCE):
+            recording.add(whole.add(rows[start : start + ROWS_AT_ONCE]), [])
+            recording.send()
+        recording.add(whole.rest(), [])
+    return folder / RECORDING_FILE
+
+
+def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, dict[str, Any]] | None:
+    """The run's scenario and design once both are written; None if the parent goes before that."""
+    while True:
+        try:
+            design = read_design(folder / DESIGN_FILE)
+        except InputError:  # not yet written, or half of it
+            if parent.stop or parent.gone():
+                return None
+            time.sleep(POLL_S)
+        else:
+            return read_scenario(folder), design
+
+
+if __name__ == "__main__":
+    sys.exit(main())

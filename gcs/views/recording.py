@@ -1,0 +1,419 @@
+"""The Rerun recording of a run, and the screen made for it. The one file that knows Rerun.
+
+What is in it, on the timeline sim_time, which starts with the flight (what was before it is left out, but its events,
+which stand at 0): entities with one value for each vehicle, in the scenario's order, so that a tick costs much the
+same for two hundred vehicles as for two.
+
+    formation/...   vehicles, trails, wanted places and links as seen from the leader, in m north, east, down of it
+    ground/...      the same over the ground, local NED
+    spacing/...     spacing errors of the followers, and below what they count as settled
+    delay/...       loop delay and round trip of each vehicle, and the margin of the gains it is flown with, in ms
+    headroom/...    in %
+    command/...     accelerations sent
+    modes/ID        what the station thinks of a vehicle;  events: what happened
+"""
+
+import errno
+import itertools
+import math
+import os
+import warnings
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from gcs.control.phases import patience_s
+from gcs.control.tick import Mode, TickArray
+from gcs.runs.record import RECORDING_FILE
+from gcs.views.scene import (
+    PICTURE_S,
+    TRAIL_STEP_S,
+    Color,
+    Floats,
+    Newest,
+    PictureTimes,
+    dimmed,
+    positions_m,
+    tree_of,
+    vehicle_colors,
+    wanted_extent_m,
+)
+from gcs.views.table import event_text
+from scenarios.schema import Scenario
+
+TIMELINE = "sim_time"
+UNFINISHED_FILE = RECORDING_FILE + ".part"
+TRAIL_S = 20.0
+LABELS_MAX = 40
+"""With more vehicles than this, their names would cover the scene."""
+LEGEND_MAX = 8
+"""The same for the legend of a plot."""
+
+MODE_COLORS: dict[Mode, Color] = {
+    Mode.WAITING: (110, 110, 120),
+    Mode.NOMINAL: (56, 142, 60),
+    Mode.RECOVERING: (38, 166, 154),
+    Mode.CAUTION: (245, 166, 35),
+    Mode.CRITICAL: (229, 57, 53),
+    Mode.FAILSAFE: (171, 71, 188),
+    Mode.LOST: (120, 20, 30),
+}
+LIMIT_COLOR: Color = (255, 72, 66)
+PALE: Color = (130, 135, 145)
+
+
+class Level(NamedTuple):
+    """A horizontal line of a plot."""
+
+    path: str
+    name: str
+    value: float
+    limit: bool = False
+    """Not to be crossed; drawn bold."""
+
+
+class Recording:
+    """Writes flight.rrd of one run folder: `add` as often as wanted, `send` about once a second, `close` at the end.
+
+    Until it is closed the file has another name, so a flight.rrd is always whole.
+    """
+
+    def __init__(self, folder: Path, scenario: Scenario, design: dict[str, Any]) -> None:
+        import rerun as rr
+
+        count = len(scenario.vehicles)
+        self._folder = folder
+        self._scenario = scenario
+        self._tree = tree_of(scenario)
+        self._labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
+        self._levels = _levels(scenario)
+        self._before_s = patience_s(scenario)
+        self._ticks: list[TickArray] = []
+        self._events: list[dict[str, Any]] = []
+        self._newest_m = Newest(count, 3)
+        self._newest_rtt_ms = Newest(count)
+        self._modes = np.full(count, -1)
+        self._picture_times = PictureTimes(PICTURE_S)
+        self._trail_times = PictureTimes(TRAIL_STEP_S)
+        self._trail_ends_m: Floats | None = None
+        self._stream = rr.RecordingStream("formation-gcs")
+        self._stream.save(folder / UNFINISHED_FILE, default_blueprint=_blueprint(scenario, design))
+        self._stream.send_recording_name(scenario.name)
+        self._log_scene_styles()
+        self._log_plot_styles()
+
+    @staticmethod
+    def prepare() -> None:
+        """Load what is slow to load."""
+        import rerun  # noqa: F401  # pyright: ignore[reportUnusedImport]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self.close()
+
+    def add(self, ticks: TickArray, events: list[dict[str, Any]]) -> None:
+        """Take whole ticks, shape (ticks, vehicles), and events; nothing is written yet."""
+        if ticks.size:
+            self._ticks.append(ticks)
+        self._events += events
+
+    def redesigned(self, design: dict[str, Any]) -> None:
+        """Name the margins of another design."""
+        self._stream.send_blueprint(_blueprint(self._scenario, design))
+
+    def send(self) -> None:
+        """Write what was added."""
+        if self._events:
+            self._send_events(self._events)
+            self._events = []
+        if not self._ticks:
+            return
+        ticks = np.concatenate(self._ticks)
+        self._ticks = []
+        ticks = ticks[ticks["time_s"][:, 0] >= 0]
+        if ticks.size:
+            self._send_series(ticks)
+            self._send_modes(ticks)
+            self._send_scene(ticks)
+
+    def close(self) -> None:
+        """Write what is left and give the file its final name; raises OSError if not all of it could be written."""
+        self.send()
+        try:
+            self._stream.flush()
+        except RuntimeError as error:
+            raise OSError(errno.EIO, f"the recording is not whole ({error})") from None
+        self._stream.disconnect()
+        os.replace(self._folder / UNFINISHED_FILE, self._folder / RECORDING_FILE)
+
+    def _columns(self, path: str, times_s: Floats, columns: Any) -> None:
+        import rerun as rr
+
+        self._stream.send_columns(path, [rr.TimeColumn(TIMELINE, duration=times_s)], columns)
+
+    def _scalars(self, path: str, times_s: Floats, values: Floats) -> None:
+        import rerun as rr
+
+        self._columns(path, times_s, rr.Scalars.columns(scalars=values))
+
+    def _send_series(self, ticks: TickArray) -> None:
+        times_s = ticks["time_s"][:, 0]
+        if self._tree.followers:
+            errors_m = np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])
+            self._scalars("spacing/error_m", times_s, errors_m[:, self._tree.followers])
+        self._scalars("delay/loop_ms", times_s, 1e3 * ticks["loop_delay_s"])
+        margins_ms = 1e3 * ticks["delay_margin_s"]
+        if np.isfinite(margins_ms).any():
+            self._scalars("delay/margin_ms", times_s, np.where(np.isfinite(margins_ms), margins_ms, np.nan))
+        # Round trips end at some ticks only: each is shown until the next.
+        self._scalars("delay/rtt_ms", times_s, self._newest_rtt_ms.fill(1e3 * ticks["rtt_s"]))
+        self._scalars("headroom/percent", times_s, 100 * ticks["headroom"])
+        self._scalars("command/north_m_s2", times_s, ticks["command_north_m_s2"])
+        self._scalars("command/east_m_s2", times_s, ticks["command_east_m_s2"])
+        for level in self._levels:
+            self._scalars(level.path, times_s[[0, -1]], np.full((2, 1), level.value))
+
+    def _send_modes(self, ticks: TickArray) -> None:
+        """The changes only; a vehicle that is not nominal has its mode on its label."""
+        import rerun as rr
+
+        modes = np.vstack([self._modes, ticks["mode"]])
+        times_s = ticks["time_s"][:, 0]
+        for k, line in zip(*np.nonzero(np.diff(modes, axis=0).T), strict=True):
+            state = Mode(int(ticks["mode"][line, k])).name
+            self._columns(f"modes/{self._labels[k]}", times_s[[line]], rr.StateChange.columns(state=[state]))
+        for line in np.nonzero(np.any(np.diff(modes, axis=0), axis=1))[0]:
+            labels = [
+                name if mode == Mode.NOMINAL else f"{name} {Mode(int(mode)).name}"
+                for name, mode in zip(self._labels, ticks["mode"][line], strict=True)
+            ]
+            for root in ("formation", "ground"):
+                columns = rr.Points3D.columns(labels=labels).partition([len(labels)])
+                self._columns(f"{root}/vehicles", times_s[[line]], columns)
+        self._modes = modes[-1]
+
+    def _send_scene(self, ticks: TickArray) -> None:
+        """Positions at each tick's own instant, seen from the leader and over the ground."""
+        all_m = self._newest_m.fill(positions_m(ticks))
+        shown = list(self._picture_times.pick(ticks["time_s"][:, 0]))
+        if not shown:
+            return
+        times_s, ground_m = ticks["time_s"][shown, 0], all_m[shown]
+        leader_m = ground_m[:, [self._tree.leader]]
+        places_m = {"formation": ground_m - leader_m, "ground": ground_m}
+        for root, place_m in places_m.items():
+            self._send_places(root, times_s, place_m)
+        for k in self._trail_times.pick(times_s):
+            self._send_trail(times_s[[k]], np.stack([place_m[k] for place_m in places_m.values()]), list(places_m))
+
+    def _send_places(self, root: str, times_s: Floats, place_m: Floats) -> None:
+        import rerun as rr
+
+        count, tree = place_m.shape[1], self._tree
+        points = rr.Points3D.columns(positions=place_m.reshape(-1, 3)).partition([count] * times_s.size)
+        self._columns(f"{root}/vehicles", times_s, points)
+        if not tree.followers:
+            return
+        own_m, front_m = place_m[:, tree.followers], place_m[:, tree.fronts]
+        wanted_m = front_m + tree.offsets_m
+        lengths = [len(tree.followers)] * times_s.size
+        for name, end_m in (("follows", front_m), ("gaps", wanted_m)):
+            lines = rr.LineStrips3D.columns(strips=_segments(own_m, end_m)).partition(lengths)
+            self._columns(f"{root}/{name}", times_s, lines)
+        centers = rr.Ellipsoids3D.columns(centers=wanted_m.reshape(-1, 3)).partition(lengths)
+        self._columns(f"{root}/wanted", times_s, centers)
+
+    def _send_trail(self, time_s: Floats, ends_m: Floats, roots: list[str]) -> None:
+        """The piece flown since the piece before, each logged once; the view shows those of the last seconds."""
+        import rerun as rr
+
+        before_m, self._trail_ends_m = self._trail_ends_m, ends_m
+        if before_m is not None:
+            for root, start_m, end_m in zip(roots, before_m, ends_m, strict=True):
+                pieces = rr.LineStrips3D.columns(strips=_segments(start_m, end_m)).partition([len(end_m)])
+                self._columns(f"{root}/trails", time_s, pieces)
+
+    def _send_events(self, events: list[dict[str, Any]]) -> None:
+        """One entry for what one tick says of several vehicles."""
+        import rerun as rr
+
+        entries: list[tuple[dict[str, Any], list[int]]] = []
+        for _, same in itertools.groupby(events, key=lambda event: (event["time_s"], event["kind"], event["text"])):
+            group = list(same)
+            entries.append((group[0], [event["system_id"] for event in group if event["system_id"] is not None]))
+        times_s = np.array([max(float(event["time_s"]), 0.0) for event, _ in entries])
+        texts = [event_text(event, system_ids, self._before_s) for event, system_ids in entries]
+        levels = [_event_level(event) for event, _ in entries]
+        self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
+
+    def _log_scene_styles(self) -> None:
+        """Colours, names and sizes of what moves."""
+        import rerun as rr
+
+        colors, few = vehicle_colors(len(self._labels)), len(self._labels) <= LABELS_MAX
+        own = [colors[k] for k in self._tree.followers]
+        spacing_m = min((math.hypot(*offset) for offset in self._tree.offsets_m[:, :2]), default=1.0)
+        ring_m = [0.06 * spacing_m, 0.06 * spacing_m, 0.0]
+        points = rr.Points3D.from_fields(
+            colors=colors, labels=self._labels, show_labels=few, radii=rr.Radius.ui_points(6.5 if few else 3.0)
+        )
+        wanted = rr.Ellipsoids3D.from_fields(
+            half_sizes=[ring_m], colors=[PALE], line_radii=rr.Radius.ui_points(0.8), fill_mode="majorwireframe"
+        )
+        for root in ("formation", "ground"):
+            self._stream.log(root, rr.ViewCoordinates.FRD, static=True)
+            self._stream.log(f"{root}/vehicles", points, static=True)
+            self._stream.log(f"{root}/wanted", wanted, static=True)
+            for name, width, lines in (("trails", 1.0, colors), ("gaps", 1.5, own), ("follows", 0.7, [PALE])):
+                strips = rr.LineStrips3D.from_fields(colors=lines, radii=rr.Radius.ui_points(width))
+                self._stream.log(f"{root}/{name}", strips, static=True)
+
+    def _log_plot_styles(self) -> None:
+        """Colours, names and widths of the curves."""
+        import rerun as rr
+
+        def lines(path: str, names: list[str], colors: list[Color], width: float = 1.5) -> None:
+            style = rr.SeriesLines(colors=colors, names=names, widths=[width] * len(names))
+            self._stream.log(path, style, static=True)
+
+        labels, colors = self._labels, vehicle_colors(len(self._labels))
+        followers = self._tree.followers
+        lines("spacing/error_m", [labels[k] for k in followers], [colors[k] for k in followers])
+        lines("delay/loop_ms", labels, colors)
+        lines("delay/rtt_ms", [f"{label} RTT" for label in labels], [dimmed(color) for color in colors], 0.8)
+        lines("delay/margin_ms", [f"{label} margin" for label in labels], [LIMIT_COLOR] * len(labels), 3.5)
+        for path in ("headroom/percent", "command/north_m_s2", "command/east_m_s2"):
+            lines(path, labels, colors)
+        for level in self._levels:
+            lines(level.path, [level.name], [LIMIT_COLOR if level.limit else PALE], 3.5 if level.limit else 1.0)
+        names = [mode.name for mode in Mode]
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=[MODE_COLORS[mode] for mode in Mode])
+        for label in labels:
+            self._stream.log(f"modes/{label}", lanes, static=True)
+
+
+def length_s(recording: Path) -> float | None:
+    """The last scenario time of a recording, None if nothing in it has a time."""
+    from rerun.chunk import RrdReader
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it was cut short: what is left of it may do
+        chunks = [chunk for chunk in RrdReader(recording).stream() if TIMELINE in chunk.timeline_names]
+    columns = (chunk.to_record_batch().column(TIMELINE).cast("int64") for chunk in chunks)
+    return max((1e-9 * time_ns for column in columns for time_ns in column.to_pylist()), default=None)
+
+
+def viewer_client(address: str) -> Any:
+    """A client that drives the Rerun viewer listening at an address."""
+    from rerun.experimental import ViewerClient
+
+    return ViewerClient.connect(address)
+
+
+def _levels(scenario: Scenario) -> list[Level]:
+    """What the curves are to be compared with, and zero where it would be out of sight."""
+    levels = [Level("delay/zero", "0", 0.0), Level("headroom/all", "100 %", 100.0)]
+    levels.append(Level("headroom/none", "0 %: loop delay = margin", 0.0, limit=True))
+    spacings_m = [math.hypot(*v.offset_ne_m) for v in scenario.vehicles if v.offset_ne_m is not None]
+    settled_m = sorted({round(scenario.safety.settled_fraction * spacing_m, 6) for spacing_m in spacings_m})
+    # With spacings of many lengths, the least and the greatest bound enclose the others.
+    ends_m = settled_m if len(settled_m) <= 2 else [settled_m[0], settled_m[-1]]
+    return levels + [Level(f"spacing/settled_{k}_m", f"settled: < {end:.2f} m", end) for k, end in enumerate(ends_m)]
+
+
+def _segments(start_m: Floats, end_m: Floats) -> Any:
+    """Straight lines between points of the same shape (..., 3): (lines, 2, 3)."""
+    return np.stack([start_m, end_m], axis=-2).reshape(-1, 2, 3)
+
+
+def _event_level(event: dict[str, Any]) -> str:
+    """How bad an event is: of a change of mode, the mode it ends in counts."""
+    last = event["text"].upper().split("->")[-1]
+    if any(word in last for word in ("CRITICAL", "LOST", "FAILSAFE")):
+        return "ERROR"
+    return "WARN" if "CAUTION" in last else "INFO"
+
+
+def _margins_text(design: dict[str, Any]) -> str:
+    """The margins of a design, by model, as far as there are any."""
+    named = (("sampled", design.get("delay_margin_s")), ("continuous", design.get("delay_margin_continuous_s")))
+    known = [f"{1e3 * s:.0f} ms {name}" for name, s in named if s is not None and math.isfinite(s)]
+    return "; of the fastest gains " + ", ".join(known) if known else ""
+
+
+def _blueprint(scenario: Scenario, design: dict[str, Any]) -> Any:
+    """The screen: the scene on the left, with modes and events; plots on the right; time below."""
+    import rerun.blueprint as rrb
+    from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+
+    def plot(name: str, *contents: str, legend: bool = False) -> Any:
+        corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend)
+        return rrb.TimeSeriesView(name=name, origin="/", contents=list(contents), plot_legend=corner)
+
+    few = len(scenario.vehicles) <= LEGEND_MAX
+    events = rrb.TextLogColumns(
+        timeline_columns=[TimelineColumn(timeline=TIMELINE, visible=False)],  # the text says it, as it was before 0 too
+        text_log_columns=[TextLogColumn(kind="loglevel"), TextLogColumn(kind="body")],
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                rrb.Tabs(_scene_view("formation", scenario), _scene_view("ground", scenario)),
+                rrb.Horizontal(
+                    rrb.StateTimelineView(name="Modes", origin="/modes"),
+                    rrb.TextLogView(name="Events", origin="/events", columns=events),
+                    column_shares=[2, 3],
+                ),
+                row_shares=[11, 6],
+            ),
+            rrb.Vertical(
+                plot("Spacing errors [m]", "/spacing/**", legend=few),
+                plot(f"Loop delay, RTT (dim), margin (red{_margins_text(design)}) [ms]", "/delay/**"),
+                plot("Headroom: 1 − loop delay / margin [%]", "/headroom/**"),
+                rrb.Tabs(
+                    plot("Command north [m/s²]", "/command/north_m_s2"),
+                    plot("Command east [m/s²]", "/command/east_m_s2"),
+                ),
+                row_shares=[3, 3, 2, 2],
+            ),
+            column_shares=[1, 1],
+        ),
+        rrb.TimePanel(timeline=TIMELINE, expanded=False, play_state="paused"),
+        rrb.SelectionPanel(expanded=False),
+        rrb.BlueprintPanel(expanded=False),
+    )
+
+
+def _scene_view(root: str, scenario: Scenario) -> Any:
+    """A 3D view from behind and above, from so far that it holds the wanted formation."""
+    import rerun.blueprint as rrb
+
+    middle_m, reach_m = wanted_extent_m(scenario)
+    # What is long from north to south comes near the eye at its southern end: such a formation needs more room.
+    radius_m = max(math.hypot(*reach_m), 1.4 * reach_m[0]) or 50.0
+    if root == "formation":
+        name, tracked, down_m = "Formation, seen from the leader, north up [m]", None, 0.0
+    else:
+        name, tracked, down_m = "Over the ground, local NED [m]", "/ground/vehicles", -scenario.altitude_m
+    trails = rrb.VisibleTimeRange(
+        TIMELINE,
+        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    return rrb.Spatial3DView(
+        name=name,
+        origin=f"/{root}",
+        background=(18, 20, 26),
+        eye_controls=rrb.EyeControls3D(
+            position=(middle_m[0] - 1.1 * radius_m, middle_m[1], down_m - 1.35 * radius_m),
+            look_target=(middle_m[0] - 0.18 * reach_m[0], middle_m[1], down_m),
+            eye_up=(0.0, 0.0, -1.0),
+            tracking_entity=tracked,
+        ),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=10.0 ** round(math.log10(radius_m / 1.5)), color=(60, 66, 78)),
+        overrides={f"/{root}/trails": rrb.VisibleTimeRanges([trails])},
+    )

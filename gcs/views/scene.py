@@ -1,0 +1,121 @@
+"""The formation as a picture: from tick rows to points and lines in space. Arrays only; who draws them is elsewhere."""
+
+import colorsys
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gcs.control.tick import TickArray
+from scenarios.schema import Scenario
+
+Floats = NDArray[np.float64]
+Color = tuple[int, int, int]
+
+PICTURE_S = 0.04
+"""Least time between two pictures: 25 a second are enough for the eye."""
+TRAIL_STEP_S = 0.2
+
+# Ten colours that stay apart on a dark ground; more vehicles take hues around the circle.
+PALETTE: tuple[Color, ...] = (
+    (240, 240, 240),
+    (66, 165, 245),
+    (255, 167, 38),
+    (102, 187, 106),
+    (236, 90, 160),
+    (255, 238, 88),
+    (38, 198, 218),
+    (171, 130, 255),
+    (239, 83, 80),
+    (174, 213, 129),
+)
+
+
+def vehicle_colors(count: int) -> list[Color]:
+    """One colour for each vehicle, in the scenario's order; the same in every view."""
+    if count <= len(PALETTE):
+        return list(PALETTE[:count])
+    golden = (math.sqrt(5) - 1) / 2  # steps of the golden ratio never come close to an earlier hue
+    colors = (colorsys.hsv_to_rgb(k * golden % 1, 0.55 + 0.2 * (k % 2), 1.0) for k in range(count))
+    return [(int(255 * red), int(255 * green), int(255 * blue)) for red, green, blue in colors]
+
+
+def dimmed(color: Color) -> Color:
+    """The same hue, half way to the dark ground."""
+    return (color[0] // 2 + 10, color[1] // 2 + 10, color[2] // 2 + 12)
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Who follows whom, by index in the scenario's order."""
+
+    leader: int
+    followers: list[int]
+    fronts: list[int]
+    """For each follower, whom it follows."""
+    offsets_m: Floats
+    """For each follower, where it is to be relative to that vehicle: (followers, 3), NED."""
+
+
+def tree_of(scenario: Scenario) -> Tree:
+    """The formation's tree as arrays."""
+    index = {vehicle.system_id: k for k, vehicle in enumerate(scenario.vehicles)}
+    offsets = [(*v.offset_ne_m, 0.0) for v in scenario.vehicles if v.offset_ne_m is not None]
+    return Tree(
+        leader=next(k for k, vehicle in enumerate(scenario.vehicles) if vehicle.follows is None),
+        followers=[k for k, vehicle in enumerate(scenario.vehicles) if vehicle.follows is not None],
+        fronts=[index[vehicle.follows] for vehicle in scenario.vehicles if vehicle.follows is not None],
+        offsets_m=np.array(offsets, dtype=float).reshape(-1, 3),
+    )
+
+
+def wanted_extent_m(scenario: Scenario) -> tuple[Floats, Floats]:
+    """Middle (north, east) of the wanted formation relative to the leader, and how far it reaches either way of it."""
+    places: dict[int | None, Floats] = {None: np.zeros(2)}
+    for vehicle in scenario.leader_first():
+        places[vehicle.system_id] = places[vehicle.follows] + np.array(vehicle.offset_ne_m or (0.0, 0.0))
+    corners_m = np.array(list(places.values()))
+    lowest_m, highest_m = corners_m.min(axis=0), corners_m.max(axis=0)
+    return (lowest_m + highest_m) / 2, (highest_m - lowest_m) / 2
+
+
+class Newest:
+    """Fills gaps in time: where a value is NaN, the newest one that was not."""
+
+    def __init__(self, *shape: int) -> None:
+        self._last = np.full(shape, np.nan)
+
+    def fill(self, values: Floats) -> Floats:
+        """`values` with time as its first axis, its gaps filled; still NaN before the first known value."""
+        filled = np.empty_like(values)
+        for k, line in enumerate(values):
+            filled[k] = self._last = np.where(np.isnan(line), self._last, line)
+        return filled
+
+
+class PictureTimes:
+    """Picks instants at least some time apart out of a stream of them."""
+
+    def __init__(self, step_s: float) -> None:
+        self._step_s = step_s
+        self._due_s = -np.inf
+
+    def pick(self, times_s: Floats) -> Iterator[int]:
+        for k, time_s in enumerate(times_s):
+            if time_s >= self._due_s:
+                self._due_s = time_s + self._step_s - 1e-6
+                yield k
+
+
+def positions_m(ticks: TickArray) -> Floats:
+    """Positions (ticks, vehicles, 3), NED, all brought to the instant of their tick.
+
+    The states used by one tick were sampled at different instants; at 91 m/s that is several metres.
+    Where the age of a state is unknown, the position is the one it gives.
+    """
+    sampled_m = np.stack([ticks["north_m"], ticks["east_m"], ticks["down_m"]], axis=2)
+    axes = ("velocity_north_m_s", "velocity_east_m_s", "velocity_down_m_s")
+    velocity_m_s = np.stack([ticks[axis] for axis in axes], axis=2)
+    return sampled_m + np.nan_to_num(velocity_m_s * ticks["telemetry_age_s"][..., np.newaxis])

@@ -1,0 +1,388 @@
+"""The live table: how close each vehicle of the formation is to its delay margin, while it flies.
+
+`FlightState` remembers what the table shows, `render` draws it, `plain_line` says it in one line where there is no
+terminal, and `Display` chooses between the two.
+"""
+
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from rich import box
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from gcs.control.phases import patience_s
+from gcs.control.tick import TICK, Mode, TickArray
+from gcs.plan.at_delay import figures_at
+from gcs.runs.refusals import REFUSED
+from gcs.views.console import plain_console
+from gcs.views.grid import unknown
+from scenarios.schema import Scenario
+
+Floats = NDArray[np.float64]
+
+WINDOW_S = 5.0
+"""What "the last seconds" are: percentiles and least headroom are taken over them."""
+PLAIN_EVERY_S = 5.0
+EVENTS_SHOWN = 3
+TOGETHER_S = 0.5
+"""Events that say the same within this time share a line."""
+NAMED_MAX = 12
+UNKNOWN = "–"
+
+HEADROOM_GOOD = 0.3
+"""Headroom from which it is shown in green."""
+BADNESS = (
+    Mode.NOMINAL,
+    Mode.WAITING,
+    Mode.RECOVERING,
+    Mode.CAUTION,
+    Mode.CRITICAL,
+    Mode.FAILSAFE,
+    Mode.LOST,
+)
+"""Modes, from good to bad."""
+MODE_STYLES: dict[Mode, str] = {
+    Mode.WAITING: "dim",
+    Mode.NOMINAL: "green",
+    Mode.RECOVERING: "cyan",
+    Mode.CAUTION: "yellow",
+    Mode.CRITICAL: "bold red",
+    Mode.FAILSAFE: "bold magenta",
+    Mode.LOST: "bold red",
+}
+
+
+class FlightState:
+    """What is known of a flight, as far as its ticks and events have been read."""
+
+    def __init__(self, scenario: Scenario, design: dict[str, Any]) -> None:
+        self.scenario = scenario
+        self.margin_s = np.nan
+        """Delay margin of the fastest gains."""
+        self.redesigned(design)
+        self.phase = UNKNOWN
+        self.refused = ""
+        """What did not get in, in words."""
+        self.time_s = np.nan
+        self.before_s = patience_s(scenario)
+        """What scenario time lacks to the time since the station's start, until the flight begins at 0."""
+        self.skipped = 0
+        """Ticks that were left out."""
+        self.news: list[str] = []
+        """The newest events, one line for those that say the same of several vehicles."""
+        self._last_event: tuple[str, str, float] | None = None
+        self._named: list[int] = []
+        self.system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
+        self.newest = unknown(self.system_ids)
+        self.rtt_s = self.newest["rtt_s"]
+        self._window: TickArray = np.empty((0, len(self.system_ids)), TICK)
+
+    def redesigned(self, design: dict[str, Any]) -> None:
+        """Compare with the margins of a design."""
+        self._design = design
+        self._at_delay: dict[tuple[int, int], str] = {}
+        margin_s = design["delay_margin_s"]
+        self.margin_s = np.nan if margin_s is None else float(margin_s)
+
+    def at_delay(self, figures: "Figures") -> str:
+        """α and the growth of spacing errors at the largest median of the loop delays, to the millisecond, in words."""
+        delay_s, gain_set = _worst(figures.loop_delay_s_p50), int(self.newest["gain_set"].max(initial=0))
+        if np.isnan(delay_s):
+            return ""
+        key = round(1e3 * delay_s), gain_set
+        if key not in self._at_delay:
+            found = figures_at(self._design, key[0] / 1e3, gain_set)
+            grows = "without bound" if found["string_peak"] is None else f"{found['string_peak']:.2f} times"
+            text = "" if found["alpha"] is None else f"alpha {found['alpha']:.3f}, errors grow {grows} at {key[0]} ms"
+            self._at_delay[key] = text
+        return self._at_delay[key]
+
+    def add(self, ticks: TickArray, events: list[dict[str, Any]]) -> None:
+        """Take whole ticks, shape (ticks, vehicles), and events."""
+        for event in events:
+            if event["kind"] == "phase":
+                self.phase = event["text"]
+            if event["kind"] == REFUSED:
+                self.refused = event["text"]
+            else:
+                self._add_news(event)
+        if not ticks.size:
+            return
+        numbers = np.concatenate([self._window["tick"][-1:, 0], ticks["tick"][:, 0]])
+        self.skipped += int(np.sum(np.diff(numbers) - 1))
+        self.newest = ticks[-1]
+        self.time_s = float(ticks["time_s"][-1, 0])
+        for line in ticks["rtt_s"]:
+            self.rtt_s = np.where(np.isnan(line), self.rtt_s, line)
+        window = np.concatenate([self._window, ticks])
+        self._window = window[window["time_s"][:, 0] > self.time_s - WINDOW_S]
+
+    def _add_news(self, event: dict[str, Any]) -> None:
+        same = (event["kind"], event["text"], event["time_s"] // TOGETHER_S)
+        if event["system_id"] is not None and self._named and same == self._last_event:
+            self._named.append(event["system_id"])
+            self.news[-1] = event_text(event, self._named, self.before_s)
+        else:
+            self._named = [] if event["system_id"] is None else [event["system_id"]]
+            self._last_event = same
+            self.news = [*self.news, event_text(event, self._named, self.before_s)][-EVENTS_SHOWN:]
+
+    def figures(self) -> "Figures":
+        """The figures to be shown, one value for each vehicle; NaN where unknown."""
+        now = self.newest
+        loop_delay_s = _quantiles(self._window["loop_delay_s"], (0.5, 0.99))
+        spacings_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in self.scenario.vehicles]
+        late_s = (self._window["sent_ns"][:, :1] - self._window["due_ns"][:, :1]) / 1e9
+        return Figures(
+            spacing_error_m=np.hypot(now["spacing_error_north_m"], now["spacing_error_east_m"]),
+            spacing_m=np.array(spacings_m),
+            rtt_s=self.rtt_s,
+            loop_delay_s_p50=loop_delay_s[0],
+            loop_delay_s_p99=loop_delay_s[1],
+            headroom=_quantiles(self._window["headroom"], (0.0,))[0],
+            lost=now["lost"],
+            late=now["late"],
+            modes=[Mode(int(mode)) for mode in now["mode"]],
+            lateness_s_p99=float(_quantiles(late_s, (0.99,))[0, 0]),
+        )
+
+
+@dataclass(frozen=True)
+class Figures:
+    """One value for each vehicle, in the scenario's order; the percentiles and the headroom of the last seconds."""
+
+    spacing_error_m: Floats
+    spacing_m: Floats
+    rtt_s: Floats
+    loop_delay_s_p50: Floats
+    loop_delay_s_p99: Floats
+    headroom: Floats
+    lost: NDArray[np.uint32]
+    late: NDArray[np.uint32]
+    modes: list[Mode]
+    lateness_s_p99: float
+
+    def worst_first(self) -> list[int]:
+        """Indices of vehicles: first those in the worst mode, within a mode those with the least headroom."""
+        headroom = np.nan_to_num(self.headroom, nan=np.inf)
+        return sorted(range(len(self.modes)), key=lambda k: (-BADNESS.index(self.modes[k]), headroom[k], k))
+
+    def not_nominal(self) -> dict[Mode, list[int]]:
+        """Indices of the vehicles in each mode but NOMINAL, worst mode first."""
+        found = {mode: [k for k, own in enumerate(self.modes) if own == mode] for mode in reversed(BADNESS)}
+        return {mode: indices for mode, indices in found.items() if indices and mode != Mode.NOMINAL}
+
+
+def render(state: FlightState, *, width: int, height: int) -> RenderableType:
+    """The whole display, at most `height` lines: what fits of the vehicles, and how many do not."""
+    figures = state.figures()
+    head: list[RenderableType] = [_headline(state), _progress(state, width)]
+    foot = _footer(state, figures)
+    order = list(range(len(state.system_ids)))
+    room = max(height - len(head) - len(foot) - 4, 2)  # 4: two lines of headings, the rule below, an empty line
+    if len(order) > room:
+        order = sorted(figures.worst_first()[: room - 1])
+    table = _vehicles(state, figures, order, width)
+    hidden = len(state.system_ids) - len(order)
+    more = [Text(f"  … {hidden} vehicles not shown, none of them worse", style="dim", no_wrap=True)] if hidden else []
+    return Group(*head, table, *more, Text(), *foot)
+
+
+def _headline(state: FlightState) -> Text:
+    time = UNKNOWN if np.isnan(state.time_s) else time_text(state.time_s, state.before_s, ".1f")
+    line = Text.assemble((state.scenario.name, "bold"), "  ", (state.phase, "bold cyan"), f"  {time}")
+    loop = state.scenario.control.loop
+    margin = _number(1e3 * state.margin_s, ".0f")
+    line.append(f"   delay margin {margin} ms (sampled, {loop} loop, fastest gains)", style="dim")
+    line.no_wrap = True
+    return line
+
+
+def _progress(state: FlightState, width: int) -> RenderableType:
+    duration_s = state.scenario.duration_s
+    done_s = min(max(np.nan_to_num(state.time_s), 0.0), duration_s)
+    bar = ProgressBar(total=duration_s, completed=done_s, width=max(width - 28, 10))
+    line = Table.grid(padding=(0, 2))
+    line.add_row(bar, f"{duration_s - done_s:.1f} s of {duration_s:.1f} s left")
+    return line
+
+
+_COLUMNS = (
+    ("id", 3, 0),
+    ("follows", 7, 101),
+    ("spacing\nerror m", 7, 0),
+    ("error\n%", 5, 76),
+    ("RTT\nms", 6, 76),
+    ("delay p50\nms", 9, 76),
+    ("delay p99\nms", 9, 0),
+    ("margin\nms", 6, 101),
+    ("headroom\n%", 8, 0),
+    ("", 10, 113),
+    ("lost", 5, 76),
+    ("late", 5, 76),
+    ("mode", 8, 0),
+)
+"""Heading, least width (so that columns stand still while their numbers change), and the terminal it needs."""
+
+
+def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
+    """One row for each vehicle in `order`; on a narrow terminal the columns that say least are left out."""
+    gap = 1 if width >= 101 else 0
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, gap, 0, 0))
+    for name, least, from_width in _COLUMNS:
+        if width >= from_width:
+            justify = "left" if name in ("", "mode") else "right"
+            table.add_column(name, justify=justify, no_wrap=True, min_width=least)
+    for k in order:
+        vehicle, error_m, mode = state.scenario.vehicles[k], figures.spacing_error_m[k], figures.modes[k]
+        headroom = float(figures.headroom[k])
+        cells = [
+            str(vehicle.system_id),
+            UNKNOWN if vehicle.follows is None else str(vehicle.follows),
+            _number(error_m, ".2f"),
+            _number(100 * error_m / figures.spacing_m[k], ".1f"),
+            _number(1e3 * figures.rtt_s[k], ".1f"),
+            _number(1e3 * figures.loop_delay_s_p50[k], ".1f"),
+            _number(1e3 * figures.loop_delay_s_p99[k], ".1f"),
+            _number(1e3 * state.newest["delay_margin_s"][k], ".0f"),
+            Text(_number(100 * headroom, ".0f"), headroom_style(headroom)),
+            Text(_bar(headroom), headroom_style(headroom)),
+            str(figures.lost[k]),
+            str(figures.late[k]),
+            Text(mode.name, MODE_STYLES[mode]),
+        ]
+        columns = zip(cells, _COLUMNS, strict=True)
+        table.add_row(*(cell for cell, (_, _, from_width) in columns if width >= from_width))
+    return table
+
+
+def _footer(state: FlightState, figures: Figures) -> list[Text]:
+    """The formation in one line, then the newest events."""
+    line = Text(f"least headroom {_worst_headroom(state, figures)}", no_wrap=True)
+    line.append(f"   tick lateness p99 {_number(1e3 * figures.lateness_s_p99, '.2f')} ms")
+    if state.skipped:
+        line.append(f"   {state.skipped} ticks skipped", style="yellow")
+    refused = [Text(f"refused: {state.refused}", style="yellow", no_wrap=True)] if state.refused else []
+    flown = [Text(at_delay, no_wrap=True)] if (at_delay := state.at_delay(figures)) else []
+    return [line, *flown, *refused, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
+
+
+def plain_line(state: FlightState) -> str:
+    """The formation in one line of text."""
+    figures = state.figures()
+    modes = [
+        f"{mode.name} {' '.join(str(state.system_ids[k]) for k in indices)}"
+        for mode, indices in figures.not_nominal().items()
+    ]
+    time, at_delay = time_text(state.time_s, state.before_s), state.at_delay(figures)
+    return (
+        f"{time}  spacing error max {_number(_worst(figures.spacing_error_m), '.2f')} m"
+        f"  loop delay p99 max {_number(1e3 * _worst(figures.loop_delay_s_p99), '.1f')} ms"
+        f"  headroom min {_worst_headroom(state, figures)}  {', '.join(modes) or 'all NOMINAL'}"
+        f"{at_delay and f'  {at_delay}'}"
+    )
+
+
+def time_text(time_s: float, before_s: float, form: str = "8.2f") -> str:
+    """Time of the flight; before it, time since the station's start, which scenario time is `before_s` short of."""
+    return f"start {time_s + before_s:+.2f} s" if time_s < 0.0 else f"{_number(time_s, form)} s"
+
+
+def event_text(event: dict[str, Any], system_ids: list[int], before_s: float) -> str:
+    """An event in one line of text, for the vehicles it says the same of; `before_s` as in `time_text`."""
+    named = " ".join(str(system_id) for system_id in system_ids[:NAMED_MAX])
+    if len(system_ids) > NAMED_MAX:
+        named += f" and {len(system_ids) - NAMED_MAX} more"
+    who = f"vehicle{'s' * (len(system_ids) > 1)} {named}: " if system_ids else ""
+    kind = "" if event["kind"] == "vehicle" else f"{event['kind']}  "  # else the word would stand there twice
+    return f"{time_text(event['time_s'], before_s)}  {kind}{who}{event['text']}"
+
+
+class Display:
+    """Shows a flight on standard output: as a table that is drawn anew on a terminal, else as lines of text."""
+
+    def __init__(self, state: FlightState, *, shown: bool) -> None:
+        self._state = state
+        self._console = plain_console(soft_wrap=False)
+        self._shown = shown
+        self._live = Live(auto_refresh=False, console=self._console) if shown and self._console.is_terminal else None
+        self._plain_due_s = -np.inf
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def events(self, events: list[dict[str, Any]]) -> None:
+        """Say each event once, where there is no terminal to keep a table on."""
+        if self._live is None:
+            for event in events:
+                system_ids = [] if event["system_id"] is None else [event["system_id"]]
+                self._say(event_text(event, system_ids, self._state.before_s))
+
+    def show(self, *, last: bool = False) -> None:
+        """Show the flight as it is now."""
+        state = self._state
+        if self._live is not None:
+            # The last line stays free for the cursor: a display as high as the terminal would scroll it.
+            picture = render(state, width=self._console.width, height=self._console.height - 1)
+            self._live.update(picture, refresh=True)
+        elif state.time_s >= self._plain_due_s or last:
+            self._plain_due_s = (state.time_s // PLAIN_EVERY_S + 1) * PLAIN_EVERY_S
+            self._say(plain_line(state))
+
+    def _say(self, line: str) -> None:
+        if self._shown:
+            print(line, flush=True)
+
+
+def _quantiles(values: Floats, probabilities: tuple[float, ...]) -> Floats:
+    """Quantiles (as the nearest value above) over axis 0, of the values that are not NaN; NaN where there are none.
+
+    As np.nanquantile, which takes a hundred times longer with a NaN in every column.
+    """
+    ordered = np.sort(values, axis=0)  # NaN last
+    count = np.sum(~np.isnan(values), axis=0)
+    result = np.full((len(probabilities), values.shape[1]), np.nan)
+    known = np.nonzero(count)[0]
+    for line, probability in zip(result, probabilities, strict=True):
+        line[known] = ordered[np.ceil(probability * (count[known] - 1)).astype(int), known]
+    return result
+
+
+def _worst(values: Floats) -> float:
+    return float(np.nanmax(values)) if not np.all(np.isnan(values)) else np.nan
+
+
+def _worst_headroom(state: FlightState, figures: Figures) -> str:
+    if np.all(np.isnan(figures.headroom)):
+        return UNKNOWN
+    worst = int(np.nanargmin(figures.headroom))
+    return f"{100 * figures.headroom[worst]:.0f} % (vehicle {state.system_ids[worst]})"
+
+
+def _number(value: float, form: str) -> str:
+    return UNKNOWN if np.isnan(value) else format(value, form)
+
+
+def headroom_style(headroom: float) -> str:
+    if np.isnan(headroom):
+        return "dim"
+    return "green" if headroom >= HEADROOM_GOOD else "yellow" if headroom >= 0 else "bold red"
+
+
+def _bar(headroom: float) -> str:
+    """Headroom as a bar of ten cells."""
+    eighths = int(np.clip(np.nan_to_num(headroom), 0, 1) * 80)
+    return ("█" * (eighths // 8) + " ▏▎▍▌▋▊▉"[eighths % 8]).ljust(10)[:10]

@@ -1,0 +1,161 @@
+"""Show a recording: the Rerun viewer on the screen, or a picture made without one.
+
+ViewerError(Exception)    a recording or a viewer that is not there, in one line
+"""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time  # noqa: TID251 (waits for another program)
+from collections.abc import Generator
+from contextlib import contextmanager
+from math import floor
+from pathlib import Path
+from typing import IO, Any
+
+from gcs.interrupts import raised
+from gcs.runs.record import RECORDING_FILE
+from gcs.views.recording import TIMELINE, UNFINISHED_FILE, length_s, viewer_client
+
+START_S = 20.0
+SETTLE_S = 20.0
+DEFAULT_PICTURE_S = 10.0
+_MAGIC = b"RRF"
+"""How every .rrd file begins."""
+_WANTED = "wanted a recording of a run (.rrd)"
+
+
+class ViewerError(Exception):
+    """A recording that cannot be shown."""
+
+
+def view(folder_or_rrd: Path) -> int:
+    """Open the Rerun viewer on a recording; returns when it is closed, with its exit code."""
+    recording = find_recording(folder_or_rrd)
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError("no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; a picture can be made without")
+    print(f"viewer   {recording}: until its window is closed", flush=True)
+    return subprocess.run([_program(), str(recording)], check=False).returncode
+
+
+def picture_time_s(recording: Path, wanted_s: float | None) -> float:
+    """The scenario time of a picture: the one wanted, if the recording is that long, else ten seconds or its end.
+
+    Raises
+    ------
+    ViewerError
+        If the recording ends before, or holds no flight.
+    """
+    try:
+        end_s = length_s(recording)
+    except (OSError, RuntimeError, ValueError):  # cut short, or of another version
+        end_s = None
+    if end_s is None:
+        raise ViewerError(f"{recording}: read no flight in it, {_WANTED}")
+    if wanted_s is None:
+        return min(DEFAULT_PICTURE_S, end_s)
+    if not 0.0 <= wanted_s <= end_s:
+        length = f"{floor(1e3 * end_s) / 1e3:g} s"
+        raise ViewerError(f"--at: read {wanted_s:g}, wanted seconds from 0: {recording} is {length} long")
+    return wanted_s
+
+
+def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 1600, height: int = 900) -> list[str]:
+    """Write a picture of the recording's screen at a scenario time; returns what the views report as wrong.
+
+    Raises
+    ------
+    ViewerError
+        If there is no finished recording, or the viewer does not start: it needs a Vulkan driver, but no screen.
+    """
+    recording = find_recording(folder_or_rrd)
+    with _headless(width, height) as viewer:
+        viewer.open(str(recording.resolve()))
+        try:
+            viewer.set_time(TIMELINE, duration=time_s, play_state="paused")
+        except ConnectionError:  # it has loaded nothing with times
+            raise ViewerError(f"{recording}: the viewer reads no flight in it; {_WANTED}") from None
+        viewer.run_command("ui.toggle_top_panel")  # it has nothing to say on a picture
+        png.write_bytes(_settled_picture(viewer))
+        state = viewer.get_state()
+    if not state.views:
+        raise ViewerError(f"{recording}: the viewer shows nothing of it; {_WANTED}")
+    return [f"{shown.name}: {report}" for shown in state.views for report in shown.reports]
+
+
+def find_recording(folder_or_rrd: Path) -> Path:
+    """The finished recording of a run folder, or the file itself."""
+    if folder_or_rrd.is_file():
+        return _begun_as_recording(folder_or_rrd)
+    recording = folder_or_rrd / RECORDING_FILE
+    if recording.is_file():
+        return _begun_as_recording(recording)
+    if not folder_or_rrd.is_dir():
+        raise ViewerError(f"{folder_or_rrd}: no such run folder or recording")
+    if (folder_or_rrd / UNFINISHED_FILE).exists():
+        raise ViewerError(f"{folder_or_rrd}: the recording is not finished; the run still flies, or it was killed")
+    raise ViewerError(f"{folder_or_rrd}: no {RECORDING_FILE} here; wanted a run folder or an .rrd file")
+
+
+def _begun_as_recording(file: Path) -> Path:
+    with file.open("rb") as opened:
+        if opened.read(len(_MAGIC)) != _MAGIC:
+            raise ViewerError(f"{file}: read a file of another kind; {_WANTED}")
+    return file
+
+
+def vulkan_missing() -> bool:
+    """Whether no Vulkan driver is installed, which a picture without a screen needs."""
+    folders = (Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d"), Path("/usr/local/share/vulkan/icd.d"))
+    return not any(file.suffix == ".json" for folder in folders if folder.is_dir() for file in folder.iterdir())
+
+
+@contextmanager
+def _headless(width: int, height: int) -> Generator[Any]:
+    """A viewer without a window, listening on a free port of this machine only."""
+    if vulkan_missing():
+        raise ViewerError("no Vulkan driver to draw with; on Debian and Ubuntu: apt install mesa-vulkan-drivers")
+    command = [_program(), "--headless", "--bind", "127.0.0.1", "--port", "0", "--window-size", f"{width}x{height}"]
+    with raised(), tempfile.TemporaryFile() as log:
+        environment = os.environ | {"RERUN_APP_ONLY": "true"}  # what the package sets when it starts a viewer itself
+        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+        try:
+            yield viewer_client(_address(process, log))
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def _settled_picture(viewer: Any) -> bytes:
+    """A picture without the notes of a starting viewer, and with what it loads after its first frames."""
+    pictures = [viewer.take_screenshot()]
+    give_up = time.monotonic() + SETTLE_S
+    while pictures[-3:] != 3 * pictures[-1:] and time.monotonic() < give_up:
+        pictures.append(viewer.take_screenshot())
+    return pictures[-1]
+
+
+def _address(process: subprocess.Popen[bytes], log: IO[bytes]) -> str:
+    """Where a starting viewer listens: it says so in its log, and then that it draws."""
+    give_up = time.monotonic() + START_S
+    while True:
+        text = os.pread(log.fileno(), 1 << 20, 0).decode(errors="replace")
+        address = re.search(r"rerun\+http://[0-9.:]+/proxy", text)
+        if address and "Headless viewer running" in text:
+            return address.group()
+        if process.poll() is not None or time.monotonic() > give_up:
+            last = (text.strip().splitlines() or ["it said nothing"])[-1]
+            raise ViewerError(f"the Rerun viewer does not start without a screen: {last}")
+        time.sleep(0.02)
+
+
+def _program() -> str:
+    """The viewer's binary, which the Python package brings along."""
+    package = importlib.util.find_spec("rerun_cli")
+    program = Path(package.origin or "").parent / "rerun" if package else Path("rerun")
+    if not program.is_file():
+        raise ViewerError("the Rerun viewer is not installed; it comes with the Python package rerun-sdk")
+    return str(program)

@@ -1,0 +1,321 @@
+"""From a telemetry log alone: the ticks of a flight as the log shows them, with their latencies, errors and modes.
+
+The frames of the log go, in its order, through the code that the station has for them: clocks, sequence numbers, states
+brought to one instant. A log of this station shows its ticks by the time_boot_ms of its set-points; any other log is
+looked at as often as the scenario's control rate says.
+
+Not in a log: how long telemetry waited in the station's socket, and by how much the monitor had opened the formation,
+so errors are those against the formation as designed. A tick's lateness is told against the most punctual one.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from math import nan
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gains.formation.model import FormationModel
+from gcs.autopilot.copters import locate
+from gcs.control.history import StateHistory
+from gcs.control.law import Blend, FeedbackLaw, distances_m, feedback_law, formation_control
+from gcs.control.onboard_stream import Stream, law_of
+from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Mode, TickArray
+from gcs.link import mavlink
+from gcs.link.startup import Startup
+from gcs.plan.formation import Formation, plan_formation
+from gcs.plan.planner import flight_plan
+from gcs.station.monitor import VehicleState
+from gcs.station.station import SILENCE_S
+from gcs.station.tick_rows import Repetitions, Reported, Tick, VehicleTick, tick_rows
+from gcs.watch.links import Watch, WatchedVehicle
+from scenarios.schema import NS_PER_S, Scenario
+
+Frames = list[tuple[int, mavlink.Frame]]
+Laws = Callable[[Sequence[bool]], FeedbackLaw]
+Events = list[dict[str, object]]
+
+_TOLD = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
+_LONGEST_GAP_NS = 10 * NS_PER_S
+"""In a log that says nothing for longer there are no ticks."""
+_LEAST_TICKS = 3
+_NO_BLEND = Blend()
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """What a log shows of a flight: rows and events as of a run, and its links."""
+
+    ticks: TickArray
+    events: Events
+    links: Watch
+    own: bool
+    """Whether the log is one of this station, so that its ticks and the flight's end are known."""
+
+
+class _Outline(NamedTuple):
+    """What a first look at a log shows."""
+
+    base_ns: int
+    """Log time of key 0, by the most punctual set-point."""
+    keys: list[int]
+    """time_boot_ms of the set-points of this station's ticks; none in a log of another."""
+    start_key: int
+    """The flight's first tick."""
+    exchanges: bool
+    """Whether requests of TIMESYNC are in the log, and not only telemetry."""
+
+
+@dataclass
+class _OpenTick:
+    """A tick some of whose set-points have been read."""
+
+    key_ms: int
+    sent_ns: int
+    commands: dict[int, tuple[float, float]] = field(default_factory=dict[int, tuple[float, float]])
+
+
+def rebuild(frames: Frames, scenario: Scenario, margins_s: tuple[float, ...]) -> Rebuilt:
+    """The flight of a scenario in a log; `margins_s` are those of the gain schedule, fastest first."""
+    replayed = _Replay(scenario, margins_s, _outline(frames, scenario))
+    for time_ns, frame in frames:
+        replayed.take(time_ns, frame)
+    return replayed.finished()
+
+
+def watched(frames: Iterable[tuple[int, mavlink.Frame]]) -> Watch:
+    """The links in a log, whosever it is."""
+    watch = Watch()
+    for time_ns, frame in frames:
+        watch.take(frame, time_ns)
+        watch.look(time_ns)
+    return watch
+
+
+def _outline(frames: Frames, scenario: Scenario) -> _Outline:
+    vehicles = {vehicle.system_id for vehicle in scenario.vehicles}
+    sent_ns: dict[int, int] = {}
+    start_key = None
+    exchanges = False
+    for time_ns, frame in frames:
+        if frame.system_id in vehicles:
+            continue
+        if frame.msg_id == mavlink.SET_POSITION_TARGET_LOCAL_NED:
+            sent_ns.setdefault(frame.fields[0], time_ns)
+        elif frame.msg_id == mavlink.STATUSTEXT and start_key is None and sent_ns:
+            told = _told(frame)
+            if told is not None and told[1] == Mode.NOMINAL.name:
+                start_key = list(sent_ns)[-1]  # it is told at the tick after
+        exchanges = exchanges or (frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0)
+    keys = list(sent_ns)
+    period_ms = 1e3 / scenario.rates.control_hz
+    own = len(keys) >= _LEAST_TICKS and abs(float(np.median(np.diff(keys))) - period_ms) < 1.5
+    if not own:
+        return _Outline(frames[0][0], [], 0, exchanges)
+    base_ns = min(time_ns - key * 1_000_000 for key, time_ns in sent_ns.items())
+    return _Outline(base_ns, keys, keys[0] if start_key is None else start_key, exchanges)
+
+
+def _told(frame: mavlink.Frame) -> tuple[int, str] | None:
+    """What a STATUSTEXT of the station tells of a vehicle: its mode, or the number of its gain set."""
+    found = _TOLD.match(frame.fields[1].split(b"\0")[0].decode(errors="replace"))
+    return None if found is None else (int(found[1]), found[2] or found[3])
+
+
+def _errors_of(scenario: Scenario, formation: Formation) -> tuple[Laws, Any]:
+    """The law around lost vehicles, and the function that forms the errors by it, as the station has them."""
+    if scenario.control.loop == "onboard":  # what is streamed, and so how old it is, depends on the gains
+        _, plan = flight_plan(scenario)
+        return partial(law_of, plan), Stream(plan).control
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    no_gains = (np.zeros((model.inputs, model.states)),)  # only the errors are wanted
+    return partial(feedback_law, formation, no_gains), formation_control
+
+
+class _Replay:
+    """The station's picture of the vehicles, built up again."""
+
+    def __init__(self, scenario: Scenario, margins_s: tuple[float, ...], outline: _Outline) -> None:
+        self._scenario, self._margins_s, self._outline = scenario, margins_s, outline
+        self._formation = plan_formation(scenario)
+        ids = self._formation.system_ids
+        self._repetitions = Repetitions(scenario.rates, len(ids))
+        self.watch = Watch(ids)
+        self._vehicles = [self.watch.vehicles[system_id] for system_id in ids]
+        self._row = {system_id: row for row, system_id in enumerate(ids)}
+        self._starts: list[Startup | None] = [None] * len(ids)
+        if scenario.dynamics == "autopilot":
+            self._starts = [Startup(altitude_m=scenario.altitude_m, telemetry_interval_us=1.0) for _ in ids]
+        for vehicle, startup in zip(self._vehicles, self._starts, strict=True):
+            vehicle.remote.startup = startup
+        self._frame_ned_m = [(0.0, 0.0, 0.0)] * len(ids)
+        self._history = StateHistory(len(ids))
+        self._laws, self._control = _errors_of(scenario, self._formation)
+        self._lost = [False] * len(ids)
+        self._law = self._laws(self._lost)
+        self._telemetry_ns = [0] * len(ids)
+        self._reported = [Reported()] * len(ids)
+        self._states = [VehicleState()] * len(ids)
+        self._jumps = [0] * len(ids)
+        self._exchanges = [0] * len(ids)
+        """Of each vehicle, those that earlier ticks have shown."""
+        self._period_ns = round(NS_PER_S / scenario.rates.control_hz)
+        self._start_ns = outline.base_ns + outline.start_key * 1_000_000
+        first_key, last_key = (outline.keys[0], outline.keys[-1]) if outline.keys else (0, -1)
+        half_ns = self._period_ns // 2
+        self._own_ns = (outline.base_ns + first_key * 1_000_000 - half_ns, outline.base_ns + last_key * 1_000_000)
+        self._grid_ns = self._newest_ns = 0
+        self._open: _OpenTick | None = None
+        self._rows: list[TickArray] = []
+        self._events: Events = []
+
+    def take(self, time_ns: int, frame: mavlink.Frame) -> None:
+        """Take in the next frame of the log."""
+        self._newest_ns = time_ns
+        station = frame.system_id not in self._row
+        if station and frame.msg_id == mavlink.SET_POSITION_TARGET_LOCAL_NED and self._outline.keys:
+            self._set_point(time_ns, frame)
+            return
+        self._close_tick()
+        self._look(time_ns)
+        if station and frame.msg_id == mavlink.STATUSTEXT:
+            self._take_told(time_ns, frame)
+        vehicle = self.watch.take(frame, time_ns)
+        self.watch.look(time_ns)
+        row = self._row.get(frame.system_id)
+        if vehicle is None or row is None:
+            return
+        self._take_telemetry(row, vehicle, time_ns, frame)
+
+    def finished(self) -> Rebuilt:
+        """What was found, once the log has been read."""
+        self._close_tick()
+        self._look(self._newest_ns + self._period_ns)  # what came after the last tick
+        rows = np.concatenate(self._rows) if self._rows else np.empty(0, TICK)
+        rows = rows[np.argsort(rows["tick"], kind="stable")]
+        return Rebuilt(rows, self._events, self.watch, bool(self._outline.keys))
+
+    def _set_point(self, time_ns: int, frame: mavlink.Frame) -> None:
+        key_ms, command, target = frame.fields[0], frame.fields[7:9], frame.fields[13]
+        if self._open is None or self._open.key_ms != key_ms:
+            self._close_tick()
+            self._open = _OpenTick(key_ms, time_ns)
+        self._open.sent_ns = time_ns
+        self._open.commands[target] = command
+
+    def _close_tick(self) -> None:
+        if self._open is not None:
+            due_ns = self._outline.base_ns + self._open.key_ms * 1_000_000
+            self._tick(due_ns, self._open.sent_ns, self._open.commands, self._open.key_ms)
+            self._open = None
+
+    def _look(self, time_ns: int) -> None:
+        """Ticks without set-points: before and after those of this station, or where there is none of it."""
+        if time_ns - self._grid_ns > _LONGEST_GAP_NS:
+            behind = (time_ns - self._outline.base_ns) // self._period_ns
+            self._grid_ns = self._outline.base_ns + behind * self._period_ns
+        while self._grid_ns < time_ns:
+            if not self._outline.keys:
+                self._tick(self._grid_ns, self._grid_ns, self._all_known(), 0)
+            elif not self._own_ns[0] <= self._grid_ns <= self._own_ns[1]:
+                self._tick(self._grid_ns, self._grid_ns, {}, 0)
+            self._grid_ns += self._period_ns
+
+    def _all_known(self) -> dict[int, tuple[float, float]]:
+        """In a log without this station's set-points: its vehicles count as flown while all have reported."""
+        return dict.fromkeys(self._row, (nan, nan)) if self._history.complete else {}
+
+    def _take_told(self, time_ns: int, frame: mavlink.Frame) -> None:
+        """A mode or a gain set, as the station told it."""
+        system_id, told = _told(frame) or (0, "")
+        row = self._row.get(system_id)
+        if row is None:
+            return
+        state = self._states[row]
+        if told.isdecimal():
+            gain_set = min(int(told), len(self._margins_s) - 1)
+            self._states[row] = VehicleState(mode=state.mode, gain_set=gain_set)
+        elif told in Mode.__members__:
+            self._states[row] = VehicleState(mode=Mode[told], gain_set=state.gain_set)
+            self._event(time_ns, "mode", f"{state.mode.name} -> {told}", system_id)
+
+    def _take_telemetry(self, row: int, vehicle: WatchedVehicle, time_ns: int, frame: mavlink.Frame) -> None:
+        startup, clock = self._starts[row], vehicle.remote.clock
+        if startup is not None:
+            startup.take(frame.msg_id, frame.fields)
+        if clock.jumps > self._jumps[row]:
+            self._jumps[row] = clock.jumps
+            self._history.forget(row)
+            self._event(time_ns, "vehicle", CLOCK_JUMPED, vehicle.remote.system_id)
+        if frame.msg_id != mavlink.LOCAL_POSITION_NED:
+            return
+        boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
+        bound_s = nan
+        sample_ns = clock.sampled_ns(boot_ms, time_ns, newest=vehicle.remote.newest)
+        if sample_ns is not None:
+            bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
+        elif self._outline.exchanges:
+            if not clock.exchange_due:
+                self._telemetry_ns[row] = time_ns
+            return
+        else:
+            sample_ns = boot_ms * 1_000_000 + vehicle.least_delay_ns
+        origin_north, origin_east, origin_down = self._frame_ned_m[row]
+        if self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
+            self._telemetry_ns[row] = time_ns
+            self._reported[row] = Reported(
+                boot_ms, down + origin_down, v_down, received_ns=time_ns, bound_s=bound_s
+            )  # fmt: skip
+
+    def _tick(self, due_ns: int, sent_ns: int, commands: dict[int, tuple[float, float]], key_ms: int) -> None:
+        """The rows of one tick, from what the station knew when it sent these set-points."""
+        time_s = (due_ns - self._start_ns) / NS_PER_S
+        flying = bool(commands) and time_s >= 0
+        if not flying:
+            locate(self._starts, self._frame_ned_m, self._history)
+        lost = [flying and sent_ns - heard_ns > SILENCE_S * NS_PER_S for heard_ns in self._telemetry_ns]
+        if lost != self._lost:
+            self._lost, self._law = lost, self._laws(lost)
+        controls = self._control(
+            self._history,
+            self._law,
+            [_NO_BLEND] * len(lost),
+            nominal_velocity_m_s=self._scenario.nominal_velocity_at(time_s),
+        )
+        nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns), axis=1).tolist()
+        seen: list[VehicleTick] = []
+        for row, (vehicle, control, state) in enumerate(zip(self._vehicles, controls, self._states, strict=True)):
+            command = commands.get(vehicle.remote.system_id)
+            sent = control._replace(command_m_s2=command or (nan, nan))
+            margin_s = self._margins_s[state.gain_set]
+            rtt_s = self._fresh_rtt_s(row, vehicle)
+            seen.append(
+                VehicleTick(
+                    vehicle.remote,
+                    state,
+                    sent,
+                    self._reported[row],
+                    rtt_s,
+                    nearest_m[row],
+                    command is not None,
+                    margin_s,
+                    self._repetitions.repeated_s(row, control.used_ns, due_ns),
+                )
+            )
+        number = round((due_ns - self._start_ns) / self._period_ns)
+        rows, _ = tick_rows(Tick(number, time_s, due_ns, key_ms, seen), sent_ns)
+        self._rows.append(rows)
+
+    def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:
+        """The oldest round trip that is in no earlier tick, NaN if there is none."""
+        taken = self._exchanges[row]
+        if taken == len(vehicle.rtt_s):
+            return nan
+        self._exchanges[row] = taken + 1
+        return vehicle.rtt_s[taken]
+
+    def _event(self, time_ns: int, kind: str, text: str, system_id: int | None = None) -> None:
+        time_s = round((time_ns - self._start_ns) / NS_PER_S, 6)
+        self._events.append({"time_s": time_s, "kind": kind, "system_id": system_id, "text": text})

@@ -1,0 +1,137 @@
+"""`gcs replay`: what is asked of a log, and the summary made of it."""
+
+from dataclasses import dataclass
+from math import hypot, inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gcs.control.tick import TickArray
+from gcs.runs.files import read_design, read_summary
+from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
+from gcs.runs.summary import summarise
+from gcs.views.console import plain_console
+from gcs.views.report import delay_text, print_flight
+from gcs.watch.rebuild import Rebuilt, rebuild, watched
+from gcs.watch.table import links_table
+from gcs.watch.tlog import TelemetryLog
+from scenarios import files
+from scenarios.schema import Scenario
+
+_COMPARED = ("verdict", "loop", "delay_margin_s", "loop_delay_s", "headroom_min", "settling_time_s", "distance_min_m")
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """Where a log is, and what it is compared with as far as that is known."""
+
+    log_file: Path
+    scenario: Scenario | None
+    design: dict[str, Any] | None
+    recorded: dict[str, Any] | None
+    """The summary of the run that the log is of."""
+
+
+def found(run_or_file: Path) -> Replayed:
+    """The log, and what stands beside it in the folder of a run."""
+    folder = run_or_file if run_or_file.is_dir() else run_or_file.parent
+    log_file = folder / TLOG_FILE if run_or_file.is_dir() else run_or_file
+    own = log_file.name == TLOG_FILE
+    scenario_file, design_file, summary_file = (folder / name for name in (SCENARIO_FILE, DESIGN_FILE, SUMMARY_FILE))
+    scenario = files.load(scenario_file) if own and scenario_file.exists() else None
+    design = read_design(design_file) if own and design_file.exists() else None
+    recorded = read_summary(summary_file) if own and summary_file.exists() else None
+    return Replayed(log_file, scenario, design, recorded)
+
+
+def replay(log: TelemetryLog, replayed: Replayed) -> dict[str, Any]:
+    """The summary of a log: of its links, and of the flight if the scenario is known."""
+    first_ns, last_ns = log.frames[0][0], log.frames[-1][0]
+    scenario, design = replayed.scenario, replayed.design
+    margin_s = None if design is None else design["delay_margin_s"]
+    rebuilt = None if scenario is None else rebuild(log.frames, scenario, _margins_s(design))
+    watch = watched(log.frames) if rebuilt is None else rebuilt.links
+    result: dict[str, Any] = {
+        "log": {
+            "file": str(replayed.log_file),
+            "frames": len(log.frames),
+            "duration_s": (last_ns - first_ns) * 1e-9,
+            "left_out": dict(log.counters + watch.counters),
+        },
+        "delay_margin_s": margin_s,
+        "stations": sorted(watch.stations),
+        "links": watch.figures(last_ns, margin_s),
+    }
+    if rebuilt is not None and scenario is not None:
+        result["flight"] = _flight(scenario, design, rebuilt)
+    if replayed.recorded is not None:
+        result["recorded"] = {name: replayed.recorded.get(name) for name in _COMPARED}
+    return result
+
+
+def _margins_s(design: dict[str, Any] | None) -> tuple[float, ...]:
+    """Of the gain schedule; one that is unbounded or unknown is infinite."""
+    schedule: list[dict[str, Any]] = [{}] if design is None else design.get("schedule") or [design]
+    margins_s = [entry.get("delay_margin_s") for entry in schedule]
+    return tuple(inf if margin_s is None else float(margin_s) for margin_s in margins_s)
+
+
+def _flight(scenario: Scenario, design: dict[str, Any] | None, rebuilt: Rebuilt) -> dict[str, Any]:
+    reason = _reason(scenario, rebuilt)
+    ends = [{"time_s": 0.0, "kind": "end", "system_id": None, "text": reason}]
+    design = {"delay_margin_s": None, "delay_margin_continuous_s": None} | (design or {})
+    summary = summarise(scenario, design, rebuilt.ticks, [*rebuilt.events, *ends])
+    if not rebuilt.own:
+        summary |= {"verdict": "not judged", "settling_time_s": None, "control": None}
+    del summary["files"]
+    return summary
+
+
+def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
+    """Why the flight ended, by its last tick."""
+    flown = rebuilt.ticks[rebuilt.ticks["commanded"] & (rebuilt.ticks["time_s"] >= 0)]
+    if not rebuilt.own:
+        return "the log has no set-points of this station"
+    if not flown.size:
+        return "nothing was flown"
+    last = flown[flown["tick"] == flown["tick"][-1]]
+    if (broken := _broken(scenario, last)) is not None:
+        return broken
+    left = sorted({vehicle.system_id for vehicle in scenario.vehicles} - set(last["system_id"].tolist()))
+    if left:
+        return f"lost: vehicles {', '.join(map(str, left))} are sent nothing at the end"
+    end_s = float(last["time_s"][0])
+    if end_s < scenario.duration_s - 1.5 / scenario.rates.control_hz:
+        return f"interrupted: set-points end after {end_s:.1f} s of {scenario.duration_s:g} s"
+    return "completed: duration reached"
+
+
+def _broken(scenario: Scenario, last: TickArray) -> str | None:
+    """Which limit the last tick breaks, in the order in which the station looks."""
+    closest_m = float(np.fmin.reduce(last["nearest_m"]))
+    if closest_m < scenario.safety.collision_distance_m:
+        return f"broken: vehicles have collided, {closest_m:.1f} m apart"
+    for row in last:
+        error_m = hypot(row["spacing_error_north_m"], row["spacing_error_east_m"])
+        if error_m > scenario.safety.spacing_error_limit_m:
+            limit_m = scenario.safety.spacing_error_limit_m
+            return f"broken: spacing error of vehicle {row['system_id']} is {error_m:.0f} m, limit {limit_m:g} m"
+    return None
+
+
+def print_replay(result: dict[str, Any]) -> None:
+    """The log, its links, and the flight as far as it is known."""
+    console = plain_console()
+    log, width = result["log"], console.width
+    left_out = "".join(f"; {count} {reason}" for reason, count in log["left_out"].items())
+    console.print(f"log      {log['file']}: {log['frames']} frames in {log['duration_s']:.1f} s{left_out}")
+    if not result["links"]:
+        console.print("no vehicle in this log")
+    elif "flight" in result:
+        print_flight(result["flight"], console)
+    else:
+        console.print(links_table(result["links"], width))
+    if "recorded" in result:
+        recorded = result["recorded"]
+        console.print(f"recorded {recorded['verdict']}: {delay_text(recorded)}")

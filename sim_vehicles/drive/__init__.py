@@ -1,0 +1,1 @@
+"""The fleet in real time: command line, UDP sockets, signing."""

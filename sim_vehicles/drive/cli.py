@@ -1,0 +1,333 @@
+"""The command `sim-vehicles`: fly a scenario's vehicles on UDP until told to stop."""
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import signal
+import socket
+import sys
+import time  # noqa: TID251 - the command starts the vehicles' clock
+from collections import Counter
+from collections.abc import Callable, Generator
+from ipaddress import ip_address
+from pathlib import Path
+from typing import TYPE_CHECKING, Never
+
+if TYPE_CHECKING:
+    from scenarios.schema import Scenario
+    from sim_vehicles.drive.fleet import Fleet
+    from sim_vehicles.drive.udp import Sockets
+    from sim_vehicles.links.truth import TruthLog
+    from sim_vehicles.vehicles.shell import Change
+
+SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
+NS_PER_S = 1_000_000_000
+GOODBYE_NS = NS_PER_S
+"""After the vehicles were shut down: their answers are under way."""
+
+DESCRIPTION = """\
+Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
+They stay on the launcher, or on the ground, until a ground station arms and commands them: any that speaks MAVLink.
+
+With --links-only no vehicle is flown: any MAVLink vehicles that send to a --vehicle-port get the scenario's links, each
+those of its system id, and the station hears each from a port of its own."""
+
+
+def main() -> None:
+    """Entry point."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """The command with its arguments: the exit code."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.links_only != bool(options.vehicle_port):
+        parser.error("read one of --links-only and --vehicle-port, wanted both or neither")
+    if options.links_only and options.key:
+        parser.error("read --key with --links-only, wanted one of them: links pass signed frames on as they are")
+    with _signals() as signals, contextlib.ExitStack() as opened:
+        # After parsing, so that --help and a mistyped option answer at once.
+        from scenarios.errors import ScenarioError
+        from scenarios.files import load
+        from scenarios.signing.keys import KeyFileError
+        from sim_vehicles.links.truth import TruthLog
+
+        try:
+            scenario = load(options.scenario)
+        except ScenarioError as error:
+            return _complain(str(error))
+        log = None
+        if options.truth:
+            try:
+                log = TruthLog(options.truth)
+            except (OSError, ValueError) as error:
+                return _complain(f"--truth: {error}, wanted a new file, or a truth log to go on with")
+            opened.callback(log.close)
+        if options.counters:
+            try:
+                options.counters.open("ab").close()
+            except OSError as error:
+                return _complain(f"--counters: {options.counters}: {error.strerror}, wanted a file that can be written")
+        try:
+            run_it = _links_only if options.links_only else _fly
+            run_it(scenario, log, signals, options, opened)
+        except (_AddressError, KeyFileError) as error:
+            return _complain(str(error))
+    return INTERRUPTED if signal.SIGINT in signals else SUCCESS
+
+
+class _AddressError(Exception):
+    """An address that was given cannot be used."""
+
+
+def _fly(
+    scenario: "Scenario",
+    log: "TruthLog | None",
+    signals: list[int],
+    options: argparse.Namespace,
+    opened: contextlib.ExitStack,
+) -> None:
+    from sim_vehicles.drive.fleet import Fleet
+    from sim_vehicles.drive.guard import open_links
+    from sim_vehicles.drive.udp import Ports, fly
+
+    system_ids = tuple(sorted(v.system_id for v in scenario.vehicles))
+    epoch_ns = time.time_ns() - time.monotonic_ns()
+    signed = open_links(options.key, system_ids, epoch_ns=epoch_ns) if options.key else None
+    try:
+        ports = Ports(system_ids, options.station)
+    except OSError as error:
+        raise _AddressError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
+    opened.callback(ports.close)
+    start_ns = time.monotonic_ns()
+    fleet = Fleet(scenario, start_ns, record=log.record if log else None, signed=signed)
+    say = _Lines(start_ns)
+    how = ", signed" if signed else ""
+    if not signed:
+        say.openness([options.station], "others may send from there and nothing is signed; see --key")
+    say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
+    stop = _stop_rule(signals, start_ns, options, say, fleet)
+    if not stop(start_ns, start_ns):
+        fly(fleet, ports, stop=stop, tell=_teller(say, log, ports.sockets))
+    say.changes(fleet.take_changes())
+    counters = fleet.counters + ports.counters
+    say.summary(counters, log)
+    if options.counters:
+        with contextlib.suppress(OSError):  # the flight is over: the line above has said it
+            options.counters.write_text(json.dumps(counters))
+
+
+def _links_only(
+    scenario: "Scenario",
+    log: "TruthLog | None",
+    signals: list[int],
+    options: argparse.Namespace,
+    opened: contextlib.ExitStack,
+) -> None:
+    from sim_vehicles.drive.relay_udp import Peers, relay
+    from sim_vehicles.links.relay import Relay
+
+    try:
+        peers = Peers(options.vehicle_port, options.station)
+    except OSError as error:
+        ports = ", ".join(map(_shown, options.vehicle_port))
+        text = f"--vehicle-port {ports}, --station {_shown(options.station)}: {error.strerror or error}"
+        raise _AddressError(text) from None
+    opened.callback(peers.sockets.close)
+    start_ns = time.monotonic_ns()
+    links = Relay(scenario, start_ns, record=log.record if log else None)
+    say = _Lines(start_ns)
+    ports = ", ".join(map(_shown, options.vehicle_port))
+    say.openness(options.vehicle_port, "links pass on what anybody sends; only stations and vehicles can sign")
+    say.line(f"the links of {scenario.name}, from vehicles at {ports}, to {_shown(options.station)}")
+    relay(links, peers, stop=_stop_rule(signals, start_ns, options, say), tell=_teller(say, log, peers.sockets))
+    say.summary(links.counters + peers.sockets.counters, log)
+
+
+def _stop_rule(
+    signals: list[int], start_ns: int, options: argparse.Namespace, say: "_Lines", fleet: "Fleet | None" = None
+) -> Callable[[int, int], bool]:
+    """When to end, from the time and the instant of a station's last command."""
+    duration_ns, silence_ns = options.duration * NS_PER_S, options.stop_after_silence * NS_PER_S
+    alone_since_ns = start_ns if options.parent is None else math.inf
+
+    def stop(now_ns: int, commanded_ns: int) -> bool:
+        nonlocal alone_since_ns
+        if alone_since_ns == math.inf and os.getppid() != options.parent:
+            alone_since_ns = now_ns
+            say.line("the process that started this has gone")
+            if commanded_ns == start_ns:
+                return True  # nobody has flown them: there is nothing to be taken over
+            if fleet is not None:
+                fleet.orphan()
+        if fleet is not None and now_ns - fleet.shut_down_ns >= GOODBYE_NS:
+            return True
+        silent = now_ns - max(commanded_ns, alone_since_ns) >= silence_ns
+        return bool(signals) or now_ns - start_ns >= duration_ns or silent
+
+    return stop
+
+
+def _teller(say: "_Lines", log: "TruthLog | None", sockets: "Sockets") -> Callable[[list["Change"]], None]:
+    def tell(changes: list["Change"]) -> None:
+        say.changes(changes)
+        say.lateness(sockets)
+        if log:
+            log.flush()
+
+    return tell
+
+
+class _Lines:
+    """Lines for a person, on the terminal or in the log of whoever started this."""
+
+    def __init__(self, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._read = True
+        self._late = 0
+        self._late_line_ns = start_ns
+
+    def line(self, text: str) -> None:
+        if self._read:
+            try:
+                print(text, flush=True)
+            except OSError:  # terminal or pipe was closed; the vehicles fly on
+                self._read = False
+
+    def openness(self, addresses: list[tuple[str, int]], why: str) -> None:
+        """A line on each address that is not this machine's alone."""
+        for host, port in addresses:
+            if not ip_address(host).is_loopback:
+                self.line(f"warning: {host}:{port} is open: {why}")
+
+    def changes(self, changes: list["Change"]) -> None:
+        for change in changes:
+            self.line(
+                f"{(change.time_ns - self._start_ns) / NS_PER_S:8.3f} s  vehicle {change.system_id}: {change.text}"
+            )
+
+    def lateness(self, sockets: "Sockets") -> None:
+        """At most once a second: how much left too late for the links to be what the scenario says."""
+        late, now_ns = sockets.counters["left_late"], time.monotonic_ns()
+        if late > self._late and now_ns - self._late_line_ns >= NS_PER_S:
+            since_s = (now_ns - self._late_line_ns) / NS_PER_S
+            self.line(
+                f"{(now_ns - self._start_ns) / NS_PER_S:8.3f} s  this host does not keep up: {late - self._late} "
+                f"datagrams left more than 5 ms late in {since_s:.1f} s, the latest {sockets.latest_ns / 1e6:.1f} ms"
+            )
+            self._late, self._late_line_ns, sockets.latest_ns = late, now_ns, 0
+
+    def summary(self, counters: Counter[str], log: "TruthLog | None") -> None:
+        """The last line: what was counted."""
+        counters += Counter(truth_lost=log.lost if log else 0)
+        self.line(
+            "received: " + (", ".join(f"{name} {count}" for name, count in sorted(counters.items())) or "nothing")
+        )
+
+
+@contextlib.contextmanager
+def _signals() -> Generator[list[int]]:
+    """The list that the signals to end are appended to while the context lasts; under nohup SIGHUP is none of them."""
+    caught: list[int] = []
+    wanted = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        wanted.append(signal.SIGHUP)
+    before = [signal.signal(number, lambda number, _: caught.append(number)) for number in wanted]
+    try:
+        yield caught
+    finally:
+        for number, handler in zip(wanted, before, strict=True):
+            signal.signal(number, handler)
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    """A parser that complains in one line."""
+
+    def error(self, message: str) -> Never:
+        sys.exit(_complain(message))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _OneLineParser(
+        prog="sim-vehicles", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenario", type=Path, metavar="SCENARIO", help="scenario file (TOML)")
+    parser.add_argument(
+        "--station",
+        type=_address,
+        default=("127.0.0.1", 14550),
+        metavar="HOST:PORT",
+        help="where the station listens (127.0.0.1:14550)",
+    )
+    parser.add_argument("--key", type=Path, metavar="FILE", help="sign, and take only what is signed with this key")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="write what really happened when; continues a log")
+    parser.add_argument("--counters", type=Path, metavar="FILE", help="at the end, write what was counted, as JSON")
+    parser.add_argument(
+        "--stop-after-silence",
+        type=_seconds,
+        default=math.inf,
+        metavar="SECONDS",
+        help="end when no station has commanded a vehicle for that long (never)",
+    )
+    parser.add_argument(
+        "--parent",
+        type=int,
+        metavar="PID",
+        help="the process that starts this one; with --stop-after-silence: silence counts once it has ended",
+    )
+    parser.add_argument(
+        "--duration", type=_seconds, default=math.inf, metavar="SECONDS", help="end after that time (never)"
+    )
+    parser.add_argument(
+        "--links-only", action="store_true", help="fly no vehicles; put the links before other vehicles"
+    )
+    parser.add_argument(
+        "--vehicle-port",
+        type=_port,
+        action="append",
+        default=[],
+        metavar="[HOST:]PORT",
+        help="with --links-only: vehicles send here (127.0.0.1); may be given more than once",
+    )
+    return parser
+
+
+def _port(text: str) -> tuple[str, int]:
+    return _address(text if ":" in text else f"127.0.0.1:{text}")
+
+
+def _shown(address: tuple[str, int]) -> str:
+    return f"{address[0]}:{address[1]}"
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
+        raise argparse.ArgumentTypeError(f"read {text!r}, wanted HOST:PORT with a port from 1 to 65535")
+    try:
+        found = socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as error:
+        raise argparse.ArgumentTypeError(f"read {text!r}, wanted a host that can be found ({error})") from None
+    return str(found[0][4][0]), int(port)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not seconds > 0:
+        raise argparse.ArgumentTypeError(f"read {text!r}, wanted a number of seconds above 0")
+    return seconds
+
+
+def _complain(text: str) -> int:
+    print(f"sim-vehicles: {text}", file=sys.stderr)
+    return USAGE
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,245 @@
+"""All vehicles of a scenario with their links, as one function of datagrams and time.
+
+Both the driver on real UDP and one on a virtual clock call `Fleet.step`; the same seed, start and datagrams give the
+same bytes at the same instants.
+"""
+
+import heapq
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from operator import itemgetter
+
+from scenarios import schema
+from scenarios.files import fingerprint
+from scenarios.signing.link import SignedLink
+from sim_vehicles.links.links import Link, LinkSet
+from sim_vehicles.links.truth import Record
+from sim_vehicles.services.clock import NEVER_NS
+from sim_vehicles.services.services import LONGEST_TEXT
+from sim_vehicles.vehicles.copter import Copter, multicopter
+from sim_vehicles.vehicles.double_integrator import Vehicle, launched
+from sim_vehicles.vehicles.dynamics import State
+from sim_vehicles.vehicles.onboard import OnboardLoop
+from sim_vehicles.vehicles.shell import Change, Shell
+
+Datagram = tuple[int, bytes, int]
+"""(system id of the vehicle, bytes, host time in ns)"""
+
+_DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
+
+
+@dataclass(slots=True)
+class _Member:
+    vehicle: Shell[Vehicle] | Shell[Copter]
+    up: Link
+    down: Link
+    signed: SignedLink | None = None
+    leaves_ns: int = NEVER_NS
+    """The earliest instant at which a datagram of this vehicle can leave its up link."""
+    acts_ns: int = NEVER_NS
+    """In order of time only: the next instant at which the vehicle does something or a datagram reaches it."""
+
+
+class Fleet:
+    """The vehicles and links of a scenario.
+
+    Vehicles do not meet each other here, so each is brought up to date only when a datagram of its own can leave,
+    in order of that time and of system id; nothing is late for it, since everything it does has its exact instant.
+    Only where links have channels does what one vehicle sends delay the others, and only sensors let one see another:
+    then all that happens is done in order of time, and at one instant first what the station sends and then the
+    vehicles by system id.
+
+    Vehicles with an end of a signed link, by system id, sign what they send and are given what could be verified.
+    """
+
+    def __init__(
+        self,
+        scenario: schema.Scenario,
+        start_ns: int,
+        *,
+        record: Record | None = None,
+        signed: Mapping[int, SignedLink] | None = None,
+    ) -> None:
+        self._refused: Counter[str] = Counter()
+        self._record = record
+        self._start_ns = start_ns
+        self._members: dict[int, _Member] = {}
+        self._heap: list[tuple[int, int]] = []
+        """(leaves_ns, system id); entries that no longer agree with the member are stale and skipped."""
+        self._links = LinkSet(scenario, start_ns, record=record)
+        self._acts: list[tuple[int, int]] = []
+        """In order of time only: (acts_ns, system id), stale entries likewise."""
+        self._entering: list[tuple[int, int, int, bytes]] = []
+        """In order of time only: (time, system id, number, data) of what the station has sent, earliest first."""
+        self._entered = 0
+        sensors = scenario.control.loop == "onboard"
+        experiment = f"{fingerprint(scenario)} {scenario.name}"[:LONGEST_TEXT]
+        self._in_order = sensors or self._links.have_channels
+        for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
+            if scenario.dynamics == "autopilot":
+                vehicle = multicopter(
+                    scenario, own, start_ns, record=record, signed=bool(signed), experiment=experiment
+                )
+            else:
+                onboard = OnboardLoop(scenario, own.system_id, self._seen) if sensors else None
+                vehicle = launched(scenario, own, start_ns, record=record, onboard=onboard, experiment=experiment)
+            self._members[own.system_id] = _Member(
+                vehicle, *self._links.of(own.system_id), signed[own.system_id] if signed else None
+            )
+        for member in self._members.values():
+            self._plan(member)
+
+    @property
+    def system_ids(self) -> tuple[int, ...]:
+        """The vehicles, ascending."""
+        return tuple(self._members)
+
+    @property
+    def next_event_ns(self) -> int:
+        """Before this instant `step` returns nothing, unless datagrams come in."""
+        heap = self._heap
+        while heap and self._members[heap[0][1]].leaves_ns != heap[0][0]:
+            heapq.heappop(heap)
+        return heap[0][0] if heap else NEVER_NS
+
+    @property
+    def commanded_ns(self) -> int:
+        """When a station last commanded a vehicle, with a set-point or otherwise; the start if never."""
+        return max(self._start_ns, *(member.vehicle.authority.commanded_ns for member in self._members.values()))
+
+    @property
+    def shut_down_ns(self) -> int:
+        """When the last vehicle was told to shut down; NEVER_NS while one is not."""
+        told_ns = [member.vehicle.services.shut_down_ns for member in self._members.values()]
+        return NEVER_NS if None in told_ns else max(ns for ns in told_ns if ns is not None)
+
+    def orphan(self) -> None:
+        """From now on the vehicles shut down when they are told to: the station that started them has gone."""
+        for member in self._members.values():
+            member.vehicle.services.orphaned = True
+
+    @property
+    def counters(self) -> Counter[str]:
+        """The vehicles' counters added up, with the links' (LinkSet.counters)."""
+        total = self._links.counters()
+        total.update({f"refused_{reason.lower().replace(' ', '_')}": count for reason, count in self._refused.items()})
+        for member in self._members.values():
+            total.update(member.vehicle.counters)
+        return total
+
+    def vehicle(self, system_id: int) -> Shell[Vehicle] | Shell[Copter]:
+        """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
+        return self._members[system_id].vehicle
+
+    def take_changes(self) -> list[Change]:
+        """What happened to the vehicles since the last call, in order of time."""
+        changes: list[Change] = []
+        for member in self._members.values():
+            if member.vehicle.changes:
+                changes += member.vehicle.changes
+                member.vehicle.changes.clear()
+        return sorted(changes)
+
+    def step(self, received: Iterable[Datagram], now_ns: int) -> list[Datagram]:
+        """What leaves the up links by now, with the exact instants at which it does, in order of time.
+
+        Parameters
+        ----------
+        received
+            Datagrams of the station with the instants at which each enters its vehicle's down link.
+        """
+        if self._links.zero_ns == NEVER_NS:
+            received = list(received)
+            for _, data, time_ns in received:
+                self._links.hear(data, time_ns)
+        if self._in_order:
+            self._run_in_order(received, now_ns)
+        else:
+            for system_id, data, time_ns in received:
+                member = self._members[system_id]
+                member.down.send(data, time_ns)
+                if member.down.next_due_ns + member.up.least_delay_ns < member.leaves_ns:
+                    self._plan(member)
+        out: list[Datagram] = []
+        heap = self._heap
+        while heap and heap[0][0] <= now_ns:
+            leaves_ns, system_id = heapq.heappop(heap)
+            member = self._members[system_id]
+            if leaves_ns != member.leaves_ns:
+                continue
+            self._live(member, now_ns)
+            for entry in member.up.due(now_ns):
+                out.append((system_id, entry[3], entry[0]))
+                if self._record is not None:
+                    self._record(member.up.row(entry, now_ns))
+            self._plan(member)
+        out.sort(key=_DUE_THEN_SYSTEM_ID)
+        return out
+
+    def state(self, system_id: int, now_ns: int) -> State:
+        """The true state of a vehicle now, everything that has reached it by now included."""
+        if self._in_order:
+            self._run_in_order((), now_ns)
+        member = self._members[system_id]
+        self._live(member, now_ns)
+        self._plan(member)
+        return member.vehicle.craft.state_at(now_ns)
+
+    def _seen(self, system_id: int, now_ns: int) -> State | None:
+        """What a sensor sees of a vehicle: its true state now; everything before is done. None if it is not there."""
+        member = self._members.get(system_id)
+        return None if member is None else member.vehicle.craft.state_at(now_ns)
+
+    def _run_in_order(self, received: Iterable[Datagram], now_ns: int) -> None:
+        """Let everything enter its link in order of time, from the station and from the vehicles, until now."""
+        for system_id, data, time_ns in received:
+            self._entered += 1
+            heapq.heappush(self._entering, (time_ns, system_id, self._entered, data))
+        acts, entering = self._acts, self._entering
+        while True:
+            acts_ns, acting_id = acts[0] if acts else (NEVER_NS, 0)
+            enters_ns = entering[0][0] if entering else NEVER_NS
+            if enters_ns <= acts_ns and enters_ns <= now_ns:
+                time_ns, system_id, _, data = heapq.heappop(entering)
+                member = self._members[system_id]
+                member.down.send(data, time_ns)
+            elif acts_ns <= now_ns:
+                heapq.heappop(acts)
+                member = self._members[acting_id]
+                if acts_ns != member.acts_ns:
+                    continue
+                self._live(member, acts_ns)
+            else:
+                return
+            self._plan(member)
+
+    def _live(self, member: _Member, now_ns: int) -> None:
+        """Bring a vehicle up to now; what it sends enters its up link."""
+        arrived: list[tuple[bytes, int]] = []
+        if member.down.next_due_ns <= now_ns:
+            for entry in member.down.due(now_ns):
+                arrived.append((entry[3], entry[0]))
+                if self._record is not None:
+                    self._record(member.down.row(entry, entry[0]))
+        if member.signed is not None:
+            arrived = [(member.signed.verify(data, time_ns, self._refused), time_ns) for data, time_ns in arrived]
+            arrived = [(data, time_ns) for data, time_ns in arrived if data]
+        for data, time_ns in member.vehicle.step(arrived, now_ns):
+            member.up.send(data if member.signed is None else member.signed.sign(data, time_ns), time_ns)
+
+    def _plan(self, member: _Member) -> None:
+        """Note when a datagram of the vehicle can leave next. Comparisons, not min(): every datagram comes by here."""
+        acts_ns, arrives_ns = member.vehicle.next_event_ns, member.down.next_due_ns
+        leaves_ns = (arrives_ns if arrives_ns < acts_ns else acts_ns) + member.up.least_delay_ns
+        leaves_ns = min(leaves_ns, member.up.next_due_ns)
+        if leaves_ns != member.leaves_ns:
+            member.leaves_ns = leaves_ns
+            heapq.heappush(self._heap, (leaves_ns, member.vehicle.system_id))
+        if self._in_order:
+            self._plan_act(member, min(acts_ns, arrives_ns))
+
+    def _plan_act(self, member: _Member, acts_ns: int) -> None:
+        if acts_ns != member.acts_ns:
+            member.acts_ns = acts_ns
+            heapq.heappush(self._acts, (acts_ns, member.vehicle.system_id))

@@ -1,0 +1,133 @@
+"""A Relay on real UDP: vehicles of other programs speak to our ports, the station hears each from its own.
+
+What a vehicle sends to one of our ports goes through its up link and, from a socket that is that vehicle's alone, to
+the station; what the station answers there goes through the down link to the address the vehicle last spoke from.
+"""
+
+import time  # noqa: TID251 - this is the real-time driver
+from collections.abc import Callable
+
+from scenarios.schema import NS_PER_S
+from sim_vehicles.drive.udp import LONGEST_WAIT_NS, Received, Sockets, undisturbed
+from sim_vehicles.links.relay import Passing, Relay, holds_key, sender
+from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
+from sim_vehicles.vehicles.shell import Change
+
+MOST_PEERS = 1000
+"""Addresses that vehicles speak from; each vehicle may be started again a few times."""
+SILENCE_NS = 3 * NS_PER_S // 2
+"""A vehicle that has not been heard for this long may have been started again, and speak from another address."""
+
+
+class Peers:
+    """The vehicles' addresses and the sockets on both sides.
+
+    Raises
+    ------
+    OSError
+        If a vehicle port cannot be bound.
+    """
+
+    def __init__(
+        self, vehicle_ports: list[tuple[str, int]], station: tuple[str, int], *, silence_ns: int = SILENCE_NS
+    ) -> None:
+        self.sockets = Sockets()
+        self.changes: list[Change] = []
+        """Who was found; whoever reads may clear it."""
+        self._station = station
+        self._silence_ns = silence_ns
+        self._station_side: dict[int, int] = {}
+        """System id to the file number of the socket that the station hears it from."""
+        self._system_ids: dict[int, int] = {}
+        """The other way round."""
+        self._peers: dict[tuple[int, tuple[str, int]], int] = {}
+        """(File number of our port, the vehicle's address) to system id."""
+        self._addresses: dict[int, tuple[int, tuple[str, int]]] = {}
+        """System id to where it was last heard from,"""
+        self._heard_ns: dict[int, int] = {}
+        """and when."""
+        try:
+            for address in vehicle_ports:
+                self.sockets.add(bind=address)
+            self.sockets.add(connect=station)  # found out now, not with the first vehicle, if it cannot be used
+        except OSError:
+            self.sockets.close()
+            raise
+
+    def receive(self) -> list[Passing]:
+        """Everything that has arrived, from either side."""
+        received: list[Passing] = []
+        for datagram in self.sockets.receive():
+            if holds_key(datagram.data):
+                self.sockets.counters["refused_setup_signing"] += 1
+                continue
+            system_id = self._system_ids.get(datagram.file_number)
+            if system_id is not None:
+                received.append(Passing(datagram.time_ns, LINK_DOWN, system_id, datagram.data))
+            elif (system_id := self._vehicle(datagram)) is not None:
+                received.append(Passing(datagram.time_ns, LINK_UP, system_id, datagram.data))
+        return received
+
+    def send(self, passing: list[Passing]) -> None:
+        """Send what has left the links."""
+        for due_ns, kind, system_id, data in passing:
+            if kind == LINK_UP:
+                self.sockets.send(self._station_side[system_id], data, due_ns)
+            else:
+                file_number, address = self._addresses[system_id]
+                self.sockets.send(file_number, data, due_ns, address)
+
+    def _vehicle(self, datagram: Received) -> int | None:
+        """The vehicle that a datagram on one of our ports is from, or None if it does not say."""
+        place = datagram.file_number, datagram.address
+        system_id = self._peers.get(place) or sender(datagram.data)
+        if system_id is None:
+            self.sockets.counters["refused_peer"] += 1
+            return None
+        known = self._addresses.get(system_id, place)
+        if known != place and datagram.time_ns - self._heard_ns[system_id] < self._silence_ns:
+            self.sockets.counters["refused_second_source"] += 1
+            return None
+        if place not in self._peers:
+            if len(self._peers) >= MOST_PEERS or not self._admit(system_id):
+                self.sockets.counters["refused_peer"] += 1
+                return None
+            self._peers[place] = system_id
+            text = f"found at {datagram.address[0]}:{datagram.address[1]}"
+            self.changes.append(Change(datagram.time_ns, system_id, text))
+        self._addresses[system_id], self._heard_ns[system_id] = place, datagram.time_ns
+        return system_id
+
+    def _admit(self, system_id: int) -> bool:
+        if system_id not in self._station_side:
+            try:
+                number = self.sockets.add(connect=self._station)
+            except OSError:
+                self.sockets.counters["send_failed"] += 1
+                return False
+            self._station_side[system_id] = number
+            self._system_ids[number] = system_id
+        return True
+
+
+def relay(
+    links: Relay,
+    peers: Peers,
+    *,
+    stop: Callable[[int, int], bool],
+    tell: Callable[[list[Change]], None],
+) -> None:
+    """Run the links in real time until `stop(now_ns, last_heard_ns)`; `stop` and `tell` as for `udp.fly`."""
+    next_look_ns = 0
+    with undisturbed():
+        while True:
+            peers.sockets.wait(min(links.next_event_ns, next_look_ns))
+            # The clock before the sockets: every datagram that came by then is among those received.
+            now_ns = time.monotonic_ns()
+            peers.send(links.step(peers.receive(), now_ns))
+            if now_ns >= next_look_ns:
+                next_look_ns = now_ns + LONGEST_WAIT_NS
+                tell(peers.changes)
+                peers.changes = []
+                if stop(now_ns, links.last_heard_ns):
+                    return

@@ -1,0 +1,250 @@
+"""Vehicles on real UDP: the one place here that reads a clock or touches a socket.
+
+One thread, one socket per vehicle. The kernel stamps what arrives, so the emulated down link begins when the datagram
+reached the host and not when this loop got round to reading it; what is sent waits for its due time to some tens of
+microseconds.
+"""
+
+import contextlib
+import ctypes
+import gc
+import select
+import socket
+import struct
+import time  # noqa: TID251 - this is the real-time driver
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
+from typing import NamedTuple
+
+from scenarios.schema import NS_PER_S
+from sim_vehicles.drive.fleet import Datagram, Fleet
+from sim_vehicles.vehicles.shell import Change
+
+LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
+"""Before a due time the loop stops sleeping and looks at the clock this long: with few vehicles, waking from sleep is
+most of the error. Of all vehicles together not more than the second figure, a tenth of a core at 50 Hz."""
+LONGEST_WAIT_NS = NS_PER_S // 10
+"""The loop looks at the flags that end it at least this often."""
+DATAGRAM_BYTES = 2048
+READS_PER_WAKE = 1000
+"""From one socket, so that a flood into it cannot stop the others."""
+LATE_NS = 5_000_000
+"""What leaves more than this after it was due is counted: the emulated link is then not what the scenario says."""
+CLOCK_GAP_NS = 3_000
+"""A reading of the two clocks that took longer was interrupted and is not used."""
+
+_SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
+_PR_SET_TIMERSLACK = 29
+_STAMP = struct.Struct("qq")
+
+
+class Received(NamedTuple):
+    """A datagram with the socket it came to, the instant at which it reached this host, and its sender."""
+
+    file_number: int
+    data: bytes
+    time_ns: int
+    address: tuple[str, int]
+
+
+class Sockets:
+    """All sockets of a process: one place that waits for them, reads them, and knows how late what is sent is."""
+
+    def __init__(self) -> None:
+        self.counters: Counter[str] = Counter()
+        """`send_refused` (nobody listens at the port), `send_failed`, `receive_refused`, `left_late`."""
+        self.latest_ns = 0
+        """How late the latest was that counted as `left_late`; whoever reads may set it to 0."""
+        self._epoll = select.epoll()
+        self._sockets: dict[int, socket.socket] = {}
+        self._clocks = _Clocks()
+        self._emptied_ns = time.monotonic_ns()
+
+    def add(self, *, bind: tuple[str, int] | None = None, connect: tuple[str, int] | None = None) -> int:
+        """Open a socket, bound or connected, and give its file number; one that is connected hears nobody else.
+
+        Raises
+        ------
+        OSError
+            If the address cannot be used.
+        """
+        own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        number = own.fileno()
+        self._sockets[number] = own
+        own.setblocking(False)
+        own.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        if bind is not None:
+            own.bind(bind)
+        if connect is not None:
+            own.connect(connect)
+        self._epoll.register(own, select.EPOLLIN)
+        return number
+
+    def close(self) -> None:
+        """Close all sockets."""
+        self._epoll.close()
+        for own in self._sockets.values():
+            own.close()
+
+    def wait(self, until_ns: int) -> None:
+        """Sleep until then, or until a datagram is there."""
+        # epoll rounds its own time-outs up to whole milliseconds; select does not.
+        spin_ns = min(LONGEST_SPIN_NS, SPIN_OF_ALL_NS // max(1, len(self._sockets)))
+        remaining_ns = until_ns - spin_ns - time.monotonic_ns()
+        if remaining_ns > 0 and select.select((self._epoll,), (), (), remaining_ns / NS_PER_S)[0]:
+            return
+        while time.monotonic_ns() < until_ns:
+            pass
+
+    def receive(self) -> list[Received]:
+        """Everything that has arrived."""
+        begin_ns = time.monotonic_ns()
+        to_monotonic_ns = self._clocks.to_monotonic_ns()
+        received: list[Received] = []
+        emptied = True
+        for file_number, _ in self._epoll.poll(0):
+            read = 0
+            for data, stamp_ns, address in self._read(self._sockets[file_number]):
+                # If the wall clock is set, stamps jump; but nothing came before the sockets were last empty.
+                latest_ns = time.monotonic_ns()
+                time_ns = latest_ns if stamp_ns is None else stamp_ns + to_monotonic_ns
+                time_ns = min(max(time_ns, self._emptied_ns), latest_ns)
+                received.append(Received(file_number, data, time_ns, address))
+                read += 1
+            emptied = emptied and read < READS_PER_WAKE
+        if emptied:
+            self._emptied_ns = begin_ns
+        return received
+
+    def send(self, file_number: int, data: bytes, due_ns: int, address: tuple[str, int] | None = None) -> None:
+        """Send to the address, or where the socket is connected to; that nobody listens there is no fault of ours."""
+        own = self._sockets[file_number]
+        try:
+            if address is None:
+                own.send(data)
+            else:
+                own.sendto(data, address)
+        except ConnectionRefusedError:
+            self.counters["send_refused"] += 1
+        except OSError:
+            self.counters["send_failed"] += 1
+        late_ns = time.monotonic_ns() - due_ns
+        if late_ns > LATE_NS:
+            self.counters["left_late"] += 1
+            self.latest_ns = max(self.latest_ns, late_ns)
+
+    def _read(self, own: socket.socket) -> Iterator[tuple[bytes, int | None, tuple[str, int]]]:
+        for _ in range(READS_PER_WAKE):
+            try:
+                data, ancillary, _, address = own.recvmsg(DATAGRAM_BYTES, 64)
+            except BlockingIOError:
+                return
+            except OSError:  # the answer to something sent when nobody listened
+                self.counters["receive_refused"] += 1
+                continue
+            stamp_ns = None
+            if ancillary and len(ancillary[0][2]) == _STAMP.size:
+                seconds, nanoseconds = _STAMP.unpack(ancillary[0][2])
+                stamp_ns = seconds * NS_PER_S + nanoseconds
+            yield data, stamp_ns, address
+
+
+class Ports:
+    """The vehicles' sockets, each connected to the station: nobody else's datagrams are taken.
+
+    Raises
+    ------
+    OSError
+        If the station's address cannot be used.
+    """
+
+    def __init__(self, system_ids: tuple[int, ...], station: tuple[str, int]) -> None:
+        self.sockets = Sockets()
+        try:
+            self._file_numbers = {system_id: self.sockets.add(connect=station) for system_id in system_ids}
+        except OSError:
+            self.close()
+            raise
+        self._system_ids = {number: system_id for system_id, number in self._file_numbers.items()}
+
+    @property
+    def counters(self) -> Counter[str]:
+        """The sockets' counters."""
+        return self.sockets.counters
+
+    def close(self) -> None:
+        """Close all sockets."""
+        self.sockets.close()
+
+    def wait(self, until_ns: int) -> None:
+        """Sleep until then, or until a datagram is there."""
+        self.sockets.wait(until_ns)
+
+    def receive(self) -> list[Datagram]:
+        """Everything that has arrived, each with the instant at which it reached this host."""
+        system_ids = self._system_ids
+        return [(system_ids[number], data, time_ns) for number, data, time_ns, _ in self.sockets.receive()]
+
+    def send(self, datagrams: list[Datagram]) -> None:
+        """Send to the station."""
+        for system_id, data, due_ns in datagrams:
+            self.sockets.send(self._file_numbers[system_id], data, due_ns)
+
+
+class _Clocks:
+    """The difference between the kernel's stamps (CLOCK_REALTIME) and CLOCK_MONOTONIC, followed continuously."""
+
+    def __init__(self) -> None:
+        self._offset_ns = time.monotonic_ns() - time.time_ns()
+        self._read_ns = 0
+
+    def to_monotonic_ns(self) -> int:
+        """What to add to a stamp."""
+        before_ns = time.monotonic_ns()
+        real_ns = time.time_ns()
+        after_ns = time.monotonic_ns()
+        if after_ns - before_ns < CLOCK_GAP_NS or after_ns - self._read_ns > NS_PER_S:
+            self._offset_ns = (before_ns + after_ns) // 2 - real_ns
+            self._read_ns = after_ns
+        return self._offset_ns
+
+
+def fly(
+    fleet: Fleet,
+    ports: Ports,
+    *,
+    stop: Callable[[int, int], bool],
+    tell: Callable[[list[Change]], None],
+) -> None:
+    """Run the vehicles in real time until `stop(now_ns, commanded_ns)`.
+
+    `stop` and `tell` (with what happened to the vehicles since) are called about ten times a second.
+    """
+    next_look_ns = 0
+    with undisturbed():
+        while True:
+            ports.wait(min(fleet.next_event_ns, next_look_ns))
+            # The clock before the sockets: every datagram that came by then is among those received.
+            now_ns = time.monotonic_ns()
+            ports.send(fleet.step(ports.receive(), now_ns))
+            if now_ns >= next_look_ns:
+                next_look_ns = now_ns + LONGEST_WAIT_NS
+                tell(fleet.take_changes())
+                if stop(now_ns, fleet.commanded_ns):
+                    return
+
+
+@contextlib.contextmanager
+def undisturbed() -> Generator[None]:
+    """Timers as exact as the kernel can, and no pauses for garbage."""
+    # The default slack lets the kernel put off a wake-up by 50 µs.
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    # A collection stops the loop for milliseconds. Nothing in it makes reference cycles, so nothing piles up.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()

@@ -1,0 +1,214 @@
+"""What happens to one datagram on a link that misbehaves: a pure function of the link, the time and the draws.
+
+A link is compiled once into a frozen `Behaviour`, all times in ns. Of the two random streams of a link, one decides
+what is lost, doubled or corrupted and one how late things are, and every datagram takes the same number of draws from
+both whatever they are used for: more loss leaves the delays as they are, and no link's traffic moves another's draws.
+"""
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from scenarios import schema
+from scenarios.schema import NS_PER_S
+from sim_vehicles.links.truth import CORRUPTED, LOST, OUTAGE, PASSED
+
+MOST_FLIPS = 4
+_BLOCK = 128
+"""Datagrams whose draws are made at once: numpy's cost for one is that for a hundred."""
+
+
+class Draws(NamedTuple):
+    """All that is random about one datagram. But the delays, uniform in [0, 1)."""
+
+    burst: float
+    loss: float
+    duplicate: float
+    corrupt: float
+    flips: tuple[float, ...]
+    """Where a bit is flipped, as a part of the datagram; `corrupt` also says how many are used."""
+    jitter_ns: int
+    duplicate_jitter_ns: int
+
+
+class Outcome(NamedTuple):
+    """What happens to a datagram."""
+
+    fate: int
+    bad: bool
+    """The link's state for the next datagram."""
+    delay_ns: int
+    duplicate_delay_ns: int
+    """-1 if there is no second copy."""
+    flips: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Behaviour:
+    """A link's schema as integers of ns."""
+
+    points_ns: tuple[tuple[int, int], ...]
+    """(link time, delay), at least one."""
+    least_delay_ns: int
+    """No datagram takes less time than this."""
+    outages_ns: tuple[tuple[int, int], ...]
+    reordering: bool
+    to_bad: float
+    to_good: float
+    loss_good: float
+    loss_bad: float
+    duplicate: float
+    corrupt: float
+
+    @property
+    def timed(self) -> bool:
+        """Whether it matters what time it is."""
+        return len(self.points_ns) > 1 or bool(self.outages_ns)
+
+
+def behaviour_of(link: schema.Link) -> Behaviour:
+    """The compiled form of a link's schema."""
+    points = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
+    points_ns = tuple((_ns(time_s), _ns(delay_s)) for time_s, delay_s in points)
+    bursts = link.loss_bursts
+    return Behaviour(
+        points_ns=points_ns,
+        least_delay_ns=max(0, min(delay_ns for _, delay_ns in points_ns) + _least_jitter_ns(link.jitter)),
+        outages_ns=tuple((_ns(outage.from_s), _ns(outage.until_s)) for outage in link.outages),
+        reordering=link.reordering,
+        to_bad=bursts.to_bad_probability if bursts else 0.0,
+        to_good=bursts.to_good_probability if bursts else 1.0,
+        loss_good=bursts.loss_good_probability if bursts else link.loss_probability,
+        loss_bad=bursts.loss_bad_probability if bursts else 0.0,
+        duplicate=link.duplicate_probability,
+        corrupt=link.corrupt_probability,
+    )
+
+
+def constant(link: schema.Link) -> bool:
+    """Whether all that the link does is to be late by its delay_s."""
+    plain = schema.Link(delay_s=link.delay_s, reordering=link.reordering, channel=link.channel)
+    return link == plain and link.channel is None
+
+
+def outcome(link: Behaviour, *, bad: bool, time_ns: int, draws: Draws) -> Outcome:
+    """The fate of a datagram that enters at a link time, but for what a channel or a full link does to it."""
+    bad = draws.burst >= link.to_good if bad else draws.burst < link.to_bad
+    fate = PASSED
+    for from_ns, until_ns in link.outages_ns:
+        if from_ns <= time_ns < until_ns:
+            fate |= OUTAGE
+    if draws.loss < (link.loss_bad if bad else link.loss_good):
+        fate |= LOST
+    flips: tuple[float, ...] = ()
+    if draws.corrupt < link.corrupt:
+        fate |= CORRUPTED
+        # Below its bound the draw is uniform once more, and says how many.
+        flips = draws.flips[: 1 + int(MOST_FLIPS * draws.corrupt / link.corrupt)]
+    delay_ns = delay_at(link, time_ns)
+    twice = draws.duplicate < link.duplicate
+    duplicate_ns = max(0, delay_ns + draws.duplicate_jitter_ns) if twice else -1
+    return Outcome(fate, bad, max(0, delay_ns + draws.jitter_ns), duplicate_ns, flips)
+
+
+def delay_at(link: Behaviour, time_ns: int) -> int:
+    """The constant part of the delay at a link time: linear between points, at a step already the second."""
+    points = link.points_ns
+    if len(points) == 1:
+        return points[0][1]
+    after = bisect_right(points, time_ns, key=lambda point: point[0])
+    if after in (0, len(points)):
+        return points[after - (after > 0)][1]
+    (begin_ns, before_ns), (end_ns, then_ns) = points[after - 1], points[after]
+    return before_ns + (then_ns - before_ns) * (time_ns - begin_ns) // (end_ns - begin_ns)
+
+
+def flipped(data: bytes, flips: tuple[float, ...]) -> bytes:
+    """The datagram with its bits flipped at these parts of its length; two at one place count once."""
+    changed = bytearray(data)
+    for place in {int(part * len(data) * 8) for part in flips} if data else ():
+        changed[place // 8] ^= 1 << place % 8
+    return bytes(changed)
+
+
+class _Delays(Protocol):
+    """Draws the jitter of a number of datagrams and of their second copies, in s."""
+
+    def __call__(self, count: int) -> list[tuple[float, float]]: ...
+
+
+class Stream:
+    """The draws of one link, datagram by datagram."""
+
+    def __init__(self, link: schema.Link, seed: int, key: tuple[int, int]) -> None:
+        fates, delays = np.random.SeedSequence(seed, spawn_key=key).spawn(2)
+        self._fates = np.random.default_rng(fates)
+        self._delays = _delays_of(link.jitter, np.random.default_rng(delays))
+        self._block: list[Draws] = []
+
+    def next(self) -> Draws:
+        """The draws of the next datagram."""
+        if not self._block:
+            uniform: list[list[float]] = self._fates.random((_BLOCK, 4 + MOST_FLIPS)).tolist()
+            delays = self._delays(_BLOCK)
+            self._block = [
+                Draws(burst, loss, duplicate, corrupt, tuple(flips), _ns(first_s), _ns(second_s))
+                for (burst, loss, duplicate, corrupt, *flips), (first_s, second_s) in zip(uniform, delays, strict=True)
+            ]
+            self._block.reverse()
+        return self._block.pop()
+
+
+def _delays_of(jitter: schema.Jitter | None, rng: np.random.Generator) -> _Delays:
+    if jitter is None:
+        return lambda count: [(0.0, 0.0)] * count
+    if jitter.distribution == "trace":
+        return _replayed(jitter.trace_s or (0.0,), rng)
+    scale_s, shape = jitter.scale_s or 0.0, jitter.shape or 1.0
+
+    def drawn(count: int) -> list[tuple[float, float]]:
+        size = (count, 2)
+        match jitter.distribution:
+            case "uniform":
+                values = rng.uniform(-scale_s, scale_s, size)
+            case "normal":
+                values = rng.normal(0.0, scale_s, size)
+            case "exponential":
+                values = rng.exponential(scale_s, size)
+            case _:
+                values = rng.gamma(shape, scale_s, size)
+        return [(first, second) for first, second in values.tolist()]
+
+    return drawn
+
+
+def _replayed(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:
+    """A trace in its own order, which keeps what neighbours have in common. A second copy takes the delay after."""
+    at = int(rng.integers(len(trace_s)))
+
+    def drawn(count: int) -> list[tuple[float, float]]:
+        nonlocal at
+        places = [(at + k) % len(trace_s) for k in range(count + 1)]
+        at = places[-1]
+        return [(trace_s[k], trace_s[then]) for k, then in pairwise(places)]
+
+    return drawn
+
+
+def _least_jitter_ns(jitter: schema.Jitter | None) -> int:
+    match jitter:
+        case schema.Jitter(distribution="uniform", scale_s=float(scale_s)):
+            return -_ns(scale_s)
+        case schema.Jitter(distribution="normal"):
+            return -(2**63)
+        case schema.Jitter(distribution="trace", trace_s=(_, *_) as trace_s):
+            return _ns(min(trace_s))
+        case _:
+            return 0
+
+
+def _ns(time_s: float) -> int:
+    return round(time_s * NS_PER_S)

@@ -1,0 +1,117 @@
+"""The links of a scenario in front of vehicles that are not ours, as one function of datagrams and time.
+
+A vehicle is known by the system id of its first frame; only headers are read. Which links it gets, its random streams
+and the truth log are those it would have had in a Fleet.
+"""
+
+import heapq
+from collections import Counter
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from scenarios import schema
+from sim_vehicles.links.links import Link, LinkSet
+from sim_vehicles.links.truth import LINK_DOWN, LINK_UP, Record
+from sim_vehicles.services.clock import NEVER_NS
+
+MAGIC_1, MAGIC_2 = 0xFE, 0xFD
+SETUP_SIGNING = (256).to_bytes(3, "little")
+
+
+class Passing(NamedTuple):
+    """A datagram on its way through the links: up to the station, or down to the vehicle. Order is that of time."""
+
+    time_ns: int
+    kind: int
+    """LINK_UP or LINK_DOWN."""
+    system_id: int
+    data: bytes
+
+
+def sender(data: bytes) -> int | None:
+    """System id of a datagram's first frame, MAVLink 1 or 2; None if that is no vehicle's (1 to 250)."""
+    if len(data) >= 12 and data[0] == MAGIC_2:
+        system_id = data[5]
+    elif len(data) >= 8 and data[0] == MAGIC_1:
+        system_id = data[3]
+    else:
+        return None
+    return system_id if 1 <= system_id <= 250 else None
+
+
+def holds_key(data: bytes) -> bool:
+    """Whether a frame of a datagram is SETUP_SIGNING, which is never passed on."""
+    at = 0
+    while at + 12 <= len(data) and data[at] == MAGIC_2:
+        if data[at + 7 : at + 10] == SETUP_SIGNING:
+            return True
+        at += 12 + data[at + 1] + 13 * (data[at + 2] & 1)
+    return False
+
+
+class Relay:
+    """Links between any vehicles and a station."""
+
+    def __init__(self, scenario: schema.Scenario, start_ns: int, *, record: Record | None = None) -> None:
+        self.last_heard_ns = start_ns
+        """When the station was last heard; the start if never."""
+        self._record = record
+        self._links = LinkSet(scenario, start_ns, record=record)
+        self._entering: list[Passing] = []
+        """What has been read but came after the last step's now: something earlier may still be unread."""
+        self._heap: list[tuple[int, int, int]] = []
+        """(due_ns, kind, system id) of each link's next datagram; entries that no longer agree are stale."""
+
+    @property
+    def counters(self) -> Counter[str]:
+        """What happened on all links."""
+        return self._links.counters()
+
+    @property
+    def next_event_ns(self) -> int:
+        """Before this instant `step` returns nothing, unless datagrams come in."""
+        heap = self._heap
+        while heap and self._link(heap[0][1], heap[0][2]).next_due_ns != heap[0][0]:
+            heapq.heappop(heap)
+        due_ns = heap[0][0] if heap else NEVER_NS
+        return min(due_ns, self._entering[0].time_ns) if self._entering else due_ns
+
+    def step(self, received: Iterable[Passing], now_ns: int) -> list[Passing]:
+        """What leaves the links by now, with the exact instants at which it does, in order of time."""
+        entering = self._entering
+        for passing in received:
+            heapq.heappush(entering, passing)
+        while entering and entering[0].time_ns <= now_ns:
+            time_ns, kind, system_id, data = heapq.heappop(entering)
+            if kind == LINK_DOWN:
+                self.last_heard_ns = max(self.last_heard_ns, time_ns)
+                if self._links.zero_ns == NEVER_NS:
+                    self._links.hear(data, time_ns)
+            link = self._link(kind, system_id)
+            before_ns = link.next_due_ns
+            link.send(data, time_ns)
+            if link.next_due_ns != before_ns:
+                heapq.heappush(self._heap, (link.next_due_ns, kind, system_id))
+        out: list[Passing] = []
+        heap = self._heap
+        while heap and heap[0][0] <= now_ns:
+            due_ns, kind, system_id = heapq.heappop(heap)
+            link = self._link(kind, system_id)
+            if due_ns != link.next_due_ns:
+                continue
+            for entry in link.due(now_ns):
+                out.append(Passing(entry[0], kind, system_id, entry[3]))
+                if self._record is not None:
+                    self._record(link.row(entry, now_ns))
+            if link.next_due_ns != NEVER_NS:
+                heapq.heappush(heap, (link.next_due_ns, kind, system_id))
+        out.sort(key=_order)
+        return out
+
+    def _link(self, kind: int, system_id: int) -> Link:
+        up, down = self._links.of(system_id)
+        return up if kind == LINK_UP else down
+
+
+def _order(passing: Passing) -> tuple[int, int, int]:
+    return passing[:3]

@@ -1,0 +1,141 @@
+"""A vehicle's parameters: named numbers that a station lists, reads and sets, kept while the vehicle lives."""
+
+import math
+import struct
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from scenarios.schema import Safety
+from sim_vehicles.services.mavlink import Encoder
+from sim_vehicles.services.service_messages import (
+    BY_NAME,
+    DOES_NOT_EXIST,
+    INT32,
+    PARAMETER_VALUE,
+    REAL32,
+    ParameterList,
+    ParameterRead,
+    ParameterSet,
+    parameter_error,
+    parameter_value,
+)
+
+LIST_INTERVAL_US = 20_000
+"""Between two parameters of a list: 37 bytes each, a third of a radio of 57,600 bit/s."""
+LONGEST_NAME = 16
+TIMEOUT_S = (0.1, 120.0)
+
+_FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter: what it is at first, and which values are taken."""
+
+    name: str
+    """At most 16 ASCII characters."""
+    value: float
+    low: float = -math.inf
+    high: float = math.inf
+    whole: bool = False
+    """Whether it is an INT32; the others are REAL32."""
+
+    def __post_init__(self) -> None:
+        assert self.name.isascii(), self.name
+        assert 0 < len(self.name) <= LONGEST_NAME, self.name
+        assert self.low <= self.value <= self.high, self.name
+
+
+class Parameters:
+    """The parameters of one vehicle and what it answers about them.
+
+    Values are those of float32, as they travel. `bytewise` says how an INT32 travels in the float of a message: its
+    bytes as they are (PX4), or converted (ArduPilot).
+    """
+
+    def __init__(self, known: Iterable[Parameter], *, bytewise: bool = False) -> None:
+        self._known = {parameter.name: parameter for parameter in sorted(known, key=lambda parameter: parameter.name)}
+        self._names = tuple(self._known)
+        self._values: dict[str, float] = {
+            name: known.value if known.whole else _FLOAT.unpack(_FLOAT.pack(known.value))[0]
+            for name, known in self._known.items()
+        }
+        self.bytewise = bytewise
+        self._listed = len(self._names)
+        """Index of the next one of a list that was asked for."""
+
+    def __getitem__(self, name: str) -> float:
+        return self._values[name]
+
+    def answer(
+        self, message: ParameterList | ParameterRead | ParameterSet, encoder: Encoder, counters: Counter[str]
+    ) -> list[bytes]:
+        """Frames to be sent at once. A list is not: it begins, or begins anew, and `next_of_list` gives it.
+
+        A set value is answered by the value that then holds: the old one if the new one is not finite, of another
+        type, or out of range, which counts as `refused_parameter_value`. `refused_parameter_name` is unknown.
+        """
+        if isinstance(message, ParameterList):
+            self._listed = 0
+            return []
+        name = message.name
+        if isinstance(message, ParameterRead) and message.number != BY_NAME:
+            name = self._names[message.number] if 0 <= message.number < len(self._names) else ""
+        parameter = self._known.get(name)
+        if parameter is None:
+            counters["refused_parameter_name"] += 1
+            return [encoder.pack(parameter_error(message, DOES_NOT_EXIST))]
+        if isinstance(message, ParameterSet):
+            value = self._read(message)
+            # NaN fails the comparison
+            if parameter.low <= value <= parameter.high and value == (round(value) if parameter.whole else value):
+                self._values[name] = value
+            else:
+                counters["refused_parameter_value"] += 1
+        return [self._frame(name, encoder)]
+
+    @property
+    def listing(self) -> bool:
+        """Whether a list that was asked for is not yet sent."""
+        return self._listed < len(self._names)
+
+    def next_of_list(self, encoder: Encoder) -> bytes:
+        """The next parameter of the list."""
+        self._listed += 1
+        return self._frame(self._names[self._listed - 1], encoder)
+
+    def _frame(self, name: str, encoder: Encoder) -> bytes:
+        kind = INT32 if self._known[name].whole else REAL32
+        value = self._values[name]
+        data = _INT.pack(int(value)) if self.bytewise and kind == INT32 else _FLOAT.pack(value)
+        payload = parameter_value(name, data, kind, self._names.index(name), len(self._names))
+        return encoder.frame(PARAMETER_VALUE, payload)
+
+    def _read(self, message: ParameterSet) -> float:
+        """The value that a message sets, NaN if there is none."""
+        whole = self._known[message.name].whole
+        if self.bytewise and message.kind != (INT32 if whole else REAL32):
+            return math.nan
+        value = float((_INT if self.bytewise and whole else _FLOAT).unpack(message.value)[0])
+        return value if math.isfinite(value) else math.nan
+
+
+def of_vehicle(system_id: int, safety: Safety) -> list[Parameter]:
+    """What every vehicle without a copter's autopilot has, by ArduPilot's names."""
+    return [
+        fixed("SYSID_THISMAV", system_id),
+        timeout("GUID_TIMEOUT", safety.setpoint_timeout_s),
+        timeout("FS_GCS_TIMEOUT", safety.heartbeat_timeout_s),
+    ]
+
+
+def timeout(name: str, value_s: float) -> Parameter:
+    """How long something may be silent, in s."""
+    low, high = TIMEOUT_S
+    return Parameter(name, value_s, min(low, value_s), max(high, value_s))
+
+
+def fixed(name: str, value: int) -> Parameter:
+    """A whole number that cannot be changed in flight."""
+    return Parameter(name, value, value, value, whole=True)

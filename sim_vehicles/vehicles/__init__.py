@@ -1,0 +1,1 @@
+"""Simulated vehicles: one MAVLink shell, and the crafts in it (double integrator, multicopter, own loop)."""

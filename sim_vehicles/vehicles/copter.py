@@ -1,0 +1,298 @@
+"""A simulated multicopter with an autopilot of its own: what ArduCopter or PX4 looks like from outside.
+
+It boots, sends heartbeats, then telemetry, then has a position; it may be armed, takes off to an altitude, follows
+velocity and acceleration set-points with a lag, and lands. The fleet takes it in place of `vehicle.Vehicle` when the
+scenario's dynamics are `autopilot`.
+"""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from scenarios import schema
+from scenarios.schema import NS_PER_S
+from sim_vehicles.links.truth import Record
+from sim_vehicles.services import mavlink
+from sim_vehicles.services.clock import NEVER_NS, BootClock
+from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M
+from sim_vehicles.vehicles.copter_dynamics import Motion, Target, advance
+from sim_vehicles.vehicles.copter_reports import Facts, report, reported
+from sim_vehicles.vehicles.copter_rules import (
+    FAILED,
+    PX4_TAKEOFF_ALTITUDE,
+    RULES,
+    TEMPORARILY_REJECTED,
+    commanded_mode,
+    parameters,
+    setpoint_target,
+)
+from sim_vehicles.vehicles.dynamics import State, state_from
+from sim_vehicles.vehicles.setpoints import ABSURD
+from sim_vehicles.vehicles.shell import Answer, Radio, Shell
+
+ORIGIN_STREAM = 7
+"""Last word of the spawn key of the random stream of a vehicle's local origin."""
+TAKEN_OFF_M = 0.3
+HOME_M = 0.5
+"""Nearer to home than this, it lands."""
+SINK_FAST_M_S, SINK_M_S, SINK_SLOWLY_BELOW_M = 1.5, 0.7, 5.0
+_ACCEPTED: Answer = mavlink.ACCEPTED, ""
+
+
+def multicopter(
+    scenario: schema.Scenario,
+    own: schema.Vehicle,
+    start_ns: int,
+    *,
+    record: Record | None = None,
+    signed: bool = False,
+    experiment: str = "",
+) -> "Shell[Copter]":
+    """A multicopter on the ground."""
+    radio = Radio(scenario, own, start_ns, record)
+    craft = Copter(scenario, own, radio)
+    # MAVLink 1 cannot be signed.
+    version_1_first = craft.rules.version_1_first and not signed
+    return Shell(scenario, radio, craft, version_1_first=version_1_first, experiment=experiment)
+
+
+class Copter:
+    """A multicopter with its autopilot: the craft in a shell."""
+
+    def __init__(self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio) -> None:
+        start_ns = radio.start_ns
+        self.settings = scenario.autopilot
+        self.rules = RULES[own.flavour or scenario.autopilot.flavour]
+        self.version = self.rules.version
+        self.parameters = parameters(self.rules, own.system_id)
+        self.intervals_us: Mapping[int, int] = dict.fromkeys(reported(self.rules), 0)
+        self.reports_from_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
+        self.mode = self.rules.first_mode
+        self.armed = self.failsafe = False
+        self.landed = True
+        self.home_ne_m = own.position_ne_m
+        self.motion = Motion(*own.position_ne_m)
+        stream = np.random.SeedSequence(scenario.seed, spawn_key=(own.system_id, ORIGIN_STREAM))
+        spread = (2.0 * np.random.default_rng(stream).random(3) - 1.0) * self.settings.origin_spread_m
+        north_m, east_m, up_m = spread.tolist()
+        self.origin_neu_m: tuple[float, float, float] = (north_m, east_m, up_m)
+        """Where its local frame begins, in the frame of the scenario."""
+        self._radio = radio
+        self._target = Target()
+        self._takeoff_m: float | None = None
+        self._motion_ns = start_ns
+        self._setpoint_ns: int | None = None
+        self._armed_ns = NEVER_NS
+        self._read_timeouts()
+        self._refusals_left = self.settings.arming_refusals
+        self._ready_ns = start_ns + round(self.settings.ready_after_s * NS_PER_S)
+        self._jumps = deque(
+            (start_ns + round(j.at_s * NS_PER_S), round(j.by_s * NS_PER_S)) for j in self.settings.clock_jumps
+        )
+
+    def state_at(self, time_ns: int) -> State:
+        """The true state in the scenario's frame at a time not before the last event, if nothing arrives until then."""
+        motion = self.motion
+        if not self.landed and time_ns > self._motion_ns:
+            motion, _ = advance(motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
+        return state_from(motion[0:2], motion[2:4])
+
+    # What happens by itself
+
+    @property
+    def deadline_ns(self) -> int:
+        """The next instant at which something happens that is not a report."""
+        deadline_ns = self._jumps[0][0] if self._jumps else NEVER_NS
+        if self._setpoint_ns is not None and not self.landed and self.mode == self.rules.guided_mode:
+            deadline_ns = min(deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)
+        if self.armed and self.landed:
+            deadline_ns = min(deadline_ns, self._armed_ns + self._ground_disarm_ns)
+        return deadline_ns
+
+    def happen(self, time_ns: int) -> None:
+        """A clock that jumps, a vehicle that is armed and does not take off, or set-points that stop."""
+        self._advance(time_ns)
+        if self._jumps and time_ns == self._jumps[0][0]:
+            _, by_ns = self._jumps.popleft()
+            clock = self._radio.clock
+            self._radio.set_clock(BootClock(time_ns, clock.boot_ns(time_ns) + by_ns, clock.drift_ppb), time_ns)
+            self._radio.tell(time_ns, "clock jumped")
+        elif self.armed and self.landed:
+            self.armed = False
+            self._radio.tell(time_ns, "disarmed: not taken off")
+        else:
+            self._lose_setpoints(time_ns)
+
+    def _lose_setpoints(self, time_ns: int) -> None:
+        """ArduCopter stays guided and stops; PX4 leaves offboard and holds."""
+        self._setpoint_ns = None
+        self._target = self._stopped()
+        if self.rules.guided_mode != self.rules.takeoff_mode:
+            self.mode, self.failsafe = self.rules.hold_mode, True
+        self._radio.tell(time_ns, "set-points stopped")
+        self._radio.say(time_ns, "No offboard signal" if self.failsafe else "Guided: no set-points, stopping")
+
+    # What arrives
+
+    def acts_at(self, time_ns: int) -> int:
+        """Nothing acts before what has acted already."""
+        self._advance(time_ns)
+        return self._motion_ns
+
+    def hear_heartbeat(self, time_ns: int) -> None:
+        """Whether its station is there changes nothing here."""
+
+    def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
+        """Fly a set-point from now on, if it is guided and off the ground."""
+        gain = self.settings.velocity_gain_1_s
+        reason, target = setpoint_target(setpoint, self.rules, yaw_rad=self.motion.yaw_rad, velocity_gain_1_s=gain)
+        guided = self.mode == self.rules.guided_mode
+        if reason:
+            if guided and self.rules.velocity_grows and not self.landed:
+                self._takeoff_m, self._target = None, self._stopped()  # ArduCopter's answer to what it does not take
+            return reason
+        self._setpoint_ns = time_ns  # PX4 also counts those that come before offboard: they let it enter
+        if not guided or not self.armed:
+            return "ignored_not_guided" if not guided else "ignored_not_armed"
+        if not self.landed:
+            self._takeoff_m = None  # a set-point ends a guided take-off where it is
+            self._target = target
+            self._radio.acted(setpoint, time_ns)
+        return "setpoints"
+
+    def parameters_set(self, time_ns: int) -> None:
+        """Take time-outs as the parameters now are."""
+        before = self._setpoint_timeout_ns, self._ground_disarm_ns
+        self._read_timeouts()
+        if (self._setpoint_timeout_ns, self._ground_disarm_ns) != before:
+            self._armed_ns = time_ns  # timers begin anew, so that none ends in the past
+            self._setpoint_ns = None if self._setpoint_ns is None else time_ns
+
+    def _read_timeouts(self) -> None:
+        self._setpoint_timeout_ns = round(self.parameters[self.rules.setpoint_timeout_parameter] * NS_PER_S)
+        self._ground_disarm_ns = round(self.parameters[self.rules.ground_disarm_parameter] * NS_PER_S)
+
+    # Commands
+
+    def command(self, command: mavlink.Command, time_ns: int) -> Answer | None:
+        """Answer a command about arming, modes, take-off and landing."""
+        match command.command:
+            case mavlink.COMMAND_ARM:
+                return self._arm(command, time_ns)
+            case mavlink.COMMAND_MODE:
+                return self.change_mode(commanded_mode(command, self.rules), time_ns)
+            case mavlink.COMMAND_TAKEOFF:
+                return self._take_off(command, time_ns), ""
+            case mavlink.COMMAND_LAND:
+                return self.change_mode(self.rules.land_mode, time_ns)
+            case mavlink.COMMAND_RETURN:
+                return self.change_mode(self.rules.return_mode, time_ns)
+            case _:
+                return None
+
+    def _ready(self, time_ns: int) -> bool:
+        return time_ns >= self._ready_ns
+
+    def _arm(self, command: mavlink.Command, time_ns: int) -> Answer:
+        if command.param1 == 0.0:
+            if not self.landed:
+                return FAILED, ""
+            self.armed = False
+            return _ACCEPTED
+        if self.armed:
+            return _ACCEPTED
+        if not self._ready(time_ns):
+            return self.rules.arming_refused, "PreArm: Need Position Estimate"
+        if self._refusals_left:
+            self._refusals_left -= 1
+            return self.rules.arming_refused, "Arm: Accels inconsistent"
+        self.armed, self._armed_ns = True, time_ns
+        self._radio.tell(time_ns, "armed")
+        if self._takeoff_m is not None:
+            self._leave_ground(time_ns)
+        return _ACCEPTED
+
+    def change_mode(self, mode: int | None, time_ns: int) -> Answer:
+        """Change the mode on command, if there is such a mode."""
+        if mode is None or mode not in self.rules.modes:
+            return mavlink.DENIED, ""
+        if mode == self.mode:
+            return _ACCEPTED
+        if mode != self.rules.first_mode and not self._ready(time_ns):
+            return self.rules.arming_refused, ""  # these modes need a position
+        streamed = self._setpoint_ns is not None and time_ns - self._setpoint_ns < self._setpoint_timeout_ns
+        if mode == self.rules.guided_mode != self.rules.takeoff_mode and not streamed:
+            return TEMPORARILY_REJECTED, "Offboard needs set-points"
+        self.mode, self.failsafe, self._takeoff_m = mode, False, None
+        self._target = self._stopped()
+        if mode == self.rules.guided_mode == self.rules.takeoff_mode:
+            self._setpoint_ns = time_ns  # the time-out begins with the mode
+        self._radio.tell(time_ns, self.rules.modes[mode])
+        return _ACCEPTED
+
+    def _take_off(self, command: mavlink.Command, time_ns: int) -> int:
+        """ArduCopter wants the altitude above home, armed and guided; PX4 the one above sea level, in any mode."""
+        own_mode = self.rules.takeoff_mode == self.rules.guided_mode
+        altitude_m = command.param7 - (0.0 if own_mode else ORIGIN_ALTITUDE_M)
+        if not own_mode and math.isnan(altitude_m):
+            altitude_m = self.parameters[PX4_TAKEOFF_ALTITUDE]
+        if own_mode and not (self.armed and self.mode == self.rules.guided_mode):
+            return FAILED
+        if not own_mode and math.isfinite(command.param5 + command.param6):
+            return mavlink.DENIED  # it would take off towards that latitude and longitude, which is not simulated
+        if not (self.landed and self._ready(time_ns) and 0.0 < altitude_m < ABSURD):
+            return FAILED if own_mode else TEMPORARILY_REJECTED
+        self.mode, self._takeoff_m = self.rules.takeoff_mode, altitude_m
+        if self.armed:
+            self._leave_ground(time_ns)
+        return mavlink.ACCEPTED
+
+    # What it sends
+
+    def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None:
+        """The frame of one of its messages; before it has a position it cannot say where it is."""
+        state = self.mode, self.armed, self.landed, self.failsafe, self.home_ne_m
+        facts = Facts(self.motion, self.origin_neu_m, *state, self._ready(time_ns))
+        return report(message_id, self._radio.encoder, self.rules, facts, boot_ms & mavlink.UINT32)
+
+    # Motion
+
+    def _stopped(self) -> Target:
+        """What it does in a mode by itself: nothing, sink, or fly home."""
+        gain, place = self.settings.velocity_gain_1_s, self.home_ne_m if self.mode == self.rules.return_mode else None
+        climb_m_s = -SINK_FAST_M_S if self.mode == self.rules.land_mode else 0.0
+        return Target(velocity_gain_1_s=gain, climb_m_s=climb_m_s, place_ne_m=place)
+
+    def _leave_ground(self, time_ns: int) -> None:
+        self.landed = False
+        self._target = self._stopped()._replace(altitude_m=self._takeoff_m)
+        self._setpoint_ns = None
+        self._radio.tell(time_ns, "takes off")
+
+    def _advance(self, time_ns: int) -> None:
+        if time_ns <= self._motion_ns:
+            return
+        duration_s, self._motion_ns = (time_ns - self._motion_ns) / NS_PER_S, time_ns
+        if self.landed:
+            return
+        self.motion, self._target = advance(self.motion, self._target, self.settings, duration_s)
+        altitude_m = self.motion.altitude_m
+        if self._takeoff_m is not None and altitude_m > self._takeoff_m - TAKEN_OFF_M:
+            self._takeoff_m = None
+            if self.rules.takeoff_mode != self.rules.guided_mode:
+                self.mode = self.rules.hold_mode
+                self._target = self._stopped()
+            self._radio.tell(time_ns, "taken off")
+        elif self.mode == self.rules.land_mode:
+            sink = SINK_M_S if altitude_m < SINK_SLOWLY_BELOW_M else SINK_FAST_M_S
+            self._target = self._target._replace(climb_m_s=-sink)
+            if altitude_m <= 0.0:
+                self.landed, self.armed = True, False
+                self.motion = Motion(self.motion.north_m, self.motion.east_m, yaw_rad=self.motion.yaw_rad)
+                self._radio.tell(time_ns, "landed")
+        elif self.mode == self.rules.return_mode and math.dist(self.motion[:2], self.home_ne_m) < HOME_M:
+            self.mode = self.rules.land_mode
+            self._target = self._stopped()
+            self._radio.tell(time_ns, self.rules.modes[self.mode])

@@ -1,0 +1,88 @@
+"""What a simulated multicopter says of itself: its state to frames."""
+
+import math
+from typing import NamedTuple
+
+from sim_vehicles.services import mavlink, services
+from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
+from sim_vehicles.vehicles.copter_dynamics import Motion
+from sim_vehicles.vehicles.copter_rules import Rules
+
+READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
+"""Estimator flags with all that is wanted; and attitude only, constant position mode, uninitialised."""
+
+
+class Facts(NamedTuple):
+    """What the reports say, at one instant. `origin_neu_m` is where its local frame begins, in the scenario's frame."""
+
+    motion: Motion
+    origin_neu_m: tuple[float, float, float]
+    mode: int
+    armed: bool
+    landed: bool
+    failsafe: bool
+    home_ne_m: tuple[float, float]
+    """Where it stood on the ground first, in the scenario's frame."""
+    ready: bool
+    """It has a position. Without one it sends a global position of zeros and no local one, as ArduPilot does."""
+
+
+def reported(rules: Rules) -> tuple[int, ...]:
+    """The messages that it sends if asked for them, besides those of every vehicle."""
+    return (
+        mavlink.LOCAL_POSITION,
+        mavlink.GLOBAL_POSITION,
+        mavlink.GLOBAL_ORIGIN,
+        mavlink.HOME_POSITION,
+        rules.estimator_message,
+    )
+
+
+def report(message_id: int, encoder: mavlink.Encoder, rules: Rules, facts: Facts, boot_ms: int) -> bytes | None:
+    """The frame of one of the messages, None if there is nothing to say yet."""
+    motion, (origin_north_m, origin_east_m, origin_up_m) = facts.motion, facts.origin_neu_m
+    frame: bytes | None = None
+    if message_id == mavlink.HEARTBEAT:
+        frame = encoder.heartbeat(_base_mode(facts), facts.mode, _status(facts), rules.autopilot)
+    elif message_id == rules.estimator_message:
+        frame = encoder.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if facts.ready else NOT_READY_FLAGS)
+    elif message_id == mavlink.GLOBAL_POSITION or message_id in services.EXTRA:
+        frame = services.report(message_id, encoder, _condition(facts, boot_ms))
+    elif message_id == mavlink.LOCAL_POSITION and facts.ready:
+        north, east = motion.north_m - origin_north_m, motion.east_m - origin_east_m
+        down = origin_up_m - motion.altitude_m
+        frame = encoder.local_position(boot_ms, north, east, down, motion[2:4], -motion.climb_m_s)
+    elif message_id == mavlink.GLOBAL_ORIGIN and facts.ready:
+        frame = encoder.global_origin(*degrees(origin_north_m, origin_east_m), ORIGIN_ALTITUDE_M + origin_up_m)
+    elif message_id == mavlink.HOME_POSITION and facts.ready:
+        north, east = facts.home_ne_m
+        local = north - origin_north_m, east - origin_east_m, origin_up_m
+        frame = encoder.home_position(*degrees(north, east), ORIGIN_ALTITUDE_M, local)
+    return frame
+
+
+def _base_mode(facts: Facts) -> int:
+    return mavlink.BASE_MODE_CUSTOM | (mavlink.BASE_MODE_ARMED if facts.armed else 0)
+
+
+def _status(facts: Facts) -> int:
+    if facts.failsafe:
+        return mavlink.STATUS_CRITICAL
+    return mavlink.STATUS_STANDBY if facts.landed else mavlink.STATUS_ACTIVE
+
+
+def _condition(facts: Facts, boot_ms: int) -> services.Condition:
+    """What it reports to other stations: it leans into its acceleration."""
+    motion = facts.motion
+    cosine, sine = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
+    north, east = motion.acceleration_north_m_s2 / GRAVITY_M_S2, motion.acceleration_east_m_s2 / GRAVITY_M_S2
+    roll_rad, pitch_rad = math.atan(cosine * east - sine * north), -math.atan(cosine * north + sine * east)
+    return services.Condition(
+        boot_ms,
+        degrees(motion.north_m, motion.east_m),
+        ORIGIN_ALTITUDE_M + motion.altitude_m,
+        (*motion[2:4], -motion.climb_m_s),
+        (roll_rad, pitch_rad, motion.yaw_rad),
+        flying=not facts.landed,
+        has_position=facts.ready,
+    )

@@ -1,0 +1,185 @@
+"""What two autopilots do with modes, arming, take-off and set-points: their rules, as data and pure functions.
+
+Read in ArduCopter's mode_guided.cpp and GCS_MAVLink_Copter.cpp, and in PX4's mavlink_receiver.cpp, Commander.cpp and
+offboardCheck.cpp.
+"""
+
+import math
+from dataclasses import dataclass
+
+from sim_vehicles.services import mavlink, setup_parameters
+from sim_vehicles.services.mavlink import Command, Setpoint
+from sim_vehicles.services.parameters import Parameter, Parameters, fixed, timeout
+from sim_vehicles.vehicles.copter_dynamics import Target
+from sim_vehicles.vehicles.setpoints import (
+    ABSURD,
+    ACCELERATION_AXES,
+    BODY_FRAMES,
+    FORCE_SET,
+    LOCAL_FRAMES,
+    POSITION_AXES,
+    VELOCITY_AXES,
+    YAW_IGNORED,
+    YAW_RATE_IGNORED,
+    to_local,
+)
+
+TEMPORARILY_REJECTED, FAILED = 1, 4
+PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
+"""Parameter: the altitude above the ground, in m, of a take-off whose command names none."""
+GROUND_DISARM_S = 10.0
+"""Armed and not taken off for this long, both disarm again."""
+
+
+def px4_mode(main: int, sub: int = 0) -> int:
+    """HEARTBEAT.custom_mode of a PX4 mode."""
+    return main << 16 | sub << 24
+
+
+@dataclass(frozen=True)
+class Rules:
+    """One autopilot."""
+
+    autopilot: int
+    """MAV_AUTOPILOT"""
+    modes: dict[int, str]
+    first_mode: int
+    guided_mode: int
+    takeoff_mode: int
+    """In which a take-off is flown; a take-off command changes to it unless it is the guided mode."""
+    hold_mode: int
+    land_mode: int
+    return_mode: int
+    estimator_message: int
+    """Reports the estimator's flags: EKF_STATUS_REPORT, ESTIMATOR_STATUS."""
+    arming_refused: int
+    """MAV_RESULT of what is refused because it is not ready."""
+    parameters_bytewise: bool
+    """How it sends integers as parameters."""
+    version: tuple[int, int, int]
+    """What AUTOPILOT_VERSION says; stations warn of what they hold to be older than their oldest."""
+    system_id_parameter: str
+    setpoint_timeout_parameter: str
+    ground_disarm_parameter: str
+    setpoint_timeout_s: float
+    velocity_grows: bool
+    """Whether the velocity target grows with the acceleration between two set-points."""
+    version_1_first: bool
+    """Whether it speaks MAVLink 1 until it hears MAVLink 2 (MAV_PROTO_VER 0)."""
+
+
+ARDUPILOT = Rules(
+    autopilot=3,
+    modes={0: "STABILIZE", 4: "GUIDED", 5: "LOITER", 6: "RTL", 9: "LAND", 17: "BRAKE"},
+    first_mode=0,
+    guided_mode=4,
+    takeoff_mode=4,
+    hold_mode=17,
+    land_mode=9,
+    return_mode=6,
+    estimator_message=193,
+    arming_refused=FAILED,
+    parameters_bytewise=False,
+    version=(4, 6, 0),
+    system_id_parameter="SYSID_THISMAV",
+    setpoint_timeout_parameter="GUID_TIMEOUT",
+    ground_disarm_parameter="DISARM_DELAY",
+    setpoint_timeout_s=3.0,
+    velocity_grows=True,
+    version_1_first=False,
+)
+PX4 = Rules(
+    autopilot=12,
+    modes={
+        px4_mode(3): "POSCTL",
+        px4_mode(4, 2): "AUTO.TAKEOFF",
+        px4_mode(4, 3): "AUTO.LOITER",
+        px4_mode(4, 5): "AUTO.RTL",
+        px4_mode(4, 6): "AUTO.LAND",
+        px4_mode(6): "OFFBOARD",
+    },
+    first_mode=px4_mode(4, 3),
+    guided_mode=px4_mode(6),
+    takeoff_mode=px4_mode(4, 2),
+    hold_mode=px4_mode(4, 3),
+    land_mode=px4_mode(4, 6),
+    return_mode=px4_mode(4, 5),
+    estimator_message=230,
+    arming_refused=TEMPORARILY_REJECTED,
+    parameters_bytewise=True,
+    version=(1, 16, 0),
+    system_id_parameter="MAV_SYS_ID",
+    setpoint_timeout_parameter="COM_OF_LOSS_T",
+    ground_disarm_parameter="COM_DISARM_PRFLT",
+    setpoint_timeout_s=1.0,
+    velocity_grows=False,
+    version_1_first=True,
+)
+RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
+
+
+def parameters(rules: Rules, system_id: int) -> Parameters:
+    """What a multicopter of this autopilot has."""
+    known = [
+        fixed(rules.system_id_parameter, system_id),
+        timeout(rules.setpoint_timeout_parameter, rules.setpoint_timeout_s),
+        timeout(rules.ground_disarm_parameter, GROUND_DISARM_S),
+    ]
+    if rules is PX4:
+        known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *setup_parameters.of_px4()]
+    else:
+        known += setup_parameters.of_ardupilot()
+    return Parameters(known, bytewise=rules.parameters_bytewise)
+
+
+def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]:
+    """What a set-point asks for: (why it is not flown or "", velocity counts, acceleration counts).
+
+    One ignored axis drops all three of its kind. What ArduCopter does not take makes it stop; PX4 ignores it.
+    """
+    mask = setpoint.type_mask
+    velocity, acceleration = not mask & VELOCITY_AXES, not mask & ACCELERATION_AXES
+    if setpoint.frame not in LOCAL_FRAMES and setpoint.frame not in BODY_FRAMES:
+        return "refused_frame", False, False
+    if mask & FORCE_SET and (acceleration or rules is PX4):
+        return "refused_force", False, False
+    if not mask & POSITION_AXES or not (velocity or acceleration):
+        return "refused_mask", False, False  # flying to positions is not simulated
+    return "", velocity, acceleration
+
+
+def setpoint_target(
+    setpoint: Setpoint, rules: Rules, *, yaw_rad: float, velocity_gain_1_s: float
+) -> tuple[str, Target]:
+    """Why a set-point is not flown, or "", and what it makes a vehicle with that yaw try.
+
+    Fields that are ignored may hold anything, also NaN, as some clients send.
+    """
+    reason, velocity_counts, acceleration_counts = setpoint_meaning(setpoint, rules)
+    setpoint = to_local(setpoint, yaw_rad)
+    acceleration = setpoint.acceleration_ned_m_s2 if acceleration_counts else (0.0, 0.0, 0.0)
+    velocity = setpoint.velocity_ned_m_s if velocity_counts else (0.0, 0.0, 0.0)
+    yaw = None if setpoint.type_mask & YAW_IGNORED else setpoint.yaw_rad
+    rate = 0.0 if setpoint.type_mask & YAW_RATE_IGNORED else setpoint.yaw_rate_rad_s
+    if not math.hypot(*acceleration, *velocity, yaw or 0.0, rate) <= ABSURD:
+        return "refused_absurd", Target()
+    return reason, Target(
+        *acceleration[:2],
+        *velocity[:2],
+        velocity_gain_1_s=velocity_gain_1_s if velocity_counts else 0.0,
+        growth=1.0 if velocity_counts and rules.velocity_grows else 0.0,
+        climb_m_s=-velocity[2],
+        yaw_rad=yaw,
+        yaw_rate_rad_s=rate,
+    )
+
+
+def commanded_mode(command: Command, rules: Rules) -> int | None:
+    """The custom mode that a DO_SET_MODE asks for, None if there is none such."""
+    if not math.isfinite(command.param1 + command.param2 + command.param3):
+        return None
+    base, main, sub = int(command.param1), int(command.param2), int(command.param3)
+    if not base & mavlink.BASE_MODE_CUSTOM:
+        return None
+    mode = px4_mode(main, sub) if rules is PX4 else main
+    return mode if mode in rules.modes else None

@@ -1,0 +1,260 @@
+"""One simulated UAV without an autopilot of another make: a double integrator that is launched.
+
+It starts on the launcher: held at its initial state, and reporting the initial position and velocity, until it has
+been armed, is in GUIDED and the first set-point is accepted; from that instant on it flies.
+"""
+
+import math
+from collections.abc import Mapping
+
+from scenarios import schema
+from scenarios.schema import NS_PER_S
+from sim_vehicles.links.truth import Record
+from sim_vehicles.services import mavlink
+from sim_vehicles.services.earth import (
+    GRAVITY_M_S2,
+    ORIGIN_ALTITUDE_M,
+    ORIGIN_LATITUDE_DEG,
+    ORIGIN_LONGITUDE_DEG,
+    degrees,
+)
+from sim_vehicles.services.parameters import Parameters, of_vehicle
+from sim_vehicles.services.services import Condition, report, whole
+from sim_vehicles.services.setup_parameters import of_ardupilot
+from sim_vehicles.vehicles.autopilot import MODE_NAMES, Autopilot
+from sim_vehicles.vehicles.dynamics import (
+    COAST,
+    VELOCITY_GAIN_1_S,
+    Command,
+    State,
+    advance,
+    bounds_of,
+    rates,
+    state_from,
+)
+from sim_vehicles.vehicles.onboard import STEP, OnboardLoop, formation_parameters
+from sim_vehicles.vehicles.setpoints import ACCELERATION, AXES, VELOCITY, VELOCITY_ACCELERATION, fault, to_local
+from sim_vehicles.vehicles.shell import Answer, Radio, Shell
+
+CANNOT_LAND: Answer = mavlink.DENIED, "cannot land or return, LOITER holds the course"
+"""Said in words as well: a person who asks for this may not see the result."""
+
+
+def launched(
+    scenario: schema.Scenario,
+    own: schema.Vehicle,
+    start_ns: int,
+    *,
+    record: Record | None = None,
+    onboard: OnboardLoop | None = None,
+    experiment: str = "",
+) -> "Shell[Vehicle]":
+    """A vehicle on its launcher; with `onboard` it has a loop of its own."""
+    radio = Radio(scenario, own, start_ns, record)
+    return Shell(scenario, radio, Vehicle(scenario, own, radio, onboard), experiment=experiment)
+
+
+class Vehicle:
+    """What flies, with its autopilot: the craft in a shell."""
+
+    version: tuple[int, int, int] = (4, 6, 0)
+    """Of the ArduCopter whose messages and modes it has."""
+    intervals_us: Mapping[int, int] = {
+        mavlink.LOCAL_POSITION: 250_000,
+        mavlink.GLOBAL_POSITION: 1_000_000,
+        mavlink.HOME_POSITION: 0,
+    }
+    """Sent unasked, slowly, as an autopilot does on a telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes it."""
+
+    def __init__(
+        self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio, onboard: OnboardLoop | None
+    ) -> None:
+        self.autopilot = Autopilot(scenario.safety)
+        formation = [] if onboard is None else formation_parameters()
+        self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot(), *formation])
+        self.reports_from_ns = radio.start_ns
+        self._radio = radio
+        self._onboard = onboard
+        self._altitude_m = scenario.altitude_m
+        self._bounds = bounds_of(scenario.limits)
+        self._state = state_from(own.position_ne_m, own.velocity_ne_m_s)
+        self._state_ns = radio.start_ns
+        self._command = COAST
+        if onboard is not None:
+            radio.schedule.set_interval(STEP, onboard.interval_us, radio.start_ns)
+
+    @property
+    def deadline_ns(self) -> int:
+        """When the failsafe begins unless something is heard before."""
+        return self.autopilot.deadline_ns
+
+    def state_at(self, time_ns: int) -> State:
+        """The true state at a time not before the last event, if nothing arrives until then."""
+        if not self.autopilot.flying or time_ns <= self._state_ns:
+            return self._state
+        return advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
+
+    def acts_at(self, time_ns: int) -> int:
+        """Nothing acts before what has acted already; the state is brought up to date when it is needed."""
+        return max(time_ns, self._state_ns)
+
+    def hear_heartbeat(self, time_ns: int) -> None:
+        """A station's heartbeat arrived."""
+        self.autopilot.hear_heartbeat(max(time_ns, self._state_ns))
+
+    def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
+        """Fly a set-point from now on if it can be, the first one as the start of the flight."""
+        on_launcher = not self.autopilot.flying
+        counts = setpoint.type_mask & AXES
+        onboard = self._onboard if self._onboard is not None and self._onboard.on else None
+        reason = fault(setpoint)
+        if onboard is not None and counts != VELOCITY_ACCELERATION:
+            reason = reason or "refused_mask"  # its own loop wants to know the formation's velocity
+        reason = reason or self.autopilot.accept_setpoint(time_ns)
+        if reason:
+            return reason
+        if on_launcher:
+            self._state_ns = time_ns  # its state is the initial one until now
+            self._radio.tell(time_ns, "flying")
+        self._advance(time_ns)
+        if setpoint.frame != mavlink.FRAME_LOCAL_NED:
+            setpoint = to_local(setpoint, self._state.yaw_rad)
+        north, east, _ = setpoint.acceleration_ned_m_s2
+        if onboard is not None:
+            onboard.stream(setpoint.velocity_ned_m_s[:2], (north, east))
+            self._command = onboard.command()
+        elif counts == ACCELERATION:
+            self._command = Command(north, east)
+        elif counts == VELOCITY:
+            self._command = Command(0.0, 0.0, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
+        else:
+            self._command = Command(north, east, *setpoint.velocity_ned_m_s[:2], VELOCITY_GAIN_1_S)
+        self._radio.acted(setpoint, time_ns)
+        return "setpoints"
+
+    def parameters_set(self, time_ns: int) -> None:
+        """Take time-outs and the loop's gains as the parameters now are."""
+        timeouts_s = self.parameters["GUID_TIMEOUT"], self.parameters["FS_GCS_TIMEOUT"]
+        self.autopilot.set_timeouts(*timeouts_s, time_ns)
+        if self._onboard is not None:
+            self._onboard.set(self.parameters)
+
+    # Commands
+
+    def command(self, command: mavlink.Command, time_ns: int) -> Answer | None:
+        """Answer a command about arming, modes and the ways to begin and to end a flight."""
+        match command.command:
+            case mavlink.COMMAND_ARM:
+                return self._arm(command, time_ns), ""
+            case mavlink.COMMAND_MODE:
+                own_modes = (whole(command.param1) or 0) & mavlink.BASE_MODE_CUSTOM
+                return self.change_mode(whole(command.param2) if own_modes else None, time_ns)
+            case mavlink.COMMAND_TAKEOFF:
+                return self._take_off(time_ns), ""
+            case mavlink.COMMAND_LAND | mavlink.COMMAND_RETURN:
+                return CANNOT_LAND
+            case _:
+                return None
+
+    def _arm(self, command: mavlink.Command, time_ns: int) -> int:
+        if command.param1 not in (0.0, 1.0):
+            return mavlink.DENIED
+        was = self.autopilot.armed
+        result = self.autopilot.arm(command.param1 == 1.0)
+        if self.autopilot.armed != was:
+            self._radio.tell(time_ns, "armed" if self.autopilot.armed else "disarmed")
+        return result
+
+    def _take_off(self, time_ns: int) -> int:
+        """Leave the launcher, at the altitude and with the velocity that it has there, whatever altitude is wanted."""
+        result = self.autopilot.take_off(time_ns)
+        if result == mavlink.ACCEPTED:
+            self._state_ns = time_ns
+            self._radio.tell(time_ns, "flying")
+        return result
+
+    def change_mode(self, mode: int | None, time_ns: int) -> Answer:
+        """Change the mode on command."""
+        if mode is None:
+            return mavlink.DENIED, ""
+        if mode in (mavlink.MODE_LAND, mavlink.MODE_RETURN):
+            return CANNOT_LAND
+        before = (self.autopilot.mode, self.autopilot.failsafe)
+        result = self.autopilot.set_mode(mode, time_ns)
+        if (self.autopilot.mode, self.autopilot.failsafe) != before:
+            self._advance(time_ns)
+            self._command = self._alone()
+            self._radio.tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
+        return result, ""
+
+    # What happens by itself
+
+    def happen(self, time_ns: int) -> None:
+        """Enter the failsafe."""
+        self._advance(time_ns)
+        self.autopilot.fail()
+        self._command = self._alone()
+        text = f"failsafe: {self.autopilot.failsafe} stopped"
+        self._radio.tell(time_ns, text)
+        self._radio.say(time_ns, text)
+
+    def _alone(self) -> Command:
+        """What it does without set-points: its own loop, if it has one and is not told to hold, or fly straight on."""
+        onboard = self._onboard
+        if onboard is None:
+            return COAST
+        onboard.drop_stream()
+        return onboard.command() if self._own_loop_flies(onboard) else COAST
+
+    def _own_loop_flies(self, onboard: OnboardLoop) -> bool:
+        autopilot = self.autopilot
+        return onboard.on and autopilot.flying and (autopilot.mode == mavlink.MODE_GUIDED or autopilot.failsafe != "")
+
+    def _step_onboard(self, time_ns: int, boot_ms: int) -> None:
+        onboard = self._onboard
+        if onboard is None or not onboard.on:
+            return
+        self._advance(time_ns)
+        onboard.step(time_ns, boot_ms, self._state)
+        if self._own_loop_flies(onboard):
+            self._command = onboard.command()
+
+    def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None:
+        """A report, or a step of its own loop, which says nothing."""
+        if message_id == STEP:
+            self._step_onboard(time_ns, boot_ms)
+            return None
+        boot_ms &= mavlink.UINT32
+        encoder = self._radio.encoder
+        if message_id == mavlink.HEARTBEAT:
+            autopilot = self.autopilot
+            return encoder.heartbeat(autopilot.base_mode, autopilot.mode, autopilot.system_status)
+        if message_id == mavlink.HOME_POSITION:
+            return encoder.home_position(ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M)
+        self._advance(time_ns)
+        if message_id == mavlink.LOCAL_POSITION:
+            state = self._state
+            return encoder.local_position(boot_ms, state[0], state[1], -self._altitude_m, state.velocity_ne_m_s())
+        return report(message_id, encoder, self._condition(boot_ms))
+
+    def _condition(self, boot_ms: int) -> Condition:
+        """What it reports to other stations: in flight it banks as in a coordinated turn."""
+        state, roll_rad = self._state, 0.0
+        if self.autopilot.flying:
+            _, _, turn_rate_rad_s, _ = rates(state.yaw_rad, state.speed_m_s, self._command, self._bounds)
+            roll_rad = math.atan2(state.speed_m_s * turn_rate_rad_s, GRAVITY_M_S2)
+        return Condition(
+            boot_ms,
+            degrees(state.north_m, state.east_m),
+            ORIGIN_ALTITUDE_M + self._altitude_m,
+            (*state.velocity_ne_m_s(), 0.0),
+            (roll_rad, 0.0, math.remainder(state.yaw_rad, math.tau)),
+            flying=self.autopilot.flying,
+            has_position=True,
+        )
+
+    def _advance(self, time_ns: int) -> None:
+        if time_ns > self._state_ns:
+            if self.autopilot.flying:
+                self._state = advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
+            self._state_ns = time_ns

@@ -1,0 +1,53 @@
+"""What a set-point says, before any autopilot's rules: which of its vectors count, and in which frame."""
+
+import math
+
+from sim_vehicles.services import mavlink
+from sim_vehicles.services.mavlink import Setpoint
+
+POSITION_AXES, VELOCITY_AXES, ACCELERATION_AXES = 0x007, 0x038, 0x1C0
+AXES = POSITION_AXES | VELOCITY_AXES | ACCELERATION_AXES
+VELOCITY, ACCELERATION, VELOCITY_ACCELERATION = AXES & ~VELOCITY_AXES, AXES & ~ACCELERATION_AXES, POSITION_AXES
+"""Of AXES what is ignored when only velocity, only acceleration, or both count."""
+FORCE_SET, YAW_IGNORED, YAW_RATE_IGNORED = 0x200, 0x400, 0x800
+LOCAL_FRAMES, BODY_FRAMES = (1, 7), (8, 9)
+"""LOCAL_NED and LOCAL_OFFSET_NED, BODY_NED and BODY_OFFSET_NED: the same for velocities and accelerations."""
+ABSURD = 1e4
+"""A set-point with more m/s² or m/s than this is refused."""
+
+
+def fault(setpoint: Setpoint) -> str:
+    """Why the plain vehicle refuses a set-point, or an empty string. NaN fails every comparison, so it is absurd.
+
+    It takes the whole vectors of velocity, acceleration, or both; its heading is its course, so yaw is not looked at.
+    """
+    if setpoint.frame != mavlink.FRAME_LOCAL_NED and setpoint.frame not in BODY_FRAMES:
+        return "refused_frame"
+    mask = setpoint.type_mask
+    counts = mask & AXES
+    if counts in (VELOCITY_ACCELERATION, VELOCITY):
+        if not math.hypot(*setpoint.velocity_ned_m_s) <= ABSURD:
+            return "refused_absurd"
+    elif counts != ACCELERATION:
+        return "refused_mask"
+    if counts == VELOCITY:
+        return ""
+    if mask & FORCE_SET:
+        return "refused_mask"
+    return "" if math.hypot(*setpoint.acceleration_ned_m_s2) <= ABSURD else "refused_absurd"
+
+
+def to_local(setpoint: Setpoint, yaw_rad: float) -> Setpoint:
+    """The set-point with its vectors in the local frame, if they were in that of the body at this yaw."""
+    if setpoint.frame not in BODY_FRAMES:
+        return setpoint
+    cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
+
+    def turned(forward: float, right: float, down: float) -> tuple[float, float, float]:
+        return cosine * forward - sine * right, sine * forward + cosine * right, down
+
+    return setpoint._replace(
+        velocity_ned_m_s=turned(*setpoint.velocity_ned_m_s),
+        acceleration_ned_m_s2=turned(*setpoint.acceleration_ned_m_s2),
+        frame=mavlink.FRAME_LOCAL_NED,
+    )

@@ -1,0 +1,265 @@
+"""What every simulated vehicle does on its link, whatever flies: a MAVLink system of its own.
+
+Bytes and time in, bytes and time out. The shell reads datagrams, obeys one station, answers TIMESYNC, commands and
+requests, and reports on a schedule. The `Craft` in it knows how the vehicle moves and what its autopilot accepts.
+Everything happens at its exact instant, however late `step` is called.
+"""
+
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
+from typing import Generic, NamedTuple, Protocol, TypeVar
+
+from scenarios import schema
+from sim_vehicles.links.truth import ACTED, SAMPLED, Record
+from sim_vehicles.services import mavlink
+from sim_vehicles.services.authority import Authority
+from sim_vehicles.services.clock import BootClock
+from sim_vehicles.services.parameters import Parameters
+from sim_vehicles.services.schedule import Schedule
+from sim_vehicles.services.service_messages import PARAMETER_VALUE, ParameterSet, SetMode
+from sim_vehicles.services.services import Services
+from sim_vehicles.vehicles.dynamics import State
+
+TIMESYNC_INTERVAL_US = 10_000_000
+HEARTBEAT_INTERVAL_US = 1_000_000
+LONGEST_HISTORY = 1000
+"""Changes kept if nobody reads them; a hostile sender can cause them without end."""
+
+Answer = tuple[int, str]
+"""The MAV_RESULT of a command, and what the vehicle says besides, "" for nothing."""
+
+
+class Change(NamedTuple):
+    """Something a person watching would want to know, such as "failsafe: set-points stopped"."""
+
+    time_ns: int
+    system_id: int
+    text: str
+
+
+class Radio:
+    """What the shell and the craft share: the clock, the counters, and all that is sent and told.
+
+    `counters` says what came in: `heartbeats`, `commands`, `timesync_requests`, `timesync_replies`, `setpoints`, and
+    by reason what was not obeyed: `refused_...` for what is wrong with it, `ignored_...` for what is well formed but
+    not for this vehicle or not now.
+    """
+
+    def __init__(
+        self, scenario: schema.Scenario, own: schema.Vehicle, start_ns: int, record: Record | None = None
+    ) -> None:
+        self.system_id = own.system_id
+        self.start_ns = start_ns
+        self.counters: Counter[str] = Counter()
+        self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
+        """Appended to; whoever reads may clear it."""
+        self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
+        self.schedule = Schedule(self.clock)
+        self.encoder = mavlink.Encoder(own.system_id)
+        self.record = record
+        self.out: list[tuple[bytes, int]] = []
+        """What has been sent in this step, with its instants."""
+
+    def send(self, frame: bytes, time_ns: int) -> None:
+        """Send a frame of the encoder's."""
+        self.out.append((frame, time_ns))
+
+    def say(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
+        """Send a STATUSTEXT."""
+        self.send(self.encoder.statustext(severity, text), time_ns)
+
+    def tell(self, time_ns: int, text: str) -> None:
+        """Note a change."""
+        self.changes.append(Change(time_ns, self.system_id, text))
+
+    def acted(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
+        """Write down in the truth that a set-point acts from now on."""
+        if self.record is not None:
+            self.record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
+
+    def set_clock(self, clock: BootClock, time_ns: int) -> None:
+        """Go on with another clock."""
+        self.clock = clock
+        self.schedule.set_clock(clock, time_ns)
+
+
+class Craft(Protocol):
+    """What flies. Times are in order; `acts_at` says when what arrives late acts."""
+
+    parameters: Parameters
+    version: tuple[int, int, int]
+    """Of its autopilot."""
+    intervals_us: Mapping[int, int]
+    """The messages that it reports besides heartbeats, each with its interval if nobody asks, 0 for none."""
+    reports_from_ns: int
+    """Before this it sends heartbeats only."""
+
+    @property
+    def deadline_ns(self) -> int: ...  # when something happens by itself that is not a report
+
+    def happen(self, time_ns: int) -> None: ...
+    def state_at(self, time_ns: int) -> State: ...
+    def acts_at(self, time_ns: int) -> int: ...
+    def hear_heartbeat(self, time_ns: int) -> None: ...
+
+    def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str: ...  # the name of the counter to raise
+    def command(self, command: mavlink.Command, time_ns: int) -> Answer | None: ...  # None: it is not about flying
+    def change_mode(self, mode: int | None, time_ns: int) -> Answer: ...  # None: it is not known which
+    def parameters_set(self, time_ns: int) -> None: ...
+    def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None: ...  # None: there is nothing to say
+
+
+Flown = TypeVar("Flown", bound=Craft, covariant=True)  # noqa: PLC0105 - the craft's own type, for who looks inside
+
+
+class Shell(Generic[Flown]):
+    """A vehicle as its link sees it.
+
+    With `version_1_first` it speaks MAVLink 1 until it hears MAVLink 2, as a PX4. `experiment` is the text of its
+    parameter SCENARIO.
+    """
+
+    def __init__(
+        self,
+        scenario: schema.Scenario,
+        radio: Radio,
+        craft: Flown,
+        *,
+        version_1_first: bool = False,
+        experiment: str = "",
+    ) -> None:
+        self.system_id = radio.system_id
+        self.craft = craft
+        self.radio = radio
+        self.counters, self.changes = radio.counters, radio.changes
+        self.authority = Authority(scenario.safety.heartbeat_timeout_s)
+        self._speaks_version_1 = version_1_first
+        self._timesync_ts1 = -1
+        from_ns = craft.reports_from_ns
+        self._schedule = schedule = radio.schedule
+        schedule.add_once(mavlink.HEARTBEAT, radio.start_ns)  # found at once, not after up to a second
+        schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, from_ns)
+        intervals_us = {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
+        for message_id, interval_us in intervals_us.items():
+            schedule.set_interval(
+                message_id, interval_us, radio.start_ns if message_id == mavlink.HEARTBEAT else from_ns
+            )
+        self.services = Services(
+            radio.encoder, schedule, craft.parameters, craft.version, intervals_us, from_ns, experiment
+        )
+
+    @property
+    def next_event_ns(self) -> int:
+        """When the vehicle next does something if nothing arrives."""
+        scheduled_ns, deadline_ns = self._schedule.next_ns, self.craft.deadline_ns
+        return deadline_ns if deadline_ns < scheduled_ns else scheduled_ns
+
+    def step(self, datagrams: Iterable[tuple[bytes, int]], now_ns: int) -> list[tuple[bytes, int]]:
+        """Live until now: what arrives, as (datagram, instant) in order of time, to what is sent, likewise.
+
+        A datagram with an instant that is already behind acts at once. One that arrives at the very instant of
+        something scheduled comes first: a set-point on the deadline is in time.
+        """
+        self.radio.out = out = []
+        for data, time_ns in datagrams:
+            self._run(time_ns)
+            self._receive(data, time_ns)
+        self._run(now_ns + 1)
+        return out
+
+    def _run(self, end_ns: int) -> None:
+        """Do what is due before the end. At one instant the deadline comes first, and reports show what it did."""
+        schedule, craft = self._schedule, self.craft
+        while True:
+            deadline_ns = craft.deadline_ns
+            if deadline_ns <= schedule.next_ns:
+                if deadline_ns >= end_ns:
+                    return
+                craft.happen(deadline_ns)
+            elif schedule.next_ns >= end_ns:
+                return
+            else:
+                self._report(*schedule.pop())
+
+    def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
+        if self._speaks_version_1 and message_id != mavlink.HEARTBEAT:
+            return  # nobody listens yet who could want it
+        radio, craft = self.radio, self.craft
+        craft.acts_at(time_ns)
+        if message_id == mavlink.TIMESYNC:
+            self._timesync_ts1 = radio.clock.boot_ns(time_ns)
+            frame = radio.encoder.timesync(0, self._timesync_ts1)
+        elif message_id == PARAMETER_VALUE:
+            frame = self.services.next_parameter(time_ns)
+        else:
+            own = craft.report(message_id, time_ns, boot_ms)
+            if own is None:
+                return
+            frame = mavlink.in_version_1(own) if self._speaks_version_1 else own
+            if message_id == mavlink.LOCAL_POSITION and radio.record is not None:
+                radio.record((SAMPLED, self.system_id, boot_ms & mavlink.UINT32, time_ns, time_ns, time_ns))
+        radio.send(frame, time_ns)
+
+    def _receive(self, data: bytes, time_ns: int) -> None:
+        counters, authority = self.counters, self.authority
+        for source, message in mavlink.read_datagram(data, counters):
+            self._speaks_version_1 = False
+            if isinstance(message, mavlink.Heartbeat):
+                self._take_heartbeat(source, message, time_ns)
+            elif isinstance(message, mavlink.Timesync):
+                self._take_timesync(message, time_ns)
+            elif message.target_system != self.system_id or message.target_component not in mavlink.OUR_COMPONENTS:
+                counters["ignored_not_addressed"] += 1
+            elif authority.obeys(source, message, time_ns):
+                self._obey(message, self.craft.acts_at(time_ns))
+            elif text := authority.refusal(source, counters):
+                # No COMMAND_ACK: the station has no way to tell it from the answer to an equal command of its own.
+                self.radio.tell(time_ns, text)
+                self.radio.say(time_ns, text, mavlink.SEVERITY_WARNING)
+
+    def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
+        if heartbeat.vehicle_type != mavlink.TYPE_GCS:
+            self.counters["ignored_heartbeat"] += 1
+        elif not self.authority.hears(source, time_ns):
+            self.counters["ignored_not_the_station"] += 1
+        else:
+            self.counters["heartbeats"] += 1
+            self.craft.hear_heartbeat(time_ns)
+
+    def _take_timesync(self, message: mavlink.Timesync, time_ns: int) -> None:
+        if message.target_system not in (0, self.system_id):
+            self.counters["ignored_not_addressed"] += 1
+        elif message.tc1 == 0:
+            self.counters["timesync_requests"] += 1
+            # Not 0 even at the very boot: that would make the reply a request.
+            tc1 = self.radio.clock.boot_ns(time_ns) or 1
+            self.radio.send(self.radio.encoder.timesync(tc1, message.ts1), time_ns)
+        else:  # a reply that was not asked for is one to another vehicle, or a duplicate
+            asked = message.ts1 == self._timesync_ts1
+            self.counters["timesync_replies" if asked else "ignored_timesync_reply"] += 1
+
+    def _obey(self, message: mavlink.Asked, time_ns: int) -> None:
+        if isinstance(message, mavlink.Setpoint):
+            self.counters[self.craft.take_setpoint(message, time_ns)] += 1
+        elif isinstance(message, mavlink.Command):
+            self._take_command(message, time_ns)
+        elif isinstance(message, SetMode):
+            mode = message.custom_mode if message.base_mode & mavlink.BASE_MODE_CUSTOM else None
+            if text := self.craft.change_mode(mode, time_ns)[1]:
+                self.radio.say(time_ns, text)
+        else:
+            for frame in self.services.answer(message, self.counters, time_ns):
+                self.radio.send(frame, time_ns)
+            if isinstance(message, ParameterSet):
+                self.craft.parameters_set(time_ns)
+
+    def _take_command(self, command: mavlink.Command, time_ns: int) -> None:
+        """The acknowledgement goes before what the command makes the vehicle say, as request and reply are read."""
+        self.counters["commands"] += 1
+        radio, answer = self.radio, self.craft.command(command, time_ns)
+        result, more = self.services.command(command, time_ns) if answer is None else (answer[0], [])
+        radio.send(radio.encoder.command_ack(command.command, result, command.source), time_ns)
+        for message in more:
+            radio.send(radio.encoder.pack(message), time_ns)
+        if answer is not None and answer[1]:
+            radio.say(time_ns, answer[1])
