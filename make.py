@@ -34,11 +34,11 @@ JOBS: dict[str, tuple[str, list[str]]] = {
     "test": ("run the tests", ["python -m pytest -n auto"]),
     "soak": (
         "fly random experiments in virtual time and check invariants: --flights N --seed S [--workers W]",
-        ["python tests/soak.py"],
+        ["python -m tests.soak"],
     ),
     "clients": (
         "fly the vehicles under MAVProxy and MAVSDK's server, which it installs (1.2 GB)",
-        ["uv pip install --quiet --group clients", "python -m pytest -n 0 -rs tests/test_clients.py"],
+        ["uv pip install --quiet --group clients", "python -m pytest -n 0 -rs tests/clients/test_clients.py"],
     ),
     "lint": (
         "check format, style, types and import contracts",

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-import gcs.runs.record
+import gcs.control.tick
 import sim_vehicles.links.truth
 from docs.generate.blocks import table
 
@@ -57,7 +57,7 @@ def columns(module: ModuleType, dtype: "np.dtype[Any]") -> str:
 
 
 def tick_columns() -> str:
-    return columns(gcs.runs.record, gcs.control.tick.TICK)
+    return columns(gcs.control.tick, gcs.control.tick.TICK)
 
 
 def modes() -> str:

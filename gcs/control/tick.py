@@ -65,10 +65,7 @@ TICK = np.dtype(
         ("nearest_m", "<f8"),  # distance to the nearest other vehicle, at the tick's instant; NaN while unknown
         ("queue_s", "<f8"),  # from the kernel's receive stamp of the newest state to its use by a step
         ("up_delay_s", "<f8"),  # one-way delay of the newest state: from sample_ns to the kernel's receive stamp
-        (
-            "sample_bound_s",
-            "<f8",
-        ),  # most that sample_ns, telemetry_age_s and up_delay_s can be wrong (gcs/link/clocks.py)
+        ("sample_bound_s", "<f8"),  # largest error of sample_ns, telemetry_age_s and up_delay_s (gcs/link/clocks.py)
         ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
         ("down_bound_s", "<f8"),  # most that it can be wrong
         ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s - repeated_s; ground loop: of the newest

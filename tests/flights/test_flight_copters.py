@@ -1,0 +1,370 @@
+"""Flights of vehicles with autopilots in virtual time, from boot to hold, and what the start-up has to cope with."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from gcs.control.phases import START_PATIENCE_S
+from gcs.control.tick import TickArray
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.link.datagram import Datagram
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import described, flight_plan
+from gcs.runs.summary import verdict
+from gcs.station.absence import TAKEN_OVER
+from gcs.station.station import Event, Station
+from scenarios.files import load
+from scenarios.schema import ClockJump, Link, Links, Outage, Response, Scenario, VehicleLinks
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.vehicles.copter import Copter
+from sim_vehicles.vehicles.copter_rules import RULES
+from tests.gcs.station.test_station import HOME, Peer, messages
+from tests.support.paths import SCENARIOS
+from tests.support.sim_client import command
+
+COPTERS5 = load(SCENARIOS / "copters5.toml")
+PERIOD_S = 0.02
+TRUTH = Response(lag_s=COPTERS5.autopilot.lag_s, velocity_gain_1_s=COPTERS5.autopilot.velocity_gain_1_s)
+
+
+def three(*, duration_s: float = 15.0, up_down: Link | None = None, **changes: Any) -> Scenario:
+    """The leader and one platoon of copters5, with an autopilot changed."""
+    kept: dict[str, Any] = {"vehicles": COPTERS5.vehicles[:3], "duration_s": duration_s}
+    links = Links(up=up_down, down=up_down) if up_down else COPTERS5.links
+    autopilot = COPTERS5.autopilot.model_copy(update=changes)
+    return COPTERS5.model_copy(update=kept | {"links": links, "autopilot": autopilot})
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A flight that has ended: its ticks, events and vehicles."""
+
+    station: Station
+    fleet: Fleet
+    ticks: TickArray
+    events: list[Event]
+
+    @property
+    def flown(self) -> TickArray:
+        """Ticks of the formation flight, without those in which the vehicles are told to hold."""
+        last = self.ticks["tick"][self.ticks["commanded"]][-1]
+        return self.ticks[(self.ticks["time_s"] >= 0.0) & (self.ticks["tick"] <= last)]
+
+    def error_m(self, system_id: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+        rows = self.flown[self.flown["system_id"] == system_id]
+        return np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
+
+    def texts(self, kind: str) -> list[str]:
+        return [event.text for event in self.events if event.kind == kind]
+
+    def copter(self, system_id: int) -> Copter:
+        craft = self.fleet.vehicle(system_id).craft
+        assert isinstance(craft, Copter)
+        return craft
+
+
+def fly(plan: FlightPlan, fleet: Fleet | None = None, start_ns: int = START_NS) -> Flight:
+    station, fleet = Station(plan, start_ns=start_ns), fleet or Fleet(plan.scenario, start_ns)
+    ticks = list(fly_lockstep(plan, station=station, vehicles=fleet))
+    return Flight(station, fleet, np.concatenate(ticks), station.events)
+
+
+@cache
+def planned(flavour: str) -> FlightPlan:
+    return flight_plan(three(flavour=flavour))[1]
+
+
+def plan_for(scenario: Scenario) -> FlightPlan:
+    """The gains of copters5 with another scenario of the same formation: designing takes longer than flying."""
+    return replace(planned("ardupilot"), scenario=scenario)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_copters_start_on_the_ground_fly_the_formation_and_hold(flavour: str) -> None:
+    flight = fly(planned(flavour))
+    assert flight.station.end_reason == "completed: duration reached"
+    for system_id in (2, 3):
+        error_m = flight.error_m(system_id)
+        assert error_m[0] > 1.0
+        assert error_m[-1] < 0.01 * 17.0
+    for system_id in (1, 2, 3):
+        copter = flight.copter(system_id)
+        assert copter.mode == copter.rules.hold_mode
+        assert copter.motion.altitude_m == pytest.approx(20.0, abs=0.3)
+
+
+def test_the_distances_flown_are_true_although_each_vehicle_has_its_own_origin() -> None:
+    flight = fly(planned("ardupilot"))
+    # the last positions in the scenario's frame, braking by then in the same way
+    place = {k: np.array(flight.copter(k).motion[:2]) for k in (1, 2, 3)}
+    assert place[2] - place[1] == pytest.approx([-12.0, 12.0], abs=0.05)  # origins are said to 11 mm
+    down_m = flight.flown["down_m"][-3:]
+    assert np.ptp(down_m) == pytest.approx(0.0, abs=0.1)  # all at 20 m above one ground
+    assert place[3] - place[2] == pytest.approx([-12.0, 12.0], abs=0.05)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_identified_response_is_the_truth_and_its_margin_is_flown_with(flavour: str) -> None:
+    flight = fly(planned(flavour))
+    responses = flight.station.plan.responses
+    assert responses is not None
+    assert responses.source == "identified"
+    for found in responses.of.values():
+        assert found.lag_s == pytest.approx(TRUTH.lag_s, rel=0.02)
+        assert found.velocity_gain_1_s == pytest.approx(TRUTH.velocity_gain_1_s, rel=0.02)
+    given = flight_plan(three(flavour=flavour).model_copy(update={"response": TRUTH}))[1]
+    assert flight.station.plan.delay_margin_s < planned(flavour).delay_margin_s - TRUTH.lag_s / 2
+    assert given.delay_margin_s == pytest.approx(0.6, abs=1e-6)  # what the scenario asks for, with the response
+
+
+def test_a_given_response_leaves_the_manoeuvre_out_and_the_design_says_so() -> None:
+    design, plan = flight_plan(three().model_copy(update={"response": TRUTH}))
+    flight = fly(plan)
+    assert "identifying" not in flight.texts("phase")
+    assert design["response"]["source"] == "given"
+    assert design["delay_margin_s"] == pytest.approx(0.6, abs=1e-6)
+    assert design["response"]["delay_margin_at_once_s"] > 0.6 + TRUTH.lag_s / 2
+
+
+def test_design_of_a_flight_names_what_was_identified() -> None:
+    design, _ = flight_plan(three())
+    flight = fly(planned("ardupilot"))
+    known = described(design, flight.station.plan)
+    assert known["delay_margin_s"] == flight.station.plan.delay_margin_s < design["delay_margin_s"]
+    assert [vehicle["system_id"] for vehicle in known["response"]["vehicles"]] == [1, 2, 3]
+    assert known["schedule"][2]["delay_margin_s"] == flight.station.plan.margins_s[2]
+
+
+def test_gains_on_a_graph_get_the_margin_with_the_response_too() -> None:
+    control = COPTERS5.control.model_copy(update={"method": "graph-lqr", "delay_margin_s": 0.5})
+    design, plan = flight_plan(three().model_copy(update={"control": control}))
+    flight = fly(plan)
+    assert flight.station.end_reason == "completed: duration reached"
+    assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
+    known = described(design, flight.station.plan)
+    assert known["delay_margin_s"] < design["delay_margin_s"] - TRUTH.lag_s / 2
+    assert known["delay_margin_s"] < known["delay_margin_continuous_s"]
+
+
+def settled(flight: Flight) -> bool:
+    rows = max(float(flight.error_m(system_id)[-100:].max()) for system_id in (2, 3))
+    return rows < 0.01 * 17.0
+
+
+def at_loop_delay(plan: FlightPlan, delay_s: float) -> Flight:
+    """A flight whose vehicles' mean loop delay is about this, with a monitor that only watches."""
+    waiting_s = PERIOD_S / 2
+    link_s = (delay_s - waiting_s) / 2
+    scenario = plan.scenario.with_link_delay(up_s=link_s, down_s=link_s)
+    watching = scenario.monitor.model_copy(update={"act": False})
+    return fly(replace(plan, scenario=scenario.model_copy(update={"monitor": watching, "duration_s": 60.0})))
+
+
+def test_the_flight_breaks_at_the_margin_with_the_response_and_not_at_that_without() -> None:
+    without_s = planned("ardupilot").delay_margin_s
+    with_s = fly(planned("ardupilot")).station.plan.delay_margin_s
+    assert with_s < 0.8 * without_s
+    plan = planned("ardupilot")
+    assert settled(at_loop_delay(plan, 0.9 * with_s))
+    beyond = at_loop_delay(plan, 1.1 * with_s)  # far below the margin that leaves the response out
+    assert not settled(beyond)
+    assert 1.1 * with_s < 0.9 * without_s
+    assert verdict(beyond.station.end_reason, None) == "unstable"
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_start_up_goes_through_losses_and_refusals(flavour: str, seed: int) -> None:
+    lossy = Link(delay_s=0.03, loss_probability=0.15)
+    scenario = three(flavour=flavour, arming_refusals=3, up_down=lossy).model_copy(update={"seed": seed})
+    flight = fly(plan_for(scenario))
+    assert flight.station.end_reason == "completed: duration reached"
+    assert sum("to command 400" in text for text in flight.texts("vehicle")) >= 3
+    assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.5  # losses keep pushing the vehicles a little
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_telemetry_that_begins_40_s_after_boot_is_waited_for(flavour: str) -> None:
+    scenario = three(flavour=flavour, telemetry_after_s=40.0, ready_after_s=55.0)
+    flight = fly(plan_for(scenario))
+    assert flight.station.end_reason == "completed: duration reached"
+    began_ns = float(flight.flown["due_ns"][0])
+    assert began_ns > START_NS + 55e9
+
+
+def test_a_vehicle_that_never_gets_a_position_ends_the_start_in_its_own_time_and_is_named() -> None:
+    scenario = three(duration_s=1.0, ready_after_s=1e6)
+    flight = fly(plan_for(scenario))
+    reason = flight.station.end_reason
+    assert reason.startswith("not ready: vehicle 1 has no position yet (estimator flags 0x481); vehicle 2 ")
+    assert "has no position yet (estimator flags 0x481)" in flight.texts("start")
+    assert flight.ticks["due_ns"][-1] == pytest.approx(START_NS + 120e9, abs=10e9)
+    assert all(not flight.copter(k).armed for k in (1, 2, 3))
+
+
+def test_vehicles_already_in_the_air_are_held_when_another_never_starts() -> None:
+    dead = VehicleLinks(system_id=3, up=Link(loss_probability=1.0), down=Link())
+    scenario = three()
+    scenario = scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (dead,)})})
+    flight = fly(plan_for(scenario))
+    assert flight.station.end_reason == "not ready: vehicle 3 not heard"
+    for system_id in (1, 2):
+        assert flight.copter(system_id).mode == flight.copter(system_id).rules.hold_mode
+
+
+def test_no_flight_begins_without_a_vehicle_that_has_fallen_silent_while_it_climbed() -> None:
+    gone = Link(delay_s=0.02, outages=(Outage(from_s=6.0, until_s=1e6),))
+    vehicles = (VehicleLinks(system_id=3, up=gone, down=gone),)
+    scenario = three().model_copy(update={"response": TRUTH})
+    links = scenario.links.model_copy(update={"vehicles": vehicles, "times_from": "start"})
+    flight = fly(plan_for(scenario.model_copy(update={"links": links})))
+    assert flight.station.end_reason == "not ready: vehicle 3 is silent"
+    assert not flight.ticks["commanded"].any()
+    assert "is silent" in flight.texts("start")
+    assert "is heard again" not in flight.texts("vehicle")
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+@pytest.mark.parametrize("by_s", [-0.2, 0.2, 5.0])
+def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str, by_s: float) -> None:
+    scenario = three(flavour=flavour, clock_jumps=(ClockJump(at_s=25.0, by_s=by_s),))
+    flight = fly(plan_for(scenario))
+    assert flight.station.end_reason == "completed: duration reached"
+    assert flight.texts("vehicle").count("its clock jumped") == 3
+    assert all(flight.fleet.vehicle(k).counters["timesync_replies"] >= 2 for k in (1, 2, 3))  # to requests of their own
+    time_s = flight.flown["time_s"]
+    assert time_s[0] + 2.0 < 25.0 - (flight.flown["due_ns"][0] - START_NS) * 1e-9 < time_s[-1]  # it was in flight
+    assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
+
+
+@pytest.mark.parametrize(("flavour", "mode", "left"), [("ardupilot", 5, "GUIDED"), ("px4", 3 << 16, "OFFBOARD")])
+def test_a_pilot_who_takes_over_in_the_manoeuvre_ends_it(flavour: str, mode: int, left: str) -> None:
+    flight = fly_with_a_pilot(flavour, {13.0 - START_PATIENCE_S: mode})
+    assert flight.station.end_reason == f"not identified: vehicle 3 left {left}: flown by its pilot or by itself"
+    modes = [flight.copter(k).mode for k in (1, 2, 3)]
+    assert modes == [RULES[flavour].hold_mode] * 2 + [mode]
+
+
+@pytest.mark.parametrize("by_s", [-0.2, 5.0])
+def test_a_clock_that_jumps_in_the_manoeuvre_leaves_the_same_response(by_s: float) -> None:
+    flight = fly(plan_for(three(duration_s=1.0, clock_jumps=(ClockJump(at_s=13.0, by_s=by_s),))))
+    times = [event.time_s for event in flight.events if event.text in ("identifying", "its clock jumped")]
+    assert 0.5 < times[-1] - times[0] < 4.0  # while the vehicles were being moved
+    responses = flight.station.plan.responses
+    assert responses is not None
+    for found in responses.of.values():
+        assert found.lag_s == pytest.approx(TRUTH.lag_s, rel=0.02)
+        assert found.velocity_gain_1_s == pytest.approx(TRUTH.velocity_gain_1_s, rel=0.02)
+
+
+def test_clocks_that_drift_by_500_ppm_change_nothing() -> None:
+    drifting = COPTERS5.clocks.model_copy(update={"drift_max_ppm": 500.0})
+    flight = fly(plan_for(three().model_copy(update={"clocks": drifting})))
+    assert flight.station.end_reason == "completed: duration reached"
+    assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_after_an_outage_longer_than_the_time_outs_the_vehicle_is_called_back(flavour: str) -> None:
+    gone = Link(delay_s=0.02, outages=(Outage(from_s=28.0, until_s=32.0),))
+    links = COPTERS5.links.model_copy(
+        update={"vehicles": (VehicleLinks(system_id=3, up=gone, down=gone),), "times_from": "start"}
+    )
+    flight = fly(plan_for(three(flavour=flavour, duration_s=40.0).model_copy(update={"links": links})))
+    assert flight.station.end_reason == "completed: duration reached"
+    assert "is lost" in flight.texts("vehicle")
+    assert flight.error_m(3)[-1] < 0.17
+    assert flight.fleet.vehicle(3).counters["setpoints"] > 1000
+
+
+@pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 6), ("px4", 4 << 16 | 5 << 24)])
+def test_a_vehicle_whose_pilot_sends_it_home_is_left_alone_and_flown_around(flavour: str, mode: int) -> None:
+    flight = fly_with_a_pilot(flavour, {5.0: mode})
+    assert flight.station.end_reason == "taken over: vehicles 3"
+    flight.fleet.step([], int(flight.ticks["due_ns"][-1]) + 60_000_000_000)
+    assert flight.copter(3).landed  # the return was not stopped in flight, nor at the end
+    rules = flight.copter(2).rules
+    assert [flight.copter(k).mode for k in (1, 2)] == [rules.hold_mode] * 2
+    assert flight.error_m(2)[-1] < 0.17
+    assert flight.texts("vehicle")[-2:] == [f"left {flight.station.vehicles[2].kind.guided_name}", TAKEN_OVER]
+
+
+@pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 5), ("px4", 3 << 16)])
+def test_a_vehicle_that_its_pilot_gives_back_flies_in_the_formation_again(flavour: str, mode: int) -> None:
+    flight = fly_with_a_pilot(flavour, {5.0: mode, 8.0: RULES[flavour].guided_mode})
+    assert flight.station.end_reason == "completed: duration reached"
+    assert flight.texts("vehicle")[-1] == "is given back"
+    assert flight.error_m(3)[-1] < 0.17
+
+
+def fly_with_a_pilot(flavour: str, modes: dict[float, int]) -> Flight:
+    """A flight in which the pilot of vehicle 3 changes its mode at these times."""
+    scenario = three(flavour=flavour, duration_s=20.0)
+    station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    wanted, ticks = deque(sorted(modes.items())), list[TickArray]()
+    for tick in fly_lockstep(station.plan, station=station, vehicles=fleet):
+        ticks.append(tick)
+        if wanted and tick["time_s"][0] > wanted[0][0]:
+            # what a switch of its remote control does is the command, without a link
+            vehicle, (_, mode) = fleet.vehicle(3), wanted.popleft()
+            packed = (mode >> 16 & 0xFF, mode >> 24) if flavour == "px4" else (mode, 0)
+            vehicle.step([(command(176, 1, *packed, system=3), int(tick["due_ns"][0]))], int(tick["due_ns"][0]))
+    return Flight(station, fleet, np.concatenate(ticks), station.events)
+
+
+def test_a_second_station_takes_over_vehicles_that_are_in_the_air() -> None:
+    first = fly(planned("ardupilot"))
+    took_off = sum(change.text == "takes off" for change in first.fleet.take_changes())
+    second = fly(planned("ardupilot"), first.fleet, int(first.ticks["due_ns"][-1]) + 100_000_000)
+    assert second.station.end_reason == "completed: duration reached"
+    again = sum(change.text == "takes off" for change in second.fleet.take_changes())
+    assert (took_off, again) == (3, 0)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_told_to_land_at_the_end_they_do(flavour: str) -> None:
+    flight = fly(plan_for(three(flavour=flavour, duration_s=3.0).model_copy(update={"at_end": "land"})))
+    end_ns = int(flight.ticks["due_ns"][-1])
+    flight.fleet.step([], end_ns + 60_000_000_000)
+    assert all(flight.copter(k).landed and not flight.copter(k).armed for k in (1, 2, 3))
+
+
+def test_an_arduplane_is_refused_at_once_and_by_name() -> None:
+    station, plane = Station(planned("ardupilot"), start_ns=START_NS), Peer(2)
+    station.step([plane.datagram(plane.link.heartbeat_encode(1, 3, 1, 0, 3), START_NS)], START_NS)
+    told = [station.step([], START_NS + 20_000_000 * k)[0] for k in range(1, 60)]
+    assert station.end_reason.startswith("refused: vehicle 2 is an ArduPlane")
+    assert not any(messages(outgoing, "COMMAND_LONG") for outgoing in told)  # whoever flies it is not disturbed
+
+
+def test_a_px4_that_speaks_mavlink_1_at_first_is_heard_and_answered_in_mavlink_2() -> None:
+    first = dialect.MAVLink(None, srcSystem=2, srcComponent=1)
+    heartbeat = bytes(first.heartbeat_encode(2, 12, 1, 4 << 16 | 3 << 24, 3).pack(first, force_mavlink1=True))
+    assert heartbeat[0] == 0xFE
+    station = Station(planned("px4"), start_ns=START_NS)
+    damaged = heartbeat[:-1] + bytes([heartbeat[-1] ^ 1])
+    station.step([Datagram(damaged, HOME, START_NS)], START_NS)
+    assert station.vehicles[1].address is None
+    outgoing, _ = station.step([Datagram(b"\xfe" + bytes(30) + heartbeat, HOME, START_NS)], START_NS + 20_000_000)
+    assert station.vehicles[1].address is None  # no frame begins where one should
+    outgoing, _ = station.step([Datagram(heartbeat * 2, HOME, START_NS)], START_NS + 1_100_000_000)
+    assert station.vehicles[1].kind.name == "PX4 multicopter"
+    assert all(data[0] == 0xFD for data, _ in outgoing)
+    assert messages(outgoing, "HEARTBEAT")
+
+
+def test_a_gimbal_with_the_vehicles_system_id_is_not_taken_for_the_vehicle() -> None:
+    station, peer = Station(planned("ardupilot"), start_ns=START_NS), Peer(2)
+    gimbal: Any = dialect.MAVLink(None, srcSystem=2, srcComponent=154)
+    station.step([peer.heartbeat(START_NS)], START_NS)
+    heartbeat = peer.datagram(peer.link.heartbeat_encode(26, 8, 0, 0, 4), START_NS)
+    other = heartbeat._replace(data=bytes(gimbal.heartbeat_encode(26, 8, 0, 0, 4).pack(gimbal)))
+    outgoing, _ = station.step([other], START_NS + 20_000_000)
+    assert station.counters["other component"] == 1
+    assert station.end_reason == ""
+    assert messages(outgoing, "COMMAND_LONG") == []  # one command is in flight already

@@ -1,0 +1,154 @@
+"""The monitor in flight, in virtual time: it speaks before the formation suffers, and its action saves the flight.
+
+`MONITOR_SEEDS=200 python3 make.py test tests/flights/test_flight_monitor.py` flies as many seeds; a few are flown by
+default.
+"""
+
+import os
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from gcs.control.tick import Mode, TickArray
+from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from gcs.station.station import Station
+from scenarios.files import load
+from scenarios.schema import DelayPoint, Jitter, Link, Links, Monitor, Safety
+from tests.support.paths import SCENARIOS
+
+TRIANGLE = load(SCENARIOS / "triangle5.toml")
+SEEDS = range(int(os.environ.get("MONITOR_SEEDS", "3")))
+QUIET_S = 8.0
+"""The formation has settled by then."""
+
+
+def ramp(highest_s: float) -> Links:
+    """From 20 ms each way at 10 s to a highest delay at 40 s, held for 10 s, and back within 8 s."""
+    points = ((10.0, 0.02), (40.0, highest_s), (50.0, highest_s), (58.0, 0.02))
+    link = Link(delay_points=tuple(DelayPoint(at_s=at_s, delay_s=delay_s) for at_s, delay_s in points))
+    return Links(up=link, down=link)
+
+
+@cache
+def planned() -> FlightPlan:
+    return flight_plan(TRIANGLE)[1]
+
+
+def flown(**changes: Any) -> tuple[TickArray, Station]:
+    plan = replace(planned(), scenario=TRIANGLE.model_copy(update=changes))
+    station = Station(plan, start_ns=START_NS)
+    return np.concatenate(list(fly_lockstep(plan, station=station))), station
+
+
+def error_m(ticks: TickArray) -> Any:
+    error = np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])
+    return np.where((ticks["time_s"] > QUIET_S) & ticks["commanded"], error, np.nan)
+
+
+def first_time_s(station: Station, mode: Mode) -> float:
+    return min(e.time_s for e in station.events if e.kind == "mode" and e.text.endswith(f"-> {mode.name}"))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_with_the_monitor_the_formation_survives_three_times_its_first_margin(seed: int) -> None:
+    ticks, station = flown(seed=seed, duration_s=75.0, links=ramp(0.44))
+    assert station.end_reason == "completed: duration reached"
+    assert np.nanmax(ticks["loop_delay_s"]) > 2.9 * planned().delay_margin_s
+    assert np.nanmax(error_m(ticks)) < 0.01 * 172.4  # of the spacing
+    last = ticks[ticks["time_s"] < 75.0][-5:]
+    assert set(last["mode"]) == {Mode.NOMINAL}  # all the way back
+    assert set(last["gain_set"]) == {0}
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_without_its_action_caution_and_critical_come_before_the_error_and_the_formation_breaks(seed: int) -> None:
+    ticks, station = flown(seed=seed, duration_s=75.0, links=ramp(0.44), monitor=Monitor(act=False))
+    assert station.end_reason.startswith("broken")
+    out_s = float(ticks["time_s"][error_m(ticks) > 0.01 * 172.4].min())
+    assert first_time_s(station, Mode.CAUTION) < first_time_s(station, Mode.CRITICAL) < out_s
+
+
+@pytest.mark.parametrize("seed", sorted({*SEEDS, 105}))  # 105: slow telemetry before the flight was judged
+def test_no_false_alarm_in_a_nominal_flight_with_jitter(seed: int) -> None:
+    """20 ms each way, and 10 ms of exponential jitter on top of each: a loop delay of about 80 ms against 300 ms."""
+    link = Link(delay_s=0.02, jitter=Jitter(distribution="exponential", scale_s=0.01))
+    ticks, station = flown(seed=seed, duration_s=20.0, links=Links(up=link, down=link))
+    assert station.end_reason == "completed: duration reached"
+    assert set(ticks[(ticks["time_s"] > 0.1) & (ticks["time_s"] < 20.0)]["mode"]) == {Mode.NOMINAL}
+
+
+def test_gains_change_without_a_jump_in_command() -> None:
+    ticks, _ = flown(seed=1, duration_s=75.0, links=ramp(0.44))
+    for system_id in (1, 2, 3, 4, 5):
+        own = ticks[(ticks["system_id"] == system_id) & ticks["commanded"] & (ticks["time_s"] > QUIET_S)]
+        changes = np.flatnonzero(np.diff(own["gain_set"].astype(int))) + 1
+        assert changes.size == 4
+        jump = np.abs(np.diff(own["command_north_m_s2"]))
+        around = [float(jump[k - 1]) for k in changes]
+        # No greater than what the command does from tick to tick in the second around it.
+        for k, step in zip(changes.tolist(), around, strict=True):
+            assert step <= 1.5 * float(np.max(np.delete(jump[k - 25 : k + 25], 24))) + 1e-3
+
+
+def test_release_when_even_the_slowest_gains_have_no_headroom_leaves_vehicles_in_failsafe() -> None:
+    # Released while the formation opens, vehicles drift apart; on the way back their spacing errors are large.
+    safety = Safety(spacing_error_limit_m=2000.0)
+    ticks, station = flown(seed=1, duration_s=90.0, links=ramp(0.9), safety=safety)
+    assert station.end_reason == "completed: duration reached"
+    modes = {Mode(int(mode)) for mode in np.unique(ticks["mode"])}
+    assert Mode.FAILSAFE in modes
+    assert float(np.nanmin(ticks["nearest_m"])) > 50.0
+    last = ticks[ticks["time_s"] < 90.0][-5:]
+    assert set(last["mode"]) <= {Mode.NOMINAL, Mode.CAUTION, Mode.RECOVERING}
+
+
+@dataclass
+class Overheard:
+    """Vehicles, and all that the station sends them."""
+
+    vehicles: Vehicles
+    sent: list[bytes] = field(default_factory=list)
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        self.sent += [data for _, data, _ in received]
+        return self.vehicles.step(received, now_ns)
+
+
+def test_every_change_of_mode_and_gains_is_an_event_and_a_statustext() -> None:
+    plan = replace(planned(), scenario=TRIANGLE.model_copy(update={"duration_s": 45.0, "links": ramp(0.44)}))
+    station, vehicles = Station(plan, start_ns=START_NS), Overheard(vehicles_of(plan))
+    for _ in fly_lockstep(plan, station=station, vehicles=vehicles):
+        pass
+    changes = [
+        f"vehicle {e.system_id}: {e.text.split('-> ')[-1].split(',')[0]}"
+        for e in station.events
+        if e.kind in ("mode", "gains")
+    ]
+    assert sum("gain set" in change for change in changes) > 5
+    parsed = [dialect.MAVLink(None).parse_buffer(data) or [] for data in vehicles.sent]  # checksum and layout: theirs
+    messages: list[Any] = [message for some in parsed for message in some]
+    told = [message for message in messages if message.get_type() == "STATUSTEXT"]
+    # What is decided in the flight's last tick is no longer seen to be sent.
+    assert [message.text for message in told] == changes[: len(told)]
+    assert len(told) >= len(changes) - len(plan.formation.system_ids)
+    assert {m.severity for m in told if m.text.endswith("CRITICAL")} == {dialect.MAV_SEVERITY_CRITICAL}
+    assert {m.severity for m in told if m.text.endswith("CAUTION")} == {dialect.MAV_SEVERITY_WARNING}
+
+
+def test_a_collision_ends_the_flight_as_broken_and_the_least_distance_is_in_the_summary() -> None:
+    # Vehicles that stand nearer to each other than is allowed, from the flight's first tick on.
+    ticks, station = flown(duration_s=5.0, safety=Safety(collision_distance_m=150.0))
+    assert station.end_reason.startswith("broken: vehicles")
+    assert "have collided" in station.end_reason
+    events = [{"time_s": 0.0, "kind": "end", "text": station.end_reason, "system_id": None}]
+    design = {"delay_margin_s": 0.3, "delay_margin_continuous_s": 0.3}
+    summary = summarise(planned().scenario, design, ticks, events)
+    assert summary["verdict"] == "unstable"
+    assert 0.0 < summary["distance_min_m"] < 150.0

@@ -1,0 +1,169 @@
+"""Measured latencies against what the emulated links and vehicles wrote down, in virtual time, over a grid of links."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from gcs.control.tick import TickArray
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.plan.planner import flight_plan
+from gcs.runs.grade import Truth, graded, true_loop_delays_s, true_round_trips
+from gcs.runs.summary import summarise
+from gcs.station.station import Station
+from scenarios.files import load
+from scenarios.schema import Clocks, FixedGains, Jitter, Link, Links, Monitor, Outage, Safety
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.links.truth import DTYPE, LINK_UP, SAMPLED, Row
+from sim_vehicles.services.clock import BootClock
+from tests.support.paths import SCENARIOS
+
+CHAIN = load(SCENARIOS / "chain3.toml")
+WEAK = FixedGains(K1=-0.05, K2=0.0, K3=0.001)
+"""A loop with a margin of many seconds, so that any link can be flown."""
+JITTER = Jitter(distribution="uniform", scale_s=0.01)
+GRID = {
+    "0.2 ms": (Link(delay_s=0.0001), Link(delay_s=0.0001), 20.0),
+    "40 ms": (Link(delay_s=0.02), Link(delay_s=0.02), 20.0),
+    "asymmetric": (Link(delay_s=0.09), Link(delay_s=0.01), 20.0),
+    "5 s": (Link(delay_s=2.5), Link(delay_s=2.5), 20.0),
+    "5 s, 30 % loss": (Link(delay_s=2.5, loss_probability=0.3), Link(delay_s=2.5, loss_probability=0.3), 20.0),
+    "30 % loss": (Link(delay_s=0.05, loss_probability=0.3), Link(delay_s=0.05, loss_probability=0.3), 20.0),
+    "drift 300 ppm": (Link(delay_s=0.05), Link(delay_s=0.02), 300.0),
+    "bunches": (
+        # Nothing overtakes, so what comes late comes together with all behind it.
+        Link(delay_s=0.02, jitter=Jitter(distribution="exponential", scale_s=0.05)),
+        Link(delay_s=0.02, jitter=Jitter(distribution="exponential", scale_s=0.05)),
+        20.0,
+    ),
+    "outage": (Link(delay_s=0.02, outages=(Outage(from_s=3.0, until_s=4.2),)), Link(delay_s=0.02), 20.0),
+    "reordering": (
+        Link(delay_s=0.05, jitter=JITTER, reordering=True, duplicate_probability=0.05),
+        Link(delay_s=0.05, jitter=JITTER, reordering=True),
+        20.0,
+    ),
+}
+CONSTANT = [name for name in GRID if name not in ("reordering", "bunches")]
+
+
+@cache
+def flown(name: str) -> tuple[TickArray, Truth]:
+    up, down, drift_ppm = GRID[name]
+    scenario = CHAIN.model_copy(
+        update={
+            "duration_s": 20.0 if name.startswith("5 s") else 8.0,
+            "control": CHAIN.control.model_copy(update={"gains": WEAK}),
+            "links": Links(up=up, down=down),
+            "clocks": Clocks(drift_max_ppm=drift_ppm),
+            "monitor": Monitor(act=False),
+            "safety": Safety(setpoint_timeout_s=30.0, heartbeat_timeout_s=30.0),
+        }
+    )
+    _, plan = flight_plan(scenario)
+    rows: list[Row] = []
+    station, fleet = Station(plan, start_ns=START_NS), Fleet(scenario, START_NS, record=rows.append)
+    ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=fleet)))
+    assert station.end_reason == "completed: duration reached"
+    return ticks, np.array([row if len(row) == 8 else (*row, 0, 0) for row in rows], DTYPE)
+
+
+@pytest.mark.parametrize("name", [name for name in GRID if name != "bunches"])
+def test_every_round_trip_is_that_of_the_links_to_the_microsecond(name: str) -> None:
+    ticks, truth = flown(name)
+    for system_id in (1, 2, 3):
+        measured = ticks["rtt_s"][(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
+        _, real = true_round_trips(truth, system_id)
+        assert measured.size > 20
+        assert np.abs(measured[:, None] - real[None, :]).min(axis=1).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", [name for name in GRID if name != "reordering"])
+def test_every_round_trip_is_in_the_ticks(name: str) -> None:
+    """Those of all replies, but for the last of a flight."""
+    ticks, truth = flown(name)
+    for system_id in (1, 2, 3):
+        measured = ticks["rtt_s"][(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
+        due_ns, real = true_round_trips(truth, system_id)
+        real = real[due_ns <= ticks["sent_ns"][-1]]
+        off_s = np.abs(measured[:, None] - real).min(axis=0)
+        assert (off_s[:-3] < 1e-6).all()
+        assert measured.size >= real.size - 3
+
+
+@pytest.mark.parametrize("name", CONSTANT)
+def test_loop_delay_is_exact_to_the_microsecond_where_links_are_constant(name: str) -> None:
+    ticks, truth = flown(name)
+    grade = graded(ticks["loop_delay_s"], true_loop_delays_s(ticks, truth))
+    assert grade["samples"] > 700
+    assert grade["error_p50_s"] < 1e-6
+    # Two clocks' rates are told apart only after a second; until then drift counts: 300 ppm of some 0.2 s.
+    assert grade["error_max_s"] < 1e-4
+
+
+def test_with_jitter_loop_delay_is_off_by_no_more_than_set_points_and_exchanges_differ() -> None:
+    """The down delay is that of the newest exchange; the set-point's own is known to nobody when it is sent."""
+    ticks, truth = flown("reordering")
+    grade = graded(ticks["loop_delay_s"], true_loop_delays_s(ticks, truth))
+    assert grade["samples"] > 700
+    assert 1e-3 < grade["error_p50_s"] < grade["error_max_s"] < 0.02 + 0.01  # jitter, and the clock's own error by it
+
+
+@pytest.mark.parametrize("name", GRID)
+def test_instants_and_one_way_delays_are_never_outside_their_bounds(name: str) -> None:
+    ticks, truth = flown(name)
+    sampled, ups = truth[truth["kind"] == SAMPLED], truth[(truth["kind"] == LINK_UP) & (truth["key"] == 32)]
+    when = {(s, k): t for s, k, t in zip(*(sampled[n].tolist() for n in ("system_id", "key", "time_ns")), strict=True)}
+    rows = ticks[np.isfinite(ticks["sample_bound_s"]) & (ticks["sample_ns"] > 0)]
+    true_ns = np.array([when[int(row["system_id"]), int(row["sample_boot_ms"])] for row in rows])
+    assert rows.size > 700
+    assert (np.abs(rows["sample_ns"] - true_ns) * 1e-9 <= rows["sample_bound_s"]).all()
+    # A state enters its link when it is sampled, so that its way up ends when the link says.
+    ups_s = {
+        (s, entered): (due - entered) * 1e-9
+        for s, entered, due in sorted(ups[["system_id", "entered_ns", "due_ns"]].tolist(), reverse=True)
+    }
+    real_s = np.array([ups_s[int(s), int(t)] for s, t in zip(rows["system_id"], true_ns, strict=True)])
+    assert (np.abs(rows["up_delay_s"] - real_s) <= rows["sample_bound_s"] + 1e-9).all()
+
+
+@pytest.mark.parametrize("name", GRID)
+def test_clock_offsets_are_never_outside_their_bounds(name: str) -> None:
+    ticks, _ = flown(name)
+    for system_id in (1, 2, 3):
+        clock = BootClock.draw(Clocks(drift_max_ppm=GRID[name][2]), CHAIN.seed, system_id, START_NS)
+        rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["clock_offset_s"])]
+        true_s = np.array([(clock.boot_ns(sent) - sent) * 1e-9 for sent in rows["sent_ns"].tolist()])
+        assert rows.size > 200
+        assert (np.abs(rows["clock_offset_s"] - true_s) <= rows["clock_offset_bound_s"]).all()
+
+
+@pytest.mark.parametrize("name", ["drift 300 ppm", "asymmetric"])
+def test_the_skew_of_a_clock_is_that_of_its_time_stamps(name: str) -> None:
+    ticks, truth = flown(name)
+    events = [{"time_s": 8.0, "kind": "end", "text": "completed: duration reached"}]
+    summary = summarise(CHAIN, {"delay_margin_s": 1.0, "delay_margin_continuous_s": 1.0}, ticks, events)
+    for vehicle in summary["vehicles"]:
+        own = truth[(truth["kind"] == SAMPLED) & (truth["system_id"] == vehicle["system_id"])]
+        slope, _ = np.polyfit((own["time_ns"] - own["time_ns"][0]) * 1e-9, own["key"] * 1e-3, 1)
+        clock = vehicle["clock"]
+        # stamps are whole milliseconds, over 8 s and more
+        assert clock["skew_ppm"] == pytest.approx(1e6 * (slope - 1.0), abs=30.0)
+        assert abs(clock["skew_ppm"] - 1e6 * (slope - 1.0)) < clock["skew_bound_ppm"]
+
+
+def test_loss_and_duplicates_are_those_of_the_links_though_they_reorder() -> None:
+    ticks, truth = flown("reordering")
+    last = ticks[ticks["tick"] == ticks["tick"].max()]
+    up = truth[truth["kind"] == LINK_UP]
+    for row in last:
+        own = up[up["system_id"] == row["system_id"]]
+        doubled = int((own["fate"] & 1 != 0).sum())
+        # Frames still under way at the end, or newer ones that came before, differ by what one jitter holds.
+        assert int(row["duplicate"]) == pytest.approx(doubled, abs=3)
+        assert int(row["lost"]) <= 5
+
+
+def test_an_unknown_is_none_and_not_zero() -> None:
+    nothing = graded(np.full(3, np.nan), np.zeros(3))
+    assert nothing["status"] == "unknown"
+    assert [nothing[key] for key in ("error_p50_s", "error_p99_s", "error_max_s")] == [None] * 3

@@ -1,0 +1,278 @@
+"""The onboard loop flown over MAVLink in virtual time: gains uploaded, own terms at once, the station's late."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gcs.control.tick import Mode, TickArray
+from gcs.drive.flown import fly_virtual, median_delays_s
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.link.upload import float32
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.onboard import own_parameters
+from gcs.plan.planner import flight_plan
+from gcs.runs.grade import instants, true_loop_delays_s
+from gcs.runs.summary import summarise
+from gcs.station.station import Station
+from gcs.stress.axes import at_coordinates
+from gcs.stress.free_response import fly_calm, response_paired
+from gcs.stress.growth import fit_growth, motion_of
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import NoOnset, Study, find_onset
+from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
+from scenarios.errors import ScenarioError
+from scenarios.files import dump, load, parse, with_loop
+from scenarios.schema import Link, Outage, Scenario, VehicleLinks
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.links.truth import ACTED, DTYPE, SAMPLED
+from sim_vehicles.services.mavlink import STATUS_CRITICAL
+from sim_vehicles.vehicles.double_integrator import Vehicle
+from tests.support.paths import SCENARIOS
+
+THESIS = SCENARIOS / "thesis_delay.toml"
+
+
+def delayed(total_s: float, **update: Any) -> Scenario:
+    """thesis_delay with a link delay, up + down."""
+    return load(THESIS).with_link_delay(up_s=total_s / 2.0, down_s=total_s / 2.0).model_copy(update=update)
+
+
+@cache
+def thesis() -> tuple[dict[str, Any], FlightPlan]:
+    """Design and plan of thesis_delay; neither depends on links and duration."""
+    return flight_plan(load(THESIS))
+
+
+def flown(scenario: Scenario) -> FlightPlan:
+    """The plan of thesis_delay with some other links, seed or duration."""
+    return replace(thesis()[1], scenario=scenario)
+
+
+def onboard(name: str, **update: Any) -> Scenario:
+    """A scenario of the ground loop, flown on board."""
+    return with_loop(load(SCENARIOS / f"{name}.toml"), "onboard", THESIS).model_copy(update=update)
+
+
+def vehicle(fleet: Fleet, system_id: int) -> Vehicle:
+    found = fleet.vehicle(system_id).craft
+    assert isinstance(found, Vehicle)
+    return found
+
+
+@pytest.mark.parametrize(("link_delay_s", "verdict"), [(0.17, "stable"), (0.9, "stable"), (1.1, "unstable")])
+def test_the_source_holds_at_its_own_delay_and_at_five_times_its_margin_and_breaks_beyond_the_computed_one(
+    link_delay_s: float, verdict: str
+) -> None:
+    scenario = delayed(link_delay_s)
+    flight = fly_virtual(flown(scenario))
+    summary = summarise(scenario, thesis()[0], flight.ticks, flight.events)
+    assert summary["verdict"] == verdict
+    assert summary["loop"] == "onboard"
+    assert summary["delay_margin_continuous_s"] == pytest.approx(1.00796, abs=1e-5)
+    assert summary["delay_margin_s"] == pytest.approx(1.00216, abs=1e-5)
+    waiting_s = summary["loop_delay_s"]["p50"] - link_delay_s
+    assert 0.0 < waiting_s < 1.0 / 50.0
+
+
+def test_with_the_monitor_acting_less_is_streamed_and_it_holds_beyond_its_margin() -> None:
+    scenario = delayed(1.1)
+    acting = scenario.monitor.model_copy(update={"act": True})
+    plan = flown(scenario.model_copy(update={"monitor": acting}))
+    assert [entry["streamed_share"] for entry in thesis()[0]["schedule"]] == [1.0, 0.5, 0.25]
+    assert list(plan.margins_s) == sorted(plan.margins_s)
+    ticks = fly_virtual(plan).ticks
+    assert set(ticks["gain_set"][(ticks["time_s"] > 5.0) & (ticks["time_s"] < 100.0)]) == {1}
+    late = ticks[(ticks["time_s"] > 60.0) & (ticks["time_s"] < 100.0)]
+    assert np.nanmax(np.hypot(late["spacing_error_north_m"], late["spacing_error_east_m"])) < 0.1
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_vehicles_hold_their_gains_as_float32_before_they_are_armed(loss: float) -> None:
+    lossy = Link(delay_s=0.05, loss_probability=loss)
+    scenario = delayed(0.1, duration_s=0.1)
+    scenario = scenario.model_copy(update={"links": scenario.links.model_copy(update={"up": lossy, "down": lossy})})
+    plan = flown(scenario)
+    fleet = Fleet(plan.scenario, START_NS)
+    for _ in fly_lockstep(plan, vehicles=fleet):
+        for row, system_id in enumerate(plan.formation.system_ids):
+            own = vehicle(fleet, system_id)
+            if own.autopilot.armed:
+                wanted = own_parameters(plan.formation, plan.gain, row)
+                assert {name: own.parameters[name] for name in wanted} == {n: float32(v) for n, v in wanted.items()}
+    assert all(vehicle(fleet, system_id).autopilot.armed for system_id in (1, 2, 3))
+
+
+def test_a_gain_that_a_vehicle_does_not_take_ends_the_start_in_one_line_and_nothing_is_armed() -> None:
+    plan = flown(delayed(0.1))
+    fleet, broken = Fleet(plan.scenario, START_NS), plan.gain.copy()
+    broken[2, 2] = 2e4  # beyond what it takes
+    station = Station(replace(plan, gain=broken), start_ns=START_NS)
+    assert list(fly_lockstep(station.plan, station=station, vehicles=fleet))
+    assert station.end_reason.startswith("refused: vehicle 2: parameter FORM_KP_NN reads 0 after 20000")
+    assert not vehicle(fleet, 2).autopilot.armed
+    assert fleet.vehicle(2).counters["refused_parameter_value"] > 0
+
+
+def test_flights_are_the_same_to_the_last_bit_and_the_seed_moves_the_sensors() -> None:
+    def ticks(seed: int) -> bytes:
+        calm = {"seed": seed, "duration_s": 2.0, "clocks": {"offset_max_s": 0.0, "drift_max_ppm": 0.0}}
+        data = delayed(0.1).model_dump() | calm
+        return fly_virtual(flown(Scenario.model_validate(data))).ticks.tobytes()
+
+    assert ticks(1) == ticks(1) != ticks(2)
+
+
+def test_without_set_points_vehicles_keep_their_places_by_their_own_sensors_and_say_so() -> None:
+    plan = flown(delayed(0.17, duration_s=3.0))
+    fleet = Fleet(plan.scenario, START_NS)
+    now_ns = START_NS
+    for ticks in fly_lockstep(plan, vehicles=fleet):
+        now_ns = int(ticks["sent_ns"][0])
+        if ticks["time_s"][0] > 2.5:
+            break
+    for _ in range(600):  # the station is gone
+        now_ns += 100_000_000
+        fleet.step((), now_ns)
+    offsets = plan.formation.offset_ne_m
+    states = [fleet.state(system_id, now_ns) for system_id in (1, 2, 3)]
+    for k in (1, 2):
+        ahead, own = states[k - 1], states[k]
+        error = (own.north_m - ahead.north_m - offsets[k, 0], own.east_m - ahead.east_m - offsets[k, 1])
+        assert np.hypot(*error) < 0.1  # noise of the sensor: 0.05 m, filtered
+        assert vehicle(fleet, k + 1).autopilot.system_status == STATUS_CRITICAL
+
+
+@pytest.mark.parametrize("act", [False, True])
+def test_while_a_vehicle_is_lost_all_keep_their_places_by_their_own_loops(act: bool) -> None:
+    """Vehicle 2, which the others act on and which acts on them, is not heard and hears nothing for six seconds."""
+    gone = Link(delay_s=0.085, outages=(Outage(from_s=8.0, until_s=14.0),))
+    scenario = delayed(0.17, duration_s=25.0)
+    links = scenario.links.model_copy(update={"vehicles": (VehicleLinks(system_id=2, up=gone, down=gone),)})
+    monitor = scenario.monitor.model_copy(update={"act": act})
+    flight = fly_virtual(flown(scenario.model_copy(update={"links": links, "monitor": monitor})))
+    told = [event["text"] for event in flight.events if event["kind"] == "vehicle"]
+    assert told[3:] == ["is lost", "is heard again", "is in failsafe"]
+    later = flight.ticks[(flight.ticks["time_s"] > 7.0) & (flight.ticks["time_s"] < 25.0)]
+    # noise of the sensor: 0.05 m, filtered
+    assert np.nanmax(np.hypot(later["spacing_error_north_m"], later["spacing_error_east_m"])) < 0.1
+    assert set(later["mode"][later["time_s"] > 24.0]) == {Mode.NOMINAL}
+
+
+@pytest.mark.parametrize("name", ["thesis_delay", "chain3"])
+def test_loop_delays_measured_are_those_of_the_truth(name: str) -> None:
+    """From the sample of the oldest state that was needed to the instant at which the set-point acts."""
+    scenario = load(THESIS) if name == "thesis_delay" else onboard(name)
+    still = scenario.clocks.model_copy(update={"drift_max_ppm": 0.0})
+    _, plan = flight_plan(scenario.model_copy(update={"duration_s": 3.0, "clocks": still}))
+    records: list[Any] = []
+    ticks = np.concatenate(list(fly_lockstep(plan, vehicles=Fleet(plan.scenario, START_NS, record=records.append))))
+    truth = np.array([(*row, *(0,) * (8 - len(row))) for row in records], DTYPE)
+    sampled, acted = instants(truth, SAMPLED), instants(truth, ACTED)
+    true_s = true_loop_delays_s(ticks, truth)
+    # whose states are needed; with none, when its own v_d comes is all that is late
+    needed = {1: (1, 2), 2: (1, 2, 3), 3: (1, 2)} if name == "thesis_delay" else {1: (1,), 2: (1,), 3: (2,)}
+    graded = Counter[int]()
+    for k in np.flatnonzero(ticks["commanded"] & (ticks["time_s"] > 1.0)):
+        row, same = ticks[k], ticks[ticks["tick"] == ticks["tick"][k]]
+        system_id, newest = int(row["system_id"]), {int(o["system_id"]): int(o["sample_boot_ms"]) for o in same}
+        since_ns = min(sampled[other, newest[other]] for other in needed[system_id])
+        until_ns = acted.get((system_id, int(row["key_ms"])))
+        if until_ns is not None:
+            graded[system_id] += 1
+            assert row["loop_delay_s"] == pytest.approx((until_ns - since_ns) * 1e-9, abs=1e-6)
+            assert true_s[k] == (until_ns - since_ns) * 1e-9  # the same as gcs grade finds it
+    assert set(graded) == {1, 2, 3}
+
+
+def probed(plan: FlightPlan, link_delay_s: float) -> Any:
+    scenario = plan.scenario.with_link_delay(up_s=link_delay_s / 2.0, down_s=link_delay_s / 2.0)
+    return fly_trial(Trial(scenario, sparse_gain(plan.gain), plan.delay_margin_s, "probe", CRITICAL))
+
+
+def test_growth_in_flight_is_that_of_the_sampled_model_on_both_sides_of_the_margin() -> None:
+    _, plan = thesis()
+    outcomes = [probed(plan, part * plan.delay_margin_s) for part in (0.5, 0.95, 1.05)]
+    assert [outcome.verdict for outcome in outcomes] == ["stable", "stable", "unstable"]
+    for outcome in outcomes:
+        assert outcome.error is None
+        assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=2e-4)
+
+
+def test_clocks_that_are_apart_leave_growth_and_loop_delays_as_they_are() -> None:
+    """The model takes the vehicles' steps as in step. By the difference of two flights with clocks at random."""
+    still = load(THESIS).clocks.model_copy(update={"drift_max_ppm": 0.0})
+    plan = flown(delayed(1.0, clocks=still))
+    calm = fly_calm(plan, None)
+    response = response_paired(plan, calm, (1, 2, 3), amplitude=1.0, folder=None)
+    delays_s = response.loop_delays_s(response.errors, (1, 2, 3))
+    assert delays_s == pytest.approx(median_delays_s(response.errors, (1, 2, 3)), abs=1e-6)
+    found = fit_growth(motion_of(response.errors, (1, 2, 3), period_s=0.02), start_s=4.2, modes=7)
+    [loop] = plan_loops(plan)
+    assert found is not None
+    # a step of 10 ms that is early or late: 0.00006 1/s here, a part in seven thousand of the margin
+    assert found.growth_1_s == pytest.approx(loop.growth_at_1_s(delays_s), abs=1e-4)
+
+
+def test_no_delay_breaks_a_leader_follower_formation_and_the_search_for_one_says_so() -> None:
+    design, plan = flight_plan(onboard("chain3"))
+    assert design["delay_margin_s"] is None
+    with pytest.raises(NoOnset, match="the margin has no limit; in 5 flights with 0 to 2 s of link delay") as caught:
+        find_onset(Study(plan), lambda trials: [fly_trial(trial) for trial in trials], tolerance=1e-4)
+    assert caught.value.as_predicted  # growth rates within a part in ten thousand of those predicted
+
+
+def test_flights_that_contradict_a_margin_without_limit_are_told() -> None:
+    _, plan = flight_plan(onboard("chain3"))
+
+    def half_as_fast(trials: Sequence[Trial]) -> list[Outcome]:
+        return [replace(fly_trial(trial), growth_1_s=-0.86) for trial in trials[:1]]
+
+    with pytest.raises(NoOnset, match=r"decay at 0\.86000 1/s or faster, predicted 1\.69363") as caught:
+        find_onset(Study(plan), half_as_fast, tolerance=0.02)
+    assert not caught.value.as_predicted
+
+
+def test_control_rates_are_varied_together_with_those_on_board() -> None:
+    scenario = at_coordinates(load(THESIS), {"rate": 25.0})
+    assert (scenario.onboard.rate_hz, scenario.onboard.sensor_hz) == (50.0, 25.0)
+    assert parse(dump(scenario), THESIS) == scenario
+
+
+def test_ticks_of_the_formation_opened_by_the_station_keep_the_wider_spacing() -> None:
+    """The vehicles' own spacing stays as it was uploaded; the rest is streamed."""
+    _, plan = flight_plan(onboard("chain3", duration_s=25.0))
+    station = Station(plan, start_ns=START_NS)
+    rows: list[TickArray] = []
+    for ticks in fly_lockstep(plan, station=station):
+        station._monitor.opening = 1.5  # pyright: ignore[reportPrivateUsage]
+        rows.append(ticks)
+    last = rows[-60]
+    gap = np.hypot(last["north_m"][1] - last["north_m"][0], last["east_m"][1] - last["east_m"][0])
+    # positions are of two instants up to a period apart, 1.8 m of way
+    assert gap == pytest.approx(1.5 * np.hypot(*plan.formation.offset_ne_m[1]), abs=2.0)
+
+
+BAD = {
+    "sensor_hz = 50.0": ("sensor_hz = 75.0", "onboard.sensor_hz", "a whole multiple of rates.control_hz = 50"),
+    "rate_hz = 100.0": ("rate_hz = 75.0", "onboard.rate_hz", "a whole multiple of onboard.sensor_hz = 50"),
+}
+
+
+@pytest.mark.parametrize("good", BAD)
+def test_what_the_onboard_loop_cannot_be_flown_with_is_refused_in_one_line(good: str) -> None:
+    bad, key, wanted = BAD[good]
+    with pytest.raises(ScenarioError) as caught:
+        parse(THESIS.read_text().replace(good, bad), Path("x.toml"))
+    assert key in str(caught.value)
+    assert wanted in str(caught.value)
+
+
+def test_vehicles_with_an_autopilot_have_no_such_loop() -> None:
+    with pytest.raises(ScenarioError, match=r"control\.loop: read 'onboard', wanted ground, with dynamics autopilot"):
+        onboard("copters5")

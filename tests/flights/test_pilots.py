@@ -1,0 +1,293 @@
+"""A vehicle that its pilot flies is the pilot's, whatever else happens to it, until it reports that it is guided."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import pytest
+
+from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.link.vehicle import RemoteVehicle
+from gcs.station.station import Station
+from scenarios.schema import ClockJump, Link, Outage, Scenario, VehicleLinks
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.vehicles.copter import Copter
+from sim_vehicles.vehicles.copter_rules import RULES
+from tests.flights.test_flight_copters import COPTERS5, TRUTH, plan_for, three
+from tests.support.sim_client import command, parse
+
+SECOND = 1_000_000_000
+LOITER, RTL, POSCTL = 5, 6, 3 << 16
+PILOTS_MODE = {"ardupilot": LOITER, "px4": POSCTL}
+COMMANDS = {"COMMAND_LONG", "COMMAND_INT", "SET_MODE"}
+SET_POINT = "SET_POSITION_TARGET_LOCAL_NED"
+SET_MESSAGE_INTERVAL = 511
+
+
+@dataclass
+class PilotsVehicle:
+    """A fleet with a pilot who changes the mode of vehicle 3; notes what the station tells it from then on."""
+
+    fleet: Fleet
+    flavour: str
+    modes: dict[float, int]
+    """Mode by time since the start in s."""
+    change: Callable[[bytes, int], list[tuple[bytes, int]]] = lambda data, now_ns: [(data, now_ns)]
+    """What becomes of a datagram that the vehicle sends."""
+    told: list[Any] = field(default_factory=list[Any])
+    """MAVLink messages."""
+    reached_ns: int = 0
+    """When the pilot's first mode must have reached the station; 0 before."""
+
+    @property
+    def copter(self) -> Copter:
+        craft = self.fleet.vehicle(3).craft
+        assert isinstance(craft, Copter)
+        return craft
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        for at_s in [at_s for at_s in self.modes if START_NS + at_s * SECOND <= now_ns]:
+            self.fleet.vehicle(3).step([(pilots_switch(self.flavour, self.modes.pop(at_s)), now_ns)], now_ns)
+            self.reached_ns = self.reached_ns or now_ns + 3 * SECOND // 2
+        if 0 < self.reached_ns < now_ns:
+            self.told += [parse(data) for system_id, data, _ in received if system_id == 3]
+        sent: Sent = []
+        for system_id, data, time_ns in self.fleet.step(received, now_ns):
+            kept = self.change(data, time_ns) if system_id == 3 else [(data, time_ns)]
+            sent += [(system_id, each, at_ns) for each, at_ns in kept]
+        return sent
+
+    @property
+    def commanded(self) -> list[str]:
+        """What it was told that is none of the station's business: all but rates, and what keeps a PX4's door open."""
+        found = [
+            str(message)
+            for message in self.told
+            if message.get_type() in COMMANDS and getattr(message, "command", 0) != SET_MESSAGE_INTERVAL
+        ]
+        hovers = [message for message in self.told if message.get_type() == SET_POINT]
+        if self.flavour == "px4":  # enters OFFBOARD, by its pilot's switch, only while set-points come
+            hovers = [m for m in hovers if (m.vx, m.vy, m.afx, m.afy) != (0.0, 0.0, 0.0, 0.0)]
+        return found + [str(message) for message in hovers]
+
+
+def pilots_switch(flavour: str, mode: int) -> bytes:
+    """What a switch of the remote control does is the command, without a link."""
+    packed = (mode >> 16 & 0xFF, mode >> 24) if flavour == "px4" else (mode, 0)
+    return command(176, 1, *packed, system=3)
+
+
+def fly(
+    scenario: Scenario,
+    flavour: str,
+    modes: dict[float, int],
+    *,
+    until_s: float = 60.0,
+    change: Callable[[bytes, int], list[tuple[bytes, int]]] | None = None,
+    fleet: Fleet | None = None,
+    start_ns: int = START_NS,
+) -> tuple[Station, PilotsVehicle]:
+    """Fly until the end, or so long after the start."""
+    station = Station(plan_for(scenario), start_ns=start_ns)
+    pilots = PilotsVehicle(fleet or Fleet(scenario, START_NS), flavour, modes)
+    if change is not None:
+        pilots.change = change
+    for tick in fly_lockstep(station.plan, station=station, vehicles=pilots):
+        if tick["due_ns"][0] > start_ns + until_s * SECOND:
+            break
+    return station, pilots
+
+
+def flown(flavour: str, **changes: Any) -> Scenario:
+    """Three copters that fly from about 13 s on, for 20 s."""
+    return three(flavour=flavour, duration_s=20.0, **changes).model_copy(update={"response": TRUTH})
+
+
+def assert_left_alone(pilots: PilotsVehicle, mode: int) -> None:
+    assert pilots.told, "nothing was sent at all: the test would not see a command"
+    assert pilots.commanded == []
+    assert pilots.copter.mode == mode
+
+
+@cache
+def flight_s(flavour: str) -> float:
+    """When the formation flight begins, after the start."""
+    station = Station(plan_for(flown(flavour)), start_ns=START_NS)
+    for tick in fly_lockstep(station.plan, station=station, vehicles=Fleet(flown(flavour), START_NS)):
+        if tick["time_s"][0] >= 0.0:
+            return (int(tick["due_ns"][0]) - START_NS) / SECOND
+    raise AssertionError("it never began")
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+@pytest.mark.parametrize("by_s", [-0.2, 3.0, -1000.0])
+def test_a_clock_that_jumps_does_not_take_a_vehicle_from_its_pilot(flavour: str, by_s: float) -> None:
+    began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
+    scenario = flown(flavour, clock_jumps=(ClockJump(at_s=began_s + 8.0, by_s=by_s),))
+    station, pilots = fly(scenario, flavour, {began_s + 5.0: mode})
+    assert "its clock jumped" in [event.text for event in station.events if event.system_id == 3]
+    assert station.end_reason == "taken over: vehicles 3"
+    assert_left_alone(pilots, mode)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_silence_and_being_heard_again_do_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+    began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
+    gone = Link(delay_s=0.02, outages=(Outage(from_s=began_s + 7.0, until_s=began_s + 12.0),))
+    own = (VehicleLinks(system_id=3, up=gone, down=gone),)
+    links = COPTERS5.links.model_copy(update={"vehicles": own, "times_from": "start"})
+    scenario = flown(flavour).model_copy(update={"links": links})
+    station, pilots = fly(scenario, flavour, {began_s + 5.0: mode})
+    texts = [event.text for event in station.events if event.system_id == 3]
+    assert "is lost" in texts
+    assert "is given back" not in texts
+    assert_left_alone(pilots, mode)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_an_old_heartbeat_after_a_silence_does_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+    """What a link held back, or somebody recorded: guided, from before the pilot took over."""
+    began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
+    kept: list[bytes] = []
+
+    def change(data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
+        since_s = (now_ns - START_NS) / SECOND - began_s
+        if since_s < 4.0 and parse(data).get_type() == "HEARTBEAT":
+            kept.append(data)
+        if not 7.0 < since_s < 12.0:
+            return [(data, now_ns)]
+        return [(kept.pop(), now_ns)] if since_s > 11.5 and len(kept) > 5 else []  # silence, and then old ones
+
+    station, pilots = fly(flown(flavour), flavour, {began_s + 5.0: mode}, change=change)
+    assert "is given back" not in [event.text for event in station.events]
+    assert_left_alone(pilots, mode)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) -> None:
+    began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
+    scenario = flown(flavour)
+    station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    ticks = fly_lockstep(station.plan, station=station, vehicles=PilotsVehicle(pilots, flavour, {began_s + 2.0: mode}))
+    for tick in ticks:
+        if tick["time_s"][0] > 5.0:
+            break
+    vehicle = station.vehicles[2]
+    assert vehicle.taken_over
+    vehicle.address = ("elsewhere", 3)
+    vehicle.forget_rates()
+    told = [vehicle.converse(station.next_event_ns + k * SECOND // 50) for k in range(500)]
+    numbers = {parse(frame).command for frame in told if frame is not None}
+    assert numbers <= {SET_MESSAGE_INTERVAL}
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+@pytest.mark.parametrize("after_the_end_s", [-1.5, 0.5, 2.0])
+def test_a_pilot_who_takes_over_while_the_flight_ends_is_not_told_to_hold(flavour: str, after_the_end_s: float) -> None:
+    began_s = flight_s(flavour)
+    mode, end_s = PILOTS_MODE[flavour], began_s + 20.0
+    lossy = VehicleLinks(system_id=2, up=Link(delay_s=0.02, outages=(Outage(from_s=end_s - 1.0, until_s=1e6),)))
+    links = COPTERS5.links.model_copy(update={"vehicles": (lossy,), "times_from": "start"})  # the end takes its 6 s
+    scenario = flown(flavour).model_copy(update={"links": links})
+    station, pilots = fly(scenario, flavour, {end_s + after_the_end_s: mode})
+    assert station.end_reason
+    assert_left_alone(pilots, mode)
+
+
+@pytest.mark.parametrize("mode", [POSCTL, 4 << 16 | 5 << 24, 4 << 16 | 6 << 24, 4 << 16 | 3 << 24])
+@pytest.mark.parametrize("at_s", [5.0, 6.0])
+def test_a_px4_pilot_who_intervenes_before_the_first_offboard_is_left_alone(mode: int, at_s: float) -> None:
+    """While it climbs; what the pilot chooses may also be the hold that a take-off ends in."""
+    station, pilots = fly(flown("px4"), "px4", {at_s: mode}, until_s=30.0)
+    assert station.vehicles[2].missing == "is armed and not in OFFBOARD: flown by its pilot or by itself"
+    assert_left_alone(pilots, pilots.copter.mode)
+    assert pilots.copter.mode != RULES["px4"].guided_mode  # a pilot's return ends in a landing
+
+
+def test_a_take_off_that_was_not_answered_is_not_told_again_to_a_px4_whose_pilot_has_intervened() -> None:
+    def change(data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
+        message = parse(data)
+        lost = message.get_type() == "COMMAND_ACK" and message.command == 22
+        return [] if lost else [(data, now_ns)]
+
+    _, pilots = fly(flown("px4"), "px4", {5.0: POSCTL}, until_s=20.0, change=change)
+    assert_left_alone(pilots, POSCTL)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_a_pilot_who_intervenes_after_the_station_has_released_a_vehicle_is_left_alone(flavour: str) -> None:
+    """A released PX4 leaves OFFBOARD by itself: it is called back from that failsafe, not from its pilot's mode."""
+    began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
+    scenario = flown(flavour)
+    station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    own = PilotsVehicle(pilots, flavour, {})
+    for tick in fly_lockstep(station.plan, station=station, vehicles=own):
+        since_s = (int(tick["due_ns"][0]) - START_NS) / SECOND - began_s
+        vehicle = station.vehicles[2]
+        if 3.0 < since_s < 7.0:
+            vehicle.goal = None  # as the monitor does
+        if since_s > 6.0 and not own.modes and own.reached_ns == 0:
+            own.modes[since_s + began_s] = mode
+    assert_left_alone(own, mode)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_the_next_station_does_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+    """The first was killed; the second knows nothing of what was before."""
+    began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
+    scenario = flown(flavour)
+    _, first = fly(scenario, flavour, {began_s + 3.0: mode}, until_s=began_s + 5.0)
+    second_ns = START_NS + round((began_s + 6.0) * SECOND)
+    station = Station(plan_for(scenario), start_ns=second_ns)
+    first.told.clear()
+    for tick in fly_lockstep(station.plan, station=station, vehicles=first):
+        if tick["due_ns"][0] > second_ns + 20 * SECOND:
+            break
+    assert station.vehicles[2].taken_over
+    assert_left_alone(first, mode)
+    # and given back it goes on
+    first.modes[(second_ns - START_NS) / SECOND + 20.0] = RULES[flavour].guided_mode
+    for tick in fly_lockstep(station.plan, station=station, vehicles=first):
+        if tick["due_ns"][0] > second_ns + 30 * SECOND:
+            break
+    assert station.phase == "flying"
+
+
+def test_a_pilot_within_a_second_of_an_answer_is_seen_by_the_next_heartbeat() -> None:
+    """What the station was told by an ACK holds against heartbeats from before, not against a mode that is new."""
+    scenario = flown("ardupilot")
+    station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    own, vehicle, answered_s = PilotsVehicle(pilots, "ardupilot", {}), station.vehicles[2], 0.0
+    for tick in fly_lockstep(station.plan, station=station, vehicles=own):
+        if vehicle.guided and own.reached_ns == 0:
+            answered_s = (int(tick["due_ns"][0]) - START_NS) / SECOND
+            own.modes[answered_s + 0.1] = RTL
+        if vehicle.taken_over:
+            assert (int(tick["due_ns"][0]) - START_NS) / SECOND - answered_s < 1.1
+            return
+    raise AssertionError("the pilot was never seen")
+
+
+def test_a_heartbeat_from_before_a_command_does_not_undo_what_its_answer_said() -> None:
+    vehicle = RemoteVehicle(3, telemetry_hz=50.0, report=lambda _kind, _text: None)
+    vehicle.address = ("127.0.0.1", 3)
+
+    def heartbeat(mode: int, *, armed: bool, at_s: float) -> tuple[int, bool]:
+        vehicle.heartbeat((mode, 2, 3, 0x80 if armed else 0, 4, 3), round(at_s * SECOND))
+        return vehicle.custom_mode, vehicle.armed
+
+    def answered(at_s: float) -> None:
+        now_ns = round(at_s * SECOND)
+        frame = vehicle.converse(now_ns)
+        assert frame is not None
+        vehicle.acknowledge((parse(frame).command, 0, 0, 0, 255, 190), now_ns)
+
+    heartbeat(0, armed=False, at_s=1.0)
+    for at_s in (1.1, 1.2, 1.3):  # rate, mode, arming
+        answered(at_s)
+    assert vehicle.guided
+    assert heartbeat(0, armed=False, at_s=1.4) == (4, True)
+    assert heartbeat(4, armed=False, at_s=1.5) == (4, True)
+    assert heartbeat(5, armed=True, at_s=1.6) == (5, True)  # which it was not in before: that is news
+    assert heartbeat(0, armed=False, at_s=3.0) == (0, False)

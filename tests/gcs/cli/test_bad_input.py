@@ -1,0 +1,183 @@
+"""Input that a command cannot use, as `main` meets it: one line with what was read and what was wanted, exit code 2."""
+
+import itertools
+import sys
+from pathlib import Path
+
+import pytest
+
+from gcs.cli.main import main
+from gcs.cli.options import listening, mirroring
+from gcs.errors import InputError
+from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, SUMMARY_FILE, TICKS_FILE, TRUTH_FILE
+from gcs.runs.summary import finish, summarise
+from gcs.views.observer import record_run
+from gcs.views.report import print_summary
+from tests.support.flown_run import DESIGN, line, ticks_of, write_run
+from tests.support.paths import ROOT
+
+CHAIN = "scenarios/chain3.toml"
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """The folder of a run, whole; `{run}` in arguments."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    scenario = line(3)
+    write_run(folder, scenario, ticks_of(scenario, start_s=0.0, count=100))
+    return folder
+
+
+def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
+    """What a command says that refuses its input: one line and nothing else."""
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr(sys, "argv", ["gcs", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = capsys.readouterr()
+    assert (ended.value.code, told.out) == (2, "")
+    assert told.err.count("\n") == 1
+    return told.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        ("view {run} --picture /proc/x.png", "--picture: /proc/x.png: No such file or directory, wanted a file that"),
+        ("view {run} --picture {run}", "run: Is a directory, wanted a file that can be written"),
+        ("view {run} --picture {run}/a.png --at nan", "--at: read nan, wanted seconds from"),
+        ("view {run} --picture {run}/a.png --at 1e300", "--at: read 1e+300, wanted seconds from"),
+        ("view README.md", "README.md: read a file of another kind; wanted a recording of a run (.rrd)"),
+        (f"fly {CHAIN} --link-delay nan", "--link-delay: read nan, wanted seconds from 0 to 60"),
+        (
+            f"stress {CHAIN} --onset --out /proc/x",
+            "--out: /proc/x: No such file or directory, wanted a folder that can",
+        ),
+        (f"stress {CHAIN} --onset --out README.md", "--out: README.md: File exists, wanted a folder that can"),
+        (f"stress {CHAIN} --onset --out {{run}}", "run is not empty, wanted a new or empty folder, or --resume"),
+        (f"stress {CHAIN} --onset --junit {{run}}", "run: Is a directory, wanted a file that can be written"),
+        (f"stress {CHAIN} --onset --tolerance nan", "--tolerance: read nan, wanted a part between 0 and 1"),
+        (f"stress {CHAIN} --delay 0:x:3", "--delay: "),
+        (f"stress {CHAIN} --delay 0:1:1000000000", "--delay: read '0:1:1000000000', wanted FROM:TO:COUNT or values"),
+        (f"bench {CHAIN} --seconds 1e9", "86400"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_before_the_work(
+    arguments: str, wanted: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert wanted in complaint(capsys, monkeypatch, *arguments.format(run=run).split())
+
+
+DAMAGED = {
+    "half a JSON file": b'{"delay_margin_s": 0.3,',
+    "another JSON": b"[1, 2]",
+    "a word for a number": b'{"delay_margin_s": "x", "delay_margin_continuous_s": 1.0}\n',
+    "bytes": bytes(range(256)) * 40,
+    "nothing": b"",
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        *itertools.product([DESIGN_FILE, PARQUET_FILE, SCENARIO_FILE], DAMAGED),
+        # in a growing file less than a line or a row is nothing yet
+        *itertools.product([EVENTS_FILE], ["a word for a number", "bytes"]),
+        (TICKS_FILE, "bytes"),
+    ],
+)
+def test_a_damaged_file_of_a_run_is_named_by_recover(
+    name: str, what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish(run)
+    (run / name).write_bytes(DAMAGED[what])
+    assert f"run/{name}: " in complaint(capsys, monkeypatch, "recover", str(run))
+    (run / name).unlink()
+    (run / name).mkdir()
+    assert f"run/{name}: " in complaint(capsys, monkeypatch, "recover", str(run))
+
+
+@pytest.mark.parametrize("what", DAMAGED)
+@pytest.mark.parametrize("name", [DESIGN_FILE, SUMMARY_FILE])
+def test_a_damaged_file_of_a_run_is_named_by_replay(
+    name: str, what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish(run)
+    (run / name).write_bytes(DAMAGED[what])
+    assert f"run/{name}: " in complaint(capsys, monkeypatch, "replay", str(run))
+
+
+@pytest.mark.parametrize("what", DAMAGED)
+def test_a_design_that_is_none_is_named_by_replay_and_monitor(
+    what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    design = run / "other.json"
+    design.write_bytes(DAMAGED[what])
+    for command in (("replay", str(run)), ("monitor", "--listen", "127.0.0.1:0")):
+        assert "run/other.json: " in complaint(capsys, monkeypatch, *command, "--design", str(design))
+
+
+@pytest.mark.parametrize("what", ["bytes", "nothing", "another JSON", "of no kind", "a folder", "not there"])
+def test_a_truth_log_that_is_none_is_named_by_grade(
+    what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if what == "a folder":
+        (run / TRUTH_FILE).mkdir()
+    elif what != "not there":
+        (run / TRUTH_FILE).write_bytes(b"UAVTRUE2" + bytes(400) if what == "of no kind" else DAMAGED[what])
+    assert TRUTH_FILE in complaint(capsys, monkeypatch, "grade", str(run))
+
+
+def test_ticks_of_vehicles_that_are_not_in_the_scenario_are_refused(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (run / SCENARIO_FILE).read_text(encoding="utf-8")
+    (run / SCENARIO_FILE).write_text(text.replace("system_id = 1\n", "system_id = 9\n"), encoding="utf-8")
+    assert "read ticks of vehicles [1]" in complaint(capsys, monkeypatch, "recover", str(run))
+
+
+@pytest.mark.parametrize(("listens", "mirror"), [("127.0.0.1", "localhost"), ("0.0.0.0", "127.0.0.1")])
+def test_a_mirror_to_the_stations_own_port_is_refused(listens: str, mirror: str) -> None:
+    with listening("--listen", f"{listens}:0") as link, pytest.raises(InputError, match="which is this station's own"):
+        mirroring(f"{mirror}:{link.address[1]}", link, None, commands=False)
+
+
+def test_a_picture_is_a_png_of_a_time_that_the_recording_has(
+    run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(*options: str) -> str:
+        return complaint(capsys, monkeypatch, "view", str(run), *options)
+
+    finish(run)
+    record_run(run)
+    assert "a.jpg, wanted a name that ends in .png" in told("--picture", str(run / "a.jpg"))
+    line = told("--picture", str(run / "a.png"), "--at", "999")
+    assert "--at: read 999, wanted seconds from 0: " in line
+    assert line.endswith(f"is {0.02 * 99:g} s long\n")
+    (run / "flight.rrd").write_bytes((run / "flight.rrd").read_bytes()[:5000])
+    assert "flight.rrd: read no flight in it, wanted" in told("--picture", str(run / "a.png"))
+    assert not list(run.glob("a.*"))
+
+
+def test_brackets_and_colons_in_text_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """A verdict's reason can name a key of a scenario, and a log's name or a vehicle's word be anything."""
+    scenario = line(2)
+    summary = summarise(scenario, DESIGN, ticks_of(scenario, start_s=0.0, count=100), [])
+    summary["reason"] = "refused: give [response] in [/the scenario] :warning:"
+    print_summary(summary, Path("[bold]"))
+    told = capsys.readouterr().out
+    assert "verdict  aborted: refused: give [response] in [/the scenario] :warning:\n" in told
+    assert "files    [bold]: " in told
+
+
+def test_an_empty_connect_is_no_leave_to_start_vehicles(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "--connect: read '', wanted HOST:PORT" in complaint(capsys, monkeypatch, "fly", CHAIN, "--connect", "")
+
+
+def test_a_name_too_long_for_a_file_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "File name too long, wanted" in complaint(capsys, monkeypatch, "view", "a" * 300)

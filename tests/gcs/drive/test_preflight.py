@@ -1,0 +1,145 @@
+"""Found before take-off, in one line with exit code 2: unstable loops, bad starts, links too slow for a flight."""
+
+import itertools
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gcs.cli.main import app, main
+from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_actions
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from scenarios.files import load
+from scenarios.schema import DelayPoint, Link, Links
+from tests.support.paths import ROOT
+
+CHAIN = load(ROOT / "scenarios/chain3.toml")
+
+
+def chain_file(folder: Path, *changes: tuple[str, str]) -> Path:
+    """chain3.toml with pieces of its text replaced."""
+    text = (ROOT / "scenarios/chain3.toml").read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    file = folder / "chain3.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def with_gains(folder: Path, K1: float, K2: float, K3: float) -> Path:
+    return chain_file(folder, ("delay_margin_s = 0.3", f"gains = {{K1 = {K1!r}, K2 = {K2!r}, K3 = {K3!r}}}"))
+
+
+def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> str:
+    monkeypatch.setattr(sys, "argv", ["gcs", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    told = capsys.readouterr()
+    assert (ended.value.code, told.out) == (2, "")
+    assert told.err.count("\n") == 1
+    return told.err
+
+
+@pytest.mark.parametrize("command", [("design",), ("fly",), ("stress", "--onset"), ("design", "--loop", "onboard")])
+@pytest.mark.parametrize(
+    ("gains", "told"),
+    [
+        ((3.0, 0.6, 5.6), "without any delay: root +3 1/s, vehicle 1;"),
+        # s² + k1 s + k3 of each follower: roots +0.5 ± √(0.25 − 4) j
+        ((1.0, 0.0, 4.0), "without any delay: root +1 1/s, vehicle 1;"),
+        # (s² + 3 s − 4) = (s + 4)(s − 1)
+        ((-3.0, 0.6, -4.0), "without any delay: root +1 1/s, vehicle 2;"),
+        ((-3.0, 0.6, 0.0), "without any delay: root +0 1/s, vehicle 2;"),
+        # 1 − 300 T is −5 at 50 Hz and −2 at the 100 Hz on board
+        ((-300.0, 0.0, 1.0), "only sampling makes unstable"),
+    ],
+)
+def test_an_unstable_loop_is_refused_with_its_root(
+    command: tuple[str, ...],
+    gains: tuple[float, float, float],
+    told: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = with_gains(tmp_path, *gains)
+    line = complaint(capsys, monkeypatch, command[0], str(file), *command[1:])
+    assert line.startswith(f"{file}: control.gains: read a loop that ")
+    assert told in line
+
+
+def test_an_unstable_coupled_loop_on_a_pattern_names_all_of_its_vehicles() -> None:
+    scenario = load(ROOT / "scenarios/thesis_gains.toml")
+    blocks = tuple(
+        block.model_copy(update={"gain": tuple(tuple(-value for value in row) for row in block.gain)})
+        for block in scenario.control.blocks
+    )
+    control = scenario.control.model_copy(update={"blocks": blocks})
+    line = unstable_loop(flight_plan(scenario.model_copy(update={"control": control}))[1])
+    assert line is not None
+    assert line.startswith("control.blocks: ")
+    assert "vehicles 1 2 3;" in line
+
+
+def test_a_stable_loop_beyond_its_margin_is_flown() -> None:
+    late = CHAIN.with_link_delay(up_s=0.4, down_s=0.4)
+    assert unstable_loop(flight_plan(late)[1]) is None
+    assert endless_link(late) is None
+    assert bad_start(late) is None
+
+
+def test_an_unstable_loop_flown_all_the_same_shows_no_headroom(tmp_path: Path) -> None:
+    from gcs.drive.flown import fly_virtual
+
+    designed, plan = flight_plan(load(with_gains(tmp_path, 3.0, 0.6, 5.6)))
+    flight = fly_virtual(without_actions(plan))
+    summary = summarise(plan.scenario, designed, flight.ticks, flight.events)
+    assert summary["verdict"] == "unstable"
+    assert summary["headroom_min"] is None
+    assert not (flight.ticks["headroom"] == -float("inf")).any()
+    assert not [event for event in flight.events if event["kind"] == "gains"]
+
+
+@pytest.mark.parametrize("gains", list(itertools.product((-1e5, 1e5), repeat=3)))
+def test_gains_of_any_size_are_assessed_and_told_as_what_they_are(
+    gains: tuple[float, float, float], tmp_path: Path
+) -> None:
+    file = with_gains(tmp_path, *gains)
+    printed = CliRunner().invoke(app, ["design", str(file), "--allow-unstable"])
+    assert printed.exit_code == 0, printed.output
+    assert "none: the sampled loop is unstable without any delay" in printed.output
+    told = CliRunner().invoke(app, ["design", str(file), "--allow-unstable", "--json"])
+    assert json.loads(told.stdout)["delay_margin_s"] == 0.0
+
+
+def test_vehicles_that_start_in_collision_or_past_the_limit_are_found_before_take_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near = chain_file(tmp_path, ("[-229.84, 233.84]", "[-133.92, 132.92]"))
+    for command in (("fly",), ("stress", "--onset")):
+        line = complaint(capsys, monkeypatch, command[0], str(near), *command[1:])
+        assert "read vehicles 2 and 3 3 m apart, wanted at least safety.collision_distance_m = 5 m" in line
+    assert flight_plan(load(near))[1].delay_margin_s > 0.29  # designed all the same
+    far = chain_file(tmp_path, ("[-229.84, 233.84]", "[-2229.84, 233.84]"))
+    assert "read vehicle 3 with a spacing error of 1974" in complaint(capsys, monkeypatch, "fly", str(far))
+
+
+def test_a_link_slower_than_the_flight_waits_for_is_found_before_take_off(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = str(ROOT / "scenarios/chain3.toml")
+    line = complaint(capsys, monkeypatch, "fly", file, "--link-delay", "40")
+    assert line == (
+        f"{file}: links: read a round trip of 80 s to vehicle 1, wanted less than the 20 s for which an answer is "
+        "waited for\n"
+    )
+    assert endless_link(CHAIN.with_link_delay(up_s=9.9, down_s=9.9)) is None
+    short = CHAIN.with_link_delay(up_s=3.0, down_s=3.0).model_copy(update={"duration_s": 6.0})
+    assert "wanted less than duration_s = 6 s" in (endless_link(short) or "")
+    # slow at first and fast before the end: commands do act
+    ramp = Link(delay_points=(DelayPoint(at_s=0.0, delay_s=4.0), DelayPoint(at_s=1.0, delay_s=0.0)))
+    assert endless_link(short.model_copy(update={"links": Links(up=ramp, down=ramp)})) is None

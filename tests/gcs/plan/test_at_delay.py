@@ -1,0 +1,68 @@
+"""α and the growth of spacing errors with delay, where a user meets them: design, table, summary."""
+
+import numpy as np
+import pytest
+
+from gcs.drive.flown import fly_virtual
+from gcs.plan.at_delay import expected_loop_delay_s, figures_at
+from gcs.plan.planner import flight_plan
+from gcs.runs.summary import summarise
+from gcs.views.table import FlightState, plain_line
+from scenarios.files import load
+from scenarios.schema import DelayPoint, Jitter, Link, Links, Rates, VehicleLinks
+from tests.support.paths import ROOT
+
+TRIANGLE = load(ROOT / "scenarios/triangle5.toml")
+
+
+def test_a_design_tells_alpha_and_growth_at_the_delay_of_its_links_and_how_far_they_hold() -> None:
+    late = TRIANGLE.with_link_delay(up_s=0.12, down_s=0.12)
+    flown = flight_plan(late)[0]["at_loop_delay"]
+    assert flown["loop_delay_s"] == pytest.approx(0.25)
+    assert flown["alpha"] == pytest.approx(0.312, abs=5e-4)
+    assert flown["string_peak"] == pytest.approx(2.49, abs=5e-3)
+    assert flown["string_peak_kept"] == 1.0
+    assert flown["string_peak_kept_to_s"] == pytest.approx(0.1607, abs=1e-4)
+    assert 0.15 < flown["alpha_kept_to_s"] < 0.17
+    beyond = flight_plan(TRIANGLE.with_link_delay(up_s=0.2, down_s=0.2))[0]["at_loop_delay"]
+    assert (beyond["alpha"], beyond["string_peak"]) == (0.0, None)
+
+
+def test_a_slower_gain_set_is_judged_as_the_design_slowed_down() -> None:
+    design, _ = flight_plan(TRIANGLE)
+    # slowed down by 2 all but the hold does the same in twice the time: 2 (0.2 + 0.01) - 0.01
+    fast, slow = figures_at(design, 0.2), figures_at(design, 0.41, gain_set=1)
+    assert fast["string_peak"] is not None
+    assert slow["string_peak"] == pytest.approx(fast["string_peak"], rel=1e-6)
+    assert figures_at({"delay_margin_s": 0.3}, 0.1) == {"loop_delay_s": 0.1, "alpha": None, "string_peak": None}
+
+
+def test_the_expected_loop_delay_is_that_of_the_slowest_links_and_half_a_telemetry_period() -> None:
+    assert expected_loop_delay_s(TRIANGLE) == pytest.approx(0.05)
+    gamma = Jitter(distribution="gamma", scale_s=0.01, shape=2.0)
+    ramp = (DelayPoint(at_s=0.0, delay_s=0.0), DelayPoint(at_s=9.0, delay_s=0.1))
+    links = Links(
+        up=Link(delay_s=0.03, jitter=gamma),
+        down=Link(delay_s=0.01),
+        vehicles=(VehicleLinks(system_id=2, down=Link(delay_points=ramp)),),
+    )
+    slow = TRIANGLE.model_copy(update={"links": links, "rates": Rates(telemetry_hz=10.0)})
+    assert expected_loop_delay_s(slow) == pytest.approx(0.03 + 0.02 + 0.1 + 0.05)
+
+
+def test_table_and_summary_tell_both_at_the_loop_delay_that_was_measured() -> None:
+    late = TRIANGLE.with_link_delay(up_s=0.09, down_s=0.09).model_copy(update={"duration_s": 6.0})
+    calm = late.model_copy(update={"monitor": late.monitor.model_copy(update={"act": False})})
+    design, plan = flight_plan(calm)
+    flight = fly_virtual(plan)
+    told = summarise(calm, design, flight.ticks, flight.events)["at_loop_delay"]
+    own = flight.ticks["loop_delay_s"][flight.ticks["commanded"]].reshape(-1, 5)
+    assert told["loop_delay_s"] == pytest.approx(np.nanmedian(own, axis=0).max(), abs=1e-9)
+    assert told == figures_at(design, told["loop_delay_s"])
+    assert 0.5 < told["alpha"] < 0.81
+    assert 1.0 < told["string_peak"] < 1.4
+    state = FlightState(calm, design)
+    rows = flight.ticks.reshape(-1, 5)
+    state.add(rows[(rows["time_s"][:, 0] > 3.0) & (rows["time_s"][:, 0] < 5.9)], [])
+    assert f"alpha {told['alpha']:.2f}" in plain_line(state)
+    assert f"errors grow {told['string_peak']:.1f}" in plain_line(state)

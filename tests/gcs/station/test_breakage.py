@@ -1,0 +1,90 @@
+"""A vehicle that comes back has the time to come back before its error ends the flight."""
+
+from dataclasses import replace
+from math import hypot, nan
+
+import numpy as np
+import pytest
+
+from gcs.control.law import VehicleControl
+from gcs.control.tick import Mode
+from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.summary import verdict
+from gcs.station.breakage import Breakage, recovery_time_s, slowest_decay_1_s
+from gcs.station.monitor import VehicleState
+from gcs.station.station import Station
+from scenarios.schema import Limits, Scenario
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.vehicles.copter_rules import RULES
+from tests.flights.test_flight_copters import TRUTH, Flight, plan_for, three
+from tests.flights.test_pilots import PILOTS_MODE, PilotsVehicle, flight_s
+
+
+def flown(flavour: str, modes: dict[float, int], **changes: object) -> Flight:
+    """A flight of 60 s in which the pilot of vehicle 3 changes its mode at these times of the flight."""
+    scenario: Scenario = three(flavour=flavour, duration_s=60.0).model_copy(update={"response": TRUTH} | changes)
+    began_s = flight_s(flavour)
+    station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
+    vehicles = PilotsVehicle(fleet, flavour, {began_s + at_s: mode for at_s, mode in modes.items()})
+    ticks = list(fly_lockstep(station.plan, station=station, vehicles=vehicles))
+    return Flight(station, fleet, np.concatenate(ticks), station.events)
+
+
+@pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
+def test_a_vehicle_given_back_far_behind_comes_back_and_the_flight_is_stable(flavour: str) -> None:
+    flight = flown(flavour, {5.0: PILOTS_MODE[flavour], 20.0: RULES[flavour].guided_mode})
+    assert flight.station.end_reason == "completed: duration reached"
+    assert "is given back" in flight.texts("vehicle")
+    limit_m = flight.station.plan.scenario.safety.spacing_error_limit_m
+    assert np.nanmax(flight.error_m(3)) > 1.5 * limit_m  # it was judged by nothing else
+    assert flight.error_m(3)[-1] < 0.17
+    assert verdict(flight.station.end_reason, 1.0) == "stable"
+
+
+def test_one_that_has_not_come_back_in_its_time_ends_the_flight_and_so_do_those_behind_it() -> None:
+    plan = plan_for(three())
+    breakage, limit_m = Breakage(plan), plan.scenario.safety.spacing_error_limit_m
+
+    def judged(time_s: float, mode: Mode, errors_m: tuple[float, float]) -> str:
+        """Vehicle 2 in a mode, with the errors of vehicles 2 and 3."""
+        states = [VehicleState(Mode.NOMINAL), VehicleState(mode), VehicleState(Mode.NOMINAL)]
+        controls = [
+            VehicleControl(1, (0.0, 0.0, 0.0, 0.0), (error_m, 0.0), (0.0, 0.0), (0.0, 0.0), 1)
+            for error_m in (nan, *errors_m)
+        ]
+        apart_m = np.full((3, 3), 100.0)
+        return breakage.judge(controls, states, [""] * 3, apart_m, [100.0] * 3, time_s)
+
+    far_m = 2.0 * limit_m
+    assert judged(1.0, Mode.NOMINAL, (0.9 * limit_m, 0.9 * limit_m)) == ""
+    assert judged(2.0, Mode.FAILSAFE, (far_m, 0.0)) == ""
+    assert judged(3.0, Mode.RECOVERING, (far_m, far_m)) == ""
+    allowed_s = recovery_time_s(plan, slowest_decay_1_s(plan), far_m, 4.0)
+    assert 10.0 < allowed_s < 120.0
+    assert judged(3.0 + 0.99 * allowed_s, Mode.NOMINAL, (far_m, far_m)) == ""
+    reason = judged(3.0 + 1.01 * allowed_s, Mode.NOMINAL, (0.0, far_m))
+    assert reason == f"broken: spacing error of vehicle 3 is {far_m:.0f} m, limit 30 m"
+
+
+def test_the_time_is_what_the_slowest_gains_need_and_the_limits_more() -> None:
+    """Against the loop itself: an error stays within the limit from then on."""
+    plan: FlightPlan = replace(plan_for(three()), scenario=three().model_copy(update={"limits": Limits()}))
+    decay_1_s = slowest_decay_1_s(plan)
+    model, K = plan.model, plan.gains[-1]
+    closed_loop = model.A + model.B @ K
+    assert decay_1_s == pytest.approx(-np.linalg.eigvals(closed_loop).real.max(), rel=1e-6)
+    limit_m = plan.scenario.safety.spacing_error_limit_m
+    for start_m in (54.0, 200.0, 5000.0):
+        time_s = recovery_time_s(plan, decay_1_s, start_m, 4.0)
+        values, vectors = np.linalg.eig(closed_loop)
+        x0 = np.zeros(model.states)
+        x0[model.spacing_slice(2)] = start_m, 0.0
+        parts = np.linalg.solve(vectors, x0)
+        later_m = [
+            hypot(*(vectors @ (parts * np.exp(values * t))).real[model.spacing_slice(2)])
+            for t in np.linspace(time_s, 2.0 * time_s, 50)
+        ]
+        assert max(later_m) < limit_m
+    limited = replace(plan, scenario=three())
+    assert recovery_time_s(limited, decay_1_s, 54.0, 4.0) > recovery_time_s(plan, decay_1_s, 54.0, 4.0) + 20.0

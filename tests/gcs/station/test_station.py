@@ -1,0 +1,173 @@
+"""The station's conversation with vehicles, frame by frame, with pymavlink as the other side."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from gains.formation.model import FormationModel
+from gcs.link.datagram import Datagram, Outgoing
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import plan_formation
+from gcs.station.station import Station
+from scenarios.files import load
+from tests.support.paths import SCENARIOS
+
+S, MS = 1_000_000_000, 1_000_000
+SCENARIO = load(SCENARIOS / "chain3.toml")
+FORMATION = plan_formation(SCENARIO)
+GAIN = FormationModel(tuple(FORMATION.predecessor.tolist())).overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
+PLAN = FlightPlan(SCENARIO, FORMATION, GAIN, 0.3)
+HOME = ("127.0.0.1", 5001)
+
+
+class Peer:
+    """One vehicle played by pymavlink: what it says and what it was told."""
+
+    def __init__(self, system_id: int, address: tuple[str, int] = HOME) -> None:
+        self.link: Any = dialect.MAVLink(None, srcSystem=system_id, srcComponent=1)
+        self.address = address
+
+    def datagram(self, message: Any, time_ns: int) -> Datagram:
+        data = bytes(message.pack(self.link))
+        self.link.seq = (self.link.seq + 1) % 256  # pymavlink counts only what it sends itself
+        return Datagram(data, self.address, time_ns)
+
+    def heartbeat(self, time_ns: int, *, base_mode: int = 1, custom_mode: int = 0, status: int = 3) -> Datagram:
+        return self.datagram(self.link.heartbeat_encode(2, 3, base_mode, custom_mode, status), time_ns)
+
+
+def messages(outgoing: list[Outgoing], kind: str, to: tuple[str, int] = HOME) -> list[Any]:
+    """The messages of one kind sent to an address, as pymavlink reads them."""
+    parser: Any = dialect.MAVLink(None)
+    read = [parser.parse_char(data) for data, address in outgoing if address == to]
+    return [message for message in read if message.get_type() == kind]
+
+
+def commands(outgoing: list[Outgoing]) -> list[tuple[int, int]]:
+    return [(message.command, message.confirmation) for message in messages(outgoing, "COMMAND_LONG")]
+
+
+def test_a_vehicle_is_set_up_step_by_step_one_command_at_a_time() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    outgoing, _ = station.step([peer.heartbeat(S)], S)
+    (interval,) = messages(outgoing, "COMMAND_LONG")
+    assert (interval.command, interval.param1, interval.param2, interval.target_system) == (511, 32, 20000, 2)
+    for command, wanted, parameter in ((511, 176, 4.0), (176, 400, 0.0)):
+        ack = peer.datagram(peer.link.command_ack_encode(command, 0), S)
+        outgoing, _ = station.step([ack], station.next_event_ns + 20 * MS)
+        (sent,) = messages(outgoing, "COMMAND_LONG")
+        assert (sent.command, sent.param2) == (wanted, parameter)
+
+
+def test_a_command_without_answer_is_repeated_with_its_confirmation_raised() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    sent: list[tuple[int, int]] = []
+    for k in range(160):
+        now_ns = S + 20 * MS * k
+        outgoing, _ = station.step([peer.heartbeat(now_ns)], now_ns)
+        sent += commands(outgoing)
+    assert sent == [(511, 0), (511, 1), (511, 2), (511, 3)]
+
+
+def test_a_refused_command_is_reported_and_tried_again_a_second_later() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    station.step([peer.heartbeat(S)], S)
+    station.step([peer.datagram(peer.link.command_ack_encode(511, 2), S)], S + 20 * MS)
+    assert "answered DENIED to command 511" in [event.text for event in station.events]
+    times = [k for k in range(2, 100) if commands(station.step([], S + 20 * MS * k)[0])]
+    assert times[0] == 50  # the answer came at S
+
+
+def test_an_acknowledgement_of_another_command_is_not_taken_for_ours() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    station.step([peer.heartbeat(S)], S)
+    station.step([peer.datagram(peer.link.command_ack_encode(400, 0), S)], S + 20 * MS)
+    assert not station.vehicles[1].armed
+    assert not station.vehicles[1].rates_set
+
+
+def test_timesync_request_of_a_vehicle_is_answered_with_the_receive_time() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    request = peer.datagram(peer.link.timesync_encode(0, 777), S + 3 * MS)
+    outgoing, _ = station.step([peer.heartbeat(S), request], S + 5 * MS)
+    (reply,) = messages(outgoing, "TIMESYNC")
+    assert (reply.tc1, reply.ts1) == (S + 3 * MS, 777)
+
+
+def test_a_heartbeat_that_is_replayed_or_overtaken_undoes_nothing() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
+    old, overtaken, new = (peer.heartbeat(S, base_mode=mode, custom_mode=4) for mode in (1, 1, 129))
+    station.step([old, new, old, overtaken], S + 5 * MS)
+    assert vehicle.armed
+    assert (vehicle.frames.duplicate, vehicle.frames.late) == (1, 1)
+
+
+def test_what_a_link_reorders_or_repeats_is_no_refusal_and_is_told_once_of_each_vehicle() -> None:
+    station, peers = Station(PLAN, start_ns=S), [Peer(2), Peer(3)]
+    for second in range(1, 5):
+        for peer in peers:
+            first, second_one, third = (peer.heartbeat(second * S) for _ in range(3))
+            station.step([first, third, second_one, third], second * S)
+    assert not station.counters
+    told = [(event.system_id, event.text) for event in station.events if event.kind == "link"]
+    texts = "its frames arrive out of order", "frames of it arrive more than once"
+    assert told == [(system_id, text) for system_id in (2, 3) for text in texts]
+
+
+def test_a_vehicle_that_begins_anew_to_count_its_frames_is_heard() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
+    peer.link.seq = 100
+    station.step([peer.heartbeat(S, base_mode=129)], S)
+    peer.link.seq = 0
+    for second in (2, 3, 4, 5):
+        station.step([peer.heartbeat(second * S, base_mode=1)], second * S)
+    assert not vehicle.armed
+    assert vehicle.frames.lost == 0
+
+
+def test_unknown_system_id_is_counted_and_not_answered() -> None:
+    station, stranger = Station(PLAN, start_ns=S), Peer(77)
+    outgoing, _ = station.step([stranger.heartbeat(S)], S)
+    assert outgoing == []
+    assert station.counters == {"unknown system id": 1}
+
+
+def test_a_second_source_of_a_known_id_is_refused_until_the_first_is_silent() -> None:
+    station, peer, thief = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666))
+    station.step([peer.heartbeat(S)], S)
+    station.step([thief.heartbeat(S + 100 * MS)], S + 100 * MS)
+    assert station.vehicles[1].address == HOME
+    assert station.counters == {"known system id from another address": 1}
+    station.step([thief.heartbeat(S + 5 * S)], S + 5 * S)  # as after a restart of the vehicle
+    assert station.vehicles[1].address == thief.address
+
+
+def test_only_a_heartbeat_makes_a_vehicle_known() -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    station.step([peer.datagram(peer.link.local_position_ned_encode(1, 0, 0, 0, 0, 0, 0), S)], S)
+    assert station.vehicles[1].address is None
+
+
+@pytest.mark.parametrize(("status", "text"), [(5, "is in failsafe"), (4, "left GUIDED")])
+def test_a_vehicle_that_leaves_guided_is_reported_and_called_back(status: int, text: str) -> None:
+    station, peer = Station(PLAN, start_ns=S), Peer(2)
+    station.step([peer.heartbeat(S, base_mode=0x81, custom_mode=4, status=4)], S)
+    station.step([peer.datagram(peer.link.command_ack_encode(511, 0), S)], S + 20 * MS)
+    later = S + 4 * S
+    outgoing, _ = station.step([peer.heartbeat(later, base_mode=0x81, custom_mode=5, status=status)], later)
+    assert text in [event.text for event in station.events]
+    assert commands(outgoing) == [(176, 0)]
+
+
+def test_ticks_that_were_slept_through_are_left_out_and_counted() -> None:
+    station = Station(PLAN, start_ns=S)
+    ticks = []
+    for now_ns in (S, S + 20 * MS, S + 95 * MS, S + 100 * MS):
+        _, tick = station.step([], now_ns)
+        assert tick is not None
+        ticks.append((tick.number, tick.due_ns))
+    assert ticks == [(0, S), (1, S + 20 * MS), (2, S + 40 * MS), (5, S + 100 * MS)]

@@ -1,0 +1,78 @@
+"""The lines over a map: where the models say the formation breaks, and where it is proved not to."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gcs.stress.axes import Axis, at_coordinates
+from gcs.stress.boundary import cell_edges, guaranteed_line, two_delays_lines
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import Study
+from gcs.stress.trial import plan_loops
+from scenarios.schema import Jitter, Link
+from tests.support.stress_pair import SCENARIO, pair_plan
+
+DELAY_JITTER = (Axis("delay", (0.02, 0.25)), Axis("jitter", (0.0, 0.05)))
+
+
+def test_flights_on_the_guaranteed_line_are_stable_and_it_ends_before_the_margin() -> None:
+    study = Study(pair_plan())
+    line = guaranteed_line(study, DELAY_JITTER)
+    assert line is not None
+    assert line[:, 0].max() < study.plan.delay_margin_s
+    assert (line[:, 1] <= line[:, 0] / 2.0).all()  # no delay below zero
+    assert line[:, 1].max() > 0.02
+    for delay_s, jitter_s in line[:: len(line) // 3].tolist():
+        outcome = fly_trial(study.trial("probe", {"delay": delay_s, "jitter": jitter_s}, seed=7))
+        assert (outcome.growth_1_s or 0.0) < 0.0
+
+
+@pytest.mark.parametrize(
+    ("axes", "distribution"),
+    [((Axis("delay", (0.0, 0.2)), Axis("loss", (0.0, 0.2))), "uniform"), (DELAY_JITTER, "normal")],
+)
+def test_nothing_is_guaranteed_where_no_delay_is_the_longest(axes: tuple[Axis, Axis], distribution: str) -> None:
+    jitter = Jitter.model_validate({"distribution": distribution, "scale_s": 0.01})
+    links = SCENARIO.links.model_copy(update={"up": Link(jitter=jitter), "down": Link(jitter=jitter)})
+    plan = replace(pair_plan(), scenario=SCENARIO.model_copy(update={"links": links}))
+    assert guaranteed_line(Study(plan), axes) is None
+
+
+def test_two_vehicles_of_a_tree_break_at_the_sides_of_a_rectangle() -> None:
+    """The sides are the sampled margins less the waiting, as near as half a period for the hold is."""
+    study = Study(pair_plan())
+    axes = (Axis("delay_1", (0.1, 0.5)), Axis("delay_2", (0.1, 0.5)))
+    near = [
+        fly_trial(study.trial("probe", {"delay_1": at, "delay_2": at}, seed=7, probe=k))
+        for k, at in ((1, 0.2), (2, 0.1))
+    ]
+    lines = np.concatenate(two_delays_lines(study, axes, near))
+    for k, loop in enumerate(plan_loops(study.plan)):
+        waiting_s = near[k].waiting_s
+        assert waiting_s is not None
+        side_s = loop.margin_s() - waiting_s
+        assert np.abs(lines[:, k] - side_s).min() < 1e-3
+        assert lines[:, k].max() < side_s + 1e-3
+
+
+def test_loops_of_several_vehicles_have_no_such_rectangle() -> None:
+    plan = pair_plan()
+    gain = plan.gain.copy()
+    gain[0, 2] = 0.5  # the leader uses the follower's spacing: one loop of two
+    study = Study(replace(plan, gain=gain, scenario=at_coordinates(SCENARIO, {"delay": 0.02})))
+    assert two_delays_lines(study, (Axis("delay_1", (0.1, 0.5)), Axis("delay_2", (0.1, 0.5))), []) == []
+
+
+@pytest.mark.parametrize(
+    ("values", "edges"),
+    [
+        ([0.2, 0.25, 0.4], [0.175, 0.225, 0.325, 0.475]),
+        ([0.2], [0.18, 0.22]),
+        ([0.0], [-0.01, 0.01]),
+    ],
+)
+def test_each_value_of_an_axis_lies_in_a_cell_that_ends_halfway_to_the_next(
+    values: list[float], edges: list[float]
+) -> None:
+    assert cell_edges(np.array(values)) == pytest.approx(edges)

@@ -1,0 +1,60 @@
+"""`gcs compare`: its figures against other ways to find them, and its page in one piece."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gains.design.design import design
+from gains.formation.model import FormationModel
+from gcs.cli.main import app
+from gcs.studies.compare import METHODS, string_peak
+from gcs.studies.compare_cost import DesignCost, left_out
+from tests.support.paths import SCENARIOS
+
+SCENARIO = SCENARIOS / "chain3.toml"
+CHAIN = FormationModel((-1, 0, 1))
+
+
+def test_string_peak_of_the_formation_is_that_of_one_follower_behind_another() -> None:
+    found = design(CHAIN, period_s=0.02)
+    K = CHAIN.overlapping_gain(found.K1, found.K2, 1.4 * found.K3)
+    k1, k2, k3 = -found.K1[0, 0], found.K2[0, 0], 1.4 * found.K3[0, 0]
+    s = 1j * np.geomspace(1e-3, 1e2, 20000)
+    peak = np.abs((k2 * s + k3) / (s**2 + k1 * s + k3)).max()
+    assert peak > 1.05
+    assert string_peak(CHAIN, K) == pytest.approx(peak, rel=1e-4)
+    assert string_peak(FormationModel((-1, 0)), np.zeros((4, 6))) is None
+
+
+def test_routes_are_flown_and_shown_side_by_side(tmp_path: Path) -> None:
+    folder = tmp_path / "compared"
+    result = CliRunner().invoke(app, ["compare", str(SCENARIO), "--out", str(folder), "--no-sizes"])
+    assert result.exit_code == 0, result.output
+    routes = {route["method"]: route for route in json.loads((folder / "compare.json").read_text())["routes"]}
+    assert tuple(routes) == METHODS
+    for route in routes.values():
+        assert route["verdict"] == "stable"
+        assert route["delay_margin_s"] == pytest.approx(0.3, rel=1e-5)
+        assert route["links"] == 2
+        assert 0 < route["settling_time_s"] < 30
+        # decay from the initial error to the settled band takes about its logarithm over the rate
+        assert route["settling_time_s"] < 12 / route["decay_rate_1_s"]
+    assert routes["inclusion"]["numbers_used"] == 4
+    assert routes["graph-lqr"]["numbers_used"] == 6
+    page = (folder / "compare.html").read_text()
+    assert "data:image/png" in page
+    assert "http" not in page
+    assert f"{routes['graph-dk']['settling_time_s']:.2f}" in page
+
+
+def test_sizes_that_were_not_tried_are_named_with_the_reason() -> None:
+    costs = [DesignCost("inclusion", size, 0.2, 3) for size in (3, 5, 10, 20, 40, 80, 200)]
+    costs += [DesignCost("graph-dk", size, 0.2, 8) for size in (3, 5, 10)]
+    costs += [DesignCost("centralised LMI", size, 20.0, 45) for size in (3, 5)]
+    assert left_out(costs) == [
+        "graph-dk: not tried on 20 vehicles and more; more than 20 states an axis",
+        "centralised LMI: not tried on 10 vehicles and more; it may take over 10 s",
+    ]

@@ -1,0 +1,218 @@
+"""Links watched from aside: what is said of their delays against the truth, in virtual time, and what is not done."""
+
+import io
+from collections import Counter
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from gcs.link import mavlink
+from gcs.watch.links import SYSTEM_ID, Requests, Watch
+from gcs.watch.table import links_table
+from scenarios.files import load
+from scenarios.schema import Jitter, Link, Links, Scenario
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.links.truth import SAMPLED, Row
+from tests.support.paths import SCENARIOS
+from tests.support.sim_client import arm, guided, heartbeat, setpoint
+
+START_NS = 1_000_000_000
+MS = 1_000_000
+CHAIN = load(SCENARIOS / "chain3.toml")
+HOST = "virtual"
+
+
+def linked(up: Link, down: Link) -> Scenario:
+    return CHAIN.model_copy(update={"links": Links(up=up, down=down)})
+
+
+class Watched:
+    """A fleet that nobody flies, and a watch of it; what a station would send may be put in as well."""
+
+    def __init__(self, scenario: Scenario, *, timesync_hz: float) -> None:
+        self.rows: list[Row] = []
+        self.fleet = Fleet(scenario, START_NS, record=self.rows.append)
+        self.watch = Watch()
+        self.requests = Requests(timesync_hz)
+        self.now_ns = START_NS
+        self.sent: list[bytes] = []
+        self.true_ages_s: list[float] = []
+        """Of the first vehicle's newest state, at each look."""
+
+    def run(self, seconds: float, station: list[tuple[int, bytes, int]] | None = None) -> None:
+        """Go on in steps of a millisecond; `station`: datagrams (system id, bytes, ns) of a station beside."""
+        due = sorted(station or [], key=lambda entry: entry[2])
+        end_ns = self.now_ns + round(seconds * 1e9)
+        to_vehicles: list[tuple[int, bytes, int]] = []
+        while self.now_ns < end_ns:
+            self.now_ns += MS
+            while due and due[0][2] < self.now_ns:
+                system_id, data, time_ns = due.pop(0)
+                to_vehicles.append((system_id, data, time_ns))
+                for frame in mavlink.decode(data, Counter()):
+                    self.watch.take(frame, time_ns)
+            for system_id, data, time_ns in self.fleet.step(to_vehicles, self.now_ns):
+                for frame in mavlink.decode_either(data, self.watch.counters):
+                    self.watch.take(frame, time_ns, (HOST, system_id))
+            looks = len(self.true_ages_s)
+            self.watch.look(self.now_ns)
+            if 1 in self.watch.vehicles and len(self.watch.vehicles[1].age_s) > looks:
+                self.true_ages_s += [self._true_age_s()] * (len(self.watch.vehicles[1].age_s) - looks)
+            outgoing = self.requests.due(self.watch, self.now_ns)
+            self.sent += [data for data, _ in outgoing]
+            to_vehicles = [(system_id, data, self.now_ns) for data, (_, system_id) in outgoing]
+
+    def _true_age_s(self) -> float:
+        boot_ms = self.watch.vehicles[1].boot_ns // MS
+        sampled = [row[3] for row in self.rows if row[:3] == (SAMPLED, 1, boot_ms)]
+        return (self.now_ns - sampled[-1]) * 1e-9 if sampled else np.nan
+
+
+def test_round_trips_and_loop_delays_are_those_of_the_links_to_the_microsecond() -> None:
+    watched = Watched(linked(Link(delay_s=0.07), Link(delay_s=0.03)), timesync_hz=10.0)
+    watched.run(8.0)
+    vehicle = watched.watch.vehicles[1]
+    assert len(vehicle.rtt_s) > 60
+    np.testing.assert_allclose(vehicle.rtt_s, 0.1, atol=1e-6)
+    # Up was slower than down by 40 ms, so the clock is off by 20 ms; the loop delay is not.
+    late_s = np.array(vehicle.age_s) - watched.true_ages_s
+    known = np.isfinite(late_s) & (np.arange(late_s.size) > 30)
+    assert known.sum() > 30
+    np.testing.assert_allclose(late_s[known], -0.02, atol=1e-5)
+    np.testing.assert_allclose((np.array(vehicle.loop_delay_s) - watched.true_ages_s)[known], 0.03, atol=1e-5)
+    figures = watched.watch.figures(watched.now_ns, 0.5)[0]
+    # Half a round trip, and what a clock may drift since the newest reply was read, by then 0.05 to 0.2 s ago.
+    assert 0.05 < figures["clock"]["bound_s"] < 0.05 + 1e-3 * 0.25
+    assert figures["headroom"] == pytest.approx(1 - figures["loop_delay_s"]["p99"] / 0.5)
+    assert figures["status"] == "measured"
+
+
+def test_silence_gives_lower_bounds_that_hold_and_rise_with_the_jitter() -> None:
+    jitter = Jitter(distribution="uniform", scale_s=0.02)
+    watched = Watched(linked(Link(delay_s=0.05, jitter=jitter), Link(delay_s=0.05)), timesync_hz=0.0)
+    watched.run(10.0)
+    assert watched.sent == []
+    vehicle = watched.watch.vehicles[1]
+    assert not vehicle.rtt_s
+    true_s, bound_s = np.array(watched.true_ages_s), np.array(vehicle.loop_delay_s)
+    known = np.isfinite(bound_s) & np.isfinite(true_s)
+    assert known.sum() > 50
+    short_s = (true_s - bound_s)[known]
+    assert (short_s > 0).all()
+    # After some seconds a frame with nearly the least delay, 30 ms, has come: that much is never seen.
+    assert 0.03 - 0.001 < short_s[-30:].min() <= short_s[-30:].max() < 0.04
+    assert watched.watch.figures(watched.now_ns, 0.3)[0]["status"] == "no exchange"
+
+
+def test_the_exchanges_of_a_station_on_the_same_stream_are_used_without_asking() -> None:
+    watched = Watched(linked(Link(delay_s=0.02), Link(delay_s=0.02)), timesync_hz=0.0)
+    asked = [(system_id, START_NS + k * 100 * MS + system_id) for k in range(40) for system_id in (1, 2, 3)]
+    station = [
+        (to, mavlink.encode(mavlink.TIMESYNC, (0, 77_000_000_000 + time_ns), sequence=0), time_ns)
+        for to, time_ns in asked
+    ]
+    watched.run(4.0, station)
+    for vehicle in watched.watch.vehicles.values():
+        assert len(vehicle.rtt_s) > 25
+        np.testing.assert_allclose(vehicle.rtt_s, 0.04, atol=1e-6)
+    assert watched.sent == []
+
+
+def test_nothing_but_timesync_requests_is_sent_and_the_rate_is_as_told() -> None:
+    watched = Watched(CHAIN, timesync_hz=5.0)
+    watched.run(10.0)
+    frames = [frame for data in watched.sent for frame in mavlink.decode(data, Counter())]
+    assert {(frame.msg_id, frame.system_id, frame.fields[0]) for frame in frames} == {(mavlink.TIMESYNC, SYSTEM_ID, 0)}
+    assert 3 * 5 * 8 < len(frames) <= 3 * 5 * 10 + 3
+
+
+def test_a_vehicle_whose_station_has_gone_goes_to_its_failsafe_though_it_is_watched() -> None:
+    watched = Watched(CHAIN, timesync_hz=10.0)
+    watched.run(1.0)
+    start_ns = watched.now_ns
+    flown = [(1, frame, start_ns + MS) for frame in (heartbeat(), arm(), guided(), setpoint())]
+    flown += [(1, frame, start_ns + k * 20 * MS) for k in range(1, 50) for frame in (heartbeat(), setpoint())]
+    watched.run(1.0, flown)
+    assert watched.watch.vehicles[1].remote.guided
+    watched.run(CHAIN.safety.heartbeat_timeout_s + 2.0)
+    assert watched.watch.vehicles[1].remote.critical
+    assert len(watched.watch.vehicles[1].rtt_s) > 40
+
+
+def test_a_vehicle_that_falls_silent_says_so_and_its_delay_does_not_grow() -> None:
+    watched = Watched(linked(Link(delay_s=0.01), Link(delay_s=0.01)), timesync_hz=10.0)
+    watched.run(5.0)
+    before = watched.watch.figures(watched.now_ns, None)[0]
+    later_ns = watched.now_ns
+    for _ in range(600):
+        later_ns += 100 * MS
+        watched.watch.look(later_ns)
+    after = watched.watch.figures(later_ns, None)[0]
+    assert (before["status"], after["status"]) == ("measured", "silent")
+    assert after["loop_delay_s"] == before["loop_delay_s"]
+    assert after["headroom"] is None
+
+
+def test_looks_are_uneven_so_that_no_telemetry_rate_is_in_step_with_them() -> None:
+    watch = Watch([1])
+    times = [0]
+    while len(times) < 500:
+        times.append(watch.look(times[-1]))
+    steps = np.array([b - a for a, b in pairwise(times)])
+    assert 50 * MS <= steps.min() < 55 * MS
+    assert 145 * MS < steps.max() <= 150 * MS
+    assert np.mean(steps) == pytest.approx(100 * MS, rel=0.01)
+    phase = np.exp(2j * np.pi * np.array(times) / (250 * MS))  # of telemetry at 4 Hz
+    assert abs(phase.mean()) < 0.05
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([mavlink.HEARTBEAT, mavlink.TIMESYNC, mavlink.LOCAL_POSITION_NED]),
+            st.integers(0, 2**63 - 1),
+            st.integers(0, 255),
+            st.integers(0, 10**12),
+        ),
+        max_size=40,
+    )
+)
+def test_whatever_a_stream_says_is_taken_and_figures_are_plain_numbers(
+    said: list[tuple[int, int, int, int]],
+) -> None:
+    watch = Watch([1])
+    now_ns = START_NS
+    for msg_id, number, sequence, step_ns in said:
+        now_ns += step_ns
+        fields = {
+            mavlink.HEARTBEAT: (0, 2, 3, number & 0xFF, 4, 3),
+            mavlink.TIMESYNC: (number, watch.ask(now_ns) if number % 2 else number),
+            mavlink.LOCAL_POSITION_NED: (number & 0xFFFFFFFF, *(0.0,) * 6),
+        }[msg_id]
+        data = mavlink.encode(msg_id, fields, sequence=sequence, system_id=1)
+        for frame in mavlink.decode(data, Counter()):
+            watch.take(frame, now_ns)
+        watch.look(now_ns)
+    [figures] = watch.figures(now_ns, 0.3)
+    assert figures["system_id"] == 1
+    assert all(value is None or np.isfinite(value) for value in figures["rtt_s"].values() if not isinstance(value, str))
+    assert figures["headroom"] is None or np.isfinite(figures["headroom"])
+
+
+@pytest.mark.parametrize("width", [50, 73, 80, 139, 140, 200])
+def test_the_table_of_links_fits_the_terminal_and_keeps_headroom_and_status(width: int) -> None:
+    watched = Watched(CHAIN, timesync_hz=10.0)
+    watched.run(1.5)
+    figures = watched.watch.figures(watched.now_ns, 0.3)
+    console = Console(file=io.StringIO(), width=width, color_system=None)
+    with console.capture() as capture:
+        console.print(links_table(figures, width))
+    lines = [line.rstrip() for line in capture.get().splitlines()]
+    assert max(map(len, lines)) <= width
+    assert sum(line.endswith(" measured") for line in lines) == 3
+    for line, vehicle in zip(lines[-3:], figures, strict=True):
+        assert f"{100 * vehicle['headroom']:.0f}" in line.split()

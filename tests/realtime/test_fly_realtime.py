@@ -1,0 +1,323 @@
+"""The commands as a user runs them: real processes, real UDP, the real clock. Figures are judged at the median."""
+
+import json
+import os
+import resource
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time  # noqa: TID251 - waits for processes, with time-outs
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from gcs.control.tick import TICK, TickArray
+from gcs.drive.sitl import ORPHAN_S
+from gcs.runs.files import read_ticks
+from gcs.runs.record import TRUTH_FILE
+from scenarios.files import dump, load
+from sim_vehicles.links.truth import ACTED, SAMPLED, read_truth
+from tests.support.paths import SCENARIOS
+
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+
+GCS = [sys.executable, "-m", "gcs.cli.main"]
+PATIENCE_S = 60.0
+
+
+def short(tmp_path: Path, name: str, duration_s: float) -> Path:
+    """A scenario of the repository, made shorter."""
+    scenario = load(SCENARIOS / f"{name}.toml").model_copy(update={"duration_s": duration_s})
+    file = tmp_path / f"{name}.toml"
+    file.write_text(dump(scenario), encoding="utf-8")
+    return file
+
+
+def fly(*arguments: str | Path, **kwargs: Any) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [*GCS, "fly", *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs
+    )
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+
+
+def flying(folder: Path, at_least_s: float = 1.0) -> bool:
+    """Whether the run has flown for that long."""
+    file = folder / "ticks.part"
+    if not file.exists():
+        return False
+    whole = file.stat().st_size // TICK.itemsize * TICK.itemsize
+    ticks = np.frombuffer(file.read_bytes()[:whole], TICK)
+    return bool(ticks.size and ticks["time_s"][-1] > at_least_s)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def vehicles_log(folder: Path) -> str:
+    return (folder / "vehicles.log").read_text(encoding="utf-8")
+
+
+def children_named(text: str) -> list[int]:
+    """Process ids whose command line contains a text that only this test uses."""
+    found: list[int] = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                command = (entry / "cmdline").read_bytes().decode(errors="replace")
+            except OSError:
+                continue
+            if text in command and "sim_vehicles.drive.cli" in command:
+                found.append(int(entry.name))
+    return found
+
+
+def true_loop_delay_s(folder: Path, ticks: TickArray) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Loop delay of each set-point that acted, from the vehicles' own log: when it acted minus when the state was."""
+    truth = read_truth(folder / TRUTH_FILE)
+    sampled = {(int(r["system_id"]), int(r["key"])): int(r["time_ns"]) for r in truth[truth["kind"] == SAMPLED]}
+    acted = {(int(r["system_id"]), int(r["key"])): int(r["time_ns"]) for r in truth[truth["kind"] == ACTED]}
+    delays = [
+        (acted[key] - sampled[state]) * 1e-9
+        for row in ticks
+        if (key := (int(row["system_id"]), int(row["key_ms"]))) in acted
+        and (state := (int(row["system_id"]), int(row["sample_boot_ms"]))) in sampled
+    ]
+    return np.array(delays)
+
+
+@pytest.mark.parametrize("delay_s", [0.02, 0.06])
+def test_flight_over_udp_settles_and_reports_the_loop_delay_that_the_links_had(tmp_path: Path, delay_s: float) -> None:
+    folder = tmp_path / "run"
+    scenario = short(tmp_path, "triangle5", 8.0)
+    process = fly(scenario, "--listen", "127.0.0.1:0", "--link-delay", str(delay_s), "--out", folder, "--json")
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, err) == (0, "")
+    summary = json.loads(out)
+    assert summary == json.loads((folder / "summary.json").read_text())
+    assert summary["verdict"] == "stable"
+    ticks = read_ticks(folder)
+    commanded = ticks[ticks["commanded"]]
+    truth_s = true_loop_delay_s(folder, commanded)
+    assert truth_s.size > 0.95 * commanded.size
+    # Within 1 ms at the median; kernel stamps make it far better on a quiet machine.
+    assert float(np.median(commanded["loop_delay_s"])) == pytest.approx(float(np.median(truth_s)), abs=1e-3)
+    for vehicle in summary["vehicles"]:
+        assert vehicle["rtt_s"]["p50"] == pytest.approx(2 * delay_s, abs=2e-3)
+        assert vehicle["lost"] == 0
+    for name in ("flight.rrd", "flight.tlog", "scenario.toml", "design.json", "ticks.parquet"):
+        assert (folder / name).stat().st_size > 100
+    assert {"flight.rrd", "flight.tlog", "ticks.parquet", "summary.json"} <= set(summary["files"])
+    check_tlog(folder / "flight.tlog")
+
+
+def check_tlog(file: Path) -> None:
+    """Every entry is a time and one frame that pymavlink accepts; times run forwards but for what a tick collects."""
+    parser: Any = dialect.MAVLink(None)
+    data = file.read_bytes()
+    at, times, kinds = 0, [], set[str]()
+    while at < len(data):
+        (time_us,) = struct.unpack_from(">Q", data, at)
+        length = 12 + data[at + 9]
+        message = parser.parse_char(data[at + 8 : at + 8 + length])
+        kinds.add(message.get_type())
+        times.append(time_us)
+        at += 8 + length
+    assert at == len(data)
+    assert {"HEARTBEAT", "LOCAL_POSITION_NED", "TIMESYNC", "SET_POSITION_TARGET_LOCAL_NED", "COMMAND_ACK"} <= kinds
+    assert abs(times[0] * 1e-6 - time.time()) < 3600
+    assert min(np.diff(times)) > -1e6
+
+
+def test_too_late_a_link_is_unstable_and_exit_code_1(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    scenario = short(tmp_path, "triangle5", 20.0)
+    process = fly(scenario, "--listen", "127.0.0.1:0", "--link-delay", "0.4", "--out", folder)
+    out, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1
+    assert "verdict  unstable: broken: spacing error of vehicle" in out
+    summary = json.loads((folder / "summary.json").read_text())
+    assert {vehicle["mode_final"] for vehicle in summary["vehicles"]} == {"FAILSAFE"}
+    assert summary["headroom_min"] < 0
+
+
+@pytest.mark.parametrize(
+    ("early", "number"),
+    [
+        (True, signal.SIGINT),
+        (False, signal.SIGINT),
+        (False, signal.SIGTERM),
+        (True, signal.SIGHUP),
+        (False, signal.SIGHUP),
+    ],
+)
+def test_ctrl_c_sigterm_and_a_closed_terminal_leave_whole_files_and_no_traceback(
+    tmp_path: Path, early: bool, number: signal.Signals
+) -> None:
+    folder = tmp_path / "run"
+    process = fly(short(tmp_path, "chain3", 60.0), "--listen", "127.0.0.1:0", "--out", folder)
+    until(lambda: (folder / "scenario.toml").exists() if early else flying(folder))
+    process.send_signal(number)
+    _, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["verdict"], summary["reason"]) == ("aborted", f"interrupted: {number.name}")
+    assert (folder / "flight.rrd").stat().st_size > 100
+    assert not children_named(str(folder))
+
+
+def test_killed_station_leaves_readable_logs_and_a_new_one_takes_the_vehicles_back(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    scenario, port = short(tmp_path, "triangle5", 10.0), free_port()
+    listen = f"127.0.0.1:{port}"
+    process = fly(scenario, "--listen", listen, "--out", first)
+    until(lambda: flying(first, 4.0))  # settled: vehicles that hold different velocities would drift far apart
+    process.kill()
+    killed_ns = time.monotonic_ns()
+    process.communicate(timeout=PATIENCE_S)
+    try:
+        until(lambda: vehicles_log(first).count("failsafe") >= 5)
+        until((first / "summary.json").exists)  # the observer finishes the run of a station that has gone
+        summary = json.loads((first / "summary.json").read_text())
+        assert summary["verdict"] == "aborted"
+        ticks = read_ticks(first)
+        assert 0 <= killed_ns - ticks["due_ns"][-1] < 1e9
+        for options, flown in ((["--link-delay", "0.4"], "fly triangle5 with other links"), ([], "fly triangle5,")):
+            another = scenario if options else short(tmp_path, "chain3", 10.0)
+            refused = fly(another, "--listen", listen, "--out", tmp_path / "refused", *options)
+            out, err = refused.communicate(timeout=PATIENCE_S)
+            assert (refused.returncode, out, err.count("\n")) == (2, "", 1)
+            assert flown in err
+        again = fly(scenario, "--listen", listen, "--out", second, "--json")
+        out, err = again.communicate(timeout=PATIENCE_S)
+        assert (again.returncode, err) == (0, "")
+        summary = json.loads(out)
+        assert (summary["verdict"], summary["fleet"]) == ("stable", "taken over: they were there already")
+        assert not (second / "vehicles.log").exists()  # it started none
+        until(lambda: not children_named(str(first)))  # and has ended those it took over
+    finally:
+        for pid in children_named(str(first)):
+            os.kill(pid, signal.SIGTERM)
+
+
+def test_vehicles_at_a_port_that_nobody_listens_at_again_end_with_their_station(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = fly(short(tmp_path, "chain3", 60.0), "--listen", "127.0.0.1:0", "--out", folder)
+    until(lambda: flying(folder))
+    process.kill()
+    process.communicate(timeout=PATIENCE_S)
+    killed_s = time.monotonic()
+    until(lambda: not children_named(str(folder)))
+    assert time.monotonic() - killed_s < ORPHAN_S / 4
+
+
+def test_a_reader_that_leaves_neither_ends_nor_changes_a_flight(tmp_path: Path) -> None:
+    process = fly(short(tmp_path, "chain3", 4.0), "--listen", "127.0.0.1:0", "--out", tmp_path / "run")
+    assert process.stdout is not None
+    assert process.stderr is not None
+    assert process.stdout.readline().startswith("design")
+    process.stdout.close()  # as `gcs fly | head -1` does
+    assert (process.wait(PATIENCE_S), process.stderr.read()) == (0, "")
+    process.stderr.close()
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert (summary["verdict"], summary["not_logged"]) == ("stable", [])
+    assert (tmp_path / "run" / "flight.rrd").exists()
+
+
+def test_a_full_disk_ends_the_logs_and_not_the_flight(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = fly(short(tmp_path, "chain3", 4.0), "--listen", "127.0.0.1:0", "--out", folder)
+    until(lambda: flying(folder))
+    full_bytes = (folder / "ticks.part").stat().st_size + TICK.itemsize // 2  # within a record
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (full_bytes, full_bytes))
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, err) == (1, "")
+    assert "verdict  unknown: completed: duration reached" in out
+    assert "log      not written: ticks.part: File too large, from" in out
+    summary = json.loads((folder / "summary.json").read_text())
+    ended_s = read_ticks(folder)["time_s"][-1]
+    assert [text.split(":")[0] for text in summary["not_logged"]].count("ticks.part") == 1
+    assert 0.0 < ended_s < 3.5
+    # set-points went on to the end: three vehicles at 50 Hz
+    assert json.loads((folder / "vehicles.json").read_text())["setpoints"] > 3 * 50 * 3.5
+    events = [json.loads(line) for line in (folder / "events.jsonl").read_text().splitlines()]
+    assert [event["text"] for event in events if event["kind"] == "log"].count("ticks.part: File too large") == 1
+    assert events[-1]["kind"] == "end"
+    assert not children_named(str(folder))
+
+
+def test_vehicles_with_loops_of_their_own_keep_their_places_without_a_station_and_are_taken_back(
+    tmp_path: Path,
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    scenario, listen = short(tmp_path, "thesis_delay", 8.0), f"127.0.0.1:{free_port()}"
+    process = fly(scenario, "--listen", listen, "--out", first)
+    until(lambda: flying(first, 4.0))
+    process.kill()
+    process.communicate(timeout=PATIENCE_S)
+    try:
+        until(lambda: vehicles_log(first).count("failsafe") >= 3)
+        again = fly(scenario, "--listen", listen, "--out", second, "--json")
+        out, err = again.communicate(timeout=PATIENCE_S)
+        assert (again.returncode, err) == (0, "")
+        summary = json.loads(out)
+        assert (summary["verdict"], summary["loop"]) == ("stable", "onboard")
+        assert summary["settling_time_s"] == 0.0  # they had kept their places
+        # the links' 160 ms, and up to two periods until states of all vehicles are there
+        assert 0.16 < summary["loop_delay_s"]["p50"] < 0.2
+        assert summary["delay_margin_s"] == pytest.approx(1.00216, abs=1e-5)
+    finally:
+        for pid in children_named(str(first)):
+            os.kill(pid, signal.SIGTERM)
+
+
+def test_killed_vehicles_end_the_flight_with_the_station_saying_which(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    process = fly(short(tmp_path, "chain3", 60.0), "--listen", "127.0.0.1:0", "--out", folder)
+    until(lambda: flying(folder))
+    (pid,) = children_named(str(folder))
+    os.kill(pid, signal.SIGKILL)
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 1
+    assert "Traceback" not in err
+    for system_id in (1, 2, 3):
+        assert f"vehicle {system_id}: is lost" in out
+    assert "verdict  aborted: lost: all vehicles" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["fly", "nowhere.toml"], "nowhere.toml: file: read"),
+        (["fly", "scenarios/chain3.toml", "--listen", "here"], "wanted HOST:PORT"),
+        (["fly", "scenarios/chain3.toml", "--listen", "192.0.2.1:14550"], "wanted a free UDP port"),
+        (["fly", "scenarios/chain3.toml", "--link-delay", "-1"], "--link-delay: read -1"),
+        (["fly", "scenarios/chain3.toml", "--no-such-option"], "--no-such-option"),
+        (["view", "nowhere"], "nowhere"),
+        (["recover", "nowhere"], "wanted the folder of a run"),
+        (["nonsense"], "nonsense"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(arguments: list[str], wanted: str) -> None:
+    done = subprocess.run(
+        [*GCS, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False, cwd=SCENARIOS.parent
+    )
+    assert done.returncode == 2
+    assert wanted in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""

@@ -1,0 +1,54 @@
+"""Ctrl-C and a closed terminal at any moment, as sent to all processes of a command: no traceback, exit code 130."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import ROOT
+
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+
+STRESS = ["stress", "scenarios/chain3.toml", "--delay", "0.1:0.3:3", "--workers", "2", "--out"]
+FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module", "times", "number"),
+    [
+        (STRESS, "typer", 1, signal.SIGINT),
+        (STRESS, "numpy", 1, signal.SIGINT),
+        (STRESS, "site", 3, signal.SIGINT),  # a worker starts: this process and the tracker of resources have
+        (STRESS, "numpy", 2, signal.SIGINT),
+        (FLY, "numpy", 1, signal.SIGINT),
+        (FLY, "site", 2, signal.SIGINT),  # the observer starts
+        (STRESS, "numpy", 1, signal.SIGHUP),
+        (STRESS, "site", 3, signal.SIGHUP),
+        (STRESS, "numpy", 2, signal.SIGHUP),
+        (FLY, "site", 2, signal.SIGHUP),
+    ],
+)
+def test_ctrl_c_or_a_closed_terminal_while_a_command_or_its_workers_import_is_no_traceback(
+    arguments: list[str], module: str, times: int, number: signal.Signals, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "gcs", *arguments, str(tmp_path / "out")]
+    environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1"}  # each process tells what it has imported
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT, env=environment,
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        seen = 0
+        for line in process.stderr:
+            seen += line.split("|")[-1].strip() == module
+            if seen == times:
+                break
+        os.killpg(process.pid, number)
+        told = process.stderr.read()
+        code = process.wait(60)
+    assert (seen, code) == (times, 130)
+    assert "Traceback" not in told
+    assert "KeyboardInterrupt" not in told

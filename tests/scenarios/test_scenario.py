@@ -1,0 +1,171 @@
+"""Scenario files: what is accepted, and that everything else is refused in one line that says why."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from scenarios.errors import ScenarioError
+from scenarios.files import dump, fingerprint, load, parse
+from scenarios.schema import Scenario
+from tests.support.paths import SCENARIOS
+
+TRIANGLE = (SCENARIOS / "triangle5.toml").read_text(encoding="utf-8")
+FILE = Path("x.toml")
+
+
+@pytest.mark.parametrize("file", sorted(SCENARIOS.glob("*.toml")), ids=lambda file: file.stem)
+def test_every_scenario_in_the_repository_is_valid_and_survives_writing(file: Path) -> None:
+    scenario = load(file)
+    assert scenario.name == file.stem
+    assert parse(dump(scenario), FILE) == scenario
+
+
+def test_a_fingerprint_survives_writing_and_tells_links_seeds_and_scenarios_apart() -> None:
+    given = [load(file) for file in sorted(SCENARIOS.glob("*.toml"))]
+    assert all(fingerprint(parse(dump(scenario), Path("again"))) == fingerprint(scenario) for scenario in given)
+    first = given[0]
+    others = [first.with_link_delay(up_s=0.4, down_s=None), first.model_copy(update={"seed": first.seed + 1})]
+    found = {fingerprint(scenario) for scenario in (*given, *others)}
+    assert len(found) == len(given) + 2
+
+
+def test_triangle5_is_the_thesis_formation() -> None:
+    scenario = load(SCENARIOS / "triangle5.toml")
+    assert scenario.nominal_velocity_at(0.0) == (pytest.approx(300 * 0.3048), 0.0)
+    offsets = {v.system_id: (v.follows, v.offset_ne_m) for v in scenario.vehicles}
+    spacing = pytest.approx(400 * 0.3048)
+    assert offsets[1] == (None, None)
+    for right, left in ((2, 4), (3, 5)):
+        (ahead_right, right_offset), (ahead_left, left_offset) = offsets[right], offsets[left]
+        assert right_offset is not None
+        assert left_offset is not None
+        assert (-right_offset[0], right_offset[1]) == (spacing, spacing)
+        assert left_offset == (right_offset[0], -right_offset[1])
+        assert (ahead_right, ahead_left) in {(1, 1), (2, 4)}
+
+
+def test_leader_first_puts_every_vehicle_after_the_one_it_follows() -> None:
+    seen: set[int | None] = {None}
+    for vehicle in load(SCENARIOS / "triangle5.toml").leader_first():
+        assert vehicle.follows in seen
+        seen.add(vehicle.system_id)
+    assert seen == {None, 1, 2, 3, 4, 5}
+
+
+def test_nominal_velocity_is_piecewise_constant() -> None:
+    scenario = load(SCENARIOS / "triangle5_turns.toml")
+    headings = [scenario.nominal_velocity_at(t) for t in (-1.0, 0.0, 24.99, 25.0, 49.0, 50.0, 1e6)]
+    assert headings == [(45.72, -79.189)] * 3 + [(91.44, 0.0)] * 2 + [(45.72, 79.189)] * 2
+
+
+def test_link_delay_override_reaches_vehicles_with_links_of_their_own() -> None:
+    text = TRIANGLE + "\n[[links.vehicles]]\nsystem_id = 3\nup = { delay_s = 0.1 }\n"
+    scenario = parse(text, FILE)
+    assert [link.delay_s for link in scenario.link_of(3)] == [0.1, 0.02]
+    assert [link.delay_s for link in scenario.link_of(2)] == [0.02, 0.02]
+    other = scenario.with_link_delay(up_s=0.4, down_s=None)
+    assert [link.delay_s for link in other.link_of(3)] == [0.4, 0.02]
+
+
+BAD = {
+    "unknown key": ("follows = 1", "folows = 1", "vehicle 2: folows", "follows"),
+    "unknown section": ("[rates]", "[rate]", "rate", "rates"),
+    "wrong unit": ("up = { delay_s = 0.02 }", "up = { delay_ms = 20 }", "links.up.delay_ms", "delay_s"),
+    "wrong type": ("seed = 1", 'seed = "one"', "seed", "integer"),
+    "number as text": ("control_hz = 50.0", 'control_hz = "50"', "rates.control_hz", "number"),
+    "date": ("duration_s = 40.0", "duration_s = 2026-01-01", "duration_s", "number"),
+    "missing key": ("seed = 1\n", "", "seed", "a value"),
+    "short pair": ("[91.44, 0.0]", "[91.44]", "nominal_velocity[0].velocity_ne_m_s[1]", "a value"),
+    "not a number": ("[91.44, 0.0]", "[nan, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "finite"),
+    "infinite": ("duration_s = 40.0", "duration_s = inf", "duration_s", "finite"),
+    "beyond single precision": ("altitude_m = 1000.0", "altitude_m = 1e300", "altitude_m", "1000000"),
+    "far away": ("[-121.92, 121.92]", "[-1e300, 121.92]", "vehicle 2: offset_ne_m[0]", "-1000000"),
+    "faster than anything": ("[91.44, 0.0]", "[1e5, 0.0]", "nominal_velocity[0].velocity_ne_m_s[0]", "10000"),
+    "a delay of years": ("up = { delay_s = 0.02 }", "up = { delay_s = 1e9 }", "links.up.delay_s", "1000000"),
+    "negative delay": ("up = { delay_s = 0.02 }", "up = { delay_s = -0.02 }", "links.up.delay_s", "at least 0"),
+    "zero rate": ("telemetry_hz = 50.0", "telemetry_hz = 0.0", "rates.telemetry_hz", "at least 1"),
+    "unknown leader": ("follows = 1", "follows = 9", "vehicle 2: follows", "system_id of a vehicle"),
+    "itself": ("follows = 1", "follows = 2", "vehicles.follows", "tree"),
+    "cycle": ("follows = 1", "follows = 3", "vehicles.follows", "tree"),
+    "two with one id": ("system_id = 3", "system_id = 2", "vehicle in place 3: system_id", "another number"),
+    "id of a station": ("system_id = 3", "system_id = 255", "vehicle 255: system_id", "at most 250"),
+    "two leaders": ("follows = 1\noffset_ne_m = [-121.92, 121.92]\n", "", "vehicles.follows", "exactly one"),
+    "offset without leader": ("follows = 1\n", "", "vehicle 2: offset_ne_m", "neither"),
+    "no distance": ("[-121.92, 121.92]", "[0.0, 0.0]", "vehicle 2: offset_ne_m", "distance"),
+    "late first velocity": ("from_s = 0.0", "from_s = 1.0", "nominal_velocity[0].from_s", "0 for the first"),
+    "too slow to fly": ("[91.44, 0.0]  #", "[0.0, 0.0]  #", "nominal_velocity[0].velocity_ne_m_s", "speed"),
+    "unknown method": ('"inclusion"', '"magic"', "control.method", "inclusion"),
+    "alpha of one": ("delay_margin_s = 0.3", "alpha = 1.0", "control.alpha", "less than 1"),
+    "gains and requirement": (
+        "delay_margin_s = 0.3",
+        "delay_margin_s = 0.3\ngains = { K1 = -1.0, K2 = 0.0, K3 = 1.0 }",
+        "control.gains",
+        "either",
+    ),
+    "lists without end": ("seed = 1", "seed = " + "[" * 20000, "file", "valid TOML"),
+    "thousands of digits": ("seed = 1", "seed = " + "9" * 5000, "file", "valid TOML"),
+    "no TOML": ("seed = 1", "seed = = 1", "file", "valid TOML"),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "key", "wanted"), BAD.values(), ids=BAD)
+def test_bad_scenario_is_refused_with_file_key_and_what_was_wanted(old: str, new: str, key: str, wanted: str) -> None:
+    assert old in TRIANGLE
+    with pytest.raises(ScenarioError) as error:
+        parse(TRIANGLE.replace(old, new, 1), FILE)
+    line = str(error.value)
+    place, _, rest = line.partition(": read ")
+    assert "\n" not in line
+    assert place.startswith(f"x.toml: {key}")
+    assert wanted in rest.partition("wanted ")[2]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "wanted"),
+    [
+        ("[91.44, 0.0]", "[1.0, 2.0, 3.0]", "read [1.0, 2.0, 3.0], wanted a list of at most 2, not 3"),
+        ("seed = 1", "seed = 1.5", "read 1.5, wanted an integer"),
+        ("offset_ne_m = [-121.92, 121.92]", "offset_ne_m = 5", "read 5, wanted a list in brackets"),
+        ("control_hz = 50.0", "control_hz = 501.0", "read 501.0, wanted a number of at most 500"),
+        ('name = "triangle5"', 'name = "a b"', "read 'a b', wanted a name of letters, digits, - and _"),
+        ('name = "triangle5"', "name = 5", "read 5, wanted text in quotes"),
+        ("up = { delay_s = 0.02 }", "up = 5", "read 5, wanted a table of keys"),
+        ("up = { delay_s = 0.02 }", "up = { reordering = 1 }", "read 1, wanted true or false"),
+        ("up = { delay_s = 0.02 }", "up = { loss_probability = 2 }", "read 2, wanted a number of at most 1"),
+        ("delay_margin_s = 0.3", "delay_margin_s = 0.0", "read 0.0, wanted a number greater than 0"),
+    ],
+)
+def test_what_was_wanted_is_said_in_plain_words_with_the_line(old: str, new: str, wanted: str) -> None:
+    changed = TRIANGLE.replace(old, new, 1)
+    with pytest.raises(ScenarioError) as error:
+        parse(changed, FILE)
+    told = str(error.value)
+    assert wanted in told
+    number = next(k for k, line in enumerate(changed.splitlines(), 1) if new in line)
+    assert f"line {number})" in told
+
+
+def test_a_vehicle_is_named_by_its_system_id_and_its_line_is_told() -> None:
+    lines = TRIANGLE.splitlines()
+    at = [k for k, line in enumerate(lines) if line.startswith("system_id")][4]
+    lines.insert(at + 1, "colour = 1")
+    with pytest.raises(ScenarioError, match=rf"x\.toml: vehicle 5: colour \(unknown key, line {at + 2}\): read 1"):
+        parse("\n".join(lines), FILE)
+
+
+def test_every_error_that_the_schema_can_raise_has_words() -> None:
+    """Kinds of the schema's types, as pydantic's own core schema of it names them."""
+    kinds = set(re.findall(r"'type': '([a-z-]+)'", repr(Scenario.__pydantic_core_schema__)))
+    covered = {"model", "model-fields", "model-field", "default", "nullable", "int", "float", "bool", "str", "tuple"}
+    assert kinds <= covered | {"literal", "definitions", "definition-ref"}
+
+
+def test_links_of_an_unknown_vehicle_are_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"links of vehicle 9: system_id \(line \d+\): read 9"):
+        parse(TRIANGLE + "\n[[links.vehicles]]\nsystem_id = 9\n", FILE)
+
+
+def test_missing_file_is_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"nowhere\.toml: file: read .*No such file"):
+        load(Path("nowhere.toml"))

@@ -1,0 +1,344 @@
+"""What has to hold in every flight of the soak, whatever is flown and whatever goes wrong.
+
+Each check gives what it found broken, in words. Where a check has a tolerance, theory gives it, and the comment says
+how; where theory promises nothing (a clock that was set, a link that is random), nothing is checked.
+"""
+
+import json
+import math
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gains.core.errors import DisagreementError, GainsError, SolverError
+from gcs.control.limits import LARGEST_COMMAND_M_S2
+from gcs.control.tick import CLOCK_JUMPED, Mode
+from gcs.drive.flown import margins_of
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.runs.grade import instants, true_loop_delays_s
+from gcs.runs.summary import summarise
+from gcs.stress.measure import fly_trial
+from gcs.stress.trial import Trial, sparse_gain
+from scenarios.schema import Link, Scenario
+from sim_vehicles.links.truth import SAMPLED
+from tests.soak.soak_flight import Flown, Stretch, fly
+from tests.soak.soak_scenarios import Experiment
+
+ALWAYS = ("time_s", "due_ns", "sent_ns")
+WHEN_COMMANDED = (
+    "telemetry_age_s", "north_m", "east_m", "velocity_north_m_s", "velocity_east_m_s", "velocity_error_north_m_s",
+    "velocity_error_east_m_s", "command_north_m_s2", "command_east_m_s2", "up_delay_s", "sample_bound_s",
+    "clock_offset_s", "clock_offset_bound_s",
+)  # fmt: skip
+COUNTS = ("received", "late", "duplicate")
+"""These never go back; what was lost does when it comes late."""
+LEAST_CHANGE = 1e-6
+"""Part by which a limit may be exceeded: float32 on the wire has 6e-8."""
+
+
+@dataclass(frozen=True)
+class Broken:
+    """An invariant that does not hold."""
+
+    invariant: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of one experiment."""
+
+    broken: tuple[Broken, ...] = ()
+    refused: str = ""
+    """The scenario was not flown, and by what reason."""
+    ended: str = ""
+    """How the flight ended: the kind of its end, or what was judged of its margin."""
+
+
+def judge(experiment: Experiment) -> Result:
+    """Fly an experiment and check everything."""
+    try:
+        _, plan = flight_plan(experiment.scenario)
+    except DisagreementError as error:
+        return Result((Broken("independent methods agree", str(error)),))
+    except GainsError as error:
+        if isinstance(error, SolverError) and (experiment.scenario.control.gains or experiment.scenario.control.blocks):
+            return Result((Broken("given gains are flown", str(error)),))
+        return Result(refused=f"{type(error).__name__}: {str(error)[:60]}")
+    except Exception:  # noqa: BLE001 - whatever it is, it is what the soak looks for
+        return Result((_raised(experiment),))
+    try:
+        if experiment.margin_ratio is not None:
+            broken, ended = _margin_kept(plan, experiment.margin_ratio)
+        else:
+            flown = fly(experiment, plan)
+            broken = list(checked(flown))
+            if experiment.twice and fly(experiment, plan).sha256 != flown.sha256:
+                broken.append(Broken("the same bytes twice", "a second flight differs"))
+            ended = flown.stretches[-1].station.end_reason.split(":")[0]
+    except Exception:  # noqa: BLE001
+        return Result((_raised(experiment),))
+    return Result(tuple(broken), ended=ended)
+
+
+def _raised(experiment: Experiment) -> Broken:
+    return Broken("no exception", traceback.format_exc())
+
+
+def checked(flown: Flown) -> Iterator[Broken]:
+    """Everything that does not hold in a flight."""
+    limit = flown.plan.scenario.limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2
+    for asked in flown.set_points:
+        if asked.acceleration_m_s2 > limit * (1.0 + LEAST_CHANGE) or math.isinf(asked.velocity_m_s):
+            yield Broken("commands within limits", f"{asked} on the wire, limit {limit:g} m/s²")
+            break
+    sampled = instants(flown.truth, SAMPLED)
+    for stretch in flown.stretches:
+        commands = np.hypot(stretch.ticks["command_north_m_s2"], stretch.ticks["command_east_m_s2"])
+        if (commands > limit * (1.0 + LEAST_CHANGE)).any():
+            yield Broken("commands within limits", f"{np.nanmax(commands):g} m/s² in the ticks, limit {limit:g}")
+    for stretch, after in zip(flown.stretches, [*flown.stretches[1:], None], strict=True):
+        yield from _rows_complete(flown, stretch)
+        yield from _clocks_bounded(flown, stretch, sampled)
+        yield from _loop_delay_true(flown, stretch, until_ns=2**62 if after is None else after.start_ns)
+        yield from _ends_true(flown, stretch)
+        yield from _jumps_true(flown, stretch)
+
+
+def _rows_complete(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
+    """Every tick there, with a row for each vehicle, and in each row what has to be known."""
+
+    def incomplete(text: str) -> Broken:
+        return Broken("rows complete", text)
+
+    plan, ticks = flown.plan, stretch.ticks
+    ids = np.array(plan.formation.system_ids)
+    period_ns = round(1e9 / plan.scenario.rates.control_hz)
+    if ticks.shape[1] != len(ids) or (ticks["system_id"] != ids).any():
+        yield incomplete(f"the rows of a tick are not those of vehicles {ids.tolist()}")
+        return
+    if (np.diff(ticks["tick"][:, 0]) != 1).any() or (np.diff(ticks["due_ns"][:, 0]) != period_ns).any():
+        yield incomplete("ticks are left out")
+    for name in ("tick", *ALWAYS):
+        if (ticks[name] != ticks[name][:, :1]).any():
+            yield incomplete(f"{name} differs between the rows of a tick")
+    for name in ALWAYS:
+        if not np.isfinite(ticks[name]).all():
+            yield incomplete(f"{name} is not finite")
+    commanded = ticks[ticks["commanded"]]
+    for name in WHEN_COMMANDED:
+        if not np.isfinite(commanded[name]).all():
+            k = int(np.flatnonzero(~np.isfinite(commanded[name]))[0])
+            yield incomplete(f"{name} = {commanded[name][k]} at {commanded['time_s'][k]:.3f} s, where it is commanded")
+    if np.isfinite(ticks["command_north_m_s2"][~ticks["commanded"]]).any():
+        yield incomplete("a command where none was sent")
+    for name in COUNTS:
+        if (np.diff(ticks[name].astype(np.int64), axis=0) < 0).any():
+            yield incomplete(f"{name} goes back")
+    if not np.isin(ticks["mode"], [int(mode) for mode in Mode]).all():
+        yield incomplete("a mode that there is none of")
+
+
+def _clocks_bounded(flown: Flown, stretch: Stretch, sampled: dict[tuple[int, int], int]) -> Iterator[Broken]:
+    """Offsets and instants of samples are within their bounds of the truth, of clocks that nobody has set.
+
+    No tolerance but a microsecond for the rounding of stamps: the bounds follow from each exchange alone.
+    """
+    for row, system_id in enumerate(flown.plan.formation.system_ids):
+        rows = stretch.ticks[:, row]
+        rows = rows[rows["sent_ns"] < flown.steps_ns.get(system_id, 2**62)]
+        known = rows[np.isfinite(rows["clock_offset_bound_s"])]
+        clock = flown.clocks[system_id]
+        true_s = np.array([(clock.boot_ns(t) - t) * 1e-9 for t in known["sent_ns"].tolist()])
+        beyond_s = np.abs(known["clock_offset_s"] - true_s) - known["clock_offset_bound_s"]
+        # float64 seconds of 1e6 s have 1e-10
+        if beyond_s.size and beyond_s.max() > 1e-6:
+            k = int(beyond_s.argmax())
+            text = (
+                f"offset of vehicle {system_id} is {beyond_s[k]:.3g} s beyond its bound at {known['time_s'][k]:.3f} s"
+            )
+            yield Broken("clock bounds", text)
+        used = rows[np.isfinite(rows["sample_bound_s"]) & (rows["sample_ns"] > 0)]
+        keys = [(system_id, boot_ms) for boot_ms in used["sample_boot_ms"].tolist()]
+        if any(key not in sampled for key in keys):
+            yield Broken("clock bounds", f"vehicle {system_id} never sampled a state that was used")
+            continue
+        off_s = np.abs(used["sample_ns"] - np.array([sampled[key] for key in keys], dtype=np.int64)) * 1e-9
+        if off_s.size and (off_s - used["sample_bound_s"]).max() > 1e-6:
+            k = int((off_s - used["sample_bound_s"]).argmax())
+            text = f"sample of vehicle {system_id} off by {off_s[k]:.3g} s, bound {used['sample_bound_s'][k]:.3g} s"
+            yield Broken("clock bounds", f"{text}, at {used['time_s'][k]:.3f} s")
+
+
+def _loop_delay_true(flown: Flown, stretch: Stretch, *, until_ns: int) -> Iterator[Broken]:
+    """Where no delay varies, the measured loop delay is the true one.
+
+    What the offset of the clock is wrong by cancels. What remains is its drift between the exchange and the sample,
+    until the line through the exchanges has the slope: a second, and as long as five exchanges take. With loops on
+    board the state used may be another vehicle's, whose clock is wrong by something else: then the bounds hold.
+    """
+    scenario = flown.plan.scenario
+    if not _constant_delays(scenario):
+        return
+    ticks = stretch.ticks.ravel()
+    known = (flown.truth["time_ns"] >= stretch.start_ns) & (flown.truth["time_ns"] < until_ns)
+    error_s = np.abs(ticks["loop_delay_s"] - true_loop_delays_s(ticks, flown.truth[known]))
+    if scenario.control.loop == "onboard":
+        error_s -= np.repeat(np.nanmax(stretch.ticks["sample_bound_s"], axis=1, initial=0.0), len(scenario.vehicles))
+        error_s -= ticks["down_bound_s"]
+    first_step_ns = min(flown.steps_ns.values(), default=2**62)
+    error_s = error_s[ticks["sent_ns"] < first_step_ns]
+    rates = scenario.rates
+    gap_s = 3.0 + 10.0 / min(rates.timesync_hz, rates.control_hz) + 2.0 * _longest_round_trip_s(scenario)
+    longest_s = gap_s + sum(min(fault_s, 10.0) for fault_s in _silences_s(flown))
+    tolerance_s = 2e-6 + 1e-6 * scenario.clocks.drift_max_ppm * longest_s
+    known = np.isfinite(error_s)
+    if known.any() and error_s[known].max() > tolerance_s:
+        k = int(np.nanargmax(error_s))
+        text = f"off by {error_s[k]:.3g} s (tolerance {tolerance_s:.2g} s) of vehicle {ticks['system_id'][k]}"
+        yield Broken("loop delay", f"{text} at {ticks['time_s'][k]:.3f} s")
+
+
+def _silences_s(flown: Flown) -> list[float]:
+    outages = [o.until_s - o.from_s for link in _links(flown.plan.scenario) for o in link.outages]
+    return [*outages, *flown.silences_s]
+
+
+def _constant_delays(scenario: Scenario) -> bool:
+    return all(link.jitter is None and not link.delay_points and link.channel is None for link in _links(scenario))
+
+
+def _links(scenario: Scenario) -> list[Link]:
+    return [link for vehicle in scenario.vehicles for link in scenario.link_of(vehicle.system_id)]
+
+
+def _longest_round_trip_s(scenario: Scenario) -> float:
+    return max(up.delay_s + down.delay_s for up, down in (scenario.link_of(v.system_id) for v in scenario.vehicles))
+
+
+def _jumps_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
+    """No clock is said to have jumped that nobody has set, where no delay varies."""
+    if not _constant_delays(flown.plan.scenario) or flown.plan.scenario.clocks.drift_max_ppm > 400.0:
+        return
+    for event in stretch.station.events:
+        if event.text == CLOCK_JUMPED and event.system_id not in flown.steps_ns:
+            yield Broken("clock jumps", f"vehicle {event.system_id} at {event.time_s:.3f} s, whose clock was not set")
+
+
+def _ends_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
+    """What is said of the end is so in truth: collisions, settled or not, and a summary that is JSON."""
+    scenario = flown.plan.scenario
+    log = stretch.flight()
+    design = margins_of(stretch.station.plan)
+    summary = summarise(scenario, design, log.ticks, log.events)
+    json.dumps(summary, allow_nan=False)
+    if stretch.replaced or not stretch.states_at_end:
+        return
+    for system_id, state in stretch.states_at_end.items():
+        if not np.isfinite(state).all():
+            yield Broken("states finite", f"vehicle {system_id}: {state}")
+            return
+    reason = stretch.station.end_reason
+    at_end = stretch.ticks[stretch.ticks["due_ns"][:, 0] == stretch.ended_ns][0]
+    place = {v.system_id: np.array(stretch.states_at_end[v.system_id][:2]) for v in scenario.vehicles}
+    away_m = _extrapolated_m(flown, stretch, at_end)
+    if "have collided" in reason:
+        one, two = (int(word) for word in reason.split("vehicles ")[1].split(" have")[0].split(" and "))
+        true_m = float(np.hypot(*(place[one] - place[two])))
+        allowed_m = scenario.safety.collision_distance_m + away_m[one] + away_m[two]
+        if true_m > allowed_m:
+            yield Broken("collision", f"{reason}, in truth {true_m:.2f} m (tolerance {allowed_m:.2f} m)")
+    if _was_opened(stretch):
+        return
+    errors = dict(_true_errors_m(stretch, scenario, place, away_m, at_end))
+    if reason.startswith("broken: spacing"):
+        system_id = int(reason.split("vehicle ")[1].split()[0])
+        true_m, off_m = errors[system_id]
+        if true_m + off_m < scenario.safety.spacing_error_limit_m:
+            yield Broken("verdict", f"{reason}; in truth {true_m:.2f} m (± {off_m:.2f} m)")
+    if reason.startswith("completed"):
+        fraction = scenario.safety.settled_fraction
+        bands_m = {v.system_id: fraction * math.hypot(*v.offset_ne_m) for v in scenario.vehicles if v.offset_ne_m}
+        beyond = [i for i, (true_m, off_m) in errors.items() if true_m - off_m > bands_m[i]]
+        within = all(true_m + off_m < bands_m[i] for i, (true_m, off_m) in errors.items())
+        if (summary["verdict"] == "stable" and beyond) or (summary["verdict"] == "unstable" and within):
+            text = {
+                i: f"{true_m:.3f} ± {off_m:.3f} m, band {bands_m[i]:.3f} m" for i, (true_m, off_m) in errors.items()
+            }
+            yield Broken("verdict", f"{summary['verdict']}; errors in truth at the end: {text}")
+
+
+def _true_errors_m(
+    stretch: Stretch, scenario: Scenario, place: dict[int, Any], away_m: dict[int, float], at_end: np.ndarray[Any, Any]
+) -> Iterator[tuple[int, tuple[float, float]]]:
+    """Spacing errors of the followers when the end was decided, and how far from them measured ones may be.
+
+    The measured error is of the instant of the newest state: what both can be off at that, and their relative velocity
+    since.
+    """
+    age_s = {int(row["system_id"]): float(row["telemetry_age_s"]) for row in at_end}
+    for v in scenario.vehicles:
+        if v.follows is not None and v.offset_ne_m is not None:
+            own, ahead = stretch.states_at_end[v.system_id], stretch.states_at_end[v.follows]
+            error = place[v.system_id] - place[v.follows] - np.array(v.offset_ne_m)
+            apart_m_s = math.hypot(own[2] - ahead[2], own[3] - ahead[3])
+            off_m = 2.0 * (away_m[v.system_id] + away_m[v.follows]) + apart_m_s * age_s[v.system_id]
+            yield v.system_id, (float(np.hypot(*error)), off_m if math.isfinite(off_m) else math.inf)
+
+
+def _was_opened(stretch: Stretch) -> bool:
+    """Whether somebody was in trouble: the wanted spacing may have been another one."""
+    flown = stretch.ticks[stretch.ticks["time_s"] >= 0.0]
+    return bool(np.isin(flown["mode"], [Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST]).any())
+
+
+def _extrapolated_m(flown: Flown, stretch: Stretch, at_end: np.ndarray[Any, Any]) -> dict[int, float]:
+    """How far each vehicle can be from where its newest state, carried on with its velocity, puts it.
+
+    With no acceleration beyond A since a state that is T old: A T² / 2, and its speed times what T can be wrong by.
+    A is the most that was commanded, and what a vehicle does by itself: its own loop, and the way to a velocity.
+    """
+    scenario, ticks = flown.plan.scenario, stretch.ticks
+    sent = np.hypot(ticks["command_north_m_s2"], ticks["command_east_m_s2"])
+    speed = np.hypot(ticks["velocity_north_m_s"], ticks["velocity_east_m_s"])
+    fastest = float(np.nanmax(speed, initial=0.0)) + max(
+        (math.hypot(*state[2:]) for state in stretch.states_at_end.values()), default=0.0
+    )
+    strongest = float(np.nanmax(sent, initial=0.0)) + 2.0 * fastest
+    if scenario.dynamics == "autopilot":
+        strongest = scenario.autopilot.acceleration_max_m_s2
+    elif scenario.control.loop == "onboard":
+        strongest = scenario.limits.acceleration_max_m_s2 or 20_000.0
+    found: dict[int, float] = {}
+    for row in at_end:
+        age_s = float(row["telemetry_age_s"]) + float(row["sample_bound_s"])
+        wrong_m = fastest * float(row["sample_bound_s"]) + 0.01
+        found[int(row["system_id"])] = strongest * age_s**2 + wrong_m if math.isfinite(age_s) else math.inf
+    return found
+
+
+def _margin_kept(plan: FlightPlan, ratio: float) -> tuple[list[Broken], str]:
+    """Errors die away below nine tenths of the plan's margin, and grow above eleven tenths.
+
+    Judged by the growth rate that a campaign's probe fits to a flight in virtual time, at the loop delay it had.
+    """
+    scenario = plan.scenario
+    margin_s = plan.delay_margin_s
+    wanted_s = ratio * min(margin_s, 2.0) - 0.5 / scenario.rates.control_hz
+    if wanted_s <= 0.0:
+        return [], "margin: below half a period"
+    delayed = scenario.with_link_delay(up_s=wanted_s / 2.0, down_s=wanted_s / 2.0)
+    found = fly_trial(Trial(delayed, sparse_gain(plan.gain), margin_s, "probe"))
+    if found.error is not None:
+        return [Broken("no exception", found.error)], ""
+    if found.growth_1_s is None or found.loop_delay_s is None:
+        return [], "margin: no growth could be fitted"
+    share, growth = found.loop_delay_s / margin_s, found.growth_1_s
+    text = f"grows by {growth:.4f} 1/s (± {found.growth_error_1_s}) at {share:.3f} of the margin of {margin_s:.4f} s"
+    if (share < 0.9 and growth > 0.0) or (share > 1.1 and growth < 0.0):
+        return [Broken("margin", text)], ""
+    return [], "margin: stable below" if share < 0.9 else "margin: unstable above" if share > 1.1 else "margin: near it"

@@ -1,0 +1,108 @@
+"""Some flights of the soak break no invariant, and it sees one that is broken.
+
+`python3 make.py soak --flights 10000 --seed 1` flies more. Each test flies a part, so that they share the processors.
+"""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from gcs.plan.planner import flight_plan
+from scenarios import files, schema
+from scenarios.schema import Clocks, Control, FixedGains, Limits
+from tests.soak.soak_checks import checked, judge
+from tests.soak.soak_flight import Flown, fly
+from tests.soak.soak_scenarios import Experiment, experiment, whole
+from tests.support.paths import SCENARIOS
+
+SEED, PARTS, FLIGHTS = 20, 20, 10
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_random_flights_break_no_invariant(part: int) -> None:
+    found = {number: judge(experiment(SEED, number)).broken for number in range(part * FLIGHTS, (part + 1) * FLIGHTS)}
+    assert {number: list(broken) for number, broken in found.items()} == {number: [] for number in found}
+
+
+@cache
+def calm_flight() -> Flown:
+    scenario = files.load(SCENARIOS / "chain3.toml")
+    changes = {
+        "duration_s": 2.0,
+        "control": Control(gains=FixedGains(K1=-3.4, K2=0.6, K3=5.6)),
+        "limits": Limits(acceleration_max_m_s2=400.0),
+    }
+    scenario = scenario.model_copy(update=changes)
+    return fly(Experiment(scenario), flight_plan(scenario)[1])
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "invariant"),
+    [
+        ("loop_delay_s", 0.05, "loop delay"),
+        ("clock_offset_s", 7.0, "clock bounds"),
+        ("sample_ns", 10**9, "clock bounds"),
+        ("command_north_m_s2", 401.0, "commands within limits"),
+        ("command_east_m_s2", float("nan"), "rows complete"),
+        ("late", 7, "rows complete"),
+        ("tick", 3, "rows complete"),
+    ],
+)
+def test_a_wrong_value_in_one_row_is_seen(column: str, value: float, invariant: str) -> None:
+    flown = calm_flight()
+    assert list(checked(flown)) == []
+    [stretch] = flown.stretches
+    ticks = stretch.ticks.copy()
+    ticks[column][len(ticks) // 2, 1] = value
+    broken = list(checked(replace(flown, stretches=[replace(stretch, ticks=ticks)])))
+    assert [one.invariant for one in broken] == [invariant]
+
+
+@pytest.mark.parametrize(
+    "reason", ["broken: vehicles 1 and 2 have collided, 0.3 m apart", "completed: duration reached"]
+)
+def test_an_end_that_is_not_so_in_truth_is_seen(reason: str) -> None:
+    """Vehicles on their places have not collided, and vehicles far off them have not settled."""
+    flown = calm_flight()
+    [stretch] = flown.stretches
+    states = dict(stretch.states_at_end)
+    if reason.startswith("completed"):
+        ticks = stretch.ticks.copy()
+        for axis in ("north", "east"):
+            ticks[f"spacing_error_{axis}_m"][:, 1:] = 0.0
+        states[2] = (states[2][0] + 50.0, *states[2][1:])
+        stretch = replace(stretch, ticks=ticks)
+    said = stretch.station.end_reason
+    stretch.station.end_reason = reason
+    broken = list(checked(replace(flown, stretches=[replace(stretch, states_at_end=states)])))
+    stretch.station.end_reason = said
+    assert [one.invariant for one in broken] == ["verdict" if reason.startswith("completed") else "collision"]
+
+
+def test_a_key_that_the_soak_does_not_draw_is_named() -> None:
+    with pytest.raises(AssertionError, match=r"Clocks differ in the keys \['drift_max_ppm'\]"):
+        whole(Clocks, offset_max_s=1.0)
+
+
+def test_every_part_of_the_schema_is_drawn() -> None:
+    """A part that no flight has would be one whose keys nobody checks."""
+
+    def parts(value: object) -> set[str]:
+        if isinstance(value, BaseModel):
+            return {type(value).__name__}.union(*(parts(getattr(value, name)) for name in type(value).model_fields))
+        return set().union(*(parts(one) for one in value)) if isinstance(value, tuple) else set()
+
+    drawn = set().union(*(parts(experiment(SEED, number).scenario) for number in range(60)))
+    assert drawn == {one.__name__ for one in schema.Part.__subclasses__()}
+
+
+def test_an_experiment_is_read_back_as_it_was_saved(tmp_path: Path) -> None:
+    for number in range(20):
+        drawn = experiment(SEED, number)
+        file = tmp_path / f"{number}.toml"
+        drawn.save(file)
+        assert Experiment.load(file) == drawn
+        assert files.load(file) == drawn.scenario

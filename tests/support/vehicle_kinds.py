@@ -1,0 +1,21 @@
+"""The three kinds of simulated vehicles for tests that hold for all of them."""
+
+from collections.abc import Callable
+
+from scenarios.schema import Autopilot, Flavour
+from sim_vehicles.vehicles.copter import Copter, multicopter
+from sim_vehicles.vehicles.shell import Craft, Shell
+from tests.support.sim_client import START, a_vehicle, scenario
+
+
+def copter(flavour: Flavour) -> Shell[Copter]:
+    """A multicopter on the ground at START."""
+    flown = scenario().model_copy(update={"dynamics": "autopilot", "autopilot": Autopilot(flavour=flavour)})
+    return multicopter(flown, flown.vehicles[0], START)
+
+
+VEHICLES: dict[str, Callable[[], Shell[Craft]]] = {
+    "plain": a_vehicle,
+    "ardupilot": lambda: copter("ardupilot"),
+    "px4": lambda: copter("px4"),
+}
