@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from gains.delay.commensurate import circle_sweep_margin
+from gains.delay._commensurate import circle_sweep_margin
 from gains.delay.constant import analyse_delay, delay_margin, frequency_sweep_margin
 from gains.delay.rightmost import rightmost_root
 from gains.margin.model_file import parse_model
