@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gcs.errors import InputError
-from gcs.runs.record import TRUTH_FILE
-from gcs.runs.files import read_ticks
 from gcs.control.tick import TickArray
+from gcs.errors import InputError
+from gcs.runs.files import read_ticks
+from gcs.runs.record import TRUTH_FILE
 from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
 
 Truth = NDArray[np.void]
