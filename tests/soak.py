@@ -1,6 +1,6 @@
 """Fly random experiments in virtual time and check that invariants hold: `python3 make.py soak --flights 1000`.
 
-Each flight is drawn from the seed and its number (`soak_scenarios.py`), flown through the product's own driver with
+Each flight is drawn from the seed and its number (`soak_experiments.py`), flown through the product's own driver with
 real bytes (`soak_flight.py`) and checked (`soak_checks.py`). What breaks an invariant is written to a folder, and flown
 again with `--only NUMBER` or `--fly FILE`. Exit code 1 if one is broken.
 """
@@ -19,8 +19,8 @@ import gcs
 
 assert gcs.__doc__  # importing it keeps BLAS to one thread, which has to happen before numpy is loaded
 
-from soak_checks import Result, judge  # noqa: E402
-from soak_scenarios import Experiment, experiment  # noqa: E402
+from soak_experiments import Experiment, experiment  # noqa: E402
+from soak_judge import Result, judge  # noqa: E402
 
 BATCH = 8
 """Flights that a process takes at a time."""

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from soak_scenarios import AUTOPILOT_START_S, Experiment, Fault
+from soak_experiments import Experiment, Fault
+from soak_scenarios import AUTOPILOT_START_S
 from test_fuzz import TO_VEHICLES, any_message, changed, noise
 
 from gcs.flown import Flight

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
-from soak_checks import checked, judge
+from soak_checks import checked
+from soak_experiments import Experiment, experiment, whole
 from soak_flight import Flown, fly
-from soak_scenarios import Experiment, experiment, whole
+from soak_judge import judge
 
 from gcs.plan import flight_plan
 from scenarios import files, schema
