@@ -56,9 +56,11 @@ class Response:
                 raise BadModelError(f"{name} = {value}; wanted a number of at least {least:g}")
 
     def transfer(self, omega: FloatArray) -> NDArray[np.complex128]:
-        """a / u at jω, from wanted to real acceleration: (s + g) / (lag s² + s + g), where g = 0 without the s in both."""
+        """a / u at jω, from wanted to real acceleration: (s + g) / (lag s² + s + g)."""
         s, g = 1j * omega, self.velocity_gain_1_s
-        return (s + g) / (self.lag_s * s**2 + s + g) if g > 0.0 else 1.0 / (self.lag_s * s + 1.0)
+        if g == 0.0:  # s in both
+            return np.reciprocal(self.lag_s * s + 1.0)
+        return (s + g) / (self.lag_s * s**2 + s + g)
 
 
 def formation_loop(

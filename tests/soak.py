@@ -9,6 +9,7 @@ import argparse
 import os
 import sys
 import time  # noqa: TID251 - it tells how long it will take
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -22,6 +23,7 @@ assert gcs.__doc__  # importing it keeps BLAS to one thread, which has to happen
 from soak_experiments import Experiment, experiment  # noqa: E402
 from soak_judge import Result, judge  # noqa: E402
 
+warnings.simplefilter("error")
 BATCH = 8
 """Flights that a process takes at a time."""
 

@@ -25,8 +25,9 @@ ALWAYS = ("time_s", "due_ns", "sent_ns")
 WHEN_COMMANDED = (
     "telemetry_age_s", "north_m", "east_m", "velocity_north_m_s", "velocity_east_m_s", "velocity_error_north_m_s",
     "velocity_error_east_m_s", "command_north_m_s2", "command_east_m_s2", "up_delay_s", "sample_bound_s",
-    "clock_offset_s", "clock_offset_bound_s",
 )  # fmt: skip
+OF_CLOCKS = ("clock_offset_s", "clock_offset_bound_s")
+"""Known of a vehicle that is commanded unless its clock was set: then from the next exchange on."""
 COUNTS = ("received", "late", "duplicate")
 """These never go back; what was lost does when it comes late."""
 LEAST_CHANGE = 1e-6
@@ -55,6 +56,7 @@ def checked(flown: Flown) -> Iterator[Broken]:
             yield Broken("commands within limits", f"{np.nanmax(commands):g} m/s² in the ticks, limit {limit:g}")
     for stretch, after in zip(flown.stretches, [*flown.stretches[1:], None], strict=True):
         yield from _rows_complete(flown, stretch)
+        yield from _commands_explained(flown, stretch)
         yield from _repetitions_true(flown, stretch)
         yield from _clocks_bounded(flown, stretch, sampled)
         yield from _loop_delay_true(flown, stretch, until_ns=2**62 if after is None else after.start_ns)
@@ -82,18 +84,31 @@ def _rows_complete(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
     for name in ALWAYS:
         if not np.isfinite(ticks[name]).all():
             yield incomplete(f"{name} is not finite")
-    commanded = ticks[ticks["commanded"]]
-    for name in WHEN_COMMANDED:
-        if not np.isfinite(commanded[name]).all():
-            k = int(np.flatnonzero(~np.isfinite(commanded[name]))[0])
-            yield incomplete(f"{name} = {commanded[name][k]} at {commanded['time_s'][k]:.3f} s, where it is commanded")
-    if np.isfinite(ticks["command_north_m_s2"][~ticks["commanded"]]).any():
-        yield incomplete("a command where none was sent")
     for name in COUNTS:
         if (np.diff(ticks[name].astype(np.int64), axis=0) < 0).any():
             yield incomplete(f"{name} goes back")
     if not np.isin(ticks["mode"], [int(mode) for mode in Mode]).all():
         yield incomplete("a mode that there is none of")
+
+
+def _commands_explained(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
+    """Whoever is commanded is known, and nobody else has a command."""
+
+    def incomplete(text: str) -> Broken:
+        return Broken("rows complete", text)
+
+    ticks = stretch.ticks
+    commanded = ticks[ticks["commanded"]]
+    for name in WHEN_COMMANDED:
+        if not np.isfinite(commanded[name]).all():
+            k = int(np.flatnonzero(~np.isfinite(commanded[name]))[0])
+            yield incomplete(f"{name} = {commanded[name][k]} at {commanded['time_s'][k]:.3f} s, where it is commanded")
+    never_set = commanded[~np.isin(commanded["system_id"], list(flown.steps_ns))]
+    for name in OF_CLOCKS:
+        if not np.isfinite(never_set[name]).all():
+            yield incomplete(f"{name} is unknown of a vehicle that is commanded and whose clock nobody has set")
+    if np.isfinite(ticks["command_north_m_s2"][~ticks["commanded"]]).any():
+        yield incomplete("a command where none was sent")
 
 
 def _repetitions_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
