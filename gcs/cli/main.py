@@ -96,6 +96,7 @@ def fly(
     from gcs.drive.fly import fly as fly_now
     from gcs.drive.takeover import CONNECTED, TAKEN_OVER, Presence
     from gcs.plan.planner import flight_plan
+    from gcs.views.report import print_design, print_summary
 
     outlive_readers()
     scenario = load_with_loop(scenario_file, loop)
@@ -121,7 +122,7 @@ def fly(
         there = Presence(link, plan.scenario, guard)
         taken_over = there.taken_over() if connect is None else []
         if not as_json:
-            _print_design(design)
+            print_design(design)
         folder = out_folder(out) if out is not None else new_folder(scenario.name)
         options = FlyOptions(
             folder=folder,
@@ -136,8 +137,6 @@ def fly(
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
     else:
-        from gcs.views.report import print_summary
-
         print_summary(summary, folder)
     raise typer.Exit(_exit_code(summary))
 
@@ -155,6 +154,7 @@ def design(
     """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
     from gcs.drive.preflight import unstable_loop
     from gcs.plan.planner import flight_plan
+    from gcs.views.report import print_design
 
     scenario = load_with_loop(scenario_file, loop)
     if method is not None:
@@ -164,9 +164,9 @@ def design(
     if (unstable := unstable_loop(plan)) is not None:
         _refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
     if as_json:
-        typer.echo(json.dumps(result, indent=2))
+        typer.echo(json.dumps(result.to_dict(), indent=2))
     else:
-        _print_design(result)
+        print_design(result)
 
 
 @app.command()
@@ -420,12 +420,6 @@ def _refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
     if not allow:
         refuse(file, finding)
     print(f"warning: {file}: {finding}", file=sys.stderr)
-
-
-def _print_design(result: dict[str, Any]) -> None:
-    from gcs.views.report import print_design
-
-    print_design(result)
 
 
 def _exit_code(summary: dict[str, Any]) -> int:

@@ -4,7 +4,7 @@ What a design says of them without delay says little of a flight: `gains.perform
 flown.
 """
 
-from typing import Any
+from math import inf
 
 import numpy as np
 
@@ -12,9 +12,8 @@ from gains.core.requirement import plain
 from gains.performance.flown_loop import ALPHA_KEPT, FlownLoop
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
+from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay
 from scenarios.schema import Jitter, Link, Scenario
-
-_GAINS = ("K1_1_s", "K2_1_s", "K3_1_s2")
 
 
 def expected_loop_delay_s(scenario: Scenario) -> float:
@@ -49,7 +48,7 @@ def _mean_jitter_s(jitter: Jitter) -> float:
             return 0.0
 
 
-def with_figures_at_delay(design: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
+def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
     """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole.
 
     Gains on a pattern have none of it: there errors do not run down a chain.
@@ -57,52 +56,56 @@ def with_figures_at_delay(design: dict[str, Any], scenario: Scenario) -> dict[st
     loops = _flown_loops(design)
     if not loops:
         return design
-    requirement: dict[str, Any] = design["requirement"] or {}
-    peak: float = requirement.get("string_peak_max") or 1.0
+    requirement = design.requirement
+    peak = (requirement and requirement.string_peak_max) or 1.0
     # of different vehicles the one that leaves least
-    alpha = requirement.get("alpha") or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
-    return design | {
-        "at_loop_delay": {
-            **figures_at(design, expected_loop_delay_s(scenario)),
-            "alpha_kept": alpha,
-            "alpha_kept_to_s": plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
-            "string_peak_kept": peak,
-            "string_peak_kept_to_s": plain(min(loop.string_limit_s(peak) for loop in loops)),
-        }
-    }
+    alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
+    flown = figures_at(design, expected_loop_delay_s(scenario))
+    kept = FiguresAtExpectedDelay(
+        loop_delay_s=flown.loop_delay_s,
+        alpha=flown.alpha,
+        string_peak=flown.string_peak,
+        alpha_kept=alpha,
+        alpha_kept_to_s=plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
+        string_peak_kept=peak,
+        string_peak_kept_to_s=plain(min(loop.string_limit_s(peak) for loop in loops)),
+    )
+    return design.model_copy(update={"at_loop_delay": kept})
 
 
-def figures_at(design: dict[str, Any], delay_s: float | None, gain_set: int = 0) -> dict[str, float | None]:
+def figures_at(design: Design, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
     """Loop delay, α and string peak of a design's gain set at a loop delay (s); None where unknown or unbounded."""
     loops = [] if delay_s is None else _flown_loops(design, gain_set)
     if not loops or delay_s is None:
-        return {"loop_delay_s": delay_s, "alpha": None, "string_peak": None}
-    return {
-        "loop_delay_s": delay_s,
-        "alpha": min(loop.alpha(delay_s) for loop in loops),
-        "string_peak": plain(max(loop.string_peak(delay_s) for loop in loops)),
-    }
+        return FiguresAtDelay(loop_delay_s=delay_s)
+    return FiguresAtDelay(
+        loop_delay_s=delay_s,
+        alpha=min(loop.alpha(delay_s) for loop in loops),
+        string_peak=plain(max(loop.string_peak(delay_s) for loop in loops)),
+    )
 
 
-def _flown_loops(design: dict[str, Any], gain_set: int = 0) -> list[FlownLoop]:
+def _flown_loops(design: Design, gain_set: int = 0) -> list[FlownLoop]:
     """The loops of the followers of an inclusion design, one for each way in which vehicles answer; else none."""
-    if any(name not in design for name in _GAINS) or design["vehicles"] < 2:
+    gains = design.inclusion_gains
+    if gains is None or design.vehicles < 2:
         return []
-    entry: dict[str, Any] = design["schedule"][gain_set] if design.get("schedule") else design
-    own, front, spacing = (float(entry.get(name, design[name])[0][0]) for name in _GAINS)
+    share, margin_s = 1.0, design.delay_margin_s
+    if design.schedule:
+        entry = design.schedule[gain_set]
+        share, margin_s = entry.streamed_share, entry.delay_margin_s
+        gains = entry.K1_1_s or gains[0], entry.K2_1_s or gains[1], entry.K3_1_s2 or gains[2]
+    own, front, spacing = (gain[0][0] for gain in gains)
     if not (own < 0.0 < spacing):
         return []
-    margin_s = entry["delay_margin_s"]
-    onboard = design["loop"] == "onboard"
-    response: dict[str, Any] = design.get("response") or {}
-    answers = {(v["lag_s"], v["velocity_gain_1_s"]) for v in response.get("vehicles", [])}
+    answers = {(v.lag_s, v.velocity_gain_1_s) for v in (design.response.vehicles if design.response else ())}
     return [
         FlownLoop(
-            ScalarGains(-own, front * entry.get("streamed_share", 1.0), spacing, 0.0),
-            delay_margin_s=float("inf") if margin_s is None else float(margin_s),
-            period_s=float(design["period_s"]),
-            loop="onboard" if onboard else "ground",
-            step_s=1.0 / design["onboard"]["rate_hz"] if onboard else 0.0,
+            ScalarGains(-own, front * share, spacing, 0.0),
+            delay_margin_s=inf if margin_s is None else margin_s,
+            period_s=design.period_s,
+            loop=design.loop,
+            step_s=1.0 / design.onboard.rate_hz if design.onboard else 0.0,
             response=None if answer is None else Response(*answer),
         )
         for answer in sorted(answers) or [None]

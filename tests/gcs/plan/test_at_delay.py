@@ -5,6 +5,7 @@ import pytest
 
 from gcs.drive.flown import fly_virtual
 from gcs.plan.at_delay import expected_loop_delay_s, figures_at
+from gcs.plan.design import Design, FiguresAtDelay
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.views.table import FlightState, plain_line
@@ -17,24 +18,27 @@ TRIANGLE = load(ROOT / "scenarios/triangle5.toml")
 
 def test_a_design_tells_alpha_and_growth_at_the_delay_of_its_links_and_how_far_they_hold() -> None:
     late = TRIANGLE.with_link_delay(up_s=0.12, down_s=0.12)
-    flown = flight_plan(late)[0]["at_loop_delay"]
-    assert flown["loop_delay_s"] == pytest.approx(0.25)
-    assert flown["alpha"] == pytest.approx(0.312, abs=5e-4)
-    assert flown["string_peak"] == pytest.approx(2.49, abs=5e-3)
-    assert flown["string_peak_kept"] == 1.0
-    assert flown["string_peak_kept_to_s"] == pytest.approx(0.1607, abs=1e-4)
-    assert 0.15 < flown["alpha_kept_to_s"] < 0.17
-    beyond = flight_plan(TRIANGLE.with_link_delay(up_s=0.2, down_s=0.2))[0]["at_loop_delay"]
-    assert (beyond["alpha"], beyond["string_peak"]) == (0.0, None)
+    flown = flight_plan(late)[0].at_loop_delay
+    assert flown is not None
+    assert flown.alpha_kept_to_s is not None
+    assert flown.loop_delay_s == pytest.approx(0.25)
+    assert flown.alpha == pytest.approx(0.312, abs=5e-4)
+    assert flown.string_peak == pytest.approx(2.49, abs=5e-3)
+    assert flown.string_peak_kept == 1.0
+    assert flown.string_peak_kept_to_s == pytest.approx(0.1607, abs=1e-4)
+    assert 0.15 < flown.alpha_kept_to_s < 0.17
+    beyond = flight_plan(TRIANGLE.with_link_delay(up_s=0.2, down_s=0.2))[0].at_loop_delay
+    assert beyond is not None
+    assert (beyond.alpha, beyond.string_peak) == (0.0, None)
 
 
 def test_a_slower_gain_set_is_judged_as_the_design_slowed_down() -> None:
     design, _ = flight_plan(TRIANGLE)
     # slowed down by 2 all but the hold does the same in twice the time: 2 (0.2 + 0.01) - 0.01
     fast, slow = figures_at(design, 0.2), figures_at(design, 0.41, gain_set=1)
-    assert fast["string_peak"] is not None
-    assert slow["string_peak"] == pytest.approx(fast["string_peak"], rel=1e-6)
-    assert figures_at({"delay_margin_s": 0.3}, 0.1) == {"loop_delay_s": 0.1, "alpha": None, "string_peak": None}
+    assert fast.string_peak is not None
+    assert slow.string_peak == pytest.approx(fast.string_peak, rel=1e-6)
+    assert figures_at(Design(delay_margin_s=0.3), 0.1) == FiguresAtDelay(loop_delay_s=0.1)
 
 
 def test_the_expected_loop_delay_is_that_of_the_slowest_links_and_half_a_telemetry_period() -> None:
@@ -58,7 +62,7 @@ def test_table_and_summary_tell_both_at_the_loop_delay_that_was_measured() -> No
     told = summarise(calm, design, flight.ticks, flight.events)["at_loop_delay"]
     own = flight.ticks["loop_delay_s"][flight.ticks["commanded"]].reshape(-1, 5)
     assert told["loop_delay_s"] == pytest.approx(np.nanmedian(own, axis=0).max(), abs=1e-9)
-    assert told == figures_at(design, told["loop_delay_s"])
+    assert told == figures_at(design, told["loop_delay_s"]).model_dump()
     assert 0.5 < told["alpha"] < 0.81
     assert 1.0 < told["string_peak"] < 1.4
     state = FlightState(calm, design)
