@@ -20,8 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.core._bracketing import met_end, peaks
 from gains.core.arrays import FloatArray
-from gains.core.bracketing import met_end, peaks
 from gains.performance.behaviour import string_peak
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains, delayed_singular_value

@@ -24,12 +24,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._bracketing import met_end
 from gains.core.arrays import FloatArray
-from gains.core.bracketing import met_end
 from gains.core.errors import BadModelError
 from gains.delay.constant import delay_margin
+from gains.sampled._loop import held_blocks
 from gains.sampled.constant import checked_loop, growth_rate, sampled_delay_margin
-from gains.sampled.loop import held_blocks
 
 # instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
 _SAME_INSTANT = 1e-11
@@ -132,7 +132,7 @@ class LiftedPlant(Protocol):
 
     >>> import numpy as np
     >>> from gains.sampled.multirate import LiftedPlant
-    >>> from gains.sampled.loop import HeldPlant
+    >>> from gains.sampled._loop import HeldPlant
     >>> plant: LiftedPlant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
     >>> [part.ravel().round(6).tolist() for part in plant.between([0.0, 0.3, 0.5])]
     [[1.0, 1.0], [0.3, 0.2]]
@@ -214,7 +214,7 @@ def multirate_map(plant: LiftedPlant, timing: Timing, *, delay_s: float) -> Floa
 
     >>> import numpy as np
     >>> from gains.sampled.multirate import Timing, multirate_map
-    >>> from gains.sampled.loop import HeldPlant
+    >>> from gains.sampled._loop import HeldPlant
     >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
     >>> multirate_map(plant, Timing(0.5, 0.5), delay_s=0.25).round(6).tolist()
     [[0.75, 0.25], [-1.0, 0.0]]
@@ -249,7 +249,7 @@ def lifted_growth(plants: Sequence[LiftedPlant], timing: Timing, *, delay_s: flo
 
     >>> import numpy as np
     >>> from gains.sampled.multirate import Timing, lifted_growth
-    >>> from gains.sampled.loop import HeldPlant
+    >>> from gains.sampled._loop import HeldPlant
     >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
     >>> round(lifted_growth([plant], Timing(0.5, 0.5), delay_s=0.0), 6)
     -1.386294
@@ -267,7 +267,7 @@ def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: floa
 
     >>> import numpy as np
     >>> from gains.sampled.multirate import Timing, lifted_margin
-    >>> from gains.sampled.loop import HeldPlant
+    >>> from gains.sampled._loop import HeldPlant
     >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=1.0)
     >>> round(lifted_margin([plant], Timing(1.0, 1.0), near_s=np.pi / 2), 6)
     1.0

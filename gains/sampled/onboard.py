@@ -14,7 +14,7 @@ As it is flown nothing of it is continuous. With the control period T of the sta
   than control T is the slower period, or the common one as `gains.sampled.multirate` has it.
 
 So over one period T the local loop is a linear map of the state alone, and what is late enters it as the command of a
-held loop enters a plant: everything that `gains.sampled.crossings` says of such loops holds for this one too. The
+held loop enters a plant: everything that `gains.sampled._crossings` says of such loops holds for this one too. The
 vehicles' steps are taken to be in step with each other; clocks that are apart by less than a step change the margin in
 the second order of the step.
 """
@@ -30,11 +30,11 @@ import numpy as np
 from gains.core.arrays import FloatArray, IntArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks
+from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
-from gains.delay.loci import factor_rank
 from gains.formation.model import FormationModel
-from gains.sampled.crossings import block_delay_margin
-from gains.sampled.loop import HeldPlant, block_radius, matrix_exponentials
+from gains.sampled._crossings import block_delay_margin
+from gains.sampled._loop import HeldPlant, block_radius, matrix_exponentials
 from gains.sampled.multirate import Timing, lifted_growth, lifted_margin
 
 # an instant this close to a step (in steps) is that of the step
@@ -150,7 +150,7 @@ class OnboardLoop:
 
 @dataclass(frozen=True, eq=False)
 class LocalPlant:
-    """One block with its local loop closed, as a `gains.sampled.loop.SampledPlant`: only what is late is missing."""
+    """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`: only what is late is missing."""
 
     free: FloatArray
     sensed: FloatArray

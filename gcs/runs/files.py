@@ -10,10 +10,10 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from gcs.control.tick import TICK, Mode, TickArray
 from gcs.errors import InputError
 from gcs.plan.design import Design, Margin
 from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE, write_whole
-from gcs.control.tick import TICK, Mode, TickArray
 from scenarios import files as scenario_files
 from scenarios.schema import Scenario
 

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gcs.control.tick import CLOCK_JUMPED, TICK, Mode, TickArray
+from gcs.errors import InputError
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
-from gcs.errors import InputError
+from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
 from gcs.runs.record import (
     DESIGN_FILE,
     END,
@@ -32,8 +34,6 @@ from gcs.runs.record import (
     write_whole,
 )
 from gcs.runs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
-from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
-from gcs.control.tick import CLOCK_JUMPED, TICK, Mode, TickArray
 from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0

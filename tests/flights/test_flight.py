@@ -77,7 +77,7 @@ def test_formation_settles_below_one_percent_of_the_spacing(name: str) -> None:
 
 
 def test_a_flight_too_short_to_settle_says_what_is_left_of_its_errors() -> None:
-    plan, design = planned("triangle5", duration_s=1.0)
+    plan, design = planned("triangle5", duration_s=0.4)
     _, summary = flown(plan, design)
     assert (summary["verdict"], summary["reason"]) == ("unstable", "completed: duration reached")
     output = io.StringIO()
@@ -85,7 +85,7 @@ def test_a_flight_too_short_to_settle_says_what_is_left_of_its_errors() -> None:
     [verdict] = [line for line in output.getvalue().splitlines() if line.startswith("verdict")]
     most_m = max(vehicle["spacing_error_max_m"] for vehicle in summary["vehicles"][1:])
     left_m = max(vehicle["spacing_error_final_m"] for vehicle in summary["vehicles"][1:])
-    assert verdict == f"verdict  unstable: not settled in 1.0 s; {left_m:.2f} m left of errors of up to {most_m:.2f} m"
+    assert verdict == f"verdict  unstable: not settled in 0.4 s; {left_m:.2f} m left of errors of up to {most_m:.2f} m"
 
 
 def test_formation_follows_the_turns() -> None:

@@ -160,3 +160,7 @@ def test_a_lag_makes_spacing_errors_grow_more_as_a_delay_of_its_length_does() ->
 def test_a_response_that_is_none_is_refused(lag_s: float, gain: float) -> None:
     with pytest.raises(BadModelError):
         Response(lag_s, gain)
+
+
+def test_a_pure_lag_transmits_a_constant_acceleration_whole() -> None:
+    assert Response(lag_s=0.15, velocity_gain_1_s=0.0).transfer(np.array([0.0])) == [1.0]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from gains.core.errors import BadModelError
+from gains.sampled._loop import HeldPlant
 from gains.sampled.constant import growth_rate
-from gains.sampled.loop import HeldPlant
 from gains.sampled.multirate import Timing, lifted_growth, multirate_delay_margin, multirate_growth_rate, multirate_map
 from gcs.stress.growth import Motion, fit_growth
 

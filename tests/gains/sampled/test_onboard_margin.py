@@ -12,8 +12,8 @@ from gains.core.errors import BadModelError
 from gains.delay.sweep import frequency_sweep_margin
 from gains.formation.model import FormationModel
 from gains.formation.pattern import bidirectional, split_own
+from gains.sampled._loop import lifted_map
 from gains.sampled.constant import growth_rate, sampled_delay_margin
-from gains.sampled.loop import lifted_map
 from gains.sampled.onboard import LocalPlant, OnboardLoop, OnboardTiming, onboard_loop
 
 FINE = OnboardTiming(0.02, steps=2, steps_per_sample=1)
