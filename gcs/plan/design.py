@@ -123,6 +123,8 @@ class FiguresAtDelay(_Part):
 
     loop_delay_s: float | None
     alpha: float | None = None
+    has_string_verdict: bool = True
+    """Whether errors run down chains of equal followers, without which there is no string peak."""
     string_peak: float | None = None
 
 
@@ -132,7 +134,7 @@ class FiguresAtExpectedDelay(FiguresAtDelay):
     alpha_kept: float
     alpha_kept_to_s: float | None
     """None where α is kept at every loop delay; the same below."""
-    string_peak_kept: float
+    string_peak_kept: float | None
     string_peak_kept_to_s: float | None
 
 

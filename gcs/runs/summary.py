@@ -134,7 +134,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: list
         "delay_margin_continuous_s": _number(design.delay_margin_continuous_s),
         "response": design.response and design.response.model_dump(mode="json", exclude_unset=True),
         "loop_delay_s": _spread(loop_delay),
-        "at_loop_delay": figures_at(design, _slowest_median_s(flown)).model_dump(),
+        "at_loop_delay": figures_at(design, scenario, _slowest_median_s(flown)).model_dump(),
         "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
         "settling_time_s": settled,
         "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,
