@@ -1,17 +1,26 @@
 """α and the growth of spacing errors at a loop delay, that expected of a scenario's links or one measured in flight.
 
-What a design says of them without delay says little of a flight: `gains.performance.flown_loop` has the loop as it is
-flown.
+What a design says of them without delay says little of a flight. `gains.performance.flown_loop` has the loop of a
+follower as it is flown, which says it all for a leader-follower tree with the same gains for each;
+`gains.performance.flown_formation` has the whole formation, for gains on any other pattern. There errors run both ways,
+so that no growth from vehicle to vehicle is defined and only α is reported.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from gains.core.requirement import plain
-from gains.performance.flown_loop import ALPHA_KEPT, FlownLoop
+from gains.design.graph import time_scaled
+from gains.formation.model import FormationModel
+from gains.performance.delayed_alpha import ALPHA_KEPT
+from gains.performance.flown_formation import FlownFormation
+from gains.performance.flown_loop import FlownLoop
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
+from gains.sampled.onboard import own_part
+from gcs.plan.formation import plan_formation
 from scenarios.schema import Jitter, Link, Scenario
 
 _GAINS = ("K1_1_s", "K2_1_s", "K3_1_s2")
@@ -50,60 +59,104 @@ def _mean_jitter_s(jitter: Jitter) -> float:
 
 
 def with_figures_at_delay(design: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
-    """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole.
-
-    Gains on a pattern have none of it: there errors do not run down a chain.
-    """
-    loops = _flown_loops(design)
+    """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole."""
+    loops = _flown_loops(design, scenario)
     if not loops:
         return design
     requirement: dict[str, Any] = design["requirement"] or {}
-    peak: float = requirement.get("string_peak_max") or 1.0
+    chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
+    peak: float | None = (requirement.get("string_peak_max") or 1.0) if chains else None
     # of different vehicles the one that leaves least
     alpha = requirement.get("alpha") or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
     return design | {
         "at_loop_delay": {
-            **figures_at(design, expected_loop_delay_s(scenario)),
+            **figures_at(design, scenario, expected_loop_delay_s(scenario)),
             "alpha_kept": alpha,
             "alpha_kept_to_s": plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
             "string_peak_kept": peak,
-            "string_peak_kept_to_s": plain(min(loop.string_limit_s(peak) for loop in loops)),
+            "string_peak_kept_to_s": plain(min(loop.string_limit_s(peak) for loop in chains)) if peak else None,
         }
     }
 
 
-def figures_at(design: dict[str, Any], delay_s: float | None, gain_set: int = 0) -> dict[str, float | None]:
-    """Loop delay, α and string peak of a design's gain set at a loop delay (s); None where unknown or unbounded."""
-    loops = [] if delay_s is None else _flown_loops(design, gain_set)
-    if not loops or delay_s is None:
-        return {"loop_delay_s": delay_s, "alpha": None, "string_peak": None}
+def figures_at(design: dict[str, Any], scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> dict[str, Any]:
+    """Loop delay, α and string peak of a design's gain set at a loop delay (s); None where unknown or unbounded.
+
+    `has_string_verdict` says whether errors run down chains of equal followers, without which there is no string peak.
+    """
+    loops = [] if delay_s is None else _flown_loops(design, scenario, gain_set)
+    chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
+    known = delay_s is not None and bool(loops)
     return {
         "loop_delay_s": delay_s,
-        "alpha": min(loop.alpha(delay_s) for loop in loops),
-        "string_peak": plain(max(loop.string_peak(delay_s) for loop in loops)),
+        "alpha": min(loop.alpha(delay_s) for loop in loops) if known and delay_s is not None else None,
+        "has_string_verdict": bool(chains),
+        "string_peak": plain(max(loop.string_peak(delay_s) for loop in chains))
+        if chains and delay_s is not None
+        else None,
     }
 
 
-def _flown_loops(design: dict[str, Any], gain_set: int = 0) -> list[FlownLoop]:
-    """The loops of the followers of an inclusion design, one for each way in which vehicles answer; else none."""
-    if any(name not in design for name in _GAINS) or design["vehicles"] < 2:
+def _flown_loops(
+    design: dict[str, Any], scenario: Scenario, gain_set: int = 0
+) -> Sequence[FlownLoop] | Sequence[FlownFormation]:
+    """What is flown, as far as it has an α at all: the formation, or the loops of its followers."""
+    if design["vehicles"] < 2:
         return []
     entry: dict[str, Any] = design["schedule"][gain_set] if design.get("schedule") else design
+    if all(name in design for name in _GAINS):
+        return _follower_loops(design, entry)
+    return [_flown_formation(design, entry, scenario)] if "K" in design else []
+
+
+def _follower_loops(design: dict[str, Any], entry: dict[str, Any]) -> list[FlownLoop]:
+    """The loops of the followers of an inclusion design, one for each way in which vehicles answer."""
     own, front, spacing = (float(entry.get(name, design[name])[0][0]) for name in _GAINS)
     if not (own < 0.0 < spacing):
         return []
-    margin_s = entry["delay_margin_s"]
     onboard = design["loop"] == "onboard"
-    response: dict[str, Any] = design.get("response") or {}
-    answers = {(v["lag_s"], v["velocity_gain_1_s"]) for v in response.get("vehicles", [])}
     return [
         FlownLoop(
             ScalarGains(-own, front * entry.get("streamed_share", 1.0), spacing, 0.0),
-            delay_margin_s=float("inf") if margin_s is None else float(margin_s),
+            delay_margin_s=_margin_s(entry),
             period_s=float(design["period_s"]),
             loop="onboard" if onboard else "ground",
             step_s=1.0 / design["onboard"]["rate_hz"] if onboard else 0.0,
-            response=None if answer is None else Response(*answer),
+            response=answer,
         )
-        for answer in sorted(answers) or [None]
+        for answer in set(_responses(design).values()) or [None]
     ]
+
+
+def _flown_formation(design: dict[str, Any], entry: dict[str, Any], scenario: Scenario) -> FlownFormation:
+    """The formation with the gains of an entry of a graph design's schedule."""
+    formation = plan_formation(scenario)
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    K = np.array(design["K"])
+    onboard = design["loop"] == "onboard"
+    if onboard:
+        own = own_part(model, K)
+        K = own + entry["streamed_share"] * (K - own)
+    else:
+        K = time_scaled(model, K, entry["time_scale"])
+    answers = _responses(design)
+    return FlownFormation(
+        model,
+        K,
+        delay_margin_s=_margin_s(entry),
+        period_s=float(design["period_s"]),
+        loop="onboard" if onboard else "ground",
+        step_s=1.0 / design["onboard"]["rate_hz"] if onboard else 0.0,
+        responses=tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
+    )
+
+
+def _margin_s(entry: dict[str, Any]) -> float:
+    margin_s = entry["delay_margin_s"]
+    return float("inf") if margin_s is None else float(margin_s)
+
+
+def _responses(design: dict[str, Any]) -> dict[int, Response]:
+    """How vehicles answer, by system id; empty if that is not known, or at once."""
+    response: dict[str, Any] = design.get("response") or {}
+    return {v["system_id"]: Response(v["lag_s"], v["velocity_gain_1_s"]) for v in response.get("vehicles", [])}

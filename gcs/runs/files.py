@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from gcs.control.tick import TICK, Mode, TickArray
 from gcs.errors import InputError
 from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE
-from gcs.control.tick import TICK, Mode, TickArray
 from scenarios import files as scenario_files
 from scenarios.schema import Scenario
 

@@ -12,12 +12,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.plan.at_delay import figures_at
-from gcs.errors import InputError
-from gcs.runs.record import (DESIGN_FILE, END, EVENTS_FILE, FLEET, LOG_ENDED, MIRROR, PARQUET_FILE, RECORDING_FILE, SCENARIO_FILE, STARTED, SUMMARY_FILE, TICKS_FILE, TRUTH_FILE, write_whole)
-from gcs.runs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
-from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
 from gcs.control.tick import CLOCK_JUMPED, TICK, Mode, TickArray
+from gcs.errors import InputError
+from gcs.plan.at_delay import figures_at
+from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
+from gcs.runs.record import (
+    DESIGN_FILE,
+    END,
+    EVENTS_FILE,
+    FLEET,
+    LOG_ENDED,
+    MIRROR,
+    PARQUET_FILE,
+    RECORDING_FILE,
+    SCENARIO_FILE,
+    STARTED,
+    SUMMARY_FILE,
+    TICKS_FILE,
+    TRUTH_FILE,
+    write_whole,
+)
+from gcs.runs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
 from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0
@@ -120,7 +135,7 @@ def summarise(
         "delay_margin_continuous_s": _number(design["delay_margin_continuous_s"]),
         "response": design.get("response"),
         "loop_delay_s": _spread(loop_delay),
-        "at_loop_delay": figures_at(design, _slowest_median_s(flown)),
+        "at_loop_delay": figures_at(design, scenario, _slowest_median_s(flown)),
         "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
         "settling_time_s": settled,
         "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,

@@ -63,20 +63,22 @@ def _print_margins(design: dict[str, Any], console: Console) -> None:
 
 def _print_figures_at_delay(flown: dict[str, Any], console: Console) -> None:
     console.print(f"         {figures_text(flown)} (that of the scenario's links)")
-    console.print(
-        f"         at least {flown['alpha_kept']:.4f} {_up_to(flown['alpha_kept_to_s'])}; growth at most "
-        f"{flown['string_peak_kept']:.2f} times {_up_to(flown['string_peak_kept_to_s'])}"
-    )
+    kept = f"at least {flown['alpha_kept']:.4f} {_up_to(flown['alpha_kept_to_s'])}"
+    if not flown["has_string_verdict"]:
+        console.print(f"         {kept}")
+        console.print("string   no verdict: with gains on a general pattern errors do not run down a chain")
+        return
+    growth = f"growth at most {flown['string_peak_kept']:.2f} times {_up_to(flown['string_peak_kept_to_s'])}"
+    console.print(f"         {kept}; {growth}")
 
 
 def figures_text(flown: dict[str, Any]) -> str:
-    """α and the growth of spacing errors at a loop delay, in words."""
-    peak = flown["string_peak"]
-    grows = "without bound" if peak is None else f"{peak:.2f} times at most"
-    return (
-        f"{flown['alpha']:.4f} at {_ms(flown['loop_delay_s'])} of loop delay, where spacing errors grow {grows} from "
-        "vehicle to vehicle"
-    )
+    """α and, where they run down a chain, the growth of spacing errors at a loop delay, in words."""
+    alpha = f"{flown['alpha']:.4f} at {_ms(flown['loop_delay_s'])} of loop delay"
+    if not flown["has_string_verdict"]:
+        return f"{alpha}, of the whole formation"
+    grows = "without bound" if flown["string_peak"] is None else f"{flown['string_peak']:.2f} times at most"
+    return f"{alpha}, where spacing errors grow {grows} from vehicle to vehicle"
 
 
 def _up_to(delay_s: float | None) -> str:
@@ -100,6 +102,8 @@ def _print_graph_design(design: dict[str, Any], console: Console) -> None:
         f"alpha    {design['alpha']:.4f} (robustness bound of the whole formation), decay "
         f"{design['decay_rate_1_s']:.2f} 1/s without delay{loss}"
     )
+    if (flown := design.get("at_loop_delay")) is not None:
+        _print_figures_at_delay(flown, console)
 
 
 def number_text(value: float | None, form: str = ".5f") -> str:

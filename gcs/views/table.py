@@ -98,9 +98,10 @@ class FlightState:
             return ""
         key = round(1e3 * delay_s), gain_set
         if key not in self._at_delay:
-            found = figures_at(self._design, key[0] / 1e3, gain_set)
-            grows = "without bound" if found["string_peak"] is None else f"{found['string_peak']:.2f} times"
-            text = "" if found["alpha"] is None else f"alpha {found['alpha']:.3f}, errors grow {grows} at {key[0]} ms"
+            found = figures_at(self._design, self.scenario, key[0] / 1e3, gain_set)
+            bound = "without bound" if found["string_peak"] is None else f"{found['string_peak']:.2f} times"
+            grows = f", errors grow {bound}" if found["has_string_verdict"] else ""
+            text = "" if found["alpha"] is None else f"alpha {found['alpha']:.3f}{grows} at {key[0]} ms"
             self._at_delay[key] = text
         return self._at_delay[key]
 

@@ -11,10 +11,7 @@ from gcs.control.tick import TickArray
 from gcs.runs.files import read_design, read_summary
 from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
 from gcs.runs.summary import summarise
-from gcs.views.console import plain_console
-from gcs.views.report import delay_text, print_flight
 from gcs.watch.rebuild import Rebuilt, rebuild, watched
-from gcs.watch.table import links_table
 from gcs.watch.tlog import TelemetryLog
 from scenarios import files
 from scenarios.schema import Scenario
@@ -118,20 +115,3 @@ def _broken(scenario: Scenario, last: TickArray) -> str | None:
             limit_m = scenario.safety.spacing_error_limit_m
             return f"broken: spacing error of vehicle {row['system_id']} is {error_m:.0f} m, limit {limit_m:g} m"
     return None
-
-
-def print_replay(result: dict[str, Any]) -> None:
-    """The log, its links, and the flight as far as it is known."""
-    console = plain_console()
-    log, width = result["log"], console.width
-    left_out = "".join(f"; {count} {reason}" for reason, count in log["left_out"].items())
-    console.print(f"log      {log['file']}: {log['frames']} frames in {log['duration_s']:.1f} s{left_out}")
-    if not result["links"]:
-        console.print("no vehicle in this log")
-    elif "flight" in result:
-        print_flight(result["flight"], console)
-    else:
-        console.print(links_table(result["links"], width))
-    if "recorded" in result:
-        recorded = result["recorded"]
-        console.print(f"recorded {recorded['verdict']}: {delay_text(recorded)}")

@@ -17,8 +17,8 @@ from docs.generate.fields import described, found_fields
 from docs.generate.keys import schema
 from docs.generate.runner import Runner
 from docs.generate.sessions import Step, steps_of
+from gcs.cli.margin import margin_of_file, margin_of_scenario
 from gcs.drive.lockstep import START_NS, fly_lockstep
-from gcs.margin import margin_of_file, margin_of_scenario
 from gcs.plan.planner import flight_plan
 from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
 from gcs.runs.summary import finish

@@ -139,8 +139,8 @@ def test_design_file_gives_the_gains_that_a_scenario_takes() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ("hears = [2]", "hears = [7]", r"vehicles\[0\].hears"),
-        ("hears = [3]", "hears = [1]", r"vehicles\[1\].hears"),
+        ("hears = [2]", "hears = [7]", "vehicle 1: hears"),
+        ("hears = [3]", "hears = [1]", "vehicle 2: hears"),
         ('method = "graph-lqr"', 'method = "inclusion"', "graph-lqr or graph-dk"),
         ('method = "graph-lqr"', 'method = "magic"', "control.method"),
         ("delay_margin_s = 0.3", "gains = { K1 = -3.0, K2 = 0.5, K3 = 5.0 }", "control.method"),

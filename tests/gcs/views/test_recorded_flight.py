@@ -80,7 +80,7 @@ def test_delays_headroom_and_errors_in_the_recording_are_those_of_the_ticks(run:
         np.testing.assert_allclose(times_s, flown["time_s"][:, 0], atol=1e-9)
         np.testing.assert_allclose(found, values, rtol=1e-12, atol=1e-9)
     assert len(flown) > 200
-    assert np.nanmax(errors_m[0]) > 10 > np.nanmax(errors_m[-1])
+    assert np.nanmax(errors_m[0]) > 4 > np.nanmax(errors_m[-1])
 
 
 def test_a_margin_is_drawn_for_the_gains_each_vehicle_is_flown_with(tmp_path: Path) -> None:
