@@ -38,7 +38,7 @@ def design(
     if (unstable := unstable_loop(plan)) is not None:
         refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
     if as_json:
-        print_json(result)
+        print_json(result.to_dict())
     else:
         from gcs.views.report import print_design
 

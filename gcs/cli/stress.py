@@ -30,6 +30,7 @@ from gcs.interrupts import raised
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
+    from gcs.plan.design import Design
     from gcs.stress.campaign import Fly
     from gcs.stress.study import Onset, Study
     from gcs.stress.trial import Outcome
@@ -212,7 +213,7 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
     return result, folder
 
 
-def _study(options: StressOptions) -> "tuple[Study, dict[str, Any]]":
+def _study(options: StressOptions) -> "tuple[Study, Design]":
     from gcs.drive.preflight import bad_start, unstable_loop
     from gcs.plan.planner import flight_plan
     from gcs.stress.study import Study

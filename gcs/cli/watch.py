@@ -98,6 +98,7 @@ def replay(
     Damaged parts of the log are left out and counted.
     """
     _refuse_both(margin, design)
+    from gcs.plan.design import Design
     from gcs.runs.files import read_design
     from gcs.watch import rebuild_report
     from gcs.watch.tlog import TlogError, read_tlog
@@ -113,7 +114,7 @@ def replay(
 
         there = replace(there, scenario=load(scenario_file), design=None, recorded=None)
     if margin is not None:
-        there = replace(there, design={"delay_margin_s": margin})
+        there = replace(there, design=Design(delay_margin_s=margin))
     elif given is not None:
         there = replace(there, design=given)
     elif there.design is None and there.scenario is not None:
@@ -170,9 +171,9 @@ def _compared_with(scenario_file: Path | None, margin: float | None, design: Pat
     if design is not None:
         from gcs.runs.files import read_design
 
-        return scenario, read_design(design)["delay_margin_s"], f"of {design}"
+        return scenario, read_design(design).delay_margin_s, f"of {design}"
     if scenario is not None:
         from gcs.plan.planner import flight_plan
 
-        return scenario, flight_plan(scenario)[0]["delay_margin_s"], f"of {scenario.name}'s gains"
+        return scenario, flight_plan(scenario)[0].delay_margin_s, f"of {scenario.name}'s gains"
     return None, None, ""

@@ -7,7 +7,7 @@ so that no growth from vehicle to vehicle is defined and only α is reported.
 """
 
 from collections.abc import Sequence
-from typing import Any
+from math import inf
 
 import numpy as np
 
@@ -20,10 +20,9 @@ from gains.performance.flown_loop import FlownLoop
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.onboard import own_part
+from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, GainSet
 from gcs.plan.formation import plan_formation
 from scenarios.schema import Jitter, Link, Scenario
-
-_GAINS = ("K1_1_s", "K2_1_s", "K3_1_s2")
 
 
 def expected_loop_delay_s(scenario: Scenario) -> float:
@@ -58,105 +57,94 @@ def _mean_jitter_s(jitter: Jitter) -> float:
             return 0.0
 
 
-def with_figures_at_delay(design: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
+def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
     """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole."""
     loops = _flown_loops(design, scenario)
     if not loops:
         return design
-    requirement: dict[str, Any] = design["requirement"] or {}
+    requirement = design.requirement
     chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
-    peak: float | None = (requirement.get("string_peak_max") or 1.0) if chains else None
+    peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
     # of different vehicles the one that leaves least
-    alpha = requirement.get("alpha") or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
-    return design | {
-        "at_loop_delay": {
-            **figures_at(design, scenario, expected_loop_delay_s(scenario)),
-            "alpha_kept": alpha,
-            "alpha_kept_to_s": plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
-            "string_peak_kept": peak,
-            "string_peak_kept_to_s": plain(min(loop.string_limit_s(peak) for loop in chains)) if peak else None,
-        }
-    }
+    alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
+    flown = FiguresAtExpectedDelay(
+        **figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump(),
+        alpha_kept=alpha,
+        alpha_kept_to_s=plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
+        string_peak_kept=peak,
+        string_peak_kept_to_s=plain(min(loop.string_limit_s(peak) for loop in chains)) if peak else None,
+    )
+    return design.model_copy(update={"at_loop_delay": flown})
 
 
-def figures_at(design: dict[str, Any], scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> dict[str, Any]:
-    """Loop delay, α and string peak of a design's gain set at a loop delay (s); None where unknown or unbounded.
-
-    `has_string_verdict` says whether errors run down chains of equal followers, without which there is no string peak.
-    """
+def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
+    """α and the string peak of a design's gain set at a loop delay (s)."""
     loops = [] if delay_s is None else _flown_loops(design, scenario, gain_set)
+    if delay_s is None or not loops:
+        return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
     chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
-    known = delay_s is not None and bool(loops)
-    return {
-        "loop_delay_s": delay_s,
-        "alpha": min(loop.alpha(delay_s) for loop in loops) if known and delay_s is not None else None,
-        "has_string_verdict": bool(chains),
-        "string_peak": plain(max(loop.string_peak(delay_s) for loop in chains))
-        if chains and delay_s is not None
-        else None,
-    }
+    return FiguresAtDelay(
+        loop_delay_s=delay_s,
+        alpha=min(loop.alpha(delay_s) for loop in loops),
+        has_string_verdict=bool(chains),
+        string_peak=plain(max(loop.string_peak(delay_s) for loop in chains)) if chains else None,
+    )
 
 
 def _flown_loops(
-    design: dict[str, Any], scenario: Scenario, gain_set: int = 0
+    design: Design, scenario: Scenario, gain_set: int = 0
 ) -> Sequence[FlownLoop] | Sequence[FlownFormation]:
     """What is flown, as far as it has an α at all: the formation, or the loops of its followers."""
-    if design["vehicles"] < 2:
+    if design.vehicles < 2:
         return []
-    entry: dict[str, Any] = design["schedule"][gain_set] if design.get("schedule") else design
-    if all(name in design for name in _GAINS):
+    entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
+    if design.inclusion_gains is not None:
         return _follower_loops(design, entry)
-    return [_flown_formation(design, entry, scenario)] if "K" in design else []
+    return [_flown_formation(design, entry, scenario)] if design.K is not None else []
 
 
-def _follower_loops(design: dict[str, Any], entry: dict[str, Any]) -> list[FlownLoop]:
+def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
     """The loops of the followers of an inclusion design, one for each way in which vehicles answer."""
-    own, front, spacing = (float(entry.get(name, design[name])[0][0]) for name in _GAINS)
+    gains = entry.K1_1_s or design.K1_1_s, entry.K2_1_s or design.K2_1_s, entry.K3_1_s2 or design.K3_1_s2
+    own, front, spacing = (0.0 if gain is None else gain[0][0] for gain in gains)
     if not (own < 0.0 < spacing):
         return []
-    onboard = design["loop"] == "onboard"
     return [
         FlownLoop(
-            ScalarGains(-own, front * entry.get("streamed_share", 1.0), spacing, 0.0),
-            delay_margin_s=_margin_s(entry),
-            period_s=float(design["period_s"]),
-            loop="onboard" if onboard else "ground",
-            step_s=1.0 / design["onboard"]["rate_hz"] if onboard else 0.0,
+            ScalarGains(-own, front * entry.streamed_share, spacing, 0.0),
+            delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
+            period_s=design.period_s,
+            loop=design.loop,
+            step_s=1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0,
             response=answer,
         )
         for answer in set(_responses(design).values()) or [None]
     ]
 
 
-def _flown_formation(design: dict[str, Any], entry: dict[str, Any], scenario: Scenario) -> FlownFormation:
+def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> FlownFormation:
     """The formation with the gains of an entry of a graph design's schedule."""
     formation = plan_formation(scenario)
     model = FormationModel(tuple(formation.predecessor.tolist()))
-    K = np.array(design["K"])
-    onboard = design["loop"] == "onboard"
-    if onboard:
-        own = own_part(model, K)
-        K = own + entry["streamed_share"] * (K - own)
+    first = np.array(design.K)
+    if design.loop == "onboard":
+        own = own_part(model, first)
+        K = own + entry.streamed_share * (first - own)
     else:
-        K = time_scaled(model, K, entry["time_scale"])
+        K = time_scaled(model, first, entry.time_scale)
     answers = _responses(design)
     return FlownFormation(
         model,
         K,
-        delay_margin_s=_margin_s(entry),
-        period_s=float(design["period_s"]),
-        loop="onboard" if onboard else "ground",
-        step_s=1.0 / design["onboard"]["rate_hz"] if onboard else 0.0,
+        delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
+        period_s=design.period_s,
+        loop=design.loop,
+        step_s=1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0,
         responses=tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
     )
 
 
-def _margin_s(entry: dict[str, Any]) -> float:
-    margin_s = entry["delay_margin_s"]
-    return float("inf") if margin_s is None else float(margin_s)
-
-
-def _responses(design: dict[str, Any]) -> dict[int, Response]:
+def _responses(design: Design) -> dict[int, Response]:
     """How vehicles answer, by system id; empty if that is not known, or at once."""
-    response: dict[str, Any] = design.get("response") or {}
-    return {v["system_id"]: Response(v["lag_s"], v["velocity_gain_1_s"]) for v in response.get("vehicles", [])}
+    known = design.response.vehicles if design.response is not None else ()
+    return {vehicle.system_id: Response(vehicle.lag_s, vehicle.velocity_gain_1_s) for vehicle in known}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gcs.control.tick import TickArray
+from gcs.plan.design import Design
 from gcs.runs.files import read_design, read_summary
 from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
 from gcs.runs.summary import summarise
@@ -25,7 +26,7 @@ class Replayed:
 
     log_file: Path
     scenario: Scenario | None
-    design: dict[str, Any] | None
+    design: Design | None
     recorded: dict[str, Any] | None
     """The summary of the run that the log is of."""
 
@@ -46,8 +47,9 @@ def replay(log: TelemetryLog, replayed: Replayed) -> dict[str, Any]:
     """The summary of a log: of its links, and of the flight if the scenario is known."""
     first_ns, last_ns = log.frames[0][0], log.frames[-1][0]
     scenario, design = replayed.scenario, replayed.design
-    margin_s = None if design is None else design["delay_margin_s"]
-    rebuilt = None if scenario is None else rebuild(log.frames, scenario, _margins_s(design))
+    margin_s = None if design is None else design.delay_margin_s
+    margins_s = (inf,) if design is None else design.margins_s
+    rebuilt = None if scenario is None else rebuild(log.frames, scenario, margins_s)
     watch = watched(log.frames) if rebuilt is None else rebuilt.links
     result: dict[str, Any] = {
         "log": {
@@ -67,18 +69,10 @@ def replay(log: TelemetryLog, replayed: Replayed) -> dict[str, Any]:
     return result
 
 
-def _margins_s(design: dict[str, Any] | None) -> tuple[float, ...]:
-    """Of the gain schedule; one that is unbounded or unknown is infinite."""
-    schedule: list[dict[str, Any]] = [{}] if design is None else design.get("schedule") or [design]
-    margins_s = [entry.get("delay_margin_s") for entry in schedule]
-    return tuple(inf if margin_s is None else float(margin_s) for margin_s in margins_s)
-
-
-def _flight(scenario: Scenario, design: dict[str, Any] | None, rebuilt: Rebuilt) -> dict[str, Any]:
+def _flight(scenario: Scenario, design: Design | None, rebuilt: Rebuilt) -> dict[str, Any]:
     reason = _reason(scenario, rebuilt)
     ends = [{"time_s": 0.0, "kind": "end", "system_id": None, "text": reason}]
-    design = {"delay_margin_s": None, "delay_margin_continuous_s": None} | (design or {})
-    summary = summarise(scenario, design, rebuilt.ticks, [*rebuilt.events, *ends])
+    summary = summarise(scenario, design or Design(delay_margin_s=None), rebuilt.ticks, [*rebuilt.events, *ends])
     if not rebuilt.own:
         summary |= {"verdict": "not judged", "settling_time_s": None, "control": None}
     del summary["files"]

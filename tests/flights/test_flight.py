@@ -14,6 +14,7 @@ from gcs.control.phases import Phase
 from gcs.control.tick import Mode, TickArray
 from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
 from gcs.link import mavlink
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
@@ -27,14 +28,14 @@ from tests.support.paths import SCENARIOS
 S = 1_000_000_000
 
 
-def planned(name: str, **changes: Any) -> tuple[FlightPlan, dict[str, Any]]:
+def planned(name: str, **changes: Any) -> tuple[FlightPlan, Design]:
     scenario = load(SCENARIOS / f"{name}.toml").model_copy(update=changes)
     design, plan = flight_plan(scenario)
     return plan, design
 
 
 def flown(
-    plan: FlightPlan, design: dict[str, Any], station: Station | None = None, **kwargs: Any
+    plan: FlightPlan, design: Design, station: Station | None = None, **kwargs: Any
 ) -> tuple[TickArray, dict[str, Any]]:
     station = station or Station(plan, start_ns=START_NS)
     ticks = np.concatenate(list(fly_lockstep(plan, station=station, **kwargs)))
@@ -127,7 +128,9 @@ def test_errors_grow_and_decay_as_the_sampled_model_says(link_delay_s: float) ->
     own = ticks[(ticks["system_id"] == 2) & ticks["commanded"]]
     delay_s = float(np.median(own["loop_delay_s"]))
     A, B = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    K = np.array([[design["K3_1_s2"][0][0], design["K1_1_s"][0][0]]])
+    assert design.inclusion_gains is not None
+    own, _, spacing = design.inclusion_gains
+    K = np.array([[spacing[0][0], own[0][0]]])
     predicted = growth_rate(A, B, K, period_s=0.02, delay_s=delay_s)
     # 1 ms of drift of the sampling instants over the flight moves the rate by 0.01 /s.
     assert dominant_growth_1_s(ticks, 2) == pytest.approx(predicted, abs=0.02)
@@ -251,9 +254,9 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
         update={"delay_margin_s": None, "gains": FixedGains(K1=-20.0, K2=0.0, K3=150.0)}
     )
     plan, design = planned("chain3", control=control, monitor=Monitor(act=False))
-    assert design["delay_margin_s"] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
+    assert design.margins_s[0] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
     _, summary = flown(plan, design)
-    assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design["delay_margin_s"]
+    assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design.margins_s[0]
     assert (summary["verdict"], summary["settling_time_s"]) == ("unstable", None)
 
 

@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.control.tick import Mode, TickArray
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
@@ -148,7 +149,6 @@ def test_a_collision_ends_the_flight_as_broken_and_the_least_distance_is_in_the_
     assert station.end_reason.startswith("broken: vehicles")
     assert "have collided" in station.end_reason
     events = [{"time_s": 0.0, "kind": "end", "text": station.end_reason, "system_id": None}]
-    design = {"delay_margin_s": 0.3, "delay_margin_continuous_s": 0.3}
-    summary = summarise(planned().scenario, design, ticks, events)
+    summary = summarise(planned().scenario, Design(delay_margin_s=0.3), ticks, events)
     assert summary["verdict"] == "unstable"
     assert 0.0 < summary["distance_min_m"] < 180.0

@@ -14,6 +14,7 @@ from gcs.control.tick import Mode, TickArray
 from gcs.drive.flown import fly_virtual, median_delays_s
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.link.upload import float32
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.onboard import own_parameters
 from gcs.plan.planner import flight_plan
@@ -44,7 +45,7 @@ def delayed(total_s: float, **update: Any) -> Scenario:
 
 
 @cache
-def thesis() -> tuple[dict[str, Any], FlightPlan]:
+def thesis() -> tuple[Design, FlightPlan]:
     """Design and plan of thesis_delay; neither depends on links and duration."""
     return flight_plan(load(THESIS))
 
@@ -84,7 +85,7 @@ def test_with_the_monitor_acting_less_is_streamed_and_it_holds_beyond_its_margin
     scenario = delayed(1.1)
     acting = scenario.monitor.model_copy(update={"act": True})
     plan = flown(scenario.model_copy(update={"monitor": acting}))
-    assert [entry["streamed_share"] for entry in thesis()[0]["schedule"]] == [1.0, 0.5, 0.25]
+    assert [entry.streamed_share for entry in thesis()[0].schedule] == [1.0, 0.5, 0.25]
     assert list(plan.margins_s) == sorted(plan.margins_s)
     ticks = fly_virtual(plan).ticks
     assert set(ticks["gain_set"][(ticks["time_s"] > 5.0) & (ticks["time_s"] < 100.0)]) == {1}
@@ -114,7 +115,7 @@ def test_a_gain_that_a_vehicle_does_not_take_ends_the_start_in_one_line_and_noth
     broken[2, 2] = 2e4  # beyond what it takes
     station = Station(replace(plan, gain=broken), start_ns=START_NS)
     assert list(fly_lockstep(station.plan, station=station, vehicles=fleet))
-    assert station.end_reason.startswith("refused: vehicle 2: parameter FORM_KP_NN reads 0 after 20000")
+    assert station.end_reason.startswith("refused: vehicle 2 holds 0 in parameter FORM_KP_NN after 20000")
     assert not vehicle(fleet, 2).flight.armed
     assert fleet.vehicle(2).counters["refused_parameter_value"] > 0
 
@@ -225,7 +226,7 @@ def test_clocks_that_are_apart_leave_growth_and_loop_delays_as_they_are() -> Non
 
 def test_no_delay_breaks_a_leader_follower_formation_and_the_search_for_one_says_so() -> None:
     design, plan = flight_plan(onboard("chain3"))
-    assert design["delay_margin_s"] is None
+    assert design.delay_margin_s is None
     with pytest.raises(NoOnset, match="the margin has no limit; in 5 flights with 0 to 2 s of link delay") as caught:
         find_onset(Study(plan), lambda trials: [fly_trial(trial) for trial in trials], tolerance=1e-4)
     assert caught.value.as_predicted  # growth rates within a part in ten thousand of those predicted

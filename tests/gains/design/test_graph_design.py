@@ -125,15 +125,15 @@ def test_design_file_gives_the_gains_that_a_scenario_takes() -> None:
     assert len(plan.around_loss) == len(plan.gains)
     head, tail = BIDIRECTIONAL.split("[control]")
     blocks = "".join(
-        f"[[control.blocks]]\nvehicle = {b['vehicle']}\nof = {b['of']}\ngain = {b['gain']}\n"
-        for b in designed["blocks"]
+        f"[[control.blocks]]\nvehicle = {b.vehicle}\nof = {b.of}\ngain = {[list(row) for row in b.gain]}\n"
+        for b in designed.blocks
     )
     head = head.replace("hears = [2]\n", "").replace("hears = [3]\n", "")
     text = head + blocks + "[links]" + tail.split("[links]")[1]
     given, replan = flight_plan(parse(text, Path("given.toml")))
     assert np.array_equal(replan.gain, plan.gain)
-    assert given["delay_margin_s"] == designed["delay_margin_s"]
-    assert given["method"] == "given"
+    assert given.delay_margin_s == designed.delay_margin_s
+    assert given.method == "given"
 
 
 @pytest.mark.parametrize(
