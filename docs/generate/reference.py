@@ -19,7 +19,9 @@ def commands_page() -> str:
     text = get_docs_for_click(obj=group, ctx=typer.Context(group, info_name="gcs"), name="gcs")
     sections = text[text.index("## ") :].replace("* `--help`: Show this message and exit.\n", "")
     sections = re.sub(r"^\$ (.*)$", lambda line: re.sub(r"[{}]", "", line[1]), sections, flags=re.MULTILINE)
-    sections = re.sub(r"`[^`]*`|<", lambda found: found[0].replace("<", "\\<") if found[0] == "<" else found[0], sections)
+    sections = re.sub(
+        r"`[^`]*`|<", lambda found: found[0].replace("<", "\\<") if found[0] == "<" else found[0], sections
+    )
     with runner() as run:
         vehicles = run.run("sim-vehicles --help")
     return f"{sections.rstrip()}\n\n## `sim-vehicles`\n\n```text\n{vehicles.rstrip()}\n```"
