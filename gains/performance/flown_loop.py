@@ -20,7 +20,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core._bracketing import met_end, peaks
 from gains.core.arrays import FloatArray
 from gains.performance.behaviour import string_peak
 from gains.performance.delayed_alpha import alpha_at, alpha_limit_s

@@ -101,12 +101,11 @@ def _flown_loops(
     design: dict[str, Any], scenario: Scenario, gain_set: int = 0
 ) -> Sequence[FlownLoop] | Sequence[FlownFormation]:
     """What is flown, as far as it has an α at all: the formation, or the loops of its followers."""
-    if design["vehicles"] < 2:
+    is_chain = all(name in design for name in _GAINS)
+    if not (is_chain or "K" in design) or design["vehicles"] < 2:
         return []
     entry: dict[str, Any] = design["schedule"][gain_set] if design.get("schedule") else design
-    if all(name in design for name in _GAINS):
-        return _follower_loops(design, entry)
-    return [_flown_formation(design, entry, scenario)] if "K" in design else []
+    return _follower_loops(design, entry) if is_chain else [_flown_formation(design, entry, scenario)]
 
 
 def _follower_loops(design: dict[str, Any], entry: dict[str, Any]) -> list[FlownLoop]:
@@ -132,17 +131,16 @@ def _flown_formation(design: dict[str, Any], entry: dict[str, Any], scenario: Sc
     """The formation with the gains of an entry of a graph design's schedule."""
     formation = plan_formation(scenario)
     model = FormationModel(tuple(formation.predecessor.tolist()))
-    K = np.array(design["K"])
-    onboard = design["loop"] == "onboard"
+    K, onboard = np.array(design["K"]), design["loop"] == "onboard"
     if onboard:
         own = own_part(model, K)
-        K = own + entry["streamed_share"] * (K - own)
+        flown = own + entry["streamed_share"] * (K - own)
     else:
-        K = time_scaled(model, K, entry["time_scale"])
+        flown = time_scaled(model, K, entry["time_scale"])
     answers = _responses(design)
     return FlownFormation(
         model,
-        K,
+        flown,
         delay_margin_s=_margin_s(entry),
         period_s=float(design["period_s"]),
         loop="onboard" if onboard else "ground",

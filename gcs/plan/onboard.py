@@ -6,7 +6,7 @@ station computes the second and sends it as the acceleration of SET_POSITION_TAR
 autopilots understand it, with the formation's velocity v_d as the velocity.
 """
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.core.requirement import plain
 from gains.formation.model import FormationModel
+from gains.performance.behaviour import behaviour
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
@@ -69,7 +70,18 @@ def onboard_plan(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, An
         slower=tuple(zip(gains[1:], sampled_s[1:], strict=True)),
         around_loss=() if plan.separable else (own,) * len(gains),
     )
-    return design | margins[0] | {"loop": "onboard", "onboard": onboard, "schedule": schedule}, flown
+    changed = margins[0] | {"loop": "onboard", "onboard": onboard, "schedule": schedule}
+    return design | changed | _onboard_behaviour(design, plan.scenario), flown
+
+
+def _onboard_behaviour(design: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
+    """The behaviour of inclusion gains at the delay that the ground loop's is told for, in the loop that is flown."""
+    if "behaviour" not in design:
+        return {}
+    own, front, spacing = (np.array(design[name]) for name in ("K1_1_s", "K2_1_s", "K3_1_s2"))
+    step_s = 1.0 / scenario.onboard.rate_hz
+    found = behaviour((own, front, spacing), design["behaviour"]["delay_s"], own_delay_s=step_s / 2.0)
+    return {"behaviour": {name: plain(value) for name, value in asdict(found).items()}}
 
 
 def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, float]:

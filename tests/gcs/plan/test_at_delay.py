@@ -41,6 +41,8 @@ def test_a_slower_gain_set_is_judged_as_the_design_slowed_down() -> None:
     fast, slow = figures_at(design, TRIANGLE, 0.2), figures_at(design, TRIANGLE, 0.41, gain_set=1)
     assert fast["string_peak"] is not None
     assert slow["string_peak"] == pytest.approx(fast["string_peak"], rel=1e-6)
+    nothing = {"loop_delay_s": 0.1, "alpha": None, "has_string_verdict": False, "string_peak": None}
+    assert figures_at({"delay_margin_s": 0.3}, TRIANGLE, 0.1) == nothing
 
 
 def test_the_expected_loop_delay_is_that_of_the_slowest_links() -> None:
