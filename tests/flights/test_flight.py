@@ -250,7 +250,8 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
     control = scenario.control.model_copy(
         update={"delay_margin_s": None, "gains": FixedGains(K1=-20.0, K2=0.0, K3=150.0)}
     )
-    plan, design = planned("chain3", control=control, monitor=Monitor(act=False))
+    # within limits the errors end in a small cycle, inside the band of those that count as settled
+    plan, design = planned("chain3", control=control, monitor=Monitor(act=False), limits=Limits())
     assert design["delay_margin_s"] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
     _, summary = flown(plan, design)
     assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design["delay_margin_s"]
