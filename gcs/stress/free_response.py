@@ -31,6 +31,7 @@ delays, exact to the last digit of telemetry.
 """
 
 from dataclasses import dataclass, replace
+from math import ceil, isfinite
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,10 @@ from gcs.stress.growth import CHANNELS
 from scenarios.schema import Limits, Link, Safety, Scenario, Vehicle
 
 PROBE_S = 20.0
+"""How long a probe is flown, if that is enough."""
+_RANDOM_LOOP_DELAYS, _LONGEST_S = 66.0, 120.0
+"""On links that lose or delay at random, a probe shows a mean growth rate. Its error falls with the number of loop
+delays that the probe lasts: this many, for at most this long."""
 _SPEED_MIN_M_S = 1e-3
 """The kinematics are singular at speed 0."""
 _DIRECTION_NE = np.array([1.0, -0.8])
@@ -140,6 +145,13 @@ def _alike(rows: TickArray, others: TickArray) -> int:
     return count if same.all() else int(np.argmin(same))
 
 
+def probe_duration_s(plan: FlightPlan) -> float:
+    """How long a probe is flown: on random links for a number of loop delays at the margin, where that is longer."""
+    if has_constant_links(plan.scenario) or not isfinite(plan.delay_margin_s):
+        return PROBE_S
+    return max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
+
+
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
     """The plan's scenario with all vehicles in place at nominal velocity, except for an error of the given ones.
 
@@ -147,7 +159,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     of the leader (m/s), whose position is not controlled. It points in `_DIRECTION_NE` and differs from vehicle to
     vehicle.
     """
-    scenario, place = plan.scenario, plan.formation.place_ne_m()
+    scenario, place, duration_s = plan.scenario, plan.formation.place_ne_m(), probe_duration_s(plan)
     row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
     vehicles: list[Vehicle] = []
@@ -167,12 +179,12 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         "vehicles": tuple(vehicles),
         "nominal_velocity": scenario.nominal_velocity[:1],
         "limits": Limits(speed_min_m_s=_SPEED_MIN_M_S),
-        "duration_s": PROBE_S,
+        "duration_s": duration_s,
         "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
         "safety": scenario.safety.model_copy(
             update={
-                "setpoint_timeout_s": 2.0 * PROBE_S,
-                "heartbeat_timeout_s": 2.0 * PROBE_S,
+                "setpoint_timeout_s": 2.0 * duration_s,
+                "heartbeat_timeout_s": 2.0 * duration_s,
                 "spacing_error_limit_m": Safety().spacing_error_limit_m,
             }
         ),
