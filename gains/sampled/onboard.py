@@ -128,7 +128,7 @@ class OnboardLoop:
         continuous_s = self.continuous_margin_s()
         if hardly_sampled(rates, near_s=continuous_s):  # a command held for T stands for a delay of T / 2
             one_rate = replace(self, timing=replace(self.timing, telemetry_s=None))
-            return one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0
+            return max(0.0, one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0)
         return lifted_margin([SteppedPlant(plant) for plant in plants], rates, near_s=continuous_s)
 
     def growth_1_s(self, delay_s: float) -> float:

@@ -118,7 +118,7 @@ def _repetitions_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
     # by a rounded period in ns at most
     if not ((repeated_s >= 0.0) & (repeated_s < 1.0 / rates.telemetry_hz + 1e-9)).all():
         yield Broken("repetitions", f"{repeated_s.min():g} to {repeated_s.max():g} s of {1.0 / rates.telemetry_hz:g} s")
-    if rates.telemetry_hz >= rates.control_hz and repeated_s.any():
+    elif rates.telemetry_hz >= rates.control_hz and repeated_s.any():
         yield Broken("repetitions", "though telemetry is no slower than control")
     newer = np.diff(ticks["sample_boot_ms"].astype(np.int64), axis=0) != 0
     if flown.plan.scenario.control.loop == "ground" and repeated_s[1:][newer & ticks["commanded"][1:]].any():

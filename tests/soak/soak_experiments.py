@@ -138,4 +138,4 @@ def _margin_experiment(rng: Rng, name: str) -> Experiment:
     }
     drawn.pop("response", None)
     ratio = one_of(rng, between(rng, 0.3, 0.9), between(rng, 1.1, 1.6))
-    return Experiment(valid(drawn), margin_ratio=ratio)
+    return Experiment(valid(drawn), margin_ratio=ratio, allow_unstable=chance(rng, 0.8))

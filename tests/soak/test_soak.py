@@ -7,12 +7,13 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
 from gcs.plan.planner import flight_plan
 from scenarios import files, schema
-from scenarios.schema import Clocks, Control, FixedGains, Limits
+from scenarios.schema import Clocks, Control, FixedGains, Limits, Rates, Scenario
 from tests.soak.soak_checks import checked
 from tests.soak.soak_experiments import Experiment, experiment, whole
 from tests.soak.soak_flight import Flown, fly
@@ -28,15 +29,20 @@ def test_random_flights_break_no_invariant(part: int) -> None:
     assert {number: list(broken) for number, broken in found.items()} == {number: [] for number in found}
 
 
-@cache
-def calm_flight() -> Flown:
+def short_scenario(gains: FixedGains, telemetry_hz: float = 50.0) -> Scenario:
     scenario = files.load(SCENARIOS / "chain3.toml")
     changes = {
         "duration_s": 2.0,
-        "control": Control(gains=FixedGains(K1=-3.4, K2=0.6, K3=5.6)),
+        "control": Control(gains=gains),
         "limits": Limits(acceleration_max_m_s2=400.0),
+        "rates": Rates(telemetry_hz=telemetry_hz),
     }
-    scenario = scenario.model_copy(update=changes)
+    return scenario.model_copy(update=changes)
+
+
+@cache
+def calm_flight(telemetry_hz: float = 50.0) -> Flown:
+    scenario = short_scenario(FixedGains(K1=-3.4, K2=0.6, K3=5.6), telemetry_hz)
     return fly(Experiment(scenario), flight_plan(scenario)[1])
 
 
@@ -60,6 +66,27 @@ def test_a_wrong_value_in_one_row_is_seen(column: str, value: float, invariant: 
     ticks[column][len(ticks) // 2, 1] = value
     broken = list(checked(replace(flown, stretches=[replace(stretch, ticks=ticks)])))
     assert [one.invariant for one in broken] == [invariant]
+
+
+@pytest.mark.parametrize(("telemetry_hz", "wrong_s"), [(50.0, 0.001), (10.0, 0.11), (10.0, 0.04)])
+def test_a_repetition_that_is_none_is_seen(telemetry_hz: float, wrong_s: float) -> None:
+    flown = calm_flight(telemetry_hz)
+    assert list(checked(flown)) == []
+    [stretch] = flown.stretches
+    ticks = stretch.ticks.copy()
+    newer = np.flatnonzero(np.diff(ticks["sample_boot_ms"][:, 1]) != 0) + 1
+    ticks["repeated_s"][newer[len(newer) // 2], 1] = wrong_s
+    broken = {one.invariant for one in checked(replace(flown, stretches=[replace(stretch, ticks=ticks)]))}
+    assert broken == {"repetitions", "loop delay"}
+
+
+def test_an_unstable_loop_is_refused_or_flown_where_that_is_allowed() -> None:
+    scenario = short_scenario(FixedGains(K1=3.0, K2=0.6, K3=5.6))
+    refused = judge(Experiment(scenario))
+    assert refused.refused.startswith("control.gains: read a loop that is unstable without any delay")
+    flown = judge(Experiment(scenario, allow_unstable=True))
+    assert (flown.refused, flown.broken) == ("", ())
+    assert flown.ended
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,15 @@ def test_a_margin_long_against_uneven_periods_is_where_growth_changes_sign(telem
     assert loop.growth_1_s(margin_s * (1.0 - 3e-4)) < 0.0 < loop.growth_1_s(margin_s * (1.0 + 3e-4))
 
 
+def test_a_vehicle_whose_own_loop_is_too_fast_for_its_steps_leaves_no_margin_at_uneven_periods() -> None:
+    K = np.zeros((4, 7))
+    K[:3, :5] = PRINTED
+    K[3, 5:] = 3.0, -300.0  # 1 − 300 T = −5
+    loop = onboard_loop(FormationModel((-1, 0, 1, 0), axes=1), K, OnboardTiming(0.02, telemetry_s=0.025))
+    assert loop.continuous_margin_s() > 30.0 * loop.timing.rates.held_s
+    assert loop.sampled_margin_s() == 0.0
+
+
 def test_sampled_margin_goes_to_the_continuous_one_with_the_period() -> None:
     fine = onboard_loop(CHAIN, PRINTED, OnboardTiming(0.0002))
     assert fine.sampled_margin_s() == pytest.approx(fine.continuous_margin_s(), rel=1e-4)
