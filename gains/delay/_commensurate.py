@@ -32,9 +32,8 @@ from gains.delay._crossings import (
     polish,
     separating_points,
 )
-from gains.delay._loci import Loci, UnitCrossing, solved_beside_poles, unit_crossings
-from gains.delay._zero_root import zero_passage
-from gains.delay.constant import (
+from gains.delay._loci import Loci, UnitCrossing, highest_frequency, solved_beside_poles, unit_crossings
+from gains.delay._windows import (
     BlockAnalysis,
     DelayAnalysis,
     block_analysis,
@@ -42,6 +41,7 @@ from gains.delay.constant import (
     combined_analysis,
     unstable_roots,
 )
+from gains.delay._zero_root import zero_passage
 
 # a locus is an eigenvalue of a companion matrix, of which many are wanted; beyond this size angles are followed instead
 _LARGEST_LOCI = 30
@@ -86,17 +86,20 @@ def analyse_commensurate(
     """
     check_horizon(horizon_s)
     blocks = distinct_blocks(*_checked(matrices))
-    return combined_analysis([_analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
+    return combined_analysis([analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
 
 
-def _analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
+def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
+    """One block of x'(t) = sum_k A_k x(t - k tau), its matrices being A_0, A_1, ..."""
     terms = balanced(*block.matrices)
     delayed = [DelayedTerm(matrix, 0.0, k) for k, matrix in enumerate(terms)]
     roots = np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).astype(np.complex128)
     passage = zero_passage(terms, np.zeros(len(terms)), np.arange(len(terms))) if leave_out_zero else None
-    if passage is None and has_fixed_root(terms, roots):
-        return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
-    found = block_crossings(terms)
+    if passage is None and _has_fixed_root(terms, roots):
+        # a simple eigenvalue on the axis may be this far off by rounding
+        unstable = int(np.count_nonzero(roots.real > 1e-13 * norm_of(terms)))
+        return BlockAnalysis(block.copies, delayed, unstable=unstable, fixed_on_axis=True)
+    found = _block_crossings(terms)
     unstable = unstable_roots(roots, found, passage)
     return block_analysis(block.copies, delayed, found, unstable, passage, highest_frequency(terms))
 
@@ -121,7 +124,7 @@ def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
     return min(_circle_margin(balanced(*block.matrices)) for block in blocks)
 
 
-def block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
+def _block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
     """Crossings of the imaginary axis of one block, omega > 0, ascending; theta = omega tau modulo 2 pi."""
     present = [k for k, matrix in enumerate(terms) if k > 0 and matrix.any()]
     if not present:
@@ -170,15 +173,9 @@ def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
     return sorted(crossings, key=lambda crossing: crossing.omega)
 
 
-def highest_frequency(terms: Sequence[FloatArray]) -> float:
-    """Bound (rad/s) of every root on the imaginary axis, whatever the delays; terms[0] acts at once."""
-    turning = float(np.linalg.norm(terms[0] - terms[0].T)) / 2.0
-    return turning + float(sum(np.linalg.norm(matrix) for matrix in terms[1:]))
-
-
-def has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
+def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
     """Whether an eigenvalue on the imaginary axis of sum A_k (all of them: `roots`) is a root at every delay."""
-    scale = float(sum(np.linalg.norm(matrix) for matrix in terms))
+    scale = norm_of(terms)
     if scale == 0.0:
         return True
     for root in roots[np.abs(roots.real) < 1e-6 * scale]:

@@ -31,6 +31,14 @@ class DelayedTerm:
         return self.known_s + self.multiple * tau_s
 
 
+def by_multiple(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
+    """A_0, A_1, ..., A_m of sum_k A_k x(t - k tau), from terms without known delays."""
+    matrices = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
+    for term in terms:
+        matrices[term.multiple] = matrices[term.multiple] + term.matrix
+    return matrices
+
+
 def crossing_error(terms: Sequence[DelayedTerm], omega: float, tau_s: float) -> tuple[float, float]:
     """Estimated errors of the frequency omega (rad/s) and of the delay tau (s) of a crossing, by its sensitivity.
 

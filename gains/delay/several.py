@@ -61,32 +61,6 @@ class DelayBox:
         return not self.coupled
 
 
-def stable_at(A0: ArrayLike, late: Sequence[ArrayLike], delays_s: Sequence[float]) -> bool:
-    """Whether x'(t) = A0 x(t) + sum_k late[k] x(t - delays_s[k]) is asymptotically stable.
-
-    Parameters
-    ----------
-    A0, late
-        Real matrices (n, n), 1/s: what acts at once, and what acts late, one for each delay.
-
-    Raises
-    ------
-    BadModelError
-        As of `gains.delay.rightmost.rightmost_root`, or there are not as many delays as late matrices.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau_1) - x(t - tau_2) is stable up to pi / 4 = 0.785 if the delays are equal:
-
-    >>> from gains.delay.several import stable_at
-    >>> stable_at([[0]], [[[-1]], [[-1]]], [0.78, 0.78]), stable_at([[0]], [[[-1]], [[-1]]], [0.79, 0.79])
-    (True, False)
-    """
-    if len(late) != len(delays_s):
-        raise BadModelError(f"delays_s has {len(delays_s)} delays; {len(late)} are wanted, as late matrices")
-    return rightmost_root([(A0, 0.0), *zip(late, delays_s, strict=True)]).real < 0.0
-
-
 def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
     """The rectangle of delays that x'(t) = A0 x(t) + sum_k late[k] x(t - tau_k) takes, block by block.
 

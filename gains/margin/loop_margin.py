@@ -16,8 +16,8 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
-from gains.delay._crossing_error import DelayedTerm, crossing_error
-from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
+from gains.delay._crossing_error import DelayedTerm, by_multiple, crossing_error
+from gains.delay.constant import Crossing, DelayAnalysis
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
 
@@ -179,17 +179,11 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
 def _analysed(terms: Sequence[DelayedTerm]) -> DelayAnalysis:
     """The windows in the common divisor of the delays."""
     from gains.delay._commensurate import analyse_commensurate
-    from gains.delay._mixed import MixedTerm, analyse_mixed
+    from gains.delay._mixed import analyse_mixed
 
     if any(term.known_s for term in terms):
-        mixed = [MixedTerm(term.matrix, term.known_s, term.multiple) for term in terms]
-        return analyse_mixed(mixed, leave_out_zero=True)
-    late = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
-    for term in terms:
-        late[term.multiple] = late[term.multiple] + term.matrix
-    if len(late) == 2:
-        return analyse_delay(late[0], late[1], leave_out_zero=True)
-    return analyse_commensurate(late, leave_out_zero=True)
+        return analyse_mixed(terms, leave_out_zero=True)
+    return analyse_commensurate(by_multiple(terms), leave_out_zero=True)
 
 
 def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._crossing_error import DelayedTerm, crossing_error
+from gains.delay._crossing_error import DelayedTerm, by_multiple, crossing_error
 from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
 
 # a sweep of blocks of n states costs some n^3: these are 0.2 s, and 0.08 s one of 12 states
@@ -123,9 +123,7 @@ def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thoroug
     on_axis = analysis.roots_fixed_at_zero > 0 or any(crossing.delay_s == 0.0 for crossing in analysis.crossings)
     if on_axis or any(term.known_s for term in terms):
         return None
-    matrices = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
-    for term in terms:
-        matrices[term.multiple] = matrices[term.multiple] + term.matrix
+    matrices = by_multiple(terms)
     sizes = [len(block.indices) for block in distinct_blocks(*matrices)]
     if not thorough and sum(size**3 for size in sizes) > _SWEEP_BUDGET:
         return None

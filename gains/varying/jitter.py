@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._crossings import highest_frequency
-from gains.delay._loci import factor_rank
+from gains.delay._loci import factor_rank, highest_frequency
 from gains.delay.constant import analyse_delay
 from gains.varying._lmi import Unknown, positive_definite_solution
 from gains.varying.bounds import varying_delay_bound
@@ -228,7 +227,7 @@ def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float) -> float:
     r = B.shape[1]
     if r == 0:
         return inf
-    highest = highest_frequency(now, late)
+    highest = highest_frequency((now, late))
     coarse = highest * np.logspace(-3.0, 2.0, _FREQUENCIES_SCALING)
     D = _scaling(_loop_gains(now, late, B, C, mean_s, coarse)) if r > 1 else np.eye(1)
     fine = np.concatenate(
