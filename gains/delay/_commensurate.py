@@ -2,11 +2,12 @@
 
 With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda, so at each frequency there are finitely
 many lambda with det(j omega I - sum_k A_k lambda^{-k}) = 0: the eigenvalues of a block companion matrix. They are loci
-as those of one delay (`gains.delay._loci`): a root is on the imaginary axis where a modulus is one, and it goes right
-where that modulus falls with the frequency, whatever the delay. Everything else is as with one delay.
+like those of one delay (`_loci`): a root is on the imaginary axis where a modulus is one, and it moves to the right
+where that modulus falls with the frequency, whatever the delay. With one delay alone (m = 1) the crossings come from
+`_crossings`; everything else is the same.
 
-The frequencies come from a pencil and from Newton's method along the unit circle, see `gains.delay._circle_angles`. A
-sweep of the circle is the second opinion.
+The frequencies come from a pencil and from Newton's method along the unit circle, see `_circle_angles`. A sweep of the
+circle is the second opinion (`gains.margin.opinions`).
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, for the same problem as a
 polynomial eigenvalue problem.
@@ -105,7 +106,7 @@ def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
 
 
 def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
-    """The delay margin of `analyse_commensurate` by a sweep along the unit circle: a second opinion.
+    """The delay margin of `analyse_commensurate`, found by a sweep along the unit circle: a second opinion.
 
     The eigenvalues s of A(theta) = sum_k A_k e^{-j k theta} on a grid of angles; where one crosses the imaginary axis
     at j omega, tau = theta / omega is critical. Sorted real parts are continuous in the angle, so crossings are

@@ -1,6 +1,7 @@
-"""How well a crossing of the imaginary axis is known, from its own sensitivity to rounding.
+"""Terms of a loop with one unknown delay, and how accurately a crossing of the imaginary axis is known.
 
-Methods in double precision blur a multiple root alike, however well they agree with each other.
+All methods in double precision blur a multiple root alike, however well they agree with each other. The error of a
+crossing is therefore estimated from its own sensitivity to rounding.
 """
 
 from collections.abc import Sequence

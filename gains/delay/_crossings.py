@@ -1,9 +1,8 @@
 """Where roots of x'(t) = A0 x(t) + A1 x(t - tau) cross the imaginary axis, found without a grid.
 
-The algebraic test gives a finite list of frequencies that contains every crossing. The loci of the loop
-(`gains.delay._loci`) are then counted between these frequencies, which says how many crossings there are and in which
-direction, brackets them, and does not rely on the list being accurate; Newton's method on the characteristic matrix
-gives the last digits.
+The algebraic test gives a finite list of frequencies near every crossing. Counting the loci of the loop (`_loci`)
+between these frequencies then tells how many crossings there are and in which direction, and brackets them; it does not
+rely on the accuracy of the list. Newton's method on the characteristic matrix gives the last digits.
 """
 
 from collections.abc import Sequence

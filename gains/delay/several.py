@@ -1,4 +1,4 @@
-"""Several independent delays, one for each link: which combinations does the loop take?
+"""Several independent delays, one for each link: the combinations under which the loop is stable.
 
 x'(t) = A0 x(t) + A1 x(t - tau_1) + A2 x(t - tau_2) has a root j omega where det(j omega I - A0 - A1 e^{-j alpha} -
 A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. Fixing alpha leaves one delay and a complex A0, whose
@@ -44,7 +44,7 @@ class Polyline:
 
 @dataclass(frozen=True)
 class DelayBox:
-    """Which delays tau_1, ..., tau_m the loop takes independently of each other.
+    """The delays tau_1, ..., tau_m that the loop takes independently of each other.
 
     `limits_s` is the limit of each delay as far as blocks with that delay alone set it; `inf` without limit, and all
     zero if a block is unstable without delay. `coupled` lists the sets of delays (indices into the delays) that meet
@@ -102,7 +102,7 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
 
 
 def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list[FloatArray]:
-    """The part of B K that each vehicle's command contributes, one matrix (n, n) a vehicle: its own delayed term.
+    """The part of B K that comes from each vehicle's command, one matrix (n, n) a vehicle: a delayed term of its own.
 
     Parameters
     ----------

@@ -54,18 +54,18 @@ class MarginCrossing:
 
 @dataclass(frozen=True)
 class LoopMargin:
-    """What is known of a loop for all values of its `unknown`: a delay, or the sampling period.
+    """The verdict on a loop for all values of its `unknown`: a delay, or the sampling period.
 
     Attributes
     ----------
     unknown
         Its name; "period" for the sampling period.
     stable_intervals_s
-        The windows of stability, inf without an end, complete up to `complete_to_s`.
+        The windows of stability, complete up to `complete_to_s`; the last may end at inf.
     delay_margin_s, delay_margin_error_s
         The end of the window that begins at 0, or 0, and its estimated error.
     unstable_roots_at_zero_delay, roots_fixed_at_zero
-        Roots right of the axis with the unknown at zero; roots at 0 that are left out of everything else.
+        The number of roots right of the axis with the unknown at zero; of roots at 0 that nothing else here counts.
     checked_by
         The names of the methods that confirmed the windows.
     """
@@ -96,7 +96,7 @@ class LoopAtGivenDelays:
 
 
 def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays:
-    """What the delays of a model may be.
+    """The delays, or the sampling periods, at which the loop of a model is stable.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays
 
 
 def as_known(value: float, error: float) -> str:
-    """A number with as many digits, six at most, as its error leaves: the last one is off by one at most.
+    """A number with as many digits as its error leaves, six at most; the last digit is off by one at most.
 
     Examples
     --------

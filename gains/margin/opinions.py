@@ -2,10 +2,10 @@
 
 The exact analysis is compared with a sweep along the unit circle (`gains.delay._commensurate.circle_sweep_margin`) and
 the rightmost root beside the ends of the windows, or, where a root at zero is left out, with a count of the roots by
-the argument principle. None of them shares algebra with it. What differs by more than rounding explains is an error.
+the argument principle. None of them shares algebra with it. A difference larger than rounding explains is an error.
 
-All methods in double precision blur a root in the same way, however well they agree: an m-fold eigenvalue is known to
-eps^(1/m). So the error of a crossing is estimated from its own sensitivity, see `crossing_error`.
+All methods in double precision blur a multiple root alike, however well they agree: an m-fold eigenvalue is known to
+eps^(1/m). The error of a crossing is therefore estimated from its own sensitivity, see `crossing_error`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -53,7 +53,7 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root at delays below and above
     it.
 
-    Slower by a factor of a hundred; for a design that is to be flown, not for the inside of an optimisation.
+    It is a hundred times slower: meant for a design that is to be flown, not for the inside of an optimisation.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 
 
 def second_opinions(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], *, thorough: bool = False) -> Opinions:
-    """Confirm an analysis of x'(t) = sum of the terms, as far as that takes a fraction of a second.
+    """Confirm an analysis of x'(t) = sum of the terms by the methods that take no more than a fraction of a second.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Which stability bound covers the delay that a link really has: constant, slowly varying, or jumping about.
+"""The stability bound that covers the delay of a real link, be it constant, slowly varying or jumping.
 
 The margin for constant delays is exact but says nothing about a delay that varies; the bounds for varying delays are
-proved but lower. Given an observed delay (mean, spread, rate of change) the bounds are tried from the least to the
-most demanding one, and the first that covers the observation is reported, with the others for comparison.
+proved but lower. For an observed delay (mean, spread, rate of change) `bound_covering` tries the bounds from the least
+to the most demanding one and reports the first that covers the observation, with the others for comparison.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ class CoveringBound:
         delays from 0 up to `bound_s`. "spread": any variation within `bound_s` - mean of the mean. "any": any
         variation from 0 up to `bound_s`. "none": no bound covers it; the loop may be stable all the same.
     bound_s
-        The largest delay that bound admits, nan for "none".
+        The largest delay that this bound admits, nan for "none".
     largest_s
         The largest delay observed, mean + spread.
     constant_margin_s, rate_bound_s, spread_bound_s, any_bound_s
