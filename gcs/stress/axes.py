@@ -108,10 +108,10 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
         if name.startswith("delay_"):
             scenario = _with_vehicle_delay(scenario, int(name.removeprefix("delay_")), delay_s)
     if "jitter" in coordinates:
-        scenario = _changed_links(scenario, lambda link: _with_jitter(link, coordinates["jitter"]))
+        scenario = _with_every_link(scenario, lambda link: _with_jitter(link, coordinates["jitter"]))
     if "loss" in coordinates:
         loss = {"loss_probability": coordinates["loss"]}
-        scenario = _changed_links(scenario, lambda link: link.model_copy(update=loss))
+        scenario = _with_every_link(scenario, lambda link: link.model_copy(update=loss))
     return scenario
 
 
@@ -153,11 +153,5 @@ def _with_vehicle_delay(scenario: Scenario, system_id: int, delay_s: float) -> S
     return scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (*others, own)})})
 
 
-def _changed_links(scenario: Scenario, change: Callable[[Link], Link]) -> Scenario:
-    """The scenario with every link changed."""
-    links = scenario.links
-    own = tuple(
-        v.model_copy(update={"up": v.up and change(v.up), "down": v.down and change(v.down)}) for v in links.vehicles
-    )
-    update = {"up": change(links.up), "down": change(links.down), "vehicles": own}
-    return scenario.model_copy(update={"links": links.model_copy(update=update)})
+def _with_every_link(scenario: Scenario, change: Callable[[Link], Link]) -> Scenario:
+    return scenario.with_links(change, change)

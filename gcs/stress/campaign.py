@@ -143,7 +143,8 @@ def local_workers(count: int) -> Generator[Fly]:
 
         def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
             if not pools:
-                pools.append(_pool(count))
+                with held_back():  # multiprocessing's resource tracker, which starts here, would die of SIGHUP
+                    pools.append(_pool(count))
                 stack.callback(pools[0].shutdown, cancel_futures=True)
             try:
                 with held_back():  # workers that are just starting leave Ctrl-C to this process

@@ -17,6 +17,7 @@ What would hide the loop is taken out:
   Its loop is the same for that: what the station uses of the others is brought to the instant of its own state.
 * Changes of the nominal velocity, and the noise of the vehicles' sensors.
 * The vehicles' failsafe, which lossy links would now and then call for: it opens the loop.
+* The scenario's limit of the spacing error: a growing error has to be seen for long enough to be measured.
 * The vehicles' limits. A small error stays within them, and so within them the loop is this one; but links that lose or
   delay at random push vehicles by more than an error of a millimetre, and what is cut off then is no linear response.
   `past_limits` says when they do.
@@ -28,7 +29,7 @@ from gains.core.arrays import FloatArray
 from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import TickArray
 from gcs.plan.flight_plan import FlightPlan
-from scenarios.schema import Limits, Link, Scenario, Vehicle
+from scenarios.schema import Limits, Link, Safety, Scenario, Vehicle
 
 PROBE_S = 20.0
 _SPEED_MIN_M_S = 1e-3
@@ -69,7 +70,11 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         "duration_s": PROBE_S,
         "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
         "safety": scenario.safety.model_copy(
-            update={"setpoint_timeout_s": 2.0 * PROBE_S, "heartbeat_timeout_s": 2.0 * PROBE_S}
+            update={
+                "setpoint_timeout_s": 2.0 * PROBE_S,
+                "heartbeat_timeout_s": 2.0 * PROBE_S,
+                "spacing_error_limit_m": Safety().spacing_error_limit_m,
+            }
         ),
     }
     return scenario.model_copy(update=update)

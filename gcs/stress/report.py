@@ -62,15 +62,15 @@ def write_report(
         axes=axes,
         random=not exact(study, axes),
         coupled=any(len(loop.system_ids) > 1 for loop in plan_loops(study.plan)),
-        again=replay_command(folder, result["worst"][0]) if result["worst"] else "",
+        again=refly_command(folder, result["worst"][0]) if result["worst"] else "",
     )
     file = folder / REPORT_FILE
     file.write_text(page, encoding="utf-8")
     return file
 
 
-def replay_command(folder: Path, trial_id: str) -> str:
-    """What flies a trial of a campaign again."""
+def refly_command(folder: Path, trial_id: str) -> str:
+    """The command that flies a trial of a campaign again."""
     return shlex.join(["gcs", "stress", str(folder / "scenario.toml"), "--out", str(folder), "--trial", trial_id])
 
 

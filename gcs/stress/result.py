@@ -3,24 +3,26 @@
 import platform
 import subprocess
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gcs.plan.design import Design
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.figures import worst_of
 from gcs.stress.study import NoOnset, Onset, Study, curve_error
 from gcs.stress.trial import Outcome
 
+_GAINS = ("K1_1_s", "K2_1_s", "K3_1_s2", "blocks")
 _PACKAGES = ("formation-gcs", "numpy", "scipy", "clarabel", "cvxpy", "pymavlink")
 
 
 def result_of(
     study: Study,
-    design: Mapping[str, Any],
+    design: Design,
     outcomes: Sequence[Outcome],
     *,
     axes: Sequence[Axis],
@@ -43,10 +45,10 @@ def result_of(
     worst = worst_of(outcomes)
     return {
         "scenario": study.plan.scenario.name,
-        "delay_margin_s": design["delay_margin_s"],
-        "delay_margin_continuous_s": design["delay_margin_continuous_s"],
-        "period_s": design["period_s"],
-        "gains": {name: design[name] for name in ("K1_1_s", "K2_1_s", "K3_1_s2", "blocks") if name in design},
+        "delay_margin_s": design.delay_margin_s,
+        "delay_margin_continuous_s": design.delay_margin_continuous_s,
+        "period_s": design.period_s,
+        "gains": {name: gain for name, gain in design.to_dict().items() if name in _GAINS},
         "real_time": study.real_time,
         "axes": {axis.name: list(axis.values) for axis in axes},
         "onset": None if onset is None else onset.to_dict(),

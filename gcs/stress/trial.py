@@ -126,9 +126,7 @@ def plan_of(trial: Trial) -> FlightPlan:
     K = np.zeros((2 * n, 4 * n - 2))
     for row, column, value in trial.gain:
         K[row, column] = value
-    calm = trial.scenario.monitor.model_copy(update={"act": False})
-    scenario = trial.scenario.model_copy(update={"monitor": calm})
-    return FlightPlan(scenario, formation, K, trial.delay_margin_s)
+    return FlightPlan(trial.scenario.with_calm_monitor(), formation, K, trial.delay_margin_s)
 
 
 def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:

@@ -18,7 +18,7 @@ from sim_vehicles.links.truth import Record
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.services import LONGEST_TEXT
 from sim_vehicles.vehicles.copter import Copter, multicopter
-from sim_vehicles.vehicles.double_integrator import Vehicle, launched
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator, launched
 from sim_vehicles.vehicles.dynamics import State
 from sim_vehicles.vehicles.onboard import OnboardLoop
 from sim_vehicles.vehicles.shell import Change, Shell
@@ -31,7 +31,7 @@ _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 @dataclass(slots=True)
 class _Member:
-    vehicle: Shell[Vehicle] | Shell[Copter]
+    vehicle: Shell[DoubleIntegrator] | Shell[Copter]
     up: Link
     down: Link
     signed: SignedLink | None = None
@@ -128,7 +128,7 @@ class Fleet:
             total.update(member.vehicle.counters)
         return total
 
-    def vehicle(self, system_id: int) -> Shell[Vehicle] | Shell[Copter]:
+    def vehicle(self, system_id: int) -> Shell[DoubleIntegrator] | Shell[Copter]:
         """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
         return self._members[system_id].vehicle
 

@@ -19,7 +19,7 @@ from gains.margin.model_file import parse_model
 from gains.margin.opinions import checked_delay_margin
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
-from gcs.margin import margin_of_model
+from gcs.cli.margin import margin_of_model
 
 Matrix = NDArray[np.float64]
 Pair = tuple[Matrix, Matrix]

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from tests.support.flown_run import line, prepare, ticks_of
 
 from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.summary import finish
 from gcs.stress.campaign import CampaignError, Store
 from gcs.stress.trial import Outcome
+from tests.support.flown_run import line, prepare, ticks_of
 
 THREE = line(3)
 
