@@ -29,6 +29,8 @@ INTERNAL_FUNCTIONS = {
     "gains.formation.pattern.checked_pattern_gain",
     "gains.margin.opinions.margin_error_s",
     "gains.margin.opinions.second_opinions",
+    "gains.performance.delayed_alpha.alpha_at",
+    "gains.performance.delayed_alpha.alpha_limit_s",
     "gains.performance.robust.negative",
     "gains.performance.robust.solved",
     "gains.sampled.constant.checked_loop",
