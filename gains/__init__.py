@@ -1,36 +1,146 @@
-"""Control mathematics of formations: gains for an information pattern, and the delay that their loops take.
+"""Control mathematics of formations: gains for an information pattern, and how much delay their loops take.
 
-Nothing is imported here; each module is imported by its name. Matrices are arrays or nested lists, A, B, K with the
-feedback u = +K x; times in s, frequencies in rad/s, state matrices in 1/s. Exceptions are in `errors`.
+The names below are what a user imports; importing one loads only what it needs. The rooms that they come from hold
+more, each room using those below it:
 
-Loops with a constant delay
-    `delay` (windows and margin, exact), `delay_sweep`, `rightmost`, `delay_opinions` (what confirms it),
-    `commensurate` and `mixed_delays` (multiples of one delay, beside known ones), `several_delays`, `model_file` and
-    `loop_margin` (any of these, and sampled loops, from one description)
-Loops as they are flown
-    `sampled` (sampled and held), `period_windows`, `multirate`, `onboard`, `response` (vehicles that lag),
-    `flown_loop` (what a delay leaves of robustness and string stability)
-Delays that vary
-    `varying_delay`, `jitter` (which bound covers what was observed)
-Formations and patterns
-    `formation`, `pattern`, `fixed_modes`, `string_stability`, `behaviour`, `structure` (blocks that really interact)
-Designs
-    `design` (one call for both routes), `requirement`; by the inclusion principle: `inclusion`,
-    `robust`, `required`, `search`, `scalar_gains`;
-    by graphs: `graph_design`, `bipartite`, `lqr`, `structured_lqr`, `dk_iteration`; to compare with: `centralised`
-Inside
-    `lmi` (inequalities with a proof that is checked); crossings and loci of the loops in the modules not named here
+* `core`: requirements, errors, array types, and the splitting of a matrix into blocks that interact.
+* `formation`: formation models and information patterns, the inclusion principle, partitions, fixed modes.
+* `delay`: loops with constant delays: every window of stability, the delay margin, the rightmost root, two delays.
+* `sampled`: loops as they are flown: sampled and held, telemetry at another rate, own errors fed back on board.
+* `varying`: delays that change: which of them a loop is proved to take.
+* `margin`: the engine of `gcs margin`: any linear loop from one description, confirmed by second opinions.
+* `performance`: what given gains do: robustness, growth down the chain, vehicles that respond with a lag.
+* `design`: from a requirement to gains.
+
+A module whose name begins with an underscore is internal. Matrices are arrays or nested lists; A, B and K are those of
+x' = A x + B u, u = +K x. Times are in s, frequencies in rad/s, state matrices in 1/s.
 
 Examples
 --------
 Gains for a leader and two followers that take 0.3 s at 50 Hz; without sampling the loop takes half a period more:
 
->>> from gains.delay.constant import delay_margin
->>> from gains.design.design import design
->>> from gains.formation.model import FormationModel
->>> from gains.core.requirement import Requirement
+>>> from gains import FormationModel, Requirement, delay_margin, design
 >>> chain = FormationModel((-1, 0, 1))
 >>> found = design(chain, Requirement(delay_margin_s=0.3), period_s=0.02)
 >>> round(found.delay_margin_s, 3), round(delay_margin(*chain.ground_loop(found.K1, found.K2, found.K3)), 3)
 (0.3, 0.31)
 """
+
+import sys
+from types import ModuleType
+
+# that of `typing`, whose import would take far longer than that of this package
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from gains.core.errors import BadModelError, DisagreementError, GainsError, InfeasibleError, SolverError
+    from gains.core.requirement import Requirement
+    from gains.delay.constant import DelayAnalysis, analyse_delay, delay_margin
+    from gains.delay.rightmost import rightmost_root
+    from gains.delay.several import boundary_of_two_delays, delay_box
+    from gains.design.design import Design, design, evaluate_gains, trade_off
+    from gains.formation.fixed_modes import fixed_modes
+    from gains.formation.model import FormationModel
+    from gains.formation.pattern import Pattern, all_to_all, bidirectional, formation_plant, leader_follower
+    from gains.margin.loop_margin import LoopMargin, loop_margin
+    from gains.margin.model_file import parse_model
+    from gains.margin.opinions import checked_delay_margin
+    from gains.performance.response import Response
+    from gains.performance.robust import robustness
+    from gains.sampled.constant import sampled_delay_margin
+    from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
+    from gains.sampled.multirate import Timing, multirate_delay_margin
+    from gains.sampled.onboard import OnboardTiming, onboard_loop
+    from gains.varying.bounds import varying_delay_bound
+    from gains.varying.jitter import Jitter, bound_covering, spread_bound
+
+__all__ = [
+    "BadModelError",
+    "CoupledBlock",
+    "DelayAnalysis",
+    "Design",
+    "DisagreementError",
+    "FormationModel",
+    "GainsError",
+    "InfeasibleError",
+    "Jitter",
+    "LoopMargin",
+    "OnboardTiming",
+    "Pattern",
+    "Requirement",
+    "Response",
+    "SolverError",
+    "Timing",
+    "all_to_all",
+    "analyse_delay",
+    "bidirectional",
+    "bound_covering",
+    "boundary_of_two_delays",
+    "checked_delay_margin",
+    "coupled_blocks",
+    "delay_box",
+    "delay_margin",
+    "design",
+    "evaluate_gains",
+    "fixed_modes",
+    "formation_plant",
+    "leader_follower",
+    "loop_margin",
+    "multirate_delay_margin",
+    "onboard_loop",
+    "parse_model",
+    "rightmost_root",
+    "robustness",
+    "sampled_delay_margin",
+    "spread_bound",
+    "trade_off",
+    "varying_delay_bound",
+]
+
+_NAMES = {
+    "core.errors": "BadModelError DisagreementError GainsError InfeasibleError SolverError",
+    "core.requirement": "Requirement",
+    "delay.constant": "DelayAnalysis analyse_delay delay_margin",
+    "delay.rightmost": "rightmost_root",
+    "delay.several": "boundary_of_two_delays delay_box",
+    "design.design": "Design design evaluate_gains trade_off",
+    "formation.fixed_modes": "fixed_modes",
+    "formation.model": "FormationModel",
+    "formation.pattern": "Pattern all_to_all bidirectional formation_plant leader_follower",
+    "margin.loop_margin": "LoopMargin loop_margin",
+    "margin.model_file": "parse_model",
+    "margin.opinions": "checked_delay_margin",
+    "performance.response": "Response",
+    "performance.robust": "robustness",
+    "sampled.constant": "sampled_delay_margin",
+    "sampled.coupled_block": "CoupledBlock coupled_blocks",
+    "sampled.multirate": "Timing multirate_delay_margin",
+    "sampled.onboard": "OnboardTiming onboard_loop",
+    "varying.bounds": "varying_delay_bound",
+    "varying.jitter": "Jitter bound_covering spread_bound",
+}
+_HOME = {name: f"gains.{module}" for module, names in _NAMES.items() for name in names.split()}
+
+
+class _Package(ModuleType):
+    """This package; importing the room `gains.design` leaves the name `design` to the function."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,1 +1,1 @@
-"""What every part of the mathematics needs: array types, errors, block structure, bracketing, requirements."""
+"""What all other rooms use: array types, errors, blocks of a matrix, bracketing of roots, requirements."""

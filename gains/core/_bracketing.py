@@ -1,7 +1,7 @@
 """Roots and peaks of scalar functions, within brackets.
 
-Most functions here take all abscissae (k,) and return all values (k,): one batch of eigenvalue problems a step, which
-is what the time goes to.
+Most functions here evaluate all abscissae (k,) at once, as one batch of eigenvalue problems a step: nearly all the time
+is spent there.
 """
 
 from collections.abc import Callable

@@ -4,10 +4,10 @@
 
     ValueError
     └── GainsError             what `gains` raises on purpose
-        ├── BadModelError      a matrix or number handed in is not what was wanted: shape, sign, not finite
+        ├── BadModelError      an argument is not what was wanted: its shape, its sign, not finite
         ├── InfeasibleError    the design problem has no solution for the data given
         ├── SolverError        the optimiser stopped without a solution that can be trusted
-        └── DisagreementError  independent methods gave different answers to one question
+        └── DisagreementError  independent methods give different answers to one question
 """
 
 
@@ -16,7 +16,7 @@ class GainsError(ValueError):
 
 
 class BadModelError(GainsError):
-    """A matrix or a number handed in is not what was wanted; the message names what was read and what was wanted."""
+    """An argument is not what was wanted; the message names what was read and what was wanted."""
 
 
 class InfeasibleError(GainsError):
@@ -28,4 +28,4 @@ class SolverError(GainsError):
 
 
 class DisagreementError(GainsError):
-    """Independent methods gave different answers to one question; the message lists each method's answer."""
+    """Independent methods give different answers to one question; the message lists the answer of each."""

@@ -1,4 +1,7 @@
-"""What a design must reach, and the plain form in which designs are written."""
+"""What a design must reach, and the plain types in which designs are written to JSON.
+
+`gains.design.design` turns a requirement into gains.
+"""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -14,7 +17,7 @@ ALPHA_MIN, DELAY_MARGIN_MAX_S = 5e-4, 30.0
 
 @dataclass(frozen=True)
 class OnboardPeak:
-    """A limit on the growth of spacing errors in a loop of which only what is from other vehicles is late.
+    """A limit on the growth of spacing errors in the onboard loop, where only the errors of other vehicles arrive late.
 
     Examples
     --------

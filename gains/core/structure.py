@@ -1,10 +1,10 @@
-"""Splitting a linear model into the parts that really interact.
+"""Splits a linear model into the blocks that really interact.
 
 A leader-follower tree is block triangular. Its identical followers form one defective eigenvalue chain as long as
 the tree is deep, and rounding spreads a defective eigenvalue of multiplicity N over a circle of radius eps^(1/N):
 from about eight vehicles on, every method that looks at the whole matrix returns wrong verdicts. The strongly
-connected components of the pattern are the diagonal blocks of the triangular form; the spectrum, with or without
-delays, is the union of theirs, so the blocks are analysed one by one, and equal blocks once.
+connected components of the pattern are the diagonal blocks of the triangular form. The spectrum, with or without
+delays, is the union of theirs, so each block is analysed on its own, and equal blocks once.
 """
 
 import heapq
@@ -24,10 +24,10 @@ _LARGEST_CLOSURE = 64
 
 @dataclass(frozen=True)
 class Block:
-    """A diagonal block of the triangular form, once for all its equal copies.
+    """A diagonal block of the triangular form, which stands for all its equal copies.
 
     `indices` are the states of the first copy, `copies` the number of equal blocks, `matrices` the diagonal blocks of
-    the matrices handed in, in their order.
+    the given matrices, in their order.
     """
 
     indices: IntArray
@@ -140,7 +140,7 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
 
 
 def project_out_equilibria(*matrices: ArrayLike) -> tuple[FloatArray, ...]:
-    """The matrices without the states along which nothing ever acts: consensus without its common value.
+    """The matrices without the directions along which nothing ever acts: a consensus without its common value.
 
     Directions v with A_k v = 0 for every k (or, for conserved quantities, w'A_k = 0) carry a root of
     det(sI - A_0 - A_1 e^{-s tau} - ...) at s = 0 for every delay. An orthonormal basis whose first columns span them
@@ -174,7 +174,7 @@ def project_out_equilibria(*matrices: ArrayLike) -> tuple[FloatArray, ...]:
 
 
 def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], int]:
-    """The matrices with `project_out_equilibria` done in each strongly connected block, and how many states went.
+    """The matrices after `project_out_equilibria` in each strongly connected block, and the number of states removed.
 
     The blocks are put side by side, which keeps the spectrum. A block in which nothing moves at all (an integrator
     that nobody feeds back) stays as it is.
@@ -244,7 +244,7 @@ def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
 def is_singular_for_any_delay(matrices: Iterable[FloatArray] | FloatArray) -> bool:
     """Whether the sum of the matrices is singular to rounding: s = 0 is then a root however late each one acts.
 
-    Each row is judged in its own unit: a motion that is slow beside others is none that stands still.
+    Each row is judged in its own unit, so a motion that is merely slow beside others does not count as a standstill.
 
     Examples
     --------

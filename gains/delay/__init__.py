@@ -1,1 +1,1 @@
-"""Delay margins of continuous loops with constant delays."""
+"""Continuous loops with constant delays: windows of stability, delay margins, rightmost roots. Begin at `constant`."""

@@ -2,11 +2,12 @@
 
 With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda, so at each frequency there are finitely
 many lambda with det(j omega I - sum_k A_k lambda^{-k}) = 0: the eigenvalues of a block companion matrix. They are loci
-as those of one delay (`gains.delay._loci`): a root is on the imaginary axis where a modulus is one, and it goes right
-where that modulus falls with the frequency, whatever the delay. Everything else is as with one delay.
+like those of one delay (`_loci`): a root is on the imaginary axis where a modulus is one, and it moves to the right
+where that modulus falls with the frequency, whatever the delay. With one delay alone (m = 1) the crossings come from
+`_crossings`; everything else is the same.
 
-The frequencies come from a pencil and from Newton's method along the unit circle, see `gains.delay._circle_angles`. A
-sweep of the circle is the second opinion.
+The frequencies come from a pencil and from Newton's method along the unit circle, see `_circle_angles`. A sweep of the
+circle is the second opinion (`gains.margin.opinions`).
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, for the same problem as a
 polynomial eigenvalue problem.
@@ -32,9 +33,8 @@ from gains.delay._crossings import (
     polish,
     separating_points,
 )
-from gains.delay._loci import Loci, UnitCrossing, solved_beside_poles, unit_crossings
-from gains.delay._zero_root import zero_passage
-from gains.delay.constant import (
+from gains.delay._loci import Loci, UnitCrossing, highest_frequency, solved_beside_poles, unit_crossings
+from gains.delay._windows import (
     BlockAnalysis,
     DelayAnalysis,
     block_analysis,
@@ -42,6 +42,7 @@ from gains.delay.constant import (
     combined_analysis,
     unstable_roots,
 )
+from gains.delay._zero_root import zero_passage
 
 # a locus is an eigenvalue of a companion matrix, of which many are wanted; beyond this size angles are followed instead
 _LARGEST_LOCI = 30
@@ -86,23 +87,26 @@ def analyse_commensurate(
     """
     check_horizon(horizon_s)
     blocks = distinct_blocks(*_checked(matrices))
-    return combined_analysis([_analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
+    return combined_analysis([analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
 
 
-def _analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
+def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
+    """One block of x'(t) = sum_k A_k x(t - k tau), its matrices being A_0, A_1, ..."""
     terms = balanced(*block.matrices)
     delayed = [DelayedTerm(matrix, 0.0, k) for k, matrix in enumerate(terms)]
     roots = np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).astype(np.complex128)
     passage = zero_passage(terms, np.zeros(len(terms)), np.arange(len(terms))) if leave_out_zero else None
-    if passage is None and has_fixed_root(terms, roots):
-        return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
-    found = block_crossings(terms)
+    if passage is None and _has_fixed_root(terms, roots):
+        # a simple eigenvalue on the axis may be this far off by rounding
+        unstable = int(np.count_nonzero(roots.real > 1e-13 * norm_of(terms)))
+        return BlockAnalysis(block.copies, delayed, unstable=unstable, fixed_on_axis=True)
+    found = _block_crossings(terms)
     unstable = unstable_roots(roots, found, passage)
     return block_analysis(block.copies, delayed, found, unstable, passage, highest_frequency(terms))
 
 
 def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
-    """The delay margin of `analyse_commensurate` by a sweep along the unit circle: a second opinion.
+    """The delay margin of `analyse_commensurate`, found by a sweep along the unit circle: a second opinion.
 
     The eigenvalues s of A(theta) = sum_k A_k e^{-j k theta} on a grid of angles; where one crosses the imaginary axis
     at j omega, tau = theta / omega is critical. Sorted real parts are continuous in the angle, so crossings are
@@ -121,7 +125,7 @@ def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
     return min(_circle_margin(balanced(*block.matrices)) for block in blocks)
 
 
-def block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
+def _block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
     """Crossings of the imaginary axis of one block, omega > 0, ascending; theta = omega tau modulo 2 pi."""
     present = [k for k, matrix in enumerate(terms) if k > 0 and matrix.any()]
     if not present:
@@ -170,15 +174,9 @@ def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
     return sorted(crossings, key=lambda crossing: crossing.omega)
 
 
-def highest_frequency(terms: Sequence[FloatArray]) -> float:
-    """Bound (rad/s) of every root on the imaginary axis, whatever the delays; terms[0] acts at once."""
-    turning = float(np.linalg.norm(terms[0] - terms[0].T)) / 2.0
-    return turning + float(sum(np.linalg.norm(matrix) for matrix in terms[1:]))
-
-
-def has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
+def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
     """Whether an eigenvalue on the imaginary axis of sum A_k (all of them: `roots`) is a root at every delay."""
-    scale = float(sum(np.linalg.norm(matrix) for matrix in terms))
+    scale = norm_of(terms)
     if scale == 0.0:
         return True
     for root in roots[np.abs(roots.real) < 1e-6 * scale]:

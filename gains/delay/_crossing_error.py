@@ -1,6 +1,7 @@
-"""How well a crossing of the imaginary axis is known, from its own sensitivity to rounding.
+"""Terms of a loop with one unknown delay, and how accurately a crossing of the imaginary axis is known.
 
-Methods in double precision blur a multiple root alike, however well they agree with each other.
+All methods in double precision blur a multiple root alike, however well they agree with each other. The error of a
+crossing is therefore estimated from its own sensitivity to rounding.
 """
 
 from collections.abc import Sequence
@@ -29,6 +30,14 @@ class DelayedTerm:
     def delay_s(self, tau_s: float) -> float:
         """The delay (s) at one value of the unknown."""
         return self.known_s + self.multiple * tau_s
+
+
+def by_multiple(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
+    """A_0, A_1, ..., A_m of sum_k A_k x(t - k tau), from terms without known delays."""
+    matrices = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
+    for term in terms:
+        matrices[term.multiple] = matrices[term.multiple] + term.matrix
+    return matrices
 
 
 def crossing_error(terms: Sequence[DelayedTerm], omega: float, tau_s: float) -> tuple[float, float]:

@@ -1,9 +1,8 @@
 """Where roots of x'(t) = A0 x(t) + A1 x(t - tau) cross the imaginary axis, found without a grid.
 
-The algebraic test gives a finite list of frequencies that contains every crossing. The loci of the loop
-(`gains.delay._loci`) are then counted between these frequencies, which says how many crossings there are and in which
-direction, brackets them, and does not rely on the list being accurate; Newton's method on the characteristic matrix
-gives the last digits.
+The algebraic test gives a finite list of frequencies near every crossing. Counting the loci of the loop (`_loci`)
+between these frequencies then tells how many crossings there are and in which direction, and brackets them; it does not
+rely on the accuracy of the list. Newton's method on the characteristic matrix gives the last digits.
 """
 
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from gains.delay._loci import (
     UnitCrossing,
     delay_loci,
     factor_rank,
+    highest_frequency,
     slope_sign,
     unit_crossings,
     without_limits_at_zero,
@@ -56,8 +56,8 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
     B, C = factor_rank(A1)
     if B.shape[1] == 0:
         return []
-    candidates = _candidates(A0, A1, B, C, highest_frequency(A0, A1))
-    found = crossings_of_loci(delay_loci(A0, B, C), candidates, highest_frequency(A0, A1))
+    highest = highest_frequency((A0, A1))
+    found = crossings_of_loci(delay_loci(A0, B, C), _candidates(A0, A1, B, C, highest), highest)
     polished = [polish((A0, A1), crossing) for crossing in found if is_root((A0, A1), crossing)]
     return sorted(polished, key=lambda crossing: (crossing.omega, crossing.theta))
 
@@ -78,11 +78,6 @@ def crossings_of_loci(loci: Loci, candidates: FloatArray, highest: float) -> lis
     """All crossings of the unit circle, mere touches included, given frequencies that come near each of them."""
     crossings = unit_crossings(loci, separating_points(candidates, highest))
     return without_limits_at_zero(loci, crossings + hidden_crossings(loci, candidates, crossings), highest)
-
-
-def highest_frequency(A0: FloatArray, A1: FloatArray) -> float:
-    """Bound (rad/s) of every crossing frequency: lambda_max((A0 - A0')/(2j)) + ||A1||, in the Frobenius norm."""
-    return float(np.linalg.norm(A0 - A0.T) / 2.0 + np.linalg.norm(A1))
 
 
 def _candidates(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, highest: float) -> FloatArray:

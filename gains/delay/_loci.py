@@ -7,7 +7,7 @@ Sorted moduli are continuous functions of the frequency however the eigenvalues 
 bracketing safe: between two frequencies at which a different number of moduli exceeds one, there is a crossing.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +49,12 @@ def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     rank = int(np.count_nonzero(singular > matrix.shape[0] * _EPS * singular[0])) if singular[0] > 0.0 else 0
     root = np.sqrt(singular[:rank])
     return U[:, :rank] * root, root[:, np.newaxis] * Vh[:rank]
+
+
+def highest_frequency(terms: Sequence[FloatArray]) -> float:
+    """Bound (rad/s) of every root on the imaginary axis, whatever the delays; terms[0] acts at once."""
+    turning = float(np.linalg.norm(terms[0] - terms[0].T)) / 2.0
+    return turning + float(sum(np.linalg.norm(matrix) for matrix in terms[1:]))
 
 
 def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray) -> Loci:

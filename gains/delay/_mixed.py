@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
-from gains.delay._commensurate import column_space, companion_loci, highest_frequency
+from gains.delay._commensurate import column_space, companion_loci
 from gains.delay._crossing_error import DelayedTerm
 from gains.delay._crossings import AxisCrossing
-from gains.delay._loci import Loci, unit_crossings, without_limits_at_zero
+from gains.delay._loci import Loci, highest_frequency, unit_crossings, without_limits_at_zero
+from gains.delay._windows import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
 from gains.delay._zero_root import zero_passage
-from gains.delay.constant import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
 from gains.delay.sweep import near_unit_extrema
 
 # rad by which e^{-j omega d} turns between neighbouring frequencies
@@ -36,26 +36,8 @@ _DETERMINANT_TURN, _HALVINGS = 0.5, 40
 _LEAST_FREQUENCY = 1e-7
 
 
-@dataclass(frozen=True)
-class MixedTerm:
-    """A x(t - known_s - multiple * tau): `matrix` A real (n, n) in 1/s, `known_s` >= 0, `multiple` whole and >= 0.
-
-    Examples
-    --------
-    -x(t - 0.5 - 2 tau):
-
-    >>> from gains.delay._mixed import MixedTerm
-    >>> MixedTerm([[-1]], known_s=0.5, multiple=2)
-    MixedTerm(matrix=[[-1]], known_s=0.5, multiple=2)
-    """
-
-    matrix: ArrayLike
-    known_s: float
-    multiple: int
-
-
 def analyse_mixed(
-    terms: Sequence[MixedTerm], *, horizon_s: float | None = None, leave_out_zero: bool = False
+    terms: Sequence[DelayedTerm], *, horizon_s: float | None = None, leave_out_zero: bool = False
 ) -> DelayAnalysis:
     """Stability windows, critical delays and margin in tau of x'(t) = sum A x(t - known_s - multiple tau).
 
@@ -81,8 +63,10 @@ def analyse_mixed(
     --------
     x'(t) = -x(t - 0.5 - tau) leaves pi / 2 - 0.5 for tau:
 
-    >>> from gains.delay._mixed import MixedTerm, analyse_mixed
-    >>> round(analyse_mixed([MixedTerm([[-1]], known_s=0.5, multiple=1)]).delay_margin_s, 6)
+    >>> import numpy as np
+    >>> from gains.delay._crossing_error import DelayedTerm
+    >>> from gains.delay._mixed import analyse_mixed
+    >>> round(analyse_mixed([DelayedTerm(np.array([[-1.0]]), known_s=0.5, multiple=1)]).delay_margin_s, 6)
     1.070796
     """
     matrices = _checked(terms)
@@ -128,7 +112,7 @@ def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_
     >>> count_unstable_roots([([[-1]], 2.0)])
     2
     """
-    checked = [MixedTerm(matrix, delay_s, 0) for matrix, delay_s in terms]
+    checked = [DelayedTerm(matrix, delay_s, 0) for matrix, delay_s in terms]
     blocks, delays_s = distinct_blocks(*_checked(checked)), np.array([term.known_s for term in checked])
     count = 0
     for block in blocks:
@@ -227,7 +211,7 @@ def _unstable_roots(parts: _Parts, at_zero: bool) -> int:
     return round(total / pi)
 
 
-def _checked(terms: Sequence[MixedTerm]) -> list[FloatArray]:
+def _checked(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
     if len(terms) == 0:
         raise BadModelError("terms is empty; at least one is wanted")
     for i, term in enumerate(terms):

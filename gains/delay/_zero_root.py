@@ -1,7 +1,7 @@
 """A simple root at s = 0 that stays there at every delay, as the common value of a consensus, and what passes it.
 
 With M(s) = sI - sum_k A_k e^{-s d_k}, M(0) = -sum_k A_k does not depend on the delays: where it is singular, s = 0 is a
-root at all of them, whether or not anything stands still on its way (in x' = -x + x(t - tau) nothing does). With
+root at all of them, even where no state stands still by itself, as in x' = -x + x(t - tau). With
 w'M(0) = 0 and M(0) v = 0 the other roots near zero solve
 
     f(s) / s = w'M'v + s w'(M''/2 - M' G M') v + ...,   M' = I + sum_k d_k A_k,  M'' = -sum_k d_k^2 A_k,
@@ -47,7 +47,7 @@ class ZeroPassage:
 def zero_passage(
     matrices: Sequence[FloatArray] | FloatArray, known_s: FloatArray, multiples: IntArray
 ) -> ZeroPassage | None:
-    """What passes the simple root of a block at s = 0, or None if it has no such root at every delay.
+    """The root that passes the simple root of a block at s = 0; None if s = 0 is no simple root at every delay.
 
     Parameters
     ----------

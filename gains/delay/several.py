@@ -1,4 +1,4 @@
-"""Several independent delays, one for each link: which combinations does the loop take?
+"""Several independent delays, one for each link: the combinations under which the loop is stable.
 
 x'(t) = A0 x(t) + A1 x(t - tau_1) + A2 x(t - tau_2) has a root j omega where det(j omega I - A0 - A1 e^{-j alpha} -
 A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. Fixing alpha leaves one delay and a complex A0, whose
@@ -44,7 +44,7 @@ class Polyline:
 
 @dataclass(frozen=True)
 class DelayBox:
-    """Which delays tau_1, ..., tau_m the loop takes independently of each other.
+    """The delays tau_1, ..., tau_m that the loop takes independently of each other.
 
     `limits_s` is the limit of each delay as far as blocks with that delay alone set it; `inf` without limit, and all
     zero if a block is unstable without delay. `coupled` lists the sets of delays (indices into the delays) that meet
@@ -59,32 +59,6 @@ class DelayBox:
     def is_exact(self) -> bool:
         """Whether no limit depends on another delay."""
         return not self.coupled
-
-
-def stable_at(A0: ArrayLike, late: Sequence[ArrayLike], delays_s: Sequence[float]) -> bool:
-    """Whether x'(t) = A0 x(t) + sum_k late[k] x(t - delays_s[k]) is asymptotically stable.
-
-    Parameters
-    ----------
-    A0, late
-        Real matrices (n, n), 1/s: what acts at once, and what acts late, one for each delay.
-
-    Raises
-    ------
-    BadModelError
-        As of `gains.delay.rightmost.rightmost_root`, or there are not as many delays as late matrices.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau_1) - x(t - tau_2) is stable up to pi / 4 = 0.785 if the delays are equal:
-
-    >>> from gains.delay.several import stable_at
-    >>> stable_at([[0]], [[[-1]], [[-1]]], [0.78, 0.78]), stable_at([[0]], [[[-1]], [[-1]]], [0.79, 0.79])
-    (True, False)
-    """
-    if len(late) != len(delays_s):
-        raise BadModelError(f"delays_s has {len(delays_s)} delays; {len(late)} are wanted, as late matrices")
-    return rightmost_root([(A0, 0.0), *zip(late, delays_s, strict=True)]).real < 0.0
 
 
 def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
@@ -128,7 +102,7 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
 
 
 def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list[FloatArray]:
-    """The part of B K that each vehicle's command contributes, one matrix (n, n) a vehicle: its own delayed term.
+    """The part of B K that comes from each vehicle's command, one matrix (n, n) a vehicle: a delayed term of its own.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from gains.core._bracketing import may_reach_zero, peaks
 from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._loci import Loci, delay_loci, log_moduli, unit_crossings, without_limits_at_zero
+from gains.delay._loci import Loci, delay_loci, highest_frequency, log_moduli, unit_crossings, without_limits_at_zero
 
 # points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
 _POINTS_PER_DECADE = 60
@@ -54,7 +54,7 @@ def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 
 def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
     """Ascending frequencies (rad/s) up to the bound of every crossing frequency, dense around resonances."""
-    highest = 1.1 * float(np.linalg.norm(A0 - A0.T) / 2.0 + np.linalg.norm(A1))
+    highest = 1.1 * highest_frequency((A0, A1))
     grid = [highest * np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE)]
     roots = np.concatenate([np.linalg.eigvals(A0), np.linalg.eigvals(A0 + A1)])
     offsets = np.sinh(np.linspace(-5.0, 5.0, 41))

@@ -1,1 +1,1 @@
-"""Formation models and information patterns, the inclusion principle, partitions and fixed modes."""
+"""Formation models, information patterns, the inclusion principle, partitions and fixed modes. Begin at `model`."""

@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
-from gains.core.structure import real_matrix
 from gains.formation.pattern import Link, Pattern, Plant, check_fits, checked_pattern_gain
 
 Origin = Literal["by input", "by output", "greedy", "search"]
@@ -94,7 +93,7 @@ class ExpandedGain:
     >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
     >>> expanded.expand([[-1, 0], [2, -3]]).tolist()
     [[-1.0, 0.0, 0.0], [0.0, 2.0, -3.0]]
-    >>> expanded.contract([[-1, 0, 0], [0, 2, -3]]).tolist()
+    >>> (expanded.phi1 @ expanded.expand([[-1, 0], [2, -3]]) @ expanded.phi2).tolist()
     [[-1.0, 0.0], [2.0, -3.0]]
     """
 
@@ -104,23 +103,8 @@ class ExpandedGain:
     phi2: FloatArray
     mask: NDArray[np.bool_]
 
-    def contract(self, K_expanded: ArrayLike) -> FloatArray:
-        """K = φ1 K̄ φ2 (4.3).
-
-        Raises
-        ------
-        BadModelError
-            If K̄ has not the shape or not the zeros of the mask.
-        """
-        gain = real_matrix("K_expanded", K_expanded)
-        if gain.shape != self.mask.shape:
-            raise BadModelError(f"K_expanded has shape {gain.shape}; {self.mask.shape} is wanted")
-        if gain[~self.mask].any():
-            raise BadModelError("K_expanded has entries outside its diagonal blocks; zeros are wanted there")
-        return self.phi1 @ gain @ self.phi2
-
     def expand(self, K: ArrayLike) -> FloatArray:
-        """K̄ with `contract(K̄)` = K: every block of K goes to the one subgraph that holds its link.
+        """K̄ with φ1 K̄ φ2 = K (4.3): every block of K goes to the one subgraph that holds its link.
 
         Raises
         ------

@@ -2,7 +2,7 @@
 
 λ is a fixed mode of x' = A x + B u, y = C x under a pattern if it is an eigenvalue of A + B K C for every K with the
 pattern. If it lies in the closed right half plane, no such gain stabilises the plant, and no design should be tried. It
-is found in two ways, which have to agree:
+is found in two ways, which must agree:
 
 * by rank: λ is fixed if and only if the inputs can be split into two sets D and E such that
 
@@ -10,10 +10,10 @@ is found in two ways, which have to agree:
 
   with C_E the outputs that the inputs in E use. The rank is a submodular function of D, so the least one is found
   without trying all 2^m sets;
-* by chance: λ is an eigenvalue of A + B K C for several random K with the pattern.
+* by random gains: λ is an eigenvalue of A + B K C for several random K with the pattern.
 
-Both are made for one strongly connected component of plant and pattern at a time: the closed loop is block triangular,
-and λ is fixed if and only if it is so in one of the diagonal blocks.
+Both treat one strongly connected component of plant and pattern at a time: the closed loop is block triangular, and λ
+is fixed if and only if it is fixed in one of the diagonal blocks.
 
 Sources: Sahoo 2012 (see `gains.formation.model`), section 4, for the expanded decentralised plant, in which every input
 is a station; B. D. O. Anderson and D. J. Clements, "Algebraic characterization of fixed modes in decentralized

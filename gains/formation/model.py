@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
+from gains.core.structure import strongly_connected_blocks
 
 LEADER = -1
 
@@ -171,6 +172,13 @@ class FormationModel:
         All feedback is late: A0 = A, A1 = B K, both (states, states). Arguments as of `overlapping_gain`.
         """
         return self.A, self.B @ self.overlapping_gain(K1, K2, K3)
+
+    def coupled_vehicles(self, K: FloatArray) -> list[list[int]]:
+        """Groups of vehicles that act on each other with the gain K (inputs, states), those ahead first."""
+        outputs = [self.output_slice(i) for i in range(self.vehicles)]
+        pattern = np.abs(self.A) + np.abs(self.B @ K)
+        acts = np.array([[pattern[own, other].sum() for other in outputs] for own in outputs])
+        return [members.tolist() for members in strongly_connected_blocks(acts)]
 
     def _known(self, vehicle: int) -> int:
         if not 0 <= vehicle < self.vehicles:

@@ -1,8 +1,8 @@
 """Who may use whose output: information patterns of a decentralised static feedback u = K y, y = C x.
 
 A pattern is a binary block matrix; its block (i, j) is 1 where the output of vehicle j may be used in the input of
-vehicle i. The gain has any numbers in these blocks and zeros elsewhere. A leader-follower tree, bidirectional coupling
-and vehicles with several predecessors are all patterns.
+vehicle i. The gain may have any entries in these blocks and has zeros elsewhere. A leader-follower tree, bidirectional
+coupling and vehicles with several predecessors are all patterns.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.6), and section 5, eqs. (5.1), (5.2).
 """

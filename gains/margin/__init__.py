@@ -1,1 +1,1 @@
-"""The delay margin of any linear loop, confirmed by second opinions; the engine of `gcs margin`."""
+"""The delay margin of any linear loop, with second opinions: the engine of `gcs margin`. Begin at `loop_margin`."""

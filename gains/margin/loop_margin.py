@@ -16,8 +16,8 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
-from gains.delay._crossing_error import DelayedTerm, crossing_error
-from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
+from gains.delay._crossing_error import DelayedTerm, by_multiple, crossing_error
+from gains.delay.constant import Crossing, DelayAnalysis
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
 
@@ -54,18 +54,18 @@ class MarginCrossing:
 
 @dataclass(frozen=True)
 class LoopMargin:
-    """What is known of a loop for all values of its `unknown`: a delay, or the sampling period.
+    """The verdict on a loop for all values of its `unknown`: a delay, or the sampling period.
 
     Attributes
     ----------
     unknown
         Its name; "period" for the sampling period.
     stable_intervals_s
-        The windows of stability, inf without an end, complete up to `complete_to_s`.
+        The windows of stability, complete up to `complete_to_s`; the last may end at inf.
     delay_margin_s, delay_margin_error_s
         The end of the window that begins at 0, or 0, and its estimated error.
     unstable_roots_at_zero_delay, roots_fixed_at_zero
-        Roots right of the axis with the unknown at zero; roots at 0 that are left out of everything else.
+        The number of roots right of the axis with the unknown at zero; of roots at 0 that nothing else here counts.
     checked_by
         The names of the methods that confirmed the windows.
     """
@@ -96,7 +96,7 @@ class LoopAtGivenDelays:
 
 
 def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays:
-    """What the delays of a model may be.
+    """The delays, or the sampling periods, at which the loop of a model is stable.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays
 
 
 def as_known(value: float, error: float) -> str:
-    """A number with as many digits, six at most, as its error leaves: the last one is off by one at most.
+    """A number with as many digits as its error leaves, six at most; the last digit is off by one at most.
 
     Examples
     --------
@@ -179,17 +179,11 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
 def _analysed(terms: Sequence[DelayedTerm]) -> DelayAnalysis:
     """The windows in the common divisor of the delays."""
     from gains.delay._commensurate import analyse_commensurate
-    from gains.delay._mixed import MixedTerm, analyse_mixed
+    from gains.delay._mixed import analyse_mixed
 
     if any(term.known_s for term in terms):
-        mixed = [MixedTerm(term.matrix, term.known_s, term.multiple) for term in terms]
-        return analyse_mixed(mixed, leave_out_zero=True)
-    late = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
-    for term in terms:
-        late[term.multiple] = late[term.multiple] + term.matrix
-    if len(late) == 2:
-        return analyse_delay(late[0], late[1], leave_out_zero=True)
-    return analyse_commensurate(late, leave_out_zero=True)
+        return analyse_mixed(terms, leave_out_zero=True)
+    return analyse_commensurate(by_multiple(terms), leave_out_zero=True)
 
 
 def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:

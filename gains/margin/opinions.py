@@ -2,10 +2,10 @@
 
 The exact analysis is compared with a sweep along the unit circle (`gains.delay._commensurate.circle_sweep_margin`) and
 the rightmost root beside the ends of the windows, or, where a root at zero is left out, with a count of the roots by
-the argument principle. None of them shares algebra with it. What differs by more than rounding explains is an error.
+the argument principle. None of them shares algebra with it. A difference larger than rounding explains is an error.
 
-All methods in double precision blur a root in the same way, however well they agree: an m-fold eigenvalue is known to
-eps^(1/m). So the error of a crossing is estimated from its own sensitivity, see `crossing_error`.
+All methods in double precision blur a multiple root alike, however well they agree: an m-fold eigenvalue is known to
+eps^(1/m). The error of a crossing is therefore estimated from its own sensitivity, see `crossing_error`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._crossing_error import DelayedTerm, crossing_error
+from gains.delay._crossing_error import DelayedTerm, by_multiple, crossing_error
 from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
 
 # a sweep of blocks of n states costs some n^3: these are 0.2 s, and 0.08 s one of 12 states
@@ -53,7 +53,7 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root at delays below and above
     it.
 
-    Slower by a factor of a hundred; for a design that is to be flown, not for the inside of an optimisation.
+    It is a hundred times slower: meant for a design that is to be flown, not for the inside of an optimisation.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 
 
 def second_opinions(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], *, thorough: bool = False) -> Opinions:
-    """Confirm an analysis of x'(t) = sum of the terms, as far as that takes a fraction of a second.
+    """Confirm an analysis of x'(t) = sum of the terms by the methods that take no more than a fraction of a second.
 
     Parameters
     ----------
@@ -123,9 +123,7 @@ def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thoroug
     on_axis = analysis.roots_fixed_at_zero > 0 or any(crossing.delay_s == 0.0 for crossing in analysis.crossings)
     if on_axis or any(term.known_s for term in terms):
         return None
-    matrices = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
-    for term in terms:
-        matrices[term.multiple] = matrices[term.multiple] + term.matrix
+    matrices = by_multiple(terms)
     sizes = [len(block.indices) for block in distinct_blocks(*matrices)]
     if not thorough and sum(size**3 for size in sizes) > _SWEEP_BUDGET:
         return None

@@ -1,1 +1,1 @@
-"""Delay margins of loops as flown: sampled and held, at several rates, or with a local loop on board."""
+"""Loops as they are flown: sampled and held, at two rates, or with a loop on board. Begin at `constant`."""

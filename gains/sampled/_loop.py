@@ -15,7 +15,7 @@ _WHOLE = 1e-12
 
 
 class SampledPlant(Protocol):
-    """What is under a held command: one block, linear, and the same in every period."""
+    """The plant under a held command: one block, linear, and the same in every period."""
 
     @property
     def A(self) -> FloatArray: ...  # noqa: N802 - the source's letter
@@ -30,8 +30,7 @@ class SampledPlant(Protocol):
     def period_s(self) -> float: ...
 
     def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What the last `duration_s` (k,) of a period do to the state at their beginning, (k, n, n), and with an input
-        held over them, (k, n, r)."""
+        """Maps over the last `duration_s` (k,) of a period: of the state (k, n, n), of an input held (k, n, r)."""
         ...
 
 

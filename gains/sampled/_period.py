@@ -1,4 +1,4 @@
-"""The largest period that one block of the sampled and held loop of `gains.sampled.constant` takes."""
+"""The least period at which one block of the sampled and held loop of `gains.sampled.constant` loses stability."""
 
 from math import inf
 

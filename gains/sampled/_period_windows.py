@@ -1,4 +1,4 @@
-"""All windows of the period for which the sampled and held loop without further delay is stable.
+"""All windows of the sampling period in which the sampled and held loop is stable without further delay.
 
 The least period at which stability is lost is `gains.sampled.constant.sampling_period_limit`. A loop may be stable
 again at longer periods, or need a long one in the first place (an oscillator pushed at the right instants), so here the

@@ -1,4 +1,4 @@
-"""The loop that is really flown: sampled, late and held.
+"""The loop that is flown: sampled, late and held.
 
 The plant x' = A x + B u is sampled at t_k = k T. The command u_k = K x(t_k) acts from t_k + tau until t_k + tau + T,
 when the next one replaces it (zero-order hold). tau >= 0 is the whole loop delay: transport up, waiting, computing and
@@ -8,8 +8,11 @@ transport down. With tau = q T + e, 0 <= e < T, the state at the next sample is
     Phi = e^{A T},  G0 = int_0^{T-e} e^{A s} ds B,  G1 = int_{T-e}^{T} e^{A s} ds B,
 
 the modified z-transform in state space. The loop is stable exactly when the spectral radius of this one-period map is
-below one. The margin over tau is computed in `gains.sampled._crossings`; for small T it is the continuous margin less
-T / 2, up to terms in T^2.
+below one. The margin in tau is computed in `_crossings`; for small T it is the continuous margin less T / 2, up to
+terms in T^2.
+
+Go on to `multirate` if telemetry and control have different rates, to `onboard` if vehicles feed back their own
+errors, and to `coupled_block` for the blocks of a formation.
 """
 
 import numpy as np

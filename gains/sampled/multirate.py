@@ -1,16 +1,16 @@
-"""Telemetry at one rate, control at another: when samples are used, and the loop of `gains.sampled.constant` with that.
+"""Telemetry at one rate, control at another: when samples are used, and the margin of the loop that results.
 
 The vehicle samples its state every `telemetry_s`, the station computes a command every `control_s` from the newest
 sample that has arrived. Only the slower of the two counts: a command from a sample that was used before repeats what is
-held already, and a sample that a newer one overtakes is never used. So over a common period T of both, n commands act,
-n being the number of periods of the slower one in T:
+already held, and a sample that is overtaken by a newer one is never used. Over a common period T of both, n commands
+act, n being the number of periods of the slower one in T:
 
 * The slower period is a whole multiple of the faster one, n = 1: every command is late by the same, and the loop is
   that of `gains.sampled.constant` with the slower period.
-* It is not: a command's loop delay is the least one plus 0, g, 2 g, ... (n - 1) g in an order that the rates fix,
-  g being the faster period / n. A phase between vehicle and station, and how the delay is split between the ways up
-  and down, only turn this order round. So the least loop delay says it all, and so does the mean one, which is by
-  (n - 1) g / 2 longer and changes less from rate to rate: *loop delay* here is the mean of those of the commands that
+* Otherwise a command's loop delay is the least one plus 0, g, 2 g, ... (n - 1) g, in an order that the rates fix, with
+  g the faster period divided by n. The phase between vehicle and station, and how the delay is split between uplink and
+  downlink, only rotate this order. The least loop delay therefore determines the loop, and so does the mean one, which
+  is longer by (n - 1) g / 2 and changes less from rate to rate. *Loop delay* here is that mean, over the commands that
   are the first from their sample.
 """
 
@@ -85,12 +85,12 @@ class Timing:
 
     @property
     def commands(self) -> int:
-        """n: commands from new samples in a common period."""
+        """n: the number of commands from new samples in a common period."""
         return self._ratio.denominator
 
     @property
     def common_s(self) -> float:
-        """T: the common period of both."""
+        """T: the common period of control and telemetry."""
         return self.commands * self.held_s
 
     @property
@@ -100,12 +100,12 @@ class Timing:
 
     @property
     def step_s(self) -> float:
-        """g: by multiples of this the loop delays of commands differ; the faster period where n = 1."""
+        """g: the loop delays of commands differ by multiples of it; the faster period if n = 1."""
         return self.faster_s / self.commands
 
     @property
     def spread_s(self) -> float:
-        """By how much the mean loop delay of a common period is longer than the least one."""
+        """How much longer the mean loop delay of a common period is than the least one."""
         return (self.faster_s - self.step_s) / 2.0
 
     @property
@@ -127,7 +127,7 @@ class Timing:
 
 
 class LiftedPlant(Protocol):
-    """What is under held commands: linear, and the same in every common period.
+    """The plant under held commands: linear, and the same in every common period.
 
     Examples
     --------
@@ -182,10 +182,10 @@ def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timi
 def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
     """The least (mean) loop delay (s) at which the loop loses stability; 0 if at once, `inf` if none is found.
 
-    Where the slower period is a multiple of the faster one it is that of `gains.sampled.constant`, exact; where the
-    margin is long against both, that of the slower period alone, see `hardly_sampled`. Else the least loop delay is
-    raised in small steps, peaks refined: a search, not a proof, up to three times the margin of the continuous loop and
-    ten of the slower periods. Arguments as of `multirate_growth_rate`.
+    If the slower period is a multiple of the faster one, the margin is that of `gains.sampled.constant`, exact; if the
+    margin is long against both, that of the slower period alone, see `hardly_sampled`. Otherwise the least loop delay
+    is raised in small steps and peaks are refined, up to three times the margin of the continuous loop plus ten of the
+    slower periods: a search, not a proof. Arguments as of `multirate_growth_rate`.
 
     Raises
     ------

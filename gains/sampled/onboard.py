@@ -1,22 +1,21 @@
-"""The onboard loop as it is flown: own errors fed back at the vehicle, those of others by a station, late.
+"""The onboard loop as it is flown: each vehicle feeds back its own errors, a station those of others, late.
 
 Every vehicle uses its own errors at once, those of others tau late (Sahoo 2012, eqs. 5.1, 5.2)::
 
     x'(t) = (A + B K_own) x(t) + B K_others x(t - tau)
 
-As it is flown nothing of it is continuous. With the control period T of the station:
+In flight nothing of this is continuous. With the control period T of the station:
 
-* The vehicle computes its own part of the command `steps` times in T and holds it. Its velocity error it knows at that
-  instant. Its spacing error it knows from its sensor, which looks at every `steps_per_sample`-th step; between two
-  looks the spacing is carried on with the relative velocity that the sensor saw.
+* The vehicle computes its own part of the command `steps` times in T and holds it. It knows its velocity error at that
+  instant. Its spacing error comes from a sensor that looks at every `steps_per_sample`-th step; between two looks the
+  spacing is extrapolated with the relative velocity that the sensor saw.
 * The station computes its part from states that all vehicles sampled at one instant t_k = k T, with the first of the
   vehicles' steps. It acts from t_k + tau on, at that very instant, and is held for T. With telemetry at another rate
   than control T is the slower period, or the common one as `gains.sampled.multirate` has it.
 
-So over one period T the local loop is a linear map of the state alone, and what is late enters it as the command of a
-held loop enters a plant: everything that `gains.sampled._crossings` says of such loops holds for this one too. The
-vehicles' steps are taken to be in step with each other; clocks that are apart by less than a step change the margin in
-the second order of the step.
+Over one period T the local loop is therefore a linear map of the state alone, and the late part enters it as the
+command of a held loop enters a plant: everything that `_crossings` says of such loops holds here too. The vehicles are
+assumed to step together; clocks that differ by less than a step change the margin only to second order in the step.
 """
 
 from collections.abc import Sequence
@@ -43,16 +42,16 @@ _SAME_INSTANT = 1e-9
 
 @dataclass(frozen=True)
 class OnboardTiming:
-    """How often things happen.
+    """The periods of the onboard loop: of the station, of the vehicles' steps and of their sensors.
 
     Attributes
     ----------
     control_s
-        Period (s) of what the station computes.
+        Period (s) of the station's commands.
     steps
         Steps of the vehicle's own loop in a control period.
     steps_per_sample
-        The sensor looks at one of so many steps; a divisor of `steps`.
+        The sensor looks once in this many steps; a divisor of `steps`.
     telemetry_s
         Period (s) of telemetry; that of the control if None.
 

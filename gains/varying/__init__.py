@@ -1,1 +1,1 @@
-"""Bounds that hold for delays that vary in time."""
+"""Delays that vary in time: bounds below which a loop is proved stable. Begin at `jitter`."""

@@ -1,17 +1,16 @@
 """Delays that vary: how large may tau(t) become in x'(t) = A0 x(t) + A1 x(t - tau(t))?
 
-No exact bound is known. Each function here gives a lower bound that is proved: the loop is stable for every delay of
-the stated kind below it, and it never exceeds the margin for constant delays.
+No exact bound is known. `varying_delay_bound` proves a lower one: the loop is stable for every delay of the stated kind
+below it, and it never exceeds the margin for constant delays.
 
 * |tau'| <= mu, 0 <= tau(t) <= h: a Lyapunov-Krasovskii functional and Wirtinger's inequality. A. Seuret and
   F. Gouaisbaut, "Wirtinger-based integral inequality: application to time-delay systems", Automatica 49(9), 2013,
   whose published bounds this reproduces.
-* constant delays, for comparison: the hierarchy of A. Seuret and F. Gouaisbaut, "Hierarchy of LMI conditions for the
-  stability analysis of time-delay systems", Systems & Control Letters 81, 2015, which converges to the exact margin.
-* any variation at all: small gain on v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain from
+* Any variation at all: small gain on v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain from
   x' is at most h.
 
-Every Lyapunov functional found is checked by the eigenvalues of its matrices, see `gains.varying._lmi`.
+Every Lyapunov functional found is checked by the eigenvalues of its matrices, see `gains.varying._lmi`. A delay that
+stays near its mean may be bounded higher by `gains.varying.jitter`.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,7 +32,6 @@ _ACCURACY = 1e-4
 _LONGEST = 1e3
 # states of one block; the unknowns grow with the square and the work with the sixth power
 _LARGEST_BLOCK = 8
-_MOST_ORDERS = 6
 
 
 def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
@@ -67,73 +65,6 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     if not rate >= 0.0:
         raise BadModelError(f"rate is {rate}; a number >= 0 is wanted, inf for any variation")
     return min(_varying_bound_of_block(now, late, rate) / unit for now, late, unit in _checked_blocks(A0, A1))
-
-
-def hierarchy_bound(A0: ArrayLike, A1: ArrayLike, *, order: int) -> float:
-    """The largest constant delay (s), up to the exact margin, that the Legendre functional of this order proves.
-
-    Order 0 is Jensen's inequality, 1 Wirtinger's; the bounds grow with the order. Each proves stability at the delay
-    itself; for all shorter delays that is the exact margin's to say, which is the limit of the bisection. Never more
-    than 1000 / (||A0|| + ||A1||), also for a loop that is stable at every delay.
-
-    Parameters
-    ----------
-    A0, A1
-        As of `varying_delay_bound`.
-    order
-        N from 0 to 6.
-
-    Raises
-    ------
-    BadModelError
-        Matrices that do not fit, a block too large, or an order that is not from 0 to 6.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau): Jensen's inequality proves sqrt(2), the exact margin is pi / 2.
-
-    >>> from gains.varying.bounds import hierarchy_bound
-    >>> [round(hierarchy_bound([[0]], [[-1]], order=order), 3) for order in (0, 2)]
-    [1.414, 1.571]
-    """
-    if not 0 <= order <= _MOST_ORDERS:
-        raise BadModelError(f"order is {order}; a whole number from 0 to {_MOST_ORDERS} is wanted")
-
-    def bound(now: FloatArray, late: FloatArray) -> float:
-        def proved(delay_s: float) -> bool:
-            return _legendre_functional_exists(now, late, delay_s, order)
-
-        return _bisected(proved, _upper_end(now, late))
-
-    return min(bound(now, late) / unit for now, late, unit in _checked_blocks(A0, A1))
-
-
-def small_gain_bound(A0: ArrayLike, A1: ArrayLike) -> float:
-    """A delay h (s) such that the loop is stable for every tau(t) in [0, h], however it varies.
-
-    h = 1 / min over D of max over omega of ||D C j omega (j omega I - A0 - A1)^{-1} B D^{-1}||, A1 = B C of full rank;
-    D is a full matrix because the delay acts on all signals alike. The minimum is found, and proved, by the bounded
-    real lemma with the unknown P = D'D. 0 when the loop is unstable without delay, `inf` without a delayed part.
-
-    Parameters
-    ----------
-    A0, A1
-        As of `varying_delay_bound`.
-
-    Raises
-    ------
-    BadModelError
-        Matrices that do not fit, or a block too large.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau(t)): the largest |j omega / (j omega + 1)| is 1.
-
-    >>> from gains.varying.bounds import small_gain_bound
-    >>> round(small_gain_bound([[0]], [[-1]]), 3)
-    1.0
-    """
-    return min(_small_gain_of_block(now, late) / unit for now, late, unit in _checked_blocks(A0, A1))
 
 
 def _checked_blocks(A0: ArrayLike, A1: ArrayLike) -> list[tuple[FloatArray, FloatArray, float]]:
@@ -253,42 +184,13 @@ def _varying_functional_exists(now: FloatArray, late: FloatArray, h: float, rate
     return positive_definite_solution(shapes if any_rate else [*shapes, Unknown(n)], inequalities) is not None
 
 
-def _legendre_functional_exists(now: FloatArray, late: FloatArray, h: float, order: int) -> bool:
-    """The inequalities of Seuret and Gouaisbaut 2015 at the constant delay h, with `order` Legendre polynomials L_k.
-
-    V = z'Pz + int x'Sx + h int int x''R x', z = (x, int L_0 x, ..., int L_{N-1} x) over [t-h, t], the quadratic form
-    being in (x(t), x(t-h), int L_k x / h).
-    """
-    n = now.shape[0]
-    size = (order + 2) * n
-    parts = [np.eye(size)[k * n : (k + 1) * n] for k in range(order + 2)]
-    x, x_h, means = parts[0], parts[1], parts[2:]
-    speed = now @ x + late @ x_h
-    # L_k(0) x - L_k(-h) x_h - int L_k' x = h / (2k + 1) times the k-th Legendre coefficient of x'
-    slopes = [
-        x
-        - (-1.0) ** k * x_h
-        - sum((((2 * i + 1) * (1.0 - (-1.0) ** (k + i))) * means[i] for i in range(min(k, order))), np.zeros((n, size)))
-        for k in range(order + 1)
-    ]
-    state = np.vstack([x, *(h * mean for mean in means)])
-    change = np.vstack([speed, *slopes[:order]])
-
-    def inequalities(unknowns: Sequence[FloatArray]) -> Sequence[FloatArray]:
-        P, S, R = unknowns
-        positive = P.copy()
-        for k in range(order):
-            place = slice((k + 1) * n, (k + 2) * n)
-            positive[place, place] += (2 * k + 1) / h * S
-        derivative = _he(state.T @ P @ change) + x.T @ S @ x - x_h.T @ S @ x_h + h * h * speed.T @ R @ speed
-        for k, slope in enumerate(slopes):
-            derivative -= (2 * k + 1) * slope.T @ R @ slope
-        return [positive, S, R, -derivative]
-
-    return positive_definite_solution([Unknown((order + 1) * n), Unknown(n), Unknown(n)], inequalities) is not None
-
-
 def _small_gain_of_block(now: FloatArray, late: FloatArray) -> float:
+    """A delay h such that the block is stable for every tau(t) in [0, h], however it varies.
+
+    h = 1 / min over D of max over omega of ||D C j omega (j omega I - A0 - A1)^{-1} B D^{-1}||, A1 = B C of full rank;
+    D is a full matrix because the delay acts on all signals alike. The minimum is found, and proved, by the bounded
+    real lemma with the unknown P = D'D. 0 when the loop is unstable without delay, `inf` without a delayed part.
+    """
     total = now + late
     if float(np.linalg.eigvals(total).real.max()) >= 0.0:
         return 0.0

@@ -1,8 +1,8 @@
-"""Which stability bound covers the delay that a link really has: constant, slowly varying, or jumping about.
+"""The stability bound that covers the delay of a real link, be it constant, slowly varying or jumping.
 
 The margin for constant delays is exact but says nothing about a delay that varies; the bounds for varying delays are
-proved but lower. Given an observed delay (mean, spread, rate of change) the bounds are tried from the least to the
-most demanding one, and the first that covers the observation is reported, with the others for comparison.
+proved but lower. For an observed delay (mean, spread, rate of change) `bound_covering` tries the bounds from the least
+to the most demanding one and reports the first that covers the observation, with the others for comparison.
 """
 
 from collections.abc import Sequence
@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._crossings import highest_frequency
-from gains.delay._loci import factor_rank
+from gains.delay._loci import factor_rank, highest_frequency
 from gains.delay.constant import analyse_delay
 from gains.varying._lmi import Unknown, positive_definite_solution
 from gains.varying.bounds import varying_delay_bound
@@ -65,7 +64,7 @@ class CoveringBound:
         delays from 0 up to `bound_s`. "spread": any variation within `bound_s` - mean of the mean. "any": any
         variation from 0 up to `bound_s`. "none": no bound covers it; the loop may be stable all the same.
     bound_s
-        The largest delay that bound admits, nan for "none".
+        The largest delay that this bound admits, nan for "none".
     largest_s
         The largest delay observed, mean + spread.
     constant_margin_s, rate_bound_s, spread_bound_s, any_bound_s
@@ -228,7 +227,7 @@ def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float) -> float:
     r = B.shape[1]
     if r == 0:
         return inf
-    highest = highest_frequency(now, late)
+    highest = highest_frequency((now, late))
     coarse = highest * np.logspace(-3.0, 2.0, _FREQUENCIES_SCALING)
     D = _scaling(_loop_gains(now, late, B, C, mean_s, coarse)) if r > 1 else np.eye(1)
     fine = np.concatenate(

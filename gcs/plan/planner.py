@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gains.core.arrays import FloatArray, IntArray
+from gains.core.arrays import FloatArray
 from gains.core.requirement import Requirement, plain
-from gains.core.structure import strongly_connected_blocks
 from gains.design.design import Design as InclusionDesign
 from gains.design.design import design, evaluate_gains
 from gains.design.graph import GraphDesign, evaluate_graph_gain, time_scaled
@@ -179,7 +178,7 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
         gain=found.K,
         delay_margin_s=found.delay_margin_s,
         slower=tuple((entry.K, entry.delay_margin_s) for entry in slower),
-        separable=len(_loops(model, found.K)) == model.vehicles,
+        separable=len(model.coupled_vehicles(found.K)) == model.vehicles,
         around_loss=() if control.loop == "onboard" else _around_loss(model, found.delay_margin_s, scales, period_s),
     )
     schedule = [
@@ -217,13 +216,6 @@ def _blocks(K: FloatArray, formation: Formation, model: FormationModel, pattern:
         Block(vehicle=ids[i], of=ids[j], gain=K[model.input_slice(i), model.output_slice(j)].tolist())
         for i, j in pattern.links
     ]
-
-
-def _loops(model: FormationModel, K: FloatArray) -> list[IntArray]:
-    """Groups of vehicles that act on each other."""
-    outputs = [model.output_slice(i) for i in range(model.vehicles)]
-    pattern = np.abs(model.A) + np.abs(model.B @ K)
-    return strongly_connected_blocks(np.array([[pattern[own, other].sum() for other in outputs] for own in outputs]))
 
 
 def _around_loss(

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.delay.several import boundary_of_two_delays, late_by_vehicle
+from gains.sampled.coupled_block import unlike_blocks
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
 from gcs.stress.axes import Axis, at_coordinates
 from gcs.stress.figures import MEASURED, figure_of, saved
-from gcs.stress.onset import distinct
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, plan_loops
 
@@ -90,7 +90,7 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in every):
         return None
     period_s = study.plan.timing.held_s
-    loops = [(loop.A, loop.B @ loop.K) for loop in distinct(plan_loops(study.plan))]
+    loops = [(loop.A, loop.B @ loop.K) for loop in unlike_blocks(plan_loops(study.plan))]
     try:
         any_s = min(varying_delay_bound(A0, A1, rate=inf) for A0, A1 in loops)
     except BadModelError:  # the loop is too large for a proof

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gains.sampled.coupled_block import CoupledBlock, unlike_blocks
 from gcs.stress.axes import Axis, place_text
-from gcs.stress.onset import Loop, distinct
 from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, plan_loops
 
@@ -34,7 +34,7 @@ def growth_figure(
     figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
     room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 240)
-    sampled, continuous = _curves(distinct(plan_loops(study.plan)), grid_s)
+    sampled, continuous = _curves(unlike_blocks(plan_loops(study.plan)), grid_s)
     above.axhline(0.0, color=LIMIT, linewidth=0.8)
     above.plot(grid_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
     above.plot(grid_s, sampled, color=SAMPLED, linewidth=1.4, label="sampled model, exact")
@@ -119,7 +119,7 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
     return list(apart.values())[:_WORST]
 
 
-def _curves(kinds: Sequence[Loop], delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _curves(kinds: Sequence[CoupledBlock], delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Growth rates of the formation by the sampled and the continuous model: the largest over its loops."""
     sampled = np.array([[kind.growth_1_s(float(at)) for at in delay_s] for kind in kinds])
     continuous = np.array([[kind.growth_continuous_1_s(float(at)) for at in delay_s] for kind in kinds])

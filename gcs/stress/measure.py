@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gains.sampled.coupled_block import CoupledBlock, critical_block
 from gcs.drive.flown import first_uses, fly_plan, fly_virtual, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
@@ -29,7 +30,6 @@ from gcs.stress.free_response import (
     response_paired,
 )
 from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth
-from gcs.stress.onset import Loop, critical_loop
 from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_loops, plan_of, with_summary
 
 AMPLITUDES = (1.0, 0.03, 0.001)
@@ -87,7 +87,7 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     outcome = with_summary(plan, flight, outcome)
     flown = flight.ticks[flight.ticks["time_s"] >= 0.0]
     delays_s = median_delays_s(flown, plan.formation.system_ids)
-    loop = critical_loop(plan_loops(plan), delays_s)
+    loop = critical_block(plan_loops(plan), delays_s)
     slowest = max(loop.system_ids, key=lambda system_id: delays_s[system_id])
     up, down = plan.scenario.link_of(slowest)
     outcome = replace(
@@ -134,7 +134,7 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     delays_s = effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
     loops = plan_loops(base)
     if trial.probe == CRITICAL:
-        probed = critical_loop(loops, delays_s)
+        probed = critical_block(loops, delays_s)
     else:
         probed = next(loop for loop in loops if trial.probe in loop.system_ids)
     slowest = max(probed.system_ids, key=lambda system_id: delays_s[system_id])
@@ -159,7 +159,7 @@ def _folder_of(folder: Path | None, amplitude: float) -> Path | None:
     return None if folder is None else folder / f"error-{amplitude:g}-m"
 
 
-def _with_response(loop: Loop, respond: Callable[[float], FreeResponse], outcome: Outcome) -> Outcome:
+def _with_response(loop: CoupledBlock, respond: Callable[[float], FreeResponse], outcome: Outcome) -> Outcome:
     """The outcome with the growth rate after an initial error of a metre, or of less if that grows too fast."""
     for amplitude in AMPLITUDES:
         response = respond(amplitude)
@@ -173,7 +173,7 @@ def _with_response(loop: Loop, respond: Callable[[float], FreeResponse], outcome
     return outcome
 
 
-def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tuple[Loop, Loop, float]:
+def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tuple[CoupledBlock, CoupledBlock, float]:
     """The loop to be probed, the loop it stands for, and how long the latter's telemetry waits for the control tick.
 
     The loop that breaks first may be far down the tree, where vehicles ahead would drive it. So the equal loop nearest
@@ -181,7 +181,7 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
     """
     loops, links = plan_loops(plan), plan.scenario.links
     if probe == CRITICAL:
-        critical = critical_loop(loops, loop_delay_s)
+        critical = critical_block(loops, loop_delay_s)
         probed = next(loop for loop in loops if loop.same_as(critical))
     else:
         probed = critical = next(loop for loop in loops if probe in loop.system_ids)
@@ -190,7 +190,7 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
     return probed, critical, (loop_delay_s[slowest] - up.delay_s - down.delay_s) % critical.timing.step_s
 
 
-def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcome:
+def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -> Outcome:
     """The outcome with the growth rate of the probed loop, and the rates predicted at its loop delays."""
     own = response.errors
     outcome = replace(outcome, growth_1_s=None, growth_error_1_s=None, fit_samples=None)

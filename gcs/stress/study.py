@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from gains.sampled.coupled_block import CoupledBlock, unlike_blocks
 from gcs.plan.flight_plan import FlightPlan
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.campaign import Run
-from gcs.stress.onset import GrowthPoint, Loop, Zero, distinct, locate_zero
+from gcs.stress.onset import GrowthPoint, Zero, locate_zero
 from gcs.stress.trial import CRITICAL, Kind, Outcome, Trial, plan_loops, sparse_gain
 
 _ROUNDS = 8
@@ -223,7 +224,7 @@ def _found(
     assert nearest.probed is not None
     assert nearest.critical is not None
     loop = next(loop for loop in loops if nearest.probed in loop.system_ids)
-    margins_s = [kind.margin_s() for kind in distinct(loops)]
+    margins_s = [kind.margin_s() for kind in unlike_blocks(loops)]
     # for the loop of least margin, test the design's own figure, which the station flies by
     predicted_s = study.plan.delay_margin_s if loop.margin_s() == min(margins_s) else loop.margin_s()
     waiting_s = _waiting_s(near)
@@ -255,7 +256,7 @@ def _found(
     )
 
 
-def _to_check(loops: Sequence[Loop], probed: Loop) -> list[int]:
+def _to_check(loops: Sequence[CoupledBlock], probed: CoupledBlock) -> list[int]:
     """One vehicle of each other kind of loop, and the last vehicle."""
-    others = [kind.system_ids[0] for kind in distinct(loops) if not kind.same_as(probed)]
+    others = [kind.system_ids[0] for kind in unlike_blocks(loops) if not kind.same_as(probed)]
     return list(dict.fromkeys([*others, loops[-1].system_ids[-1]]))

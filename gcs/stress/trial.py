@@ -12,13 +12,13 @@ from typing import Literal, Self
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
 from gcs.control.tick import TickArray
 from gcs.drive.flown import Flight, margins_of
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
 from gcs.plan.onboard import timing_of
 from gcs.runs.summary import summarise
-from gcs.stress.onset import Loop, loops_of
 from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]
@@ -128,10 +128,10 @@ def plan_of(trial: Trial) -> FlightPlan:
     return FlightPlan(trial.scenario.with_calm_monitor(), formation, K, trial.delay_margin_s)
 
 
-def plan_loops(plan: FlightPlan) -> list[Loop]:
-    """The loops of a plan."""
-    predecessors, system_ids = plan.formation.predecessor.tolist(), plan.formation.system_ids
-    return loops_of(predecessors, system_ids, plan.gain, timing=plan.timing, onboard=timing_of(plan.scenario))
+def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
+    """The coupled blocks of a plan."""
+    onboard = timing_of(plan.scenario)
+    return coupled_blocks(plan.model, plan.gain, plan.formation.system_ids, timing=plan.timing, onboard=onboard)
 
 
 def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
 from gains.delay._commensurate import analyse_commensurate, circle_sweep_margin
-from gains.delay._mixed import MixedTerm, analyse_mixed
+from gains.delay._crossing_error import DelayedTerm
+from gains.delay._mixed import analyse_mixed
 from gains.delay.constant import analyse_delay
 from gains.delay.rightmost import rightmost_root
 from tests.support.paths import DATA
@@ -139,7 +140,7 @@ def test_wrong_terms_are_named(matrices: list[Matrix], message: str) -> None:
 
 def test_known_delay_beside_the_unknown_shortens_it() -> None:
     # x' = -x(t - 0.1 - tau): pi / 2 less what is known
-    analysis = analyse_mixed([MixedTerm([[-1.0]], 0.1, 1)])
+    analysis = analyse_mixed([DelayedTerm(np.array([[-1.0]]), 0.1, 1)])
     assert analysis.delay_margin_s == pytest.approx(pi / 2.0 - 0.1, rel=1e-12)
 
 
@@ -151,7 +152,7 @@ def test_windows_beside_known_delays_are_those_of_the_rightmost_root(seed: int) 
     rightmost = float(np.linalg.eigvals(sum(matrices[1:], matrices[0])).real.max())
     matrices[0] = matrices[0] - (rightmost + rng.uniform(-0.2, 1.6)) * np.eye(n)
     known_s, steps = (0.0, float(rng.uniform(0.0, 2.0)), 0.0, float(rng.uniform(0.0, 1.0))), (0, 0, 1, step)
-    analysis = analyse_mixed([MixedTerm(*term) for term in zip(matrices, known_s, steps, strict=True)], horizon_s=4.0)
+    analysis = analyse_mixed([DelayedTerm(*term) for term in zip(matrices, known_s, steps, strict=True)], horizon_s=4.0)
     for delay_s in (0.0, *rng.uniform(0.01, 4.0, 3).tolist()):
         windows = analysis.stable_intervals_s
         if delay_s > 0.0 and min((abs(delay_s - end) for window in windows for end in window), default=inf) < 1e-6:
@@ -164,19 +165,19 @@ def test_windows_beside_known_delays_are_those_of_the_rightmost_root(seed: int) 
 def test_unstable_roots_are_counted_with_the_known_delay() -> None:
     # x' = -x(t - d): a pair crosses at d = pi/2 and the next at 5 pi/2
     for known_s, roots in ((1.0, 0), (3.0, 2), (9.0, 4)):
-        terms = [MixedTerm([[-1.0]], known_s, 0), MixedTerm([[0.001]], 0.0, 1)]
+        terms = [DelayedTerm(np.array([[-1.0]]), known_s, 0), DelayedTerm(np.array([[0.001]]), 0.0, 1)]
         assert analyse_mixed(terms, horizon_s=1e-3).unstable_roots_at_zero_delay == roots
 
 
 @pytest.mark.parametrize(
     ("term", "message"),
     [
-        (MixedTerm([[-1.0]], -0.1, 1), "known_s is -0.1"),
-        (MixedTerm([[-1.0]], 0.1, -1), "multiple is -1"),
-        (MixedTerm([[-1e6]], 1e3, 1), "longest known delay"),
+        (DelayedTerm(np.array([[-1.0]]), -0.1, 1), "known_s is -0.1"),
+        (DelayedTerm(np.array([[-1.0]]), 0.1, -1), "multiple is -1"),
+        (DelayedTerm(np.array([[-1e6]]), 1e3, 1), "longest known delay"),
     ],
 )
-def test_wrong_mixed_terms_are_named(term: MixedTerm, message: str) -> None:
+def test_wrong_mixed_terms_are_named(term: DelayedTerm, message: str) -> None:
     with pytest.raises(BadModelError, match=message):
         analyse_mixed([term])
 
@@ -184,7 +185,7 @@ def test_wrong_mixed_terms_are_named(term: MixedTerm, message: str) -> None:
 @pytest.mark.parametrize("horizon_s", [0.0, -1.0, float("nan")])
 def test_horizon_must_be_positive(horizon_s: float) -> None:
     with pytest.raises(BadModelError, match="horizon_s is"):
-        analyse_mixed([MixedTerm([[-1.0]], 0.1, 1)], horizon_s=horizon_s)
+        analyse_mixed([DelayedTerm(np.array([[-1.0]]), 0.1, 1)], horizon_s=horizon_s)
     with pytest.raises(BadModelError, match="horizon_s is"):
         analyse_commensurate([[[0.0]], [[-1.0]]], horizon_s=horizon_s)
 

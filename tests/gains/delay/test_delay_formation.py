@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gains.delay.constant import analyse_delay, delay_margin, frequency_sweep_margin
+from gains.delay.constant import analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
+from gains.delay.sweep import frequency_sweep_margin
 from gains.margin.opinions import checked_delay_margin
 from gains.sampled.constant import sampled_delay_margin
 

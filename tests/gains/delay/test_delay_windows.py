@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
 from gains.core.structure import project_out_equilibria
-from gains.delay.constant import Crossing, analyse_delay, delay_margin, frequency_sweep_margin
+from gains.delay.constant import Crossing, analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
+from gains.delay.sweep import frequency_sweep_margin
 
 Matrix = NDArray[np.float64]
 Pair = tuple[Matrix, Matrix]

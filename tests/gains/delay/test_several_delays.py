@@ -1,5 +1,6 @@
 """Independent delays: the curves of two delays, the rectangle of a leader-follower formation, stability at a point."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from math import inf, pi, sqrt
 
@@ -9,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from gains.core.errors import BadModelError
 from gains.delay.constant import analyse_delay, delay_margin
-from gains.delay.several import Polyline, boundary_of_two_delays, crossing_curves, delay_box, late_by_vehicle, stable_at
+from gains.delay.rightmost import rightmost_root
+from gains.delay.several import Polyline, boundary_of_two_delays, crossing_curves, delay_box, late_by_vehicle
 from gains.formation.model import FormationModel
 
 Matrix = NDArray[np.float64]
@@ -21,6 +23,10 @@ def random_loop(seed: int) -> list[Matrix]:
     matrices = [rng.normal(size=(n, n)) for _ in range(3)]
     rightmost = float(np.linalg.eigvals(sum(matrices[1:], matrices[0])).real.max())
     return [matrices[0] - (rightmost + 0.5) * np.eye(n), *matrices[1:]]
+
+
+def stable_at(A0: ArrayLike, late: Sequence[ArrayLike], delays_s: Sequence[float]) -> bool:
+    return rightmost_root([(A0, 0.0), *zip(late, delays_s, strict=True)]).real < 0.0
 
 
 def residual(matrices: list[Matrix], line: Polyline) -> float:
@@ -188,12 +194,6 @@ def test_delays_that_act_on_nothing_have_no_limit() -> None:
 def test_box_of_curves_must_be_finite(longest_s: tuple[float, float]) -> None:
     with pytest.raises(BadModelError, match="longest_s is"):
         crossing_curves([[-1.0]], [[1.0]], [[1.0]], longest_s=longest_s)
-
-
-@pytest.mark.parametrize(("late", "delays_s"), [([[[1.0]]], [1.0, 2.0]), ([[[1.0]], [[1.0]]], [1.0])])
-def test_each_late_matrix_needs_its_delay(late: list[ArrayLike], delays_s: list[float]) -> None:
-    with pytest.raises(BadModelError, match="as late matrices"):
-        stable_at([[-3.0]], late, delays_s)
 
 
 @pytest.mark.parametrize("seed", range(24))

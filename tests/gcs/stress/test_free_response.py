@@ -9,6 +9,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 
 from gains.core.arrays import FloatArray
+from gains.sampled.coupled_block import CoupledBlock
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.effective_delay import commands_of, effective_delay_s
 from gcs.runs.grade import ACTED, SAMPLED, instants
@@ -16,7 +17,6 @@ from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import FreeResponse, fly_calm, in_place, response_paired
 from gcs.stress.growth import CHANNELS
 from gcs.stress.measure import fly_trial
-from gcs.stress.onset import Loop
 from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
 from scenarios.schema import Limits, Link, VehicleLinks
@@ -29,7 +29,7 @@ def plan_with(**coordinates: float) -> FlightPlan:
     return replace(pair_plan(), scenario=at_coordinates(SCENARIO, coordinates))
 
 
-def modelled(loop: Loop, response: FreeResponse, before: FloatArray) -> FloatArray:
+def modelled(loop: CoupledBlock, response: FreeResponse, before: FloatArray) -> FloatArray:
     """The loop's errors at the samples of the response's rows, integrated from command to command.
 
     x' = A x + B u exactly, u = K x(sampled) from the instant at which each command acted, u = 0 before the first.

@@ -1,58 +1,9 @@
-"""Loops of a formation, and the delay at which measured growth passes zero."""
-
-from math import atan, pi, sqrt
+"""The delay at which measured growth passes zero."""
 
 import numpy as np
 import pytest
 
-from gains.formation.model import FormationModel
-from gains.sampled.multirate import Timing
-from gcs.stress.onset import GrowthPoint, Loop, critical_loop, distinct, locate_zero, loops_of
-
-TREE = (-1, 0, 1, 0, 3)
-K1, K2, K3 = -3.4, 0.6, 5.6
-
-
-def tree_loops(period_s: float = 0.02) -> list[Loop]:
-    K = FormationModel(TREE).overlapping_gain(K1 * np.eye(2), K2 * np.eye(2), K3 * np.eye(2))
-    return loops_of(TREE, (1, 2, 3, 4, 5), K, timing=Timing(period_s, period_s))
-
-
-def test_every_vehicle_of_a_tree_is_a_loop_of_its_own_and_followers_are_alike() -> None:
-    loops = tree_loops()
-    assert sorted(loop.system_ids for loop in loops) == [(1,), (2,), (3,), (4,), (5,)]
-    leader, follower = distinct(loops)
-    assert (leader.system_ids, follower.system_ids) == ((1,), (2,))
-    assert leader.K.tolist() == [[K1, 0.0], [0.0, K1]]
-    assert follower.K.tolist() == [[K3, 0.0, K1, 0.0], [0.0, K3, 0.0, K1]]
-
-
-def test_vehicles_that_act_on_each_other_are_one_loop() -> None:
-    model = FormationModel((-1, 0, 1))
-    K = model.overlapping_gain(K1 * np.eye(2), K2 * np.eye(2), K3 * np.eye(2))
-    K[model.input_slice(1), model.velocity_slice(2)] = 0.1 * np.eye(2)  # vehicle 2 looks back as well
-    loops = loops_of((-1, 0, 1), (7, 8, 9), K, timing=Timing(0.02, 0.02))
-    assert [loop.system_ids for loop in loops] == [(7,), (8, 9)]
-
-
-def test_models_meet_the_closed_formulas_at_a_short_period() -> None:
-    """Margins of the continuous blocks in closed form; a period T takes half of itself away."""
-    period_s = 1e-3
-    leader, follower = distinct(tree_loops(period_s))
-    omega = sqrt((K1**2 + sqrt(K1**4 + 4.0 * K3**2)) / 2.0)
-    for loop, margin_s in ((leader, pi / (-2.0 * K1)), (follower, atan(-K1 * omega / K3) / omega)):
-        assert loop.margin_s() == pytest.approx(margin_s - period_s / 2.0, abs=1e-6)
-        at_s = margin_s - period_s / 2.0
-        assert loop.growth_1_s(at_s) == pytest.approx(0.0, abs=1e-5)
-        assert loop.growth_continuous_1_s(at_s) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_the_critical_loop_is_the_one_that_grows_most_at_its_own_delay() -> None:
-    loops = tree_loops()
-    delays = {1: 0.25, 2: 0.25, 3: 0.25, 4: 0.28, 5: 0.27}
-    assert critical_loop(loops, delays).system_ids == (4,)
-    assert critical_loop(loops, {**delays, 1: 0.6}).system_ids == (1,)
-    assert critical_loop(loops, dict.fromkeys(delays, 0.25)).system_ids == (2,)  # the first of equals
+from gcs.stress.onset import GrowthPoint, locate_zero
 
 
 def curve(delay_s: float) -> float:

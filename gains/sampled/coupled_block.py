@@ -1,0 +1,166 @@
+"""Vehicles that act on each other, block by block: the margin of each block and its growth at any loop delay.
+
+The states of a formation fall into blocks that do not act on those ahead of them: in a leader-follower tree every
+vehicle is a block of its own. The formation is stable exactly when every block is, each at its own loop delay, so the
+block with the least room (margin minus loop delay) is the one that breaks first.
+
+The margins are those of `gains.sampled.multirate`, or of `gains.sampled.onboard` if the vehicles feed back their own
+errors. `gcs stress` flies formations to see whether these predictions hold.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.delay.constant import delay_margin
+from gains.delay.rightmost import rightmost_root
+from gains.delay.several import late_by_vehicle
+from gains.formation.model import FormationModel
+from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
+from gains.sampled.onboard import OnboardLoop, OnboardTiming, onboard_loop
+
+
+@dataclass(frozen=True, eq=False)
+class CoupledBlock:
+    """Vehicles that act on each other, with their part of e' = A e + B u, u = K e; the same axes for all.
+
+    `system_ids` names the vehicles. `onboard` is their part of the onboard loop; without it all feedback is late.
+    """
+
+    system_ids: tuple[int, ...]
+    A: FloatArray
+    B: FloatArray
+    K: FloatArray
+    timing: Timing
+    onboard: OnboardLoop | None = None
+
+    @property
+    def has_late_terms(self) -> bool:
+        """Whether any feedback inside the block is late; in the onboard loop a vehicle on its own has none."""
+        return self.onboard is None or bool(self.onboard.late.any())
+
+    def margin_s(self) -> float:
+        """The least loop delay (s) at which the sampled and held loop loses stability."""
+        if self.onboard is not None:
+            return self.onboard.sampled_margin_s()
+        return float(multirate_delay_margin(self.A, self.B, self.K, self.timing))
+
+    def margin_continuous_s(self) -> float:
+        """The least loop delay (s) at which the continuous model loses stability; the hold counts as half a period."""
+        whole_s = delay_margin(self.A, self.B @ self.K) if self.onboard is None else self.onboard.continuous_margin_s()
+        return whole_s - self.timing.held_s / 2.0
+
+    def growth_1_s(self, delay_s: float) -> float:
+        """Growth rate (1/s) of the sampled and held loop at a loop delay."""
+        if self.onboard is not None:
+            return self.onboard.growth_1_s(delay_s)
+        return multirate_growth_rate(self.A, self.B, self.K, self.timing, delay_s=delay_s)
+
+    def growth_continuous_1_s(self, delay_s: float) -> float:
+        """Real part (1/s) of the rightmost root of the continuous model; the hold counts as half a period of delay."""
+        return self.growth_continuous_at_1_s(dict.fromkeys(self.system_ids, delay_s))
+
+    def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
+        """The same where each vehicle's command has a loop delay of its own (`gains.delay.several`)."""
+        late_gain = self.K if self.onboard is None else self.B.T @ self.onboard.late
+        at_once = [(self.A, 0.0)] if self.onboard is None else self.onboard.continuous_at_once()
+        axes = self.B.shape[1] // len(self.system_ids)
+        late = late_by_vehicle(
+            self.B, late_gain, [slice(axes * k, axes * (k + 1)) for k in range(len(self.system_ids))]
+        )
+        delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
+        return rightmost_root([*at_once, *zip(late, delays_s, strict=True)]).real
+
+    def growth_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
+        """Growth rate (1/s) of the sampled loop where each vehicle has a loop delay of its own.
+
+        Exact if the delays are equal. Otherwise it is the rate at their mean, plus what their differences add in the
+        continuous model.
+        """
+        delays_s = [loop_delay_s[system_id] for system_id in self.system_ids]
+        mean_s = sum(delays_s) / len(delays_s)
+        rate_1_s = self.growth_1_s(mean_s)
+        if max(delays_s) == min(delays_s):
+            return rate_1_s
+        return rate_1_s + self.growth_continuous_at_1_s(loop_delay_s) - self.growth_continuous_1_s(mean_s)
+
+    def same_as(self, other: "CoupledBlock") -> bool:
+        """Whether the other block is the same system, made of other vehicles."""
+        mine, its = (self.A, self.B, self.K), (other.A, other.B, other.K)
+        return self.timing == other.timing and all(
+            a.shape == b.shape and bool((a == b).all()) for a, b in zip(mine, its, strict=True)
+        )
+
+
+def coupled_blocks(
+    model: FormationModel,
+    K: FloatArray,
+    system_ids: Sequence[int],
+    *,
+    timing: Timing,
+    onboard: OnboardTiming | None = None,
+) -> list[CoupledBlock]:
+    """The blocks of a formation flown with the gain K (inputs, states) of u = K e, those ahead first.
+
+    Parameters
+    ----------
+    system_ids
+        One for each vehicle, in the order of `model`.
+    timing, onboard
+        When the station samples and commands, and the timing of the onboard loop; without `onboard` the station closes
+        every loop.
+
+    Examples
+    --------
+    A chain of three: each vehicle is a block, and the two followers are alike. Sampling at 50 Hz costs half a period:
+
+    >>> import numpy as np
+    >>> from gains import FormationModel, Timing, coupled_blocks
+    >>> chain = FormationModel((-1, 0, 1))
+    >>> K = chain.overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
+    >>> blocks = coupled_blocks(chain, K, (1, 2, 3), timing=Timing(control_s=0.02, telemetry_s=0.02))
+    >>> [(block.system_ids, round(block.margin_s(), 3)) for block in blocks]
+    [((1,), 1.561), ((2,), 0.701), ((3,), 0.701)]
+    """
+    whole = None if onboard is None else onboard_loop(model, K, onboard)
+    A, B = model.A, model.B
+    blocks: list[CoupledBlock] = []
+    for members in model.coupled_vehicles(K):
+        own = np.concatenate([np.r_[model.output_slice(i)] for i in members])
+        inputs = np.concatenate([np.r_[model.input_slice(i)] for i in members])
+        blocks.append(
+            CoupledBlock(
+                system_ids=tuple(system_ids[i] for i in members),
+                A=A[np.ix_(own, own)],
+                B=B[np.ix_(own, inputs)],
+                K=K[np.ix_(inputs, own)],
+                timing=timing,
+                onboard=None if whole is None else whole.part(own),
+            )
+        )
+    return blocks
+
+
+def unlike_blocks(blocks: Sequence[CoupledBlock]) -> list[CoupledBlock]:
+    """The first block of each kind."""
+    kinds: list[CoupledBlock] = []
+    for block in blocks:
+        if not any(block.same_as(kind) for kind in kinds):
+            kinds.append(block)
+    return kinds
+
+
+def critical_block(blocks: Sequence[CoupledBlock], loop_delay_s: Mapping[int, float]) -> CoupledBlock:
+    """The block of largest predicted growth at the loop delays of its vehicles; the first one in a tie."""
+    rates: list[float] = []
+    known: list[tuple[CoupledBlock, list[float], float]] = []
+    for block in blocks:
+        delays_s = [round(loop_delay_s[system_id], 9) for system_id in block.system_ids]
+        rate = next((r for other, d, r in known if d == delays_s and other.same_as(block)), None)
+        if rate is None:
+            rate = block.growth_at_1_s(loop_delay_s)
+            known.append((block, delays_s, rate))
+        rates.append(rate)
+    return blocks[int(np.argmax(rates))]

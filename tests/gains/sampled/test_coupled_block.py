@@ -1,0 +1,55 @@
+"""Coupled blocks of a formation: which vehicles they hold, and their margins and growth."""
+
+from math import atan, pi, sqrt
+
+import numpy as np
+import pytest
+
+from gains.formation.model import FormationModel
+from gains.sampled.coupled_block import CoupledBlock, coupled_blocks, critical_block, unlike_blocks
+from gains.sampled.multirate import Timing
+
+TREE = (-1, 0, 1, 0, 3)
+K1, K2, K3 = -3.4, 0.6, 5.6
+
+
+def tree_blocks(period_s: float = 0.02) -> list[CoupledBlock]:
+    K = FormationModel(TREE).overlapping_gain(K1 * np.eye(2), K2 * np.eye(2), K3 * np.eye(2))
+    return coupled_blocks(FormationModel(TREE), K, (1, 2, 3, 4, 5), timing=Timing(period_s, period_s))
+
+
+def test_every_vehicle_of_a_tree_is_a_block_of_its_own() -> None:
+    blocks = tree_blocks()
+    assert sorted(block.system_ids for block in blocks) == [(1,), (2,), (3,), (4,), (5,)]
+    leader, follower = unlike_blocks(blocks)
+    assert (leader.system_ids, follower.system_ids) == ((1,), (2,))
+    assert leader.K.tolist() == [[K1, 0.0], [0.0, K1]]
+    assert follower.K.tolist() == [[K3, 0.0, K1, 0.0], [0.0, K3, 0.0, K1]]
+
+
+def test_vehicles_that_act_on_each_other_are_one_block() -> None:
+    model = FormationModel((-1, 0, 1))
+    K = model.overlapping_gain(K1 * np.eye(2), K2 * np.eye(2), K3 * np.eye(2))
+    K[model.input_slice(1), model.velocity_slice(2)] = 0.1 * np.eye(2)  # vehicle 2 looks back as well
+    blocks = coupled_blocks(model, K, (7, 8, 9), timing=Timing(0.02, 0.02))
+    assert [block.system_ids for block in blocks] == [(7,), (8, 9)]
+
+
+def test_models_meet_the_closed_formulas_at_a_short_period() -> None:
+    """Margins of the continuous blocks in closed form; a period T takes half of itself away."""
+    period_s = 1e-3
+    leader, follower = unlike_blocks(tree_blocks(period_s))
+    omega = sqrt((K1**2 + sqrt(K1**4 + 4.0 * K3**2)) / 2.0)
+    for block, margin_s in ((leader, pi / (-2.0 * K1)), (follower, atan(-K1 * omega / K3) / omega)):
+        assert block.margin_s() == pytest.approx(margin_s - period_s / 2.0, abs=1e-6)
+        at_s = margin_s - period_s / 2.0
+        assert block.growth_1_s(at_s) == pytest.approx(0.0, abs=1e-5)
+        assert block.growth_continuous_1_s(at_s) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_critical_block_is_the_one_that_grows_most_at_its_own_delay() -> None:
+    blocks = tree_blocks()
+    delays = {1: 0.25, 2: 0.25, 3: 0.25, 4: 0.28, 5: 0.27}
+    assert critical_block(blocks, delays).system_ids == (4,)
+    assert critical_block(blocks, {**delays, 1: 0.6}).system_ids == (1,)
+    assert critical_block(blocks, dict.fromkeys(delays, 0.25)).system_ids == (2,)  # the first of equals
