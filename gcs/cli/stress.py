@@ -166,8 +166,7 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
     from gcs.drive.fly import new_folder
     from gcs.runs.record import write_whole
     from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
-    from gcs.stress.report import write_report
-    from gcs.stress.result import result_of
+    from gcs.stress.report import result_of, write_report
     from gcs.stress.study import NoOnset, find_onset
     from scenarios.files import dump
 

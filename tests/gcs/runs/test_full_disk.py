@@ -90,7 +90,9 @@ def test_a_campaign_ends_in_one_line_and_keeps_what_it_had(tmp_path: Path) -> No
     store.add(one)
     with (
         disk_full_at(store.file.stat().st_size + 20),
-        pytest.raises(CampaignError, match=r"trials\.jsonl: File too large; 1 trials are stored; go on with --resume"),
+        pytest.raises(
+            CampaignError, match=r"trials\.jsonl: File too large; 1 trials are stored; continue with --resume"
+        ),
     ):
         store.add(two)
     store.close()
