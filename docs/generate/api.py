@@ -42,6 +42,7 @@ def _entry(node: Any) -> str:
         assert not overloaded, node.name  # its implementation has the docstring
         result = f" -> {ast.unparse(node.returns)}" if node.returns else ""
         signature = f"{node.name}({_arguments(node.args)}){result}"
+    signature = signature.replace("'", '"')  # as ruff formats it, in Markdown too
     return f"### `{node.name}`\n\n```python\n{signature}\n```\n\n{text}"
 
 

@@ -44,7 +44,11 @@ class Runner:
 
     def json(self, command: str, *, wanted: tuple[int, ...] = (0,)) -> Any:
         """The JSON that a command prints."""
-        return json.loads(self.run(f"{command} --json", wanted=wanted))
+        text = self.run(f"{command} --json", wanted=wanted)
+        try:
+            return json.loads(text)
+        except ValueError:
+            raise CommandError(f"{command} --json: read {text[:200]!r}, wanted JSON") from None
 
 
 @contextlib.contextmanager
