@@ -58,7 +58,7 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         ["python -m docs.generate reference"],
     ),
     "measurements": (
-        "measure the figures in README and docs anew; NAMEs: only these; --check: compare the exact ones",
+        "measure the figures in README and docs anew: NAMEs or all, --timed: only those in real time; --check: compare",
         ["python -m docs.generate measurements"],
     ),
     "docs": (

@@ -1,16 +1,28 @@
-"""The start of `gcs`: the signals that end a command do so in one line from here on, also while it imports."""
+"""The start of `gcs`: from here on the signals that end a command do so in one line, even while it still imports."""
 
-from gcs.interrupts import end_at_once
+import contextlib
+import os
+import signal
+
+from gcs.cli.exit_codes import INTERRUPTED
+from gcs.interrupts import ending_signals
 from gcs.output import open_what_is_closed
 
 
 def main() -> None:
     """Entry point."""
-    end_at_once()
+    for number in ending_signals():
+        signal.signal(number, _end_at_once)
     open_what_is_closed()
     from gcs.cli.main import main as command
 
     command()
+
+
+def _end_at_once(*_: object) -> None:
+    with contextlib.suppress(OSError):  # the terminal may have gone
+        os.write(2, b"interrupted\n")
+    os._exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ as pairs (north, east). All vehicles fly at one altitude: the formation control 
 Numbers are bounded where the messages (single precision) and the clocks (nanoseconds) can still tell them apart.
 """
 
+from collections.abc import Callable
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -478,18 +479,28 @@ class Scenario(Part):
                 current = entry
         return current.velocity_ne_m_s
 
+    def with_calm_monitor(self) -> Self:
+        """The same scenario with a monitor that only watches, and without slower gains to switch to."""
+        monitor = self.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
+        return self.model_copy(update={"monitor": monitor})
+
     def with_link_delay(self, *, up_s: float | None, down_s: float | None) -> Self:
         """The same scenario with other constant link delays for every vehicle; None leaves a direction as it is.
 
-        Delay points go; jitter, losses and channels stay.
+        Delay points are dropped; jitter, losses and channels stay.
         """
 
-        def delayed(link: Link, delay_s: float | None) -> Link:
-            return link if delay_s is None else link.model_copy(update={"delay_s": delay_s, "delay_points": ()})
+        def delayed(delay_s: float | None) -> Callable[[Link], Link]:
+            changed = {} if delay_s is None else {"delay_s": delay_s, "delay_points": ()}
+            return lambda link: link.model_copy(update=changed)
 
+        return self.with_links(delayed(up_s), delayed(down_s))
+
+    def with_links(self, change_up: Callable[[Link], Link], change_down: Callable[[Link], Link]) -> Self:
+        """The same scenario with every up link and every down link changed."""
         own = tuple(
-            v.model_copy(update={"up": v.up and delayed(v.up, up_s), "down": v.down and delayed(v.down, down_s)})
+            v.model_copy(update={"up": v.up and change_up(v.up), "down": v.down and change_down(v.down)})
             for v in self.links.vehicles
         )
-        links = {"up": delayed(self.links.up, up_s), "down": delayed(self.links.down, down_s), "vehicles": own}
+        links = {"up": change_up(self.links.up), "down": change_down(self.links.down), "vehicles": own}
         return self.model_copy(update={"links": self.links.model_copy(update=links)})

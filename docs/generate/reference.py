@@ -1,12 +1,34 @@
 """The blocks of the reference, and the schema that editors read: all of them follow from the code."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
-from docs.generate import api, blocks, commands, fields, keys
+import typer
+from typer.cli import get_docs_for_click
+
+from docs.generate import api, blocks, fields, keys
+from docs.generate.runner import runner
+
+
+def commands_page() -> str:
+    """A section for each command of `gcs`, as Typer documents it, and one for `sim-vehicles`, which has no Typer."""
+    from gcs.cli.main import app
+
+    group = typer.main.get_command(app)
+    text = get_docs_for_click(obj=group, ctx=typer.Context(group, info_name="gcs"), name="gcs")
+    sections = text[text.index("## ") :].replace("* `--help`: Show this message and exit.\n", "")
+    sections = re.sub(r"^\$ (.*)$", lambda line: re.sub(r"[{}]", "", line[1]), sections, flags=re.MULTILINE)
+    sections = re.sub(
+        r"`[^`]*`|<", lambda found: found[0].replace("<", "\\<") if found[0] == "<" else found[0], sections
+    )
+    with runner() as run:
+        vehicles = run.run("sim-vehicles --help")
+    return f"{sections.rstrip()}\n\n## `sim-vehicles`\n\n```text\n{vehicles.rstrip()}\n```"
+
 
 MAKERS: dict[str, Callable[[], str]] = {
-    "commands": commands.commands_page,
+    "commands": commands_page,
     "scenario-keys": keys.keys_page,
     "tick-columns": fields.tick_columns,
     "modes": fields.modes,

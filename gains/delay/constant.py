@@ -7,7 +7,7 @@ by one, see `gains.core.structure`.
 
 Methods of this kind are set side by side in E. Jarlebring and M. E. Hochstenbach, "Polynomial two-parameter eigenvalue
 problems and matrix pencil methods for stability of delay-differential equations", arXiv:0809.3634. The test
-used here is derived in `gains.delay.crossings`.
+used here is derived in `gains.delay._crossings`.
 """
 
 from collections.abc import Sequence
@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
-from gains.delay.crossing_error import DelayedTerm, crossing_error
-from gains.delay.crossings import AxisCrossing, axis_crossings, highest_frequency
+from gains.delay._crossing_error import DelayedTerm, crossing_error
+from gains.delay._crossings import AxisCrossing, axis_crossings, highest_frequency
+from gains.delay._zero_root import ZeroPassage, zero_passage
 from gains.delay.sweep import frequency_sweep_margin
-from gains.delay.zero_root import ZeroPassage, zero_passage
 
 __all__ = [
     "Crossing",

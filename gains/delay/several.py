@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import distinct_blocks, real_matrix, square_matrices
+from gains.delay._curves import Curve, at_delay, crossing_solutions
 from gains.delay.constant import delay_margin
-from gains.delay.curves import Curve, at_delay, crossing_solutions
 from gains.delay.rightmost import rightmost_root
 
 # a rightmost root counts as on the axis when it is this close to it, relative to its own size

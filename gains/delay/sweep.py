@@ -11,10 +11,10 @@ from math import inf, pi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._bracketing import may_reach_zero, peaks
 from gains.core.arrays import FloatArray
-from gains.core.bracketing import may_reach_zero, peaks
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay.loci import Loci, delay_loci, log_moduli, unit_crossings, without_limits_at_zero
+from gains.delay._loci import Loci, delay_loci, log_moduli, unit_crossings, without_limits_at_zero
 
 # points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
 _POINTS_PER_DECADE = 60

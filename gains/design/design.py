@@ -12,7 +12,7 @@ Source: Sahoo 2012 (see `gains.formation.model`), sections 3 and 5.
 """
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, Self, overload
+from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,7 +35,7 @@ from gains.performance.behaviour import (
     follower_block,
     leader_block,
 )
-from gains.performance.robust import Certificate, SolverFacts, certify, robustness
+from gains.performance.robust import Certificate, certify, robustness
 from gains.sampled.constant import sampled_delay_margin
 
 PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
@@ -98,41 +98,6 @@ class Design:
         """Return plain lists, numbers and strings, for JSON; a number that is not finite becomes None."""
         renamed = {"K1": "K1_1_s", "K2": "K2_1_s", "K3": "K3_1_s2"}
         return {renamed.get(name, name): plain(value) for name, value in asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Return the design that `to_dict` was called on.
-
-        Raises
-        ------
-        BadModelError
-            If a field is missing or is not of the kind wanted.
-        """
-        try:
-            certificate, requirement = data["certificate"], data["requirement"]
-            return cls(
-                K1=np.array(data["K1_1_s"], dtype=float),
-                K2=np.array(data["K2_1_s"], dtype=float),
-                K3=np.array(data["K3_1_s2"], dtype=float),
-                alpha=_number(data["alpha"]),
-                delay_margin_s=_number(data["delay_margin_s"]),
-                delay_margin_continuous_s=_number(data["delay_margin_continuous_s"]),
-                period_s=_number(data["period_s"]),
-                vehicles=int(data["vehicles"]),
-                leader=BlockMargin(**_numbers(data["leader"])),
-                follower=BlockMargin(**_numbers(data["follower"])),
-                behaviour=Behaviour(**_numbers(data["behaviour"])),
-                certificate=None if certificate is None else _certificate_from(certificate),
-                requirement=None if requirement is None else Requirement(**requirement),
-                trade_off=tuple(TradeOffPoint(**_numbers(point)) for point in data["trade_off"]),
-                method=data["method"],
-                loop=data["loop"],
-                pattern=data["pattern"],
-            )
-        except KeyError as error:
-            raise BadModelError(f"the design has no field {error}; wanted all fields that to_dict writes") from error
-        except (TypeError, AttributeError) as error:
-            raise BadModelError(f"the design is not as to_dict writes it: {error}") from error
 
 
 @overload
@@ -349,22 +314,3 @@ def trade_off(
 def _check_period(period_s: float) -> None:
     if not (np.isfinite(period_s) and period_s > 0):
         raise BadModelError(f"period_s = {period_s}; wanted a positive number of seconds")
-
-
-def _number(value: float | None) -> float:
-    """Inverse of `plain` for a number; which kind of not finite it was is not kept, except that no margin ends: ∞."""
-    return float("inf") if value is None else float(value)
-
-
-def _numbers(data: dict[str, Any]) -> dict[str, float]:
-    return {name: _number(value) for name, value in data.items()}
-
-
-def _certificate_from(data: dict[str, Any]) -> Certificate:
-    return Certificate(
-        P=np.array(data["P"], dtype=float),
-        alpha=float(data["alpha"]),
-        P_eigenvalue_min=float(data["P_eigenvalue_min"]),
-        s_procedure_eigenvalue_max=float(data["s_procedure_eigenvalue_max"]),
-        solver=SolverFacts(**data["solver"]),
-    )

@@ -7,7 +7,7 @@ possible.
 from dataclasses import replace
 from math import floor, log10
 
-from gains.core.bracketing import met_end
+from gains.core._bracketing import met_end
 from gains.core.errors import InfeasibleError
 from gains.core.requirement import DELAY_MARGIN_MAX_S, PeakLimit, Requirement
 from gains.design.search import fastest_decay, largest_alpha, largest_margin

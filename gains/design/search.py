@@ -7,8 +7,8 @@ is random, and no frequency grid decides a margin. The designs found are checked
 
 import numpy as np
 
+from gains.core._bracketing import met_end
 from gains.core.arrays import FloatArray
-from gains.core.bracketing import met_end
 from gains.core.requirement import OnboardPeak, PeakLimit
 from gains.performance.scalar_gains import (
     ScalarGains,

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import DisagreementError, InfeasibleError
 from gains.core.structure import distinct_blocks, strongly_connected_blocks
+from gains.formation._submodular import least_exhaustive, least_submodular
 from gains.formation.pattern import Link, Pattern, Plant, check_fits
-from gains.formation.submodular import least_exhaustive, least_submodular
 
 # up to this many inputs in one component all subsets are tried (256 ranks); above, the submodular minimum is computed
 LARGEST_EXHAUSTIVE = 8

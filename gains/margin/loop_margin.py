@@ -1,9 +1,9 @@
 """The delay margin of any linear loop that `gains.margin.model_file` describes: one record, with what confirms it.
 
-Which analysis answers depends on the model: `gains.delay.constant` for one late part, `gains.delay.commensurate` for
-multiples of the unknown, `gains.delay.mixed` with known delays beside it, `gains.sampled.constant` for a held loop with
-a known period, and `gains.sampled.period_windows` if the period is the unknown. `gains.margin.opinions` confirms what
-it can.
+Which analysis answers depends on the model: `gains.delay.constant` for one late part, `gains.delay._commensurate` for
+multiples of the unknown delay, `gains.delay._mixed` if there are known delays beside it, `gains.sampled.constant` for a
+held loop of known period, and `gains.sampled._period_windows` if the period is the unknown. `gains.margin.opinions`
+confirms what it can. The model is read by `gains.margin.model_file`; `gcs margin` prints the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,8 +16,8 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
+from gains.delay._crossing_error import DelayedTerm, crossing_error
 from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
-from gains.delay.crossing_error import DelayedTerm, crossing_error
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
 
@@ -178,8 +178,8 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
 
 def _analysed(terms: Sequence[DelayedTerm]) -> DelayAnalysis:
     """The windows in the common divisor of the delays."""
-    from gains.delay.commensurate import analyse_commensurate
-    from gains.delay.mixed import MixedTerm, analyse_mixed
+    from gains.delay._commensurate import analyse_commensurate
+    from gains.delay._mixed import MixedTerm, analyse_mixed
 
     if any(term.known_s for term in terms):
         mixed = [MixedTerm(term.matrix, term.known_s, term.multiple) for term in terms]
@@ -200,8 +200,8 @@ def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
 
 
 def _with_unknown_period(model: HeldModel) -> LoopMargin:
+    from gains.sampled._period_windows import analyse_period
     from gains.sampled.constant import period_map
-    from gains.sampled.period_windows import analyse_period
 
     def error_s(period_s: float) -> float:
         return _map_error(lambda at_s: period_map(model.A, model.B, model.K, period_s=at_s, delay_s=0.0), period_s)

@@ -21,21 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gains.core.bracketing import met_end, peaks
 from gains.performance.behaviour import string_peak
+from gains.performance.delayed_alpha import alpha_at, alpha_limit_s
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains, delayed_singular_value
 from gains.performance.string_stability import largest_magnitude
 
 # Frequencies of the first look at σ_min; its least ones are refined by golden section.
 _FREQUENCIES, _DECADES_BELOW = 400, 3
-# Delays of the first look at how far a property holds, up to the margin or, where there is none, up to this many times
-# the slowest time constant.
-_DELAYS, _LONGEST = 32, 50.0
-# α at its limit is within this share of what it is to be.
-_RESOLUTION = 1e-7
-# Where no α is asked for, it counts as kept down to this share of its value without delay.
-ALPHA_KEPT = 0.99
+# Where there is no margin, delays are looked at up to this many times the slowest time constant.
+_LONGEST = 50.0
 # A growth this little above the limit is rounding.
 _ROUNDING = 1e-9
 # A gain this small beside k1 is none.
@@ -80,24 +75,8 @@ class FlownLoop:
     response: Response | None = None
 
     def alpha(self, delay_s: float) -> float:
-        """α at a loop delay (s); 0 from the margin on.
-
-        The least of σ_min on a grid of frequencies, refined. Beyond the highest one σ_min is larger than at rest, since
-        it exceeds ω less the size of the gains.
-        """
-        if not delay_s < self.delay_margin_s:
-            return 0.0
-        omega = self._frequencies()
-
-        def depth(at: FloatArray) -> FloatArray:
-            return -self._singular_value(at, delay_s)
-
-        values = depth(omega)
-        inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
-        best = float(values.max())
-        if inner.size:
-            best = max(best, float(depth(peaks(depth, omega[inner - 1], omega[inner + 1])).max()))
-        return -best
+        """α at a loop delay (s); 0 from the margin on."""
+        return alpha_at(self, delay_s)
 
     def string_peak(self, delay_s: float) -> float:
         """Largest growth of a spacing error from one vehicle to the next at a loop delay (s); `inf` past the margin."""
@@ -109,21 +88,7 @@ class FlownLoop:
 
     def alpha_limit_s(self, alpha: float) -> float:
         """The largest loop delay up to which α is kept: `inf` if at every one, 0 if not even without delay."""
-        longest_s = min(self.delay_margin_s, _LONGEST / self._slowest())
-        delays = np.linspace(0.0, longest_s, _DELAYS, endpoint=False)
-        omega = self._frequencies()
-        kept = np.array([self._singular_value(omega, delay_s).min() for delay_s in delays.tolist()]) >= alpha
-        at_rest = self.alpha(0.0) - alpha
-        if at_rest < 0.0 or not kept[0]:
-            return 0.0
-        if kept.all() and self.delay_margin_s == inf:
-            return inf
-        failed = int(np.argmin(kept)) if not kept.all() else _DELAYS
-        low, high = float(delays[failed - 1]), longest_s if failed == _DELAYS else float(delays[failed])
-        ends = [(delay_s, self.alpha(delay_s) - alpha) for delay_s in (low, high)]
-        if ends[0][1] < 0.0:  # a valley between the frequencies looked at first
-            ends = [(0.0, at_rest), ends[0]]
-        return met_end(lambda delay_s: self.alpha(delay_s) - alpha, ends[0], ends[1], resolution=_RESOLUTION * alpha)
+        return alpha_limit_s(self, alpha)
 
     def string_limit_s(self, peak: float) -> float:
         """The largest loop delay up to which no spacing error grows by more than `peak` >= 1 from vehicle to vehicle.
@@ -175,11 +140,15 @@ class FlownLoop:
         never = np.where(turns, c <= -1.0, excess <= _ROUNDING * k1**2 * x)
         return np.where(never, 0.0, omega / np.maximum(angle, _ROUNDING * omega))
 
+    @property
+    def longest_s(self) -> float:
+        return _LONGEST / self._slowest()
+
     def _slowest(self) -> float:
         k1, k3 = self.gains.k1, self.gains.k3
         return min(k1, k3**0.5, k3 / k1)
 
-    def _frequencies(self) -> FloatArray:
+    def frequencies(self) -> FloatArray:
         k1, k2, k3 = self.gains.k1, self.gains.k2, self.gains.k3
         highest = 4.0 * (1.0 + abs(k1) + abs(k2) + abs(k3))
         return np.concatenate([[0.0], np.geomspace(self._slowest() * 10.0**-_DECADES_BELOW, highest, _FREQUENCIES)])
@@ -192,7 +161,7 @@ class FlownLoop:
     def _answer(self, omega: FloatArray) -> NDArray[np.complex128]:
         return np.ones_like(omega, dtype=np.complex128) if self.response is None else self.response.transfer(omega)
 
-    def _singular_value(self, omega: FloatArray, delay_s: float) -> FloatArray:
+    def singular_value(self, omega: FloatArray, delay_s: float) -> FloatArray:
         own_s, front_s = self._delays_s(delay_s)
         answer = self._answer(omega)
         own, front = answer * np.exp(-1j * omega * own_s), answer * np.exp(-1j * omega * front_s)

@@ -54,6 +54,8 @@ class Response:
     def transfer(self, omega: FloatArray) -> NDArray[np.complex128]:
         """a / u at jω, from wanted to real acceleration: (s + g) / (lag s² + s + g)."""
         s, g = 1j * omega, self.velocity_gain_1_s
+        if g == 0.0:  # a root at 0 cancels
+            return np.reciprocal(self.lag_s * s + 1.0)
         return (s + g) / (self.lag_s * s**2 + s + g)
 
 

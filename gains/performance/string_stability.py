@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.core._bracketing import peaks
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.core.bracketing import peaks
 from gains.core.errors import BadModelError
 from gains.delay.constant import delay_margin
 

@@ -8,7 +8,7 @@ transport down. With tau = q T + e, 0 <= e < T, the state at the next sample is
     Phi = e^{A T},  G0 = int_0^{T-e} e^{A s} ds B,  G1 = int_{T-e}^{T} e^{A s} ds B,
 
 the modified z-transform in state space. The loop is stable exactly when the spectral radius of this one-period map is
-below one. The margin over tau is computed in `gains.sampled.crossings`; for small T it is the continuous margin less
+below one. The margin over tau is computed in `gains.sampled._crossings`; for small T it is the continuous margin less
 T / 2, up to terms in T^2.
 """
 
@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, real_matrix, square_matrices
-from gains.sampled.crossings import block_delay_margin
-from gains.sampled.loop import HeldPlant, block_radius, held_blocks, lifted_map
-from gains.sampled.period import block_period_limit
+from gains.sampled._crossings import block_delay_margin
+from gains.sampled._loop import HeldPlant, block_radius, held_blocks, lifted_map
+from gains.sampled._period import block_period_limit
 
 
 def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> FloatArray:

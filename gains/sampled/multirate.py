@@ -24,12 +24,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._bracketing import met_end
 from gains.core.arrays import FloatArray
-from gains.core.bracketing import met_end
 from gains.core.errors import BadModelError
 from gains.delay.constant import delay_margin
+from gains.sampled._loop import held_blocks
 from gains.sampled.constant import checked_loop, growth_rate, sampled_delay_margin
-from gains.sampled.loop import held_blocks
 
 # instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
 _SAME_INSTANT = 1e-11
@@ -41,6 +41,9 @@ _MOST_COMMANDS = 20
 _LOOKS, _LOOKS_MARGIN = 6, 40
 # the margin is searched up to this many continuous margins, and slower periods more
 _SEARCHED_MARGINS, _SEARCHED_PERIODS = 3.0, 10.0
+# Margins of more of the slower periods are those of one rate: measured, two parts in 10^4 at most are left to the order
+# of the loop delays, and the search, with eigenvalues of ever larger maps, would take minutes.
+_MOST_PERIODS = 30.0
 # the radius at a margin is this far below one at most
 _RESOLUTION = 1e-13
 # a local maximum of the radius is refined when its sample is above this
@@ -132,7 +135,7 @@ class LiftedPlant(Protocol):
 
     >>> import numpy as np
     >>> from gains.sampled.multirate import LiftedPlant
-    >>> from gains.sampled.loop import HeldPlant
+    >>> from gains.sampled._loop import HeldPlant
     >>> plant: LiftedPlant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
     >>> [part.ravel().round(6).tolist() for part in plant.between([0.0, 0.3, 0.5])]
     [[1.0, 1.0], [0.3, 0.2]]
@@ -179,9 +182,10 @@ def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timi
 def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
     """The least (mean) loop delay (s) at which the loop loses stability; 0 if at once, `inf` if none is found.
 
-    Where the slower period is a multiple of the faster one it is that of `gains.sampled.constant`, exact. Else the
-    least loop delay is raised in small steps, peaks refined: a search, not a proof, up to three
-    times the margin of the continuous loop and ten of the slower periods. Arguments as of `multirate_growth_rate`.
+    Where the slower period is a multiple of the faster one it is that of `gains.sampled.constant`, exact; where the
+    margin is long against both, that of the slower period alone, see `hardly_sampled`. Else the least loop delay is
+    raised in small steps, peaks refined: a search, not a proof, up to three times the margin of the continuous loop and
+    ten of the slower periods. Arguments as of `multirate_growth_rate`.
 
     Raises
     ------
@@ -202,6 +206,8 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
         return sampled_delay_margin(A, B, K, period_s=timing.held_s)
     plant, entry, feedback = checked_loop(A, B, K)
     continuous_s = delay_margin(plant, entry @ feedback)
+    if hardly_sampled(timing, near_s=continuous_s):
+        return sampled_delay_margin(A, B, K, period_s=timing.held_s)
     return lifted_margin(held_blocks(plant, entry, feedback, period_s=timing.common_s), timing, near_s=continuous_s)
 
 
@@ -214,7 +220,7 @@ def multirate_map(plant: LiftedPlant, timing: Timing, *, delay_s: float) -> Floa
 
     >>> import numpy as np
     >>> from gains.sampled.multirate import Timing, multirate_map
-    >>> from gains.sampled.loop import HeldPlant
+    >>> from gains.sampled._loop import HeldPlant
     >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
     >>> multirate_map(plant, Timing(0.5, 0.5), delay_s=0.25).round(6).tolist()
     [[0.75, 0.25], [-1.0, 0.0]]
@@ -249,13 +255,26 @@ def lifted_growth(plants: Sequence[LiftedPlant], timing: Timing, *, delay_s: flo
 
     >>> import numpy as np
     >>> from gains.sampled.multirate import Timing, lifted_growth
-    >>> from gains.sampled.loop import HeldPlant
+    >>> from gains.sampled._loop import HeldPlant
     >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
     >>> round(lifted_growth([plant], Timing(0.5, 0.5), delay_s=0.0), 6)
     -1.386294
     """
     radius = max(_radius(plant, timing, delay_s) for plant in plants)
     return float(np.log(radius)) / timing.common_s if radius > 0.0 else -inf
+
+
+def hardly_sampled(timing: Timing, *, near_s: float) -> bool:
+    """Whether a margin near this is so long against the periods that only the mean loop delay and the mean time for
+    which a command is held count.
+
+    Examples
+    --------
+    >>> from gains.sampled.multirate import Timing, hardly_sampled
+    >>> [hardly_sampled(Timing(0.02, 0.03), near_s=near_s) for near_s in (0.3, 3.0)]
+    [False, True]
+    """
+    return _MOST_PERIODS * timing.held_s < near_s < inf
 
 
 def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: float) -> float:
@@ -267,7 +286,7 @@ def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: floa
 
     >>> import numpy as np
     >>> from gains.sampled.multirate import Timing, lifted_margin
-    >>> from gains.sampled.loop import HeldPlant
+    >>> from gains.sampled._loop import HeldPlant
     >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=1.0)
     >>> round(lifted_margin([plant], Timing(1.0, 1.0), near_s=np.pi / 2), 6)
     1.0
@@ -276,12 +295,12 @@ def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: floa
     last_s = _SEARCHED_MARGINS * known_s + _SEARCHED_PERIODS * timing.held_s
     step_s = max(timing.held_s / _LOOKS, known_s / _LOOKS_MARGIN)
     looks = (timing.spread_s + np.arange(0.0, last_s, step_s)).tolist()
-    margins_s: list[float] = []
+    least_s = inf
     for plant in plants:
-        # without feedback one look tells
-        found_s = _first_unstable(partial(_radius, plant, timing), looks if plant.K.any() else looks[:1])
-        margins_s.append(found_s)
-    return min(margins_s)
+        # without feedback one look tells; beyond the margin of another plant none does
+        seen = [look for look in looks if look < least_s + step_s] if plant.K.any() else looks[:1]
+        least_s = min(least_s, _first_unstable(partial(_radius, plant, timing), seen))
+    return least_s
 
 
 def _radius(plant: LiftedPlant, timing: Timing, delay_s: float) -> float:

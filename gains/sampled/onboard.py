@@ -14,13 +14,13 @@ As it is flown nothing of it is continuous. With the control period T of the sta
   than control T is the slower period, or the common one as `gains.sampled.multirate` has it.
 
 So over one period T the local loop is a linear map of the state alone, and what is late enters it as the command of a
-held loop enters a plant: everything that `gains.sampled.crossings` says of such loops holds for this one too. The
+held loop enters a plant: everything that `gains.sampled._crossings` says of such loops holds for this one too. The
 vehicles' steps are taken to be in step with each other; clocks that are apart by less than a step change the margin in
 the second order of the step.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from math import ceil, inf
@@ -30,12 +30,12 @@ import numpy as np
 from gains.core.arrays import FloatArray, IntArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks
+from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
-from gains.delay.loci import factor_rank
 from gains.formation.model import FormationModel
-from gains.sampled.crossings import block_delay_margin
-from gains.sampled.loop import HeldPlant, block_radius, matrix_exponentials
-from gains.sampled.multirate import Timing, lifted_growth, lifted_margin
+from gains.sampled._crossings import block_delay_margin
+from gains.sampled._loop import HeldPlant, block_radius, matrix_exponentials
+from gains.sampled.multirate import Timing, hardly_sampled, lifted_growth, lifted_margin
 
 # an instant this close to a step (in steps) is that of the step
 _SAME_INSTANT = 1e-9
@@ -125,7 +125,11 @@ class OnboardLoop:
         plants, rates = self.plants(), self.timing.rates
         if rates.commands == 1:
             return min(block_delay_margin(plant) for plant in plants)
-        return lifted_margin([SteppedPlant(plant) for plant in plants], rates, near_s=self.continuous_margin_s())
+        continuous_s = self.continuous_margin_s()
+        if hardly_sampled(rates, near_s=continuous_s):  # a command held for T stands for a delay of T / 2
+            one_rate = replace(self, timing=replace(self.timing, telemetry_s=None))
+            return one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0
+        return lifted_margin([SteppedPlant(plant) for plant in plants], rates, near_s=continuous_s)
 
     def growth_1_s(self, delay_s: float) -> float:
         """Exponential rate of the slowest motion of the loop as flown: negative when stable."""
@@ -150,7 +154,7 @@ class OnboardLoop:
 
 @dataclass(frozen=True, eq=False)
 class LocalPlant:
-    """One block with its local loop closed, as a `gains.sampled.loop.SampledPlant`: only what is late is missing."""
+    """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`: only what is late is missing."""
 
     free: FloatArray
     sensed: FloatArray

@@ -11,7 +11,7 @@ the stated kind below it, and it never exceeds the margin for constant delays.
 * any variation at all: small gain on v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain from
   x' is at most h.
 
-Every Lyapunov functional found is checked by the eigenvalues of its matrices, see `gains.varying.lmi`.
+Every Lyapunov functional found is checked by the eigenvalues of its matrices, see `gains.varying._lmi`.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,9 +23,9 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
+from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
-from gains.delay.loci import factor_rank
-from gains.varying.lmi import Unknown, positive_definite_solution
+from gains.varying._lmi import Unknown, positive_definite_solution
 
 # bisection stops at this relative accuracy
 _ACCURACY = 1e-4

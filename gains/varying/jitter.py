@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
+from gains.delay._crossings import highest_frequency
+from gains.delay._loci import factor_rank
 from gains.delay.constant import analyse_delay
-from gains.delay.crossings import highest_frequency
-from gains.delay.loci import factor_rank
+from gains.varying._lmi import Unknown, positive_definite_solution
 from gains.varying.bounds import varying_delay_bound
-from gains.varying.lmi import Unknown, positive_definite_solution
 
 Cover = Literal["constant", "rate", "spread", "any", "none"]
 

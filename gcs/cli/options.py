@@ -1,8 +1,11 @@
-"""What a user gives to a command, and the one line that says what is wrong with it."""
+"""Options that several commands share, and the one-line error for each bad value."""
 
+import json
+import sys
+from enum import Enum
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,27 +15,72 @@ if TYPE_CHECKING:
     from gcs.drive.guard import Guard
     from gcs.drive.mirror import Mirror
     from gcs.drive.udp import StationSocket
+    from scenarios.schema import Scenario
 
+
+class Loop(Enum):
+    """Where the loop is closed, as `control.loop` of a scenario."""
+
+    GROUND = "ground"
+    ONBOARD = "onboard"
+
+
+ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file, as scenarios/triangle5.toml")]
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="run folder")]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
+AllowUnstable = Annotated[
+    bool, typer.Option("--allow-unstable", help="accept gains whose loop is unstable without any delay")
+]
+LoopOption = Annotated[
+    Loop | None,
+    typer.Option("--loop", help="in place of the scenario's: own errors fed back by the station or on board"),
+]
 KeyFile = Annotated[
     Path | None, typer.Option(metavar="FILE", help="sign, and take only what is signed with this key (see gcs key)")
 ]
 
 
+def print_json(result: Any) -> None:
+    """Print a result as `--json` asks for it."""
+    typer.echo(json.dumps(result, indent=2, allow_nan=False))
+
+
+def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":
+    """The scenario in a file, with its loop closed elsewhere if `loop` is given.
+
+    Raises
+    ------
+    scenarios.errors.ScenarioError
+        If the file cannot be used, or not with this loop.
+    """
+    from scenarios.files import load, with_loop
+
+    scenario = load(file)
+    return scenario if loop is None else with_loop(scenario, loop.value, file)
+
+
 def within(option: str, value: float, least: float, most: float, unit: str = "") -> None:
-    """Refuse a number that is not in a range, NaN among them."""
+    """Refuse a number outside a range, or NaN."""
     if not least <= value <= most:
         raise InputError(f"{option}: read {value:g}, wanted {unit or 'a number'} from {least:g} to {most:g}")
 
 
 def refuse(file: Path, *findings: str | None) -> None:
-    """Refuse a scenario for the first thing found in it, if there is one."""
+    """Refuse a scenario for the first of these findings that is not None."""
     for finding in findings:
         if finding is not None:
             raise InputError(f"{file}: {finding}")
 
 
+def refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
+    """Refuse a scenario for a finding, or only warn of it if the user allows it."""
+    if not allow:
+        refuse(file, finding)
+    print(f"warning: {file}: {finding}", file=sys.stderr)
+
+
 def out_folder(out: Path, wanted: str = "a new or empty folder") -> Path:
-    """The new or empty folder that --out names, made if need be."""
+    """The new or empty folder that --out names; it is created if it does not exist."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         used = any(out.iterdir())
@@ -44,7 +92,7 @@ def out_folder(out: Path, wanted: str = "a new or empty folder") -> Path:
 
 
 def out_file(option: str, file: Path) -> None:
-    """Refuse a file that cannot be written, before the work whose result goes there; its folder is made."""
+    """Refuse a file that cannot be written, before the work whose result goes there; creates its folder."""
     try:
         new = not file.exists()
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -56,7 +104,7 @@ def out_file(option: str, file: Path) -> None:
 
 
 def address(option: str, text: str) -> tuple[str, int]:
-    """HOST:PORT as given to an option."""
+    """Host and port from the HOST:PORT given to an option."""
     host, _, port = text.rpartition(":")
     try:
         known = bool(host.encode("idna")) and port.isdecimal() and len(port) <= 5 and int(port) <= 65535
@@ -79,7 +127,7 @@ def listening(option: str, text: str) -> "StationSocket":
 
 
 def warn_if_open(link: "StationSocket", *, signed: bool) -> None:
-    """One line where others than this machine can reach a socket without a key."""
+    """Warn of a socket that other machines can reach while nothing is signed."""
     host, port = link.address
     if not signed and not ip_address(host).is_loopback:
         text = "others can reach it and nothing is signed; gcs key FILE makes a key for --key"
@@ -87,7 +135,7 @@ def warn_if_open(link: "StationSocket", *, signed: bool) -> None:
 
 
 def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
-    """What signs and verifies with the key in a file, if one was given."""
+    """The guard that signs and verifies with the key in a file; None if no key was given."""
     if key is None:
         return None
     from gcs.drive.guard import open_guard

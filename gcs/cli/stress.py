@@ -1,7 +1,6 @@
 """`gcs stress`: fly the formation at many link delays, and see whether it breaks where the margin says.
 
-The command's options are here, light to import; the work is in `study` (what is flown), `campaign` (how it is flown and
-stored), `result` (what was found) and `report` (what is shown), all of this package.
+The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
 """
 
 import contextlib
@@ -14,25 +13,35 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gcs.cli.loop_option import Loop, LoopOption, load_with_loop
-from gcs.cli.options import out_file, out_folder, refuse
+from gcs.cli.exit_codes import FAILED
+from gcs.cli.options import (
+    AsJson,
+    Loop,
+    LoopOption,
+    ScenarioFile,
+    load_scenario,
+    out_file,
+    out_folder,
+    print_json,
+    refuse,
+)
 from gcs.errors import InputError
 from gcs.interrupts import raised
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
+    from gcs.plan.design import Design
     from gcs.stress.campaign import Fly
     from gcs.stress.study import Onset, Study
     from gcs.stress.trial import Outcome
 
 RESULT_FILE = "stress.json"
 SCENARIO_FILE = "scenario.toml"
-_FAILED, _INTERRUPTED = 1, 130
 
 
 @dataclass(frozen=True)
 class StressOptions:
-    """What the user asked for, as `stress` documents it."""
+    """The options of a campaign, as `stress` documents them."""
 
     scenario_file: Path
     loop: Loop | None
@@ -48,7 +57,7 @@ class StressOptions:
 
 
 def stress(
-    scenario_file: Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file")],
+    scenario_file: ScenarioFile,
     delay: Annotated[
         str,
         typer.Option(
@@ -86,7 +95,7 @@ def stress(
     ] = None,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/<scenario>-stress-<time>")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Turn the link delay up until the formation breaks, and compare with the margin.
 
@@ -119,7 +128,7 @@ def stress(
     try:
         if trial:
             assert out is not None
-            raise typer.Exit(_fly_again(options, out, trial, as_json=as_json))
+            raise typer.Exit(_refly(options, out, trial, as_json=as_json))
         result, folder = _campaign(options, out, shown=not as_json)
     except CampaignError as error:
         raise InputError(str(error)) from None
@@ -128,16 +137,16 @@ def stress(
 
         write_junit(result, junit)
     if as_json:
-        typer.echo(json.dumps(result, indent=2))
+        print_json(result)
     else:
         from gcs.cli.stress_output import print_result
 
         print_result(result, folder)
-    raise typer.Exit(0 if result["passed"] else _FAILED)
+    raise typer.Exit(0 if result["passed"] else FAILED)
 
 
 def _check(options: StressOptions, out: Path | None, trial: str) -> None:
-    """What no single option can show."""
+    """Refuse combinations of options that contradict each other."""
     if (trial or options.resume) and (out is None or not out.is_dir()):
         flag = "--trial" if trial else "--resume"
         raise InputError(f"--out: read {out}, wanted the folder of a campaign, as {flag} is given")
@@ -153,12 +162,11 @@ def _check(options: StressOptions, out: Path | None, trial: str) -> None:
 
 
 def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple[dict[str, Any], Path]:
-    """Fly what was asked for; the result as plain types, and the folder it is in."""
+    """Fly the campaign; returns its result as plain types, and the folder that holds it."""
     from gcs.drive.fly import new_folder
     from gcs.runs.record import write_whole
     from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
-    from gcs.stress.report import write_report
-    from gcs.stress.result import result_of
+    from gcs.stress.report import result_of, write_report
     from gcs.stress.study import NoOnset, find_onset
     from scenarios.files import dump
 
@@ -204,21 +212,18 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
     return result, folder
 
 
-def _study(options: StressOptions) -> "tuple[Study, dict[str, Any]]":
+def _study(options: StressOptions) -> "tuple[Study, Design]":
     from gcs.drive.preflight import bad_start, unstable_loop
     from gcs.plan.planner import flight_plan
     from gcs.stress.study import Study
 
-    scenario = load_with_loop(options.scenario_file, options.loop)
+    scenario = load_scenario(options.scenario_file, options.loop)
     if scenario.dynamics == "autopilot":
         wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
         raise InputError(f"{options.scenario_file}: dynamics: read 'autopilot', wanted {wanted}")
-    # the slower gains of the schedule are not flown here, and need not be designed
-    scheduled = scenario.model_copy(
-        update={"monitor": scenario.monitor.model_copy(update={"time_scales": (1.0,), "act": False})}
-    )
+    # a campaign does not fly the slower gains of the schedule, so they need not be designed
     refuse(options.scenario_file, bad_start(scenario))
-    design, plan = flight_plan(scheduled)
+    design, plan = flight_plan(scenario.with_calm_monitor())
     refuse(options.scenario_file, unstable_loop(plan))
     return Study(plan, real_time=options.real_time), design
 
@@ -250,7 +255,7 @@ def _workers(options: StressOptions) -> "Generator[Fly]":
 
 @contextlib.contextmanager
 def _progress(shown: bool) -> Generator[Any]:
-    """While entered, gives a function (name, total or None) -> callback that advances a bar on the terminal."""
+    """While entered, provides a function (name, total or None) -> callback that advances a progress bar."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -284,15 +289,15 @@ def _progress(shown: bool) -> Generator[Any]:
         yield begin
 
 
-def _fly_again(options: StressOptions, folder: Path, wanted: str, *, as_json: bool) -> int:
-    """Fly a stored trial again, say how it went, and give the exit code."""
-    from gcs.cli.stress_output import print_replay
-    from gcs.stress.refly import replayed
+def _refly(options: StressOptions, folder: Path, wanted: str, *, as_json: bool) -> int:
+    """Fly a stored trial again, print how it went, and return the exit code."""
+    from gcs.cli.stress_output import print_reflown
+    from gcs.stress.refly import refly
 
     study, _ = _study(options)
-    replay = replayed(study, folder, wanted, real_time=options.real_time)
+    reflown = refly(study, folder, wanted, real_time=options.real_time)
     if as_json:
-        typer.echo(replay.outcome.to_json())
+        typer.echo(reflown.outcome.to_json())
     else:
-        print_replay(replay)
-    return _FAILED if replay.outcome.error is not None or replay.differs else 0
+        print_reflown(reflown)
+    return FAILED if reflown.outcome.error is not None or reflown.differs else 0

@@ -1,4 +1,4 @@
-"""What a campaign says on the terminal, and to CI in JUnit XML."""
+"""What `gcs stress` prints, and the JUnit XML it writes for CI."""
 
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from gcs.stress.axes import place_text
-from gcs.stress.refly import Replay
-from gcs.stress.report import MOST_ROWS, REPORT_FILE, replay_command
+from gcs.stress.refly import Reflown
+from gcs.stress.report import MOST_ROWS, REPORT_FILE, refly_command
 from gcs.views.console import plain_console
 from gcs.views.page import milliseconds_text as _ms
 from gcs.views.report import UNKNOWN
@@ -19,11 +19,11 @@ from gcs.views.report import number_text as _number
 
 _FILE_WIDTH = 120
 _ID = 8
-"""Characters of an id that are shown; `--trial` takes the beginning of one."""
+"""Characters of an id that are shown; `--trial` accepts the beginning of an id."""
 
 
 def print_result(result: dict[str, Any], folder: Path) -> None:
-    """The onset beside the margin, the sweep, and where the files are."""
+    """Print the onset beside the margin, the points of the sweep, and where the files are."""
     console = plain_console()
     if not console.is_terminal:
         console.width = _FILE_WIDTH
@@ -65,7 +65,7 @@ def print_result(result: dict[str, Any], folder: Path) -> None:
         console.print(f"failed   {failed['id']}, seed {failed['seed']}, {place_text(failed['coordinates'])}: {last}")
     console.print(f"files    {folder}: {REPORT_FILE}, stress.json, trials.jsonl, trials.parquet")
     if result["worst"]:
-        console.print(f"again    {replay_command(folder, result['worst'][0])}")
+        console.print(f"again    {refly_command(folder, result['worst'][0])}")
     if result["failure"]:
         console.print(Text.assemble(("failed", "bold red"), f"   {result['failure']}"))
 
@@ -77,7 +77,7 @@ def _kinds(trials_of_kind: dict[str, int]) -> str:
 
 
 def _print_noise(console: Console, noise: dict[str, Any] | None) -> None:
-    """What the machine did to flights in real time."""
+    """Print how much the machine disturbed flights in real time."""
     if noise is None or "lateness_s_p50" not in noise:
         return
     late, latest, steal = noise["lateness_s_p50"], noise["lateness_s_p99"], noise["steal_share"]
@@ -106,9 +106,9 @@ def _table(points: list[dict[str, Any]]) -> Table:
     return table
 
 
-def print_replay(replay: Replay) -> None:
-    """One trial that was flown again."""
-    console, outcome = plain_console(), replay.outcome
+def print_reflown(reflown: Reflown) -> None:
+    """Print the outcome of a trial that was flown again, and whether it is the same."""
+    console, outcome = plain_console(), reflown.outcome
     console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {place_text(outcome.coordinates)}")
     console.print(f"verdict  {outcome.verdict}: {outcome.reason}")
     if outcome.growth_1_s is not None:
@@ -119,18 +119,18 @@ def print_replay(replay: Replay) -> None:
         )
     if outcome.real_time:
         console.print("again    in real time, where no two flights are the same")
-    elif replay.differs:
-        console.print(f"again    not as it was flown first: {', '.join(replay.differs)}")
+    elif reflown.differs:
+        console.print(f"again    not as it was flown first: {', '.join(reflown.differs)}")
     else:
         console.print(f"again    the same to the last bit, tick log {outcome.ticks_sha256}")
-    for run in replay.runs:
+    for run in reflown.runs:
         console.print(f"look     gcs view {run}")
     if outcome.error is not None:
         console.print(outcome.error)
 
 
 def write_junit(result: dict[str, Any], file: Path) -> None:
-    """Test cases for CI: that onset and margin agree, and that every trial could be flown."""
+    """Write one test case that onset and margin agree, and one for every trial that could not be flown."""
     failed = {entry["id"]: entry for entry in result["trials_failed"]}
     name = f"gcs stress {result['scenario']}"
     count = 1 + len(failed)

@@ -1,9 +1,5 @@
-"""The options of `gcs monitor` and `gcs replay`.
+"""`gcs monitor` and `gcs replay`: what links and telemetry logs say, without commanding anything."""
 
-The work is in `links` (what frames say), `live` (the socket), `tlog` and `replay` (logs), all of this package.
-"""
-
-import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from gcs.cli.options import KeyFile, listening, opened_guard
+from gcs.cli.exit_codes import FAILED, INTERRUPTED
+from gcs.cli.options import AsJson, KeyFile, listening, opened_guard, print_json
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
-_FAILED, _INTERRUPTED = 1, 130
 _TIMESYNC_HZ = 10.0
+ComparedMargin = Annotated[
+    float | None, typer.Option("--margin", metavar="SECONDS", help="compare with this delay margin", min=0.0)
+]
 
 
 def monitor(
@@ -26,39 +25,35 @@ def monitor(
     listen: Annotated[
         str, typer.Option("--listen", "--connect", metavar="HOST:PORT", help="where vehicles or a mirror send to")
     ] = "127.0.0.1:14550",
-    margin: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="compare with this delay margin", min=0.0)
-    ] = None,
+    margin: ComparedMargin = None,
     design: Annotated[
         Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margin of a run's design.json")
     ] = None,
     key: KeyFile = None,
-    silent: Annotated[bool, typer.Option("--silent", help="send nothing: delays are lower bounds then")] = False,
-    seconds: Annotated[
-        float, typer.Option("--for", metavar="SECONDS", help="end by itself after this time", min=0.1)
-    ] = float("inf"),
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
+    silent: Annotated[bool, typer.Option("--silent", help="send nothing; delays are then lower bounds")] = False,
+    seconds: Annotated[float, typer.Option("--for", metavar="SECONDS", help="stop after this time", min=0.1)] = float(
+        "inf"
+    ),
+    as_json: AsJson = False,
 ) -> None:
     """Watch the latencies of vehicles against a margin, without commanding anything.
 
-    All that is sent are TIMESYNC requests (10 a second to each address), which vehicles answer with their clock. No
-    heartbeat is sent. With --silent nothing is sent: exchanges of a station on the same stream are used if there are
-    any; otherwise delays are told against the fastest frames, and are lower bounds.
+    The monitor sends only TIMESYNC requests (10 a second to each address), which vehicles answer with their clock. It
+    sends no heartbeat. With --silent it sends nothing: it uses the exchanges of a station on the same stream, if there
+    are any; otherwise it measures delays against the fastest frames, which makes them lower bounds.
 
     Exit code 1 if an expected vehicle, or any at all, was not heard, or if the loop delay (p99) was past the margin.
     """
-    if margin is not None and design is not None:
-        raise InputError("read --margin and --design, wanted one of them")
-    if sys.stdout.isatty():  # a closed terminal ends it by a signal; a reader that has enough, by what is printed
+    _refuse_both(margin, design)
+    if sys.stdout.isatty():  # a closed terminal ends the command by a signal, a reader that has enough by EPIPE
         outlive_readers()
     guard = opened_guard(key, role="monitor")
     with listening("--listen", listen) as link:
         scenario, margin_s, margin_of = _compared_with(scenario_file, margin, design)
-        # After the socket: what comes while these load keeps its receive stamp.
+        # Imported after the socket is open: datagrams that come meanwhile keep their receive stamps.
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
         from gcs.watch.live import MonitorOptions, monitor_links
-        from gcs.watch.table import print_report
 
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
         options = MonitorOptions(
@@ -73,10 +68,14 @@ def monitor(
             report = monitor_links(link, watch, options, stop_reason, guard)
             interrupted = bool(stop_reason())
     if as_json:
-        typer.echo(json.dumps(report, indent=2, allow_nan=False))
+        print_json(report)
     else:
-        print_report(report)
-    raise typer.Exit(_INTERRUPTED if interrupted else _exit_code(report))
+        from gcs.views.console import plain_console
+        from gcs.watch.table import render
+
+        console = plain_console(soft_wrap=False)
+        console.print(render(report, width=console.width))
+    raise typer.Exit(INTERRUPTED if interrupted else _exit_code(report))
 
 
 def replay(
@@ -86,27 +85,25 @@ def replay(
     scenario_file: Annotated[
         Path | None, typer.Argument(metavar="[SCENARIO]", help="the formation flown, where it is not in the run")
     ] = None,
-    margin: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="compare with this delay margin", min=0.0)
-    ] = None,
+    margin: ComparedMargin = None,
     design: Annotated[
         Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margins of this design")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON and nothing else")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Rebuild latencies, errors and margins from a telemetry log alone.
 
-    Round trips come from the TIMESYNC exchanges in the log; in one without, delays are lower bounds, told against the
-    fastest frames. Errors need the formation, of the run's folder or of SCENARIO. What is damaged is left out and
-    counted.
+    Round trips come from the TIMESYNC exchanges in the log. Without them, delays are measured against the fastest
+    frames, which makes them lower bounds. Spacing errors need the formation, from the run's folder or from SCENARIO.
+    Damaged parts of the log are left out and counted.
     """
-    if margin is not None and design is not None:
-        raise InputError("read --margin and --design, wanted one of them")
+    _refuse_both(margin, design)
+    from gcs.plan.design import Design
     from gcs.runs.files import read_design
-    from gcs.watch import rebuild_report as replay_report
+    from gcs.watch import rebuild_report
     from gcs.watch.tlog import TlogError, read_tlog
 
-    there = replay_report.found(run)
+    there = rebuild_report.found(run)
     given = None if design is None else read_design(design)
     try:
         log = read_tlog(there.log_file)
@@ -117,27 +114,53 @@ def replay(
 
         there = replace(there, scenario=load(scenario_file), design=None, recorded=None)
     if margin is not None:
-        there = replace(there, design={"delay_margin_s": margin})
+        there = replace(there, design=Design(delay_margin_s=margin))
     elif given is not None:
         there = replace(there, design=given)
     elif there.design is None and there.scenario is not None:
         from gcs.plan.planner import flight_plan
 
         there = replace(there, design=flight_plan(there.scenario)[0])
-    result = replay_report.replay(log, there)
+    result = rebuild_report.replay(log, there)
     if as_json:
-        typer.echo(json.dumps(result, indent=2, allow_nan=False))
+        print_json(result)
     else:
-        replay_report.print_replay(result)
+        _print_replay(result)
+
+
+def _print_replay(result: dict[str, Any]) -> None:
+    """Print what was read of the log, its links, and the flight if the formation is known."""
+    from gcs.views.console import plain_console
+    from gcs.views.report import delay_text, print_flight
+    from gcs.watch.table import links_table
+
+    console = plain_console()
+    log = result["log"]
+    left_out = "".join(f"; {count} {reason}" for reason, count in log["left_out"].items())
+    console.print(f"log      {log['file']}: {log['frames']} frames in {log['duration_s']:.1f} s{left_out}")
+    if not result["links"]:
+        console.print("no vehicle in this log")
+    elif "flight" in result:
+        print_flight(result["flight"], console)
+    else:
+        console.print(links_table(result["links"], console.width))
+    if "recorded" in result:
+        recorded = result["recorded"]
+        console.print(f"recorded {recorded['verdict']}: {delay_text(recorded)}")
+
+
+def _refuse_both(margin: float | None, design: Path | None) -> None:
+    if margin is not None and design is not None:
+        raise InputError("read --margin and --design, wanted one of them")
 
 
 def _exit_code(report: dict[str, Any]) -> int:
     bad = {"not heard", "past the margin"} & {vehicle["status"] for vehicle in report["vehicles"]}
-    return _FAILED if bad or not report["vehicles"] else 0
+    return FAILED if bad or not report["vehicles"] else 0
 
 
 def _compared_with(scenario_file: Path | None, margin: float | None, design: Path | None) -> tuple[Any, Any, str]:
-    """The scenario, the margin in s (None: none is known) and in words where it is from."""
+    """The scenario, the delay margin in s (None if none is known), and the source of that margin in words."""
     scenario = None
     if scenario_file is not None:
         from scenarios.files import load
@@ -148,9 +171,9 @@ def _compared_with(scenario_file: Path | None, margin: float | None, design: Pat
     if design is not None:
         from gcs.runs.files import read_design
 
-        return scenario, read_design(design)["delay_margin_s"], f"of {design}"
+        return scenario, read_design(design).delay_margin_s, f"of {design}"
     if scenario is not None:
         from gcs.plan.planner import flight_plan
 
-        return scenario, flight_plan(scenario)[0]["delay_margin_s"], f"of {scenario.name}'s gains"
+        return scenario, flight_plan(scenario)[0].delay_margin_s, f"of {scenario.name}'s gains"
     return None, None, ""

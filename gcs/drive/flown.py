@@ -1,6 +1,5 @@
 """Flies a plan to its end and returns its log: in virtual time, or in real time as `gcs fly` does."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,10 +8,12 @@ import numpy as np
 
 from gcs.control.tick import TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.effective_delay import truth_of
+from gcs.runs.files import write_design
 from gcs.runs.grade import Truth
-from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.runs.record import SCENARIO_FILE, RunWriter
 from gcs.station.station import Station
 from scenarios import files as scenario_files
 
@@ -66,16 +67,16 @@ def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: boo
     return Flight(np.concatenate(rows), events, truth_of(records) if with_truth else None)
 
 
-def margins_of(plan: FlightPlan) -> dict[str, Any]:
+def margins_of(plan: FlightPlan) -> Design:
     """The part of a design that a run's files need; the campaign's report has the margins of the continuous model."""
-    return {"delay_margin_s": plan.delay_margin_s, "delay_margin_continuous_s": None}
+    return Design(delay_margin_s=plan.delay_margin_s, delay_margin_continuous_s=None)
 
 
 def prepared_folder(plan: FlightPlan, folder: Path) -> RunWriter:
     """A new run folder with its scenario and margins, and the writer of its logs."""
     folder.mkdir(parents=True)
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
-    (folder / DESIGN_FILE).write_text(json.dumps(margins_of(plan), indent=2), encoding="utf-8")
+    write_design(folder, margins_of(plan))
     return RunWriter(folder)
 
 

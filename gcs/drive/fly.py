@@ -1,7 +1,6 @@
 """One flight in real time: start the vehicles, fly, record, sum up."""
 
 import contextlib
-import json
 import os
 import subprocess
 import sys
@@ -16,9 +15,11 @@ from gcs.drive.mirror import Mirror
 from gcs.drive.sitl import VehicleProcess
 from gcs.drive.udp import StationSocket, clock_ns, drive, prepare_real_time
 from gcs.interrupts import held_back, stop_signals
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import described
-from gcs.runs.record import DESIGN_FILE, END, FLEET, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter, write_whole
+from gcs.runs.files import write_design
+from gcs.runs.record import DESIGN_FILE, END, FLEET, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter
 from gcs.runs.summary import finish
 from gcs.station.station import Station
 from scenarios import files as scenario_files
@@ -45,7 +46,7 @@ class FlyOptions:
 
 def fly(
     plan: FlightPlan,
-    design: dict[str, Any],
+    design: Design,
     link: StationSocket,
     options: FlyOptions,
     guard: Guard | None = None,
@@ -54,7 +55,7 @@ def fly(
     """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder."""
     folder = options.folder
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
-    (folder / DESIGN_FILE).write_text(json.dumps(design, indent=2), encoding="utf-8")
+    write_design(folder, design)
     with stop_signals() as asked_to_stop:
         unwritten = _flown(plan, design, link, options, guard, mirror, asked_to_stop)
         return finish(folder, unwritten=unwritten)
@@ -62,7 +63,7 @@ def fly(
 
 def _flown(
     plan: FlightPlan,
-    design: dict[str, Any],
+    design: Design,
     link: StationSocket,
     options: FlyOptions,
     guard: Guard | None,
@@ -93,7 +94,7 @@ def _flown(
 
         def new_plan(found: FlightPlan) -> None:
             try:
-                write_whole(folder / DESIGN_FILE, json.dumps(described(design, found), indent=2).encode())
+                write_design(folder, described(design, found))
             except OSError as error:
                 writer.ended(DESIGN_FILE, error)
             text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from gcs.control.tick import TickArray
 from gcs.drive.fly import FlyOptions, fly
 from gcs.drive.udp import StationSocket
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.grade import Truth, read_truth
@@ -26,7 +27,7 @@ class ProcessorShares(NamedTuple):
 
 
 def fly_real_time(
-    plan: FlightPlan, design: dict[str, Any], folder: Path | None
+    plan: FlightPlan, design: Design, folder: Path | None
 ) -> tuple[TickArray, list[dict[str, Any]], Truth, ProcessorShares]:
     """Fly a plan in real time.
 

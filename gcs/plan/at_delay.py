@@ -1,20 +1,28 @@
 """α and the growth of spacing errors at a loop delay, that expected of a scenario's links or one measured in flight.
 
-What a design says of them without delay says little of a flight: `gains.performance.flown_loop` has the loop as it is
-flown.
+What a design says of them without delay says little of a flight. `gains.performance.flown_loop` has the loop of a
+follower as it is flown, which says it all for a leader-follower tree with the same gains for each;
+`gains.performance.flown_formation` has the whole formation, for gains on any other pattern. There errors run both ways,
+so that no growth from vehicle to vehicle is defined and only α is reported.
 """
 
-from typing import Any
+from collections.abc import Sequence
+from math import inf
 
 import numpy as np
 
 from gains.core.requirement import plain
-from gains.performance.flown_loop import ALPHA_KEPT, FlownLoop
+from gains.design.graph import time_scaled
+from gains.formation.model import FormationModel
+from gains.performance.delayed_alpha import ALPHA_KEPT
+from gains.performance.flown_formation import FlownFormation
+from gains.performance.flown_loop import FlownLoop
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
+from gains.sampled.onboard import own_part
+from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, GainSet
+from gcs.plan.formation import plan_formation
 from scenarios.schema import Jitter, Link, Scenario
-
-_GAINS = ("K1_1_s", "K2_1_s", "K3_1_s2")
 
 
 def expected_loop_delay_s(scenario: Scenario) -> float:
@@ -49,61 +57,94 @@ def _mean_jitter_s(jitter: Jitter) -> float:
             return 0.0
 
 
-def with_figures_at_delay(design: dict[str, Any], scenario: Scenario) -> dict[str, Any]:
-    """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole.
-
-    Gains on a pattern have none of it: there errors do not run down a chain.
-    """
-    loops = _flown_loops(design)
+def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
+    """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole."""
+    loops = _flown_loops(design, scenario)
     if not loops:
         return design
-    requirement: dict[str, Any] = design["requirement"] or {}
-    peak: float = requirement.get("string_peak_max") or 1.0
+    requirement = design.requirement
+    chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
+    peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
     # of different vehicles the one that leaves least
-    alpha = requirement.get("alpha") or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
-    return design | {
-        "at_loop_delay": {
-            **figures_at(design, expected_loop_delay_s(scenario)),
-            "alpha_kept": alpha,
-            "alpha_kept_to_s": plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
-            "string_peak_kept": peak,
-            "string_peak_kept_to_s": plain(min(loop.string_limit_s(peak) for loop in loops)),
-        }
-    }
+    alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
+    flown = FiguresAtExpectedDelay(
+        **figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump(),
+        alpha_kept=alpha,
+        alpha_kept_to_s=plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
+        string_peak_kept=peak,
+        string_peak_kept_to_s=plain(min(loop.string_limit_s(peak) for loop in chains)) if peak else None,
+    )
+    return design.model_copy(update={"at_loop_delay": flown})
 
 
-def figures_at(design: dict[str, Any], delay_s: float | None, gain_set: int = 0) -> dict[str, float | None]:
-    """Loop delay, α and string peak of a design's gain set at a loop delay (s); None where unknown or unbounded."""
-    loops = [] if delay_s is None else _flown_loops(design, gain_set)
-    if not loops or delay_s is None:
-        return {"loop_delay_s": delay_s, "alpha": None, "string_peak": None}
-    return {
-        "loop_delay_s": delay_s,
-        "alpha": min(loop.alpha(delay_s) for loop in loops),
-        "string_peak": plain(max(loop.string_peak(delay_s) for loop in loops)),
-    }
+def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
+    """α and the string peak of a design's gain set at a loop delay (s)."""
+    loops = [] if delay_s is None else _flown_loops(design, scenario, gain_set)
+    if delay_s is None or not loops:
+        return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
+    chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
+    return FiguresAtDelay(
+        loop_delay_s=delay_s,
+        alpha=min(loop.alpha(delay_s) for loop in loops),
+        has_string_verdict=bool(chains),
+        string_peak=plain(max(loop.string_peak(delay_s) for loop in chains)) if chains else None,
+    )
 
 
-def _flown_loops(design: dict[str, Any], gain_set: int = 0) -> list[FlownLoop]:
-    """The loops of the followers of an inclusion design, one for each way in which vehicles answer; else none."""
-    if any(name not in design for name in _GAINS) or design["vehicles"] < 2:
+def _flown_loops(
+    design: Design, scenario: Scenario, gain_set: int = 0
+) -> Sequence[FlownLoop] | Sequence[FlownFormation]:
+    """What is flown, as far as it has an α at all: the formation, or the loops of its followers."""
+    if design.vehicles < 2:
         return []
-    entry: dict[str, Any] = design["schedule"][gain_set] if design.get("schedule") else design
-    own, front, spacing = (float(entry.get(name, design[name])[0][0]) for name in _GAINS)
+    entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
+    if design.inclusion_gains is not None:
+        return _follower_loops(design, entry)
+    return [_flown_formation(design, entry, scenario)] if design.K is not None else []
+
+
+def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
+    """The loops of the followers of an inclusion design, one for each way in which vehicles answer."""
+    gains = entry.K1_1_s or design.K1_1_s, entry.K2_1_s or design.K2_1_s, entry.K3_1_s2 or design.K3_1_s2
+    own, front, spacing = (0.0 if gain is None else gain[0][0] for gain in gains)
     if not (own < 0.0 < spacing):
         return []
-    margin_s = entry["delay_margin_s"]
-    onboard = design["loop"] == "onboard"
-    response: dict[str, Any] = design.get("response") or {}
-    answers = {(v["lag_s"], v["velocity_gain_1_s"]) for v in response.get("vehicles", [])}
     return [
         FlownLoop(
-            ScalarGains(-own, front * entry.get("streamed_share", 1.0), spacing, 0.0),
-            delay_margin_s=float("inf") if margin_s is None else float(margin_s),
-            period_s=float(design["period_s"]),
-            loop="onboard" if onboard else "ground",
-            step_s=1.0 / design["onboard"]["rate_hz"] if onboard else 0.0,
-            response=None if answer is None else Response(*answer),
+            ScalarGains(-own, front * entry.streamed_share, spacing, 0.0),
+            delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
+            period_s=design.period_s,
+            loop=design.loop,
+            step_s=1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0,
+            response=answer,
         )
-        for answer in sorted(answers) or [None]
+        for answer in set(_responses(design).values()) or [None]
     ]
+
+
+def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> FlownFormation:
+    """The formation with the gains of an entry of a graph design's schedule."""
+    formation = plan_formation(scenario)
+    model = FormationModel(tuple(formation.predecessor.tolist()))
+    first = np.array(design.K)
+    if design.loop == "onboard":
+        own = own_part(model, first)
+        K = own + entry.streamed_share * (first - own)
+    else:
+        K = time_scaled(model, first, entry.time_scale)
+    answers = _responses(design)
+    return FlownFormation(
+        model,
+        K,
+        delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
+        period_s=design.period_s,
+        loop=design.loop,
+        step_s=1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0,
+        responses=tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
+    )
+
+
+def _responses(design: Design) -> dict[int, Response]:
+    """How vehicles answer, by system id; empty if that is not known, or at once."""
+    known = design.response.vehicles if design.response is not None else ()
+    return {vehicle.system_id: Response(vehicle.lag_s, vehicle.velocity_gain_1_s) for vehicle in known}

@@ -7,14 +7,13 @@ autopilots understand it, with the formation's velocity v_d as the velocity.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
-from gains.core.requirement import plain
 from gains.formation.model import FormationModel
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
+from gcs.plan.design import Design, GainSet, OnboardPart
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 from scenarios.schema import Scenario
@@ -35,7 +34,7 @@ def timing_of(scenario: Scenario) -> OnboardTiming | None:
     )
 
 
-def onboard_plan(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, Any], FlightPlan]:
+def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     """Design and plan of a ground loop, made those of the onboard loop with the same gains.
 
     Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. The
@@ -51,17 +50,16 @@ def onboard_plan(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, An
     gains = [own + share * others for share in shares]
     loops = [onboard_loop(plan.model, gain, timing) for gain in gains]
     sampled_s = [loop.sampled_margin_s() for loop in loops]
-    margins = [
-        {"delay_margin_s": plain(margin_s), "delay_margin_continuous_s": plain(loop.continuous_margin_s())}
-        for loop, margin_s in zip(loops, sampled_s, strict=True)
-    ]
-    onboard = {
-        "rate_hz": plan.scenario.onboard.rate_hz,
-        "sensor_hz": plan.scenario.onboard.sensor_hz,
-        "ground_delay_margin_s": design["delay_margin_s"],
-        "ground_delay_margin_continuous_s": design["delay_margin_continuous_s"],
-    }
-    schedule = [{"streamed_share": share} | margin for share, margin in zip(shares, margins, strict=True)]
+    onboard = OnboardPart(
+        rate_hz=plan.scenario.onboard.rate_hz,
+        sensor_hz=plan.scenario.onboard.sensor_hz,
+        ground_delay_margin_s=design.delay_margin_s,
+        ground_delay_margin_continuous_s=design.delay_margin_continuous_s,
+    )
+    schedule = tuple(
+        GainSet(streamed_share=share, delay_margin_s=margin_s, delay_margin_continuous_s=loop.continuous_margin_s())
+        for share, margin_s, loop in zip(shares, sampled_s, loops, strict=True)
+    )
     flown = replace(
         plan,
         gain=gains[0],
@@ -69,7 +67,7 @@ def onboard_plan(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, An
         slower=tuple(zip(gains[1:], sampled_s[1:], strict=True)),
         around_loss=() if plan.separable else (own,) * len(gains),
     )
-    return design | margins[0] | {"loop": "onboard", "onboard": onboard, "schedule": schedule}, flown
+    return design.with_schedule(schedule, loop="onboard", onboard=onboard), flown
 
 
 def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, float]:

@@ -1,21 +1,23 @@
 """From a scenario to what is flown: formation, gains, margins."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import FloatArray, IntArray
 from gains.core.requirement import Requirement, plain
 from gains.core.structure import strongly_connected_blocks
-from gains.design.design import Design, design, evaluate_gains
-from gains.design.graph import evaluate_graph_gain, time_scaled
+from gains.design.design import Design as InclusionDesign
+from gains.design.design import design, evaluate_gains
+from gains.design.graph import GraphDesign, evaluate_graph_gain, time_scaled
 from gains.design.required import requirement_with
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, leader_follower, with_links, without_links
 from gains.performance.behaviour import string_peak
 from gains.performance.response import Response, continuous_margin, sampled_margin
 from gcs.plan.at_delay import with_figures_at_delay
+from gcs.plan.design import Block, Design, GainSet, ResponsePart, VehicleResponse
 from gcs.plan.flight_plan import FlightPlan, loop_timing
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.onboard import onboard_plan
@@ -30,8 +32,8 @@ _MORE = 1.1
 """What the rates take of a margin asked for is asked for so many times more: it is a small part of the margin."""
 
 
-def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
-    """The design as plain types (what design.json holds), and the plan to fly it.
+def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
+    """The design of a scenario, and the plan to fly it.
 
     Raises
     ------
@@ -52,64 +54,69 @@ def flight_plan(scenario: Scenario) -> tuple[dict[str, Any], FlightPlan]:
         delay_margin_s=found.delay_margin_s,
         slower=tuple((model.overlapping_gain(s.K1, s.K2, s.K3), s.delay_margin_s) for _, s in schedule),
     )
-    whole = found.to_dict() | {"schedule": [_entry(1.0, found), *(_entry(*slower) for slower in schedule)]}
+    entries = (_entry(1.0, found), *(_entry(*slower) for slower in schedule))
+    whole = Design.model_validate(found.to_dict() | {"schedule": entries})
     return _flown_loop(*_with_responses(whole, plan, responses))
 
 
-def _flown_loop(design: dict[str, Any], plan: FlightPlan) -> tuple[dict[str, Any], FlightPlan]:
+def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     """Design and plan of a ground loop, made those of the scenario's loop, with the figures at its delay."""
     if plan.scenario.control.loop == "onboard":
         design, plan = onboard_plan(design, plan)
     return with_figures_at_delay(design, plan.scenario), plan
 
 
-def _with_responses(
-    whole: dict[str, Any], plan: FlightPlan, responses: Responses | None
-) -> tuple[dict[str, Any], FlightPlan]:
+def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None) -> tuple[Design, FlightPlan]:
     """Design and plan with the margins of given responses."""
     if responses is None:
-        unknown = {"response": {"source": NOT_YET_KNOWN}} if plan.scenario.dynamics == "autopilot" else {}
+        if plan.scenario.dynamics == "autopilot":
+            whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
         if plan.timing.commands == 1:  # what the design was found with
-            return whole | unknown, plan
+            return whole, plan
         plan = plan.with_margins(margins_with(plan.model, plan.gains, None, plan.timing), None)
-        margins = [{"delay_margin_s": plain(margin_s)} for margin_s in plan.margins_s]
-        schedule = [entry | margin for entry, margin in zip(whole["schedule"], margins, strict=True)]
-        return whole | margins[0] | {"schedule": schedule} | unknown, plan
+        continuous_s = [entry.delay_margin_continuous_s for entry in whole.schedule]
+        return whole.with_schedule(_with_margins(whole, plan.margins_s, continuous_s)), plan
     of = responses.in_order(plan.formation.system_ids)
     plan = plan.with_margins(margins_with(plan.model, plan.gains, of, plan.timing), responses)
     return described(whole, plan), plan
 
 
-def described(design: dict[str, Any], plan: FlightPlan) -> dict[str, Any]:
+def described(design: Design, plan: FlightPlan) -> Design:
     """The design with the vehicles' responses in it: its margins become those with them.
 
     `delay_margin_at_once_s` is the margin that the same gains have on vehicles that answer at once.
     """
     assert plan.responses is not None
     every = plan.responses.in_order(plan.formation.system_ids)
-    margins = [
-        {"delay_margin_s": sampled_s, "delay_margin_continuous_s": continuous_margin(plan.model, K, every)}
-        for K, sampled_s in zip(plan.gains, plan.margins_s, strict=True)
-    ]
-    blocks = [np.array(design[name]) for name in ("K1_1_s", "K2_1_s", "K3_1_s2") if name in design]
-    schedule = [entry | margin for entry, margin in zip(design["schedule"], margins, strict=True)]
-    response: dict[str, Any] = {
-        "source": plan.responses.source,
-        "model": "lag a' = u + g (v_s - v) - a, v_s' = u",
-        "vehicles": [
-            {"system_id": system_id, "lag_s": found.lag_s, "velocity_gain_1_s": found.velocity_gain_1_s}
+    continuous_s = [continuous_margin(plan.model, K, every) for K in plan.gains]
+    response = ResponsePart(
+        source=plan.responses.source,
+        model="lag a' = u + g (v_s - v) - a, v_s' = u",
+        vehicles=tuple(
+            VehicleResponse(system_id=system_id, lag_s=found.lag_s, velocity_gain_1_s=found.velocity_gain_1_s)
             for system_id, found in sorted(plan.responses.of.items())
-        ],
-        "delay_margin_at_once_s": design["delay_margin_s"],
-    }
-    if len(blocks) == 3:  # the same for each vehicle, as on a leader-follower tree only
-        own, front, spacing = blocks
+        ),
+        delay_margin_at_once_s=design.delay_margin_s,
+    )
+    if design.inclusion_gains is not None:  # the same for each vehicle, as on a leader-follower tree only
+        own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
         peaks = [string_peak((own, front, spacing), 0.0, answer=answer.transfer) for answer in set(every)]
-        response["string_peak"] = max(peaks)
-    return with_figures_at_delay(design | margins[0] | {"schedule": schedule, "response": response}, plan.scenario)
+        response = response.model_copy(update={"string_peak": max(peaks)})
+    schedule = _with_margins(design, plan.margins_s, continuous_s)
+    return with_figures_at_delay(design.with_schedule(schedule, response=response), plan.scenario)
 
 
-def _schedule(scenario: Scenario, model: FormationModel, found: Design) -> list[tuple[float, Design]]:
+def _with_margins(
+    design: Design, sampled_s: Sequence[float], continuous_s: Sequence[float | None]
+) -> tuple[GainSet, ...]:
+    """The design's gain schedule with these margins."""
+    return tuple(
+        entry.model_copy(update={"delay_margin_s": plain(own_s), "delay_margin_continuous_s": plain(late_s)})
+        for entry, own_s, late_s in zip(design.schedule, sampled_s, continuous_s, strict=True)
+    )
+
+
+def _schedule(scenario: Scenario, model: FormationModel, found: InclusionDesign) -> list[tuple[float, InclusionDesign]]:
     """The design slowed down by the scenario's factors.
 
     With K1 / s, K2 / s and K3 / s² the loop does the same things s times slower, so its delay margin is s times larger.
@@ -121,13 +128,13 @@ def _schedule(scenario: Scenario, model: FormationModel, found: Design) -> list[
     ]
 
 
-def _entry(time_scale: float, design: Design) -> dict[str, Any]:
-    names = ("K1_1_s", "K2_1_s", "K3_1_s2", "alpha", "delay_margin_s", "delay_margin_continuous_s")
-    whole = design.to_dict()
-    return {"time_scale": time_scale} | {name: whole[name] for name in names}
+def _entry(time_scale: float, found: InclusionDesign | GraphDesign, **gains: Sequence[Block]) -> GainSet:
+    names = found.to_dict()
+    known = {name: names[name] for name in GainSet.model_fields if name in names}
+    return GainSet.model_validate({"time_scale": time_scale} | known | gains)
 
 
-def _design(scenario: Scenario, model: FormationModel, response: Response | None) -> Design:
+def _design(scenario: Scenario, model: FormationModel, response: Response | None) -> InclusionDesign:
     control, timing = scenario.control, loop_timing(scenario)
     if control.gains is not None:
         own, front, spacing = (gain * np.eye(2) for gain in (control.gains.K1, control.gains.K2, control.gains.K3))
@@ -147,7 +154,7 @@ def _requirement(scenario: Scenario) -> Requirement:
     )
 
 
-def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel) -> tuple[dict[str, Any], FlightPlan]:
+def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel) -> tuple[Design, FlightPlan]:
     """Design and plan on an information pattern, designed or given block by block."""
     control, timing = scenario.control, loop_timing(scenario)
     period_s = timing.held_s
@@ -174,19 +181,14 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
         separable=len(_loops(model, found.K)) == model.vehicles,
         around_loss=() if control.loop == "onboard" else _around_loss(model, found.delay_margin_s, scales, period_s),
     )
-    names = ("alpha", "decay_rate_1_s", "delay_margin_s", "delay_margin_continuous_s")
     schedule = [
-        {"time_scale": scale, "blocks": _blocks(entry.K, formation, model, pattern)}
-        | {name: entry.to_dict()[name] for name in names}
+        _entry(scale, entry, blocks=_blocks(entry.K, formation, model, pattern))
         for scale, entry in zip(scales, [found, *slower], strict=True)
     ]
     ids = formation.system_ids
-    result = found.to_dict() | {
-        "links": [[ids[i], ids[j]] for i, j in found.links],
-        "blocks": schedule[0]["blocks"],
-        "schedule": schedule,
-    }
-    return _with_responses(result, plan, given_responses(scenario))
+    links = [(ids[i], ids[j]) for i, j in found.links]
+    parts = {"links": links, "blocks": schedule[0].blocks, "schedule": schedule}
+    return _with_responses(Design.model_validate(found.to_dict() | parts), plan, given_responses(scenario))
 
 
 def _pattern(scenario: Scenario, formation: Formation, model: FormationModel) -> Pattern:
@@ -207,16 +209,16 @@ def _given_gain(scenario: Scenario, formation: Formation, model: FormationModel)
     return K
 
 
-def _blocks(K: FloatArray, formation: Formation, model: FormationModel, pattern: Pattern) -> list[dict[str, Any]]:
+def _blocks(K: FloatArray, formation: Formation, model: FormationModel, pattern: Pattern) -> list[Block]:
     """The gain matrix block by block, as a scenario gives it."""
     ids = formation.system_ids
     return [
-        {"vehicle": ids[i], "of": ids[j], "gain": K[model.input_slice(i), model.output_slice(j)].tolist()}
+        Block(vehicle=ids[i], of=ids[j], gain=K[model.input_slice(i), model.output_slice(j)].tolist())
         for i, j in pattern.links
     ]
 
 
-def _loops(model: FormationModel, K: FloatArray) -> list[Any]:
+def _loops(model: FormationModel, K: FloatArray) -> list[IntArray]:
     """Groups of vehicles that act on each other."""
     outputs = [model.output_slice(i) for i in range(model.vehicles)]
     pattern = np.abs(model.A) + np.abs(model.B @ K)

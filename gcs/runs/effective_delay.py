@@ -5,8 +5,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.runs.grade import ACTED, SAMPLED, Truth, instants, true_loop_delays_s
 from gcs.control.tick import TickArray
+from gcs.runs.grade import ACTED, SAMPLED, Truth, instants, true_loop_delays_s
 
 _TRUTH = np.dtype([("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_ns", "<i8")])
 

@@ -3,33 +3,25 @@
 Raised everywhere here: gcs.errors.InputError.
 """
 
+import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from gcs.errors import InputError
-from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE
 from gcs.control.tick import TICK, Mode, TickArray
+from gcs.errors import InputError
+from gcs.plan.design import Design, Margin
+from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE, write_whole
 from scenarios import files as scenario_files
 from scenarios.schema import Scenario
 
-_Margin = Annotated[float, Field(ge=0)] | None
-"""In s; None or infinite where there is no limit."""
+_Record = TypeVar("_Record", bound=BaseModel)
 
 
 class _Part(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow")
-
-
-class _GainSet(_Part):
-    delay_margin_s: _Margin
-
-
-class _Design(_GainSet):
-    delay_margin_continuous_s: _Margin = None
-    schedule: list[_GainSet] = []
 
 
 class _Delays(_Part):
@@ -41,7 +33,7 @@ class _Delays(_Part):
 class _Summary(_Part):
     verdict: str
     loop: Literal["ground", "onboard"]
-    delay_margin_s: _Margin
+    delay_margin_s: Margin
     loop_delay_s: _Delays
     headroom_min: float | None
 
@@ -61,14 +53,19 @@ def read_scenario(folder: Path) -> Scenario:
     return scenario_files.load(folder / SCENARIO_FILE)
 
 
-def read_design(file: Path) -> dict[str, Any]:
+def read_design(file: Path) -> Design:
     """A design.json, of which only the margins have to be there."""
-    return _checked(file, _Design, f"the {DESIGN_FILE} of a run")
+    return _checked(file, Design, f"the {DESIGN_FILE} of a run")
+
+
+def write_design(folder: Path, design: Design) -> None:
+    """Write a run's design.json, whole or not at all."""
+    write_whole(folder / DESIGN_FILE, json.dumps(design.to_dict(), indent=2, allow_nan=False).encode())
 
 
 def read_summary(file: Path) -> dict[str, Any]:
     """A summary.json."""
-    return _checked(file, _Summary, "the summary of a run")
+    return _checked(file, _Summary, "the summary of a run").model_dump()
 
 
 def read_ticks(folder: Path) -> TickArray:
@@ -101,10 +98,10 @@ def _from_parquet(file: Path) -> TickArray:
     return ticks
 
 
-def _checked(file: Path, kind: type[BaseModel], wanted: str) -> dict[str, Any]:
-    """The JSON of a file as plain types, if it is of a kind."""
+def _checked(file: Path, kind: type[_Record], wanted: str) -> _Record:
+    """The record of a kind that a JSON file holds."""
     try:
-        return kind.model_validate_json(file.read_bytes()).model_dump()
+        return kind.model_validate_json(file.read_bytes(), strict=True)
     except OSError as error:
         raise InputError(f"{file}: {error.strerror}, wanted {wanted}") from None
     except ValidationError as errors:

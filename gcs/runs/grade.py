@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gcs.errors import InputError
-from gcs.runs.record import TRUTH_FILE
-from gcs.runs.files import read_ticks
 from gcs.control.tick import TickArray
+from gcs.errors import InputError
+from gcs.runs.files import read_ticks
+from gcs.runs.record import TRUTH_FILE
 from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
 
 Truth = NDArray[np.void]
@@ -53,24 +53,6 @@ def grade(folder: Path) -> dict[str, Any]:
         "rtt": graded(trip_errors_s, np.zeros(len(trip_errors_s))),
         "link_delay": graded(late_s, np.zeros(len(late_s))),
     }
-
-
-def print_grade(result: dict[str, Any]) -> None:
-    """One line for each quantity."""
-    kinds = {
-        "loop_delay": "loop delay, measured",
-        "rtt": "round trip, measured",
-        "link_delay": "link delay, applied upwards",
-    }
-    print(f"errors against the truth, {result['vehicles']} vehicles, ms")
-    for name, title in kinds.items():
-        own = result[name]
-        figures = [_ms(own[f"error_{part}_s"]) for part in ("p50", "p99", "max")]
-        print(f"{title:<28} p50 {figures[0]}  p99 {figures[1]}  max {figures[2]}  of {own['samples']}")
-
-
-def _ms(value_s: float | None) -> str:
-    return "–" if value_s is None else f"{1e3 * value_s:.3f}"
 
 
 def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:

@@ -12,12 +12,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.plan.at_delay import figures_at
-from gcs.errors import InputError
-from gcs.runs.record import (DESIGN_FILE, END, EVENTS_FILE, FLEET, LOG_ENDED, MIRROR, PARQUET_FILE, RECORDING_FILE, SCENARIO_FILE, STARTED, SUMMARY_FILE, TICKS_FILE, TRUTH_FILE, write_whole)
-from gcs.runs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
-from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
 from gcs.control.tick import CLOCK_JUMPED, TICK, Mode, TickArray
+from gcs.errors import InputError
+from gcs.plan.at_delay import figures_at
+from gcs.plan.design import Design
+from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
+from gcs.runs.record import (
+    DESIGN_FILE,
+    END,
+    EVENTS_FILE,
+    FLEET,
+    LOG_ENDED,
+    MIRROR,
+    PARQUET_FILE,
+    RECORDING_FILE,
+    SCENARIO_FILE,
+    STARTED,
+    SUMMARY_FILE,
+    TICKS_FILE,
+    TRUTH_FILE,
+    write_whole,
+)
+from gcs.runs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
 from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0
@@ -88,9 +104,7 @@ def _write_parquet(folder: Path, ticks: TickArray) -> None:
     (folder / TICKS_FILE).unlink(missing_ok=True)
 
 
-def summarise(
-    scenario: Scenario, design: dict[str, Any], ticks: TickArray, events: list[dict[str, Any]]
-) -> dict[str, Any]:
+def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: list[dict[str, Any]]) -> dict[str, Any]:
     """The summary of a run, as plain types; an unknown is None."""
     commanded = ticks["tick"][ticks["commanded"]]
     flown = ticks[(ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1))]
@@ -116,11 +130,11 @@ def summarise(
         "fleet": said[FLEET][-1] if said[FLEET] else STARTED,
         "not_logged": not_logged,
         "loop": scenario.control.loop,
-        "delay_margin_s": _number(design["delay_margin_s"]),
-        "delay_margin_continuous_s": _number(design["delay_margin_continuous_s"]),
-        "response": design.get("response"),
+        "delay_margin_s": _number(design.delay_margin_s),
+        "delay_margin_continuous_s": _number(design.delay_margin_continuous_s),
+        "response": design.response and design.response.model_dump(mode="json", exclude_unset=True),
         "loop_delay_s": _spread(loop_delay),
-        "at_loop_delay": figures_at(design, _slowest_median_s(flown)),
+        "at_loop_delay": figures_at(design, scenario, _slowest_median_s(flown)).model_dump(),
         "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
         "settling_time_s": settled,
         "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,

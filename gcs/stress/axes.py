@@ -1,10 +1,10 @@
-"""The axes of a campaign: what of a scenario is varied, and over which values.
+"""The axes of a campaign: the quantities of a scenario that vary, and their values.
 
 *Link delay* here is the total of a vehicle's two links, up plus down, so that it compares directly with the delay
-margin: what is missing to the loop delay is only the time that telemetry waits for the next control tick, less than one
-period. It is split into an up link of whole control periods, as near to half as can be, and a down link of the rest.
-With any other split the waiting would jump by a period as the up link grows past one, and the loop delay would grow in
-steps; with this one it grows as the link delay does.
+margin: the loop delay is this plus the time that telemetry waits for the next control tick, less than one period. The
+up link takes a whole number of control periods, as near to half as possible, and the down link the rest. With any other
+split the waiting would jump by a period whenever the up link crossed a whole period, and the loop delay would grow in
+steps; with this one it grows with the link delay.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,19 +16,19 @@ from scenarios.schema import Jitter, Link, Scenario, VehicleLinks
 
 
 class AxisError(Exception):
-    """Values of an axis that cannot be used: what was read and what was wanted."""
+    """The values of an axis cannot be used: what was read and what was wanted."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One thing that is varied. `name` is "delay", "jitter", "loss", "rate", or "delay_<system id>"."""
+    """One varied quantity. `name` is "delay", "jitter", "loss", "rate", or "delay_<system id>"."""
 
     name: str
     values: tuple[float, ...]
 
     @property
     def label(self) -> str:
-        """What stands at the axis of a plot."""
+        """The label at the axis of a plot."""
         if self.name.startswith("delay_"):
             return f"link delay of vehicle {self.name.removeprefix('delay_')}, up + down [s]"
         return _LABELS[self.name]
@@ -41,7 +41,7 @@ _LABELS = {
     "rate": "control and telemetry rate [Hz]",
 }
 _MOST = 10_000
-"""Values of an axis."""
+"""Most values of an axis."""
 _RANGES = {"delay": (0.0, 60.0), "jitter": (0.0, 10.0), "loss": (0.0, 1.0), "rate": (1.0, 500.0)}
 
 
@@ -63,7 +63,7 @@ def parse_axis(name: str, text: str) -> Axis:
             values = [float(word) for word in text.split(",")]
     except ValueError:
         values = []
-    # the same number that a user would write, so that ids do not depend on how a range was cut
+    # rounded to what a user would write, so that ids do not depend on how a range was divided
     values = [round(value, 9) for value in values]
     if not values or not all(low <= value <= high for value in values):
         wanted = f"FROM:TO:COUNT or values as 0.1,0.2, from {low:g} to {high:g}, at most {_MOST}"
@@ -88,8 +88,8 @@ def parse_vehicle_axis(text: str, system_ids: tuple[int, ...]) -> Axis:
 def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenario:
     """The scenario at one point of a campaign.
 
-    A rate is set for control, for telemetry if both were the same, and on board in proportion. Jitter keeps the
-    distribution of a link that has one, and is uniform (mean 0, from minus to plus the value) where there is none.
+    A rate applies to control, to telemetry if both rates were equal, and on board in proportion. Jitter keeps the
+    distribution of a link that has one; elsewhere it is uniform within ± the value.
     """
     if "rate" in coordinates:
         rates, hz = scenario.rates, coordinates["rate"]
@@ -108,27 +108,27 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
         if name.startswith("delay_"):
             scenario = _with_vehicle_delay(scenario, int(name.removeprefix("delay_")), delay_s)
     if "jitter" in coordinates:
-        scenario = _changed_links(scenario, lambda link: _with_jitter(link, coordinates["jitter"]))
+        scenario = _with_every_link(scenario, lambda link: _with_jitter(link, coordinates["jitter"]))
     if "loss" in coordinates:
         loss = {"loss_probability": coordinates["loss"]}
-        scenario = _changed_links(scenario, lambda link: link.model_copy(update=loss))
+        scenario = _with_every_link(scenario, lambda link: link.model_copy(update=loss))
     return scenario
 
 
 def has_constant_links(scenario: Scenario) -> bool:
-    """Whether every link has a constant delay and nothing else, so that the models say exactly what it does."""
+    """Whether every link has only a constant delay, so that the models describe it exactly."""
     links = scenario.links
     every = [links.up, links.down, *(link for v in links.vehicles for link in (v.up, v.down) if link is not None)]
     return all(link == Link(delay_s=link.delay_s) for link in every)
 
 
 def place_text(coordinates: Mapping[str, float]) -> str:
-    """A point of a campaign in words."""
+    """The text for a point of a campaign."""
     return ", ".join(f"{name.replace('_', ' of ')} {value:g}" for name, value in coordinates.items())
 
 
 def split_delay(total_s: float, period_s: float) -> tuple[float, float]:
-    """Up and down parts of a total link delay: up a whole number of periods, down the rest, about half each."""
+    """Split a total link delay into up, a whole number of periods, and down, the rest: about half each."""
     up_s = round(round(total_s / 2.0 / period_s) * period_s, 12)
     return up_s, max(0.0, round(total_s - up_s, 12))
 
@@ -153,11 +153,5 @@ def _with_vehicle_delay(scenario: Scenario, system_id: int, delay_s: float) -> S
     return scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (*others, own)})})
 
 
-def _changed_links(scenario: Scenario, change: Callable[[Link], Link]) -> Scenario:
-    """The scenario with every link changed."""
-    links = scenario.links
-    own = tuple(
-        v.model_copy(update={"up": v.up and change(v.up), "down": v.down and change(v.down)}) for v in links.vehicles
-    )
-    update = {"up": change(links.up), "down": change(links.down), "vehicles": own}
-    return scenario.model_copy(update={"links": links.model_copy(update=update)})
+def _with_every_link(scenario: Scenario, change: Callable[[Link], Link]) -> Scenario:
+    return scenario.with_links(change, change)

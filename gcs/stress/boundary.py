@@ -1,4 +1,4 @@
-"""The map of a campaign with two axes: where it breaks in flight, where it should, and where it cannot."""
+"""The map of a campaign with two axes: where the formation breaks in flight, where predicted, and where it cannot."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,9 +28,9 @@ _MOST_TICKS = 12
 def map_figure(
     file: Path, *, study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome], verdicts: Sequence[Outcome]
 ) -> Path | None:
-    """Measured growth over two axes, mean of the seeds, with the boundary in flight and the predicted ones.
+    """Measured growth over two axes, averaged over the seeds, with the measured and the predicted boundaries.
 
-    The marks are of the flights `verdicts`, of which the worst seed counts.
+    The marks show the flights `verdicts`, each cell that of its worst seed.
     """
     axes = [replace(axis, values=tuple(sorted(axis.values))) for axis in axes]
     measured = _cells(axes, outcomes, "growth_1_s")
@@ -70,13 +70,13 @@ def map_figure(
 
 
 def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
-    """(k, 2) link delays and the largest jitters below which the formation is proved stable however the delay varies.
+    """(k, 2) link delays and the jitter below which the formation is proved stable however the delay varies.
 
     With jitter of at most j each way and periods T of telemetry and control, the age of the state behind the command
-    in action lies between d - 2 j and d + 2 j + 2 T. It is covered as a deviation from its middle
-    (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies) or as any variation from 0 on
-    (`gains.varying.bounds.varying_delay_bound`). None for other axes, for jitter that has no largest value, and for the
-    onboard loop, of which not all feedback is late.
+    in action lies between d - 2 j and d + 2 j + 2 T. Two bounds cover it: one for deviations from the middle
+    (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies), one for any variation between 0 and a
+    maximum (`gains.varying.bounds.varying_delay_bound`). None for other axes, for unbounded jitter, and for the onboard
+    loop, where not all feedback is late.
     """
     scenario = study.plan.scenario
     if (
@@ -98,7 +98,7 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     delays_s = np.linspace(axes[0].values[0], axes[0].values[-1], _POINTS)
     around_s = [min(spread_bound(A0, A1, mean_s=delay + period_s) for A0, A1 in loops) for delay in delays_s.tolist()]
     jitter_s = np.maximum((np.array(around_s) - period_s) / 2.0, (any_s - 2.0 * period_s - delays_s) / 2.0)
-    # no delay is below zero
+    # delays cannot be negative
     jitter_s = np.minimum(jitter_s, delays_s / 2.0)
     return np.stack([delays_s, jitter_s], axis=1)[jitter_s >= 0.0]
 
@@ -106,7 +106,7 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
 def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[FloatArray]:
     """The edge of stability over the link delays of two vehicles, from the continuous model of the whole formation.
 
-    Empty for other axes, for the onboard loop, and for vehicles whose loop has others in it: their delays matter too.
+    Empty for other axes, for the onboard loop, and for vehicles in a loop with others, whose delays matter too.
     """
     if not all(axis.name.startswith("delay_") for axis in axes) or study.plan.scenario.control.loop != "ground":
         return []
@@ -117,7 +117,7 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     model, places = plan.model, [plan.formation.system_ids.index(system_id) for system_id in ids]
     late = late_by_vehicle(model.B, plan.gain, [model.input_slice(k) for k in range(model.vehicles)])
     others = sum((late[k] for k in range(model.vehicles) if k not in places), model.A)
-    # from the model's delay to that of the links: less the hold, and the waiting for the control tick
+    # the link delay is the model's delay less the hold and the waiting for the control tick
     less_s = np.array([plan.timing.held_s / 2.0 + _waiting_s(outcomes, system_id) for system_id in ids])
     longest_s = (axes[0].values[-1] + float(less_s[0]), axes[1].values[-1] + float(less_s[1]))
     lines = boundary_of_two_delays(others, late[places[0]], late[places[1]], longest_s=longest_s)
@@ -130,7 +130,7 @@ def _waiting_s(outcomes: Sequence[Outcome], system_id: int) -> float:
 
 
 def _mark(plot: Any, axes: Sequence[Axis], verdicts: Sequence[Outcome], dark: NDArray[np.bool_]) -> None:
-    """The verdict of each cell's flights from the scenario's own initial states; light marks on dark cells."""
+    """Mark the verdict of each cell's own-state flights; light marks on dark cells."""
     across, up = (np.array(axis.values) for axis in axes)
     found = _verdicts(axes, verdicts)
     for verdict, marker, size in (("unstable", "x", 22), ("stable", "o", 8), ("aborted", "+", 22)):

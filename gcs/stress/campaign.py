@@ -1,7 +1,7 @@
-"""Many trials, flown on all processors or on a cluster, each stored the moment it ends.
+"""Fly many trials on all processors or on a cluster, and store each as soon as it ends.
 
-The store is one file of JSON lines to which a finished trial is appended with one system call, so a killed campaign
-loses nothing that was finished, and a later one takes it up: what is stored under a trial's id is not flown again.
+The store is one file of JSON lines. A finished trial is appended with one system call, so a killed campaign loses no
+finished trial, and a later one resumes it: a trial whose id is stored is not flown again.
 """
 
 import contextlib
@@ -28,13 +28,13 @@ PARQUET_FILE = "trials.parquet"
 _PR_SET_PDEATHSIG = 1
 
 Fly = Callable[[Sequence[Trial]], Iterator[Outcome]]
-"""Flies trials and gives their outcomes as they end, in any order."""
+"""Flies trials and yields their outcomes as they end, in any order."""
 Run = Callable[[Sequence[Trial]], list[Outcome]]
-"""Gives the outcomes of trials in their order, flying those that are not stored."""
+"""Returns the outcomes of trials in their order, flying those that are not stored."""
 
 
 class CampaignError(Exception):
-    """A campaign that cannot go on: one line."""
+    """The campaign cannot continue: one line."""
 
 
 class Store:
@@ -57,7 +57,7 @@ class Store:
             raise CampaignError(f"{folder}: another gcs stress works there; wanted a folder of its own") from None
         text = self.file.read_bytes()
         for line in text.splitlines():
-            with contextlib.suppress(ValueError, TypeError):  # a line cut short by a kill; its trial is flown again
+            with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; its trial is flown again
                 outcome = Outcome.from_json(line.decode())
                 self.outcomes[outcome.id] = outcome
         if text and not text.endswith(b"\n"):
@@ -79,15 +79,15 @@ class Store:
 
     @property
     def resume(self) -> str:
-        """How to go on with the campaign."""
-        return f"{len(self.outcomes)} trials are stored; go on with --resume --out {self.file.parent}"
+        """What tells the user how to resume the campaign."""
+        return f"{len(self.outcomes)} trials are stored; continue with --resume --out {self.file.parent}"
 
     def close(self) -> None:
         self._log.close()
 
 
 def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None:
-    """Refuse, for an option, a folder that is no campaign, or one of another scenario than this, as TOML.
+    """Refuse a folder that holds no campaign, or a campaign of another scenario; `scenario` is TOML.
 
     Raises
     ------
@@ -105,14 +105,14 @@ def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None
 def run_campaign(
     trials: Sequence[Trial], store: Store, fly: Fly, *, ended: Callable[[Outcome, int], None] | None = None
 ) -> list[Outcome]:
-    """The outcomes of trials in their order; those that are not stored are flown, each only once.
+    """Return the outcomes of trials in their order; those not stored are flown, each once.
 
-    `ended` is called for each trial that has ended, with the number of those still to come.
+    `ended` is called with each outcome and the number of trials still to come.
 
     Raises
     ------
     KeyboardInterrupt
-        Also if a flight in real time was ended by Ctrl-C; it does not count as flown.
+        Also if Ctrl-C ended a flight in real time; that flight does not count as flown.
     """
     missing = {trial.id: trial for trial in trials if trial.id not in store.outcomes}
     left = len(missing)
@@ -128,13 +128,13 @@ def run_campaign(
         if error.errno not in DISK_FULL:
             raise
         raise CampaignError(f"{error.filename}: {error.strerror}; {store.resume}") from None
-    # the same trial may stand at another place of another sweep
+    # the same trial may have other coordinates in another sweep
     return [replace(store.outcomes[trial.id], coordinates=dict(trial.coordinates)) for trial in trials]
 
 
 @contextlib.contextmanager
 def local_workers(count: int) -> Generator[Fly]:
-    """Fly trials in `count` processes; with one, in this process."""
+    """While entered, fly trials in `count` processes; if one, in this process."""
     if count == 1:
         yield _here
         return
@@ -143,10 +143,11 @@ def local_workers(count: int) -> Generator[Fly]:
 
         def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
             if not pools:
-                pools.append(_pool(count))
+                with held_back():  # multiprocessing's resource tracker, which starts here, would die of SIGHUP
+                    pools.append(_pool(count))
                 stack.callback(pools[0].shutdown, cancel_futures=True)
             try:
-                with held_back():  # workers that are just starting leave Ctrl-C to this process
+                with held_back():  # workers that are starting leave Ctrl-C to this process
                     futures = [pools[0].submit(fly_trial, trial) for trial in trials]
                 for future in as_completed(futures):
                     yield future.result()
@@ -160,7 +161,7 @@ def local_workers(count: int) -> Generator[Fly]:
 
 @contextlib.contextmanager
 def dask_workers(address: str) -> Generator[Fly]:
-    """Fly trials on the workers of a Dask cluster, which have this package installed.
+    """While entered, fly trials on the workers of a Dask cluster, where this package is installed.
 
     Raises
     ------
@@ -178,7 +179,7 @@ def dask_workers(address: str) -> Generator[Fly]:
         raise CampaignError(f"--dask: read {address!r} ({error}), wanted the address of a Dask scheduler") from None
 
     def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
-        # the id as key: a scheduler that still has the result of an earlier client gives it without a flight
+        # the id as key: a scheduler that still has the result for an earlier client returns it without a flight
         futures = [client.submit(fly_trial, trial, key=f"trial-{trial.id}", pure=True) for trial in trials]
         for _, outcome in dask_as_completed(futures, with_results=True):
             yield outcome
@@ -188,7 +189,7 @@ def dask_workers(address: str) -> Generator[Fly]:
 
 
 def write_parquet(outcomes: Iterable[Outcome], folder: Path) -> Path:
-    """All outcomes as one table: a column for each field, and `at_<axis>` for each axis of the campaign."""
+    """Write all outcomes as one table: a column for each field, and `at_<axis>` for each axis."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -221,11 +222,11 @@ def _leave_to_parent(*_: object) -> None: ...
 
 
 def _prepare_worker(parent: int) -> None:
-    """What a terminal sends is the parent's to answer; and without a parent there is nobody to fly for."""
+    """Leave signals of the terminal to the parent, and die with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as under nohup, which a flight would keep to
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # under nohup it stays ignored
         signal.signal(signal.SIGHUP, _leave_to_parent)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, FROM_TERMINAL)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:  # it died while this process was starting, before it could be told
+    if os.getppid() != parent:  # the parent died while this process was starting
         os._exit(1)

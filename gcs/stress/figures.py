@@ -20,9 +20,9 @@ _WORST = 6
 def growth_figure(
     file: Path, *, study: Study, outcomes: Sequence[Outcome], own: Sequence[Outcome], onset: Onset | None
 ) -> Path | None:
-    """Growth rate against loop delay: both models, the flights with their errors, and what is left between them.
+    """Growth rate against loop delay: both models, the flights with their errors, and the residuals below.
 
-    `own`, the flights from the scenario's own initial states, are marks at the lower edge.
+    The flights `own`, from the scenario's own initial states, are marked at the lower edge.
     """
     probes = [o for o in outcomes if o.growth_1_s is not None and o.loop_delay_s is not None]
     if not probes:
@@ -64,7 +64,7 @@ def growth_figure(
 
 
 def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path | None:
-    """Growth rate against any one axis: flights, and the sampled model at the loop delay that each had."""
+    """Growth rate against one axis: the flights, and the sampled model at the loop delay of each."""
     probes = [o for o in outcomes if o.growth_1_s is not None]
     if not probes:
         return None
@@ -85,7 +85,7 @@ def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path 
 
 
 def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
-    """The largest spacing error of the worst flights over time."""
+    """The largest spacing error over time, for the worst flights."""
     worst = worst_of(outcomes)
     if not worst:
         return None
@@ -103,7 +103,7 @@ def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
 
 
 def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """The flights that broke soonest, or else came nearest to it: own initial states before probes."""
+    """The flights that broke soonest, then those that came closest; probes only if there is no own flight."""
     flown = [outcome for outcome in outcomes if outcome.trace_m]
     own = [outcome for outcome in flown if outcome.kind == "own"]
 
@@ -112,7 +112,7 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
         return broke, -float(len(outcome.trace_m)) if broke else 0.0, outcome.spacing_error_max_m or 0.0
 
     ordered = sorted(own or flown, key=badness, reverse=True)
-    # what is varied may have no part in what breaks: of flights that went alike the first stands for all
+    # the varied quantity may not matter: of identical flights only the first is listed
     apart: dict[tuple[float, ...], Outcome] = {}
     for outcome in ordered:
         apart.setdefault(tuple(outcome.trace_m), outcome)
@@ -120,7 +120,7 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
 
 
 def _curves(kinds: Sequence[Loop], delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Growth rates of the formation by the sampled and the continuous model: the largest of its loops'."""
+    """Growth rates of the formation by the sampled and the continuous model: the largest over its loops."""
     sampled = np.array([[kind.growth_1_s(float(at)) for at in delay_s] for kind in kinds])
     continuous = np.array([[kind.growth_continuous_1_s(float(at)) for at in delay_s] for kind in kinds])
     return sampled.max(axis=0), continuous.max(axis=0)
@@ -129,7 +129,7 @@ def _curves(kinds: Sequence[Loop], delay_s: FloatArray) -> tuple[FloatArray, Flo
 def figure_of(
     rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
 ) -> tuple[Any, Any]:
-    """A figure that needs no screen, and its plots: a list from the top, or rows of columns if there are several."""
+    """A figure that needs no screen, and its plots from the top: a list, or rows of columns."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -144,7 +144,7 @@ def figure_of(
 
 
 def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
-    """Verdicts of flights with large errors, at the link delay's loop delay, along the lower edge."""
+    """Mark the verdicts of own-state flights at their loop delays, along the lower edge."""
     for verdict, marker, color in (("stable", "o", SAMPLED), ("unstable", "x", MEASURED)):
         at = [o.loop_delay_s for o in own if o.verdict == verdict and o.loop_delay_s is not None]
         if at:
@@ -154,7 +154,7 @@ def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
 
 
 def _link_delay_axis(plot: Any, onset: Onset) -> None:
-    """The same delays as link delays, at the top."""
+    """Add the link delays as a second axis at the top."""
 
     def to_link_s(loop_delay_s: FloatArray) -> FloatArray:
         return loop_delay_s - onset.waiting_s

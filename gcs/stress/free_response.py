@@ -1,10 +1,33 @@
 """The free response of one loop, as flown: what its errors do after it alone was disturbed.
 
-On constant links one flight shows it, see `gcs.stress.probe`. Links that lose or delay at random push the vehicles all
-the time, by what the station knows wrongly of clocks and instants, and errors travel down the chain. But the loops are
-linear and the links draw the same delays whatever they carry. So the formation is flown twice with the same seed, in
-place and with one loop disturbed, and the difference of the two flights is the free response of that loop through the
-delays that were drawn, with everything else gone to the last digit of telemetry.
+A *probe* is a flight in which the formation starts exactly in place at its nominal velocity, except for a small error
+of the vehicles of one loop. Nothing acts on the vehicles ahead, so the flight shows the free response of that loop
+alone. In a formation with errors of its own, identical loops along the chain drive each other at resonance
+(t^k e^{st}), and growth can be read only after a long time.
+
+A probe removes everything that would hide the loop:
+
+* Clock drift moves the sampling instants, and with them the loop delay while it is being measured.
+* Vehicles on the launcher report a velocity but do not move. The station extrapolates their states to one instant, so
+  it would see errors of up to v T where there are none, and push every vehicle at the start. Vehicles that sample at
+  the same instant do not have this error, so all clocks are equal. The time that telemetry of the probed loop waits for
+  the control tick then no longer follows from its clock; it is kept by moving less than one period of delay between its
+  up and down links.
+* Links that differ start the vehicles at different instants. They also leave each clock wrong by half the asymmetry of
+  its links, which the station sees as errors. So all vehicles have the links of the probed one. Its loop is unchanged:
+  the station extrapolates the others' states to the instant of its own.
+* Changes of the nominal velocity, and the noise of the vehicles' sensors.
+* The vehicles' failsafe, which lossy links would trigger now and then: it opens the loop.
+* The scenario's limit on the spacing error: a growing error must be seen for long enough to be measured.
+* The vehicles' limits. A small error stays within them, so within them the loop is the same. But links that lose or
+  delay at random push vehicles by more than an error of a millimetre, and a response that limits clip is not linear.
+  `past_limits` says when that happens.
+
+On constant links one flight is enough. Links that lose or delay at random push the vehicles all the time, because the
+station's estimates of clocks and instants are wrong, and errors travel down the chain. But the loops are linear, and
+the links draw the same delays whatever they carry. So the formation is flown twice with the same seed, once in place
+and once with one loop disturbed. The difference of the two flights is the free response of that loop through the drawn
+delays, exact to the last digit of telemetry.
 """
 
 from dataclasses import dataclass, replace
@@ -12,26 +35,32 @@ from pathlib import Path
 
 import numpy as np
 
-from gains.core.arrays import IntArray
+from gains.core.arrays import FloatArray, IntArray
+from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import TickArray
 from gcs.drive.flown import Flight, fly_plan, fly_virtual, median_delays_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.effective_delay import commands_of, commands_on_board, effective_delay_s
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
-from gcs.stress.probe import in_place, linear_until_s
-from scenarios.schema import Scenario
+from scenarios.schema import Limits, Link, Safety, Scenario, Vehicle
 
+PROBE_S = 20.0
+_SPEED_MIN_M_S = 1e-3
+"""The kinematics are singular at speed 0."""
+_DIRECTION_NE = np.array([1.0, -0.8])
+"""Direction of a probe's error. It is not a diagonal, where the modes of gains that couple north and east lie; it is
+near one, because two nearly equal modes are hard to separate where both are large."""
 _LINEAR_SHARE = 0.8
-"""Part of the nominal speed that an error may reach: the vehicles' linearisation is exact, but not at speed zero."""
+"""Share of the nominal speed that an error may reach: the vehicles' linearisation is exact except at speed zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class FreeResponse:
-    """Errors of one loop's vehicles in rows of ticks, in order of time, with the flight that they are from.
+    """The errors of one loop's vehicles as rows of ticks, in order of time, and their flight.
 
-    Up to `until_s` after the first row no limit and no singularity was near; the same of the calm flight of a pair,
-    which no smaller disturbance outlasts, is `calm_until_s`. `varying` says that the delays vary.
+    Until `until_s` after the first row, no limit and no singularity was near. `calm_until_s` is the same for the calm
+    flight of a pair, which bounds it for every disturbance. `varying` says that the delays vary.
     """
 
     plan: FlightPlan
@@ -42,7 +71,7 @@ class FreeResponse:
     calm_until_s: float = np.inf
 
     def loop_delays_s(self, rows: TickArray, system_ids: tuple[int, ...]) -> dict[int, float]:
-        """Loop delays in some of the rows: the effective ones where the truth is known, else the measured medians."""
+        """Loop delays in some of the rows: effective ones if the truth is known, else measured medians."""
         if self.flight.truth is None:
             return median_delays_s(rows, system_ids)
         return effective_delays_s(self.plan, rows, self.flight, system_ids)
@@ -51,23 +80,23 @@ class FreeResponse:
 def response_alone(
     plan: FlightPlan, scenario: Scenario, system_ids: tuple[int, ...], *, real_time: bool, folder: Path | None
 ) -> FreeResponse:
-    """Fly a probe's scenario, see `gcs.stress.probe.probe_scenario`."""
+    """Fly a probe's scenario, see `probe_scenario`."""
     probe = replace(plan, scenario=scenario)
-    # loop delays that differ from command to command count with their mean, which only the truth has exactly
+    # where loop delays differ from command to command their mean counts, which only the truth has exactly
     flight = fly_plan(probe, real_time=real_time, folder=folder, with_truth=plan.timing.commands > 1)
     errors = _rows_of(flight.ticks, system_ids)
     return FreeResponse(probe, flight, errors, linear_until_s(scenario, errors, share=_LINEAR_SHARE))
 
 
 def fly_calm(plan: FlightPlan, folder: Path | None) -> Flight:
-    """The formation in place on the scenario's own links: the first flight of a pair."""
+    """Fly the formation in place on the scenario's own links: the first flight of a pair."""
     return fly_virtual(replace(plan, scenario=in_place(plan, (), amplitude=0.0)), folder, with_truth=True)
 
 
 def response_paired(
     plan: FlightPlan, calm: Flight, system_ids: tuple[int, ...], *, amplitude: float, folder: Path | None
 ) -> FreeResponse:
-    """Fly the second of a pair, with an error of the given vehicles, and take the first from it."""
+    """Fly the second flight of a pair, with an error of the given vehicles, and subtract the first."""
     disturbed = replace(plan, scenario=in_place(plan, system_ids, amplitude=amplitude))
     flight = fly_virtual(disturbed, folder, with_truth=True)
     rows, calm_rows = _rows_of(flight.ticks, system_ids), _rows_of(calm.ticks, system_ids)
@@ -86,7 +115,7 @@ def response_paired(
 def effective_delays_s(
     plan: FlightPlan, rows: TickArray, flight: Flight, system_ids: tuple[int, ...]
 ) -> dict[int, float]:
-    """The constant loop delay that each vehicle's commands in these rows stand for."""
+    """The constant loop delay that is equivalent to those of each vehicle's commands in these rows."""
     truth = flight.truth
     assert truth is not None
     whole = flight.ticks[np.isin(flight.ticks["tick"], rows["tick"])]
@@ -103,9 +132,115 @@ def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
 
 
 def _alike(rows: TickArray, others: TickArray) -> int:
-    """How many rows from the first on are of the same ticks and used the same states: until one flight broke."""
+    """The number of first rows with the same ticks and the same states used, before one of the flights broke."""
     count = min(len(rows), len(others))
     same = np.ones(count, dtype=bool)
     for name in ("tick", "system_id", "sample_boot_ms"):
         same &= rows[name][:count] == others[name][:count]
     return count if same.all() else int(np.argmin(same))
+
+
+def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
+    """The plan's scenario with all vehicles in place at nominal velocity, except for an error of the given ones.
+
+    No vehicle enters its failsafe or meets a limit. The error is in the position of a follower (m), and in the velocity
+    of the leader (m/s), whose position is not controlled. It points in `_DIRECTION_NE` and differs from vehicle to
+    vehicle.
+    """
+    scenario, place = plan.scenario, plan.formation.place_ne_m()
+    row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
+    [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
+    vehicles: list[Vehicle] = []
+    for vehicle in scenario.vehicles:
+        position = np.array(leader.position_ne_m) + place[row[vehicle.system_id]]
+        velocity = np.array(scenario.nominal_velocity[0].velocity_ne_m_s)
+        if vehicle.system_id in system_ids:
+            k = system_ids.index(vehicle.system_id)
+            error = amplitude * (1.0 + 0.3 * k) * (-1.0) ** k * _DIRECTION_NE
+            if vehicle is leader:
+                velocity += error
+            else:
+                position += error
+        update = {"position_ne_m": tuple(position.tolist()), "velocity_ne_m_s": tuple(velocity.tolist())}
+        vehicles.append(vehicle.model_copy(update=update))
+    update = {
+        "vehicles": tuple(vehicles),
+        "nominal_velocity": scenario.nominal_velocity[:1],
+        "limits": Limits(speed_min_m_s=_SPEED_MIN_M_S),
+        "duration_s": PROBE_S,
+        "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
+        "safety": scenario.safety.model_copy(
+            update={
+                "setpoint_timeout_s": 2.0 * PROBE_S,
+                "heartbeat_timeout_s": 2.0 * PROBE_S,
+                "spacing_error_limit_m": Safety().spacing_error_limit_m,
+            }
+        ),
+    }
+    return scenario.model_copy(update=update)
+
+
+def probe_scenario(
+    plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float, links: tuple[Link, Link], waiting_s: float
+) -> Scenario:
+    """The plan's scenario `in_place`, with equal clocks and the same `links` (up, down) for all vehicles.
+
+    Delay is moved between the links so that telemetry waits `waiting_s` for the control tick.
+    """
+    scenario = in_place(plan, system_ids, amplitude=amplitude)
+    up, down = with_waiting(*links, period_s=plan.timing.step_s, waiting_s=waiting_s)
+    update = {
+        "links": scenario.links.model_copy(update={"up": up, "down": down, "vehicles": ()}),
+        "clocks": scenario.clocks.model_copy(update={"drift_max_ppm": 0.0, "offset_max_s": 0.0}),
+    }
+    return scenario.model_copy(update=update)
+
+
+def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> tuple[Link, Link]:
+    """The links with delay moved between them, so that telemetry sampled at whole periods waits `waiting_s`.
+
+    The up link then takes a whole number of periods less the waiting, and the sum of both delays is unchanged. Links
+    too short for that keep the loop delay instead: the down link takes the time that telemetry does not wait.
+    """
+    if up.delay_points or down.delay_points:
+        return up, down
+    to_down_s = (up.delay_s + waiting_s) % period_s
+    to_down_s -= period_s if to_down_s > up.delay_s else 0.0
+    from_up_s = to_down_s
+    if down.delay_s + to_down_s < 0.0:
+        from_up_s, to_down_s = 0.0, waiting_s - (-up.delay_s) % period_s
+
+    def moved(link: Link, by_s: float) -> Link:
+        return link.model_copy(update={"delay_s": max(0.0, link.delay_s + by_s)})
+
+    return moved(up, -from_up_s), moved(down, to_down_s)
+
+
+def linear_until_s(scenario: Scenario, own: TickArray, *, share: float) -> float:
+    """Time from the first row to the first error near the singularity at speed zero; infinity if there is none.
+
+    `own` are rows of the probed vehicles, in order of time. `share` is the share of the nominal speed that a velocity
+    error may reach.
+    """
+    speed = float(np.hypot(*scenario.nominal_velocity[0].velocity_ne_m_s))
+    error_m_s, size_m_s2 = _sizes(own)
+    beyond = np.flatnonzero((error_m_s > share * speed) | (size_m_s2 > 0.9 * LARGEST_COMMAND_M_S2))
+    return float(own["time_s"][beyond[0]] - own["time_s"][0]) if beyond.size else np.inf
+
+
+def past_limits(scenario: Scenario, own: TickArray) -> bool:
+    """Whether vehicles with the scenario's limits could not have flown what these rows show."""
+    limits = scenario.limits
+    if limits == Limits():
+        return False
+    speed_m_s = np.hypot(own["velocity_north_m_s"], own["velocity_east_m_s"])
+    _, size_m_s2 = _sizes(own)
+    most_m_s2 = np.minimum(limits.acceleration_max_m_s2 or np.inf, (limits.turn_rate_max_rad_s or np.inf) * speed_m_s)
+    slow, fast = speed_m_s < limits.speed_min_m_s, speed_m_s > (limits.speed_max_m_s or np.inf)
+    return bool((slow | fast | (size_m_s2 > most_m_s2)).any())
+
+
+def _sizes(own: TickArray) -> tuple[FloatArray, FloatArray]:
+    """Velocity errors (m/s) and commands (m/s²)."""
+    error_m_s = np.hypot(own["velocity_error_north_m_s"], own["velocity_error_east_m_s"])
+    return error_m_s, np.hypot(own["command_north_m_s2"], own["command_east_m_s2"])

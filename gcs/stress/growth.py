@@ -1,13 +1,13 @@
-"""How fast the errors of a flight grow or die away, with the uncertainty of the figure.
+"""How fast the errors of a flight grow or decay, with the uncertainty of that rate.
 
-"Did it diverge within 60 s" is a poor test of a delay margin: near the margin errors change so slowly that either
-answer is luck. Here the modes z_k of the flown loop are fitted to the tick record, y[n] = sum_k a_k z_k^n in every
+"Did it diverge within 60 s" is a poor test of a delay margin: near the margin, errors change so slowly that the answer
+is left to chance. Here the modes z_k of the flown loop are fitted to the tick record, y[n] = sum_k a_k z_k^n in every
 channel, and the growth rate is ln|z| / T of the slowest one; its zero is the margin.
 
 Method: ESPRIT (Roy and Kailath, "ESPRIT - estimation of signal parameters via rotational invariance techniques",
-IEEE Trans. ASSP 37(7), 1989) on Hankel matrices of all channels side by side, which share their modes. It is done
-twice: the second time on y[n] e^{-g n T} with g from the first, so that the beginning and the end of a motion that
-grows or shrinks by orders of magnitude count alike.
+IEEE Trans. ASSP 37(7), 1989) on Hankel matrices of all channels side by side, which share their modes. It runs twice:
+the second time on y[n] e^{-g n T} with g from the first, so that the start and the end of a motion that changes by
+orders of magnitude have equal weight.
 """
 
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ from gains.core.arrays import ComplexArray, FloatArray
 from gcs.control.tick import TickArray
 
 DECAY_KEPT = 0.02
-"""A motion is followed until it has shrunk to this part of what it was: rounding of the telemetry, which the loop feeds
-back and amplifies, lies well below that, also in real time."""
+"""A motion is followed until it has shrunk to this share of its largest value. Rounding of the telemetry, which the
+loop feeds back and amplifies, lies well below that, in real time too."""
 FEWEST_SAMPLES = 12
 _MOST_SAMPLES = 300
-"""More are thinned out: the accuracy is in the length of the window, the cost in the number of samples."""
+"""More samples are thinned out: accuracy comes from the length of the window, cost from the number of samples."""
 _ENVELOPE_S = 1.0
 _FEWEST_ENVELOPE = 4
 _FEWEST_SIGNS = 3
-"""Changes of sign from which a frequency is read: one whole turn."""
+"""Fewest changes of sign that give a frequency: one full cycle."""
 _LONGEST_HANKEL = 120
 FOLLOWER_MODES = 4
-"""Two of its own and two of what is late: enough for a vehicle that nobody behind acts on."""
+"""Two states and two late states: enough for a vehicle on which none behind it acts."""
 _RANK_FLOOR = 1e-9
 _LEAST_SHARE = 0.1
-"""A mode counts when it carries this part of the motion: what rounding and noise of the clock add carries less."""
+"""A mode counts if it carries this share of the motion; modes from rounding and clock noise carry less."""
 CHANNELS = (
     "spacing_error_north_m",
     "spacing_error_east_m",
@@ -53,7 +53,7 @@ class Motion:
     values
         (n, channels) spacing errors in m and velocity errors in m/s.
     period_s
-        Distance of two instants.
+        Time between two instants.
     """
 
     time_s: FloatArray
@@ -65,9 +65,9 @@ class Motion:
 class Growth:
     """Rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
 
-    `error_1_s` is the standard error: the larger of what the misfit allows and of half the difference between the
-    first and the second half of the window. The window is `start_s` to `end_s` of the motion's time. The frequency is
-    None where the motion shows none.
+    `error_1_s` is the standard error: the larger of that from the misfit and half the difference between the first and
+    the second half of the window. The window is `start_s` to `end_s` of the motion's time. The frequency is None if the
+    motion does not oscillate.
     """
 
     growth_1_s: float
@@ -79,11 +79,11 @@ class Growth:
 
 
 def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -> Motion:
-    """The errors of some vehicles at the instants of the states that were used to command them.
+    """The errors of some vehicles at the sampling instants of the states used to command them.
 
     A state that two ticks used (telemetry late or slower than control) counts once. `sample_boot_ms` is exact, so
-    the samples are equally spaced to the last digit when telemetry is regular; when it is not, a cubic spline
-    brings them to equally spaced instants.
+    the samples of regular telemetry are equally spaced to the last digit; otherwise a cubic spline interpolates them
+    at equally spaced instants.
     """
     columns: list[FloatArray] = []
     for system_id in system_ids:
@@ -101,8 +101,8 @@ def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -
 def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: int = FOLLOWER_MODES) -> Growth | None:
     """The growth rate of a motion from `start_s` on, when faster modes have died away.
 
-    The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. `modes` is how many are looked for: a
-    loop of several vehicles has more that last. None if fewer than `FEWEST_SAMPLES` are left or nothing moves.
+    The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. `modes` is the most to look for: a loop
+    of several vehicles has more slow ones. None if fewer than `FEWEST_SAMPLES` are left or nothing moves.
     """
     time_s, values = _window(motion, start_s, end_s)
     if len(values) < FEWEST_SAMPLES:
@@ -130,11 +130,10 @@ def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: 
 
 
 def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Growth | None:
-    """The growth rate of a motion through delays that vary: slope of the logarithm of its size, all channels together.
+    """The growth rate of a motion under varying delays: the slope of the logarithm of its norm over all channels.
 
-    Such a motion has no modes of its own, only a mean rate; to fit modes to it finds some that are not there. The
-    window is that of `fit_growth`, the standard error half the difference between its halves. The frequency is that of
-    the changes of sign.
+    Such a motion has a mean rate but no modes; a fit would find spurious ones. The window is that of `fit_growth`, and
+    the standard error half the difference between its halves. The frequency follows from the changes of sign.
     """
     time_s, values = _window(motion, start_s, end_s)
     scale = np.sqrt((values**2).mean(axis=0)) if len(values) else np.zeros(0)
@@ -149,9 +148,9 @@ def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Gro
 def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Growth | None:
     """The growth rate of a whole formation's errors, from their size at every `period_s`: slope of ln(envelope).
 
-    For flights that have no free response to fit modes to: random links push the vehicles all the time, and large
-    errors are of many vehicles at once. The envelope is the largest of a second; it is followed until it has sunk to
-    `DECAY_KEPT`, below which noise may keep it.
+    For flights without a free response to fit: random links push the vehicles all the time, and many vehicles have
+    large errors at once. The envelope is the largest size within a second; it is followed until it has shrunk to
+    `DECAY_KEPT`, where noise may sustain it.
     """
     reach = max(1, round(_ENVELOPE_S / period_s))
     if size.size < reach + 1:
@@ -166,7 +165,7 @@ def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Gro
 
 
 def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
-    """The slope of a logarithm over time, and half the difference of its halves."""
+    """The slope of a logarithm over time, with half the difference between its halves as the error."""
     slopes = [float(np.polyfit(t, y, 1)[0]) for t, y in _whole_and_halves(time_s, level)]
     return Growth(
         growth_1_s=slopes[0],
@@ -179,7 +178,7 @@ def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
 
 
 def _frequency(time_s: FloatArray, values: FloatArray) -> float | None:
-    """The median of the channels' mean frequencies, two changes of sign a turn; None if none has `_FEWEST_SIGNS`."""
+    """The median of the channels' mean frequencies, from their changes of sign; None if no channel has enough."""
     found: list[float] = []
     for channel in values.T:
         before = np.flatnonzero(channel[:-1] * channel[1:] < 0.0)
@@ -196,7 +195,7 @@ def _whole_and_halves(time_s: FloatArray, level: FloatArray) -> list[tuple[Float
 
 
 def _window(motion: Motion, start_s: float, end_s: float) -> tuple[FloatArray, FloatArray]:
-    """Instants and values from the start to the end, or until the motion has died away."""
+    """Instants and values from the start to the end, or until the motion has decayed."""
     inside = (motion.time_s >= start_s) & (motion.time_s < end_s)
     values = motion.values[inside]
     values = values[: _count_before_rest(values)]
@@ -206,13 +205,13 @@ def _window(motion: Motion, start_s: float, end_s: float) -> tuple[FloatArray, F
 def _equally_spaced(time_s: FloatArray, values: FloatArray, period_s: float) -> FloatArray:
     if len(time_s) < 4 or np.allclose(np.diff(time_s), period_s, rtol=0.0, atol=1e-6):
         return values
-    from scipy.interpolate import CubicSpline  # slow to import, and regular telemetry does not need it
+    from scipy.interpolate import CubicSpline  # slow to import, and rarely needed
 
     return CubicSpline(time_s, values)(np.arange(0.0, time_s[-1], period_s))
 
 
 def _count_before_rest(values: FloatArray) -> int:
-    """Number of samples until all that follows is below `DECAY_KEPT` of the largest, in the mean of the channels."""
+    """Number of samples before all that follow stay below `DECAY_KEPT` of the largest, averaged over the channels."""
     if not values.size:
         return 0
     size = (np.abs(values) / np.maximum(np.abs(values).max(axis=0), np.finfo(float).tiny)).mean(axis=1)
@@ -230,7 +229,7 @@ def _slowest_mode(values: FloatArray, period_s: float, modes: int) -> tuple[comp
         return None
     slowest = _slowest(z, values)
     trend_1_s = float(np.log(abs(slowest)) / period_s)
-    # relative to the middle of the window, so that no weight overflows
+    # relative to the middle of the window, so that the weights do not overflow
     flattened = values * np.exp(np.clip(-trend_1_s * (time_s - time_s.mean()), -300.0, 300.0))[:, np.newaxis]
     z = _modes(flattened, modes)
     if z is None:
@@ -240,7 +239,7 @@ def _slowest_mode(values: FloatArray, period_s: float, modes: int) -> tuple[comp
 
 
 def _modes(values: FloatArray, most: int) -> ComplexArray | None:
-    """Modes z shared by all channels, ESPRIT of order `most` or less."""
+    """Modes z shared by all channels, by ESPRIT of order `most` or less."""
     count = len(values)
     rows = min(count // 2, _LONGEST_HANKEL)
     windows = np.lib.stride_tricks.sliding_window_view(values, count - rows + 1, axis=0)  # (rows, channels, columns)
@@ -273,7 +272,7 @@ def _slowest(z: ComplexArray, values: FloatArray) -> complex:
 def _with_error(z: ComplexArray, values: FloatArray, period_s: float) -> tuple[complex, float]:
     """The slowest mode and the standard error of its rate, from the misfit.
 
-    The rate enters as t e^{st}; the part of this motion that no change of the amplitudes can make determines it.
+    A change of the rate adds t e^{st}; the part of it that the amplitudes cannot reproduce determines the rate.
     """
     slowest = _slowest(z, values)
     powers, amplitudes = _amplitudes(z, values)

@@ -1,12 +1,12 @@
-"""A trial is flown and judged: the growth rate of the loop that breaks first, and the verdict of the whole flight.
+"""Fly a trial and judge it: the growth rate of the loop that breaks first, and the verdict of the whole flight.
 
-A *probe* measures the growth rate of one loop, see `gcs.stress.probe`; where links lose or delay at random, by the
-difference of two flights, see `gcs.stress.free_response`. An *own* trial flies the scenario's own initial states,
-large errors and all, and gives the verdict that `gcs fly` would give. In both the monitor only watches: the margin of
-the designed gains is on trial, not what is done before it is reached.
+A *probe* measures the growth rate of one loop from its free response, in one flight or in a pair of flights
+(`gcs.stress.free_response`). An *own* trial flies the scenario's own initial states, large errors included, and gives
+the verdict that `gcs fly` would give. In both the monitor only watches: a trial tests the margin of the designed gains,
+not the actions that keep a flight within it.
 """
 
-import time  # noqa: TID251 - the time a trial takes is for the progress bar and the report; nothing flown depends on it
+import time  # noqa: TID251 - how long a trial takes is only reported; nothing flown depends on it
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,34 +18,42 @@ from gcs.drive.flown import first_uses, fly_plan, fly_virtual, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
 from gcs.stress.axes import has_constant_links
-from gcs.stress.free_response import FreeResponse, effective_delays_s, fly_calm, response_alone, response_paired
+from gcs.stress.free_response import (
+    PROBE_S,
+    FreeResponse,
+    effective_delays_s,
+    fly_calm,
+    past_limits,
+    probe_scenario,
+    response_alone,
+    response_paired,
+)
 from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth
 from gcs.stress.onset import Loop, critical_loop
-from gcs.stress.probe import PROBE_S, past_limits, probe_scenario
 from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_loops, plan_of, with_summary
 
 AMPLITUDES = (1.0, 0.03, 0.001)
-"""Initial error of a probe in m (the leader's in m/s); the next is for growth that leaves the linear range too soon."""
+"""Initial errors of a probe in m (m/s for the leader); the next is used if growth leaves the linear range too soon."""
 _PILOT_S, _PILOT_PERIODS = 1.0, 6.0
 _SETTLED_LOOP_DELAYS = 4.0
-"""Modes other than the slowest are gone, or small enough to be fitted along, after this many loop delays."""
+"""After this many loop delays, modes other than the slowest are gone, or small enough to be fitted with it."""
 _FLYING_LOOP_DELAYS = 1.0
-"""Until then the states used are those of vehicles on the launcher; enough where nothing is fed back late."""
+"""Until then the station uses states of vehicles on the launcher; enough where no feedback is late."""
 _BEGUN_LOOP_DELAYS = 2.0
-"""Nothing that a vehicle did at the start is left to be acted on after this many."""
+"""After this many loop delays, no command depends on what a vehicle did at the start any more."""
 _CALM_SHARE = 0.8
-"""A disturbed flight that stays in the linear range for this part of the time that the calm one does is long enough."""
+"""A disturbed flight is long enough if it stays in the linear range this share of the calm one's time."""
 _WANTED_LOOP_DELAYS = 8.0
 _WANTED_SAMPLES = 60
 _WANTED_ERROR = 0.01
-"""Standard error of a growth rate as a share of it: with several vehicles in a loop other modes take long to go."""
+"""Wanted standard error as a share of the growth rate: in loops of several vehicles, other modes decay slowly."""
 
 
 def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
-    """Fly a trial and judge it; what it meets is in the outcome's `error`. Only a full disk is raised, as OSError.
+    """Fly a trial and judge it. An exception becomes the outcome's `error`; only a full disk is raised, as OSError.
 
-    With `folder` the files of its flight are left there as `gcs fly` leaves them, for a probe in one folder for each
-    size of the initial error that was flown. In real time they are written anyway, and go again without `folder`.
+    With `folder`, the files of its flight are kept there as `gcs fly` leaves them; a probe has one folder for each size
+    of the initial error flown. In real time files are always written, and deleted again without `folder`.
     """
     began_s = time.perf_counter()
     outcome = Outcome(
@@ -67,8 +75,7 @@ def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
 
 
 def _needs_pair(trial: Trial) -> bool:
-    """Whether one flight cannot show the free response of one loop, as `gcs.stress.probe` wants it; not in real time,
-    where no two flights have the same delays."""
+    """Whether the free response of one loop takes two flights. Not in real time, where no two have the same delays."""
     links = {trial.scenario.link_of(vehicle.system_id) for vehicle in trial.scenario.vehicles}
     coupled = any(len(loop.system_ids) > 1 for loop in plan_loops(plan_of(trial)))
     return not trial.real_time and (not has_constant_links(trial.scenario) or (coupled and len(links) > 1))
@@ -97,7 +104,7 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 
 
 def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
-    """One loop alone, on links that are all those of the loop that is the first to break."""
+    """Probe one loop in one flight, with the links of the loop that breaks first for all vehicles."""
     base = plan_of(trial)
     pilot_s = max(_PILOT_S, _PILOT_PERIODS * base.timing.held_s)
     pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": pilot_s})))
@@ -121,7 +128,7 @@ def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 
 
 def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
-    """The loop that is the first to break, on the scenario's own links, by the difference of two flights."""
+    """Probe the loop that breaks first on the scenario's own links, by the difference of two flights."""
     base = plan_of(trial)
     calm = fly_calm(base, _folder_of(folder, 0.0))
     delays_s = effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
@@ -153,7 +160,7 @@ def _folder_of(folder: Path | None, amplitude: float) -> Path | None:
 
 
 def _with_response(loop: Loop, respond: Callable[[float], FreeResponse], outcome: Outcome) -> Outcome:
-    """The outcome with what the response to a metre of error shows, or to less where that grows too fast."""
+    """The outcome with the growth rate after an initial error of a metre, or of less if that grows too fast."""
     for amplitude in AMPLITUDES:
         response = respond(amplitude)
         outcome = with_summary(response.plan, response.flight, replace(outcome, amplitude_m=amplitude))
@@ -167,10 +174,10 @@ def _with_response(loop: Loop, respond: Callable[[float], FreeResponse], outcome
 
 
 def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tuple[Loop, Loop, float]:
-    """The loop to be probed, the loop it stands for, and the waiting of the latter for the control tick.
+    """The loop to be probed, the loop it stands for, and how long the latter's telemetry waits for the control tick.
 
-    The first to break may be far down the tree, where whatever moves ahead of it would drive it, so the same loop
-    nearest to the leader is probed for it, with its links and its waiting.
+    The loop that breaks first may be far down the tree, where vehicles ahead would drive it. So the equal loop nearest
+    to the leader is probed in its place, with its links and its waiting.
     """
     loops, links = plan_loops(plan), plan.scenario.links
     if probe == CRITICAL:
@@ -184,7 +191,7 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
 
 
 def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcome:
-    """The outcome with the growth rate of the probed loop, and the rates predicted at the loop delays it had."""
+    """The outcome with the growth rate of the probed loop, and the rates predicted at its loop delays."""
     own = response.errors
     outcome = replace(outcome, growth_1_s=None, growth_error_1_s=None, fit_samples=None)
     if not own.size:
@@ -193,7 +200,7 @@ def _with_growth(loop: Loop, response: FreeResponse, outcome: Outcome) -> Outcom
     delay_s = max(response.loop_delays_s(own, loop.system_ids).values())
     settled = _SETTLED_LOOP_DELAYS if loop.has_late_terms else _FLYING_LOOP_DELAYS
     start_s = settled * delay_s + 2.0 * loop.timing.held_s
-    # as many as its states, and as many again of what is late; given gains may differ north and east, or couple them
+    # one for each state and one for each late state; given gains may differ north and east, or couple them
     modes = 2 * max(FOLLOWER_MODES, len(loop.A))
     motion = motion_of(own, loop.system_ids, period_s=loop.timing.held_s)
     if response.varying:
@@ -227,7 +234,7 @@ def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
 
 
 def _left_linear_range_too_soon(outcome: Outcome) -> bool:
-    """Whether a smaller error would show more: the flight grew, and left too short a window."""
+    """Whether a smaller error would show more: the errors grew, and the window is too short."""
     if outcome.fit_start_s is None or outcome.fit_end_s is None:
         return False
     if outcome.growth_1_s is None:

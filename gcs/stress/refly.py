@@ -1,4 +1,4 @@
-"""One trial of a campaign flown again: the same to the last bit in virtual time, with files and a Rerun recording."""
+"""Fly one trial of a campaign again: the same to the last bit in virtual time, with files and a Rerun recording."""
 
 import contextlib
 from dataclasses import dataclass, replace
@@ -14,23 +14,27 @@ from gcs.views.observer import record_run
 
 
 @dataclass(frozen=True)
-class Replay:
-    """`differs` names what is not as it was when the trial was first flown; empty in real time, where all may be."""
+class Reflown:
+    """A trial flown again.
+
+    `differs` names the figures that changed since its first flight. It is empty in real time, where any may change.
+    """
 
     outcome: Outcome
     runs: list[Path]
     differs: list[str]
 
 
-def replayed(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Replay:
-    """Fly the one trial of a campaign's folder whose id begins with `wanted`.
+def refly(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Reflown:
+    """Fly again the one trial in a campaign's folder whose id begins with `wanted`.
 
-    Its runs are left in `flights` beside the campaign's table. With `real_time` it is flown over UDP, whatever it was.
+    Its runs are left in `flights` beside the campaign's table. With `real_time` it is flown over UDP, even if it was
+    first flown in virtual time.
 
     Raises
     ------
     CampaignError
-        If it is not one trial, or was flown with another scenario.
+        If not exactly one id begins so, or the trial was flown with another scenario.
     """
     stored = _stored(folder, wanted)
     trial = _trial_of(study, stored, folder)
@@ -42,7 +46,7 @@ def replayed(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Rep
         finish(flight)
         record_run(flight)
         finish(flight)  # again: it lists the files
-    return Replay(outcome, runs, [] if again.real_time else _differences(outcome, stored))
+    return Reflown(outcome, runs, [] if again.real_time else _differences(outcome, stored))
 
 
 def _stored(folder: Path, wanted: str) -> Outcome:
@@ -70,7 +74,7 @@ def _differences(outcome: Outcome, stored: Outcome) -> list[str]:
 
 
 def _free(parent: Path, stem: str) -> Path:
-    """A name that is free; whoever fills it makes it."""
+    """A path that is not taken yet; the caller creates it."""
     parent.mkdir(parents=True, exist_ok=True)
     names = (stem if count == 1 else f"{stem}-{count}" for count in range(1, 1000))
     return next(parent / name for name in names if not (parent / name).exists())

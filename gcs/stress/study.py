@@ -1,4 +1,4 @@
-"""What a campaign asks: the growth rate over axes, and where it passes zero."""
+"""Which trials a campaign flies: over its axes, and in search of the onset."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -16,22 +16,22 @@ from gcs.stress.trial import CRITICAL, Kind, Outcome, Trial, plan_loops, sparse_
 _ROUNDS = 8
 _FLIGHTS_A_ROUND = 5
 _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
-"""Link delays flown where no delay is to break the formation."""
+"""Link delays flown where no delay is predicted to break the formation."""
 _FIRST_WIDTH, _FINEST_WIDTH = 3.0, 0.1
-"""Half widths of the first and of the closest round of an onset search, in tolerances."""
+"""Half widths of the first and of the finest round of an onset search, in tolerances."""
 _SMOOTH_MISFIT = 3.0
-"""Flights farther than this off a parabola, root mean square in standard errors, do not lie on one."""
+"""Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """The trials of a scenario: one plan whose gains are kept, whatever is varied."""
+    """The trials of a scenario: one plan, whose gains stay the same whatever varies."""
 
     plan: FlightPlan
     real_time: bool = False
 
     def trial(self, kind: Kind, coordinates: dict[str, float], *, seed: int, probe: int = CRITICAL) -> Trial:
-        """The trial at one point. `seed` is the scenario's, which draws clocks, jitter and loss."""
+        """The trial at one point. `seed` is the scenario's, from which clocks, jitter and loss are drawn."""
         scenario = at_coordinates(self.plan.scenario, coordinates).model_copy(update={"seed": seed})
         return Trial(
             scenario=scenario,
@@ -46,8 +46,8 @@ class Study:
     def sweep(self, axes: Sequence[Axis], *, seeds: int) -> list[Trial]:
         """The trials of a sweep (one axis) or map (two), with the scenario's seed and those that follow it.
 
-        At every point a probe and the scenario's own flight. In real time links that lose or delay at random leave no
-        free response to probe, since no two flights have the same delays: then only the latter.
+        Every point gets a probe and an own trial. In real time, random links leave no free response to probe, since no
+        two flights have the same delays: then only the own trial.
         """
         points = [dict(zip([a.name for a in axes], at, strict=True)) for at in product(*(a.values for a in axes))]
         constant = all(has_constant_links(at_coordinates(self.plan.scenario, point)) for point in points)
@@ -60,10 +60,10 @@ class Study:
 class Onset:
     """Where the formation breaks, in flight and in the models.
 
-    All delays are loop delays of the vehicle that breaks first but `link_delay_s`, which is the total link delay, up
-    plus down, at which it has that loop delay: `waiting_s` less. `predicted_s` is the sampled margin that the design
-    claims, `difference` measured over predicted less one. `predicted_continuous_s` is the continuous model's margin
-    less half a period for the hold.
+    All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
+    down, that causes this loop delay, shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
+    `difference` is measured / predicted − 1. `predicted_continuous_s` is the continuous model's margin less half a
+    period for the hold.
     """
 
     loop_delay_s: float
@@ -82,10 +82,10 @@ class Onset:
     checks: tuple[Outcome, ...]
     """Probes of the other kinds of loops and of the last vehicle, at the onset."""
     own: tuple[Outcome, ...]
-    """The scenario's own initial states, at nine tenths of the onset's link delay and at eleven."""
+    """Own trials at 0.9 and 1.1 times the onset's link delay."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain types for JSON; of the flights only what identifies them."""
+        """Plain types for JSON, with the ids of the flights."""
         plain = asdict(self)
         for name in ("flights", "checks", "own"):
             plain[name] = [outcome.id for outcome in getattr(self, name)]
@@ -93,9 +93,9 @@ class Onset:
 
 
 class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
-    """There is no delay at which the formation begins to break, or it was not found: one line that says why.
+    """No delay breaks the formation, or none was found: one line that says why.
 
-    `as_predicted` says that the margin has no limit and that flights bear it out.
+    `as_predicted` says that the margin has no limit and that the flights confirm it.
     """
 
     def __init__(self, line: str, *, as_predicted: bool = False) -> None:
@@ -104,11 +104,11 @@ class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a f
 
 
 def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
-    """Fly probes around the predicted onset, closer and closer, until the zero of their growth rates is located.
+    """Fly probes around the predicted onset, ever closer, until the zero of their growth rates is located.
 
-    A round is a few flights at once, spread evenly over three tolerances to either side at first, then over one, and
-    over a part of one where no smooth curve goes through the flights. The search follows the measured growth wherever
-    it leads: the prediction only says where to begin.
+    A round is a few flights at once, spread evenly over three tolerances to either side, then over one, and over a
+    fraction of one if no smooth curve fits the flights. The search follows the measured growth; the prediction only
+    says where to start.
 
     Raises
     ------
@@ -123,9 +123,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
     seed = study.plan.scenario.seed
     centre_s, width_s = predicted_s - study.plan.timing.faster_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
     flights: dict[str, Outcome] = {}
-    noisy = study.real_time or not has_constant_links(
-        study.plan.scenario
-    )  # from closer by noise is all there is to see
+    noisy = study.real_time or not has_constant_links(study.plan.scenario)  # closer flights would show only noise
     for round_number in range(1, _ROUNDS + 1):
         spread = centre_s + width_s * np.linspace(-1.0, 1.0, _FLIGHTS_A_ROUND)
         links_s = dict.fromkeys(round(float(delay_s), 6) for delay_s in np.maximum(spread, 0.0))
@@ -144,7 +142,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
             return _found(study, run, zero, near, tuple(flights.values()), rounds=round_number)
         if centre_s <= 0.0 and ahead_s <= 0.0:
             break
-        # no farther than twice the width at once: a far extrapolation is a guess
+        # at most twice the width at once: extrapolating farther would be a guess
         centre_s += float(np.clip(ahead_s, -2.0 * width_s, 2.0 * width_s))
         if abs(ahead_s) < width_s:
             width_s = wanted_s if width_s > 1.001 * wanted_s else _FINEST_WIDTH * wanted_s
@@ -156,7 +154,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
 
 
 def _no_limit(study: Study, run: Run, *, tolerance: float) -> NoOnset:
-    """What flights show of a loop that no delay is to break."""
+    """Fly a loop that no delay is predicted to break, and say what the flights show."""
     flown = run([study.trial("probe", {"delay": d}, seed=study.plan.scenario.seed) for d in _LIMITLESS_LINKS_S])
     pairs = [(o.growth_1_s, o.predicted_growth_1_s) for o in flown]
     known = [(measured, predicted) for measured, predicted in pairs if measured is not None and predicted is not None]
@@ -174,7 +172,7 @@ def _no_limit(study: Study, run: Run, *, tolerance: float) -> NoOnset:
 
 
 def points_of(outcomes: Sequence[Outcome]) -> list[GrowthPoint]:
-    """The measured rates of those outcomes that have one."""
+    """The measured growth rates of the outcomes that have one."""
     return [
         GrowthPoint(o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
         for o in outcomes
@@ -183,12 +181,12 @@ def points_of(outcomes: Sequence[Outcome]) -> list[GrowthPoint]:
 
 
 def links_of(outcomes: Any) -> list[float]:
-    """Link delays of outcomes, up plus down."""
+    """The total link delays of outcomes."""
     return [outcome.link_delay_s or 0.0 for outcome in outcomes]
 
 
 def curve_error(outcomes: Sequence[Outcome]) -> float | None:
-    """Largest difference of measured and predicted growth rates, as a part of the range of the predicted ones."""
+    """Largest difference between measured and predicted growth rates, as a share of the range of the predicted ones."""
     pairs = [
         (o.growth_1_s, o.predicted_growth_1_s)
         for o in outcomes
@@ -202,7 +200,7 @@ def curve_error(outcomes: Sequence[Outcome]) -> float | None:
 
 
 def _downhill(near: Sequence[Outcome]) -> float:
-    """+1 to look at longer delays, -1 at shorter ones."""
+    """+1 to search at longer delays, -1 at shorter ones."""
     rates = [outcome.growth_1_s for outcome in near if outcome.growth_1_s is not None]
     return -1.0 if rates and min(rates) > 0.0 else 1.0
 
@@ -226,7 +224,7 @@ def _found(
     assert nearest.critical is not None
     loop = next(loop for loop in loops if nearest.probed in loop.system_ids)
     margins_s = [kind.margin_s() for kind in distinct(loops)]
-    # of the loop of least margin the design's own figure is on trial, the one that the station flies by
+    # for the loop of least margin, test the design's own figure, which the station flies by
     predicted_s = study.plan.delay_margin_s if loop.margin_s() == min(margins_s) else loop.margin_s()
     waiting_s = _waiting_s(near)
     link_s = max(0.0, zero.loop_delay_s - waiting_s)
@@ -258,6 +256,6 @@ def _found(
 
 
 def _to_check(loops: Sequence[Loop], probed: Loop) -> list[int]:
-    """One vehicle of every other kind of loop, and the last vehicle."""
+    """One vehicle of each other kind of loop, and the last vehicle."""
     others = [kind.system_ids[0] for kind in distinct(loops) if not kind.same_as(probed)]
     return list(dict.fromkeys([*others, loops[-1].system_ids[-1]]))

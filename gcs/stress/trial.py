@@ -1,6 +1,6 @@
-"""One trial and its outcome: a formation flown once, and what that says of its stability. Both can be pickled.
+"""One trial and its outcome: a formation flown once, and what the flight says about its stability.
 
-`gcs.stress.measure` flies it.
+Both can be pickled. `gcs.stress.measure` flies trials.
 """
 
 import hashlib
@@ -23,17 +23,17 @@ from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]
 CRITICAL = 0
-"""In place of a system id: probe the loop that is predicted to be the first to break."""
+"""In place of a system id: probe the loop that is predicted to break first."""
 
 TRACE_PERIOD_S = 0.25
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Everything a trial depends on. `coordinates` say where it stands in a campaign, and have no effect on it.
+    """Everything a trial depends on, and its `coordinates` in the campaign, which have no effect on it.
 
-    `gain` holds the entries (row, column, value) of K that are not zero, `probe` the system id of a vehicle of the loop
-    to be probed, or `CRITICAL`.
+    `gain` holds the nonzero entries (row, column, value) of K. `probe` is the system id of a vehicle in the loop to be
+    probed, or `CRITICAL`.
     """
 
     scenario: Scenario
@@ -54,19 +54,18 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out of a trial: one row of the campaign's table. None where it is unknown or does not apply.
+    """The outcome of a trial: one row of the campaign's table. None where a value is unknown or does not apply.
 
-    `verdict` is that of the whole flight for an own trial, the sign of the growth rate for a probe. `probed` is the
-    first vehicle of the loop that was measured; it stands for the loop of vehicle `critical`, whose `waiting_s` for
-    the control tick it has. `loop_delay_s` is the effective one over the window of the fit (`gcs.runs.effective_delay`;
-    on constant links each is it), for an own trial the median that was measured in flight. `loop_delay_spread_s` is by
-    how much the 90th percentile of the measured ones is above their median. `predicted_*` are the models' growth rates
-    at that delay. The growth of an own trial is that of the envelope of all spacing errors, which is rough.
-    `ticks_sha256` is that of the tick log, in virtual time: the same trial has the same in any process.
-    `past_limits` says that random links alone, without any error, push vehicles past the scenario's limits, without
-    which a probe is flown.
-    `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`. `error` holds a traceback if the
-    trial itself failed.
+    `verdict` is that of the whole flight for an own trial, and the sign of the growth rate for a probe. `probed` is the
+    first vehicle of the measured loop; it stands for the loop of vehicle `critical`, and its telemetry waits as long
+    for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit
+    (`gcs.runs.effective_delay`; on constant links all are equal), and for an own trial the median measured in flight.
+    `loop_delay_spread_s` is the 90th percentile of the measured ones minus their median. `predicted_*` are the models'
+    growth rates at that delay. The growth of an own trial is that of the envelope of all spacing errors, a rough
+    figure. `ticks_sha256` is that of the tick log in virtual time; the same trial has the same one in any process.
+    `past_limits` says that random links alone, without any error, push vehicles past the scenario's limits; a probe is
+    flown without these limits. `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`. `error`
+    holds a traceback if the trial failed.
     """
 
     id: str
@@ -106,7 +105,7 @@ class Outcome:
     error: str | None = None
 
     def to_json(self) -> str:
-        """One line."""
+        """One line of JSON."""
         return json.dumps(asdict(self), allow_nan=False)
 
     @classmethod
@@ -115,20 +114,18 @@ class Outcome:
 
 
 def sparse_gain(K: FloatArray) -> tuple[tuple[int, int, float], ...]:
-    """The entries of K that are not zero, as `Trial.gain` wants them."""
+    """The nonzero entries of K, as in `Trial.gain`."""
     return tuple((int(i), int(j), float(K[i, j])) for i, j in np.argwhere(K != 0.0))
 
 
 def plan_of(trial: Trial) -> FlightPlan:
-    """The plan of a trial as given, without the changes that a probe makes."""
+    """The plan of a trial, before the changes that a probe makes."""
     formation = plan_formation(trial.scenario)
     n = len(formation.system_ids)
     K = np.zeros((2 * n, 4 * n - 2))
     for row, column, value in trial.gain:
         K[row, column] = value
-    calm = trial.scenario.monitor.model_copy(update={"act": False})
-    scenario = trial.scenario.model_copy(update={"monitor": calm})
-    return FlightPlan(scenario, formation, K, trial.delay_margin_s)
+    return FlightPlan(trial.scenario.with_calm_monitor(), formation, K, trial.delay_margin_s)
 
 
 def plan_loops(plan: FlightPlan) -> list[Loop]:
@@ -158,7 +155,7 @@ def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
 
 
 def _trace(ticks: TickArray) -> list[float]:
-    """The largest spacing error of all vehicles in each stretch of `TRACE_PERIOD_S` of the flight, to four digits."""
+    """The largest spacing error of all vehicles in each `TRACE_PERIOD_S` of the flight, to four digits."""
     rows = ticks[(ticks["time_s"] >= 0.0) & (ticks["tick"] <= ticks["tick"][ticks["commanded"]].max(initial=-1))]
     error = np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
     rows, error = rows[np.isfinite(error)], error[np.isfinite(error)]
@@ -171,5 +168,5 @@ def _trace(ticks: TickArray) -> list[float]:
 
 
 def finite(value: float) -> float | None:
-    """Rounded to nine places; None if it is not finite."""
+    """The value rounded to nine decimals; None if it is not finite."""
     return round(float(value), 9) if np.isfinite(value) else None

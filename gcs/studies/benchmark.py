@@ -5,7 +5,6 @@ import tempfile
 import time  # noqa: TID251 - the time it takes is what is measured; nothing flown depends on it
 from dataclasses import dataclass
 from pathlib import Path
-from shutil import which
 from statistics import median
 from typing import Any
 
@@ -20,8 +19,6 @@ from scenarios.signing.keys import KEY_BYTES, Key
 _COLUMN = 10
 """Vehicles behind one another in a large formation; the columns follow one leader."""
 _SPACING_M = 100.0
-_WHOLE_CORE = 0.95
-"""Part of a core from which on a flight counts as not disturbed."""
 
 
 @dataclass
@@ -139,41 +136,3 @@ def _flight(plan: FlightPlan, key: Key | None = None) -> dict[str, float]:
         "s_per_tick": taken_s / ticks,
         "station_s_per_tick": (taken_s - vehicles.taken_s) / ticks,
     }
-
-
-def print_benchmark(result: dict[str, Any]) -> None:
-    how = "compiled" if result["compiled"] else "interpreted"
-    print(f"{result['vehicles']} vehicles at {result['control_hz']:g} Hz, one core, hot path {how}")
-    print(
-        f"virtual time    {result['real_time_factor']:.3g} times real time "
-        f"(best of {result['flights']}; median {result['real_time_factor_p50']:.3g})"
-    )
-    if result["core_share"] < _WHOLE_CORE:
-        whole = result["real_time_factor"] / result["core_share"]
-        print(f"                with {result['core_share']:.0%} of a core; {whole:.3g} times with all of it")
-    print(
-        f"station alone   {1e6 * result['station_s_per_tick']:.0f} µs a tick, "
-        f"{100 * result['station_share_of_period']:.1f} % of its period"
-    )
-    if (cost := result["signed"]) is not None:
-        print(
-            f"signed          takes {cost['time_ratio']:.2f} times as long (median {cost['time_ratio_p50']:.2f}), "
-            f"the station {cost['station_time_ratio']:.2f} times (median {cost['station_time_ratio_p50']:.2f})"
-        )
-    if not result["compiled"]:
-        first = "" if which(os.environ.get("CC", "cc")) else "install a C compiler, then "
-        print(f"twice as fast:  {first}python3 make.py compile")
-
-
-def print_real_time(result: dict[str, Any]) -> None:
-    """How punctual the station was, then the errors of what it measured."""
-    from gcs.runs.grade import print_grade
-
-    control = result["control"]
-    late = control["lateness_s"]
-    print(f"{result['reason']}; load {result['load_average']:.1f}, {result['steal_share']:.1%} taken by the host")
-    print(
-        f"set-points sent after they were due: p50 {1e3 * late['p50']:.3f} ms, p99 {1e3 * late['p99']:.3f} ms, "
-        f"{control['deadline_misses']} deadline misses of {control['ticks']} ticks"
-    )
-    print_grade(result)

@@ -5,8 +5,7 @@ delay takes the margin of the gains designed for that rate, or the formation no 
 at random, so each formation is flown with several seeds, and holds if it does with all of them.
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,14 +17,13 @@ from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
 from gcs.studies.benchmark import with_vehicles
-from gcs.views.report import number_text
 from scenarios.schema import Scenario
 
 _START_ERROR_M = 2.0
 """Every second vehicle begins so far aside of its place."""
 _DECAYED = 0.1
 """A formation that is steered has brought its errors down to this share in the last third of a flight."""
-_FEWEST = 2
+FEWEST = 2
 
 
 @dataclass(frozen=True)
@@ -115,12 +113,12 @@ def capacity(
 def _capacity_of(scenario: Scenario, rate_hz: float, most: int, seeds: int) -> Capacity:
     best: Load | None = None
     worst: Load | None = None
-    count = _FEWEST
+    count = FEWEST
     try:
-        while worst is None or count not in (worst.vehicles, best.vehicles if best else _FEWEST - 1):
+        while worst is None or count not in (worst.vehicles, best.vehicles if best else FEWEST - 1):
             load = worst_load(scenario, rate_hz, count, seeds)
             best, worst = (load, worst) if load.holds else (best, load)
-            low = best.vehicles if best else _FEWEST - 1
+            low = best.vehicles if best else FEWEST - 1
             if worst is None and low == most:
                 break
             count = min(2 * low, most) if worst is None else (low + worst.vehicles) // 2
@@ -148,8 +146,7 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
         If no gains meet the scenario's requirement at this rate.
     """
     rates = scenario.rates.model_copy(update={"control_hz": rate_hz, "telemetry_hz": rate_hz})
-    calm = scenario.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
-    formed = with_vehicles(scenario.model_copy(update={"rates": rates, "monitor": calm}), vehicles)
+    formed = with_vehicles(scenario.with_calm_monitor().model_copy(update={"rates": rates}), vehicles)
     _, plan = flight_plan(_displaced(formed))
     losses = LinkLosses()
     station, counted = Station(plan, start_ns=START_NS), _Counted(vehicles_of(plan, record=losses.record))
@@ -195,47 +192,3 @@ def _displaced(scenario: Scenario) -> Scenario:
         for north, east in [vehicle.position_ne_m]
     ]
     return scenario.model_copy(update={"vehicles": tuple(vehicles)})
-
-
-def to_dict(found: list[Capacity]) -> dict[str, Any]:
-    """For JSON."""
-    return {"capacities": [asdict(capacity) for capacity in found]}
-
-
-def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
-    """For each rate the largest formation that is carried, and the one that is not."""
-    from rich import box
-    from rich.table import Table
-
-    from gcs.views.console import plain_console
-
-    console = plain_console()
-    table = Table(box=box.SIMPLE_HEAD, title=f"{scenario.name}: what its links carry", title_justify="left")
-    for heading in ("Hz", "UAVs", "loop delay, ms\np50  p99", "margin\nms", "byte/s", "lost, %\nup  down", ""):
-        table.add_column(heading, justify="right", no_wrap=True, min_width=4)
-    for capacity in found:
-        for load in (capacity.most, capacity.next):
-            if load is not None:
-                table.add_row(*_row(load), style="" if load.holds else "dim")
-    console.print(table)
-    for capacity in found:
-        if capacity.failed:
-            console.print(f"{capacity.rate_hz:g} Hz: {capacity.failed}")
-        elif capacity.most is None:
-            console.print(f"{capacity.rate_hz:g} Hz: not even {_FEWEST} vehicles")
-
-
-def _row(load: Load) -> list[str]:
-    def ms(value: float | None) -> str:
-        return number_text(None if value is None else 1e3 * value, ".0f")
-
-    gone = load.headroom_p01 is None or load.headroom_p01 <= 0.0
-    return [
-        f"{load.rate_hz:g}",
-        str(load.vehicles),
-        f"{ms(load.loop_delay_p50_s)}  {ms(load.loop_delay_p99_s)}",
-        ms(load.delay_margin_s),
-        f"{load.station_bytes_s:.0f}",
-        f"{100.0 * load.lost_up:.1f}  {100.0 * load.lost_down:4.1f}",
-        "holds" if load.holds else "margin gone" if gone else load.reason,
-    ]

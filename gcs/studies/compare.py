@@ -96,9 +96,8 @@ def compare(scenario: Scenario) -> tuple[list[Route], Flights]:
 
 
 def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
-    calm = scenario.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
     begun_s = time.perf_counter()
-    designed, plan = flight_plan(scenario.model_copy(update={"monitor": calm}))
+    designed, plan = flight_plan(scenario.with_calm_monitor())
     design_s = time.perf_counter() - begun_s
     flight = fly_virtual(plan)
     summary = summarise(plan.scenario, designed, flight.ticks, flight.events)
@@ -236,32 +235,3 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
             ]
         table.append((title, texts))
     return table
-
-
-def print_comparison(scenario: Scenario, routes: list[Route], grown: list[DesignCost]) -> None:
-    """The tables on the terminal."""
-    from rich import box
-    from rich.table import Table
-
-    from gcs.views.console import plain_console
-
-    console = plain_console()
-    title = f"{scenario.name}: designed for what it asks for, flown over its links"
-    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="")
-    for heading in ("", *(route.method for route in routes)):
-        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
-    for title, texts in rows(routes):
-        table.add_row(title, *texts)
-    console.print(table)
-    for route in routes:
-        if route.failed:
-            console.print(f"{route.method}: {route.failed}")
-    if grown:
-        table = Table(box=box.SIMPLE_HEAD)
-        for heading in ("design of a chain", "vehicles", "free gains an axis", "time, s", RATIO):
-            table.add_column(heading, justify="right", no_wrap=not table.columns)
-        for size, ratio in zip(grown, ratios(grown), strict=True):
-            table.add_row(size.method, str(size.vehicles), str(size.free_gains), f"{size.design_s:.3f}", f"{ratio:.2f}")
-        console.print(table)
-        for line in left_out(grown):
-            console.print(line)

@@ -1,6 +1,5 @@
 """The flights behind the figures of the source: by our station, and of its chapter 5 by the nonlinear model."""
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -69,8 +68,7 @@ def flown(name: str, method: str) -> tuple[TickArray, float | None]:
     if method != "inclusion":
         margin_s = design(CHAIN, Requirement(alpha=ALPHA), period_s=PERIOD_S).delay_margin_s
         control = control.model_copy(update={"alpha": None, "delay_margin_s": margin_s, "method": method})
-    calm = scenario.monitor.model_copy(update={"act": False, "time_scales": (1.0,)})
-    scenario = scenario.with_link_delay(up_s=0.0, down_s=0.0)
-    designed, plan = flight_plan(scenario.model_copy(update={"control": control, "monitor": calm}))
-    flight = fly_virtual(replace(plan))
+    scenario = scenario.with_link_delay(up_s=0.0, down_s=0.0).with_calm_monitor()
+    designed, plan = flight_plan(scenario.model_copy(update={"control": control}))
+    flight = fly_virtual(plan)
     return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events)["settling_time_s"]

@@ -16,12 +16,12 @@ import sys
 import time  # noqa: TID251 (this process is a driver: it runs at the pace of the flight it watches)
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+from gcs.plan.design import Design
 from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
 from gcs.runs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE
 from gcs.runs.summary import finish
@@ -83,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def observe(folder: Path, scenario: Scenario, design: dict[str, Any], *, parent: Parent, show_table: bool) -> None:
+def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent, show_table: bool) -> None:
     """Follow the run in `folder` until it ends or is left alone."""
     tail = RunTail(folder)
     whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])
@@ -133,7 +133,7 @@ def record_run(folder: Path) -> Path:
     return folder / RECORDING_FILE
 
 
-def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, dict[str, Any]] | None:
+def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, Design] | None:
     """The run's scenario and design once both are written; None if the parent goes before that."""
     while True:
         try:

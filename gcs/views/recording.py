@@ -26,6 +26,7 @@ import numpy as np
 
 from gcs.control.phases import patience_s
 from gcs.control.tick import Mode, TickArray
+from gcs.plan.design import Design
 from gcs.runs.record import RECORDING_FILE
 from gcs.views.scene import (
     PICTURE_S,
@@ -80,7 +81,7 @@ class Recording:
     Until it is closed the file has another name, so a flight.rrd is always whole.
     """
 
-    def __init__(self, folder: Path, scenario: Scenario, design: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, scenario: Scenario, design: Design) -> None:
         import rerun as rr
 
         count = len(scenario.vehicles)
@@ -121,7 +122,7 @@ class Recording:
             self._ticks.append(ticks)
         self._events += events
 
-    def redesigned(self, design: dict[str, Any]) -> None:
+    def redesigned(self, design: Design) -> None:
         """Name the margins of another design."""
         self._stream.send_blueprint(_blueprint(self._scenario, design))
 
@@ -338,14 +339,14 @@ def _event_level(event: dict[str, Any]) -> str:
     return "WARN" if "CAUTION" in last else "INFO"
 
 
-def _margins_text(design: dict[str, Any]) -> str:
+def _margins_text(design: Design) -> str:
     """The margins of a design, by model, as far as there are any."""
-    named = (("sampled", design.get("delay_margin_s")), ("continuous", design.get("delay_margin_continuous_s")))
-    known = [f"{1e3 * s:.0f} ms {name}" for name, s in named if s is not None and math.isfinite(s)]
+    named = (("sampled", design.delay_margin_s), ("continuous", design.delay_margin_continuous_s))
+    known = [f"{1e3 * s:.0f} ms {name}" for name, s in named if s is not None]
     return "; of the fastest gains " + ", ".join(known) if known else ""
 
 
-def _blueprint(scenario: Scenario, design: dict[str, Any]) -> Any:
+def _blueprint(scenario: Scenario, design: Design) -> Any:
     """The screen: the scene on the left, with modes and events; plots on the right; time below."""
     import rerun.blueprint as rrb
     from rerun.blueprint.encodings import TextLogColumn, TimelineColumn

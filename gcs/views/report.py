@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, ResponsePart
 from gcs.runs.record import STARTED
 from gcs.runs.refusals import in_words
 from gcs.views.console import plain_console
@@ -16,37 +17,36 @@ from gcs.views.console import plain_console
 UNKNOWN = "–"
 
 
-def print_design(design: dict[str, Any], console: Console | None = None) -> None:
+def print_design(design: Design, console: Console | None = None) -> None:
     """Gains, robustness, both margins, and the trade-off between robustness and margin."""
     console = console or plain_console()
-    console.print(f"design   {design['method']}, loop {design['loop']}, period {design['period_s'] * 1e3:g} ms")
-    if "blocks" in design:
+    console.print(f"design   {design.method}, loop {design.loop}, period {design.period_s * 1e3:g} ms")
+    if design.inclusion_gains is None or design.behaviour is None:
         _print_graph_design(design, console)
         return
-    own, front, spacing = (design[name][0][0] for name in ("K1_1_s", "K2_1_s", "K3_1_s2"))
-    behaviour = design["behaviour"]
+    own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
     console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
     console.print("         u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike")
     _print_margins(design, console)
-    console.print(_response(design.get("response")), end="")
+    console.print(_response(design.response), end="")
     console.print(
-        f"alpha    {design['alpha']:.4f} (robustness bound), decay {behaviour['decay_rate_1_s']:.2f} 1/s without delay"
+        f"alpha    {design.alpha:.4f} (robustness bound), decay {design.behaviour.decay_rate_1_s:.2f} 1/s without delay"
     )
-    if (flown := design.get("at_loop_delay")) is not None:
-        _print_figures_at_delay(flown, console)
-    if not design["trade_off"]:
+    if design.at_loop_delay is not None:
+        _print_figures_at_delay(design.at_loop_delay, console)
+    if not design.trade_off:
         return
     table = Table(box=box.SIMPLE_HEAD, title="the trade-off it sits on", title_justify="left", title_style="")
     table.add_column("delay margin, ms", justify="right")
     table.add_column("largest alpha", justify="right")
-    for point in design["trade_off"]:
-        table.add_row(_ms(point["delay_margin_s"], unit=""), f"{point['alpha']:.3f}")
+    for point in design.trade_off:
+        table.add_row(_ms(point.delay_margin_s, unit=""), f"{point.alpha:.3f}")
     console.print(table)
 
 
-def _print_margins(design: dict[str, Any], console: Console) -> None:
-    sampled_s, continuous_s = design["delay_margin_s"], design["delay_margin_continuous_s"]
-    if design["loop"] == "onboard" and sampled_s is None:
+def _print_margins(design: Design, console: Console) -> None:
+    sampled_s, continuous_s = design.delay_margin_s, design.delay_margin_continuous_s
+    if design.loop == "onboard" and sampled_s is None:
         console.print("margin   no limit: no delay of what the station streams makes this loop unstable")
     elif sampled_s == 0.0:
         console.print("margin   none: the sampled loop is unstable without any delay")
@@ -54,29 +54,31 @@ def _print_margins(design: dict[str, Any], console: Console) -> None:
         console.print(
             f"margin   {_ms(sampled_s)} of loop delay in the sampled loop, {_ms(continuous_s)} in the continuous model"
         )
-    if design["vehicles"] == 1:
+    if design.vehicles == 1:
         console.print("         of the one vehicle's own velocity loop, as nobody follows it")
-    if design["loop"] == "onboard":
-        ground_s = design["onboard"]["ground_delay_margin_s"]
+    if design.onboard is not None:
+        ground_s = design.onboard.ground_delay_margin_s
         console.print(f"         {_ms(ground_s)} if the station closed every loop with the same gains")
 
 
-def _print_figures_at_delay(flown: dict[str, Any], console: Console) -> None:
+def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> None:
     console.print(f"         {figures_text(flown)} (that of the scenario's links)")
-    console.print(
-        f"         at least {flown['alpha_kept']:.4f} {_up_to(flown['alpha_kept_to_s'])}; growth at most "
-        f"{flown['string_peak_kept']:.2f} times {_up_to(flown['string_peak_kept_to_s'])}"
-    )
+    kept = f"at least {flown.alpha_kept:.4f} {_up_to(flown.alpha_kept_to_s)}"
+    if flown.string_peak_kept is None:
+        console.print(f"         {kept}")
+        console.print("string   no verdict: with gains on a general pattern errors do not run down a chain")
+        return
+    growth = f"growth at most {flown.string_peak_kept:.2f} times {_up_to(flown.string_peak_kept_to_s)}"
+    console.print(f"         {kept}; {growth}")
 
 
-def figures_text(flown: dict[str, Any]) -> str:
-    """α and the growth of spacing errors at a loop delay, in words."""
-    peak = flown["string_peak"]
-    grows = "without bound" if peak is None else f"{peak:.2f} times at most"
-    return (
-        f"{flown['alpha']:.4f} at {_ms(flown['loop_delay_s'])} of loop delay, where spacing errors grow {grows} from "
-        "vehicle to vehicle"
-    )
+def figures_text(flown: FiguresAtDelay) -> str:
+    """α and, where they run down a chain, the growth of spacing errors at a loop delay, in words."""
+    alpha = f"{flown.alpha:.4f} at {_ms(flown.loop_delay_s)} of loop delay"
+    if not flown.has_string_verdict:
+        return f"{alpha}, of the whole formation"
+    grows = "without bound" if flown.string_peak is None else f"{flown.string_peak:.2f} times at most"
+    return f"{alpha}, where spacing errors grow {grows} from vehicle to vehicle"
 
 
 def _up_to(delay_s: float | None) -> str:
@@ -85,21 +87,23 @@ def _up_to(delay_s: float | None) -> str:
     return "at no loop delay" if delay_s == 0.0 else f"up to {_ms(delay_s)} of it"
 
 
-def _print_graph_design(design: dict[str, Any], console: Console) -> None:
+def _print_graph_design(design: Design, console: Console) -> None:
     """The gain matrix by blocks: who uses whose errors, and how."""
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("vehicle", "uses", "spacing error, 1/s²", "velocity error, 1/s"):
         table.add_column(heading, justify="right")
-    for block in design["blocks"]:
-        *spacing, north, east = zip(*block["gain"], strict=True)
-        table.add_row(str(block["vehicle"]), str(block["of"]), _matrix(spacing), _matrix([north, east]))
+    for block in design.blocks:
+        *spacing, north, east = zip(*block.gain, strict=True)
+        table.add_row(str(block.vehicle), str(block.of), _matrix(spacing), _matrix([north, east]))
     console.print(table)
     _print_margins(design, console)
-    loss = "" if design["cost_loss"] is None else f"; costs {design['cost_loss']:.1%} more than with all information"
+    loss = "" if design.cost_loss is None else f"; costs {design.cost_loss:.1%} more than with all information"
     console.print(
-        f"alpha    {design['alpha']:.4f} (robustness bound of the whole formation), decay "
-        f"{design['decay_rate_1_s']:.2f} 1/s without delay{loss}"
+        f"alpha    {design.alpha:.4f} (robustness bound of the whole formation), decay "
+        f"{design.decay_rate_1_s:.2f} 1/s without delay{loss}"
     )
+    if design.at_loop_delay is not None:
+        _print_figures_at_delay(design.at_loop_delay, console)
 
 
 def number_text(value: float | None, form: str = ".5f") -> str:
@@ -132,10 +136,11 @@ def print_flight(summary: dict[str, Any], console: Console) -> None:
     for text in summary.get("not_logged", ()):
         console.print(f"log      not written: {text}")
     console.print(f"delay    {delay_text(summary)}")
-    flown = summary.get("at_loop_delay")
-    if flown is not None and flown["alpha"] is not None:
-        console.print(f"alpha    {figures_text(flown)}")
-    console.print(_response(summary.get("response")), end="")
+    at_delay = FiguresAtDelay.model_validate(summary.get("at_loop_delay") or {"loop_delay_s": None})
+    if at_delay.alpha is not None:
+        console.print(f"alpha    {figures_text(at_delay)}")
+    if (response := summary.get("response")) is not None:
+        console.print(_response(ResponsePart.model_validate(response)), end="")
     control = summary["control"]
     if control is not None:
         console.print(
@@ -188,23 +193,23 @@ def delay_text(summary: dict[str, Any]) -> str:
     )
 
 
-def _response(response: dict[str, Any] | None) -> str:
+def _response(response: ResponsePart | None) -> str:
     """A line on how the vehicles answer, if they do not do so at once."""
     if response is None:
         return ""
-    if "vehicles" not in response:
+    if not response.vehicles:
         text = "this margin is of vehicles that answer at once; theirs is found before the formation flight"
-        return f"response {response['source']}: {text}\n"
+        return f"response {response.source}: {text}\n"
     lags, gains = (
-        sorted(f"{vehicle[name]:.{digits}f}" for vehicle in response["vehicles"])
-        for name, digits in (("lag_s", 3), ("velocity_gain_1_s", 2))
+        sorted(texts)
+        for texts in zip(*((f"{v.lag_s:.3f}", f"{v.velocity_gain_1_s:.2f}") for v in response.vehicles), strict=True)
     )
-    peak = response.get("string_peak")
+    peak = response.string_peak
     grows = "" if peak is None else f"; spacing errors grow by {peak:.2f} at most from vehicle to vehicle with it"
     lag, gain = (" to ".join(dict.fromkeys((each[0], each[-1]))) for each in (lags, gains))
     return (
-        f"response {response['source']}: lag {lag} s, velocity gain {gain} 1/s; in the margin, which would be "
-        f"{_ms(response['delay_margin_at_once_s'])} without it{grows}\n"
+        f"response {response.source}: lag {lag} s, velocity gain {gain} 1/s; in the margin, which would be "
+        f"{_ms(response.delay_margin_at_once_s)} without it{grows}\n"
     )
 
 

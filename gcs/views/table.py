@@ -20,6 +20,7 @@ from rich.text import Text
 from gcs.control.phases import patience_s
 from gcs.control.tick import TICK, Mode, TickArray
 from gcs.plan.at_delay import figures_at
+from gcs.plan.design import Design
 from gcs.runs.refusals import REFUSED
 from gcs.views.console import plain_console
 from gcs.views.grid import unknown
@@ -62,7 +63,7 @@ MODE_STYLES: dict[Mode, str] = {
 class FlightState:
     """What is known of a flight, as far as its ticks and events have been read."""
 
-    def __init__(self, scenario: Scenario, design: dict[str, Any]) -> None:
+    def __init__(self, scenario: Scenario, design: Design) -> None:
         self.scenario = scenario
         self.margin_s = np.nan
         """Delay margin of the fastest gains."""
@@ -84,12 +85,11 @@ class FlightState:
         self.rtt_s = self.newest["rtt_s"]
         self._window: TickArray = np.empty((0, len(self.system_ids)), TICK)
 
-    def redesigned(self, design: dict[str, Any]) -> None:
+    def redesigned(self, design: Design) -> None:
         """Compare with the margins of a design."""
         self._design = design
         self._at_delay: dict[tuple[int, int], str] = {}
-        margin_s = design["delay_margin_s"]
-        self.margin_s = np.nan if margin_s is None else float(margin_s)
+        self.margin_s = np.nan if design.delay_margin_s is None else design.delay_margin_s
 
     def at_delay(self, figures: "Figures") -> str:
         """α and the growth of spacing errors at the largest median of the loop delays, to the millisecond, in words."""
@@ -98,9 +98,10 @@ class FlightState:
             return ""
         key = round(1e3 * delay_s), gain_set
         if key not in self._at_delay:
-            found = figures_at(self._design, key[0] / 1e3, gain_set)
-            grows = "without bound" if found["string_peak"] is None else f"{found['string_peak']:.2f} times"
-            text = "" if found["alpha"] is None else f"alpha {found['alpha']:.3f}, errors grow {grows} at {key[0]} ms"
+            found = figures_at(self._design, self.scenario, key[0] / 1e3, gain_set)
+            bound = "without bound" if found.string_peak is None else f"{found.string_peak:.2f} times"
+            grows = f", errors grow {bound}" if found.has_string_verdict else ""
+            text = "" if found.alpha is None else f"alpha {found.alpha:.3f}{grows} at {key[0]} ms"
             self._at_delay[key] = text
         return self._at_delay[key]
 

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 
 from gcs.control.tick import TickArray
+from gcs.plan.design import Design
 from gcs.runs.files import read_design, read_summary
 from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
 from gcs.runs.summary import summarise
-from gcs.views.console import plain_console
-from gcs.views.report import delay_text, print_flight
 from gcs.watch.rebuild import Rebuilt, rebuild, watched
-from gcs.watch.table import links_table
 from gcs.watch.tlog import TelemetryLog
 from scenarios import files
 from scenarios.schema import Scenario
@@ -28,7 +26,7 @@ class Replayed:
 
     log_file: Path
     scenario: Scenario | None
-    design: dict[str, Any] | None
+    design: Design | None
     recorded: dict[str, Any] | None
     """The summary of the run that the log is of."""
 
@@ -49,8 +47,9 @@ def replay(log: TelemetryLog, replayed: Replayed) -> dict[str, Any]:
     """The summary of a log: of its links, and of the flight if the scenario is known."""
     first_ns, last_ns = log.frames[0][0], log.frames[-1][0]
     scenario, design = replayed.scenario, replayed.design
-    margin_s = None if design is None else design["delay_margin_s"]
-    rebuilt = None if scenario is None else rebuild(log.frames, scenario, _margins_s(design))
+    margin_s = None if design is None else design.delay_margin_s
+    margins_s = (inf,) if design is None else design.margins_s
+    rebuilt = None if scenario is None else rebuild(log.frames, scenario, margins_s)
     watch = watched(log.frames) if rebuilt is None else rebuilt.links
     result: dict[str, Any] = {
         "log": {
@@ -70,18 +69,10 @@ def replay(log: TelemetryLog, replayed: Replayed) -> dict[str, Any]:
     return result
 
 
-def _margins_s(design: dict[str, Any] | None) -> tuple[float, ...]:
-    """Of the gain schedule; one that is unbounded or unknown is infinite."""
-    schedule: list[dict[str, Any]] = [{}] if design is None else design.get("schedule") or [design]
-    margins_s = [entry.get("delay_margin_s") for entry in schedule]
-    return tuple(inf if margin_s is None else float(margin_s) for margin_s in margins_s)
-
-
-def _flight(scenario: Scenario, design: dict[str, Any] | None, rebuilt: Rebuilt) -> dict[str, Any]:
+def _flight(scenario: Scenario, design: Design | None, rebuilt: Rebuilt) -> dict[str, Any]:
     reason = _reason(scenario, rebuilt)
     ends = [{"time_s": 0.0, "kind": "end", "system_id": None, "text": reason}]
-    design = {"delay_margin_s": None, "delay_margin_continuous_s": None} | (design or {})
-    summary = summarise(scenario, design, rebuilt.ticks, [*rebuilt.events, *ends])
+    summary = summarise(scenario, design or Design(delay_margin_s=None), rebuilt.ticks, [*rebuilt.events, *ends])
     if not rebuilt.own:
         summary |= {"verdict": "not judged", "settling_time_s": None, "control": None}
     del summary["files"]
@@ -118,20 +109,3 @@ def _broken(scenario: Scenario, last: TickArray) -> str | None:
             limit_m = scenario.safety.spacing_error_limit_m
             return f"broken: spacing error of vehicle {row['system_id']} is {error_m:.0f} m, limit {limit_m:g} m"
     return None
-
-
-def print_replay(result: dict[str, Any]) -> None:
-    """The log, its links, and the flight as far as it is known."""
-    console = plain_console()
-    log, width = result["log"], console.width
-    left_out = "".join(f"; {count} {reason}" for reason, count in log["left_out"].items())
-    console.print(f"log      {log['file']}: {log['frames']} frames in {log['duration_s']:.1f} s{left_out}")
-    if not result["links"]:
-        console.print("no vehicle in this log")
-    elif "flight" in result:
-        print_flight(result["flight"], console)
-    else:
-        console.print(links_table(result["links"], width))
-    if "recorded" in result:
-        recorded = result["recorded"]
-        console.print(f"recorded {recorded['verdict']}: {delay_text(recorded)}")

@@ -3,11 +3,10 @@
 from typing import Any
 
 from rich import box
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gcs.views.console import plain_console
 from gcs.views.table import UNKNOWN, headroom_style
 from gcs.watch.links import Figures
 
@@ -46,12 +45,6 @@ def plain_line(report: dict[str, Any]) -> str:
         f"{report['duration_s']:8.1f} s  {len(vehicles)} vehicles: {', '.join(states)}  RTT p99 max {_ms(rtt_s)} ms"
         f"  loop delay p99 max {_ms(loop_s)} ms  headroom min {_percent(least)} %"
     )
-
-
-def print_report(report: dict[str, Any], console: Console | None = None) -> None:
-    """The figures of the whole time."""
-    console = console or plain_console(soft_wrap=False)
-    console.print(render(report, width=console.width))
 
 
 def _badness(figures: Figures) -> tuple[bool, float]:

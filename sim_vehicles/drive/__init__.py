@@ -1,1 +1,1 @@
-"""The fleet in real time: command line, UDP sockets, signing."""
+"""The fleet, a function of datagrams and time; the command `sim-vehicles`, its UDP sockets and its signing."""

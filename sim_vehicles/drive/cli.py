@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
 NS_PER_S = 1_000_000_000
 GOODBYE_NS = NS_PER_S
-"""After the vehicles were shut down: their answers are under way."""
+"""Time between the shut-down of the last vehicle and the end: answers are still under way."""
 
 DESCRIPTION = """\
 Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
-They stay on the launcher, or on the ground, until a ground station arms and commands them: any that speaks MAVLink.
+They stay on the launcher, or on the ground, until a MAVLink ground station arms and commands them.
 
-With --links-only no vehicle is flown: any MAVLink vehicles that send to a --vehicle-port get the scenario's links, each
-those of its system id, and the station hears each from a port of its own."""
+With --links-only no vehicle is simulated: MAVLink vehicles that send to a --vehicle-port get the scenario's links for
+their system ids, and the station hears each vehicle from a port of its own."""
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """The command with its arguments: the exit code."""
+    """Run the command with its arguments and return the exit code."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.links_only != bool(options.vehicle_port):
@@ -49,7 +49,7 @@ def run(arguments: list[str]) -> int:
     if options.links_only and options.key:
         parser.error("read --key with --links-only, wanted one of them: links pass signed frames on as they are")
     with _signals() as signals, contextlib.ExitStack() as opened:
-        # After parsing, so that --help and a mistyped option answer at once.
+        # imported after parsing, so that --help and a mistyped option answer at once
         from scenarios.errors import ScenarioError
         from scenarios.files import load
         from scenarios.signing.keys import KeyFileError
@@ -116,7 +116,7 @@ def _fly(
     counters = fleet.counters + ports.counters
     say.summary(counters, log)
     if options.counters:
-        with contextlib.suppress(OSError):  # the flight is over: the line above has said it
+        with contextlib.suppress(OSError):  # the flight is over, and the summary has been printed
             options.counters.write_text(json.dumps(counters))
 
 
@@ -150,7 +150,7 @@ def _links_only(
 def _stop_rule(
     signals: list[int], start_ns: int, options: argparse.Namespace, say: "_Lines", fleet: "Fleet | None" = None
 ) -> Callable[[int, int], bool]:
-    """When to end, from the time and the instant of a station's last command."""
+    """The rule that ends the command, from the time now and that of a station's last command."""
     duration_ns, silence_ns = options.duration * NS_PER_S, options.stop_after_silence * NS_PER_S
     alone_since_ns = start_ns if options.parent is None else math.inf
 
@@ -160,7 +160,7 @@ def _stop_rule(
             alone_since_ns = now_ns
             say.line("the process that started this has gone")
             if commanded_ns == start_ns:
-                return True  # nobody has flown them: there is nothing to be taken over
+                return True  # nobody has flown them, so nobody will take them over
             if fleet is not None:
                 fleet.orphan()
         if fleet is not None and now_ns - fleet.shut_down_ns >= GOODBYE_NS:
@@ -182,7 +182,7 @@ def _teller(say: "_Lines", log: "TruthLog | None", sockets: "Sockets") -> Callab
 
 
 class _Lines:
-    """Lines for a person, on the terminal or in the log of whoever started this."""
+    """Prints lines for a person, on the terminal or in the log of the parent process."""
 
     def __init__(self, start_ns: int) -> None:
         self._start_ns = start_ns
@@ -198,7 +198,7 @@ class _Lines:
                 self._read = False
 
     def openness(self, addresses: list[tuple[str, int]], why: str) -> None:
-        """A line on each address that is not this machine's alone."""
+        """Warn of each address that other machines can reach."""
         for host, port in addresses:
             if not ip_address(host).is_loopback:
                 self.line(f"warning: {host}:{port} is open: {why}")
@@ -210,7 +210,7 @@ class _Lines:
             )
 
     def lateness(self, sockets: "Sockets") -> None:
-        """At most once a second: how much left too late for the links to be what the scenario says."""
+        """Report, at most once a second, datagrams that left too late for the links to be the scenario's."""
         late, now_ns = sockets.counters["left_late"], time.monotonic_ns()
         if late > self._late and now_ns - self._late_line_ns >= NS_PER_S:
             since_s = (now_ns - self._late_line_ns) / NS_PER_S
@@ -221,7 +221,7 @@ class _Lines:
             self._late, self._late_line_ns, sockets.latest_ns = late, now_ns, 0
 
     def summary(self, counters: Counter[str], log: "TruthLog | None") -> None:
-        """The last line: what was counted."""
+        """Print the last line: the counters."""
         counters += Counter(truth_lost=log.lost if log else 0)
         self.line(
             "received: " + (", ".join(f"{name} {count}" for name, count in sorted(counters.items())) or "nothing")
@@ -230,7 +230,7 @@ class _Lines:
 
 @contextlib.contextmanager
 def _signals() -> Generator[list[int]]:
-    """The list that the signals to end are appended to while the context lasts; under nohup SIGHUP is none of them."""
+    """While entered, the ending signals are appended to a list; under nohup SIGHUP is not one of them."""
     caught: list[int] = []
     wanted = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
@@ -244,7 +244,7 @@ def _signals() -> Generator[list[int]]:
 
 
 class _OneLineParser(argparse.ArgumentParser):
-    """A parser that complains in one line."""
+    """A parser whose errors are one line."""
 
     def error(self, message: str) -> Never:
         sys.exit(_complain(message))
@@ -262,27 +262,27 @@ def _parser() -> argparse.ArgumentParser:
         metavar="HOST:PORT",
         help="where the station listens (127.0.0.1:14550)",
     )
-    parser.add_argument("--key", type=Path, metavar="FILE", help="sign, and take only what is signed with this key")
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="write what really happened when; continues a log")
-    parser.add_argument("--counters", type=Path, metavar="FILE", help="at the end, write what was counted, as JSON")
+    parser.add_argument("--key", type=Path, metavar="FILE", help="sign, and accept only what is signed with this key")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="write the truth log, or continue one")
+    parser.add_argument("--counters", type=Path, metavar="FILE", help="write the counters as JSON at the end")
     parser.add_argument(
         "--stop-after-silence",
         type=_seconds,
         default=math.inf,
         metavar="SECONDS",
-        help="end when no station has commanded a vehicle for that long (never)",
+        help="end when no station has commanded a vehicle for this long (never)",
     )
     parser.add_argument(
         "--parent",
         type=int,
         metavar="PID",
-        help="the process that starts this one; with --stop-after-silence: silence counts once it has ended",
+        help="the parent process; with --stop-after-silence: silence counts only after it has ended",
     )
     parser.add_argument(
-        "--duration", type=_seconds, default=math.inf, metavar="SECONDS", help="end after that time (never)"
+        "--duration", type=_seconds, default=math.inf, metavar="SECONDS", help="end after this time (never)"
     )
     parser.add_argument(
-        "--links-only", action="store_true", help="fly no vehicles; put the links before other vehicles"
+        "--links-only", action="store_true", help="simulate no vehicles; put the links in front of other vehicles"
     )
     parser.add_argument(
         "--vehicle-port",
@@ -290,7 +290,7 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="[HOST:]PORT",
-        help="with --links-only: vehicles send here (127.0.0.1); may be given more than once",
+        help="with --links-only: vehicles send here (127.0.0.1); repeatable",
     )
     return parser
 

@@ -18,7 +18,7 @@ from sim_vehicles.links.truth import Record
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.services import LONGEST_TEXT
 from sim_vehicles.vehicles.copter import Copter, multicopter
-from sim_vehicles.vehicles.double_integrator import Vehicle, launched
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator, launched
 from sim_vehicles.vehicles.dynamics import State
 from sim_vehicles.vehicles.onboard import OnboardLoop
 from sim_vehicles.vehicles.shell import Change, Shell
@@ -31,26 +31,26 @@ _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 @dataclass(slots=True)
 class _Member:
-    vehicle: Shell[Vehicle] | Shell[Copter]
+    vehicle: Shell[DoubleIntegrator] | Shell[Copter]
     up: Link
     down: Link
     signed: SignedLink | None = None
     leaves_ns: int = NEVER_NS
     """The earliest instant at which a datagram of this vehicle can leave its up link."""
     acts_ns: int = NEVER_NS
-    """In order of time only: the next instant at which the vehicle does something or a datagram reaches it."""
+    """Used in order of time only: when the vehicle next acts, or a datagram reaches it."""
 
 
 class Fleet:
     """The vehicles and links of a scenario.
 
-    Vehicles do not meet each other here, so each is brought up to date only when a datagram of its own can leave,
-    in order of that time and of system id; nothing is late for it, since everything it does has its exact instant.
-    Only where links have channels does what one vehicle sends delay the others, and only sensors let one see another:
-    then all that happens is done in order of time, and at one instant first what the station sends and then the
-    vehicles by system id.
+    Vehicles do not affect each other, so each is brought up to date only when a datagram of its own can leave, in order
+    of that time and of system id. Nothing is late for it, since everything it does has its exact instant. There are two
+    exceptions: in a shared channel one vehicle's datagrams delay another's, and a sensor sees another vehicle. Then
+    events run in order of time, at one instant first the station's datagrams and then the vehicles by system id.
 
-    Vehicles with an end of a signed link, by system id, sign what they send and are given what could be verified.
+    `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and the vehicles
+    get only what could be verified.
     """
 
     def __init__(
@@ -66,12 +66,12 @@ class Fleet:
         self._start_ns = start_ns
         self._members: dict[int, _Member] = {}
         self._heap: list[tuple[int, int]] = []
-        """(leaves_ns, system id); entries that no longer agree with the member are stale and skipped."""
+        """(leaves_ns, system id); an entry that its member contradicts is stale and skipped."""
         self._links = LinkSet(scenario, start_ns, record=record)
         self._acts: list[tuple[int, int]] = []
-        """In order of time only: (acts_ns, system id), stale entries likewise."""
+        """Used in order of time only: (acts_ns, system id); stale entries are skipped."""
         self._entering: list[tuple[int, int, int, bytes]] = []
-        """In order of time only: (time, system id, number, data) of what the station has sent, earliest first."""
+        """Used in order of time only: (time, system id, number, data) of the station's datagrams, earliest first."""
         self._entered = 0
         sensors = scenario.control.loop == "onboard"
         experiment = f"{fingerprint(scenario)} {scenario.name}"[:LONGEST_TEXT]
@@ -97,7 +97,7 @@ class Fleet:
 
     @property
     def next_event_ns(self) -> int:
-        """Before this instant `step` returns nothing, unless datagrams come in."""
+        """Before this instant `step` returns nothing, unless datagrams arrive."""
         heap = self._heap
         while heap and self._members[heap[0][1]].leaves_ns != heap[0][0]:
             heapq.heappop(heap)
@@ -105,35 +105,35 @@ class Fleet:
 
     @property
     def commanded_ns(self) -> int:
-        """When a station last commanded a vehicle, with a set-point or otherwise; the start if never."""
+        """When a station last commanded a vehicle; the start if never."""
         return max(self._start_ns, *(member.vehicle.authority.commanded_ns for member in self._members.values()))
 
     @property
     def shut_down_ns(self) -> int:
-        """When the last vehicle was told to shut down; NEVER_NS while one is not."""
+        """When the last vehicle was told to shut down; NEVER_NS unless all were."""
         told_ns = [member.vehicle.services.shut_down_ns for member in self._members.values()]
         return NEVER_NS if None in told_ns else max(ns for ns in told_ns if ns is not None)
 
     def orphan(self) -> None:
-        """From now on the vehicles shut down when they are told to: the station that started them has gone."""
+        """From now on the vehicles obey a command to shut down: the station that started them has gone."""
         for member in self._members.values():
             member.vehicle.services.orphaned = True
 
     @property
     def counters(self) -> Counter[str]:
-        """The vehicles' counters added up, with the links' (LinkSet.counters)."""
+        """The sum of the vehicles' counters, and those of the links (LinkSet.counters)."""
         total = self._links.counters()
         total.update({f"refused_{reason.lower().replace(' ', '_')}": count for reason, count in self._refused.items()})
         for member in self._members.values():
             total.update(member.vehicle.counters)
         return total
 
-    def vehicle(self, system_id: int) -> Shell[Vehicle] | Shell[Copter]:
+    def vehicle(self, system_id: int) -> Shell[DoubleIntegrator] | Shell[Copter]:
         """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
         return self._members[system_id].vehicle
 
     def take_changes(self) -> list[Change]:
-        """What happened to the vehicles since the last call, in order of time."""
+        """The changes of all vehicles since the last call, in order of time."""
         changes: list[Change] = []
         for member in self._members.values():
             if member.vehicle.changes:
@@ -142,7 +142,7 @@ class Fleet:
         return sorted(changes)
 
     def step(self, received: Iterable[Datagram], now_ns: int) -> list[Datagram]:
-        """What leaves the up links by now, with the exact instants at which it does, in order of time.
+        """The datagrams that leave the up links by now, with their exact instants, in order of time.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class Fleet:
         return out
 
     def state(self, system_id: int, now_ns: int) -> State:
-        """The true state of a vehicle now, everything that has reached it by now included."""
+        """The true state of a vehicle now, after everything that has reached it by now."""
         if self._in_order:
             self._run_in_order((), now_ns)
         member = self._members[system_id]
@@ -187,12 +187,12 @@ class Fleet:
         return member.vehicle.craft.state_at(now_ns)
 
     def _seen(self, system_id: int, now_ns: int) -> State | None:
-        """What a sensor sees of a vehicle: its true state now; everything before is done. None if it is not there."""
+        """What a sensor sees of a vehicle: its true state now; None if there is no such vehicle."""
         member = self._members.get(system_id)
         return None if member is None else member.vehicle.craft.state_at(now_ns)
 
     def _run_in_order(self, received: Iterable[Datagram], now_ns: int) -> None:
-        """Let everything enter its link in order of time, from the station and from the vehicles, until now."""
+        """Run everything until now in order of time: the station's datagrams, and the vehicles."""
         for system_id, data, time_ns in received:
             self._entered += 1
             heapq.heappush(self._entering, (time_ns, system_id, self._entered, data))
@@ -215,7 +215,7 @@ class Fleet:
             self._plan(member)
 
     def _live(self, member: _Member, now_ns: int) -> None:
-        """Bring a vehicle up to now; what it sends enters its up link."""
+        """Bring a vehicle up to date; what it sends enters its up link."""
         arrived: list[tuple[bytes, int]] = []
         if member.down.next_due_ns <= now_ns:
             for entry in member.down.due(now_ns):
@@ -229,7 +229,7 @@ class Fleet:
             member.up.send(data if member.signed is None else member.signed.sign(data, time_ns), time_ns)
 
     def _plan(self, member: _Member) -> None:
-        """Note when a datagram of the vehicle can leave next. Comparisons, not min(): every datagram comes by here."""
+        """Note when a datagram of the vehicle can leave next. Comparisons, not min(): this runs for every datagram."""
         acts_ns, arrives_ns = member.vehicle.next_event_ns, member.down.next_due_ns
         leaves_ns = (arrives_ns if arrives_ns < acts_ns else acts_ns) + member.up.least_delay_ns
         leaves_ns = min(leaves_ns, member.up.next_due_ns)

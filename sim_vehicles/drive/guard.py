@@ -9,11 +9,11 @@ from scenarios.signing.stamps import Stamps, open_stamps
 from sim_vehicles.services.mavlink import CRC_EXTRA
 
 LINK_ID = 0
-"""Of the one socket that each vehicle has."""
+"""The link id of the one socket that each vehicle has."""
 
 
 def signed_links(key: Key, system_ids: Iterable[int], *, epoch_ns: int, stamps: Stamps) -> dict[int, SignedLink]:
-    """The vehicles' ends by system id; `epoch_ns` is when the clock of the vehicles is 0, in ns since 1970."""
+    """The vehicles' ends by system id; `epoch_ns` is the time, in ns since 1970, at which their clock is 0."""
     return {
         system_id: SignedLink(
             key, link_id=LINK_ID, crc_extra=CRC_EXTRA, epoch_ns=epoch_ns, stamps=stamps, owner=system_id
@@ -23,7 +23,7 @@ def signed_links(key: Key, system_ids: Iterable[int], *, epoch_ns: int, stamps: 
 
 
 def open_links(key_file: Path, system_ids: Iterable[int], *, epoch_ns: int) -> dict[int, SignedLink]:
-    """The same with the key in a file; the timestamps that were heard are kept beside it.
+    """The same with the key in a file; the newest timestamps are kept in a file beside it.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""A Relay on real UDP: vehicles of other programs speak to our ports, the station hears each from its own.
+"""A Relay on real UDP: vehicles of other programs send to our ports, and the station hears each from a port of its own.
 
-What a vehicle sends to one of our ports goes through its up link and, from a socket that is that vehicle's alone, to
-the station; what the station answers there goes through the down link to the address the vehicle last spoke from.
+A vehicle's datagrams go through its up link to the station, from a socket of that vehicle's own. The station's answers
+to that socket go through the down link to the address from which the vehicle last sent.
 """
 
 import time  # noqa: TID251 - this is the real-time driver
@@ -14,9 +14,9 @@ from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
 from sim_vehicles.vehicles.shell import Change
 
 MOST_PEERS = 1000
-"""Addresses that vehicles speak from; each vehicle may be started again a few times."""
+"""Addresses that vehicles may send from in all; a restarted vehicle may have a new one."""
 SILENCE_NS = 3 * NS_PER_S // 2
-"""A vehicle that has not been heard for this long may have been started again, and speak from another address."""
+"""A vehicle silent for this long may have been restarted, and may send from another address."""
 
 
 class Peers:
@@ -33,23 +33,23 @@ class Peers:
     ) -> None:
         self.sockets = Sockets()
         self.changes: list[Change] = []
-        """Who was found; whoever reads may clear it."""
+        """Vehicles found; a reader may clear it."""
         self._station = station
         self._silence_ns = silence_ns
         self._station_side: dict[int, int] = {}
         """System id to the file number of the socket that the station hears it from."""
         self._system_ids: dict[int, int] = {}
-        """The other way round."""
+        """The inverse of `_station_side`."""
         self._peers: dict[tuple[int, tuple[str, int]], int] = {}
         """(File number of our port, the vehicle's address) to system id."""
         self._addresses: dict[int, tuple[int, tuple[str, int]]] = {}
-        """System id to where it was last heard from,"""
+        """System id to the port and address of the vehicle's last datagram."""
         self._heard_ns: dict[int, int] = {}
-        """and when."""
+        """System id to the time of that datagram."""
         try:
             for address in vehicle_ports:
                 self.sockets.add(bind=address)
-            self.sockets.add(connect=station)  # found out now, not with the first vehicle, if it cannot be used
+            self.sockets.add(connect=station)  # a bad station address fails here, not with the first vehicle
         except OSError:
             self.sockets.close()
             raise
@@ -78,7 +78,7 @@ class Peers:
                 self.sockets.send(file_number, data, due_ns, address)
 
     def _vehicle(self, datagram: Received) -> int | None:
-        """The vehicle that a datagram on one of our ports is from, or None if it does not say."""
+        """The vehicle that sent a datagram to one of our ports, or None if that is unknown or refused."""
         place = datagram.file_number, datagram.address
         system_id = self._peers.get(place) or sender(datagram.data)
         if system_id is None:

@@ -1,8 +1,7 @@
-"""Vehicles on real UDP: the one place here that reads a clock or touches a socket.
+"""Vehicles on real UDP, with one thread and one socket per vehicle.
 
-One thread, one socket per vehicle. The kernel stamps what arrives, so the emulated down link begins when the datagram
-reached the host and not when this loop got round to reading it; what is sent waits for its due time to some tens of
-microseconds.
+The kernel stamps what arrives, so the emulated down link begins when the datagram reached the host, not when this loop
+read it. Datagrams leave within some tens of microseconds of their due time.
 """
 
 import contextlib
@@ -21,17 +20,17 @@ from sim_vehicles.drive.fleet import Datagram, Fleet
 from sim_vehicles.vehicles.shell import Change
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
-"""Before a due time the loop stops sleeping and looks at the clock this long: with few vehicles, waking from sleep is
-most of the error. Of all vehicles together not more than the second figure, a tenth of a core at 50 Hz."""
+"""How long the loop polls the clock instead of sleeping before a due time: with few vehicles, waking up is most of the
+error. The second figure bounds it for all vehicles together, to a tenth of a core at 50 Hz."""
 LONGEST_WAIT_NS = NS_PER_S // 10
-"""The loop looks at the flags that end it at least this often."""
+"""The loop checks at least this often whether to stop."""
 DATAGRAM_BYTES = 2048
 READS_PER_WAKE = 1000
-"""From one socket, so that a flood into it cannot stop the others."""
+"""Datagrams read from one socket before the others, so that a flood into it cannot block them."""
 LATE_NS = 5_000_000
-"""What leaves more than this after it was due is counted: the emulated link is then not what the scenario says."""
+"""A datagram that leaves later than this is counted: the emulated link is then not the scenario's."""
 CLOCK_GAP_NS = 3_000
-"""A reading of the two clocks that took longer was interrupted and is not used."""
+"""A reading of both clocks that took longer than this was interrupted, and is discarded."""
 
 _SO_TIMESTAMPNS = 35  # Linux; Python has no name for it
 _PR_SET_TIMERSLACK = 29
@@ -39,7 +38,7 @@ _STAMP = struct.Struct("qq")
 
 
 class Received(NamedTuple):
-    """A datagram with the socket it came to, the instant at which it reached this host, and its sender."""
+    """A datagram with its receiving socket, the instant at which it reached this host, and its sender."""
 
     file_number: int
     data: bytes
@@ -48,20 +47,20 @@ class Received(NamedTuple):
 
 
 class Sockets:
-    """All sockets of a process: one place that waits for them, reads them, and knows how late what is sent is."""
+    """All sockets of the process: waits for them, reads them, sends, and counts late datagrams."""
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
         """`send_refused` (nobody listens at the port), `send_failed`, `receive_refused`, `left_late`."""
         self.latest_ns = 0
-        """How late the latest was that counted as `left_late`; whoever reads may set it to 0."""
+        """The largest lateness among those counted as `left_late`; a reader may reset it to 0."""
         self._epoll = select.epoll()
         self._sockets: dict[int, socket.socket] = {}
         self._clocks = _Clocks()
         self._emptied_ns = time.monotonic_ns()
 
     def add(self, *, bind: tuple[str, int] | None = None, connect: tuple[str, int] | None = None) -> int:
-        """Open a socket, bound or connected, and give its file number; one that is connected hears nobody else.
+        """Open a socket, bound or connected, and return its file number; a connected one hears only its peer.
 
         Raises
         ------
@@ -87,8 +86,8 @@ class Sockets:
             own.close()
 
     def wait(self, until_ns: int) -> None:
-        """Sleep until then, or until a datagram is there."""
-        # epoll rounds its own time-outs up to whole milliseconds; select does not.
+        """Sleep until a time, or until a datagram has arrived."""
+        # select, because epoll rounds its time-outs up to whole milliseconds
         spin_ns = min(LONGEST_SPIN_NS, SPIN_OF_ALL_NS // max(1, len(self._sockets)))
         remaining_ns = until_ns - spin_ns - time.monotonic_ns()
         if remaining_ns > 0 and select.select((self._epoll,), (), (), remaining_ns / NS_PER_S)[0]:
@@ -105,7 +104,7 @@ class Sockets:
         for file_number, _ in self._epoll.poll(0):
             read = 0
             for data, stamp_ns, address in self._read(self._sockets[file_number]):
-                # If the wall clock is set, stamps jump; but nothing came before the sockets were last empty.
+                # Stamps jump if the wall clock is set; but nothing is older than when the sockets were last empty.
                 latest_ns = time.monotonic_ns()
                 time_ns = latest_ns if stamp_ns is None else stamp_ns + to_monotonic_ns
                 time_ns = min(max(time_ns, self._emptied_ns), latest_ns)
@@ -117,7 +116,7 @@ class Sockets:
         return received
 
     def send(self, file_number: int, data: bytes, due_ns: int, address: tuple[str, int] | None = None) -> None:
-        """Send to the address, or where the socket is connected to; that nobody listens there is no fault of ours."""
+        """Send to the address, or to the socket's peer; failures are counted."""
         own = self._sockets[file_number]
         try:
             if address is None:
@@ -139,7 +138,7 @@ class Sockets:
                 data, ancillary, _, address = own.recvmsg(DATAGRAM_BYTES, 64)
             except BlockingIOError:
                 return
-            except OSError:  # the answer to something sent when nobody listened
+            except OSError:  # the ICMP answer to a datagram sent while nobody listened
                 self.counters["receive_refused"] += 1
                 continue
             stamp_ns = None
@@ -150,7 +149,7 @@ class Sockets:
 
 
 class Ports:
-    """The vehicles' sockets, each connected to the station: nobody else's datagrams are taken.
+    """The vehicles' sockets, each connected to the station, so that datagrams of others are not accepted.
 
     Raises
     ------
@@ -177,11 +176,11 @@ class Ports:
         self.sockets.close()
 
     def wait(self, until_ns: int) -> None:
-        """Sleep until then, or until a datagram is there."""
+        """Sleep until a time, or until a datagram has arrived."""
         self.sockets.wait(until_ns)
 
     def receive(self) -> list[Datagram]:
-        """Everything that has arrived, each with the instant at which it reached this host."""
+        """Everything that has arrived, with the instants at which it reached this host."""
         system_ids = self._system_ids
         return [(system_ids[number], data, time_ns) for number, data, time_ns, _ in self.sockets.receive()]
 
@@ -199,7 +198,7 @@ class _Clocks:
         self._read_ns = 0
 
     def to_monotonic_ns(self) -> int:
-        """What to add to a stamp."""
+        """What to add to a kernel stamp."""
         before_ns = time.monotonic_ns()
         real_ns = time.time_ns()
         after_ns = time.monotonic_ns()
@@ -218,13 +217,13 @@ def fly(
 ) -> None:
     """Run the vehicles in real time until `stop(now_ns, commanded_ns)`.
 
-    `stop` and `tell` (with what happened to the vehicles since) are called about ten times a second.
+    About ten times a second, `stop` is called, and `tell` with the changes since its last call.
     """
     next_look_ns = 0
     with undisturbed():
         while True:
             ports.wait(min(fleet.next_event_ns, next_look_ns))
-            # The clock before the sockets: every datagram that came by then is among those received.
+            # Read the clock before the sockets, so that every datagram that came by then is among those received.
             now_ns = time.monotonic_ns()
             ports.send(fleet.step(ports.receive(), now_ns))
             if now_ns >= next_look_ns:
@@ -236,10 +235,10 @@ def fly(
 
 @contextlib.contextmanager
 def undisturbed() -> Generator[None]:
-    """Timers as exact as the kernel can, and no pauses for garbage."""
-    # The default slack lets the kernel put off a wake-up by 50 µs.
+    """While entered, timers are as exact as the kernel allows, and no garbage collection runs."""
+    # The default timer slack lets the kernel delay a wake-up by 50 µs.
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
-    # A collection stops the loop for milliseconds. Nothing in it makes reference cycles, so nothing piles up.
+    # A collection stops the loop for milliseconds. The loop makes no reference cycles, so memory does not grow.
     gc.collect()
     gc.freeze()
     gc.disable()

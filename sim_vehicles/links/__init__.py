@@ -1,1 +1,1 @@
-"""Emulated links: delay, jitter, loss, shared channels; and the log of what really happened."""
+"""Emulated links: delay, jitter, loss and shared channels; and the truth log of what happened on them."""

@@ -1,4 +1,4 @@
-"""A limited bandwidth that one link has, or many share: a queue with a tail that drops, and one sender."""
+"""Limited bandwidth, of one link or shared by many: a drop-tail queue with one sender."""
 
 from collections import deque
 
@@ -7,22 +7,22 @@ from scenarios.schema import NS_PER_S
 
 
 class Channel:
-    """Sends one datagram at a time, in order of their coming; those of one instant in order of `send`."""
+    """Sends one datagram at a time, in order of arrival; those of one instant in order of `send`."""
 
     def __init__(self, channel: schema.Channel) -> None:
         self._ns_per_byte = channel.bits_per_byte * NS_PER_S / channel.bandwidth_bit_s
         self._most_bytes = channel.queue_bytes
         self._most_datagrams = channel.queue_datagrams
         self._free_ns = 0
-        """When all that was taken so far has been sent."""
+        """When everything accepted so far has been sent."""
         self._waiting: deque[tuple[int, int]] = deque()
-        """(when its sending begins, bytes) of what waited when last looked at, in order."""
+        """(when its sending begins, bytes) of each datagram that was waiting at the last call, in order."""
         self._waiting_bytes = 0
 
     def send(self, size_bytes: int, time_ns: int) -> tuple[int, int] | None:
-        """(When the sending of a datagram begins, when it ends), or None if the queue is full.
+        """When the sending of a datagram begins and ends, or None if the queue is full.
 
-        Times of successive calls must not go back.
+        Successive calls must be in order of time.
         """
         waiting = self._waiting
         while waiting and waiting[0][0] <= time_ns:

@@ -1,8 +1,8 @@
-"""What happens to one datagram on a link that misbehaves: a pure function of the link, the time and the draws.
+"""What happens to one datagram on a link: a pure function of the link, the time and the random draws.
 
-A link is compiled once into a frozen `Behaviour`, all times in ns. Of the two random streams of a link, one decides
-what is lost, doubled or corrupted and one how late things are, and every datagram takes the same number of draws from
-both whatever they are used for: more loss leaves the delays as they are, and no link's traffic moves another's draws.
+A link's schema is compiled once into a frozen `Behaviour`, with all times in ns. Each link has two random streams: one
+decides loss, duplication and corruption, the other the jitter. Every datagram takes the same number of draws from both,
+used or not. So more loss leaves the delays unchanged, and no link's traffic shifts the draws of another.
 """
 
 from bisect import bisect_right
@@ -18,18 +18,18 @@ from sim_vehicles.links.truth import CORRUPTED, LOST, OUTAGE, PASSED
 
 MOST_FLIPS = 4
 _BLOCK = 128
-"""Datagrams whose draws are made at once: numpy's cost for one is that for a hundred."""
+"""Datagrams whose draws are made at once: numpy takes as long for one as for a hundred."""
 
 
 class Draws(NamedTuple):
-    """All that is random about one datagram. But the delays, uniform in [0, 1)."""
+    """All that is random about one datagram: uniform in [0, 1), except the jitter."""
 
     burst: float
     loss: float
     duplicate: float
     corrupt: float
     flips: tuple[float, ...]
-    """Where a bit is flipped, as a part of the datagram; `corrupt` also says how many are used."""
+    """Where bits are flipped, as fractions of the datagram's length; `corrupt` also says how many are used."""
     jitter_ns: int
     duplicate_jitter_ns: int
 
@@ -48,12 +48,12 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Behaviour:
-    """A link's schema as integers of ns."""
+    """A link's schema with its times as integers of ns."""
 
     points_ns: tuple[tuple[int, int], ...]
     """(link time, delay), at least one."""
     least_delay_ns: int
-    """No datagram takes less time than this."""
+    """A lower bound of every datagram's delay."""
     outages_ns: tuple[tuple[int, int], ...]
     reordering: bool
     to_bad: float
@@ -65,12 +65,12 @@ class Behaviour:
 
     @property
     def timed(self) -> bool:
-        """Whether it matters what time it is."""
+        """Whether the behaviour changes with time."""
         return len(self.points_ns) > 1 or bool(self.outages_ns)
 
 
 def behaviour_of(link: schema.Link) -> Behaviour:
-    """The compiled form of a link's schema."""
+    """Compile a link's schema."""
     points = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
     points_ns = tuple((_ns(time_s), _ns(delay_s)) for time_s, delay_s in points)
     bursts = link.loss_bursts
@@ -89,13 +89,13 @@ def behaviour_of(link: schema.Link) -> Behaviour:
 
 
 def constant(link: schema.Link) -> bool:
-    """Whether all that the link does is to be late by its delay_s."""
+    """Whether the link only delays, by its constant delay_s."""
     plain = schema.Link(delay_s=link.delay_s, reordering=link.reordering, channel=link.channel)
     return link == plain and link.channel is None
 
 
 def outcome(link: Behaviour, *, bad: bool, time_ns: int, draws: Draws) -> Outcome:
-    """The fate of a datagram that enters at a link time, but for what a channel or a full link does to it."""
+    """The fate of a datagram that enters at a link time, before any channel or full link drops it."""
     bad = draws.burst >= link.to_good if bad else draws.burst < link.to_bad
     fate = PASSED
     for from_ns, until_ns in link.outages_ns:
@@ -106,7 +106,7 @@ def outcome(link: Behaviour, *, bad: bool, time_ns: int, draws: Draws) -> Outcom
     flips: tuple[float, ...] = ()
     if draws.corrupt < link.corrupt:
         fate |= CORRUPTED
-        # Below its bound the draw is uniform once more, and says how many.
+        # Given that it is below its bound, the draw is uniform again: it also picks the number of flips.
         flips = draws.flips[: 1 + int(MOST_FLIPS * draws.corrupt / link.corrupt)]
     delay_ns = delay_at(link, time_ns)
     twice = draws.duplicate < link.duplicate
@@ -115,7 +115,7 @@ def outcome(link: Behaviour, *, bad: bool, time_ns: int, draws: Draws) -> Outcom
 
 
 def delay_at(link: Behaviour, time_ns: int) -> int:
-    """The constant part of the delay at a link time: linear between points, at a step already the second."""
+    """The delay without jitter at a link time: linear between points; at a step, that after it."""
     points = link.points_ns
     if len(points) == 1:
         return points[0][1]
@@ -127,7 +127,7 @@ def delay_at(link: Behaviour, time_ns: int) -> int:
 
 
 def flipped(data: bytes, flips: tuple[float, ...]) -> bytes:
-    """The datagram with its bits flipped at these parts of its length; two at one place count once."""
+    """The datagram with bits flipped at these fractions of its length; equal places flip once."""
     changed = bytearray(data)
     for place in {int(part * len(data) * 8) for part in flips} if data else ():
         changed[place // 8] ^= 1 << place % 8
@@ -135,7 +135,7 @@ def flipped(data: bytes, flips: tuple[float, ...]) -> bytes:
 
 
 class _Delays(Protocol):
-    """Draws the jitter of a number of datagrams and of their second copies, in s."""
+    """Draws the jitter of a number of datagrams and of their duplicates, in s."""
 
     def __call__(self, count: int) -> list[tuple[float, float]]: ...
 
@@ -186,7 +186,7 @@ def _delays_of(jitter: schema.Jitter | None, rng: np.random.Generator) -> _Delay
 
 
 def _replayed(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:
-    """A trace in its own order, which keeps what neighbours have in common. A second copy takes the delay after."""
+    """A trace in its own order, which keeps the correlation of neighbours; a duplicate takes the next delay."""
     at = int(rng.integers(len(trace_s)))
 
     def drawn(count: int) -> list[tuple[float, float]]:

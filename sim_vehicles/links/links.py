@@ -1,7 +1,7 @@
 """An emulated one-way radio link: a queue ordered by the time each datagram comes out.
 
-A datagram's fate is decided when it enters, in `send`, and nowhere else: `link_fate` says what happens to it,
-`link_channel` how long it waits for bandwidth. A link whose delay is constant and does nothing else has no draws.
+A datagram's fate is decided once, when it enters (`Link.send`): `fate` says what happens to it, `channel` how long it
+waits for bandwidth. A link that only delays by a constant draws no random numbers.
 """
 
 import heapq
@@ -28,22 +28,22 @@ from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.mavlink import message_id
 
 CAPACITY = 10_000
-"""Most datagrams on their way: 100 s of delay at 50 Hz twice over. What does not fit is dropped and counted."""
+"""Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
 
 UP_STREAM, DOWN_STREAM = 1, 2
-"""Last word of the spawn key of a link's random streams, as clock.CLOCK_STREAM."""
+"""Last word of the spawn key of a link's random streams; see services.clock.CLOCK_STREAM."""
 SETPOINT_IDS = (82, 84, 86)
-"""SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and SET_POSITION_TARGET_GLOBAL_INT: with these a flight begins."""
+"""SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first of them begins the flight."""
 
 Entry = tuple[int, int, int, bytes, int, int]
-"""(due_ns, number, entered_ns, data, fate, queued_ns); equal but for `fate` are a datagram and its second copy."""
+"""(due_ns, number, entered_ns, data, fate, queued_ns). A duplicate has the number of its original."""
 
 
 class Link:
-    """Datagrams on their way.
+    """Datagrams under way in one direction.
 
-    `counts` says by name what happened to them: `duplicated`, `corrupted`, and why they were dropped. What entered
-    and the duplicates are what came out, what was dropped and what is under way.
+    `counts` says by name what happened to them: `duplicated`, `corrupted`, and why they were dropped. Datagrams that
+    entered, plus duplicates, equal those that came out, were dropped, or are under way.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Link:
         return sum(self.counts[FATES[fate]] for fate in (LOST, OUTAGE, QUEUE_FULL, LINK_FULL))
 
     def send(self, data: bytes, time_ns: int) -> None:
-        """Let a datagram enter the link."""
+        """Take in a datagram that enters the link at a time."""
         self.entered += 1  # also the order of datagrams that are due at one instant: first in, first out
         if self._stream is not None:
             self._send_drawn(data, time_ns, self._stream)
@@ -99,7 +99,7 @@ class Link:
             self.next_due_ns = self._queue[0][0]
 
     def due(self, now_ns: int) -> list[Entry]:
-        """The datagrams that have come out by now, in the order they did."""
+        """The datagrams that have come out by now, in order."""
         out: list[Entry] = []
         queue = self._queue
         while queue and queue[0][0] <= now_ns:
@@ -153,7 +153,7 @@ class Link:
 
 
 class LinkSet:
-    """The links of all vehicles of a scenario, with the channels they share and the time they go by."""
+    """The links of all vehicles of a scenario, with the channels they share and their common time."""
 
     def __init__(self, scenario: schema.Scenario, start_ns: int, *, record: Record | None = None) -> None:
         self._links = scenario.links
@@ -167,7 +167,7 @@ class LinkSet:
 
     @property
     def have_channels(self) -> bool:
-        """Whether links wait for one another, so that all that enters has to enter in order of time."""
+        """Whether links wait for one another, so that datagrams must enter in order of time."""
         return bool(self._channels)
 
     def of(self, system_id: int) -> tuple[Link, Link]:
@@ -178,7 +178,7 @@ class LinkSet:
         return self._pairs[system_id]
 
     def hear(self, data: bytes, time_ns: int) -> None:
-        """Note what the station sends before the flight has begun: its first set-point begins it."""
+        """Look for the station's first set-point, which begins the flight and the links' time."""
         if message_id(data) in SETPOINT_IDS and time_ns < self.zero_ns:
             self.zero_ns = time_ns
             for link in (link for pair in self._pairs.values() for link in pair):

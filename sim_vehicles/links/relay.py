@@ -1,7 +1,7 @@
-"""The links of a scenario in front of vehicles that are not ours, as one function of datagrams and time.
+"""The links of a scenario in front of other programs' vehicles, as one function of datagrams and time.
 
-A vehicle is known by the system id of its first frame; only headers are read. Which links it gets, its random streams
-and the truth log are those it would have had in a Fleet.
+The system id of its first frame identifies a vehicle; only headers are read. A vehicle gets the same links, random
+streams and truth log that it would have in a Fleet.
 """
 
 import heapq
@@ -19,7 +19,7 @@ SETUP_SIGNING = (256).to_bytes(3, "little")
 
 
 class Passing(NamedTuple):
-    """A datagram on its way through the links: up to the station, or down to the vehicle. Order is that of time."""
+    """A datagram on its way through the links, up to the station or down to the vehicle. Sorts by time."""
 
     time_ns: int
     kind: int
@@ -29,7 +29,7 @@ class Passing(NamedTuple):
 
 
 def sender(data: bytes) -> int | None:
-    """System id of a datagram's first frame, MAVLink 1 or 2; None if that is no vehicle's (1 to 250)."""
+    """System id of a datagram's first frame, MAVLink 1 or 2; None if it is not a vehicle's (1 to 250)."""
     if len(data) >= 12 and data[0] == MAGIC_2:
         system_id = data[5]
     elif len(data) >= 8 and data[0] == MAGIC_1:
@@ -58,9 +58,9 @@ class Relay:
         self._record = record
         self._links = LinkSet(scenario, start_ns, record=record)
         self._entering: list[Passing] = []
-        """What has been read but came after the last step's now: something earlier may still be unread."""
+        """Datagrams received later than the last step's now: an earlier one may still be unread."""
         self._heap: list[tuple[int, int, int]] = []
-        """(due_ns, kind, system id) of each link's next datagram; entries that no longer agree are stale."""
+        """(due_ns, kind, system id) of each link's next datagram; an entry that its link contradicts is stale."""
 
     @property
     def counters(self) -> Counter[str]:
@@ -69,7 +69,7 @@ class Relay:
 
     @property
     def next_event_ns(self) -> int:
-        """Before this instant `step` returns nothing, unless datagrams come in."""
+        """Before this instant `step` returns nothing, unless datagrams arrive."""
         heap = self._heap
         while heap and self._link(heap[0][1], heap[0][2]).next_due_ns != heap[0][0]:
             heapq.heappop(heap)
@@ -77,7 +77,7 @@ class Relay:
         return min(due_ns, self._entering[0].time_ns) if self._entering else due_ns
 
     def step(self, received: Iterable[Passing], now_ns: int) -> list[Passing]:
-        """What leaves the links by now, with the exact instants at which it does, in order of time."""
+        """The datagrams that leave the links by now, with their exact instants, in order of time."""
         entering = self._entering
         for passing in received:
             heapq.heappush(entering, passing)

@@ -1,7 +1,7 @@
-"""The truth log: what really happened when, on the host's clock, to grade the station's estimates against.
+"""The truth log: what happened and when, on the host's clock. The station's estimates are graded against it.
 
-A magic and then fixed-size records, written straight to the file in batches: a killed process loses its last batch at
-most, and a record cut in two at the end is left out when reading and overwritten when the log is continued.
+The file is a magic and then fixed-size records, written in batches: a killed process loses its last batch at most. An
+incomplete record at the end is skipped when reading and overwritten when the log is continued.
 """
 
 import contextlib
@@ -33,11 +33,11 @@ DTYPE = np.dtype(
 SAMPLED: the state in the LOCAL_POSITION_NED with time_boot_ms `key` was sampled at `time_ns`. ACTED: the set-point
 with the sender's time_boot_ms `key` acts from `time_ns` on. For these two the other times equal `time_ns`, and the
 last two fields are 0.
-LINK_UP, LINK_DOWN: a datagram whose first frame has the message id `key` (0xFFFFFF if it has none; as it left, so
-perhaps corrupted) entered the link at `entered_ns`, was due at `due_ns`, and left at `time_ns`: handed to a socket (in
-virtual time, to the station), or downwards taken by the simulated vehicle. For `queued_ns` it waited for the channel.
-`fate` adds up what happened to it, see FATES. If that is one of DROPPED it never left: due_ns and time_ns are
-entered_ns. Of a datagram that was duplicated there are two records, the second copy's with DUPLICATE.
+LINK_UP, LINK_DOWN: a datagram whose first frame has the message id `key` (as it left, so perhaps corrupted; 0xFFFFFF
+if it has none) entered the link at `entered_ns`, was due at `due_ns`, and left at `time_ns`. Upwards it was then handed
+to a socket (in virtual time, to the station); downwards the simulated vehicle took it. It waited `queued_ns` for the
+channel. `fate` is the sum of what happened to it, see FATES. With one of DROPPED it never left: due_ns and time_ns
+equal entered_ns. A duplicated datagram has two records; the copy's has DUPLICATE.
 """
 
 PASSED = 0
@@ -58,17 +58,17 @@ _BATCH = 1024
 
 
 Row = tuple[int, int, int, int, int, int] | tuple[int, int, int, int, int, int, int, int]
-"""One record's values, in the order of DTYPE; the last two may be left out and are 0."""
+"""One record's values in the order of DTYPE; omitted, the last two are 0."""
 Record = Callable[[Row], None]
-"""Takes one record: TruthLog.record, or the append of a list."""
+"""Takes one record: `TruthLog.record`, or the `append` of a list."""
 
 
 class TruthLog:
-    """A truth log being written; its `record` is what a Fleet takes."""
+    """A truth log open for writing; pass its `record` to a Fleet."""
 
     def __init__(self, path: Path) -> None:
         self.lost = 0
-        """Records that could not be written; the disk being full stops no vehicle."""
+        """Records that could not be written: a full disk stops no vehicle."""
         self._batch: list[bytes] = []
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         size = os.fstat(self._file).st_size
@@ -79,7 +79,7 @@ class TruthLog:
             os.close(self._file)
             raise ValueError(f"{path} exists and is not a truth log")
         self._end = size - (size - len(_MAGIC)) % DTYPE.itemsize
-        """Where the next batch goes: behind the last whole record, whatever a failed write has left there."""
+        """Where the next batch goes: after the last complete record, over whatever a failed write left there."""
 
     def record(self, row: Row) -> None:
         """Add a record to the batch, and write the batch if it is full."""
@@ -100,7 +100,7 @@ class TruthLog:
         self._batch.clear()
 
     def close(self) -> None:
-        """Write what is left; a record cut in two is cut off."""
+        """Write the last batch and cut off an incomplete record."""
         self.flush()
         with contextlib.suppress(OSError):
             os.ftruncate(self._file, self._end)
@@ -108,7 +108,7 @@ class TruthLog:
 
 
 def read_truth(path: Path) -> npt.NDArray[np.void]:
-    """The whole records of a truth log, in the order written, as an array of DTYPE.
+    """The complete records of a truth log, in the order written, as an array of DTYPE.
 
     Raises
     ------

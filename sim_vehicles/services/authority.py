@@ -19,22 +19,23 @@ _QUESTIONS = frozenset((COMMAND_CAPABILITIES, COMMAND_GET_HOME, COMMAND_GET_INTE
 
 
 class Authority:
-    """Remembers the system that commands a vehicle: the first to do so, until it has been silent for a time.
+    """Remembers the station of a vehicle: the first system that commands it, until that has been silent for a time.
 
-    Who only asks, listens or sends heartbeats does not become the station, and is not kept from it. A rate of reports
-    is set by the station, or by anybody while there is none, who does not become it: display programs do so at once.
+    A system that only asks, listens or sends heartbeats does not become the station, and is always answered. Report
+    rates are set by the station, or by any system while there is none; that does not make it the station, since display
+    programs set rates as soon as they start.
     """
 
     def __init__(self, silence_s: float) -> None:
         self.station: int | None = None
         self._silence_ns = round(silence_s * NS_PER_S)
         self.commanded_ns = 0
-        """When that system last commanded it: to ask, to listen and to send heartbeats is not to command."""
+        """When the station last commanded the vehicle; questions and heartbeats do not count."""
         self._heard_ns = 0
         self._refused: set[int] = set()
 
     def obeys(self, source: int, message: Message, time_ns: int) -> bool:
-        """Whether a message to this vehicle may be acted upon; if it wants something, its sender is the station."""
+        """Whether to act on a message to this vehicle; a command makes its sender the station."""
         if not isinstance(message, Setpoint | Command | ParameterSet | SetMode | DataStream):
             return True
         command = message.command if isinstance(message, Command) else None
@@ -48,14 +49,14 @@ class Authority:
         return True
 
     def hears(self, source: int, time_ns: int) -> bool:
-        """Whether a heartbeat of a ground station counts: it is that of the station, or there is none."""
+        """Whether a ground station's heartbeat counts: it is from the station, or there is none."""
         if source == self.station:
             self._heard_ns = time_ns
             return True
         return self.station is None or time_ns - self._heard_ns > self._silence_ns
 
     def refusal(self, source: int, counters: Counter[str]) -> str:
-        """What is said of a system that is refused, once; then an empty string."""
+        """The text that reports a refused system, at its first refusal only; else an empty string."""
         counters["refused_not_the_station"] += 1
         if source in self._refused:
             return ""

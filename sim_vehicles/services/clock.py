@@ -1,4 +1,4 @@
-"""The clock a vehicle counts from its boot: an offset and a drift against the host's clock, in exact integers."""
+"""A vehicle's boot clock: an offset and a drift from the host's clock, in exact integers."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -11,12 +11,12 @@ NS_PER_MS = 1_000_000
 PARTS = 1_000_000_000
 
 CLOCK_STREAM = 0
-"""Last word of the spawn key of the clock's random stream; other streams of a vehicle take other numbers."""
+"""Last word of the spawn key of the clock's random stream; a vehicle's other streams have other numbers."""
 
 
 @dataclass(frozen=True)
 class BootClock:
-    """Host time (CLOCK_MONOTONIC, or the virtual clock) to boot time and back, without rounding drift."""
+    """Converts host time (CLOCK_MONOTONIC, or the virtual clock) to boot time and back, without rounding drift."""
 
     start_ns: int
     """Host time at which the clock shows `offset_ns`."""
@@ -25,14 +25,14 @@ class BootClock:
 
     @classmethod
     def draw(cls, clocks: Clocks, seed: int, system_id: int, start_ns: int) -> Self:
-        """A vehicle's clock from the scenario's seed: offset in 0 to the bound, drift in plus or minus the bound."""
+        """Draw a vehicle's clock from the scenario's seed: offset from 0 to its bound, drift within ± its bound."""
         stream = np.random.SeedSequence(seed, spawn_key=(system_id, CLOCK_STREAM))
         offset, drift = np.random.default_rng(stream).random(2)
         offset_ns = int(offset * clocks.offset_max_s * NS_PER_S)
         return cls(start_ns, offset_ns, round((2.0 * drift - 1.0) * clocks.drift_max_ppm * 1000.0))
 
     def boot_ns(self, host_ns: int) -> int:
-        """What the clock shows at a host time."""
+        """The boot time at a host time."""
         return self.offset_ns + (host_ns - self.start_ns) * (PARTS + self.drift_ppb) // PARTS
 
     def host_ns(self, boot_ns: int) -> int:

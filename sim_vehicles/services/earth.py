@@ -1,4 +1,4 @@
-"""Where the scenario's frame lies on the earth, which is flat around its origin."""
+"""The scenario's frame on the earth, taken as flat around the origin."""
 
 import math
 
@@ -10,7 +10,7 @@ _EAST_PER_RADIAN_M = EARTH_RADIUS_M * math.cos(math.radians(ORIGIN_LATITUDE_DEG)
 
 
 def degrees(north_m: float, east_m: float) -> tuple[float, float]:
-    """Latitude and longitude of a place in the scenario's frame."""
+    """Latitude and longitude of a position in the scenario's frame."""
     return (
         ORIGIN_LATITUDE_DEG + math.degrees(north_m / EARTH_RADIUS_M),
         ORIGIN_LONGITUDE_DEG + math.degrees(east_m / _EAST_PER_RADIAN_M),

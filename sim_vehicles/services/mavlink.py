@@ -1,8 +1,8 @@
 """The vehicles' side of MAVLink 2: datagrams to typed messages, and reports to frames.
 
-Datagrams are cut into frames here, each on its own: pymavlink's stream parser would let a frame cut short swallow the
-next datagram. Its message tables, and its decoder for all but the one frequent message, do the rest. What is refused
-is counted by reason and never raised.
+Each datagram is split into frames on its own: with pymavlink's stream parser a truncated frame would swallow the next
+datagram. Its message tables, and its decoder for all but the frequent messages, do the rest. Refused frames are counted
+by reason, never raised.
 """
 
 import struct
@@ -21,7 +21,7 @@ SIGNED = dialect.MAVLINK_IFLAG_SIGNED
 
 COMPONENT_AUTOPILOT = dialect.MAV_COMP_ID_AUTOPILOT1
 OUR_COMPONENTS = (0, COMPONENT_AUTOPILOT)
-"""That a message to a vehicle is addressed to: all, or the autopilot."""
+"""Target components that mean this vehicle: all, or the autopilot."""
 UINT32 = 0xFFFFFFFF
 TYPE_GCS = dialect.MAV_TYPE_GCS
 MODE_STABILIZE, MODE_GUIDED, MODE_LOITER, MODE_BRAKE = 0, 4, 5, 17
@@ -61,7 +61,7 @@ SETUP_SIGNING = dialect.MAVLINK_MSG_ID_SETUP_SIGNING
 CRC_EXTRA: dict[int, bytes] = {
     number: bytes([known.crc_extra]) for number, known in dialect.mavlink_map.items() if number != SETUP_SIGNING
 }
-"""Of the messages that are taken: no key is, from a link."""
+"""The CRC_EXTRA of accepted messages; SETUP_SIGNING is not one: no key is accepted from a link."""
 _LOCAL_POSITION = dialect.MAVLink_local_position_ned_message
 _SETPOINT = dialect.MAVLink_set_position_target_local_ned_message
 _TIMESYNC = dialect.MAVLink_timesync_message
@@ -91,7 +91,7 @@ class Setpoint(NamedTuple):
 
 
 class Command(NamedTuple):
-    """COMMAND_LONG or COMMAND_INT, with the parameters this vehicle looks at."""
+    """COMMAND_LONG or COMMAND_INT, with the parameters that vehicles use."""
 
     source: tuple[int, int]
     target_system: int
@@ -121,14 +121,14 @@ class Timesync(NamedTuple):
 
 
 Asked = Setpoint | Command | Request
-"""What is addressed to one vehicle and wants something of it."""
+"""A message that asks one vehicle for something."""
 Message = Heartbeat | Timesync | Asked
 
 
 def read_datagram(data: bytes, counters: Counter[str]) -> list[tuple[int, Message]]:
-    """The messages of a datagram that a vehicle may act on, each after the system id of its source.
+    """The messages of a datagram that a vehicle may act on, each with the system id of its source.
 
-    Everything else is counted: `refused_empty`, `refused_mavlink1`, `refused_garbage` (no frame begins where one
+    Everything else is counted: `refused_empty`, `refused_mavlink1`, `refused_garbage` (no frame starts where one
     should), `refused_truncated`, `refused_incompatible` (unknown flags), `refused_unknown` (message id not in the
     dialect), `refused_setup_signing`, `refused_crc`, and `ignored_message` (valid, but nothing for a vehicle).
     """
@@ -159,7 +159,7 @@ def read_datagram(data: bytes, counters: Counter[str]) -> list[tuple[int, Messag
 
 
 def in_version_1(frame: bytes) -> bytes:
-    """A HEARTBEAT of ours as a MAVLink 1 frame."""
+    """Our own HEARTBEAT frame, converted to MAVLink 1."""
     size = dialect.MAVLink_heartbeat_message.unpacker.size
     payload = frame[HEADER_BYTES:-CHECKSUM_BYTES].ljust(size, b"\0")
     body = bytes([size, frame[4], frame[5], frame[6], HEARTBEAT]) + payload
@@ -184,14 +184,14 @@ def _refusal(data: bytes, begin: int, checked: int) -> str:
 
 
 def _append(messages: list[tuple[int, Message]], frame: bytes, checked: int, counters: Counter[str]) -> None:
-    """Decode one frame whose checksum is right; `checked` is where its payload ends."""
+    """Decode one frame with a valid checksum; `checked` is the end of its payload."""
     number = frame[7] | frame[8] << 8 | frame[9] << 16
-    # Most of the traffic is of these two messages: no object of pymavlink's is made for them.
+    # Most traffic is these two messages, so they are decoded without pymavlink's objects.
     if number == SETPOINT:
         values = _values(_SETPOINT.unpacker, frame, checked)
         messages.append((frame[5], Setpoint(values[0], values[4:7], values[7:10], *values[10:])))
     elif number == TIMESYNC:
-        # The target is an extension field that this dialect does not know yet.
+        # The target is an extension field that this dialect does not have yet.
         target = frame[HEADER_BYTES + 16] if checked > HEADER_BYTES + 16 else 0
         tc1, ts1 = _values(_TIMESYNC.unpacker, frame, checked)
         messages.append((frame[5], Timesync(tc1, ts1, target)))
@@ -204,7 +204,7 @@ def _append(messages: list[tuple[int, Message]], frame: bytes, checked: int, cou
 
 
 def _values(packing: struct.Struct, frame: bytes, checked: int) -> tuple[Any, ...]:
-    """A payload's values in wire order; trailing zeros are not sent, and extension fields are left out."""
+    """A payload's values in wire order, with the trailing zeros that are not sent, without extension fields."""
     size = packing.size
     if checked - HEADER_BYTES >= size:
         return packing.unpack_from(frame, HEADER_BYTES)
@@ -229,7 +229,7 @@ def _decode(number: int, frame: bytes) -> Message:
 
 
 class Encoder:
-    """One vehicle's frames, numbered in the order they are made."""
+    """Makes one vehicle's frames, with sequence numbers in the order of the calls."""
 
     def __init__(self, system_id: int) -> None:
         self._pymavlink = dialect.MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_AUTOPILOT)
@@ -260,7 +260,7 @@ class Encoder:
         velocity_down_m_s: float = 0.0,
         heading_deg: float,
     ) -> bytes:
-        """GLOBAL_POSITION_INT; what does not fit a field is cut to its largest value."""
+        """GLOBAL_POSITION_INT, with each value clipped to its field."""
         north, east = velocity_ne_m_s
         return self.pack(
             dialect.MAVLink_global_position_int_message(
@@ -283,7 +283,7 @@ class Encoder:
         system_status: int,
         autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
     ) -> bytes:
-        """HEARTBEAT of a quadrotor, an ArduCopter's if not told otherwise."""
+        """HEARTBEAT of a quadrotor, by default an ArduCopter."""
         return self.pack(
             dialect.MAVLink_heartbeat_message(
                 dialect.MAV_TYPE_QUADROTOR,
@@ -314,7 +314,7 @@ class Encoder:
         return self.pack(dialect.MAVLink_statustext_message(severity, encoded))
 
     def autopilot_version(self, version: tuple[int, int, int], *, parameters_bytewise: bool) -> dialect.MAVLink_message:
-        """AUTOPILOT_VERSION: capabilities, the version as one under development, zeros for what is not there."""
+        """AUTOPILOT_VERSION: capabilities, the version as a development version, and zeros for the rest."""
         major, minor, patch = version
         encoding = _BYTEWISE if parameters_bytewise else _C_CAST
         none: Sequence[int] = (0,) * 8
@@ -343,7 +343,7 @@ class Encoder:
         )
 
     def frame(self, number: int, payload: bytes) -> bytes:
-        """A frequent message, without an object of pymavlink's; `number` is below 256."""
+        """The frame of a frequent message, without pymavlink's objects; `number` is below 256."""
         payload = payload.rstrip(b"\0") or b"\0"
         mav = self._pymavlink
         body = bytes((len(payload), 0, 0, mav.seq, mav.srcSystem, COMPONENT_AUTOPILOT, number, 0, 0)) + payload
@@ -351,19 +351,19 @@ class Encoder:
         return b"\xfd" + body + mcrf4xx(body + CRC_EXTRA[number]).to_bytes(2, "little")
 
     def estimator_flags(self, message_id: int, time_us: int, flags: int) -> bytes:
-        """EKF_STATUS_REPORT or ESTIMATOR_STATUS with these flags, which mean the same in both."""
+        """EKF_STATUS_REPORT or ESTIMATOR_STATUS; the flags mean the same in both."""
         if message_id == EKF_STATUS:
             return self.pack(dialect.MAVLink_ekf_status_report_message(flags, *(0.1,) * 5))
         assert message_id == ESTIMATOR_STATUS
         return self.pack(dialect.MAVLink_estimator_status_message(time_us, flags, *(0.1,) * 8))
 
     def global_origin(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> bytes:
-        """GPS_GLOBAL_ORIGIN: where this vehicle's local frame begins."""
+        """GPS_GLOBAL_ORIGIN: the origin of this vehicle's local frame."""
         degrees = _clipped(latitude_deg * 1e7, 2**31 - 1), _clipped(longitude_deg * 1e7, 2**31 - 1)
         return self.pack(dialect.MAVLink_gps_global_origin_message(*degrees, round(altitude_m * 1e3)))
 
     def pack(self, message: dialect.MAVLink_message) -> bytes:
-        """Any message, from one of pymavlink's."""
+        """The frame of any pymavlink message."""
         frame = message.pack(self._pymavlink)
         self._pymavlink.seq = (self._pymavlink.seq + 1) & 0xFF
         return frame

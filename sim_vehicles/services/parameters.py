@@ -1,4 +1,4 @@
-"""A vehicle's parameters: named numbers that a station lists, reads and sets, kept while the vehicle lives."""
+"""A vehicle's parameters: named numbers that a station lists, reads and sets."""
 
 import math
 import struct
@@ -22,7 +22,7 @@ from sim_vehicles.services.service_messages import (
 )
 
 LIST_INTERVAL_US = 20_000
-"""Between two parameters of a list: 37 bytes each, a third of a radio of 57,600 bit/s."""
+"""Time between two parameters of a list: with 37 bytes each, a third of a 57,600 bit/s radio."""
 LONGEST_NAME = 16
 TIMEOUT_S = (0.1, 120.0)
 
@@ -31,7 +31,7 @@ _FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter: what it is at first, and which values are taken."""
+    """One parameter: its initial value and the values it accepts."""
 
     name: str
     """At most 16 ASCII characters."""
@@ -39,7 +39,7 @@ class Parameter:
     low: float = -math.inf
     high: float = math.inf
     whole: bool = False
-    """Whether it is an INT32; the others are REAL32."""
+    """Whether it is an INT32, else a REAL32."""
 
     def __post_init__(self) -> None:
         assert self.name.isascii(), self.name
@@ -48,10 +48,10 @@ class Parameter:
 
 
 class Parameters:
-    """The parameters of one vehicle and what it answers about them.
+    """The parameters of one vehicle, and its answers about them.
 
-    Values are those of float32, as they travel. `bytewise` says how an INT32 travels in the float of a message: its
-    bytes as they are (PX4), or converted (ArduPilot).
+    Values have the precision of float32, in which they are sent. `bytewise` says how the float field carries an INT32:
+    as its bytes (PX4), or converted to a float (ArduPilot).
     """
 
     def __init__(self, known: Iterable[Parameter], *, bytewise: bool = False) -> None:
@@ -63,7 +63,7 @@ class Parameters:
         }
         self.bytewise = bytewise
         self._listed = len(self._names)
-        """Index of the next one of a list that was asked for."""
+        """Index of the next parameter of a requested list."""
 
     def __getitem__(self, name: str) -> float:
         return self._values[name]
@@ -71,10 +71,10 @@ class Parameters:
     def answer(
         self, message: ParameterList | ParameterRead | ParameterSet, encoder: Encoder, counters: Counter[str]
     ) -> list[bytes]:
-        """Frames to be sent at once. A list is not: it begins, or begins anew, and `next_of_list` gives it.
+        """Frames to be sent at once. A list only starts, or restarts, here; `next_of_list` sends it.
 
-        A set value is answered by the value that then holds: the old one if the new one is not finite, of another
-        type, or out of range, which counts as `refused_parameter_value`. `refused_parameter_name` is unknown.
+        PARAM_SET is answered with the value that then holds: the old one if the new one is not finite, of another type,
+        or out of range, which counts as `refused_parameter_value`. An unknown name counts as `refused_parameter_name`.
         """
         if isinstance(message, ParameterList):
             self._listed = 0
@@ -97,7 +97,7 @@ class Parameters:
 
     @property
     def listing(self) -> bool:
-        """Whether a list that was asked for is not yet sent."""
+        """Whether a requested list is not yet complete."""
         return self._listed < len(self._names)
 
     def next_of_list(self, encoder: Encoder) -> bytes:
@@ -113,7 +113,7 @@ class Parameters:
         return encoder.frame(PARAMETER_VALUE, payload)
 
     def _read(self, message: ParameterSet) -> float:
-        """The value that a message sets, NaN if there is none."""
+        """The value that a message sets; NaN if it is not valid."""
         whole = self._known[message.name].whole
         if self.bytewise and message.kind != (INT32 if whole else REAL32):
             return math.nan
@@ -122,7 +122,7 @@ class Parameters:
 
 
 def of_vehicle(system_id: int, safety: Safety) -> list[Parameter]:
-    """What every vehicle without a copter's autopilot has, by ArduPilot's names."""
+    """The parameters of every double integrator, by ArduPilot's names."""
     return [
         fixed("SYSID_THISMAV", system_id),
         timeout("GUID_TIMEOUT", safety.setpoint_timeout_s),
@@ -131,7 +131,7 @@ def of_vehicle(system_id: int, safety: Safety) -> list[Parameter]:
 
 
 def timeout(name: str, value_s: float) -> Parameter:
-    """How long something may be silent, in s."""
+    """A parameter that says how long a stream may be silent, in s."""
     low, high = TIMEOUT_S
     return Parameter(name, value_s, min(low, value_s), max(high, value_s))
 

@@ -1,7 +1,7 @@
-"""What a vehicle sends by itself and when: on whole milliseconds of its own boot clock.
+"""When a vehicle sends its reports: on whole milliseconds of its own boot clock.
 
-A state sampled on a whole millisecond needs no rounding in time_boot_ms. The instants of a period are its multiples
-since boot, each moved up to the next millisecond, so asking for the same rate again does not move them.
+A state sampled on a whole millisecond needs no rounding in time_boot_ms. Periodic reports fall on multiples of the
+period since boot, rounded up to the next millisecond, so requesting the same rate again does not shift them.
 """
 
 import heapq
@@ -13,15 +13,15 @@ ONCE = 0
 
 
 class Schedule:
-    """The next instants of the vehicle's periodic messages and of those asked for once."""
+    """The next instants of a vehicle's periodic messages, and of those requested once."""
 
     def __init__(self, clock: BootClock) -> None:
         self._clock = clock
         self._queue: list[tuple[int, int, int, int]] = []
-        """(host time, message id, boot time in ms, period's number), earliest first; number is ONCE for a single."""
+        """(host time, message id, boot time in ms, number of the period), earliest first; the number may be ONCE."""
         self._interval_us: dict[int, int] = {}
         self._from_ns: dict[int, int] = {}
-        """When each message began to be periodic."""
+        """When each message became periodic."""
         self.next_ns = NEVER_NS
         """Host time of the next message."""
 
@@ -41,7 +41,7 @@ class Schedule:
         self.next_ns = self._queue[0][0] if self._queue else NEVER_NS
 
     def set_clock(self, clock: BootClock, now_ns: int) -> None:
-        """Go on with a clock that was set: what was to be sent still is, its instants now those of this clock."""
+        """Continue with another clock: everything scheduled is kept, at instants of the new clock."""
         singles = [(message_id, host_ns) for host_ns, message_id, _, number in self._queue if number == ONCE]
         self._clock, self._queue = clock, []
         for message_id, interval_us in self._interval_us.items():
@@ -53,12 +53,12 @@ class Schedule:
         """Send a message at the next whole millisecond, at once if now is one."""
         boot_ms = -(-self._clock.boot_ns(now_ns) // NS_PER_MS)
         entry = (max(now_ns, self._clock.host_ns(boot_ms * NS_PER_MS)), message_id, boot_ms, ONCE)
-        if entry not in self._queue:  # asked for twice within a millisecond is sent once, so the queue stays short
+        if entry not in self._queue:  # two requests within a millisecond are answered once, so the queue stays short
             heapq.heappush(self._queue, entry)
             self.next_ns = self._queue[0][0]
 
     def pop(self) -> tuple[int, int, int]:
-        """(host time, message id, boot time in ms) of the next message, which is then behind."""
+        """Remove and return the next message: (host time, message id, boot time in ms)."""
         host_ns, message_id, boot_ms, number = self._queue[0]
         if number == ONCE:
             heapq.heappop(self._queue)

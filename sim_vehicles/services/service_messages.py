@@ -1,4 +1,4 @@
-"""What other ground stations ask of a vehicle beyond its telemetry, as typed requests, and the messages that answer."""
+"""Requests of ground stations for parameters, missions, files and streams, typed; and the messages that answer them."""
 
 import struct
 from typing import NamedTuple
@@ -40,9 +40,9 @@ SENSORS = (
 )
 POSITION_SENSORS = dialect.MAV_SYS_STATUS_SENSOR_GPS | dialect.MAV_SYS_STATUS_PREARM_CHECK
 GEOFENCE = dialect.MAV_SYS_STATUS_GEOFENCE
-"""A station says "fence breach" when it is missing from the health, also if there is no fence."""
+"""Stations report a fence breach if this bit is missing from the health, even where there is no fence."""
 
-# The value as its four bytes: an integer sent bytewise may look like a NaN, which a float need not carry exactly.
+# The value as four bytes: an integer sent bytewise may look like a NaN, which a float may not preserve.
 _PARAMETER_VALUE = struct.Struct("<4sHH16sB")
 Message = dialect.MAVLink_message
 LARGEST = 2**31 - 1
@@ -72,7 +72,7 @@ class ParameterList(NamedTuple):
 
 
 class ParameterRead(NamedTuple):
-    """PARAM_REQUEST_READ; `number` is the index, BY_NAME if the name counts."""
+    """PARAM_REQUEST_READ; `number` is the index, or BY_NAME."""
 
     target_system: int
     target_component: int
@@ -81,7 +81,7 @@ class ParameterRead(NamedTuple):
 
 
 class ParameterSet(NamedTuple):
-    """PARAM_SET; `value` is its four bytes."""
+    """PARAM_SET, with the value as its four bytes."""
 
     target_system: int
     target_component: int
@@ -143,7 +143,7 @@ Request = ParameterList | ParameterRead | ParameterSet | TextRead | Mission | Fi
 
 
 def request(number: int, source: tuple[int, int], payload: bytes) -> Request:
-    """The typed request of one of REQUESTS; trailing zeros of its payload need not be there."""
+    """The typed request in a payload of one of REQUESTS; trailing zeros may be missing."""
     layout = _LAYOUTS[number]
     values = layout.unpack(payload[: layout.size].ljust(layout.size, b"\0"))
     asked: Request
@@ -178,7 +178,7 @@ def parameter_value(name: str, value: bytes, kind: int, index: int, count: int) 
 
 
 def parameter_error(message: ParameterRead | ParameterSet, error: int) -> Message:
-    """PARAM_ERROR to whoever asked; the frame bears no addressee but all."""
+    """PARAM_ERROR, addressed to all systems."""
     index = message.number if isinstance(message, ParameterRead) else BY_NAME
     return dialect.MAVLink_param_error_message(0, 0, message.name.encode("ascii", "replace")[:16], index, error)
 
@@ -205,12 +205,12 @@ def mission_ack(message: Mission, result: int) -> Message:
 
 
 def file_transfer(message: FileTransfer, payload: bytes) -> Message:
-    """FILE_TRANSFER_PROTOCOL back to who asked."""
+    """FILE_TRANSFER_PROTOCOL, to the system that asked."""
     return dialect.MAVLink_file_transfer_protocol_message(0, *message.source, list(payload.ljust(251, b"\0")))
 
 
 def sys_status(*, has_position: bool) -> Message:
-    """SYS_STATUS of a vehicle whose sensors are well, and whose battery is always full."""
+    """SYS_STATUS of a vehicle with healthy sensors and a battery that is always full."""
     present = SENSORS | POSITION_SENSORS
     health = GEOFENCE | (present if has_position else SENSORS)
     return dialect.MAVLink_sys_status_message(present, present, health, 100, 12_600, -1, 100, *(0,) * 6)
@@ -264,5 +264,5 @@ def vfr_hud(speed_m_s: float, heading_deg: float, altitude_m: float, climb_m_s: 
 
 
 def _name(field: bytes) -> str:
-    """A parameter's name; 16 characters have no zero at their end."""
+    """A parameter's name; one of 16 characters has no terminating zero."""
     return field.partition(b"\0")[0].decode("ascii", "replace")

@@ -1,7 +1,7 @@
-"""What a vehicle answers when a ground station asks for more than its telemetry; the same for every kind of vehicle.
+"""What every kind of vehicle answers when a ground station asks for more than telemetry.
 
-Most ground stations greet a vehicle with a request for AUTOPILOT_VERSION: from then on it also reports, slowly, what
-they take for granted. Our own does not, and is sent nothing that it did not ask for.
+Most ground stations greet a vehicle with a request for AUTOPILOT_VERSION. From then on it also sends, slowly, the
+reports that they expect. Our own station does not greet, and is sent only what it requests.
 """
 
 import math
@@ -34,14 +34,14 @@ from sim_vehicles.services.service_messages import (
 SHORTEST_INTERVAL_US = US_PER_MS
 LONGEST_INTERVAL_US = 2**31
 EXTRA = (SYS_STATUS, EXTENDED_SYS_STATE, GPS_RAW, ATTITUDE, BATTERY_STATUS, VFR_HUD)
-"""What every vehicle can report besides its telemetry."""
+"""The messages that every vehicle can send besides its telemetry."""
 GREETED_US = {
     **dict.fromkeys(EXTRA, 1_000_000),
     mavlink.LOCAL_POSITION: 250_000,
     mavlink.GLOBAL_POSITION: 250_000,
     mavlink.HOME_POSITION: 2_000_000,
 }
-"""What it reports once it has been greeted, unless it does already."""
+"""Intervals of the reports that start when a vehicle is greeted, unless they are already sent."""
 STREAMS: dict[int, tuple[int, ...]] = {
     0: (*EXTRA, mavlink.LOCAL_POSITION, mavlink.GLOBAL_POSITION),
     2: (SYS_STATUS, GPS_RAW),
@@ -53,9 +53,9 @@ STREAMS: dict[int, tuple[int, ...]] = {
 """MAV_DATA_STREAM: the messages of each group, as ArduPilot groups them."""
 
 SCENARIO = "SCENARIO"
-"""The extended parameter, a text, that says which experiment a simulated vehicle belongs to: the fingerprint of its
-scenario, links and seed included, and the scenario's name. It is sent only when asked for, so that stations that know
-nothing of it never see it."""
+"""The extended parameter that says, as text, which experiment a simulated vehicle belongs to: the fingerprint of its
+scenario, links and seed included, and the scenario's name. It is sent only on request, so stations that do not know it
+never see it."""
 LONGEST_TEXT = 128
 KEEP, SHUT_DOWN = 0.0, 2.0
 """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, parameter 1: do nothing, shut down."""
@@ -67,7 +67,7 @@ FTP_FILE_NOT_FOUND, FTP_UNKNOWN_COMMAND = 10, 7
 
 
 class Condition(NamedTuple):
-    """What a vehicle knows of itself at one instant, for GLOBAL_POSITION_INT and the messages of EXTRA."""
+    """A vehicle's state at one instant, for GLOBAL_POSITION_INT and the messages of EXTRA."""
 
     time_boot_ms: int
     place_deg: tuple[float, float]
@@ -86,7 +86,7 @@ def report(message_id: int, encoder: Encoder, condition: Condition) -> bytes:
     north, east, down = condition.velocity_ned_m_s
     speed_m_s, heading_deg = math.hypot(north, east), math.degrees(condition.attitude_rad[2]) % 360.0
     if message_id == mavlink.GLOBAL_POSITION:
-        # Without a position it says zeros, as ArduPilot does.
+        # Without a position it sends zeros, as ArduPilot does.
         latitude_deg, longitude_deg = condition.place_deg if condition.has_position else (0.0, 0.0)
         return encoder.global_position(
             time_boot_ms=condition.time_boot_ms,
@@ -121,8 +121,8 @@ def report(message_id: int, encoder: Encoder, condition: Condition) -> bytes:
 class Services:
     """The parameters and message rates of one vehicle, and its answers about them.
 
-    `defaults_us` are the messages that can be asked for, with the interval each has if nobody asks, 0 for none. No
-    report is sent before `reports_from_ns`. `experiment` is the text of the parameter SCENARIO.
+    `defaults_us` holds the messages that can be requested, each with its default interval, 0 for none. No report is
+    sent before `reports_from_ns`. `experiment` is the text of the parameter SCENARIO.
     """
 
     def __init__(
@@ -137,9 +137,9 @@ class Services:
     ) -> None:
         self.parameters = parameters
         self.orphaned = False
-        """Whether the station that started the simulation has gone: whoever flies the vehicles now may end it."""
+        """Whether the station that started the simulation has gone, so that whoever flies now may end it."""
         self.shut_down_ns: int | None = None
-        """When an orphan was told to shut down."""
+        """When an orphaned vehicle was told to shut down."""
         self._experiment = experiment
         self._encoder = encoder
         self._schedule = schedule
@@ -170,14 +170,14 @@ class Services:
         return frames
 
     def next_parameter(self, time_ns: int) -> bytes:
-        """The next parameter of a list, at the instant the schedule has for it."""
+        """The next parameter of a list, at its scheduled instant."""
         frame = self.parameters.next_of_list(self._encoder)
         if not self.parameters.listing:
             self._set(PARAMETER_VALUE, 0, time_ns)
         return frame
 
     def command(self, command: Command, time_ns: int) -> tuple[int, list[service_messages.Message]]:
-        """The MAV_RESULT of a command about messages, and what is sent after it; a report comes in its turn."""
+        """The MAV_RESULT of a command about messages, and what is sent right after it; reports are scheduled."""
         number, message_id, second = command.command, whole(command.param1), whole(command.param2)
         wants_message = number == mavlink.COMMAND_REQUEST
         if number == mavlink.COMMAND_INTERVAL:
@@ -223,7 +223,7 @@ class Services:
         return ACCEPTED
 
     def _greet(self, time_ns: int) -> tuple[int, list[service_messages.Message]]:
-        """AUTOPILOT_VERSION, and the beginning of what whoever asks for it takes for granted."""
+        """Send AUTOPILOT_VERSION, and start the reports that a station which asks for it expects."""
         for message_id, interval_us in GREETED_US.items():
             if not self._schedule.interval_us(message_id):
                 self._set(message_id, interval_us, time_ns)
@@ -242,12 +242,12 @@ class Services:
 
 
 def whole(parameter: float) -> int | None:
-    """A command's parameter that has to be a whole number, or None."""
+    """A command's parameter as a whole number, or None if it is not one."""
     return int(parameter) if math.isfinite(parameter) and parameter == int(parameter) else None
 
 
 def _mission_answer(request: Mission) -> service_messages.Message:
-    """Every list is empty, can be cleared, and takes nothing."""
+    """The answer of a vehicle whose lists are empty, can be cleared, and accept no items."""
     if request.asked == service_messages.MISSION_LIST:
         return service_messages.mission_count(request)
     if request.asked == service_messages.MISSION_CLEAR:
@@ -260,7 +260,7 @@ def _mission_answer(request: Mission) -> service_messages.Message:
 
 
 def _file_answer(request: FileTransfer) -> service_messages.Message:
-    """There are no files: opening one fails, sessions can be ended, and nothing else is known."""
+    """The answer of a vehicle without files: opening one fails, ending a session works, the rest is unknown."""
     number = int.from_bytes(request.payload[:2], "little") + 1
     session, asked = request.payload[2:4]
     if asked in (FTP_TERMINATE, FTP_RESET):

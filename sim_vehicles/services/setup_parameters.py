@@ -1,6 +1,6 @@
-"""Parameters by which ground stations judge whether a vehicle was set up. Nothing here obeys them.
+"""Parameters that show ground stations a vehicle which was set up. They have no effect.
 
-QGroundControl warns of a vehicle without them: it looks for a frame, calibrated sensors, a mapped radio and a battery.
+Without them QGroundControl warns: it looks for a frame, calibrated sensors, a mapped radio and a battery.
 """
 
 from sim_vehicles.services.parameters import Parameter
@@ -37,12 +37,12 @@ _PX4: dict[str, float] = {
 
 
 def of_ardupilot() -> list[Parameter]:
-    """Those of ArduCopter."""
+    """The parameters of ArduCopter."""
     return _parameters(_ARDUPILOT)
 
 
 def of_px4() -> list[Parameter]:
-    """Those of PX4."""
+    """The parameters of PX4."""
     return _parameters(_PX4)
 
 

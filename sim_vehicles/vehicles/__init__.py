@@ -1,1 +1,4 @@
-"""Simulated vehicles: one MAVLink shell, and the crafts in it (double integrator, multicopter, own loop)."""
+"""Simulated vehicles: one MAVLink shell, and the crafts it carries: double integrators and multicopters.
+
+A double integrator may have a loop on board; a multicopter behaves like ArduCopter or PX4.
+"""

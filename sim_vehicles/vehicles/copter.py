@@ -1,7 +1,7 @@
-"""A simulated multicopter with an autopilot of its own: what ArduCopter or PX4 looks like from outside.
+"""A simulated multicopter that behaves like ArduCopter or PX4 as seen from outside.
 
-It boots, sends heartbeats, then telemetry, then has a position; it may be armed, takes off to an altitude, follows
-velocity and acceleration set-points with a lag, and lands. The fleet takes it in place of `vehicle.Vehicle` when the
+It boots, sends heartbeats, then telemetry, then gets a position. It can be armed, takes off to an altitude, follows
+velocity and acceleration set-points with a lag, and lands. The fleet flies it in place of a double integrator if the
 scenario's dynamics are `autopilot`.
 """
 
@@ -36,7 +36,7 @@ ORIGIN_STREAM = 7
 """Last word of the spawn key of the random stream of a vehicle's local origin."""
 TAKEN_OFF_M = 0.3
 HOME_M = 0.5
-"""Nearer to home than this, it lands."""
+"""Distance to home at which a return becomes a landing."""
 SINK_FAST_M_S, SINK_M_S, SINK_SLOWLY_BELOW_M = 1.5, 0.7, 5.0
 _ACCEPTED: Answer = mavlink.ACCEPTED, ""
 
@@ -59,7 +59,7 @@ def multicopter(
 
 
 class Copter:
-    """A multicopter with its autopilot: the craft in a shell."""
+    """The craft in the shell: motion, and the autopilot's modes."""
 
     def __init__(self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio) -> None:
         start_ns = radio.start_ns
@@ -78,7 +78,7 @@ class Copter:
         spread = (2.0 * np.random.default_rng(stream).random(3) - 1.0) * self.settings.origin_spread_m
         north_m, east_m, up_m = spread.tolist()
         self.origin_neu_m: tuple[float, float, float] = (north_m, east_m, up_m)
-        """Where its local frame begins, in the frame of the scenario."""
+        """Origin of its local frame, in the scenario's frame."""
         self._radio = radio
         self._target = Target()
         self._takeoff_m: float | None = None
@@ -93,7 +93,7 @@ class Copter:
         )
 
     def state_at(self, time_ns: int) -> State:
-        """The true state in the scenario's frame at a time not before the last event, if nothing arrives until then."""
+        """The true state in the scenario's frame at a time after the last event, if nothing arrives until then."""
         motion = self.motion
         if not self.landed and time_ns > self._motion_ns:
             motion, _ = advance(motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
@@ -103,7 +103,7 @@ class Copter:
 
     @property
     def deadline_ns(self) -> int:
-        """The next instant at which something happens that is not a report."""
+        """The next instant at which an event happens that is not a report."""
         deadline_ns = self._jumps[0][0] if self._jumps else NEVER_NS
         if self._setpoint_ns is not None and not self.landed and self.mode == self.rules.guided_mode:
             deadline_ns = min(deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)
@@ -112,7 +112,7 @@ class Copter:
         return deadline_ns
 
     def happen(self, time_ns: int) -> None:
-        """A clock that jumps, a vehicle that is armed and does not take off, or set-points that stop."""
+        """Run the event at the deadline: a clock jump, a disarming on the ground, or set-points that stop."""
         self._advance(time_ns)
         if self._jumps and time_ns == self._jumps[0][0]:
             _, by_ns = self._jumps.popleft()
@@ -126,7 +126,7 @@ class Copter:
             self._lose_setpoints(time_ns)
 
     def _lose_setpoints(self, time_ns: int) -> None:
-        """ArduCopter stays guided and stops; PX4 leaves offboard and holds."""
+        """Stop: ArduCopter stays in guided mode, PX4 leaves offboard and holds."""
         self._setpoint_ns = None
         self._target = self._stopped()
         if self.rules.guided_mode != self.rules.takeoff_mode:
@@ -137,37 +137,37 @@ class Copter:
     # What arrives
 
     def acts_at(self, time_ns: int) -> int:
-        """Nothing acts before what has acted already."""
+        """The instant at which a message that arrives now acts: never before one that has already acted."""
         self._advance(time_ns)
         return self._motion_ns
 
     def hear_heartbeat(self, time_ns: int) -> None:
-        """Whether its station is there changes nothing here."""
+        """Heartbeats of a station have no effect."""
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
-        """Fly a set-point from now on, if it is guided and off the ground."""
+        """Fly a set-point from now on, if in guided mode and off the ground."""
         gain = self.settings.velocity_gain_1_s
         reason, target = setpoint_target(setpoint, self.rules, yaw_rad=self.motion.yaw_rad, velocity_gain_1_s=gain)
         guided = self.mode == self.rules.guided_mode
         if reason:
             if guided and self.rules.velocity_grows and not self.landed:
-                self._takeoff_m, self._target = None, self._stopped()  # ArduCopter's answer to what it does not take
+                self._takeoff_m, self._target = None, self._stopped()  # ArduCopter stops at a set-point that it refuses
             return reason
-        self._setpoint_ns = time_ns  # PX4 also counts those that come before offboard: they let it enter
+        self._setpoint_ns = time_ns  # PX4 also counts those before offboard: they allow it to enter that mode
         if not guided or not self.armed:
             return "ignored_not_guided" if not guided else "ignored_not_armed"
         if not self.landed:
-            self._takeoff_m = None  # a set-point ends a guided take-off where it is
+            self._takeoff_m = None  # a set-point ends a guided take-off at the present altitude
             self._target = target
             self._radio.acted(setpoint, time_ns)
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
-        """Take time-outs as the parameters now are."""
+        """Read the time-outs from the parameters."""
         before = self._setpoint_timeout_ns, self._ground_disarm_ns
         self._read_timeouts()
         if (self._setpoint_timeout_ns, self._ground_disarm_ns) != before:
-            self._armed_ns = time_ns  # timers begin anew, so that none ends in the past
+            self._armed_ns = time_ns  # restart the timers, so that none ends in the past
             self._setpoint_ns = None if self._setpoint_ns is None else time_ns
 
     def _read_timeouts(self) -> None:
@@ -177,7 +177,7 @@ class Copter:
     # Commands
 
     def command(self, command: mavlink.Command, time_ns: int) -> Answer | None:
-        """Answer a command about arming, modes, take-off and landing."""
+        """Answer a command about arming, modes, take-off and landing; None if it is about something else."""
         match command.command:
             case mavlink.COMMAND_ARM:
                 return self._arm(command, time_ns)
@@ -215,7 +215,7 @@ class Copter:
         return _ACCEPTED
 
     def change_mode(self, mode: int | None, time_ns: int) -> Answer:
-        """Change the mode on command, if there is such a mode."""
+        """Change the mode on command, if the autopilot has it."""
         if mode is None or mode not in self.rules.modes:
             return mavlink.DENIED, ""
         if mode == self.mode:
@@ -228,12 +228,12 @@ class Copter:
         self.mode, self.failsafe, self._takeoff_m = mode, False, None
         self._target = self._stopped()
         if mode == self.rules.guided_mode == self.rules.takeoff_mode:
-            self._setpoint_ns = time_ns  # the time-out begins with the mode
+            self._setpoint_ns = time_ns  # the time-out starts with the mode
         self._radio.tell(time_ns, self.rules.modes[mode])
         return _ACCEPTED
 
     def _take_off(self, command: mavlink.Command, time_ns: int) -> int:
-        """ArduCopter wants the altitude above home, armed and guided; PX4 the one above sea level, in any mode."""
+        """Take off: ArduCopter when armed and guided, to an altitude above home; PX4 in any mode, above sea level."""
         own_mode = self.rules.takeoff_mode == self.rules.guided_mode
         altitude_m = command.param7 - (0.0 if own_mode else ORIGIN_ALTITUDE_M)
         if not own_mode and math.isnan(altitude_m):
@@ -241,7 +241,7 @@ class Copter:
         if own_mode and not (self.armed and self.mode == self.rules.guided_mode):
             return FAILED
         if not own_mode and math.isfinite(command.param5 + command.param6):
-            return mavlink.DENIED  # it would take off towards that latitude and longitude, which is not simulated
+            return mavlink.DENIED  # a take-off towards a latitude and longitude is not simulated
         if not (self.landed and self._ready(time_ns) and 0.0 < altitude_m < ABSURD):
             return FAILED if own_mode else TEMPORARILY_REJECTED
         self.mode, self._takeoff_m = self.rules.takeoff_mode, altitude_m
@@ -252,7 +252,7 @@ class Copter:
     # What it sends
 
     def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None:
-        """The frame of one of its messages; before it has a position it cannot say where it is."""
+        """The frame of one of its messages; None for a position that it does not have yet."""
         state = self.mode, self.armed, self.landed, self.failsafe, self.home_ne_m
         facts = Facts(self.motion, self.origin_neu_m, *state, self._ready(time_ns))
         return report(message_id, self._radio.encoder, self.rules, facts, boot_ms & mavlink.UINT32)
@@ -260,7 +260,7 @@ class Copter:
     # Motion
 
     def _stopped(self) -> Target:
-        """What it does in a mode by itself: nothing, sink, or fly home."""
+        """The target of a mode without set-points: stop, sink, or fly home."""
         gain, place = self.settings.velocity_gain_1_s, self.home_ne_m if self.mode == self.rules.return_mode else None
         climb_m_s = -SINK_FAST_M_S if self.mode == self.rules.land_mode else 0.0
         return Target(velocity_gain_1_s=gain, climb_m_s=climb_m_s, place_ne_m=place)

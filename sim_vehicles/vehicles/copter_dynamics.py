@@ -1,9 +1,9 @@
-"""How a multicopter under its autopilot moves: an acceleration that follows the wanted one with a lag, and limits.
+"""How a multicopter moves: its acceleration follows the commanded one with a lag, within limits.
 
-    w = a_set + g (v_set - v),  |w| cut to the limit;   lag a' = w - a,   v' = a,   p' = v
+    w = a_set + g (v_set - v),  |w| clipped to the limit;   lag a' = w - a,   v' = a,   p' = v
 
-north and east, g = 0 if no velocity is set. v_set grows with a_set between two set-points where the autopilot does so.
-The climb rate follows the wanted one with a lag of its own. Integrated by RK4 in steps of at most 10 ms.
+for north and east; g = 0 if no velocity is set. Between set-points v_set integrates a_set if the autopilot does so. The
+climb rate follows its command with a lag of its own. RK4 integrates in steps of at most 10 ms.
 """
 
 import math
@@ -14,14 +14,14 @@ from scenarios import schema
 LONGEST_STEP_S = 0.01
 CLIMB_LAG_S = 0.3
 CLIMB_GAIN_1_S = 0.8
-"""A take-off slows down towards its altitude with this."""
+"""Gain by which a take-off slows down towards its altitude."""
 PLACE_GAIN_1_S = 0.3
-"""A flight to a place slows down towards it with this."""
+"""Gain by which a flight to a place slows down towards it."""
 YAW_RATE_MAX_RAD_S = 1.5
 
 
 class Motion(NamedTuple):
-    """Where the vehicle is and how it moves; altitude above the ground it started from."""
+    """Position, velocity and acceleration; the altitude is above the initial ground."""
 
     north_m: float
     east_m: float
@@ -35,7 +35,7 @@ class Motion(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What the autopilot tries to do. The velocity target grows by `growth` times the acceleration."""
+    """What the autopilot tries to reach. The velocity target integrates `growth` times the acceleration."""
 
     acceleration_north_m_s2: float = 0.0
     acceleration_east_m_s2: float = 0.0
@@ -45,16 +45,16 @@ class Target(NamedTuple):
     growth: float = 0.0
     climb_m_s: float = 0.0
     altitude_m: float | None = None
-    """Climb or sink to this altitude, at most with `climb_m_s`."""
+    """Climb or sink to this altitude."""
     yaw_rad: float | None = None
     yaw_rate_rad_s: float = 0.0
-    """Turn to this yaw, or if there is none with this rate."""
+    """Turn to `yaw_rad`; without one, turn at this rate."""
     place_ne_m: tuple[float, float] | None = None
-    """Fly to this place; then the velocity is found from the way that is left."""
+    """Fly to this place, with a velocity that follows from the distance left."""
 
 
 def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s: float) -> tuple[Motion, Target]:
-    """The motion `duration_s` later, and the target with the velocity it has grown to."""
+    """The motion after `duration_s`, and the target with its velocity by then."""
     steps = max(1, math.ceil(duration_s / LONGEST_STEP_S))
     h = duration_s / steps
     for _ in range(steps):
@@ -111,7 +111,7 @@ def _jerk(
 
 
 def _climbed(altitude: float, climb: float, target: Target, limits: schema.Autopilot, h: float) -> tuple[float, float]:
-    """Altitude and climb rate a step later: exact for the wanted climb rate at the beginning of the step."""
+    """Altitude and climb rate a step later: exact for the climb rate commanded at the start of the step."""
     wanted = target.climb_m_s
     if target.altitude_m is not None:
         wanted = CLIMB_GAIN_1_S * (target.altitude_m - altitude)
@@ -121,14 +121,14 @@ def _climbed(altitude: float, climb: float, target: Target, limits: schema.Autop
 
 
 def _towards(motion: Motion, target: Target, place_ne_m: tuple[float, float], speed_max_m_s: float) -> Target:
-    """The target with the velocity of a vehicle on its way to a place."""
+    """The target with the velocity towards a place."""
     north, east = place_ne_m[0] - motion.north_m, place_ne_m[1] - motion.east_m
     gain = min(PLACE_GAIN_1_S, speed_max_m_s / max(math.hypot(north, east), 1e-9))
     return target._replace(velocity_north_m_s=gain * north, velocity_east_m_s=gain * east)
 
 
 def _turned(yaw_rad: float, target: Target, h: float) -> float:
-    """The yaw a step later, from -pi to pi, turned the shorter way."""
+    """The yaw a step later, from -pi to pi, turning the shorter way."""
     turn = target.yaw_rate_rad_s * h
     if target.yaw_rad is not None:
         turn = math.remainder(target.yaw_rad - yaw_rad, math.tau)

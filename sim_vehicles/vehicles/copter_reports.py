@@ -1,4 +1,4 @@
-"""What a simulated multicopter says of itself: its state to frames."""
+"""The reports of a simulated multicopter: from its state to frames."""
 
 import math
 from typing import NamedTuple
@@ -9,11 +9,11 @@ from sim_vehicles.vehicles.copter_dynamics import Motion
 from sim_vehicles.vehicles.copter_rules import Rules
 
 READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
-"""Estimator flags with all that is wanted; and attitude only, constant position mode, uninitialised."""
+"""Estimator flags when all is well; and with attitude only, constant position mode, uninitialised."""
 
 
 class Facts(NamedTuple):
-    """What the reports say, at one instant. `origin_neu_m` is where its local frame begins, in the scenario's frame."""
+    """What the reports say at one instant. `origin_neu_m` is the origin of the local frame in the scenario's frame."""
 
     motion: Motion
     origin_neu_m: tuple[float, float, float]
@@ -22,13 +22,13 @@ class Facts(NamedTuple):
     landed: bool
     failsafe: bool
     home_ne_m: tuple[float, float]
-    """Where it stood on the ground first, in the scenario's frame."""
+    """Its initial position on the ground, in the scenario's frame."""
     ready: bool
-    """It has a position. Without one it sends a global position of zeros and no local one, as ArduPilot does."""
+    """Whether it has a position. Without one its global position is zeros and no local one is sent, as in ArduPilot."""
 
 
 def reported(rules: Rules) -> tuple[int, ...]:
-    """The messages that it sends if asked for them, besides those of every vehicle."""
+    """The messages that it sends on request, besides those of every vehicle."""
     return (
         mavlink.LOCAL_POSITION,
         mavlink.GLOBAL_POSITION,
@@ -39,7 +39,7 @@ def reported(rules: Rules) -> tuple[int, ...]:
 
 
 def report(message_id: int, encoder: mavlink.Encoder, rules: Rules, facts: Facts, boot_ms: int) -> bytes | None:
-    """The frame of one of the messages, None if there is nothing to say yet."""
+    """The frame of one of its messages; None if there is nothing to send yet."""
     motion, (origin_north_m, origin_east_m, origin_up_m) = facts.motion, facts.origin_neu_m
     frame: bytes | None = None
     if message_id == mavlink.HEARTBEAT:
@@ -72,7 +72,7 @@ def _status(facts: Facts) -> int:
 
 
 def _condition(facts: Facts, boot_ms: int) -> services.Condition:
-    """What it reports to other stations: it leans into its acceleration."""
+    """What it reports to other ground stations; it leans into its acceleration."""
     motion = facts.motion
     cosine, sine = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
     north, east = motion.acceleration_north_m_s2 / GRAVITY_M_S2, motion.acceleration_east_m_s2 / GRAVITY_M_S2

@@ -1,6 +1,6 @@
-"""What two autopilots do with modes, arming, take-off and set-points: their rules, as data and pure functions.
+"""How ArduCopter and PX4 treat modes, arming, take-off and set-points, as data and pure functions.
 
-Read in ArduCopter's mode_guided.cpp and GCS_MAVLink_Copter.cpp, and in PX4's mavlink_receiver.cpp, Commander.cpp and
+From the sources: ArduCopter's mode_guided.cpp and GCS_MAVLink_Copter.cpp; PX4's mavlink_receiver.cpp, Commander.cpp and
 offboardCheck.cpp.
 """
 
@@ -26,9 +26,9 @@ from sim_vehicles.vehicles.setpoints import (
 
 TEMPORARILY_REJECTED, FAILED = 1, 4
 PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
-"""Parameter: the altitude above the ground, in m, of a take-off whose command names none."""
+"""The parameter with the altitude above the ground, in m, for a take-off command that names none."""
 GROUND_DISARM_S = 10.0
-"""Armed and not taken off for this long, both disarm again."""
+"""Both disarm if they have not taken off this long after arming."""
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
@@ -46,24 +46,24 @@ class Rules:
     first_mode: int
     guided_mode: int
     takeoff_mode: int
-    """In which a take-off is flown; a take-off command changes to it unless it is the guided mode."""
+    """The mode in which a take-off is flown; a take-off command enters it unless it is the guided mode."""
     hold_mode: int
     land_mode: int
     return_mode: int
     estimator_message: int
-    """Reports the estimator's flags: EKF_STATUS_REPORT, ESTIMATOR_STATUS."""
+    """The message with the estimator's flags: EKF_STATUS_REPORT or ESTIMATOR_STATUS."""
     arming_refused: int
-    """MAV_RESULT of what is refused because it is not ready."""
+    """The MAV_RESULT of a command that is refused because the vehicle is not ready."""
     parameters_bytewise: bool
-    """How it sends integers as parameters."""
+    """Whether it sends integer parameters as their bytes."""
     version: tuple[int, int, int]
-    """What AUTOPILOT_VERSION says; stations warn of what they hold to be older than their oldest."""
+    """The version in AUTOPILOT_VERSION; stations warn of versions older than they support."""
     system_id_parameter: str
     setpoint_timeout_parameter: str
     ground_disarm_parameter: str
     setpoint_timeout_s: float
     velocity_grows: bool
-    """Whether the velocity target grows with the acceleration between two set-points."""
+    """Whether the velocity target integrates the acceleration between two set-points."""
     version_1_first: bool
     """Whether it speaks MAVLink 1 until it hears MAVLink 2 (MAV_PROTO_VER 0)."""
 
@@ -119,7 +119,7 @@ RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
 
 
 def parameters(rules: Rules, system_id: int) -> Parameters:
-    """What a multicopter of this autopilot has."""
+    """The parameters of a multicopter with this autopilot."""
     known = [
         fixed(rules.system_id_parameter, system_id),
         timeout(rules.setpoint_timeout_parameter, rules.setpoint_timeout_s),
@@ -135,7 +135,7 @@ def parameters(rules: Rules, system_id: int) -> Parameters:
 def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]:
     """What a set-point asks for: (why it is not flown or "", velocity counts, acceleration counts).
 
-    One ignored axis drops all three of its kind. What ArduCopter does not take makes it stop; PX4 ignores it.
+    One ignored axis drops all three of its vector. A refused set-point makes ArduCopter stop; PX4 ignores it.
     """
     mask = setpoint.type_mask
     velocity, acceleration = not mask & VELOCITY_AXES, not mask & ACCELERATION_AXES
@@ -151,9 +151,9 @@ def setpoint_meaning(setpoint: Setpoint, rules: Rules) -> tuple[str, bool, bool]
 def setpoint_target(
     setpoint: Setpoint, rules: Rules, *, yaw_rad: float, velocity_gain_1_s: float
 ) -> tuple[str, Target]:
-    """Why a set-point is not flown, or "", and what it makes a vehicle with that yaw try.
+    """Why a set-point is not flown, or "", and the target that it sets for a vehicle with this yaw.
 
-    Fields that are ignored may hold anything, also NaN, as some clients send.
+    Ignored fields may hold anything, even NaN, which some clients send.
     """
     reason, velocity_counts, acceleration_counts = setpoint_meaning(setpoint, rules)
     setpoint = to_local(setpoint, yaw_rad)
@@ -175,7 +175,7 @@ def setpoint_target(
 
 
 def commanded_mode(command: Command, rules: Rules) -> int | None:
-    """The custom mode that a DO_SET_MODE asks for, None if there is none such."""
+    """The custom mode that a DO_SET_MODE asks for; None if the autopilot does not have it."""
     if not math.isfinite(command.param1 + command.param2 + command.param3):
         return None
     base, main, sub = int(command.param1), int(command.param2), int(command.param3)

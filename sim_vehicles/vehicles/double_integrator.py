@@ -1,7 +1,7 @@
-"""One simulated UAV without an autopilot of another make: a double integrator that is launched.
+"""The double integrator: a UAV that flies the commanded acceleration at once, and speaks ArduCopter's modes.
 
-It starts on the launcher: held at its initial state, and reporting the initial position and velocity, until it has
-been armed, is in GUIDED and the first set-point is accepted; from that instant on it flies.
+It starts on the launcher, which holds it at its initial state while it reports its initial position and velocity. It
+flies from the instant at which, armed and in GUIDED, it accepts a take-off command or its first set-point.
 """
 
 import math
@@ -21,7 +21,6 @@ from sim_vehicles.services.earth import (
 from sim_vehicles.services.parameters import Parameters, of_vehicle
 from sim_vehicles.services.services import Condition, report, whole
 from sim_vehicles.services.setup_parameters import of_ardupilot
-from sim_vehicles.vehicles.autopilot import MODE_NAMES, Autopilot
 from sim_vehicles.vehicles.dynamics import (
     COAST,
     VELOCITY_GAIN_1_S,
@@ -32,12 +31,13 @@ from sim_vehicles.vehicles.dynamics import (
     rates,
     state_from,
 )
+from sim_vehicles.vehicles.flight_mode import MODE_NAMES, FlightMode
 from sim_vehicles.vehicles.onboard import STEP, OnboardLoop, formation_parameters
 from sim_vehicles.vehicles.setpoints import ACCELERATION, AXES, VELOCITY, VELOCITY_ACCELERATION, fault, to_local
 from sim_vehicles.vehicles.shell import Answer, Radio, Shell
 
 CANNOT_LAND: Answer = mavlink.DENIED, "cannot land or return, LOITER holds the course"
-"""Said in words as well: a person who asks for this may not see the result."""
+"""Also sent as STATUSTEXT: a person who asks for this may not see the result code."""
 
 
 def launched(
@@ -48,28 +48,28 @@ def launched(
     record: Record | None = None,
     onboard: OnboardLoop | None = None,
     experiment: str = "",
-) -> "Shell[Vehicle]":
-    """A vehicle on its launcher; with `onboard` it has a loop of its own."""
+) -> "Shell[DoubleIntegrator]":
+    """A double integrator on its launcher; `onboard` is its own loop, if it has one."""
     radio = Radio(scenario, own, start_ns, record)
-    return Shell(scenario, radio, Vehicle(scenario, own, radio, onboard), experiment=experiment)
+    return Shell(scenario, radio, DoubleIntegrator(scenario, own, radio, onboard), experiment=experiment)
 
 
-class Vehicle:
-    """What flies, with its autopilot: the craft in a shell."""
+class DoubleIntegrator:
+    """The craft in the shell: motion, modes, and the loop on board."""
 
     version: tuple[int, int, int] = (4, 6, 0)
-    """Of the ArduCopter whose messages and modes it has."""
+    """Of the ArduCopter whose messages and modes it speaks."""
     intervals_us: Mapping[int, int] = {
         mavlink.LOCAL_POSITION: 250_000,
         mavlink.GLOBAL_POSITION: 1_000_000,
         mavlink.HOME_POSITION: 0,
     }
-    """Sent unasked, slowly, as an autopilot does on a telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes it."""
+    """Slow defaults, as on an autopilot's telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes them."""
 
     def __init__(
         self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio, onboard: OnboardLoop | None
     ) -> None:
-        self.autopilot = Autopilot(scenario.safety)
+        self.flight = FlightMode(scenario.safety)
         formation = [] if onboard is None else formation_parameters()
         self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot(), *formation])
         self.reports_from_ns = radio.start_ns
@@ -85,36 +85,36 @@ class Vehicle:
 
     @property
     def deadline_ns(self) -> int:
-        """When the failsafe begins unless something is heard before."""
-        return self.autopilot.deadline_ns
+        """When the failsafe begins unless a station is heard before."""
+        return self.flight.deadline_ns
 
     def state_at(self, time_ns: int) -> State:
-        """The true state at a time not before the last event, if nothing arrives until then."""
-        if not self.autopilot.flying or time_ns <= self._state_ns:
+        """The true state at a time after the last event, if nothing arrives until then."""
+        if not self.flight.flying or time_ns <= self._state_ns:
             return self._state
         return advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
 
     def acts_at(self, time_ns: int) -> int:
-        """Nothing acts before what has acted already; the state is brought up to date when it is needed."""
+        """The instant at which a message that arrives now acts: never before one that has already acted."""
         return max(time_ns, self._state_ns)
 
     def hear_heartbeat(self, time_ns: int) -> None:
         """A station's heartbeat arrived."""
-        self.autopilot.hear_heartbeat(max(time_ns, self._state_ns))
+        self.flight.hear_heartbeat(max(time_ns, self._state_ns))
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
-        """Fly a set-point from now on if it can be, the first one as the start of the flight."""
-        on_launcher = not self.autopilot.flying
+        """Fly a set-point from now on, if it is valid and allowed; the first one begins the flight."""
+        on_launcher = not self.flight.flying
         counts = setpoint.type_mask & AXES
         onboard = self._onboard if self._onboard is not None and self._onboard.on else None
         reason = fault(setpoint)
         if onboard is not None and counts != VELOCITY_ACCELERATION:
-            reason = reason or "refused_mask"  # its own loop wants to know the formation's velocity
-        reason = reason or self.autopilot.accept_setpoint(time_ns)
+            reason = reason or "refused_mask"  # the loop on board needs the formation's velocity
+        reason = reason or self.flight.accept_setpoint(time_ns)
         if reason:
             return reason
         if on_launcher:
-            self._state_ns = time_ns  # its state is the initial one until now
+            self._state_ns = time_ns  # the launcher has held it until now
             self._radio.tell(time_ns, "flying")
         self._advance(time_ns)
         if setpoint.frame != mavlink.FRAME_LOCAL_NED:
@@ -133,16 +133,16 @@ class Vehicle:
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
-        """Take time-outs and the loop's gains as the parameters now are."""
+        """Read the time-outs and the loop's gains from the parameters."""
         timeouts_s = self.parameters["GUID_TIMEOUT"], self.parameters["FS_GCS_TIMEOUT"]
-        self.autopilot.set_timeouts(*timeouts_s, time_ns)
+        self.flight.set_timeouts(*timeouts_s, time_ns)
         if self._onboard is not None:
             self._onboard.set(self.parameters)
 
     # Commands
 
     def command(self, command: mavlink.Command, time_ns: int) -> Answer | None:
-        """Answer a command about arming, modes and the ways to begin and to end a flight."""
+        """Answer a command about arming, modes, take-off and landing; None if it is about something else."""
         match command.command:
             case mavlink.COMMAND_ARM:
                 return self._arm(command, time_ns), ""
@@ -159,15 +159,15 @@ class Vehicle:
     def _arm(self, command: mavlink.Command, time_ns: int) -> int:
         if command.param1 not in (0.0, 1.0):
             return mavlink.DENIED
-        was = self.autopilot.armed
-        result = self.autopilot.arm(command.param1 == 1.0)
-        if self.autopilot.armed != was:
-            self._radio.tell(time_ns, "armed" if self.autopilot.armed else "disarmed")
+        was = self.flight.armed
+        result = self.flight.arm(command.param1 == 1.0)
+        if self.flight.armed != was:
+            self._radio.tell(time_ns, "armed" if self.flight.armed else "disarmed")
         return result
 
     def _take_off(self, time_ns: int) -> int:
-        """Leave the launcher, at the altitude and with the velocity that it has there, whatever altitude is wanted."""
-        result = self.autopilot.take_off(time_ns)
+        """Leave the launcher at its altitude and velocity there, whatever altitude the command asks for."""
+        result = self.flight.take_off(time_ns)
         if result == mavlink.ACCEPTED:
             self._state_ns = time_ns
             self._radio.tell(time_ns, "flying")
@@ -179,9 +179,9 @@ class Vehicle:
             return mavlink.DENIED, ""
         if mode in (mavlink.MODE_LAND, mavlink.MODE_RETURN):
             return CANNOT_LAND
-        before = (self.autopilot.mode, self.autopilot.failsafe)
-        result = self.autopilot.set_mode(mode, time_ns)
-        if (self.autopilot.mode, self.autopilot.failsafe) != before:
+        before = (self.flight.mode, self.flight.failsafe)
+        result = self.flight.set_mode(mode, time_ns)
+        if (self.flight.mode, self.flight.failsafe) != before:
             self._advance(time_ns)
             self._command = self._alone()
             self._radio.tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
@@ -192,14 +192,14 @@ class Vehicle:
     def happen(self, time_ns: int) -> None:
         """Enter the failsafe."""
         self._advance(time_ns)
-        self.autopilot.fail()
+        self.flight.fail()
         self._command = self._alone()
-        text = f"failsafe: {self.autopilot.failsafe} stopped"
+        text = f"failsafe: {self.flight.failsafe} stopped"
         self._radio.tell(time_ns, text)
         self._radio.say(time_ns, text)
 
     def _alone(self) -> Command:
-        """What it does without set-points: its own loop, if it has one and is not told to hold, or fly straight on."""
+        """The command without set-points: that of the loop on board, if it may fly, else straight on."""
         onboard = self._onboard
         if onboard is None:
             return COAST
@@ -207,8 +207,8 @@ class Vehicle:
         return onboard.command() if self._own_loop_flies(onboard) else COAST
 
     def _own_loop_flies(self, onboard: OnboardLoop) -> bool:
-        autopilot = self.autopilot
-        return onboard.on and autopilot.flying and (autopilot.mode == mavlink.MODE_GUIDED or autopilot.failsafe != "")
+        flight = self.flight
+        return onboard.on and flight.flying and (flight.mode == mavlink.MODE_GUIDED or flight.failsafe != "")
 
     def _step_onboard(self, time_ns: int, boot_ms: int) -> None:
         onboard = self._onboard
@@ -227,8 +227,8 @@ class Vehicle:
         boot_ms &= mavlink.UINT32
         encoder = self._radio.encoder
         if message_id == mavlink.HEARTBEAT:
-            autopilot = self.autopilot
-            return encoder.heartbeat(autopilot.base_mode, autopilot.mode, autopilot.system_status)
+            flight = self.flight
+            return encoder.heartbeat(flight.base_mode, flight.mode, flight.system_status)
         if message_id == mavlink.HOME_POSITION:
             return encoder.home_position(ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M)
         self._advance(time_ns)
@@ -238,9 +238,9 @@ class Vehicle:
         return report(message_id, encoder, self._condition(boot_ms))
 
     def _condition(self, boot_ms: int) -> Condition:
-        """What it reports to other stations: in flight it banks as in a coordinated turn."""
+        """What it reports to other ground stations; in flight its roll is that of a coordinated turn."""
         state, roll_rad = self._state, 0.0
-        if self.autopilot.flying:
+        if self.flight.flying:
             _, _, turn_rate_rad_s, _ = rates(state.yaw_rad, state.speed_m_s, self._command, self._bounds)
             roll_rad = math.atan2(state.speed_m_s * turn_rate_rad_s, GRAVITY_M_S2)
         return Condition(
@@ -249,12 +249,12 @@ class Vehicle:
             ORIGIN_ALTITUDE_M + self._altitude_m,
             (*state.velocity_ne_m_s(), 0.0),
             (roll_rad, 0.0, math.remainder(state.yaw_rad, math.tau)),
-            flying=self.autopilot.flying,
+            flying=self.flight.flying,
             has_position=True,
         )
 
     def _advance(self, time_ns: int) -> None:
         if time_ns > self._state_ns:
-            if self.autopilot.flying:
+            if self.flight.flying:
                 self._state = advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
             self._state_ns = time_ns

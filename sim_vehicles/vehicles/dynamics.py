@@ -1,13 +1,13 @@
-"""One UAV: planar kinematics under the on-board feedback linearisation, with limits.
+"""How a double integrator moves: planar kinematics under feedback linearisation on board, with limits.
 
     X' = V cos ψ,   Y' = V sin ψ,   ψ' = ω,   V' = a                                   (thesis eq. 2.2-2.4)
     (a, ω) = M(ξ) u,   M = [[cos ψ, sin ψ], [-sin ψ / V, cos ψ / V]]                   (thesis eq. 2.6)
 
-u is the wanted acceleration (north, east). While no limit binds and u is constant, these equations have a solution in
-closed form, a planar double integrator, and it is used. Otherwise they are integrated by RK4, with M evaluated in every
-stage: the on-board loop is continuous, not sampled.
+u is the commanded acceleration (north, east). While u is constant and no limit binds, the solution is the closed form
+of a planar double integrator. Otherwise RK4 integrates the equations with M evaluated in every stage: the linearisation
+is continuous, not sampled.
 
-Scalars and plain functions, because this is called for every sample and every set-point of every vehicle.
+The functions take scalars because they run for every sample and every set-point of every vehicle.
 """
 
 import math
@@ -17,13 +17,13 @@ from scenarios import schema
 
 LONGEST_STEP_S = 0.02
 VELOCITY_GAIN_1_S = 2.0
-"""Gain of the velocity feedback when a set-point carries velocity as well as acceleration: time constant 0.5 s."""
+"""Gain of the velocity feedback for set-points that carry a velocity: a time constant of 0.5 s."""
 LARGEST_M_S2 = 20_000.0
-"""Acceleration of a vehicle without a limit of its own: what it reports stays a number, however unstable its loop."""
+"""Acceleration limit where the scenario sets none: reports stay finite, however unstable the loop."""
 
 
 class State(NamedTuple):
-    """Where the vehicle is; yaw is clockwise from north and is not wrapped."""
+    """Position, course and speed; yaw is clockwise from north and is not wrapped."""
 
     north_m: float
     east_m: float
@@ -36,7 +36,7 @@ class State(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What the vehicle tries to do: u = acceleration + gain (velocity - own velocity), each (north, east)."""
+    """The commanded acceleration u = acceleration + gain (velocity - own velocity), each (north, east)."""
 
     acceleration_north_m_s2: float = 0.0
     acceleration_east_m_s2: float = 0.0
@@ -50,7 +50,7 @@ COAST = Command()
 
 
 class Bounds(NamedTuple):
-    """The limits as numbers; a speed or turn rate that has none is infinite."""
+    """The limits as numbers; an omitted limit of speed or turn rate is infinite."""
 
     speed_min_m_s: float
     speed_max_m_s: float
@@ -59,7 +59,7 @@ class Bounds(NamedTuple):
 
 
 def bounds_of(limits: schema.Limits) -> Bounds:
-    """The scenario's limits in the form the integration wants."""
+    """The scenario's limits in the form that the integration needs."""
     return Bounds(
         limits.speed_min_m_s,
         limits.speed_max_m_s or math.inf,
@@ -75,7 +75,7 @@ def state_from(position_ne_m: tuple[float, float], velocity_ne_m_s: tuple[float,
 
 
 def advance(state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
-    """The state `duration_s` later, the command held."""
+    """The state after `duration_s` with the command held."""
     if _is_free(state[3], command, bounds, duration_s):
         return _free_flight(state, command[0], command[1], duration_s)
     steps = max(1, math.ceil(duration_s / LONGEST_STEP_S))
@@ -89,7 +89,7 @@ def advance(state: State, command: Command, bounds: Bounds, duration_s: float) -
 
 
 def _is_free(speed: float, command: Command, bounds: Bounds, t: float) -> bool:
-    """Whether u is constant and no limit can bind within a time."""
+    """Whether u is constant and no limit can bind within t seconds."""
     if command[4] != 0.0:
         return False
     speed_min, speed_max, acceleration_max, turn_rate_max = bounds
@@ -104,9 +104,9 @@ def _is_free(speed: float, command: Command, bounds: Bounds, t: float) -> bool:
 
 
 def _free_flight(state: State, u_north: float, u_east: float, t: float) -> State:
-    """The solution without limits: the velocity changes by u t, along and across the way flown until now.
+    """The solution without limits: the velocity changes by u t, resolved along and across the initial course.
 
-    The way turns by less than half a circle, as u is constant, so the yaw needs no wrapping.
+    With constant u the course turns by less than half a circle, so the yaw needs no wrapping.
     """
     north, east, yaw, speed = state
     cosine, sine = math.cos(yaw), math.sin(yaw)
@@ -121,7 +121,7 @@ def _free_flight(state: State, u_north: float, u_east: float, t: float) -> State
 
 
 def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> State:
-    """A Runge-Kutta step with everything in it."""
+    """A Runge-Kutta step with all limits."""
     north, east, yaw, speed = state
     half = 0.5 * h
     n1, e1, w1, a1 = rates(yaw, speed, command, bounds)
@@ -130,7 +130,7 @@ def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> S
     n4, e4, w4, a4 = rates(yaw + h * w3, speed + h * a3, command, bounds)
     sixth = h / 6.0
     speed += sixth * (a1 + 2.0 * (a2 + a3) + a4)
-    # A step across a limit overshoots it by less than one step's change; the limit holds at every step's end.
+    # A step across a limit overshoots it by less than one step's change; the speed is clipped at the end of the step.
     if speed < bounds[0]:
         speed = bounds[0]
     elif speed > bounds[1]:
@@ -146,9 +146,8 @@ def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> S
 def rates(yaw: float, speed: float, command: Command, bounds: Bounds) -> tuple[float, float, float, float]:
     """Rates of (north, east, yaw, speed).
 
-    The acceleration limit shortens the wanted acceleration vector before the linearisation and keeps its direction:
-    |u|² = a² + (V ω)², so it bounds the acceleration of the vehicle whichever way it points. The turn rate and then
-    the speed limits cut what is left, each on its own.
+    The acceleration limit shortens u before the linearisation and keeps its direction: |u|² = a² + (V ω)², so it bounds
+    the acceleration of the vehicle in every direction. The speed limits then cut a, and the turn-rate limit cuts ω.
     """
     speed_min, speed_max, acceleration_max, turn_rate_max = bounds
     u_north, u_east, velocity_north, velocity_east, gain = command
@@ -164,7 +163,7 @@ def rates(yaw: float, speed: float, command: Command, bounds: Bounds) -> tuple[f
     acceleration = cosine * u_north + sine * u_east
     if (speed <= speed_min and acceleration < 0.0) or (speed >= speed_max and acceleration > 0.0):
         acceleration = 0.0
-    # A stage may look a little below the least speed; M is never evaluated there, so it cannot meet its singularity.
+    # A stage may fall slightly below the minimum speed; M is not evaluated there, so it stays clear of its singularity.
     turn_rate = (cosine * u_east - sine * u_north) / (speed if speed > speed_min else speed_min)
     if turn_rate > turn_rate_max:
         turn_rate = turn_rate_max

@@ -1,14 +1,15 @@
-"""The vehicle's own loop (thesis eq. 5.1): its own errors, fed back at once, at its own rate, with its own sensor.
+"""The loop on board (thesis eq. 5.1): a vehicle feeds back its own errors at once, at its own rate.
 
     u = K_p (Z_ahead^p - Z^p - d) + K_v (Z^v - v_d) + w
 
-A step computes the first two terms and holds them. Spacing comes from a sensor that looks at the vehicle ahead at every
-so manieth step; in between it is carried on with the relative velocity that the sensor saw. v_d and w, what the vehicle
-cannot know by itself, are the velocity and the acceleration of the set-points; w acts from the instant at which it
-arrives, v_d from the next step.
+A step computes the first two terms and holds them. The spacing comes from a sensor that measures the vehicle ahead
+every few steps; between measurements it is extrapolated with the measured relative velocity. v_d and w, which the
+vehicle cannot know by itself, are the velocity and the acceleration of the set-points: w acts from the instant at which
+it arrives, v_d from the next step.
 
-When set-points stop, w is dropped and the rest goes on: what depends on other vehicles is stale, but the spacing that
-the sensor sees is not, and a vehicle that only coasted would drift in the middle of others that keep their places.
+When set-points stop, w is dropped and the other terms stay in force. What the station computed from other vehicles is
+stale, but the measured spacing is not, and a vehicle that only coasted would drift between others that keep their
+places.
 """
 
 import math
@@ -22,7 +23,7 @@ from sim_vehicles.services.parameters import Parameter, Parameters
 from sim_vehicles.vehicles.dynamics import Command, State
 
 STEP = -1
-"""In the vehicle's schedule, beside message ids: a step of this loop."""
+"""A step of this loop, as an entry of the vehicle's schedule beside the message ids."""
 SENSOR_STREAM = 4
 """Last word of the spawn key of the sensor's random stream."""
 LARGEST_GAIN, LARGEST_OFFSET_M = 1e4, 1e6
@@ -34,7 +35,7 @@ Look = tuple[float, float, float, float]
 
 
 def formation_parameters() -> list[Parameter]:
-    """What a station sets before the flight; the loop is off at first."""
+    """The parameters that a station sets before the flight; the loop starts switched off."""
     gains = [Parameter(name, 0.0, -LARGEST_GAIN, LARGEST_GAIN) for name in (*_NAMES_P, *_NAMES_V)]
     offsets = [Parameter(f"FORM_OFF_{axis}", 0.0, -LARGEST_OFFSET_M, LARGEST_OFFSET_M) for axis in _AXES]
     ahead = Parameter("FORM_AHEAD", 0.0, 0.0, 250.0, whole=True)
@@ -61,7 +62,7 @@ class OnboardLoop:
         self._streamed_m_s2 = self._own_m_s2 = (0.0, 0.0)
 
     def set(self, parameters: Parameters) -> None:
-        """Take gains and wanted place as the parameters now are."""
+        """Read the gains and the wanted offset from the parameters."""
         self.on = parameters["FORM_LOOP"] == 1.0
         self._ahead = int(parameters["FORM_AHEAD"])
         self._offset_m = parameters["FORM_OFF_N"], parameters["FORM_OFF_E"]
@@ -71,15 +72,15 @@ class OnboardLoop:
         self._on_velocity = a, b, c, d
 
     def stream(self, velocity_m_s: tuple[float, float], acceleration_m_s2: tuple[float, float]) -> None:
-        """Take in a set-point: the formation's velocity, and what others add to the command."""
+        """Take v_d and w from a set-point."""
         self._nominal_m_s, self._streamed_m_s2 = velocity_m_s, acceleration_m_s2
 
     def drop_stream(self) -> None:
-        """Set-points have stopped, or somebody else takes over."""
+        """Drop w: set-points have stopped, or another pilot takes over."""
         self._streamed_m_s2 = 0.0, 0.0
 
     def step(self, time_ns: int, boot_ms: int, own: State) -> None:
-        """Look if it is time to, and compute the vehicle's own part of the command."""
+        """Measure the spacing if that is due, and compute the first two terms."""
         if self._ahead and (self._seen is None or boot_ms * 1000 // self.interval_us % self._look_every == 0):
             self._seen = self._look(time_ns, own)
         if self._nominal_m_s is None:
@@ -98,7 +99,7 @@ class OnboardLoop:
         self._own_m_s2 = north, east
 
     def command(self) -> Command:
-        """What the vehicle does now; nothing before it has been told the formation's velocity."""
+        """The command in action; zero until the first set-point has brought v_d."""
         (own_north, own_east), (north, east) = self._own_m_s2, self._streamed_m_s2
         whole = own_north + north, own_east + east
         return Command(*whole) if math.isfinite(sum(whole)) else Command()

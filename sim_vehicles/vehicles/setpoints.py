@@ -1,4 +1,4 @@
-"""What a set-point says, before any autopilot's rules: which of its vectors count, and in which frame."""
+"""What a set-point says: which of its vectors count, and in which frame."""
 
 import math
 
@@ -8,18 +8,19 @@ from sim_vehicles.services.mavlink import Setpoint
 POSITION_AXES, VELOCITY_AXES, ACCELERATION_AXES = 0x007, 0x038, 0x1C0
 AXES = POSITION_AXES | VELOCITY_AXES | ACCELERATION_AXES
 VELOCITY, ACCELERATION, VELOCITY_ACCELERATION = AXES & ~VELOCITY_AXES, AXES & ~ACCELERATION_AXES, POSITION_AXES
-"""Of AXES what is ignored when only velocity, only acceleration, or both count."""
+"""The bits of AXES that are set (ignored) when only velocity, only acceleration, or both count."""
 FORCE_SET, YAW_IGNORED, YAW_RATE_IGNORED = 0x200, 0x400, 0x800
 LOCAL_FRAMES, BODY_FRAMES = (1, 7), (8, 9)
-"""LOCAL_NED and LOCAL_OFFSET_NED, BODY_NED and BODY_OFFSET_NED: the same for velocities and accelerations."""
+"""LOCAL_NED and LOCAL_OFFSET_NED, BODY_NED and BODY_OFFSET_NED: equal for velocities and accelerations."""
 ABSURD = 1e4
 """A set-point with more m/s² or m/s than this is refused."""
 
 
 def fault(setpoint: Setpoint) -> str:
-    """Why the plain vehicle refuses a set-point, or an empty string. NaN fails every comparison, so it is absurd.
+    """Why a double integrator refuses a set-point, or an empty string. NaN counts as absurd.
 
-    It takes the whole vectors of velocity, acceleration, or both; its heading is its course, so yaw is not looked at.
+    A set-point must carry the whole vector of velocity, of acceleration, or both. Yaw is ignored: the heading is the
+    course.
     """
     if setpoint.frame != mavlink.FRAME_LOCAL_NED and setpoint.frame not in BODY_FRAMES:
         return "refused_frame"
@@ -38,7 +39,7 @@ def fault(setpoint: Setpoint) -> str:
 
 
 def to_local(setpoint: Setpoint, yaw_rad: float) -> Setpoint:
-    """The set-point with its vectors in the local frame, if they were in that of the body at this yaw."""
+    """The set-point with its vectors in the local frame, turned by this yaw if they were in the body frame."""
     if setpoint.frame not in BODY_FRAMES:
         return setpoint
     cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)

@@ -1,8 +1,8 @@
-"""What every simulated vehicle does on its link, whatever flies: a MAVLink system of its own.
+"""The MAVLink system of every simulated vehicle: bytes and time in, bytes and time out.
 
-Bytes and time in, bytes and time out. The shell reads datagrams, obeys one station, answers TIMESYNC, commands and
-requests, and reports on a schedule. The `Craft` in it knows how the vehicle moves and what its autopilot accepts.
-Everything happens at its exact instant, however late `step` is called.
+The shell reads datagrams, obeys one station, answers TIMESYNC, commands and requests, and reports on a schedule. The
+`Craft` in it knows how the vehicle moves and which set-points and modes it accepts. Everything happens at its exact
+instant, however late `step` is called.
 """
 
 from collections import Counter, deque
@@ -23,14 +23,14 @@ from sim_vehicles.vehicles.dynamics import State
 TIMESYNC_INTERVAL_US = 10_000_000
 HEARTBEAT_INTERVAL_US = 1_000_000
 LONGEST_HISTORY = 1000
-"""Changes kept if nobody reads them; a hostile sender can cause them without end."""
+"""Most changes kept unread: a hostile sender can cause any number of them."""
 
 Answer = tuple[int, str]
-"""The MAV_RESULT of a command, and what the vehicle says besides, "" for nothing."""
+"""The MAV_RESULT of a command, and the STATUSTEXT sent with it, "" for none."""
 
 
 class Change(NamedTuple):
-    """Something a person watching would want to know, such as "failsafe: set-points stopped"."""
+    """An event that is shown to people, such as "failsafe: set-points stopped"."""
 
     time_ns: int
     system_id: int
@@ -38,11 +38,11 @@ class Change(NamedTuple):
 
 
 class Radio:
-    """What the shell and the craft share: the clock, the counters, and all that is sent and told.
+    """What the shell and the craft share: the clock, the counters, what is sent, and the changes.
 
-    `counters` says what came in: `heartbeats`, `commands`, `timesync_requests`, `timesync_replies`, `setpoints`, and
-    by reason what was not obeyed: `refused_...` for what is wrong with it, `ignored_...` for what is well formed but
-    not for this vehicle or not now.
+    `counters` counts what came in: `heartbeats`, `commands`, `timesync_requests`, `timesync_replies`, `setpoints`, and
+    by reason what was not obeyed: `refused_...` is wrong in itself, `ignored_...` is well formed but not for this
+    vehicle, or not now.
     """
 
     def __init__(
@@ -52,16 +52,16 @@ class Radio:
         self.start_ns = start_ns
         self.counters: Counter[str] = Counter()
         self.changes: deque[Change] = deque(maxlen=LONGEST_HISTORY)
-        """Appended to; whoever reads may clear it."""
+        """The newest at the end; a reader may clear it."""
         self.clock = BootClock.draw(scenario.clocks, scenario.seed, own.system_id, start_ns)
         self.schedule = Schedule(self.clock)
         self.encoder = mavlink.Encoder(own.system_id)
         self.record = record
         self.out: list[tuple[bytes, int]] = []
-        """What has been sent in this step, with its instants."""
+        """Frames sent in this step, with their instants."""
 
     def send(self, frame: bytes, time_ns: int) -> None:
-        """Send a frame of the encoder's."""
+        """Send a frame that the encoder made."""
         self.out.append((frame, time_ns))
 
     def say(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
@@ -73,49 +73,49 @@ class Radio:
         self.changes.append(Change(time_ns, self.system_id, text))
 
     def acted(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
-        """Write down in the truth that a set-point acts from now on."""
+        """Record in the truth log that a set-point acts from now on."""
         if self.record is not None:
             self.record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
 
     def set_clock(self, clock: BootClock, time_ns: int) -> None:
-        """Go on with another clock."""
+        """Continue with another clock."""
         self.clock = clock
         self.schedule.set_clock(clock, time_ns)
 
 
 class Craft(Protocol):
-    """What flies. Times are in order; `acts_at` says when what arrives late acts."""
+    """What flies. Calls are in order of time; `acts_at` says when a message that arrives late acts."""
 
     parameters: Parameters
     version: tuple[int, int, int]
-    """Of its autopilot."""
+    """The version that AUTOPILOT_VERSION reports."""
     intervals_us: Mapping[int, int]
-    """The messages that it reports besides heartbeats, each with its interval if nobody asks, 0 for none."""
+    """The messages it can report besides heartbeats, each with its default interval, 0 for none."""
     reports_from_ns: int
-    """Before this it sends heartbeats only."""
+    """Before this instant it sends heartbeats only."""
 
     @property
-    def deadline_ns(self) -> int: ...  # when something happens by itself that is not a report
+    def deadline_ns(self) -> int: ...  # of the next event that is not a report
 
     def happen(self, time_ns: int) -> None: ...
     def state_at(self, time_ns: int) -> State: ...
     def acts_at(self, time_ns: int) -> int: ...
     def hear_heartbeat(self, time_ns: int) -> None: ...
 
-    def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str: ...  # the name of the counter to raise
+    def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str: ...  # the counter to raise
     def command(self, command: mavlink.Command, time_ns: int) -> Answer | None: ...  # None: it is not about flying
-    def change_mode(self, mode: int | None, time_ns: int) -> Answer: ...  # None: it is not known which
+    def change_mode(self, mode: int | None, time_ns: int) -> Answer: ...  # None: an unknown one
     def parameters_set(self, time_ns: int) -> None: ...
-    def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None: ...  # None: there is nothing to say
+    def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None: ...  # None: nothing to send yet
 
 
-Flown = TypeVar("Flown", bound=Craft, covariant=True)  # noqa: PLC0105 - the craft's own type, for who looks inside
+Flown = TypeVar("Flown", bound=Craft, covariant=True)  # noqa: PLC0105 - the type of the craft inside
 
 
 class Shell(Generic[Flown]):
     """A vehicle as its link sees it.
 
-    With `version_1_first` it speaks MAVLink 1 until it hears MAVLink 2, as a PX4. `experiment` is the text of its
+    With `version_1_first` it speaks MAVLink 1 until it hears MAVLink 2, as PX4 does. `experiment` is the text of its
     parameter SCENARIO.
     """
 
@@ -137,7 +137,7 @@ class Shell(Generic[Flown]):
         self._timesync_ts1 = -1
         from_ns = craft.reports_from_ns
         self._schedule = schedule = radio.schedule
-        schedule.add_once(mavlink.HEARTBEAT, radio.start_ns)  # found at once, not after up to a second
+        schedule.add_once(mavlink.HEARTBEAT, radio.start_ns)  # so that a station finds it at once
         schedule.set_interval(mavlink.TIMESYNC, TIMESYNC_INTERVAL_US, from_ns)
         intervals_us = {mavlink.HEARTBEAT: HEARTBEAT_INTERVAL_US, **craft.intervals_us}
         for message_id, interval_us in intervals_us.items():
@@ -150,15 +150,15 @@ class Shell(Generic[Flown]):
 
     @property
     def next_event_ns(self) -> int:
-        """When the vehicle next does something if nothing arrives."""
+        """When the vehicle next acts if nothing arrives."""
         scheduled_ns, deadline_ns = self._schedule.next_ns, self.craft.deadline_ns
         return deadline_ns if deadline_ns < scheduled_ns else scheduled_ns
 
     def step(self, datagrams: Iterable[tuple[bytes, int]], now_ns: int) -> list[tuple[bytes, int]]:
-        """Live until now: what arrives, as (datagram, instant) in order of time, to what is sent, likewise.
+        """Run until now; takes the datagrams that arrive and returns those sent, with instants, in order of time.
 
-        A datagram with an instant that is already behind acts at once. One that arrives at the very instant of
-        something scheduled comes first: a set-point on the deadline is in time.
+        A datagram whose instant has passed acts at once. One that arrives at the instant of a scheduled event comes
+        first: a set-point on the deadline is in time.
         """
         self.radio.out = out = []
         for data, time_ns in datagrams:
@@ -168,7 +168,7 @@ class Shell(Generic[Flown]):
         return out
 
     def _run(self, end_ns: int) -> None:
-        """Do what is due before the end. At one instant the deadline comes first, and reports show what it did."""
+        """Run everything due before the end; at one instant the deadline first, so that reports show its effect."""
         schedule, craft = self._schedule, self.craft
         while True:
             deadline_ns = craft.deadline_ns
@@ -183,7 +183,7 @@ class Shell(Generic[Flown]):
 
     def _report(self, time_ns: int, message_id: int, boot_ms: int) -> None:
         if self._speaks_version_1 and message_id != mavlink.HEARTBEAT:
-            return  # nobody listens yet who could want it
+            return  # no station has been heard that could want it
         radio, craft = self.radio, self.craft
         craft.acts_at(time_ns)
         if message_id == mavlink.TIMESYNC:
@@ -213,7 +213,7 @@ class Shell(Generic[Flown]):
             elif authority.obeys(source, message, time_ns):
                 self._obey(message, self.craft.acts_at(time_ns))
             elif text := authority.refusal(source, counters):
-                # No COMMAND_ACK: the station has no way to tell it from the answer to an equal command of its own.
+                # No COMMAND_ACK: the station could not tell it from the answer to an equal command of its own.
                 self.radio.tell(time_ns, text)
                 self.radio.say(time_ns, text, mavlink.SEVERITY_WARNING)
 
@@ -231,10 +231,10 @@ class Shell(Generic[Flown]):
             self.counters["ignored_not_addressed"] += 1
         elif message.tc1 == 0:
             self.counters["timesync_requests"] += 1
-            # Not 0 even at the very boot: that would make the reply a request.
+            # Never 0, even at boot: that would make the reply a request.
             tc1 = self.radio.clock.boot_ns(time_ns) or 1
             self.radio.send(self.radio.encoder.timesync(tc1, message.ts1), time_ns)
-        else:  # a reply that was not asked for is one to another vehicle, or a duplicate
+        else:  # an unrequested reply is for another vehicle, or a duplicate
             asked = message.ts1 == self._timesync_ts1
             self.counters["timesync_replies" if asked else "ignored_timesync_reply"] += 1
 
@@ -254,7 +254,7 @@ class Shell(Generic[Flown]):
                 self.craft.parameters_set(time_ns)
 
     def _take_command(self, command: mavlink.Command, time_ns: int) -> None:
-        """The acknowledgement goes before what the command makes the vehicle say, as request and reply are read."""
+        """Obey a command. The acknowledgement is sent before the messages that the command causes."""
         self.counters["commands"] += 1
         radio, answer = self.radio, self.craft.command(command, time_ns)
         result, more = self.services.command(command, time_ns) if answer is None else (answer[0], [])

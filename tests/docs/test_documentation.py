@@ -2,7 +2,6 @@
 
 import dataclasses
 import doctest
-import json
 import re
 import shutil
 import subprocess
@@ -17,10 +16,11 @@ from docs.generate.fields import described, found_fields
 from docs.generate.keys import schema
 from docs.generate.runner import Runner
 from docs.generate.sessions import Step, steps_of
+from gcs.cli.margin import margin_of_file, margin_of_scenario
 from gcs.drive.lockstep import START_NS, fly_lockstep
-from gcs.margin import margin_of_file, margin_of_scenario
 from gcs.plan.planner import flight_plan
-from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.runs.files import write_design
+from gcs.runs.record import SCENARIO_FILE, RunWriter
 from gcs.runs.summary import finish
 from gcs.station.station import Station
 from gcs.stress.trial import Outcome
@@ -85,7 +85,7 @@ def fly(folder: Path, name: str, **changes: Any) -> dict[str, Any]:
     scenario = files.load(ROOT / "scenarios" / f"{name}.toml").model_copy(update={"duration_s": 2.0} | changes)
     design, plan = flight_plan(scenario)
     (folder / SCENARIO_FILE).write_text(files.dump(scenario), encoding="utf-8")
-    (folder / DESIGN_FILE).write_text(json.dumps(design), encoding="utf-8")
+    write_design(folder, design)
     station, writer = Station(plan, start_ns=START_NS), RunWriter(folder)
     for rows in fly_lockstep(plan, station=station):
         writer.tick(rows)
@@ -106,7 +106,7 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     load["two way"] = files.load(ROOT / "scenarios" / "chain3_bidirectional.toml")
     load["onboard"] = files.with_loop(load["chain3"], "onboard", Path("chain3.toml"))
     load["copters5"] = load["copters5"].model_copy(update={"response": Response(lag_s=0.15)})
-    found = [found_fields(flight_plan(scenario)[0], known) for scenario in load.values()]
+    found = [found_fields(flight_plan(scenario)[0].to_dict(), known) for scenario in load.values()]
     assert set[str]().union(*found) == known.keys()
 
 

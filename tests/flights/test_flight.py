@@ -14,6 +14,7 @@ from gcs.control.phases import Phase
 from gcs.control.tick import Mode, TickArray
 from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
 from gcs.link import mavlink
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
@@ -27,14 +28,14 @@ from tests.support.paths import SCENARIOS
 S = 1_000_000_000
 
 
-def planned(name: str, **changes: Any) -> tuple[FlightPlan, dict[str, Any]]:
+def planned(name: str, **changes: Any) -> tuple[FlightPlan, Design]:
     scenario = load(SCENARIOS / f"{name}.toml").model_copy(update=changes)
     design, plan = flight_plan(scenario)
     return plan, design
 
 
 def flown(
-    plan: FlightPlan, design: dict[str, Any], station: Station | None = None, **kwargs: Any
+    plan: FlightPlan, design: Design, station: Station | None = None, **kwargs: Any
 ) -> tuple[TickArray, dict[str, Any]]:
     station = station or Station(plan, start_ns=START_NS)
     ticks = np.concatenate(list(fly_lockstep(plan, station=station, **kwargs)))
@@ -76,7 +77,7 @@ def test_formation_settles_below_one_percent_of_the_spacing(name: str) -> None:
 
 
 def test_a_flight_too_short_to_settle_says_what_is_left_of_its_errors() -> None:
-    plan, design = planned("triangle5", duration_s=1.0)
+    plan, design = planned("triangle5", duration_s=0.4)
     _, summary = flown(plan, design)
     assert (summary["verdict"], summary["reason"]) == ("unstable", "completed: duration reached")
     output = io.StringIO()
@@ -84,7 +85,7 @@ def test_a_flight_too_short_to_settle_says_what_is_left_of_its_errors() -> None:
     [verdict] = [line for line in output.getvalue().splitlines() if line.startswith("verdict")]
     most_m = max(vehicle["spacing_error_max_m"] for vehicle in summary["vehicles"][1:])
     left_m = max(vehicle["spacing_error_final_m"] for vehicle in summary["vehicles"][1:])
-    assert verdict == f"verdict  unstable: not settled in 1.0 s; {left_m:.2f} m left of errors of up to {most_m:.2f} m"
+    assert verdict == f"verdict  unstable: not settled in 0.4 s; {left_m:.2f} m left of errors of up to {most_m:.2f} m"
 
 
 def test_formation_follows_the_turns() -> None:
@@ -127,7 +128,9 @@ def test_errors_grow_and_decay_as_the_sampled_model_says(link_delay_s: float) ->
     own = ticks[(ticks["system_id"] == 2) & ticks["commanded"]]
     delay_s = float(np.median(own["loop_delay_s"]))
     A, B = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    K = np.array([[design["K3_1_s2"][0][0], design["K1_1_s"][0][0]]])
+    assert design.inclusion_gains is not None
+    own, _, spacing = design.inclusion_gains
+    K = np.array([[spacing[0][0], own[0][0]]])
     predicted = growth_rate(A, B, K, period_s=0.02, delay_s=delay_s)
     # 1 ms of drift of the sampling instants over the flight moves the rate by 0.01 /s.
     assert dominant_growth_1_s(ticks, 2) == pytest.approx(predicted, abs=0.02)
@@ -251,21 +254,75 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
         update={"delay_margin_s": None, "gains": FixedGains(K1=-20.0, K2=0.0, K3=150.0)}
     )
     plan, design = planned("chain3", control=control, monitor=Monitor(act=False))
-    assert design["delay_margin_s"] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
+    assert design.margins_s[0] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
     _, summary = flown(plan, design)
-    assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design["delay_margin_s"]
+    assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design.margins_s[0]
     assert (summary["verdict"], summary["settling_time_s"]) == ("unstable", None)
 
 
-def test_the_main_scenario_asks_nothing_of_its_aircraft_that_they_cannot_do() -> None:
-    """Commands stay below the 3 g of its limits from the first tick on, so that limits change nothing in the flight."""
-    plan, design = planned("triangle5", duration_s=4.0)
-    limits = plan.scenario.limits
+FIXED_WING = (
+    "chain3",
+    "chain3_bidirectional",
+    "chain20",
+    "delay_ramp",
+    "radio57600",
+    "thesis_delay",
+    "thesis_gains",
+    "triangle5",
+    "triangle5_turns",
+    "wifi_bursts",
+)
+
+
+@pytest.mark.parametrize("name", FIXED_WING)
+def test_shipped_scenarios_ask_nothing_of_their_aircraft_that_they_cannot_do(name: str) -> None:
+    """Commands stay below 3 g from the first tick on, and turns below the turn rate; so limits change nothing."""
+    plan, design = planned(name)
+    scenario = plan.scenario
+    limits, courses = scenario.limits, scenario.nominal_velocity
     assert limits.acceleration_max_m_s2 is not None
+    assert limits.turn_rate_max_rad_s is not None
     assert limits.acceleration_max_m_s2 <= 3.0 * 9.81
+    # the largest commands are those of the start, and of a turn where there is one
+    until_s = courses[-1].from_s + 3.0 if len(courses) > 1 else 4.0
+    plan = replace(plan, scenario=scenario.model_copy(update={"duration_s": until_s}))
     ticks, _ = flown(plan, design)
     own = ticks[ticks["commanded"]]
-    assert np.hypot(own["command_north_m_s2"], own["command_east_m_s2"]).max() < limits.acceleration_max_m_s2
+    command = own["command_north_m_s2"] + 1j * own["command_east_m_s2"]
+    velocity = own["velocity_north_m_s"] + 1j * own["velocity_east_m_s"]
+    assert np.abs(command).max() < limits.acceleration_max_m_s2
+    assert np.abs((command / velocity).imag).max() < limits.turn_rate_max_rad_s
     without, _ = flown(replace(plan, scenario=plan.scenario.model_copy(update={"limits": Limits()})), design)
-    for name in ("spacing_error_north_m", "spacing_error_east_m"):
-        assert np.nanmax(np.abs(ticks[name] - without[name])) < 1e-2
+    for error in ("spacing_error_north_m", "spacing_error_east_m"):
+        assert np.nanmax(np.abs(ticks[error] - without[error])) < 1e-2
+
+
+def test_a_wide_start_is_flown_at_three_g_and_comes_together() -> None:
+    """Without limits the gains ask for 93 g."""
+    plan, design = planned("triangle5_scattered")
+    ticks, summary = flown(plan, design)
+    own = ticks[ticks["commanded"]]
+    size = np.hypot(own["command_north_m_s2"], own["command_east_m_s2"])
+    assert size.max() == pytest.approx(29.4, abs=1e-3)
+    speed = np.hypot(own["velocity_north_m_s"], own["velocity_east_m_s"])
+    assert 60.0 - 1e-3 < speed.min() < speed.max() < 130.0 + 1e-3
+    assert summary["verdict"] == "stable"
+    assert 7.0 < summary["settling_time_s"] < 9.0
+
+
+@pytest.mark.parametrize(
+    ("limit_m", "acts", "verdict", "most_m"),
+    [(10.0, True, "unstable", 10.5), (300.0, True, "stable", 40.0), (300.0, False, "unstable", 310.0)],
+)
+def test_what_breaks_triangle5_far_above_its_margin_is_its_tolerance_or_a_station_that_may_not_act(
+    limit_m: float, acts: bool, verdict: str, most_m: float
+) -> None:
+    """With time to change to slower gains the monitor saves it: what scenarios/triangle5.toml says of its limit."""
+    plan, design = planned("triangle5", monitor=Monitor(act=acts))
+    late = plan.scenario.with_link_delay(up_s=0.4, down_s=0.4)
+    safety = late.safety.model_copy(update={"spacing_error_limit_m": limit_m})
+    ticks, summary = flown(replace(plan, scenario=late.model_copy(update={"safety": safety})), design)
+    assert summary["verdict"] == verdict
+    while_flown = ticks[ticks["mode"] != Mode.FAILSAFE]
+    error = np.hypot(while_flown["spacing_error_north_m"], while_flown["spacing_error_east_m"])
+    assert np.nanmax(error) < most_m

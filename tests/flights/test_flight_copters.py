@@ -126,18 +126,22 @@ def test_a_given_response_leaves_the_manoeuvre_out_and_the_design_says_so() -> N
     design, plan = flight_plan(three().model_copy(update={"response": TRUTH}))
     flight = fly(plan)
     assert "identifying" not in flight.texts("phase")
-    assert design["response"]["source"] == "given"
-    assert design["delay_margin_s"] == pytest.approx(0.6, abs=1e-6)
-    assert design["response"]["delay_margin_at_once_s"] > 0.6 + TRUTH.lag_s / 2
+    assert design.response is not None
+    assert design.response.source == "given"
+    assert design.delay_margin_s == pytest.approx(0.6, abs=1e-6)
+    at_once_s = design.response.delay_margin_at_once_s
+    assert at_once_s is not None
+    assert at_once_s > 0.6 + TRUTH.lag_s / 2
 
 
 def test_design_of_a_flight_names_what_was_identified() -> None:
     design, _ = flight_plan(three())
     flight = fly(planned("ardupilot"))
     known = described(design, flight.station.plan)
-    assert known["delay_margin_s"] == flight.station.plan.delay_margin_s < design["delay_margin_s"]
-    assert [vehicle["system_id"] for vehicle in known["response"]["vehicles"]] == [1, 2, 3]
-    assert known["schedule"][2]["delay_margin_s"] == flight.station.plan.margins_s[2]
+    assert known.margins_s == flight.station.plan.margins_s
+    assert known.margins_s[0] < design.margins_s[0]
+    assert known.response is not None
+    assert [vehicle.system_id for vehicle in known.response.vehicles] == [1, 2, 3]
 
 
 def test_gains_on_a_graph_get_the_margin_with_the_response_too() -> None:
@@ -147,8 +151,8 @@ def test_gains_on_a_graph_get_the_margin_with_the_response_too() -> None:
     assert flight.station.end_reason == "completed: duration reached"
     assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
     known = described(design, flight.station.plan)
-    assert known["delay_margin_s"] < design["delay_margin_s"] - TRUTH.lag_s / 2
-    assert known["delay_margin_s"] < known["delay_margin_continuous_s"]
+    assert known.margins_s[0] < design.margins_s[0] - TRUTH.lag_s / 2
+    assert known.margins_s[0] < (known.delay_margin_continuous_s or 0.0)
 
 
 def settled(flight: Flight) -> bool:

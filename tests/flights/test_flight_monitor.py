@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.control.tick import Mode, TickArray
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
@@ -144,11 +145,10 @@ def test_every_change_of_mode_and_gains_is_an_event_and_a_statustext() -> None:
 
 def test_a_collision_ends_the_flight_as_broken_and_the_least_distance_is_in_the_summary() -> None:
     # Vehicles that stand nearer to each other than is allowed, from the flight's first tick on.
-    ticks, station = flown(duration_s=5.0, safety=Safety(collision_distance_m=150.0))
+    ticks, station = flown(duration_s=5.0, safety=Safety(collision_distance_m=180.0))
     assert station.end_reason.startswith("broken: vehicles")
     assert "have collided" in station.end_reason
     events = [{"time_s": 0.0, "kind": "end", "text": station.end_reason, "system_id": None}]
-    design = {"delay_margin_s": 0.3, "delay_margin_continuous_s": 0.3}
-    summary = summarise(planned().scenario, design, ticks, events)
+    summary = summarise(planned().scenario, Design(delay_margin_s=0.3), ticks, events)
     assert summary["verdict"] == "unstable"
-    assert 0.0 < summary["distance_min_m"] < 150.0
+    assert 0.0 < summary["distance_min_m"] < 180.0

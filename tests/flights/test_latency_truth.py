@@ -7,6 +7,7 @@ import pytest
 
 from gcs.control.tick import TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.plan.design import Design
 from gcs.plan.planner import flight_plan
 from gcs.runs.grade import Truth, graded, true_loop_delays_s, true_round_trips
 from gcs.runs.summary import summarise
@@ -141,7 +142,7 @@ def test_clock_offsets_are_never_outside_their_bounds(name: str) -> None:
 def test_the_skew_of_a_clock_is_that_of_its_time_stamps(name: str) -> None:
     ticks, truth = flown(name)
     events = [{"time_s": 8.0, "kind": "end", "text": "completed: duration reached"}]
-    summary = summarise(CHAIN, {"delay_margin_s": 1.0, "delay_margin_continuous_s": 1.0}, ticks, events)
+    summary = summarise(CHAIN, Design(delay_margin_s=1.0), ticks, events)
     for vehicle in summary["vehicles"]:
         own = truth[(truth["kind"] == SAMPLED) & (truth["system_id"] == vehicle["system_id"])]
         slope, _ = np.polyfit((own["time_ns"] - own["time_ns"][0]) * 1e-9, own["key"] * 1e-3, 1)

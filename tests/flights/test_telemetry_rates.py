@@ -38,8 +38,8 @@ def test_the_margin_of_a_flight_is_that_of_its_telemetry_rate(telemetry_hz: floa
     `tests/gains/sampled/test_multirate.py`."""
     design, plan = flight_plan(scenario_at(telemetry_hz, control=GAINS))
     assert plan.delay_margin_s == pytest.approx(margin_s, abs=1e-6)
-    assert design["delay_margin_s"] == plan.delay_margin_s
-    assert design["schedule"][1]["delay_margin_s"] == plan.margins_s[1]
+    assert design.delay_margin_s == plan.delay_margin_s
+    assert design.schedule[1].delay_margin_s == plan.margins_s[1]
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_a_design_has_the_margin_asked_for_at_any_rates(
 ) -> None:
     design, plan = flight_plan(scenario_at(telemetry_hz, control_hz, **changes))
     assert 0.3 - 1e-9 <= plan.delay_margin_s < 0.3002
-    assert design["delay_margin_s"] == plan.delay_margin_s
+    assert design.delay_margin_s == plan.delay_margin_s
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]
         (FLY, "site", 2, signal.SIGHUP),
     ],
 )
-def test_ctrl_c_or_a_closed_terminal_while_a_command_or_its_workers_import_is_no_traceback(
+def test_a_signal_while_workers_import_is_no_traceback(
     arguments: list[str], module: str, times: int, number: signal.Signals, tmp_path: Path
 ) -> None:
     command = [sys.executable, "-m", "gcs", *arguments, str(tmp_path / "out")]

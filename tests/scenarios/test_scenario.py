@@ -55,8 +55,9 @@ def test_leader_first_puts_every_vehicle_after_the_one_it_follows() -> None:
 
 def test_nominal_velocity_is_piecewise_constant() -> None:
     scenario = load(SCENARIOS / "triangle5_turns.toml")
-    headings = [scenario.nominal_velocity_at(t) for t in (-1.0, 0.0, 24.99, 25.0, 49.0, 50.0, 1e6)]
-    assert headings == [(45.72, -79.189)] * 3 + [(91.44, 0.0)] * 2 + [(45.72, 79.189)] * 2
+    courses = [scenario.nominal_velocity_at(t) for t in (-1.0, 0.0, 24.99, 25.0, 25.34, 31.65, 49.0, 56.65, 1e6)]
+    turning = [(49.802, -76.688)] * 2
+    assert courses == [(45.72, -79.189)] * 3 + turning + [(91.44, 0.0)] * 2 + [(45.72, 79.189)] * 2
 
 
 def test_link_delay_override_reaches_vehicles_with_links_of_their_own() -> None:

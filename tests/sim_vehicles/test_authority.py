@@ -117,7 +117,7 @@ def test_heartbeats_of_another_station_do_not_keep_the_failsafe_away() -> None:
         time_ns = START + tenth * SECOND // 10
         own = [(heartbeat(), time_ns)] if tenth <= 10 else []
         vehicle.step([(other, time_ns), *own], time_ns)
-    assert vehicle.craft.autopilot.failsafe
+    assert vehicle.craft.flight.failsafe
     assert vehicle.counters["heartbeats"] < 30
 
 

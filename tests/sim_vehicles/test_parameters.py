@@ -17,7 +17,7 @@ from tests.support.vehicle_kinds import VEHICLES, copter
 REAL32, INT32 = dialect.MAV_PARAM_TYPE_REAL32, dialect.MAV_PARAM_TYPE_INT32
 
 
-TIMEOUT = {"plain": "GUID_TIMEOUT", "ardupilot": "GUID_TIMEOUT", "px4": "COM_OF_LOSS_T"}
+TIMEOUT = {"double_integrator": "GUID_TIMEOUT", "ardupilot": "GUID_TIMEOUT", "px4": "COM_OF_LOSS_T"}
 
 
 def ask_list(system: int = 1) -> bytes:

@@ -36,7 +36,7 @@ ACCEPTED, DENIED, UNSUPPORTED = (
     dialect.MAV_RESULT_UNSUPPORTED,
 )
 STATION = (255, 190)
-FLYING = {"plain": 0, "ardupilot": 4, "px4": 6 << 16}
+FLYING = {"double_integrator": 0, "ardupilot": 4, "px4": 6 << 16}
 
 
 def sent_after(vehicle: Shell[Craft], data: bytes, at_s: float, until_s: float) -> list[Any]:
@@ -70,7 +70,7 @@ def test_nobody_who_does_not_ask_is_sent_more_than_telemetry(kind: str) -> None:
     vehicle = VEHICLES[kind]()
     sent = sent_after(vehicle, heartbeat(), 3.0, 30.0)
     telemetry = {"HEARTBEAT", "TIMESYNC"} | (
-        {"LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"} if kind == "plain" else set()
+        {"LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"} if kind == "double_integrator" else set()
     )
     assert {m.get_type() for m in sent} == telemetry
 
@@ -105,7 +105,7 @@ def test_whoever_asks_for_the_version_is_reported_all_that_health_is_read_from(k
 
 
 def test_a_greeting_slows_nothing_down() -> None:
-    vehicle = VEHICLES["plain"]()
+    vehicle = VEHICLES["double_integrator"]()
     vehicle.step([(command(511, 32, 20_000), START)], START)
     assert len(named(sent_after(vehicle, command(512, 148), 1.0, 2.0), "LOCAL_POSITION_NED")) >= 49
 
@@ -182,7 +182,7 @@ def test_data_streams_begin_change_and_stop(kind: str) -> None:
 
 
 def test_a_stream_of_sixty_thousand_a_second_is_one_of_a_thousand() -> None:
-    assert len(named(sent_after(VEHICLES["plain"](), stream(10, 65_535), 5.0, 5.1), "ATTITUDE")) == 100
+    assert len(named(sent_after(VEHICLES["double_integrator"](), stream(10, 65_535), 5.0, 5.1), "ATTITUDE")) == 100
 
 
 def test_a_vehicle_at_the_end_of_the_world_still_reports() -> None:
@@ -261,7 +261,7 @@ def test_a_mode_set_the_old_way_is_flown(kind: str) -> None:
 
 
 def test_a_take_off_command_launches_a_plain_vehicle_which_then_waits_for_set_points_without_end() -> None:
-    vehicle = VEHICLES["plain"]()
+    vehicle = VEHICLES["double_integrator"]()
     for data in (arm(), mode(4)):
         vehicle.step([(data, START)], START)
     assert acknowledged(sent_after(vehicle, command(22, 0, 0, 0, 0, 0, 0, 10), 1.0, 1.0), 22) == ACCEPTED

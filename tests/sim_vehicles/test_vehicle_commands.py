@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sim_vehicles.vehicles.double_integrator import Vehicle
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from sim_vehicles.vehicles.shell import Shell
 from tests.support.sim_client import (
     MS,
@@ -24,12 +24,12 @@ from tests.support.sim_client import (
 )
 
 
-def answers(vehicle: Shell[Vehicle], request: bytes, time_ns: int = START) -> list[Any]:
+def answers(vehicle: Shell[DoubleIntegrator], request: bytes, time_ns: int = START) -> list[Any]:
     """What is sent at the instant of a request, because of it."""
     return [m for m, t in parse_all(vehicle.step([(request, time_ns)], time_ns)) if t == time_ns]
 
 
-def result(vehicle: Shell[Vehicle], request: bytes, time_ns: int = START) -> int:
+def result(vehicle: Shell[DoubleIntegrator], request: bytes, time_ns: int = START) -> int:
     """The result of a command, acknowledged to who asked."""
     (ack,) = [m for m in answers(vehicle, request, time_ns) if m.get_type() == "COMMAND_ACK"]
     assert (ack.target_system, ack.target_component) == (255, 190)
@@ -37,7 +37,7 @@ def result(vehicle: Shell[Vehicle], request: bytes, time_ns: int = START) -> int
     return ack.result
 
 
-def last_heartbeat(vehicle: Shell[Vehicle], now_ns: int) -> Any:
+def last_heartbeat(vehicle: Shell[DoubleIntegrator], now_ns: int) -> Any:
     return parse_all(vehicle.step([], now_ns + SECOND), "HEARTBEAT")[-1][0]
 
 
@@ -84,11 +84,11 @@ def test_on_the_launcher_it_can_be_disarmed_but_in_flight_it_cannot() -> None:
     vehicle = a_vehicle()
     assert result(vehicle, arm()) == dialect.MAV_RESULT_ACCEPTED
     assert result(vehicle, command(400, 0)) == dialect.MAV_RESULT_ACCEPTED
-    assert not vehicle.craft.autopilot.armed
+    assert not vehicle.craft.flight.armed
     take_off(vehicle)
     assert result(vehicle, command(400, 0)) == dialect.MAV_RESULT_DENIED
     assert result(vehicle, command(400, 0, 21196)) == dialect.MAV_RESULT_DENIED  # forced
-    assert vehicle.craft.autopilot.armed
+    assert vehicle.craft.flight.armed
 
 
 @pytest.mark.parametrize("hold", [5, 17], ids=["LOITER", "BRAKE"])
@@ -111,7 +111,7 @@ def test_landing_and_return_are_refused_with_a_word_to_who_asks(wish: bytes) -> 
     ack, told = answers(vehicle, wish, START + SECOND // 2)
     assert (ack.get_type(), ack.result) == ("COMMAND_ACK", dialect.MAV_RESULT_DENIED)
     assert (told.severity, told.text.split(",")[0]) == (dialect.MAV_SEVERITY_CRITICAL, "cannot land or return")
-    assert vehicle.craft.autopilot.mode == 4
+    assert vehicle.craft.flight.mode == 4
 
 
 DENIED, UNSUPPORTED = dialect.MAV_RESULT_DENIED, dialect.MAV_RESULT_UNSUPPORTED
@@ -179,7 +179,7 @@ def test_command_int_is_answered_like_command_long() -> None:
     vehicle = a_vehicle()
     request = pack(dialect.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, 1, 0, 0, 0, 0, 0, 0))
     assert result(vehicle, request) == dialect.MAV_RESULT_ACCEPTED
-    assert vehicle.craft.autopilot.armed
+    assert vehicle.craft.flight.armed
 
 
 def test_a_timesync_request_is_answered_with_the_clock_at_its_arrival() -> None:
@@ -238,4 +238,4 @@ def test_it_cannot_be_put_back_on_the_launcher_in_flight() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     assert result(vehicle, mode(0)) == dialect.MAV_RESULT_DENIED
-    assert vehicle.craft.autopilot.mode == 4
+    assert vehicle.craft.flight.mode == 4

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.services.mavlink import read_datagram
-from sim_vehicles.vehicles.double_integrator import Vehicle
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from sim_vehicles.vehicles.shell import Shell
 from tests.support.sim_client import (
     SECOND,
@@ -30,14 +30,14 @@ NAN, INFINITY = float("nan"), float("inf")
 VALID = [setpoint(3.0, -2.0), arm(), guided(), heartbeat(), command(511, 32, 20_000), mode(5)]
 
 
-def in_flight() -> Shell[Vehicle]:
+def in_flight() -> Shell[DoubleIntegrator]:
     vehicle = a_vehicle()
     vehicle.step([(heartbeat(), START)], START)
     take_off(vehicle)
     return vehicle
 
 
-def future(vehicle: Shell[Vehicle]) -> list[tuple[bytes, int]]:
+def future(vehicle: Shell[DoubleIntegrator]) -> list[tuple[bytes, int]]:
     return vehicle.step([], START + 5 * SECOND)
 
 
@@ -133,7 +133,7 @@ def test_a_timesync_request_for_another_vehicle_is_not_answered() -> None:
 def test_several_frames_in_one_datagram_are_all_obeyed() -> None:
     vehicle = a_vehicle()
     vehicle.step([(heartbeat() + arm() + guided() + setpoint(1.0), START)], START)
-    assert vehicle.craft.autopilot.flying
+    assert vehicle.craft.flight.flying
     assert vehicle.counters == {"heartbeats": 1, "commands": 2, "setpoints": 1}
 
 
@@ -156,7 +156,7 @@ def test_a_signed_frame_is_taken_by_a_vehicle_without_a_key() -> None:
     frame = dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0).pack(signing)
     vehicle = a_vehicle()
     vehicle.step([(frame, START)], START)
-    assert vehicle.craft.autopilot.armed
+    assert vehicle.craft.flight.armed
     assert_only_counted(frame[:-1])
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sim_vehicles.vehicles.double_integrator import Vehicle
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from sim_vehicles.vehicles.shell import Shell
 from tests.support.sim_client import (
     MS,
@@ -31,7 +31,7 @@ def shown(sent: list[tuple[bytes, int]]) -> Any:
     return last.custom_mode, last.system_status
 
 
-def stream_setpoints(vehicle: Shell[Vehicle], begin_ns: int, end_ns: int) -> list[tuple[bytes, int]]:
+def stream_setpoints(vehicle: Shell[DoubleIntegrator], begin_ns: int, end_ns: int) -> list[tuple[bytes, int]]:
     """Set-points at 10 Hz without any heartbeat."""
     frames = [(setpoint(), t) for t in range(begin_ns, end_ns, 100 * MS)]
     return vehicle.step(frames, end_ns)
@@ -58,7 +58,7 @@ def test_a_set_point_on_the_deadline_is_in_time_and_one_after_it_is_not() -> Non
         take_off(vehicle)
         arrival = START + SECOND + late_ns
         vehicle.step([(setpoint(), arrival)], arrival)
-        assert bool(vehicle.craft.autopilot.failsafe) is in_failsafe
+        assert bool(vehicle.craft.flight.failsafe) is in_failsafe
         assert vehicle.counters["ignored_in_failsafe"] == int(in_failsafe)
 
 

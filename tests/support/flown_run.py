@@ -1,17 +1,17 @@
 """Runs as a flight leaves them, made in no time: vehicles in line whose spacing errors die away."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gcs.control.tick import TICK, Mode, TickArray
-from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
+from gcs.plan.design import Design
+from gcs.runs.files import write_design
+from gcs.runs.record import SCENARIO_FILE, RunWriter
 from scenarios import files
 from scenarios.schema import NominalVelocity, Scenario, Vehicle
 
-DESIGN: dict[str, Any] = {"delay_margin_s": 0.4, "delay_margin_continuous_s": 0.41}
+DESIGN = Design(delay_margin_s=0.4, delay_margin_continuous_s=0.41)
 SPEED_M_S = 50.0
 PERIOD_S = 0.02
 
@@ -56,7 +56,7 @@ def ticks_of(scenario: Scenario, *, start_s: float, count: int, first: int = 0) 
     ticks["spacing_error_east_m"] = np.where(column == 0, np.nan, 4 * error_m)
     ticks["down_delay_s"] = 0.02
     ticks["loop_delay_s"] = age_s + 0.02
-    ticks["headroom"] = 1 - ticks["loop_delay_s"] / DESIGN["delay_margin_s"]
+    ticks["headroom"] = 1 - ticks["loop_delay_s"] / (DESIGN.delay_margin_s or np.inf)
     ticks["rtt_s"] = np.where(ticks["tick"] % 5 == 0, 0.05, np.nan)
     return ticks
 
@@ -64,7 +64,7 @@ def ticks_of(scenario: Scenario, *, start_s: float, count: int, first: int = 0) 
 def prepare(folder: Path, scenario: Scenario) -> RunWriter:
     """A run folder with its inputs, and the writer of its logs."""
     (folder / SCENARIO_FILE).write_text(files.dump(scenario), encoding="utf-8")
-    (folder / DESIGN_FILE).write_text(json.dumps(DESIGN), encoding="utf-8")
+    write_design(folder, DESIGN)
     return RunWriter(folder)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from gcs.control.tick import TickArray
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.plan.design import Design
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.station.station import Station
@@ -36,7 +37,7 @@ def log_bytes(entries: list[tuple[int, bytes]]) -> bytes:
     return b"".join(struct.pack(">Q", time_ns // 1000) + data for time_ns, data in entries)
 
 
-def flown(scenario: Scenario) -> tuple[dict[str, Any], dict[str, Any], TickArray, list[tuple[int, bytes]]]:
+def flown(scenario: Scenario) -> tuple[Design, dict[str, Any], TickArray, list[tuple[int, bytes]]]:
     """The design, the summary and the ticks of a flight, and the entries of its log."""
     design, plan = flight_plan(scenario)
     station, vehicles = Station(plan, start_ns=START_NS), Logged(vehicles_of(plan))

@@ -5,8 +5,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.schema import Clocks, Limits, Link, Links, NominalVelocity, Safety, Scenario, Vehicle
-from sim_vehicles.vehicles.double_integrator import Vehicle as SimulatedVehicle
-from sim_vehicles.vehicles.double_integrator import launched
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator, launched
 from sim_vehicles.vehicles.shell import Shell
 
 SECOND = 1_000_000_000
@@ -51,7 +50,7 @@ def scenario(
     )
 
 
-def a_vehicle(**settings: Any) -> Shell[SimulatedVehicle]:
+def a_vehicle(**settings: Any) -> Shell[DoubleIntegrator]:
     """The first vehicle of such a scenario, on the launcher at START."""
     flown = scenario(**settings)
     return launched(flown, flown.vehicles[0], START)
@@ -118,8 +117,8 @@ def setpoint(
     )
 
 
-def take_off(vehicle: Shell[SimulatedVehicle], time_ns: int = START) -> None:
+def take_off(vehicle: Shell[DoubleIntegrator], time_ns: int = START) -> None:
     """Arm, GUIDED, and a first set-point that wants no acceleration, all at one instant."""
     system = vehicle.system_id
     vehicle.step([(frame, time_ns) for frame in (arm(system), guided(system), setpoint(system=system))], time_ns)
-    assert vehicle.craft.autopilot.flying
+    assert vehicle.craft.flight.flying

@@ -15,7 +15,7 @@ def copter(flavour: Flavour) -> Shell[Copter]:
 
 
 VEHICLES: dict[str, Callable[[], Shell[Craft]]] = {
-    "plain": a_vehicle,
+    "double_integrator": a_vehicle,
     "ardupilot": lambda: copter("ardupilot"),
     "px4": lambda: copter("px4"),
 }

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
-from gains.delay.commensurate import analyse_commensurate, circle_sweep_margin
+from gains.delay._commensurate import analyse_commensurate, circle_sweep_margin
+from gains.delay._mixed import MixedTerm, analyse_mixed
 from gains.delay.constant import analyse_delay
-from gains.delay.mixed import MixedTerm, analyse_mixed
 from gains.delay.rightmost import rightmost_root
 from tests.support.paths import DATA
 

@@ -125,22 +125,22 @@ def test_design_file_gives_the_gains_that_a_scenario_takes() -> None:
     assert len(plan.around_loss) == len(plan.gains)
     head, tail = BIDIRECTIONAL.split("[control]")
     blocks = "".join(
-        f"[[control.blocks]]\nvehicle = {b['vehicle']}\nof = {b['of']}\ngain = {b['gain']}\n"
-        for b in designed["blocks"]
+        f"[[control.blocks]]\nvehicle = {b.vehicle}\nof = {b.of}\ngain = {[list(row) for row in b.gain]}\n"
+        for b in designed.blocks
     )
     head = head.replace("hears = [2]\n", "").replace("hears = [3]\n", "")
     text = head + blocks + "[links]" + tail.split("[links]")[1]
     given, replan = flight_plan(parse(text, Path("given.toml")))
     assert np.array_equal(replan.gain, plan.gain)
-    assert given["delay_margin_s"] == designed["delay_margin_s"]
-    assert given["method"] == "given"
+    assert given.delay_margin_s == designed.delay_margin_s
+    assert given.method == "given"
 
 
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ("hears = [2]", "hears = [7]", r"vehicles\[0\].hears"),
-        ("hears = [3]", "hears = [1]", r"vehicles\[1\].hears"),
+        ("hears = [2]", "hears = [7]", "vehicle 1: hears"),
+        ("hears = [3]", "hears = [1]", "vehicle 2: hears"),
         ('method = "graph-lqr"', 'method = "inclusion"', "graph-lqr or graph-dk"),
         ('method = "graph-lqr"', 'method = "magic"', "control.method"),
         ("delay_margin_s = 0.3", "gains = { K1 = -3.0, K2 = 0.5, K3 = 5.0 }", "control.method"),

@@ -49,10 +49,12 @@ def test_a_growth_that_is_allowed_is_reached_at_the_worst_delay_and_not_passed(p
 def test_the_design_of_a_scenario_is_that_of_its_loop() -> None:
     scenario = with_loop(load(FILE), "onboard", FILE)
     found, plan = flight_plan(scenario)
-    assert found["K2_1_s"] == [[0.0, 0.0], [0.0, 0.0]]
-    assert found["requirement"]["loop"] == "onboard"
-    flown = found["at_loop_delay"]
-    assert (flown["string_peak"], flown["string_peak_kept_to_s"], flown["alpha_kept_to_s"]) == (1.0, None, None)
+    assert found.K2_1_s == ((0.0, 0.0), (0.0, 0.0))
+    assert found.requirement is not None
+    assert found.requirement.loop == "onboard"
+    flown = found.at_loop_delay
+    assert flown is not None
+    assert (flown.string_peak, flown.string_peak_kept_to_s, flown.alpha_kept_to_s) == (1.0, None, None)
     assert plan.delay_margin_s == np.inf
 
 

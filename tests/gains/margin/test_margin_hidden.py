@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from gains.delay.commensurate import circle_sweep_margin
+from gains.delay._commensurate import circle_sweep_margin
 from gains.delay.constant import analyse_delay, delay_margin, frequency_sweep_margin
 from gains.delay.rightmost import rightmost_root
 from gains.margin.model_file import parse_model
 from gains.margin.opinions import checked_delay_margin
 from gains.varying.bounds import hierarchy_bound, small_gain_bound, varying_delay_bound
 from gains.varying.jitter import spread_bound
-from gcs.margin import margin_of_model
+from gcs.cli.margin import margin_of_model
 
 Matrix = NDArray[np.float64]
 Pair = tuple[Matrix, Matrix]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from gains.core.errors import BadModelError
+from gains.sampled._loop import HeldPlant
 from gains.sampled.constant import growth_rate
-from gains.sampled.loop import HeldPlant
 from gains.sampled.multirate import Timing, lifted_growth, multirate_delay_margin, multirate_growth_rate, multirate_map
 from gcs.stress.growth import Motion, fit_growth
 
@@ -154,6 +154,17 @@ def test_the_mean_loop_delay_hides_next_to_nothing_of_the_rates() -> None:
     for telemetry_s in (0.045, 0.04, 0.03, 0.0333):
         even_s = multirate_delay_margin(*FOLLOWER, Timing(0.05, 0.05))
         assert multirate_delay_margin(*FOLLOWER, Timing(0.05, telemetry_s)) == pytest.approx(even_s, abs=3e-4)
+
+
+def test_a_margin_long_against_the_periods_is_that_of_the_mean_loop_delay() -> None:
+    """A part in 10^4 is left to the order of the loop delays; at 100,000 periods the map of a search has no end."""
+    timing = Timing(1.0 / 59.91, 1.0 / 124.5)
+    margin_s = multirate_delay_margin(*FOLLOWER, timing)
+    assert margin_s > 30.0 * timing.held_s
+    for factor, stable in ((1.0 - 2e-4, True), (1.0 + 2e-4, False)):
+        assert (multirate_growth_rate(*FOLLOWER, timing, delay_s=factor * margin_s) < 0.0) == stable
+    weak = multirate_delay_margin([[0.0]], [[1.0]], [[-1e-3]], timing)
+    assert weak == pytest.approx(500.0 * np.pi - timing.held_s / 2.0, rel=1e-6)
 
 
 def test_slower_telemetry_costs_margin() -> None:

@@ -12,8 +12,8 @@ from gains.core.errors import BadModelError
 from gains.delay.sweep import frequency_sweep_margin
 from gains.formation.model import FormationModel
 from gains.formation.pattern import bidirectional, split_own
+from gains.sampled._loop import lifted_map
 from gains.sampled.constant import growth_rate, sampled_delay_margin
-from gains.sampled.loop import lifted_map
 from gains.sampled.onboard import LocalPlant, OnboardLoop, OnboardTiming, onboard_loop
 
 FINE = OnboardTiming(0.02, steps=2, steps_per_sample=1)
@@ -91,6 +91,15 @@ def test_growth_changes_sign_at_the_margin(timing: OnboardTiming) -> None:
     margin_s = loop.sampled_margin_s()
     assert loop.growth_1_s(margin_s * (1.0 - 1e-6)) < 0.0 < loop.growth_1_s(margin_s * (1.0 + 1e-6))
     assert all(loop.growth_1_s(part * margin_s) < 0.0 for part in np.linspace(0.0, 0.99, 25))
+
+
+@pytest.mark.parametrize("telemetry_s", [0.025, 0.013])
+def test_a_margin_long_against_uneven_periods_is_where_growth_changes_sign(telemetry_s: float) -> None:
+    loop = onboard_loop(CHAIN, PRINTED, OnboardTiming(0.02, 4, 2, telemetry_s))
+    margin_s = loop.sampled_margin_s()
+    assert margin_s > 30.0 * loop.timing.rates.held_s
+    # two parts in 10^4 were measured to be left to the order of the loop delays
+    assert loop.growth_1_s(margin_s * (1.0 - 3e-4)) < 0.0 < loop.growth_1_s(margin_s * (1.0 + 3e-4))
 
 
 def test_sampled_margin_goes_to_the_continuous_one_with_the_period() -> None:

@@ -7,8 +7,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from gains.core.errors import BadModelError
+from gains.sampled._loop import matrix_exponentials
 from gains.sampled.constant import growth_rate, period_map, spectral_radius
-from gains.sampled.loop import matrix_exponentials
 
 Matrix = NDArray[np.float64]
 

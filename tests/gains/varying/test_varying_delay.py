@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
 from gains.delay.constant import delay_margin
+from gains.varying._lmi import Unknown, positive_definite_solution
 from gains.varying.bounds import hierarchy_bound, small_gain_bound, varying_delay_bound
 from gains.varying.jitter import Jitter, bound_covering, spread_bound
-from gains.varying.lmi import Unknown, positive_definite_solution
 
 Matrix = NDArray[np.float64]
 A0: Matrix = np.array([[-2.0, 0.0], [0.0, -0.9]])

@@ -13,7 +13,7 @@ import pytest
 
 from gains.core.errors import BadModelError, DisagreementError
 from gains.margin.model_file import parse_model
-from gcs.margin import ModelFileError, margin_of_file, margin_of_model, margin_of_scenario, print_margin
+from gcs.cli.margin import ModelFileError, margin_of_file, margin_of_model, margin_of_scenario, print_margin
 from tests.support.paths import SCENARIOS
 
 CLASSIC = {"A0": [[-2.0, 0.0], [0.0, -0.9]], "A1": [[-1.0, 0.0], [-1.0, -1.0]]}

@@ -119,12 +119,12 @@ def test_gains_of_any_size_are_assessed_and_told_as_what_they_are(
 def test_vehicles_that_start_in_collision_or_past_the_limit_are_found_before_take_off(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    near = chain_file(tmp_path, ("[-229.84, 233.84]", "[-133.92, 132.92]"))
+    near = chain_file(tmp_path, ("[-242.79, 243.09]", "[-122.82, 125.52]"))
     for command in (("fly",), ("stress", "--onset")):
         line = complaint(capsys, monkeypatch, command[0], str(near), *command[1:])
         assert "read vehicles 2 and 3 3 m apart, wanted at least safety.collision_distance_m = 5 m" in line
     assert flight_plan(load(near))[1].delay_margin_s > 0.29  # designed all the same
-    far = chain_file(tmp_path, ("[-229.84, 233.84]", "[-2229.84, 233.84]"))
+    far = chain_file(tmp_path, ("[-242.79, 243.09]", "[-2242.79, 243.09]"))
     assert "read vehicle 3 with a spacing error of 1974" in complaint(capsys, monkeypatch, "fly", str(far))
 
 

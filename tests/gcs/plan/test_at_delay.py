@@ -1,43 +1,55 @@
 """α and the growth of spacing errors with delay, where a user meets them: design, table, summary."""
 
+import io
+from typing import Literal, cast
+
 import numpy as np
 import pytest
+from rich.console import Console
 
+from gains.performance.flown_formation import FlownFormation
 from gcs.drive.flown import fly_virtual
 from gcs.plan.at_delay import expected_loop_delay_s, figures_at
+from gcs.plan.design import Design, FiguresAtDelay
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
+from gcs.views.report import print_design
 from gcs.views.table import FlightState, plain_line
-from scenarios.files import load
+from scenarios.files import load, with_loop
 from scenarios.schema import DelayPoint, Jitter, Link, Links, Rates, VehicleLinks
 from tests.support.paths import ROOT
 
 TRIANGLE = load(ROOT / "scenarios/triangle5.toml")
+TWO_WAY = load(ROOT / "scenarios/chain3_bidirectional.toml")
 
 
 def test_a_design_tells_alpha_and_growth_at_the_delay_of_its_links_and_how_far_they_hold() -> None:
     late = TRIANGLE.with_link_delay(up_s=0.12, down_s=0.12)
-    flown = flight_plan(late)[0]["at_loop_delay"]
-    assert flown["loop_delay_s"] == pytest.approx(0.25)
-    assert flown["alpha"] == pytest.approx(0.312, abs=5e-4)
-    assert flown["string_peak"] == pytest.approx(2.49, abs=5e-3)
-    assert flown["string_peak_kept"] == 1.0
-    assert flown["string_peak_kept_to_s"] == pytest.approx(0.1607, abs=1e-4)
-    assert 0.15 < flown["alpha_kept_to_s"] < 0.17
-    beyond = flight_plan(TRIANGLE.with_link_delay(up_s=0.2, down_s=0.2))[0]["at_loop_delay"]
-    assert (beyond["alpha"], beyond["string_peak"]) == (0.0, None)
+    flown = flight_plan(late)[0].at_loop_delay
+    assert flown is not None
+    assert flown.alpha_kept_to_s is not None
+    assert flown.loop_delay_s == pytest.approx(0.25)
+    assert flown.alpha == pytest.approx(0.312, abs=5e-4)
+    assert flown.string_peak == pytest.approx(2.49, abs=5e-3)
+    assert flown.string_peak_kept == 1.0
+    assert flown.string_peak_kept_to_s == pytest.approx(0.1607, abs=1e-4)
+    assert 0.15 < flown.alpha_kept_to_s < 0.17
+    beyond = flight_plan(TRIANGLE.with_link_delay(up_s=0.2, down_s=0.2))[0].at_loop_delay
+    assert beyond is not None
+    assert (beyond.alpha, beyond.string_peak) == (0.0, None)
 
 
 def test_a_slower_gain_set_is_judged_as_the_design_slowed_down() -> None:
     design, _ = flight_plan(TRIANGLE)
     # slowed down by 2 all but the hold does the same in twice the time: 2 (0.2 + 0.01) - 0.01
-    fast, slow = figures_at(design, 0.2), figures_at(design, 0.41, gain_set=1)
-    assert fast["string_peak"] is not None
-    assert slow["string_peak"] == pytest.approx(fast["string_peak"], rel=1e-6)
-    assert figures_at({"delay_margin_s": 0.3}, 0.1) == {"loop_delay_s": 0.1, "alpha": None, "string_peak": None}
+    fast, slow = figures_at(design, TRIANGLE, 0.2), figures_at(design, TRIANGLE, 0.41, gain_set=1)
+    assert fast.string_peak is not None
+    assert slow.string_peak == pytest.approx(fast.string_peak, rel=1e-6)
+    minimal = Design(delay_margin_s=0.3)
+    assert figures_at(minimal, TRIANGLE, 0.1) == FiguresAtDelay(loop_delay_s=0.1, has_string_verdict=False)
 
 
-def test_the_expected_loop_delay_is_that_of_the_slowest_links_and_half_a_telemetry_period() -> None:
+def test_the_expected_loop_delay_is_that_of_the_slowest_links() -> None:
     assert expected_loop_delay_s(TRIANGLE) == pytest.approx(0.05)
     gamma = Jitter(distribution="gamma", scale_s=0.01, shape=2.0)
     ramp = (DelayPoint(at_s=0.0, delay_s=0.0), DelayPoint(at_s=9.0, delay_s=0.1))
@@ -47,7 +59,8 @@ def test_the_expected_loop_delay_is_that_of_the_slowest_links_and_half_a_telemet
         vehicles=(VehicleLinks(system_id=2, down=Link(delay_points=ramp)),),
     )
     slow = TRIANGLE.model_copy(update={"links": links, "rates": Rates(telemetry_hz=10.0)})
-    assert expected_loop_delay_s(slow) == pytest.approx(0.03 + 0.02 + 0.1 + 0.05)
+    # half the shorter period, that of control: a repeated command is no later than the first one from its state
+    assert expected_loop_delay_s(slow) == pytest.approx(0.03 + 0.02 + 0.1 + 0.01)
 
 
 def test_table_and_summary_tell_both_at_the_loop_delay_that_was_measured() -> None:
@@ -58,7 +71,7 @@ def test_table_and_summary_tell_both_at_the_loop_delay_that_was_measured() -> No
     told = summarise(calm, design, flight.ticks, flight.events)["at_loop_delay"]
     own = flight.ticks["loop_delay_s"][flight.ticks["commanded"]].reshape(-1, 5)
     assert told["loop_delay_s"] == pytest.approx(np.nanmedian(own, axis=0).max(), abs=1e-9)
-    assert told == figures_at(design, told["loop_delay_s"])
+    assert told == figures_at(design, calm, told["loop_delay_s"]).model_dump()
     assert 0.5 < told["alpha"] < 0.81
     assert 1.0 < told["string_peak"] < 1.4
     state = FlightState(calm, design)
@@ -66,3 +79,52 @@ def test_table_and_summary_tell_both_at_the_loop_delay_that_was_measured() -> No
     state.add(rows[(rows["time_s"][:, 0] > 3.0) & (rows["time_s"][:, 0] < 5.9)], [])
     assert f"alpha {told['alpha']:.2f}" in plain_line(state)
     assert f"errors grow {told['string_peak']:.1f}" in plain_line(state)
+
+
+def test_gains_on_a_general_pattern_have_the_alpha_of_the_whole_formation_and_no_string_verdict() -> None:
+    late = TWO_WAY.with_link_delay(up_s=0.1, down_s=0.1)
+    design, plan = flight_plan(late)
+    told = design.at_loop_delay
+    assert told is not None
+    assert told.alpha is not None
+    assert told.alpha_kept_to_s is not None
+    assert told.loop_delay_s == pytest.approx(0.21)
+    assert (told.has_string_verdict, told.string_peak, told.string_peak_kept) == (False, None, None)
+    assert told.alpha < 0.99 * (design.alpha or 0.0)
+    assert 0.15 < told.alpha_kept_to_s < 0.21
+    # σ_min on a plain grid, of both axes
+    omega = np.linspace(0.0, 6.0, 6001)[:, None, None]
+    matrix = 1j * omega * np.eye(10) - plan.model.A - plan.model.B @ plan.gain * np.exp(-1j * omega * (0.21 + 0.01))
+    assert told.alpha == pytest.approx(np.linalg.svd(matrix, compute_uv=False).min(), rel=1e-5)
+    console = Console(file=io.StringIO(), width=200)
+    print_design(design, console)
+    text = cast("io.StringIO", console.file).getvalue()
+    assert f"{told.alpha:.4f} at 210.0 ms of loop delay, of the whole formation" in text
+    assert "no verdict: with gains on a general pattern errors do not run down a chain" in text
+
+
+@pytest.mark.parametrize("loop", ["ground", "onboard"])
+def test_each_gain_set_on_a_general_pattern_has_the_alpha_of_the_gains_that_are_flown(
+    loop: Literal["ground", "onboard"],
+) -> None:
+    scenario = with_loop(TWO_WAY, loop, ROOT)
+    design, plan = flight_plan(scenario)
+    for gain_set, (K, margin_s) in enumerate(zip(plan.gains, plan.margins_s, strict=True)):
+        step_s = 1.0 / scenario.onboard.rate_hz if loop == "onboard" else 0.0
+        own = FlownFormation(plan.model, K, margin_s, 0.02, loop, step_s)
+        found = figures_at(design, scenario, 0.15, gain_set).alpha
+        assert found == pytest.approx(own.alpha(0.15), rel=1e-6)  # own gains are flown as float32
+
+
+def test_table_and_summary_of_a_flight_on_a_general_pattern_tell_its_alpha_at_the_delay_measured() -> None:
+    short = TWO_WAY.model_copy(update={"duration_s": 4.0})
+    design, plan = flight_plan(short)
+    flight = fly_virtual(plan)
+    told = summarise(short, design, flight.ticks, flight.events)["at_loop_delay"]
+    assert told == figures_at(design, short, told["loop_delay_s"]).model_dump()
+    assert 0.6 < told["alpha"] < (design.alpha or 0.0)
+    state = FlightState(short, design)
+    rows = flight.ticks.reshape(-1, 3)
+    state.add(rows[rows["time_s"][:, 0] > 2.0], [])
+    assert f"alpha {told['alpha']:.2f}" in plain_line(state)
+    assert "errors grow" not in plain_line(state)

@@ -8,12 +8,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from tests.support.flown_run import line, prepare, ticks_of
 
 from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.summary import finish
 from gcs.stress.campaign import CampaignError, Store
 from gcs.stress.trial import Outcome
+from tests.support.flown_run import line, prepare, ticks_of
 
 THREE = line(3)
 
@@ -90,7 +90,9 @@ def test_a_campaign_ends_in_one_line_and_keeps_what_it_had(tmp_path: Path) -> No
     store.add(one)
     with (
         disk_full_at(store.file.stat().st_size + 20),
-        pytest.raises(CampaignError, match=r"trials\.jsonl: File too large; 1 trials are stored; go on with --resume"),
+        pytest.raises(
+            CampaignError, match=r"trials\.jsonl: File too large; 1 trials are stored; continue with --resume"
+        ),
     ):
         store.add(two)
     store.close()

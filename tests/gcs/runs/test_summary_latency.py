@@ -1,10 +1,10 @@
 """The latencies in a summary: with status and sample count, and nothing for what is unknown."""
 
 import numpy as np
-from tests.support.flown_run import DESIGN, line, ticks_of
 
 from gcs.control.tick import CLOCK_JUMPED
 from gcs.runs.summary import summarise
+from tests.support.flown_run import DESIGN, line, ticks_of
 
 
 def test_each_estimate_bears_its_status_and_samples_and_an_unknown_is_none() -> None:

@@ -14,8 +14,8 @@ from gcs.drive.flown import fly_virtual
 from gcs.plan.planner import flight_plan
 from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, TICKS_FILE
 from gcs.stress.axes import at_coordinates
+from gcs.stress.free_response import probe_scenario, with_waiting
 from gcs.stress.measure import fly_trial
-from gcs.stress.probe import probe_scenario, with_waiting
 from gcs.stress.study import Study
 from gcs.stress.trial import Trial, plan_of
 from scenarios.files import load

@@ -10,6 +10,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from gcs.control.tick import TICK, Mode, TickArray
+from gcs.plan.design import Design
 from gcs.runs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE
 from gcs.views.grid import WholeTicks
 from gcs.views.observer import record_run
@@ -159,11 +160,10 @@ def test_the_recording_brings_its_own_screen(tmp_path: Path) -> None:
     assert len(RrdReader(tmp_path / RECORDING_FILE).blueprints()) == 1
 
 
-@pytest.mark.parametrize("margin", [None, float("inf")])
-def test_gains_without_a_finite_margin_draw_no_margin(tmp_path: Path, margin: float | None) -> None:
+def test_gains_without_a_finite_margin_draw_no_margin(tmp_path: Path) -> None:
     ticks = ticks_of(FIVE, start_s=0.0, count=5)
     ticks["delay_margin_s"] = np.inf
-    with Recording(tmp_path, FIVE, DESIGN | {"delay_margin_s": margin}) as recording:
+    with Recording(tmp_path, FIVE, Design(delay_margin_s=np.inf)) as recording:
         recording.add(ticks, [])
     paths = {chunk.entity_path for chunk in RrdReader(tmp_path / RECORDING_FILE).stream()}
     drawn = "/delay/margin_ms" in paths and any(

@@ -10,6 +10,7 @@ import pytest
 
 from gcs.control.tick import TickArray
 from gcs.link import mavlink
+from gcs.plan.design import Design
 from gcs.watch.rebuild import rebuild
 from gcs.watch.rebuild_report import Replayed, replay
 from gcs.watch.tlog import parse_tlog
@@ -135,7 +136,7 @@ def test_a_log_of_another_tool_gives_links_and_errors_and_no_verdict(requests: b
     scenario = scenario_of("chain3")
     data, ticks = overheard(requests=requests)
     log = parse_tlog(data)
-    result = replay(log, Replayed(Path("other.tlog"), scenario, {"delay_margin_s": 0.3}, None))
+    result = replay(log, Replayed(Path("other.tlog"), scenario, Design(delay_margin_s=0.3), None))
     assert (result["flight"]["verdict"], result["flight"]["control"]) == ("not judged", None)
     for links in result["links"]:
         assert links["rtt_s"]["p50"] == (pytest.approx(0.04, abs=MICROSECOND) if requests else None)

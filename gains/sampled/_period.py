@@ -4,11 +4,11 @@ from math import inf
 
 import numpy as np
 
+from gains.core._bracketing import Functions, bracketed_roots, may_reach_zero, peaks
 from gains.core.arrays import FloatArray
-from gains.core.bracketing import Functions, bracketed_roots, may_reach_zero, peaks
 from gains.core.errors import GainsError
-from gains.delay.loci import factor_rank
-from gains.sampled.loop import HeldPlant
+from gains.delay._loci import factor_rank
+from gains.sampled._loop import HeldPlant
 
 # periods looked at in one go, and goes before giving up
 _CHUNK, _CHUNKS = 256, 200

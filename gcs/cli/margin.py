@@ -64,10 +64,10 @@ def margin_of_scenario(file: Path) -> dict[str, Any]:
     at_once = own_part(model, plan.gain) if onboard else np.zeros_like(plan.gain)
     terms = Term(model.A + model.B @ at_once, 0.0, Fraction(0)), Term(model.B @ (plan.gain - at_once), 0.0, Fraction(1))
     result = margin_of_model(DelayModel(terms, "tau"))
-    sampled_s = design["delay_margin_s"]
+    sampled_s = design.delay_margin_s
     what = "own errors at once, those of others late" if onboard else "all feedback late"
     flown = "no limit" if sampled_s is None else f"margin {sampled_s:.6g} s"
-    note = f"as flown, sampled and held every {design['period_s'] * 1e3:g} ms: {flown}"
+    note = f"as flown, sampled and held every {design.period_s * 1e3:g} ms: {flown}"
     notes = [f"loop {plan.scenario.control.loop}: {what}", note, *result["notes"]]
     return result | {"loop": plan.scenario.control.loop, "delay_margin_sampled_s": sampled_s, "notes": notes}
 

@@ -1,10 +1,10 @@
 """Known delays beside one unknown: x'(t) = sum_i A_i x(t - d_i - k_i tau) with d_i in seconds and k_i whole.
 
-As in `gains.delay.commensurate` the loci lambda(j omega) = e^{j omega tau} are eigenvalues of a block companion matrix;
-the known delays merely make its blocks depend on the frequency by e^{-j omega d_i}. A root is on the imaginary axis
-where a modulus is one and goes right where the modulus falls, for every delay. What is lost is the algebra: the
-frequencies come from a sweep, fine enough for the turning of e^{-j omega d_i} and with extrema near one refined. The
-unstable roots without the unknown delay are counted by the argument principle.
+As in `_commensurate`, the loci lambda(j omega) = e^{j omega tau} are eigenvalues of a block companion matrix; the known
+delays merely make its blocks depend on the frequency, by e^{-j omega d_i}. A root is on the imaginary axis where a
+modulus is one, and it moves to the right where the modulus falls, for every delay. The frequencies no longer follow
+from algebra: they come from a sweep that is fine enough for the turning of e^{-j omega d_i} and that refines extrema
+near one. The argument principle counts the roots that are unstable without the unknown delay.
 """
 
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
-from gains.delay.commensurate import column_space, companion_loci, highest_frequency
+from gains.delay._commensurate import column_space, companion_loci, highest_frequency
+from gains.delay._crossing_error import DelayedTerm
+from gains.delay._crossings import AxisCrossing
+from gains.delay._loci import Loci, unit_crossings, without_limits_at_zero
+from gains.delay._zero_root import zero_passage
 from gains.delay.constant import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
-from gains.delay.crossing_error import DelayedTerm
-from gains.delay.crossings import AxisCrossing
-from gains.delay.loci import Loci, unit_crossings, without_limits_at_zero
 from gains.delay.sweep import near_unit_extrema
-from gains.delay.zero_root import zero_passage
 
 # rad by which e^{-j omega d} turns between neighbouring frequencies
 _TURN = 0.1
@@ -44,7 +44,7 @@ class MixedTerm:
     --------
     -x(t - 0.5 - 2 tau):
 
-    >>> from gains.delay.mixed import MixedTerm
+    >>> from gains.delay._mixed import MixedTerm
     >>> MixedTerm([[-1]], known_s=0.5, multiple=2)
     MixedTerm(matrix=[[-1]], known_s=0.5, multiple=2)
     """
@@ -81,7 +81,7 @@ def analyse_mixed(
     --------
     x'(t) = -x(t - 0.5 - tau) leaves pi / 2 - 0.5 for tau:
 
-    >>> from gains.delay.mixed import MixedTerm, analyse_mixed
+    >>> from gains.delay._mixed import MixedTerm, analyse_mixed
     >>> round(analyse_mixed([MixedTerm([[-1]], known_s=0.5, multiple=1)]).delay_margin_s, 6)
     1.070796
     """
@@ -124,7 +124,7 @@ def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_
     --------
     x'(t) = -x(t - 2), beyond its margin of pi / 2:
 
-    >>> from gains.delay.mixed import count_unstable_roots
+    >>> from gains.delay._mixed import count_unstable_roots
     >>> count_unstable_roots([([[-1]], 2.0)])
     2
     """

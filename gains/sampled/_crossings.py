@@ -15,13 +15,13 @@ from math import ceil, floor, inf, pi
 
 import numpy as np
 
+from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.core.bracketing import bracketed_roots
 from gains.core.errors import DisagreementError
-from gains.delay.crossings import separating_points
-from gains.delay.loci import Loci, delay_loci, solved_beside_poles, unit_crossings
+from gains.delay._crossings import separating_points
+from gains.delay._loci import Loci, delay_loci, solved_beside_poles, unit_crossings
 from gains.delay.sweep import near_unit_extrema, sweep_frequencies
-from gains.sampled.loop import SampledPlant, block_radius, split_delay
+from gains.sampled._loop import SampledPlant, block_radius, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
 _FRACTIONS = 8

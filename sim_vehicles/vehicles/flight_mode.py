@@ -1,4 +1,4 @@
-"""Whom the vehicle obeys and when: arming, modes, the beginning of the flight, the failsafe. No bytes, no motion.
+"""When a double integrator obeys set-points: arming, modes, the start of the flight, the failsafe. No bytes, no motion.
 
 on the launcher ──first set-point or take-off, armed, GUIDED──► flying (GUIDED) ◄──commanded──► flying (LOITER, BRAKE)
                                                                       │                             │
@@ -6,7 +6,7 @@ on the launcher ──first set-point or take-off, armed, GUIDED──► flying
                                                                       ▼                             ▼
                                           failsafe: LOITER, CRITICAL, until GUIDED or LOITER is commanded
 
-LOITER and BRAKE are the same here: it holds its course. Stations say either when they mean hold.
+LOITER and BRAKE both hold the course: ground stations send either for "hold".
 """
 
 from scenarios.schema import NS_PER_S, Safety
@@ -29,17 +29,17 @@ from sim_vehicles.services.mavlink import (
 MODE_NAMES = {MODE_STABILIZE: "STABILIZE", MODE_GUIDED: "GUIDED", MODE_LOITER: "LOITER", MODE_BRAKE: "BRAKE"}
 
 
-class Autopilot:
-    """The modes of one vehicle; every method takes the instant at which the thing happens."""
+class FlightMode:
+    """The mode of one vehicle. Every method takes the instant at which its event happens."""
 
     def __init__(self, safety: Safety) -> None:
         self.armed = False
         self.mode = MODE_STABILIZE
         self.flying = False
         self.failsafe = ""
-        """Which stream stopped, empty if none."""
+        """Which stream stopped; empty if none."""
         self.deadline_ns = NEVER_NS
-        """When the failsafe begins unless something is heard before."""
+        """When the failsafe begins unless a station is heard before."""
         self._setpoint_timeout_ns = round(safety.setpoint_timeout_s * NS_PER_S)
         self._heartbeat_timeout_ns = round(safety.heartbeat_timeout_s * NS_PER_S)
         self._setpoint_ns = 0
@@ -59,7 +59,7 @@ class Autopilot:
         return STATUS_CRITICAL if self.failsafe else STATUS_ACTIVE
 
     def set_timeouts(self, setpoint_s: float, heartbeat_s: float, now_ns: int) -> None:
-        """How long the station may be silent from now on; both timers begin anew if that is a change."""
+        """Set how long the station may be silent; both timers restart if that changes."""
         timeouts_ns = round(setpoint_s * NS_PER_S), round(heartbeat_s * NS_PER_S)
         if timeouts_ns != (self._setpoint_timeout_ns, self._heartbeat_timeout_ns):
             self._setpoint_timeout_ns, self._heartbeat_timeout_ns = timeouts_ns
@@ -67,12 +67,12 @@ class Autopilot:
             self._set_deadline()
 
     def hear_heartbeat(self, now_ns: int) -> None:
-        """A station's heartbeat arrived."""
+        """Note a heartbeat of the station."""
         self._heartbeat_ns = max(self._heartbeat_ns, now_ns)
         self._set_deadline()
 
     def accept_setpoint(self, now_ns: int) -> str:
-        """Take a set-point, the first one as the start of the flight: why not, or an empty string."""
+        """Accept a set-point; the first begins the flight. Returns the reason if it is ignored, else ""."""
         if self.failsafe:
             return "ignored_in_failsafe"
         if not self.armed:
@@ -81,14 +81,14 @@ class Autopilot:
             return "ignored_not_guided"
         if not self.flying:
             self.flying = True
-            self._heartbeat_ns = now_ns  # a station that was silent before the flight has its full time from here
+            self._heartbeat_ns = now_ns  # time before the flight does not count as silence
         if now_ns > self._setpoint_ns or self._setpoint_ns == NEVER_NS:
             self._setpoint_ns = now_ns
         self._set_deadline()
         return ""
 
     def take_off(self, now_ns: int) -> int:
-        """Begin the flight on command: the MAV_RESULT. No set-points are missed before the first."""
+        """Begin the flight on command; returns the MAV_RESULT. Set-points are missed only after the first has come."""
         if self.flying or not self.armed or self.mode != MODE_GUIDED:
             return DENIED
         self.flying = True
@@ -97,16 +97,16 @@ class Autopilot:
         return ACCEPTED
 
     def arm(self, wanted: bool) -> int:
-        """Arm or disarm: the MAV_RESULT. Not disarmed in flight, forced or not: it would fall."""
+        """Arm or disarm; returns the MAV_RESULT. In flight it never disarms, even forced: it would fall."""
         if not wanted and self.flying:
             return DENIED
         self.armed = wanted
         return ACCEPTED
 
     def set_mode(self, mode: int, now_ns: int) -> int:
-        """Change the mode on command: the MAV_RESULT. In failsafe the command is the way out.
+        """Change the mode on command; returns the MAV_RESULT. A mode command also ends the failsafe.
 
-        Both timers begin anew when the mode changes or the failsafe ends: whoever takes over has the full time.
+        Both timers restart when the mode changes or the failsafe ends, so that whoever takes over has the full time.
         """
         if mode not in MODE_NAMES or (self.flying and mode == MODE_STABILIZE):
             return DENIED
@@ -118,7 +118,7 @@ class Autopilot:
         return ACCEPTED
 
     def fail(self) -> None:
-        """Enter the failsafe; to be called at the deadline."""
+        """Enter the failsafe; called at the deadline."""
         assert self.flying
         setpoints_stopped = (
             self.mode == MODE_GUIDED and self.deadline_ns == self._setpoint_ns + self._setpoint_timeout_ns
@@ -132,5 +132,5 @@ class Autopilot:
             self.deadline_ns = NEVER_NS
             return
         self.deadline_ns = self._heartbeat_ns + self._heartbeat_timeout_ns
-        if self.mode == MODE_GUIDED:  # a commanded hold waits for no set-points
+        if self.mode == MODE_GUIDED:  # a commanded hold needs no set-points
             self.deadline_ns = min(self.deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)

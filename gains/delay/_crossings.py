@@ -1,7 +1,7 @@
 """Where roots of x'(t) = A0 x(t) + A1 x(t - tau) cross the imaginary axis, found without a grid.
 
 The algebraic test gives a finite list of frequencies that contains every crossing. The loci of the loop
-(`gains.delay.loci`) are then counted between these frequencies, which says how many crossings there are and in which
+(`gains.delay._loci`) are then counted between these frequencies, which says how many crossings there are and in which
 direction, brackets them, and does not rely on the list being accurate; Newton's method on the characteristic matrix
 gives the last digits.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.delay.loci import (
+from gains.delay._loci import (
     Loci,
     UnitCrossing,
     delay_loci,

@@ -31,7 +31,7 @@ class Unknown:
     --------
     A symmetric 2×2 matrix has three independent entries:
 
-    >>> from gains.varying.lmi import Unknown
+    >>> from gains.varying._lmi import Unknown
     >>> Unknown(2).count, Unknown(2, 3).count
     (3, 6)
     """
@@ -75,7 +75,7 @@ def positive_definite_solution(unknowns: Sequence[Unknown], inequalities: Inequa
     x' = a x is stable if there is a p > 0 with −2 a p > 0:
 
     >>> import numpy as np
-    >>> from gains.varying.lmi import Unknown, positive_definite_solution
+    >>> from gains.varying._lmi import Unknown, positive_definite_solution
     >>> [
     ...     positive_definite_solution([Unknown(1)], lambda x: [x[0], -2 * a * x[0]]) is not None
     ...     for a in (-1.0, 1.0)

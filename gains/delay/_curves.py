@@ -11,7 +11,7 @@ from math import pi
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.delay.loci import UnitCrossing, unit_crossings
+from gains.delay._loci import UnitCrossing, unit_crossings
 from gains.delay.sweep import near_unit_extrema
 
 # angles from which curves are looked for, and angles of the other delay in each search

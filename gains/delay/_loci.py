@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.core.bracketing import bracketed_roots
 
 Loci = Callable[[FloatArray], ComplexArray]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, distinct_blocks
-from gains.delay.loci import factor_rank
+from gains.delay._loci import factor_rank
 
 # a delay this close to a whole number of periods (in periods) is that number: (3 * 0.02) / 0.02 is not exactly 3
 _WHOLE = 1e-12

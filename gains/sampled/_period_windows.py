@@ -12,14 +12,14 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.core.bracketing import bracketed_roots
 from gains.core.errors import GainsError
 from gains.core.structure import balanced, distinct_blocks
-from gains.delay.loci import factor_rank
+from gains.delay._loci import factor_rank
+from gains.sampled._loop import HeldPlant
+from gains.sampled._period import last_period, next_periods, with_peaks
 from gains.sampled.constant import checked_loop, sampling_period_limit
-from gains.sampled.loop import HeldPlant
-from gains.sampled.period import last_period, next_periods, with_peaks
 
 # windows are listed up to this many times the first limit, or of the slowest time constant without one
 _HORIZON = 20.0
@@ -74,7 +74,7 @@ def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
     --------
     x' = u, u = -x: x_{k+1} = (1 - T) x_k is stable up to T = 2, where it changes sign from sample to sample.
 
-    >>> from gains.sampled.period_windows import analyse_period
+    >>> from gains.sampled._period_windows import analyse_period
     >>> found = analyse_period([[0]], [[1]], [[-1]])
     >>> round(found.limit_s, 6), [(round(c.omega_rad_s, 4), c.direction) for c in found.crossings]
     (2.0, [(1.5708, 1)])

@@ -2,10 +2,10 @@
 
 With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda, so at each frequency there are finitely
 many lambda with det(j omega I - sum_k A_k lambda^{-k}) = 0: the eigenvalues of a block companion matrix. They are loci
-as those of one delay (`gains.delay.loci`): a root is on the imaginary axis where a modulus is one, and it goes right
+as those of one delay (`gains.delay._loci`): a root is on the imaginary axis where a modulus is one, and it goes right
 where that modulus falls with the frequency, whatever the delay. Everything else is as with one delay.
 
-The frequencies come from a pencil and from Newton's method along the unit circle, see `gains.delay.circle_angles`. A
+The frequencies come from a pencil and from Newton's method along the unit circle, see `gains.delay._circle_angles`. A
 sweep of the circle is the second opinion.
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, for the same problem as a
@@ -21,17 +21,9 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
-from gains.delay.circle_angles import PAST_HALF, at_angle, candidate_angles, circle_loci, circle_points, norm_of
-from gains.delay.constant import (
-    BlockAnalysis,
-    DelayAnalysis,
-    block_analysis,
-    check_horizon,
-    combined_analysis,
-    unstable_roots,
-)
-from gains.delay.crossing_error import DelayedTerm
-from gains.delay.crossings import (
+from gains.delay._circle_angles import PAST_HALF, at_angle, candidate_angles, circle_loci, circle_points, norm_of
+from gains.delay._crossing_error import DelayedTerm
+from gains.delay._crossings import (
     AxisCrossing,
     axis_crossings,
     crossings_of_loci,
@@ -40,8 +32,16 @@ from gains.delay.crossings import (
     polish,
     separating_points,
 )
-from gains.delay.loci import Loci, UnitCrossing, solved_beside_poles, unit_crossings
-from gains.delay.zero_root import zero_passage
+from gains.delay._loci import Loci, UnitCrossing, solved_beside_poles, unit_crossings
+from gains.delay._zero_root import zero_passage
+from gains.delay.constant import (
+    BlockAnalysis,
+    DelayAnalysis,
+    block_analysis,
+    check_horizon,
+    combined_analysis,
+    unstable_roots,
+)
 
 # a locus is an eigenvalue of a companion matrix, of which many are wanted; beyond this size angles are followed instead
 _LARGEST_LOCI = 30
@@ -79,7 +79,7 @@ def analyse_commensurate(
     --------
     x'(t) = -x(t - tau) - x(t - 2 tau) is stable up to tau = pi / (3 sqrt(3)), where it oscillates at sqrt(3) rad/s:
 
-    >>> from gains.delay.commensurate import analyse_commensurate
+    >>> from gains.delay._commensurate import analyse_commensurate
     >>> found = analyse_commensurate([[[0]], [[-1]], [[-1]]])
     >>> round(found.delay_margin_s, 6), round(found.crossings[0].omega_rad_s, 6)
     (0.6046, 1.732051)
@@ -113,7 +113,7 @@ def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
     --------
     The margin pi / (3 sqrt(3)) of x'(t) = -x(t - tau) - x(t - 2 tau):
 
-    >>> from gains.delay.commensurate import circle_sweep_margin
+    >>> from gains.delay._commensurate import circle_sweep_margin
     >>> round(circle_sweep_margin([[[0]], [[-1]], [[-1]]]), 6)
     0.6046
     """

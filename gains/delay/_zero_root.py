@@ -59,7 +59,7 @@ def zero_passage(
     s = 1 - e^{-s tau}, x' = x - x(t - tau): a root passes zero to the right at tau = 1.
 
     >>> import numpy as np
-    >>> from gains.delay.zero_root import zero_passage
+    >>> from gains.delay._zero_root import zero_passage
     >>> zero_passage([np.array([[1.0]]), np.array([[-1.0]])], np.zeros(2), np.arange(2))
     ZeroPassage(delay_s=1.0, direction=1)
     """

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.delay.loci import Loci
+from gains.delay._loci import Loci
 from gains.delay.sweep import near_unit_extrema
 
 # the pencil's companion matrix takes 0.1 s at this size; larger ones leave the frequencies to the sweep

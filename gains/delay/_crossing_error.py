@@ -44,7 +44,7 @@ def crossing_error(terms: Sequence[DelayedTerm], omega: float, tau_s: float) -> 
     x'(t) = -x(t - tau), known to rounding:
 
     >>> import numpy as np
-    >>> from gains.delay.crossing_error import DelayedTerm, crossing_error
+    >>> from gains.delay._crossing_error import DelayedTerm, crossing_error
     >>> omega_error, delay_error_s = crossing_error([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], 1.0, np.pi / 2.0)
     >>> delay_error_s < 1e-14
     True

@@ -1,0 +1,87 @@
+"""`gcs grade`, `view` and `recover`: what is done with the folder of a run."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gcs.cli.exit_codes import FAILED
+from gcs.cli.options import AsJson, RunFolder, out_file, print_json, within
+from gcs.errors import InputError
+
+
+def grade(run: RunFolder, as_json: AsJson = False) -> None:
+    """How true a flight's latencies were, and how punctual its emulated links: errors against the truth log."""
+    from gcs.runs.grade import grade as graded
+
+    result = graded(run)
+    if as_json:
+        print_json(result)
+    else:
+        print_grade(result)
+
+
+def print_grade(result: dict[str, Any]) -> None:
+    """Print the errors of each quantity in a line of its own."""
+    kinds = {
+        "loop_delay": "loop delay, measured",
+        "rtt": "round trip, measured",
+        "link_delay": "link delay, applied upwards",
+    }
+    print(f"errors against the truth, {result['vehicles']} vehicles, ms")
+    for name, title in kinds.items():
+        own = result[name]
+        p50, p99, largest = (_ms(own[f"error_{part}_s"]) for part in ("p50", "p99", "max"))
+        print(f"{title:<28} p50 {p50}  p99 {p99}  max {largest}  of {own['samples']}")
+
+
+def _ms(value_s: float | None) -> str:
+    from gcs.views.report import UNKNOWN
+
+    return UNKNOWN if value_s is None else f"{1e3 * value_s:.3f}"
+
+
+def view(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder, or a .rrd file")],
+    picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="write a picture; open no window")] = None,
+    at: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="scenario time of the picture; 10, or the end if sooner")
+    ] = None,
+) -> None:
+    """Open a recording in the Rerun viewer, or write a picture of it, which needs no screen.
+
+    Exit code 1 if a view of the picture reports a fault.
+    """
+    from gcs.views.viewer import ViewerError, find_recording, picture_time_s, screenshot
+    from gcs.views.viewer import view as open_viewer
+
+    if at is not None:
+        within("--at", at, 0.0, 1e6, "seconds")
+    if picture is not None:
+        out_file("--picture", picture)
+        if picture.suffix.lower() != ".png":
+            raise InputError(f"--picture: read {picture}, wanted a name that ends in .png, as what is written is PNG")
+    try:
+        recording = find_recording(run)
+        if picture is None:
+            raise typer.Exit(open_viewer(recording))
+        time_s = picture_time_s(recording, at)
+        complaints = screenshot(recording, picture, time_s=time_s)
+        typer.echo(f"picture  {picture}: {recording} at {time_s:g} s")
+    except ViewerError as error:
+        raise InputError(str(error)) from None
+    for complaint in complaints:
+        typer.echo(complaint, err=True)
+    raise typer.Exit(FAILED if complaints else 0)
+
+
+def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run that was killed")]) -> None:
+    """Finish the files of a run whose processes were killed: ticks.parquet, summary.json, flight.rrd."""
+    from gcs.runs.summary import finish
+    from gcs.views.observer import record_run
+    from gcs.views.report import print_summary
+
+    finish(run)
+    record_run(run)
+    summary = finish(run)  # again: it lists the files
+    print_summary(summary, run)

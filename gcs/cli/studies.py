@@ -1,0 +1,128 @@
+"""`gcs compare`, `thesis`, `bench` and `capacity`; what they print is in `gcs.cli.study_output`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gcs.cli.exit_codes import FAILED
+from gcs.cli.options import AsJson, ScenarioFile, load_scenario, out_folder, print_json
+from gcs.errors import InputError
+from gcs.output import outlive_readers
+
+
+def compare(
+    scenario_file: ScenarioFile,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/<scenario>-compare-<time>")] = None,
+    sizes: Annotated[bool, typer.Option(help="also time designs of growing chains")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Design and fly a scenario by the inclusion principle and on the graph, side by side: figures, a page, JSON.
+
+    Exit code 1 if no route could be designed.
+    """
+    from dataclasses import asdict
+
+    from gcs.cli.study_output import print_comparison
+    from gcs.drive.fly import new_folder
+    from gcs.studies import compare as comparing
+    from gcs.studies.compare_cost import design_costs
+
+    outlive_readers()
+    scenario = load_scenario(scenario_file)
+    folder = out_folder(out) if out is not None else new_folder(f"{scenario.name}-compare")
+    routes, flights = comparing.compare(scenario)
+    grown = design_costs() if sizes else []
+    comparing.write_comparison(folder, scenario, routes, flights, grown)
+    if as_json:
+        print_json({"routes": [asdict(route) for route in routes], "files": str(folder)})
+    else:
+        print_comparison(scenario, routes, grown)
+        typer.echo(f"files    {folder}: {comparing.REPORT_FILE}, {comparing.RESULT_FILE}, PNG")
+    raise typer.Exit(0 if flights else FAILED)
+
+
+def thesis(
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/thesis-<time>")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Reproduce the figures and numbers of the source, published and computed side by side."""
+    from dataclasses import asdict
+
+    from gcs.drive.fly import new_folder
+    from gcs.studies import thesis as source
+
+    folder = out_folder(out) if out is not None else new_folder("thesis")
+    found = source.claims()
+    page = source.write_page(folder, found)
+    if as_json:
+        print_json([asdict(claim) for claim in found])
+        return
+    for claim in found:
+        typer.echo(f"{claim.place}  {claim.subject}: {claim.verdict}")
+        typer.echo(f"    published {claim.published}; computed {claim.computed}; {claim.second}")
+    typer.echo(f"files    {page} and its figures")
+
+
+def bench(
+    scenario_file: ScenarioFile,
+    vehicles: Annotated[
+        int, typer.Option(metavar="N", min=0, max=250, help="as many vehicles instead, in columns behind a leader")
+    ] = 0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, max=86400, help="flight time of each flight")] = 8.0,
+    repeat: Annotated[int, typer.Option(metavar="N", min=1, help="flights; the fastest counts")] = 10,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="one flight over UDP instead: is it punctual, are its latencies true?")
+    ] = False,
+    signed: Annotated[bool, typer.Option("--signed", help="also measure what signing costs")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """How much faster than real time flights are computed, and what the station takes of its control period."""
+    from gcs.cli.study_output import print_benchmark, print_real_time
+    from gcs.studies import benchmark
+
+    scenario = load_scenario(scenario_file)
+    if vehicles:
+        scenario = benchmark.with_vehicles(scenario, vehicles)
+    if real_time:
+        result = benchmark.benchmark_real_time(scenario, seconds=seconds)
+    else:
+        result = benchmark.benchmark(scenario, seconds=seconds, repeat=repeat, signed=signed)
+    if as_json:
+        print_json(result)
+    elif real_time:
+        print_real_time(result)
+    else:
+        print_benchmark(result)
+
+
+def capacity(
+    scenario_file: ScenarioFile,
+    rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
+    most: Annotated[int, typer.Option(metavar="N", min=2, max=250, help="largest formation tried")] = 100,
+    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights of each formation; it is carried in all")] = 3,
+    as_json: AsJson = False,
+) -> None:
+    """How many vehicles, at which rate, the scenario's links carry before the delay margin is gone."""
+    from dataclasses import asdict
+
+    from gcs.cli.study_output import print_capacity
+    from gcs.studies.capacity import capacity as capacity_of
+
+    scenario = load_scenario(scenario_file)
+    found = capacity_of(scenario, rates_hz=_rates(rates), most=most, seeds=seeds)
+    if as_json:
+        print_json({"capacities": [asdict(capacity) for capacity in found]})
+    else:
+        print_capacity(scenario, found)
+
+
+def _rates(text: str) -> list[float]:
+    """Rates in Hz from a list with commas."""
+    try:
+        rates = [float(part) for part in text.split(",")]
+    except ValueError:
+        rates = []
+    if not rates or not all(0.1 <= rate <= 1000.0 for rate in rates):
+        raise InputError(f"--rates: {text}, wanted numbers from 0.1 to 1000 with commas, for example 2,5,10")
+    return rates

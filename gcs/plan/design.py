@@ -1,0 +1,199 @@
+"""The design of a scenario's loop, from the gains to design.json, the plan and the tables.
+
+`gcs.plan.planner.flight_plan` makes it; each stage adds its part to a copy. `gcs.runs.files` reads it back from a run.
+"""
+
+from math import inf, isinf
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from gains.core.requirement import Requirement
+from gains.performance.robust import SolverFacts
+
+Matrix = tuple[tuple[float, ...], ...]
+
+
+def _none_if_infinite(margin_s: float | None) -> float | None:
+    return None if margin_s is None or isinf(margin_s) else margin_s
+
+
+Margin = Annotated[Annotated[float, Field(ge=0)] | None, AfterValidator(_none_if_infinite)]
+"""A delay margin in s; None where no delay makes the loop unstable, or where it is not known."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class BlockMargin(_Part):
+    """Continuous delay margin of one diagonal block, and the frequency at which it is lost; None if it never is."""
+
+    delay_margin_s: Margin
+    crossing_rad_s: float | None
+
+
+class TradeOffPoint(_Part):
+    """The largest α that gains with this delay margin can have."""
+
+    delay_margin_s: float
+    alpha: float
+
+
+class Behaviour(_Part):
+    """As in `gains.performance.behaviour.Behaviour`; None for what is not finite."""
+
+    decay_rate_1_s: float
+    damping: float | None
+    decay_rate_delayed_1_s: float | None
+    damping_delayed: float | None
+    string_peak: float | None
+    string_peak_delayed: float | None
+    delay_s: float | None
+
+
+class Proof(_Part):
+    """P of the Lyapunov function, what it proves, and the eigenvalues that were checked.
+
+    Inclusion gains have the proof of `gains.performance.robust.Certificate`, gains on a pattern that of
+    `gains.design.dk_iteration.DecayProof`.
+    """
+
+    P: Matrix
+    alpha: float
+    P_eigenvalue_min: float
+    s_procedure_eigenvalue_max: float | None = None
+    inequality_eigenvalue_max: float | None = None
+    solver: SolverFacts | None = None
+
+
+class Block(_Part):
+    """The gain with which a vehicle uses the errors of another, or its own; both are system ids."""
+
+    vehicle: int
+    of: int
+    gain: Matrix
+
+
+class GainSet(_Part):
+    """One entry of the gain schedule: its gains, or the share of what is streamed, and what they are good for."""
+
+    streamed_share: float = 1.0
+    time_scale: float = 1.0
+    blocks: tuple[Block, ...] = ()
+    K1_1_s: Matrix | None = None
+    K2_1_s: Matrix | None = None
+    K3_1_s2: Matrix | None = None
+    alpha: float | None = None
+    decay_rate_1_s: float | None = None
+    delay_margin_s: Margin
+    delay_margin_continuous_s: Margin = None
+
+
+class VehicleResponse(_Part):
+    """How one vehicle responds to set-points, as in `gains.performance.response.Response`."""
+
+    system_id: int
+    lag_s: float
+    velocity_gain_1_s: float
+
+
+class ResponsePart(_Part):
+    """How the vehicles respond to set-points, and what the margin would be if they did so at once."""
+
+    source: str
+    model: str = ""
+    vehicles: tuple[VehicleResponse, ...] = ()
+    """Empty until the responses are known."""
+    delay_margin_at_once_s: Margin = None
+    string_peak: float | None = None
+
+
+class OnboardPart(_Part):
+    """Rates of the loop on board, and the margins if the station closed every loop with the same gains."""
+
+    rate_hz: float
+    sensor_hz: float
+    ground_delay_margin_s: Margin
+    ground_delay_margin_continuous_s: Margin
+
+
+class FiguresAtDelay(_Part):
+    """α and the growth of spacing errors at a loop delay; None where unknown or without bound."""
+
+    loop_delay_s: float | None
+    alpha: float | None = None
+    has_string_verdict: bool = True
+    """Whether errors run down chains of equal followers, without which there is no string peak."""
+    string_peak: float | None = None
+
+
+class FiguresAtExpectedDelay(FiguresAtDelay):
+    """The figures at the loop delay of the scenario's links, and the delays up to which they stay above a limit."""
+
+    alpha_kept: float
+    alpha_kept_to_s: float | None
+    """None where α is kept at every loop delay; the same below."""
+    string_peak_kept: float | None
+    string_peak_kept_to_s: float | None
+
+
+class Design(_Part):
+    """The gains of a scenario, what they are good for, and how that is known; fields as published in design.json.
+
+    Only the margins have to be there: what a method does not give, and what an older file lacks, keeps its default and
+    is not written. Of the margins in a schedule the first is that of the design.
+    """
+
+    K1_1_s: Matrix | None = None
+    K2_1_s: Matrix | None = None
+    K3_1_s2: Matrix | None = None
+    K: Matrix | None = None
+    links: tuple[tuple[int, int], ...] = ()
+    alpha: float | None = None
+    decay_rate_1_s: float | None = None
+    delay_margin_s: Margin
+    delay_margin_continuous_s: Margin = None
+    period_s: float = 0.0
+    vehicles: int = 0
+    leader: BlockMargin | None = None
+    follower: BlockMargin | None = None
+    behaviour: Behaviour | None = None
+    certificate: Proof | None = None
+    cost_loss: float | None = None
+    subgraphs: int = 0
+    subgraphs_smallest: int = 0
+    solver: SolverFacts | None = None
+    requirement: Requirement | None = None
+    trade_off: tuple[TradeOffPoint, ...] = ()
+    method: str = ""
+    loop: Literal["ground", "onboard"] = "ground"
+    pattern: str = ""
+    blocks: tuple[Block, ...] = ()
+    schedule: tuple[GainSet, ...] = ()
+    response: ResponsePart | None = None
+    onboard: OnboardPart | None = None
+    at_loop_delay: FiguresAtExpectedDelay | None = None
+
+    @property
+    def inclusion_gains(self) -> tuple[Matrix, Matrix, Matrix] | None:
+        """K1, K2 and K3 of a design by inclusion, None of one on a pattern."""
+        if self.K1_1_s is None or self.K2_1_s is None or self.K3_1_s2 is None:
+            return None
+        return self.K1_1_s, self.K2_1_s, self.K3_1_s2
+
+    @property
+    def margins_s(self) -> tuple[float, ...]:
+        """The delay margins of the gain schedule; infinite where there is none."""
+        every = [entry.delay_margin_s for entry in self.schedule] or [self.delay_margin_s]
+        return tuple(inf if margin_s is None else margin_s for margin_s in every)
+
+    def with_schedule(self, schedule: tuple[GainSet, ...], **parts: _Part | str) -> Self:
+        """The design with another schedule, of which the first entry gives its margins, and with other parts."""
+        first = schedule[0]
+        margins = {"delay_margin_s": first.delay_margin_s, "delay_margin_continuous_s": first.delay_margin_continuous_s}
+        return self.model_copy(update=margins | {"schedule": schedule} | parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain types for JSON: what the design has, under the published names."""
+        return self.model_dump(mode="json", exclude_unset=True)
