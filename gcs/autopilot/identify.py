@@ -1,9 +1,9 @@
-"""How a vehicle answers to set-points, found from a short manoeuvre before the formation flight.
+"""Identifies a vehicle's response to set-points from a short manoeuvre before the formation flight.
 
-All vehicles are told the same acceleration at the same time, forwards, twice as long backwards and forwards again, so
-that they end where they began and keep their distances. The velocity they report is fitted with that of the model of
-`gains.performance.response`. When a command acted is known from the time it was sent and the measured way down, when a
-state was sampled from the vehicle's clock: the delay of the link is not part of what is found.
+All vehicles are commanded the same acceleration at the same time: forwards, backwards for twice as long, and forwards
+again. So they keep their distances and end at their initial velocity. The model of `gains.performance.response` is
+fitted to the velocity they report. The instant at which a command acted follows from its sending time and the measured
+way down, the instant of a sample from the vehicle's clock. So the response found does not include the link's delay.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,10 +16,10 @@ from gains.performance.response import Response
 
 LONGEST_S = 6.0
 PROFILE = ((0.0, 1.0), (1.0, -2.0), (3.0, 2.0), (4.0, -1.0))
-"""(time in s, change of the acceleration as a part of its size)"""
+"""(time in s, change of the acceleration relative to its amplitude)"""
 _LARGEST_M_S2 = 2.0
 MISFIT_MAX = 0.1
-"""A fit that leaves more than this part of the velocity unexplained is none."""
+"""A fit that leaves more than this fraction of the velocity unexplained is refused."""
 _FEWEST_SAMPLES = 30
 _LAGS_S = np.geomspace(0.02, 1.5, 12)
 _GAINS_1_S = np.geomspace(0.05, 8.0, 12)
@@ -29,7 +29,7 @@ _NUDGE = 1e-4
 
 @dataclass(frozen=True)
 class Identified:
-    """What was found of one vehicle, with the part of the velocity (rms) that it leaves unexplained."""
+    """The response of one vehicle; `misfit` is the fraction of the velocity (rms) that it leaves unexplained."""
 
     response: Response
     misfit: float
@@ -37,18 +37,18 @@ class Identified:
 
 
 def amplitude_m_s2(limit_m_s2: float | None) -> float:
-    """Size of the manoeuvre's acceleration: half of the limit leaves room for what the velocity loop adds."""
+    """Amplitude of the manoeuvre's acceleration: half the limit, as the velocity loop adds to it."""
     return min(_LARGEST_M_S2, 0.5 * limit_m_s2) if limit_m_s2 is not None else _LARGEST_M_S2
 
 
 def manoeuvre_m_s2(since_s: float, amplitude: float) -> tuple[float, float]:
-    """The acceleration wanted so long after the manoeuvre began, north and east."""
+    """The commanded acceleration north and east, `since_s` after the manoeuvre began."""
     north = sum(change for at_s, change in PROFILE if at_s <= since_s) * amplitude
     return (north, 0.0) if since_s < PROFILE[-1][0] else (0.0, 0.0)
 
 
 def step_velocity(response: Response, since_s: FloatArray) -> FloatArray:
-    """Velocity so long after the wanted acceleration has become 1 m/s²; 0 before.
+    """Velocity `since_s` after the commanded acceleration stepped to 1 m/s²; 0 before.
 
     v(s) = (s + g) / (s² (lag s² + s + g)), v(t) = t - e^{-σt} sin(ωt) / ω with σ = 1 / (2 lag), ω² = g / lag - σ²; ω is
     imaginary for a vehicle that does not overshoot.
@@ -58,7 +58,7 @@ def step_velocity(response: Response, since_s: FloatArray) -> FloatArray:
     omega = np.sqrt(complex(response.velocity_gain_1_s / response.lag_s - decay**2))
     if abs(omega) < 1e-9 * decay:
         return t - t * np.exp(-decay * t)
-    # e^{-σt} sin(ωt) with both exponentials written out, so that neither overflows
+    # e^{-σt} sin(ωt) as two exponentials, so that neither factor overflows
     rising, falling = np.exp((1j * omega - decay) * t), np.exp((-1j * omega - decay) * t)
     return t - ((rising - falling) / (2j * omega)).real
 
@@ -66,14 +66,14 @@ def step_velocity(response: Response, since_s: FloatArray) -> FloatArray:
 def identify(
     acted_s: FloatArray, change_m_s2: FloatArray, sample_s: FloatArray, velocity_m_s: FloatArray
 ) -> Identified | None:
-    """The response that explains the velocities best, least squares; None if there are too few.
+    """The least-squares fit of a response to sampled velocities; None if there are too few.
 
     Parameters
     ----------
     acted_s, change_m_s2
-        (m,) when the wanted acceleration changed at the vehicle, and by how much.
+        (m,) when the commanded acceleration changed at the vehicle, and by how much.
     sample_s, velocity_m_s
-        (n,) sampled velocities in the direction of the manoeuvre. A constant one on top, such as drift, is left out.
+        (n,) velocities in the direction of the manoeuvre. Their mean, such as a drift, is ignored.
     """
     if sample_s.size < _FEWEST_SAMPLES or acted_s.size < len(PROFILE):
         return None
@@ -96,7 +96,7 @@ def identify(
 
 
 def _descended(misfit: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
-    """Levenberg and Marquardt's descent from a start that is near."""
+    """Levenberg-Marquardt descent from a nearby start."""
     rest, damping = misfit(x), 1e-3
     for _ in range(_STEPS):
         slope = np.stack([(misfit(x + _NUDGE * axis) - rest) / _NUDGE for axis in np.eye(x.size)], axis=1)

@@ -1,6 +1,6 @@
-"""The identification manoeuvre of all vehicles at once, tick by tick, and what it makes of the flight plan."""
+"""The identification manoeuvre of all vehicles, tick by tick, and the flight plan with the responses found."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +16,13 @@ from gcs.autopilot.identify import (
     manoeuvre_m_s2,
 )
 from gcs.control.history import StateHistory
-from gcs.link.vehicle import RemoteVehicle
+from gcs.link.vehicle import RemoteVehicle, Report
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.responses import Responses
 from scenarios.schema import NS_PER_S
 
 _UNNOTICED_NS = NS_PER_S
-"""A clock jump is noticed within this: what was sampled since has a wrong instant."""
+"""A clock jump is noticed within this time; samples since then have wrong instants."""
 
 
 class _Sample(NamedTuple):
@@ -32,14 +32,9 @@ class _Sample(NamedTuple):
 
 
 class Identification:
-    """Collects what the vehicles do in the manoeuvre, then works it out in small pieces, one a tick."""
+    """Collects the vehicles' velocities during the manoeuvre, then computes the result in steps, one per tick."""
 
-    def __init__(
-        self,
-        plan: FlightPlan,
-        vehicles: Sequence[RemoteVehicle],
-        report: Callable[[str, str, int], None],
-    ) -> None:
+    def __init__(self, plan: FlightPlan, vehicles: Sequence[RemoteVehicle], report: Report) -> None:
         self._plan = plan
         self._vehicles = vehicles
         self._report = report
@@ -49,10 +44,10 @@ class Identification:
         """When each change of the acceleration acted."""
         self._samples: list[list[_Sample]] = [[] for _ in vehicles]
         self._jumps = [vehicle.clock.jumps for vehicle in vehicles]
-        self._work = self._worked_out()
+        self._steps = self._result()
 
     def command(self, due_ns: int) -> tuple[float, float]:
-        """The acceleration that all vehicles are told at a tick; notes when it changes."""
+        """The acceleration that all vehicles are commanded at a tick; notes when it changes."""
         if self._begin_ns is None:
             self._begin_ns = due_ns
         since_s = (due_ns - self._begin_ns) / NS_PER_S
@@ -63,17 +58,17 @@ class Identification:
         return manoeuvre_m_s2(since_s, self._amplitude_m_s2)
 
     def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
-        """The plan with the margins of what was found; why nothing was; or None while it takes longer."""
+        """The plan with the margins of the responses found, or why there is none; None while it takes longer."""
         gone = next((v for v in self._vehicles if v.silent or v.taken_over), None)
         if gone is not None:
             return f"not identified: vehicle {gone.system_id} {gone.missing}"
         if self._begin_ns is None or due_ns - self._begin_ns < LONGEST_S * NS_PER_S:
             self._observe(due_ns, history)
             return None
-        return next(self._work)
+        return next(self._steps)
 
-    def _worked_out(self) -> Iterator[FlightPlan | str | None]:
-        """The result, after a None for each piece of work before it."""
+    def _result(self) -> Iterator[FlightPlan | str | None]:
+        """The result, after a None for each step before it."""
         found: dict[int, Response] = {}
         for row, vehicle in enumerate(self._vehicles):
             seen = self._fit(row)
@@ -82,8 +77,8 @@ class Identification:
                 return
             if seen.misfit > MISFIT_MAX:
                 yield (
-                    f"not identified: vehicle {vehicle.system_id} does not answer with a lag, {seen.misfit:.0%} of its "
-                    "velocity is unexplained; [response] in the scenario leaves the manoeuvre out"
+                    f"not identified: vehicle {vehicle.system_id} does not respond with a lag: {seen.misfit:.0%} of "
+                    "its velocity is unexplained; [response] in the scenario replaces the manoeuvre"
                 )
                 return
             response = found[vehicle.system_id] = seen.response

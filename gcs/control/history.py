@@ -1,6 +1,6 @@
-"""The states that vehicles reported, kept long enough to bring two of them to one instant.
+"""The states that vehicles reported, kept long enough to bring any two of them to one instant.
 
-Scalars and plain tuples: with one report a call, numpy would cost ten times what is computed.
+Scalars and plain tuples: for single reports numpy would be ten times slower.
 """
 
 from collections import deque
@@ -11,17 +11,17 @@ Report = tuple[int, State]
 """A state with its instant on the station's clock in ns."""
 
 HISTORY = 128
-"""Reports kept for each vehicle: 2.6 s at 50 Hz, which bridges links whose delays differ by that much."""
+"""Reports kept for each vehicle: 2.6 s at 50 Hz, enough for links whose delays differ by that much."""
 
 
 class StateHistory:
-    """Newest reported states of n vehicles."""
+    """The newest reports of n vehicles."""
 
     def __init__(self, vehicles: int) -> None:
         self._reports: list[deque[Report]] = [deque(maxlen=HISTORY) for _ in range(vehicles)]
 
     def add(self, vehicle: int, time_ns: int, state: State) -> bool:
-        """Take in a report; one not newer than the newest is left out: False."""
+        """Take in a report; returns False for one that is not newer than the newest, which is ignored."""
         reports = self._reports[vehicle]
         if reports and time_ns <= reports[-1][0]:
             return False
@@ -29,7 +29,7 @@ class StateHistory:
         return True
 
     def forget(self, vehicle: int) -> None:
-        """Drop what a vehicle reported, as when its clock has jumped."""
+        """Drop what a vehicle reported, for example after its clock has jumped."""
         self._reports[vehicle].clear()
 
     @property
@@ -42,12 +42,12 @@ class StateHistory:
         return reports[-1] if reports else None
 
     def at(self, vehicle: int, time_ns: int) -> State | None:
-        """The state of a vehicle at an instant, None if it has reported nothing.
+        """The state of a vehicle at an instant; None if it has reported nothing.
 
-        Between two reports: position by the cubic through both positions and velocities, velocity along a line; both
-        are exact for a constant acceleration. The cubic's slope would turn an error of the reports' instants, as when
-        the estimate of a clock moves, or the rounding of their positions into a velocity. After the newest report and
-        before the oldest: straight on with that report's velocity.
+        Between two reports the position is cubic through both positions and velocities, and the velocity linear; both
+        are exact for a constant acceleration. The cubic's slope is not used as velocity: it would contain errors of the
+        reports' instants, as when a clock estimate moves, and the rounding of positions. After the newest report and
+        before the oldest, the state is extrapolated with that report's velocity.
         """
         reports = self._reports[vehicle]
         if not reports:

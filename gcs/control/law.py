@@ -3,9 +3,9 @@
 For the leader-follower pattern u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, and u_1 = K1 e_1^v for the leader (thesis eqs.
 2.10 and 3.25); any other gain matrix K is flown by the same code.
 
-All errors that enter u_i are formed at one instant: that of vehicle i's newest state, to which the states of the others
-are brought. So the loop around vehicle i is late by vehicle i's own link only, and a slow link ahead of it cannot take
-its margin.
+All errors in u_i are formed at one instant, that of vehicle i's newest state; the states of the others are brought to
+it. So the loop around vehicle i is delayed by vehicle i's own link only, and a slow link ahead does not use up its
+margin.
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ Gain = tuple[float, float, float, float, float, float, float, float]
 
 
 class Term(NamedTuple):
-    """What one vehicle's state adds to another's command."""
+    """What one vehicle's state contributes to the command of another."""
 
     source: int
     """The vehicle k whose state is used."""
@@ -38,7 +38,7 @@ class Term(NamedTuple):
 class VehicleLaw(NamedTuple):
     """u_i = sum over its terms of G_ik (x_k - x*_k), x_k = (position, velocity), x*_k = (place in formation, v_d).
 
-    Positions are taken against the vehicle's own, so its own term has velocity only.
+    Positions are relative to the vehicle's own, so its own term has velocity only.
     """
 
     terms: tuple[Term, ...]
@@ -55,9 +55,9 @@ def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequ
 
     Each K is (inputs, states) in the order of `gains.formation.model.FormationModel`.
 
-    The nearest vehicle ahead that is left stands in for a lost one: spacing is kept to it, two spacings away, and its
-    velocity error is used. What nobody ahead can stand in for, and the spacing error of a lost vehicle itself, drops
-    out. A vehicle with nobody left ahead keeps the nominal velocity, as the leader does.
+    The nearest remaining vehicle ahead stands in for a lost one: spacing is kept to it, at the sum of both offsets, and
+    its velocity error is used. Terms without a stand-in, and the spacing error of the lost vehicle, are omitted. A
+    vehicle with nobody left ahead keeps the nominal velocity, as the leader does.
     """
     model = FormationModel(tuple(formation.predecessor.tolist()))
     stand_in: list[int] = []
@@ -100,7 +100,7 @@ def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequ
 
 
 class Blend(NamedTuple):
-    """The gains one vehicle is flown with: `share` (0 to 1) of the set flown, the rest of the former one."""
+    """The gains one vehicle is flown with: the fraction `share` of the set flown, the rest of the former set."""
 
     flown: int = 0
     former: int = 0
@@ -108,7 +108,7 @@ class Blend(NamedTuple):
 
 
 class VehicleControl(NamedTuple):
-    """What the law saw of one vehicle and wants of it, north and east; NaN where unknown or lost."""
+    """State, errors and command of one vehicle, north and east; NaN where unknown or lost."""
 
     sample_ns: int
     """Instant of its newest state, station clock; 0 while there is none."""
@@ -117,7 +117,7 @@ class VehicleControl(NamedTuple):
     velocity_error_m_s: tuple[float, float]
     command_m_s2: tuple[float, float]
     used_ns: int
-    """Instant of the errors that the command was computed from: in the ground loop `sample_ns`."""
+    """Instant of the errors from which the command was computed: `sample_ns` with the loop on the ground."""
 
 
 _UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan, nan), 0)
@@ -133,8 +133,8 @@ def formation_control(
 ) -> list[VehicleControl]:
     """Errors and commands of every vehicle from the newest reported states.
 
-    `blends` says with which gains each vehicle is flown. `opening` is a factor on the formation's spacing. A vehicle
-    whose law uses an unknown state has a NaN command; nothing is to be sent for it. No limit is applied here.
+    `blends` holds the gains of each vehicle, `opening` is a factor on the formation's spacing. If a law needs an
+    unknown state its command is NaN and must not be sent. No limit is applied here.
     """
     controls: list[VehicleControl] = []
     for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
@@ -160,7 +160,7 @@ def command_at(
     nominal_velocity_m_s: tuple[float, float],
     opening: float,
 ) -> tuple[float, float]:
-    """The command of one vehicle from the errors at an instant."""
+    """The command of one vehicle from the errors at a given instant."""
     state = history.at(row, instant_ns) or _UNKNOWN.state
     _, command = _followed(history, law, (instant_ns, state), blend, nominal_velocity_m_s, opening)
     return command

@@ -1,4 +1,4 @@
-"""The scenario's limits, held by every set-point that leaves, whatever vehicle it is for and whoever computed it."""
+"""The scenario's limits, applied to every set-point that is sent, for whatever vehicle and by whatever computed."""
 
 from dataclasses import dataclass
 from math import hypot
@@ -7,8 +7,8 @@ from typing import Any
 from scenarios.schema import Limits
 
 LARGEST_COMMAND_M_S2 = 9_999.0
-"""Limit on what is sent when the scenario sets none; beyond it a command is a fault, not a manoeuvre. Vehicles refuse
-more than 1e4, and rounding to float32 must not lead there."""
+"""The limit if the scenario sets none: a larger command is a fault, not a manoeuvre. Vehicles refuse more than 1e4,
+which rounding to float32 must not reach."""
 
 Vector = tuple[float, float]
 _VELOCITY, _ACCELERATION = slice(4, 6), slice(7, 9)
@@ -24,11 +24,11 @@ class SetPointLimits:
 
     @classmethod
     def of(cls, limits: Limits) -> "SetPointLimits":
-        """Those of a scenario."""
+        """The limits of a scenario."""
         return cls(limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, limits.speed_max_m_s or LARGEST_COMMAND_M_S2)
 
     def command(self, wanted_m_s2: Vector) -> Vector:
-        """A wanted acceleration, shortened to the limit; its direction is kept."""
+        """A wanted acceleration, shortened to the limit in its own direction."""
         return _shortened(wanted_m_s2, self.acceleration_m_s2)
 
     def set_point(self, fields: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 CLOCK_JUMPED = "its clock jumped"
 """Text of the event."""
 GAIN_SET = "gain set "
-"""How a STATUSTEXT begins that tells the gain set a vehicle is flown with from now on, after the vehicle's name."""
+"""Begins the part of a STATUSTEXT, after the vehicle's name, that announces its new gain set."""
 TickArray = NDArray[Any]
 """A structured array of dtype TICK: one row for each vehicle."""
 
 
 class Mode(IntEnum):
-    """What the station thinks of one vehicle."""
+    """The station's judgement of one vehicle."""
 
     WAITING = 0  # not heard, or not yet ready to fly
     NOMINAL = 1  # flying, loop delay well below the margin
@@ -35,7 +35,7 @@ SEVERITY = {
     Mode.CRITICAL: 2,
     Mode.FAILSAFE: 1,
 }
-"""How serious a change to the mode is, as MAV_SEVERITY: 6 info, 5 notice, 4 warning, 3 error, 2 critical, 1 alert."""
+"""MAV_SEVERITY of a change to each mode: 6 info, 5 notice, 4 warning, 3 error, 2 critical, 1 alert."""
 TICK = np.dtype(
     [
         ("tick", "<i8"),  # counts control ticks, from 0; a number left out is a tick that was skipped

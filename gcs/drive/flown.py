@@ -1,4 +1,4 @@
-"""A plan flown to its end, and its log: in virtual time, or as `gcs fly` flies it."""
+"""Flies a plan to its end and returns its log: in virtual time, or in real time as `gcs fly` does."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +20,11 @@ from scenarios import files as scenario_files
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A flight's log, whichever clock it was flown on.
+    """A flight's log, in real or virtual time.
 
-    `truth` holds when states were sampled and set-points acted, as the vehicles know it; None if in virtual time nobody
-    asked for it.
-    `steal_share` and `busy_share` are the parts of the processor time that the host took away and that anyone used; in
-    real time only.
+    `truth` holds when states were sampled and set-points acted, recorded by the vehicles; in virtual time only on
+    request. `steal_share` and `busy_share` are the fractions of the processor time that the host took away and that was
+    not idle; in real time only.
     """
 
     ticks: TickArray
@@ -36,8 +35,10 @@ class Flight:
 
 
 def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, with_truth: bool = False) -> Flight:
-    """Fly a plan; with a folder, which is made, its files are left there but for the summary. In real time the truth is
-    always known."""
+    """Fly a plan. With a folder, which is created, the run's files except the summary are left there.
+
+    In real time the vehicles' truth is always recorded.
+    """
     if not real_time:
         return fly_virtual(plan, folder, with_truth=with_truth)
     from gcs.drive.realtime_flight import fly_real_time  # processes and sockets: not for flights in virtual time
@@ -67,7 +68,7 @@ def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: boo
 
 
 def margins_of(plan: FlightPlan) -> Design:
-    """The part of a design that a run's files need; what the continuous model says is in the campaign's report."""
+    """The part of a design that a run's files need; the campaign's report has the margins of the continuous model."""
     return Design(delay_margin_s=plan.delay_margin_s, delay_margin_continuous_s=None)
 
 
@@ -80,7 +81,7 @@ def prepared_folder(plan: FlightPlan, folder: Path) -> RunWriter:
 
 
 def median_delays_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, float]:
-    """Median of each vehicle's measured loop delay; 0 for one that was never commanded."""
+    """Median of each vehicle's measured loop delay; 0 for a vehicle that was never commanded."""
     delays: dict[int, float] = {}
     for system_id in system_ids:
         own = ticks["loop_delay_s"][(ticks["system_id"] == system_id) & ticks["commanded"]]
@@ -90,6 +91,6 @@ def median_delays_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, 
 
 
 def first_uses(ticks: TickArray) -> TickArray:
-    """The rows in which a state of a vehicle was used for the first time: all, unless telemetry is slower or lost."""
+    """The rows that use a state for the first time: all rows, unless telemetry is slower than control or lost."""
     _, first = np.unique(ticks[["system_id", "sample_boot_ms"]], return_index=True)
     return ticks[np.sort(first)]

@@ -1,4 +1,4 @@
-"""One flight from scenario to summary, in real time: design, find or start the vehicles, fly, record, sum up."""
+"""One flight in real time: start the vehicles, fly, record, sum up."""
 
 import contextlib
 import os
@@ -31,17 +31,17 @@ _START_DELAY_NS = _NS // 5
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """How one flight is run; the experiment itself is in the scenario."""
+    """Options of one flight that are not part of the experiment, which the scenario describes."""
 
     folder: Path
     show_table: bool
-    """Whether the live table (or, without a terminal, its plain lines) is shown."""
+    """Whether to show the live table, or its plain lines without a terminal."""
     fleet: str = ""
-    """Where the vehicles are from, in words; empty to start simulated ones."""
+    """Who provides the vehicles, in words; empty to start simulated ones."""
     outlive_station: bool = False
-    """Whether vehicles that are started wait to be taken over if this process is killed."""
+    """Whether the simulated vehicles wait to be taken over if this process is killed."""
     key_file: Path | None = None
-    """The key of the guard, which vehicles that are started are to have as well."""
+    """The guard's key, for the simulated vehicles."""
 
 
 def fly(
@@ -52,7 +52,7 @@ def fly(
     guard: Guard | None = None,
     mirror: Mirror | None = None,
 ) -> dict[str, Any]:
-    """Fly a designed scenario in real time and return the summary of the run left in the folder."""
+    """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder."""
     folder = options.folder
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
     write_design(folder, design)
@@ -70,10 +70,10 @@ def _flown(
     mirror: Mirror | None,
     asked_to_stop: Callable[[], str],
 ) -> list[dict[str, Any]]:
-    """Fly and leave the logs in the folder; gives the events that could not be written."""
+    """Fly and leave the logs in the folder; returns the events that could not be written."""
     folder = options.folder
     with contextlib.ExitStack() as stack:
-        # Left in the reverse order: the vehicles end, the observer has finished the recording.
+        # Left in the reverse order: first the vehicles end, then the observer finishes the recording.
         vehicles: VehicleProcess | None = None
         observer = stack.enter_context(_observer(folder, show_table=options.show_table))
         if not options.fleet:
@@ -108,13 +108,13 @@ def _flown(
             writer.event(time_s=station.scenario_time_s(clock_ns()), kind=END, text=station.end_reason)
         finally:
             unwritten = writer.close()
-        if unwritten:  # the last event is among them
+        if unwritten:  # including the last event, for which the observer waits
             observer.terminate()
     return unwritten
 
 
 def new_folder(scenario_name: str) -> Path:
-    """A fresh folder for a run below runs/, named after the scenario and the local time."""
+    """A new folder for a run in runs/, named after the scenario and the local time."""
     stem = f"{scenario_name}-{time.strftime('%Y%m%d-%H%M%S')}"
     for count in range(1, 1000):
         folder = Path("runs") / (stem if count == 1 else f"{stem}-{count}")
@@ -126,9 +126,9 @@ def new_folder(scenario_name: str) -> Path:
 
 @contextlib.contextmanager
 def _observer(folder: Path, *, show_table: bool) -> Generator["subprocess.Popen[bytes]"]:
-    """The process that shows and records the flight; left, it has ended by itself or been told to."""
+    """The process that shows and records the flight. On leaving the context it has ended by itself or been ended."""
     command = [sys.executable, "-m", "gcs.views.observer", str(folder), "--parent", str(os.getpid())]
-    with held_back():  # while it starts; then it ignores Ctrl-C by itself
+    with held_back():  # once started, it ignores Ctrl-C by itself
         process = subprocess.Popen(command + ([] if show_table else ["--no-table"]), stdin=subprocess.DEVNULL)
     try:
         yield process
@@ -145,6 +145,6 @@ def _observer(folder: Path, *, show_table: bool) -> Generator["subprocess.Popen[
 
 
 def _wait_until_ready(observer: "subprocess.Popen[bytes]", folder: Path, asked_to_stop: Callable[[], str]) -> None:
-    """Wait for the observer's slow imports, so that they do not take the processor from the first ticks."""
+    """Wait for the observer's slow imports, which would otherwise compete with the first ticks for the processor."""
     while observer.poll() is None and not (folder / READY_FILE).exists() and not asked_to_stop():
         time.sleep(0.02)

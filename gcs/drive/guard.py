@@ -1,4 +1,4 @@
-"""Signing at the station's socket: verified datagrams in, signed ones out. Stations know nothing of it."""
+"""Signing at the station's socket: verified datagrams in, signed ones out. The station itself does not sign."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -12,11 +12,11 @@ from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps, open_stamps
 
 LINK_ID, MIRROR_LINK_ID = 0, 1
-"""Of the socket over which a station speaks to its vehicles, and of the one to another station."""
+"""Link ids of the socket to the vehicles and of the socket to another station."""
 
 
 class Guard:
-    """What the station sends is signed; what it receives is verified, and unsigned when it is passed on."""
+    """Signs what the station sends; verifies what it receives and removes the signatures."""
 
     def __init__(self, key: Key, *, epoch_ns: int, stamps: Stamps) -> None:
         self._link, self.mirror_link = (
@@ -31,9 +31,9 @@ class Guard:
         refused: Counter[str],
         is_another: Callable[[int, Datagram], bool] | None = None,
     ) -> list[Datagram]:
-        """The datagrams with what could be verified of them; what is refused is counted by reason.
+        """The datagrams with their verified frames only; refused ones are counted by reason.
 
-        `is_another` says of a system id whether a datagram is not from where that system speaks, see `Station`.
+        `is_another` says whether a datagram claims a system id but comes from another address, see `Station`.
         """
         verified: list[Datagram] = []
         for datagram in datagrams:
@@ -52,7 +52,7 @@ class Guard:
 
 
 def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:
-    """The guard with the key in a file; the timestamps it has heard are kept beside it, for each role apart.
+    """The guard with the key in a file; the timestamps it has seen are kept beside that, separately for each role.
 
     Raises
     ------

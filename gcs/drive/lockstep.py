@@ -1,8 +1,8 @@
 """Vehicles, links and station on one virtual clock in one process: the same code and bytes as in real time.
 
-Deterministic: the same plan gives the same ticks to the last bit. Nothing waits, so it runs as fast as it computes. The
-station is called when it has something of its own to do; what arrives before waits until then with its receive stamp,
-as it would in a socket, and no decision is made in between.
+Deterministic: the same plan gives the same ticks to the last bit. Nothing waits, so a flight is as fast as its
+computation. The station is called when something of its own is due. Datagrams that arrive before wait with their
+receive stamps, as in a socket; the station decides nothing in between.
 """
 
 from collections.abc import Iterator
@@ -21,9 +21,9 @@ from sim_vehicles.drive.guard import signed_links
 from sim_vehicles.links.truth import DROPPED, LINK_DOWN, LINK_UP, Record, Row
 
 START_NS = 1_000_000_000
-"""Virtual time at which vehicles and station start; not zero, so that a forgotten time shows."""
+"""Virtual time at which vehicles and station start; not zero, so that a forgotten time is noticed."""
 EPOCH_NS = 1_800_000_000 * 1_000_000_000
-"""What a signed flight takes virtual time 0 to be, in ns since 1970."""
+"""Virtual time 0 of a signed flight, in ns since 1970."""
 _HOST = "virtual"
 
 Sent = list[tuple[int, bytes, int]]
@@ -31,13 +31,13 @@ Sent = list[tuple[int, bytes, int]]
 
 
 class Vehicles(Protocol):
-    """The vehicles behind their links: takes the station's datagrams, gives those that arrive at the station."""
+    """The vehicles behind their links: takes the station's datagrams, returns those that arrive at the station."""
 
     def step(self, received: Sent, now_ns: int) -> Sent: ...
 
 
 class LinkLosses:
-    """Counts of what the links did, from the truth that `vehicles_of` records: datagrams in all, and lost ones."""
+    """Counts all datagrams on the links and those lost, from the truth that `vehicles_of` records."""
 
     def __init__(self) -> None:
         self.entered = {LINK_UP: 0, LINK_DOWN: 0}
@@ -62,12 +62,12 @@ class LinkLosses:
 
 
 def vehicles_of(plan: FlightPlan, *, record: Record | None = None) -> Vehicles:
-    """The simulated vehicles of a plan with their links, at the start; `record` takes the truth of what they do."""
+    """The simulated vehicles of a plan and their links, at the start; `record` takes the truth about them."""
     return Fleet(plan.scenario, START_NS, record=record)
 
 
 def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
-    """The same vehicles, and the guard of their station, both with a key and no memory of earlier flights."""
+    """The same vehicles and the guard of their station, with a common key and no memory of earlier flights."""
     links = signed_links(key, plan.formation.system_ids, epoch_ns=EPOCH_NS, stamps=Stamps())
     vehicles = Fleet(plan.scenario, START_NS, signed=links)
     return vehicles, Guard(key, epoch_ns=EPOCH_NS, stamps=Stamps())
@@ -80,11 +80,10 @@ def fly_lockstep(
     vehicles: Vehicles | None = None,
     guard: Guard | None = None,
 ) -> Iterator[TickArray]:
-    """Fly a plan in virtual time, giving each control tick's rows (a fresh copy) as it is done.
+    """Fly a plan in virtual time; yields the rows (a fresh copy) of each control tick.
 
-    A station may be passed in, so that its events and end reason can be read afterwards, and vehicles that have
-    already flown, and a guard that signs and verifies at the station's end. The address of a vehicle is (a fixed name,
-    its system id).
+    Pass a station to read its events and end reason afterwards, vehicles to go on from an earlier flight, a guard to
+    sign and verify at the station's end. The address of a vehicle is (a fixed name, its system id).
     """
     station = station or Station(plan, start_ns=START_NS)
     vehicles = vehicles or vehicles_of(plan)

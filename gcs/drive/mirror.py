@@ -1,7 +1,7 @@
-"""The stream of a flight for another ground station: what vehicles send and what the station sends, as raw MAVLink.
+"""Streams a flight to another ground station: the frames of vehicles and station, as raw MAVLink.
 
-It is read-only: what the other station sends is counted and left, unless it is asked for. Nothing waits for the other
-station; that nobody listens is counted.
+By default it is read-only: what the other station sends is counted and dropped. Nothing waits for the other station; if
+nobody listens, that is counted.
 """
 
 import contextlib
@@ -21,13 +21,13 @@ _LARGEST_DATAGRAM = 2048
 _STREAMS_WITH_POSITION = (0, 6)
 """MAV_DATA_STREAM: all, position."""
 _DATAGRAMS_A_STEP = 64
-"""Of the other station; what is more waits, and is dropped by the kernel when its buffer is full."""
+"""Datagrams read from the other station per step. The rest waits; the kernel drops what exceeds its buffer."""
 
 
 class Mirror:
-    """A socket connected to another ground station; with `commands`, what that sends goes on to the vehicles.
+    """A socket connected to another ground station; with `commands`, its frames are passed on to the vehicles.
 
-    On a signed link what goes there is signed, and what comes from there is heard only if it is.
+    On a signed link, frames to the other station are signed and its own are accepted only if signed.
 
     Raises OSError if the address cannot be used.
     """
@@ -52,25 +52,25 @@ class Mirror:
         self.close()
 
     def close(self) -> None:
-        """Send nothing more."""
+        """Close the socket."""
         self._socket.close()
 
     def forward(self, frames: Iterable[bytes], now_ns: int) -> None:
-        """Send frames on, each as it is, or signed again for this link."""
+        """Send frames to the other station, unchanged or signed for this link."""
         for frame in frames:
             try:
-                # What is signed is MAVLink 2.
+                # Signing needs MAVLink 2.
                 self._socket.send(frame if self._signed is None else self._signed.sign(frame, now_ns))
                 self.counters["forwarded"] += 1
-            except OSError:  # nobody listens there, which an earlier datagram told, or the buffer is full
+            except OSError:  # an earlier datagram met a closed port, or the buffer is full
                 self.counters["not forwarded"] += 1
 
     def passed_on(self, vehicles: list[RemoteVehicle], now_ns: int) -> list[Outgoing]:
-        """What the other station has sent since and may go on: to the vehicle it is for, or to all.
+        """Frames of the other station that may pass, each to the vehicle it is addressed to, or to all.
 
-        Only to vehicles that are flown already: one that had not been commanded before would take the other station
-        for its own. Not what would make the telemetry slower that the formation is flown with: displays ask for a few
-        positions a second when they connect.
+        They go only to vehicles already in flight: one never commanded before would take the other station for its own.
+        Requests that change the rate of the telemetry used for control are refused: displays ask for a few positions a
+        second when they connect.
         """
         own = {vehicle.system_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
         outgoing: list[Outgoing] = []
@@ -93,7 +93,7 @@ class Mirror:
         frames: list[mavlink.Frame] = []
         with contextlib.suppress(BlockingIOError):
             for _ in range(_DATAGRAMS_A_STEP):
-                with contextlib.suppress(ConnectionError):  # the answer to something that was forwarded
+                with contextlib.suppress(ConnectionError):  # an earlier datagram met a closed port
                     data = self._socket.recv(_LARGEST_DATAGRAM)
                     refused: Counter[str] = Counter()
                     if self._signed is not None:

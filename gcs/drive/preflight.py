@@ -1,6 +1,6 @@
-"""Before take-off: what makes a flight end badly whatever happens in it, found in the scenario and its plan.
+"""Checks before take-off: what in a scenario or its plan would make any flight of it end badly.
 
-Each finding is one line: the key of the scenario, what was read there and what was wanted. None: there is nothing.
+A finding is one line: the scenario's key, what was read there and what was wanted. None if there is none.
 """
 
 from dataclasses import replace
@@ -41,13 +41,13 @@ def unstable_loop(plan: FlightPlan) -> str | None:
 
 
 def without_actions(plan: FlightPlan) -> FlightPlan:
-    """The plan with a monitor that does nothing: there is no margin that its actions could keep."""
+    """The plan with a monitor that does not act: there is no margin that it could keep."""
     monitor = plan.scenario.monitor.model_copy(update={"act": False})
     return replace(plan, scenario=plan.scenario.model_copy(update={"monitor": monitor}))
 
 
 def _rightmost_root(plan: FlightPlan) -> tuple[complex, list[int]]:
-    """The rightmost root without delay of the continuous loop, and the vehicles of the coupled loop that has it."""
+    """The rightmost root of the continuous loop without delay, and the vehicles of the coupled loop it belongs to."""
     model, ids = plan.model, plan.formation.system_ids
     A, B, K = _matrices(plan)
     closed = A + B @ K
@@ -68,14 +68,14 @@ def _sampled_growth_1_s(plan: FlightPlan) -> float:
 
 
 def _matrices(plan: FlightPlan) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A, B and K of the loop flown, with the vehicles' responses if they are known."""
+    """A, B and K of the loop flown, including the vehicles' responses if known."""
     if plan.responses is None:
         return plan.model.A, plan.model.B, plan.gain
     return formation_loop(plan.model, plan.gain, plan.responses.in_order(plan.formation.system_ids))
 
 
 def bad_start(scenario: Scenario) -> str | None:
-    """Initial states that break a safety limit at the first tick: a collision, or a spacing error beyond its limit."""
+    """Initial states that violate a safety limit at the first tick: a collision or a spacing error beyond its limit."""
     safety, vehicles = scenario.safety, scenario.leader_first()
     for one, two in combinations(vehicles, 2):
         apart_m = hypot(*(a - b for a, b in zip(one.position_ne_m, two.position_ne_m, strict=True)))
@@ -97,9 +97,9 @@ def bad_start(scenario: Scenario) -> str | None:
 
 
 def endless_link(scenario: Scenario) -> str | None:
-    """A link too slow for the flight to begin, or for any command in it to rest on a state of it.
+    """A link too slow for the flight to begin, or for any command to be computed from a state of that flight.
 
-    A TIMESYNC reply that is later than the lifetime of its request says nothing, so no clock would ever be known.
+    A TIMESYNC reply that arrives after its request has expired is ignored, so no clock would ever be known.
     """
     lifetime_s = REQUEST_LIFETIME_NS / NS_PER_S
     for vehicle in scenario.leader_first():

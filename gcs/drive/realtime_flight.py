@@ -1,4 +1,4 @@
-"""A trial flown as `gcs fly` flies it: processes, UDP sockets and the real clock, the machine's noise on record."""
+"""Flies a plan as `gcs fly` does, with processes, UDP sockets and the real clock, and measures the machine's load."""
 
 import errno
 import shutil
@@ -16,11 +16,11 @@ from gcs.runs.grade import Truth, read_truth
 from gcs.runs.record import EVENTS_FILE, TICKS_FILE, TRUTH_FILE
 
 _IDLE, _WAITING, _STEAL = 3, 4, 7
-"""Places in the cpu line of /proc/stat: time without work, also while a disk is waited for, and taken by the host."""
+"""Fields of the cpu line of /proc/stat: idle, waiting for a disk, and time taken by the host."""
 
 
 class ProcessorShares(NamedTuple):
-    """Parts of the time of all processors: taken away by the host, and not idle (with the former)."""
+    """Fractions of the time of all processors: taken away by the host, and not idle, which includes the former."""
 
     steal: float
     busy: float
@@ -31,11 +31,11 @@ def fly_real_time(
 ) -> tuple[TickArray, list[dict[str, Any]], Truth, ProcessorShares]:
     """Fly a plan in real time.
 
-    With a folder, which is made, the run is left there; without, it goes when it has been read.
+    With a folder, which is created, the run is left there; otherwise it is deleted once read.
 
     Returns
     -------
-    the ticks, the events, the vehicles' truth, and where the processors' time went during the flight
+    the ticks, the events, the vehicles' truth, and the load of the processors during the flight
     """
     kept = folder is not None
     folder = folder if folder is not None else Path(tempfile.mkdtemp(prefix="stress-"))

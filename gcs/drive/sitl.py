@@ -1,4 +1,4 @@
-"""Simulated vehicles for the station, as a process of their own."""
+"""Runs the simulated vehicles of a flight in a process of their own."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ from gcs.runs.refusals import VEHICLES_FILE
 
 VEHICLES_LOG = "vehicles.log"
 ORPHAN_S = 60.0
-"""How long vehicles whose station was killed wait for another one to take them over."""
+"""How long vehicles whose station was killed wait for another one."""
 _AT_ONCE_S = 0.1
 _STOP_PATIENCE_S = 5.0
 
@@ -21,8 +21,8 @@ _STOP_PATIENCE_S = 5.0
 class VehicleProcess:
     """The simulated vehicles of a scenario as a child process.
 
-    If this process is killed, vehicles that outlive it fly on in their failsafe and can be taken over: they end when
-    no station has commanded them for ORPHAN_S. The others end with it.
+    With `outlive_station`, vehicles whose station is killed fly on in their failsafe and can be taken over. They end
+    when no station has commanded them for ORPHAN_S. Otherwise they end with this process.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class VehicleProcess:
                     *([] if key_file is None else ["--key", str(key_file)]),
                 ],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C is the station's to answer: it brings them to safety first
+                start_new_session=True,  # Ctrl-C goes to the station only, which brings them to safety first
             )  # fmt: skip
 
     @property
@@ -54,7 +54,7 @@ class VehicleProcess:
         return self._process.pid
 
     def complaint(self) -> str:
-        """Why they ended by themselves, as they said it last; empty while they live, or if somebody killed them."""
+        """Why the vehicles' process ended by itself, in its last words; empty while it lives or if it was killed."""
         if (self._process.poll() or 0) <= 0:
             return ""
         lines = self._log.read_text(encoding="utf-8", errors="replace").split("\n")

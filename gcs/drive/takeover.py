@@ -1,8 +1,8 @@
-"""Vehicles that are there before the flight: whose experiment they fly, taking them over, and their end.
+"""Vehicles that are present before the flight: which experiment they fly, taking them over, ending them.
 
-Simulated vehicles whose station was killed fly on for a while. They may be taken over, but only by a flight of the very
-same scenario, links and seed: on any others its verdict would be about something else. Each says what it flies in the
-extended parameter SCENARIO, which other ground stations never see as they do not ask for it.
+Simulated vehicles whose station was killed fly on for a while. Only a flight with the same scenario, links and seed may
+take them over: otherwise its verdict would be about another experiment. Each vehicle names what it flies in the
+extended parameter SCENARIO, which other ground stations do not ask for.
 """
 
 from collections import Counter
@@ -21,14 +21,14 @@ TAKEN_OVER = "taken over: they were there already"
 CONNECTED = "not started here (--connect)"
 _SCENARIO = "SCENARIO"
 _SHUTDOWN, _KEEP, _SHUT_DOWN = 246, 0.0, 2.0
-"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and what its first parameter asks for: nothing, which is a command all the same and
-so begins an orphan's time to live anew, and the end."""
+"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: nothing, which as a command still restarts
+an orphan's time to live; and shutdown."""
 _HEARTBEAT_PERIOD_S = 1.2
-"""Vehicles that already fly have been heard within this time."""
+"""Vehicles already in flight are heard within this time."""
 _ASK_AGAIN_NS = NS_PER_S // 4
 _LEAST_PATIENCE_S = 3.0
 _ROUND_TRIPS = 4.0
-"""How many round trips of the links, and how long at least, answers are waited for."""
+"""Answers are awaited for this many round trips of the links, and for the time above at least."""
 
 Make = Callable[[int], tuple[int, tuple[object, ...]]]
 """The message (id and fields) for a vehicle."""
@@ -37,7 +37,7 @@ Answer = Callable[[mavlink.Frame], str]
 
 
 class Presence:
-    """The vehicles of a scenario that send to a station's socket before its flight."""
+    """The vehicles of a scenario that already send to the station's socket before its flight."""
 
     def __init__(self, link: StationSocket, scenario: Scenario, guard: Guard | None) -> None:
         self._link = link
@@ -48,12 +48,12 @@ class Presence:
         self._sequence = 0
 
     def taken_over(self) -> list[int]:
-        """The system ids of the vehicles that are there and are to be flown, none if there are none.
+        """The system ids of the vehicles that are present and to be flown; empty if there are none.
 
         Raises
         ------
         InputError
-            If vehicles are there that fly another scenario, or do not say which.
+            If the vehicles present fly another scenario, or do not say which.
         """
         self._listen(self._link.bound_ns + round(_HEARTBEAT_PERIOD_S * NS_PER_S))
         there = sorted(self._addresses)
@@ -73,11 +73,11 @@ class Presence:
         return there
 
     def shut_down(self) -> None:
-        """End the processes of the vehicles that were taken over; a vehicle whose station lives does not obey."""
+        """End the processes of the vehicles taken over. A vehicle whose own station lives does not obey."""
         self._command(sorted(self._addresses), _SHUT_DOWN)
 
     def _command(self, system_ids: list[int], wanted: float) -> list[int]:
-        """Those that have answered the one command sent here."""
+        """The vehicles that acknowledged the command."""
         said = self._converse(
             system_ids,
             lambda system_id: (
@@ -89,7 +89,7 @@ class Presence:
         return sorted(said)
 
     def _converse(self, system_ids: Iterable[int], make: Make, answer: Answer) -> dict[int, str]:
-        """What each vehicle answers to a message, which is sent to it until it does or patience ends."""
+        """Each vehicle's answer to a message, which is repeated until the answer arrives or patience ends."""
         said: dict[int, str] = {}
         left = set(system_ids)
         patience_s = max(_LEAST_PATIENCE_S, _ROUND_TRIPS * longest_round_trip_s(self._scenario))
@@ -108,7 +108,7 @@ class Presence:
         return said
 
     def _listen(self, until_ns: int) -> list[mavlink.Frame]:
-        """The frames that come until then from vehicles of the scenario, whose addresses are noted."""
+        """The frames received until then from vehicles of the scenario, whose addresses are noted."""
         frames: list[mavlink.Frame] = []
         now_ns = 0
         while now_ns < until_ns:
@@ -125,7 +125,7 @@ class Presence:
         return frames
 
     def _flown(self, text: str) -> str:
-        """What vehicles fly that have said this."""
+        """What vehicles fly that gave this answer, in words."""
         _, _, name = text.partition(" ")
         if not name:
             return "do not say which scenario they fly"
@@ -133,7 +133,7 @@ class Presence:
         return f"fly {name} with other links, another seed or other settings" if same else f"fly {name}"
 
     def _refusal(self, there: list[int], flown: str) -> str:
-        """One line: who is there, what they do, and what can be done."""
+        """The error, in one line: who is present, what they fly, and what the user can do."""
         host, port = self._link.address
         who = f"vehicle{'s' * (len(there) > 1)} {' '.join(map(str, there))}"
         return (
@@ -143,7 +143,7 @@ class Presence:
 
 
 def _scenario_of(frame: mavlink.Frame) -> str:
-    """What a vehicle says of its experiment: the fingerprint and the name of the scenario."""
+    """A vehicle's answer about its experiment: fingerprint and name of the scenario."""
     if frame.msg_id != mavlink.PARAM_EXT_VALUE:
         return ""
     name, value = (field.partition(b"\0")[0].decode("ascii", "replace") for field in frame.fields[2:4])

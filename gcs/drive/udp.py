@@ -1,7 +1,7 @@
 """The station's real-time driver: one UDP socket, the monotonic clock, one select loop.
 
-The only file of the station that reads a clock or touches a socket. Kernel receive stamps (SO_TIMESTAMPNS) say when a
-datagram arrived, so a busy station does not lengthen the delays that it measures.
+The station itself reads no clock and touches no socket. Kernel receive stamps (SO_TIMESTAMPNS) say when a datagram
+arrived, so a busy station does not lengthen the delays that it measures.
 """
 
 import ctypes
@@ -38,8 +38,10 @@ def clock_ns() -> int:
 
 
 def realtime_offset_ns() -> int:
-    """What to add to the station's clock to get ns since 1970: from the quickest of three readings of both clocks, as
-    the processor can be taken away between them."""
+    """The offset from the station's clock to ns since 1970.
+
+    Taken from the quickest of three readings of both clocks, as the process may be interrupted between them.
+    """
     readings: list[tuple[int, int]] = []
     for _ in range(3):
         before_ns, real_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
@@ -78,12 +80,12 @@ class StationSocket:
         return host, port
 
     def wait(self, until_ns: int) -> None:
-        """Return when a datagram is there or the time has come."""
+        """Wait until a datagram is there, or until a time."""
         left_s = max(0, until_ns - clock_ns()) * 1e-9
         select.select([self._socket], [], [], left_s)
 
     def receive(self) -> list[Datagram]:
-        """All datagrams that wait, oldest first, with their arrival on the station's clock."""
+        """All waiting datagrams, oldest first, with their arrival on the station's clock."""
         datagrams: list[Datagram] = []
         begin_ns, to_monotonic_ns = clock_ns(), -realtime_offset_ns()
         oldest_ns = self._emptied_ns
@@ -93,12 +95,12 @@ class StationSocket:
             except BlockingIOError:
                 self._emptied_ns = begin_ns
                 break
-            except ConnectionError:  # an earlier datagram met a closed port: the vehicle will count as silent
+            except ConnectionError:  # an earlier datagram met a closed port; the vehicle will count as silent
                 self.send_errors += 1
                 continue
             seconds, nanoseconds = _TIMESPEC.unpack(ancillary[0][2])
             read_ns = clock_ns()
-            # If the wall clock is set, stamps jump; but nothing came before the socket was last empty.
+            # Stamps jump when the wall clock is set, but nothing arrived before the socket was last empty.
             received_ns = seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns
             received_ns = min(max(received_ns, oldest_ns), read_ns)
             datagrams.append(Datagram(data, address, received_ns, read_ns - received_ns))
@@ -108,12 +110,12 @@ class StationSocket:
         for data, address in outgoing:
             try:
                 self._socket.sendto(data, address)
-            except OSError:  # a full buffer or a closed port is loss, which the link statistics show
+            except OSError:  # a full buffer or a closed port is a loss, which the link statistics show
                 self.send_errors += 1
 
 
 def prepare_real_time() -> None:
-    """Make this process wake on time: least timer slack, and no garbage collection of what exists by now."""
+    """Make this process wake on time: least timer slack, and no garbage collection of what exists already."""
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     gc.collect()
     gc.freeze()
@@ -130,13 +132,13 @@ def drive(
 ) -> None:
     """Run the station in real time until its flight has ended.
 
-    `stop_reason` is asked at every tick; a text other than "" ends the flight for that reason. `new_plan` is told when
-    the station has found more out about what it flies. With a guard, what is sent and received is signed. A mirror
-    gets every frame taken in and sent, and may have some for the vehicles.
+    `stop_reason` is called at every tick; a text other than "" ends the flight for that reason. `new_plan` is called
+    when identification has changed the flight plan. With a guard, all frames are signed. A mirror gets every frame
+    received and sent, and may pass on frames to the vehicles.
     """
     plan = station.plan
     log: list[tuple[bytes, int]] = []
-    """Frames since the last tick, in the order in which they were taken in and sent, with their times."""
+    """Frames since the last tick, in the order in which they were received and sent, with their times."""
     refusals = Refusals()
 
     def log_refusals(now_ns: int, *, last: bool = False) -> None:

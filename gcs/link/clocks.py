@@ -1,24 +1,23 @@
-"""Round trips and clock offsets from TIMESYNC, for every vehicle at once.
+"""Round trip and clock offset of one vehicle, from its TIMESYNC exchanges.
 
-One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The offset is wrong by
-half of what the way up was slower than the way down, at most RTT / 2. Exchanges with a short round trip say most, so
-the estimate is a straight line through the window's offsets, weighted by 1 / (RTT - least RTT + 0.2 ms)^2: it works at
+One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The error of this offset
+is half the difference between the ways up and down, at most RTT / 2. Exchanges with a short round trip say most, so the
+estimate is a straight line through the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. It works at
 any RTT and follows the drift of the vehicle's clock.
 
-The bound owes nothing to that line. The vehicle's clock was read after the request left and before the reply came, so
-t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits go apart by DRIFT_BOUND; the line is
-kept between them, and the bound is the distance to the farther one. It holds for any delays, losses and asymmetry, as
-long as the clock keeps to DRIFT_BOUND and has not jumped since the newest exchange.
+The bound of the error does not depend on that line. The vehicle read its clock after the request left and before the
+reply arrived, so t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits move apart by
+DRIFT_BOUND. The line is kept between them, and the bound is the distance to the farther one. It holds for any delay,
+loss and asymmetry as long as the clock drifts by less than DRIFT_BOUND and has not jumped since the newest exchange.
 
-Limits that contradict each other show that the clock has jumped. A jump of less than a round trip need not: it shows
-in exchanges that differ from the line by more than their round trips, and all others before them, can explain. The
-first of these makes the limits its own alone, the third is taken for a jump.
+Limits that contradict each other show that the clock has jumped. A jump shorter than a round trip may not contradict
+them, but makes exchanges differ from the line by more than their round trips and the earlier residuals explain. The
+first such exchange resets the limits; the third in a row is reported as a clock jump.
 
-What else the vehicle stamps with its clock shows a jump sooner: a state cannot have been sampled after it was received,
-nor before the one that was sent before it. Such a state is refused and an exchange is due at once, which tells.
+Telemetry shows a jump sooner: no state is sampled after it is received, nor before the state sent before it. Such a
+state is refused, and an exchange is due at once to decide.
 
-For a loop closed over the ground an error of the offset cancels: it makes the telemetry look older by what it makes the
-command look younger.
+The loop delay of a loop closed over the ground is free of the offset's error, see `gcs.control.loop_delay`.
 """
 
 from typing import NamedTuple
@@ -31,36 +30,36 @@ from scenarios.schema import DRIFT_MAX_PPM
 WINDOW = 128
 """Exchanges kept for each vehicle: 13 s at 10 Hz, over which a drifting clock is straight to a few µs."""
 LEAST_SAMPLES = 5
-"""Exchanges wanted before a clock counts as known."""
+"""A clock counts as known after this many exchanges."""
 LATEST_NS = 1 << 62
-"""No clock shows more, to either side (a clock set back may show less than 0): 146 years. Differences fit 64 bits."""
+"""Largest plausible clock reading, 146 years; a clock set back may be negative. Differences fit 64 bits."""
 REQUEST_LIFETIME_NS = 20_000_000_000
 _LONG_AGO_NS = -(1 << 62)
 DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
 """Rate difference of two clocks beyond which a change of offset is a jump, not drift."""
 DOUBTS = 3
-"""Exchanges without one to the contrary that make a jump of what is possible without."""
+"""This many doubtful exchanges, with none in between that fits the line, are taken for a jump."""
 _UNUSUAL = 1.5
-"""Farther off the line than this times the farthest in the window is what jitter does not explain."""
+"""A sample this many times farther from the line than any in the window is an outlier, not jitter."""
 _READING_NS = 1000
-"""What stamps may be wrong by; those of a telemetry log are whole microseconds."""
+"""Resolution of the stamps: those of a telemetry log are whole microseconds."""
 _BOOT_MS_NS = 1_000_000
 _WRAP_NS = _BOOT_MS_NS << 32
-"""time_boot_ms begins anew after this: 49.7 days, or what lies before the boot of a clock that was set back."""
+"""time_boot_ms wraps after this, 49.7 days; a clock set back to before its boot wraps too."""
 _DOUBTFUL_NS = 10_000
-"""Smaller differences from the line are not worth a doubt."""
+"""An exchange this close to the line is never doubtful."""
 _WEIGHT_FLOOR_NS = 200_000.0
 _EVERY_SAMPLE = 32
 _ESTIMATE_EVERY = 4
-"""Past the first samples the line is drawn anew only at each fourth: in between it is followed, which costs nothing."""
+"""After the first samples the line is fitted at every fourth only, to save time, and extrapolated in between."""
 _sum = np.add.reduce
-"""As np.sum, at half the cost for so few."""
+"""np.sum, at half its cost for so few samples."""
 
 
 class ClockEstimate(NamedTuple):
     """Offset of one vehicle's boot clock against the station's, at `reference_ns` of the station's clock.
 
-    `bound_ns` is the most by which the offset can be wrong there; `bound_at_ns` tells it of other times.
+    `bound_ns` is the largest error of the offset there; `bound_at_ns` gives it at other times.
     """
 
     samples: int
@@ -74,7 +73,7 @@ class ClockEstimate(NamedTuple):
         return self.offset_ns + round(self.skew * (time_ns - self.reference_ns))
 
     def bound_at_ns(self, time_ns: int) -> float:
-        """Most by which the offset, or an instant that `to_station_ns` gives, can be wrong near a station time."""
+        """The largest error of the offset, or of an instant from `to_station_ns`, near a time of the station."""
         return self.bound_ns + (DRIFT_BOUND + abs(self.skew)) * abs(time_ns - self.reference_ns)
 
     def to_station_ns(self, boot_ns: int) -> int:
@@ -87,7 +86,7 @@ UNKNOWN = ClockEstimate(samples=0, offset_ns=0, skew=0.0, bound_ns=0, reference_
 
 
 class VehicleClock:
-    """TIMESYNC exchanges with one vehicle, and what they say of its clock and its link."""
+    """TIMESYNC exchanges with one vehicle, and what they show of its clock and its link."""
 
     def __init__(self) -> None:
         self.estimate = UNKNOWN
@@ -95,36 +94,36 @@ class VehicleClock:
         self.rtt_ns: int | None = None
         """Round trip of the newest exchange."""
         self.down_ns: int | None = None
-        """One-way delay station to vehicle of the newest exchange, by the estimated offset,"""
+        """One-way delay from station to vehicle of the newest exchange, by the estimated offset."""
         self.down_bound_ns = 0.0
-        """and the most by which it can be wrong."""
+        """Its largest error."""
         self.unmatched = 0
         self.backdated_ns = 0
-        """Most by which the vehicle dates its replies back."""
+        """The most by which the vehicle dates its replies back."""
         self.lost = False
-        """Whether it is known to have jumped, and not yet to what."""
+        """Whether the clock is known to have jumped, but not yet by how much."""
         self.asked_ns = 0
-        """When an exchange was last asked for."""
+        """When the last request was sent."""
         self._doubtful_state = False
         self._newest_boot_ns = _LONG_AGO_NS
-        """Of the states whose instant was believed, on the vehicle's clock as it is now."""
+        """Boot time of the newest accepted state since the last jump."""
         self._pending: dict[int, None] = {}
         self._count = 0
         self._sent_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
         self._rtt_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
         self._offset_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
         self._least_ns = self._unusual_ns = 0
-        """Of the window when the line was last drawn: its least round trip, and the farthest off the line."""
+        """Least round trip and largest residual of the window at the last fit."""
         self._low_ns = self._low_at_ns = self._high_ns = self._high_at_ns = 0
-        """Limits of the offset, each at its time."""
+        """Limits of the offset, each with the time at which it held."""
         self._since_ns = -1
-        """When the first exchange with the clock as it is now was asked for."""
+        """When the first exchange since the last jump was requested."""
         self._doubts = 0
         self._doubted_ns = 0
-        """By how much the first doubtful exchange was off the line."""
+        """Residual of the first doubtful exchange."""
 
     def request(self, now_ns: int) -> int:
-        """Note a request sent now; returns its ts1, which is unique among those waiting."""
+        """Note a request sent now; returns its ts1, unique among the pending requests."""
         self.asked_ns = now_ns
         while now_ns in self._pending:
             now_ns += 1
@@ -136,11 +135,11 @@ class VehicleClock:
 
     @property
     def exchange_due(self) -> bool:
-        """Whether a state was refused since the newest exchange, so that the next one should not wait."""
+        """Whether a state was refused since the newest exchange, so that the next exchange must not wait."""
         return self.lost or self._doubtful_state
 
     def boot_ns(self, boot_ms: int, near_ns: int) -> int:
-        """The instant on the vehicle's clock that a time_boot_ms means which came near a station time."""
+        """The instant on the vehicle's clock of a time_boot_ms received near a station time, with wraps undone."""
         boot_ns = boot_ms * _BOOT_MS_NS
         if self.estimate.samples == 0:
             return boot_ns
@@ -148,7 +147,7 @@ class VehicleClock:
         return boot_ns + turns * _WRAP_NS
 
     def sampled_ns(self, boot_ms: int, received_ns: int, *, newest: bool) -> int | None:
-        """The station's time at which a state was sampled; None if that is unknown, or cannot be.
+        """The station's time at which a state was sampled; None if it is unknown or impossible.
 
         Parameters
         ----------
@@ -157,7 +156,7 @@ class VehicleClock:
         received_ns
             When it was received, on the station's clock.
         newest
-            Whether it was sent after all states before, as its sequence number tells.
+            Whether its sequence number shows that it was sent after all states received before.
         """
         known = self.estimate
         if known.samples == 0:
@@ -169,21 +168,20 @@ class VehicleClock:
             self.estimate = UNKNOWN._replace(skew=known.skew)
             return None
         if newest and boot_ns < self._newest_boot_ns:
-            self._doubtful_state = True  # or a replay older than sequence numbers can tell: the exchange decides
+            self._doubtful_state = True  # or a replay too old for sequence numbers to show: the exchange decides
             return None
         self._newest_boot_ns = max(boot_ns, self._newest_boot_ns)
         return sample_ns
 
     def reply(self, *, tc1_ns: int, ts1_ns: int, received_ns: int) -> int | None:
-        """Take a reply in; returns the round trip in ns, or None if it answers nothing that was asked, or no clock
-        shows such a time."""
+        """Take in a reply; returns the round trip in ns, or None if it answers no request or its time is impossible."""
         if ts1_ns not in self._pending or received_ns < ts1_ns or abs(tc1_ns) >= LATEST_NS:
             self.unmatched += 1
             return None
         del self._pending[ts1_ns]
         rtt = self.rtt_ns = received_ns - ts1_ns
         if ts1_ns < self._since_ns:
-            return rtt  # overtaken by one with a clock that has jumped since
+            return rtt  # from before a jump that a newer exchange has shown
         self._doubtful_state = False
         middle = ts1_ns + rtt // 2
         offset = tc1_ns - middle
@@ -208,7 +206,7 @@ class VehicleClock:
         return rtt
 
     def _contradicts(self, low_ns: int, low_at_ns: int, high_ns: int, high_at_ns: int) -> bool:
-        """Whether limits exclude those known already, whatever the clock has drifted in between."""
+        """Whether new limits exclude the known ones, however the clock has drifted in between."""
         if self._count == 0:
             return False
         return (
@@ -217,7 +215,7 @@ class VehicleClock:
         )  # fmt: skip
 
     def _narrow(self, low_ns: int, low_at_ns: int, high_ns: int, high_at_ns: int) -> None:
-        """Take limits in: of old and new ones the nearer at the newer time."""
+        """Keep the tighter of the old and the new limits, compared at the newer time."""
         at_ns = max(low_at_ns, self._low_at_ns)
         mine, new = self._low_ns - _drift(at_ns - self._low_at_ns), low_ns - _drift(at_ns - low_at_ns)
         self._low_ns, self._low_at_ns = max(mine, new), at_ns
@@ -226,9 +224,9 @@ class VehicleClock:
         self._high_ns, self._high_at_ns = min(mine, new), at_ns
 
     def _is_doubtful(self, offset_ns: int, rtt_ns: int, at_ns: int) -> bool:
-        """Whether an exchange is off the line by more than jitter explains; counts those without one to the contrary.
+        """Whether an exchange is farther off the line than jitter explains; counts such exchanges.
 
-        Where one way alone has become slower by x, the round trip has too, and the offset is off by x / 2.
+        If one way alone became slower by x, so did the round trip, and the offset is off by x / 2.
         """
         if self._count < 2 * LEAST_SAMPLES:
             return False
@@ -250,7 +248,7 @@ class VehicleClock:
         return False
 
     def _jumped(self, ts1_ns: int, *, keep: int) -> None:
-        """Begin anew, with the newest exchanges."""
+        """Start over with the newest exchanges."""
         newest = [k % WINDOW for k in range(self._count - keep, self._count)]
         for kept in (self._sent_ns, self._rtt_ns, self._offset_ns):
             kept[:keep] = kept[newest]
@@ -259,7 +257,7 @@ class VehicleClock:
         self._count, self._doubts, self._doubted_ns, self._since_ns = keep, 0, 0, ts1_ns
 
     def _within_limits(self, at_ns: int) -> ClockEstimate:
-        """The line, brought between the limits at a time."""
+        """The estimate at a time: the line, moved between the limits."""
         known = self.estimate
         low_ns = self._low_ns - _drift(abs(at_ns - self._low_at_ns))
         high_ns = self._high_ns + _drift(abs(at_ns - self._high_at_ns))
@@ -276,14 +274,13 @@ class VehicleClock:
         t = (self._sent_ns[:n] - now_ns).astype(float)
         base = int(self._offset_ns[(self._count - 1) % WINDOW])
         y = (self._offset_ns[:n] - base).astype(float)
-        # Sums of products, not `@`: BLAS adds in an order of each processor's own, and flights are the same on all.
+        # Sums of products, not `@`: BLAS adds in an order that depends on the processor, and flights must not.
         t_mean, y_mean = _sum(weight * t), _sum(weight * y)
         t -= t_mean
         y -= y_mean
         weighted = weight * t
         spread = _sum(weighted * t)
-        # A slope from a short stretch would be noise: below 0.3 s (rms) of history the rate is the one known before,
-        # at first none.
+        # The slope of a short stretch would be noise: below 0.3 s (rms) of history the former rate is kept, at first 0.
         skew = float(_sum(weighted * y) / spread) if spread > 0.09e18 else self.estimate.skew
         skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, skew))
         self._least_ns, self._unusual_ns = least, round(float(np.abs(y - skew * t).max()))
@@ -292,5 +289,5 @@ class VehicleClock:
 
 
 def _drift(time_ns: int) -> int:
-    """Most that a clock drifts in a time."""
+    """The most that a clock drifts in a time."""
     return round(DRIFT_BOUND * time_ns)

@@ -1,4 +1,4 @@
-"""Datagrams as the station takes them in and sends them."""
+"""Datagrams as the station receives and sends them."""
 
 from typing import NamedTuple
 
@@ -13,9 +13,11 @@ class Datagram(NamedTuple):
     received_ns: int
     """The kernel's stamp, on the station's clock."""
     queued_ns: int = 0
-    """How long it waited in the socket after that for the station to be free."""
+    """Time it waited in the socket buffer before the station read it."""
 
 
 class Outgoing(NamedTuple):
+    """One datagram to be sent."""
+
     data: bytes
     address: Address

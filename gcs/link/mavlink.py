@@ -1,7 +1,7 @@
-"""The station's MAVLink 2 codec: frames in and out of datagrams.
+"""The station's MAVLink 2 codec: frames from and to datagrams.
 
-The message definitions (wire layout, CRC_EXTRA) are those of pymavlink's dialect; framing and checksum are our own,
-because they run for each of 25,000 datagrams a second with 250 vehicles. Field order is that of the wire.
+Message definitions (wire layout, CRC_EXTRA) come from pymavlink's dialect. Framing and checksum are our own, because
+they run for 25,000 datagrams a second with 250 vehicles. Fields are in wire order.
 """
 
 import struct
@@ -49,7 +49,7 @@ class _Layout(NamedTuple):
 
 
 SETUP_SIGNING = 256
-"""Holds a key. It is neither sent nor taken, and so never logged."""
+"""Carries a key, so it is neither sent nor accepted, and never logged."""
 
 
 def _layouts() -> dict[int, _Layout]:
@@ -77,13 +77,13 @@ class Frame(NamedTuple):
 
 
 def field_names(msg_id: int) -> list[str]:
-    """Names of a message's fields in wire order; an array counts as one name but as many fields."""
+    """Names of a message's fields in wire order; an array has one name but several fields."""
     messages: dict[int, Any] = dialect.mavlink_map
     return list(messages[msg_id].ordered_fieldnames)
 
 
 def _target_places() -> dict[int, int]:
-    """Where among its fields a message says to which system it goes; those that do not are left out."""
+    """Position of target_system among the fields of each message that has one."""
     messages: dict[int, Any] = dialect.mavlink_map
     return {
         msg_id: sum(message.lengths[: message.ordered_fieldnames.index("target_system")])
@@ -96,22 +96,22 @@ _TARGET_PLACES = _target_places()
 
 
 def target_system(frame: Frame) -> int:
-    """The system that a frame is for; 0 if for all."""
+    """The system that a frame is addressed to; 0 for all."""
     place = _TARGET_PLACES.get(frame.msg_id)
     return 0 if place is None else frame.fields[place]
 
 
 def message_name(msg_id: int) -> str:
-    """The name of a message that can be decoded."""
+    """The name of a message that `decode` knows."""
     messages: dict[int, Any] = dialect.mavlink_map
     return messages[msg_id].msgname
 
 
 def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
-    """The valid frames of one datagram; what is refused is counted by reason and never raised.
+    """The valid frames of one datagram; refused ones are counted by reason, and nothing is raised.
 
-    Each datagram is parsed on its own: a frame cut short cannot swallow the next datagram. A frame with a number that
-    is NaN or infinite in one of the messages used for control is refused, as its checksum says nothing about that.
+    Each datagram is parsed on its own, so a truncated frame cannot swallow the next datagram. A position used for
+    control is refused if it contains NaN or infinity, which a checksum does not show.
     """
     end = len(datagram)
     if end >= _OVERHEAD and datagram[0] == MAGIC and end == _OVERHEAD + datagram[1] and not datagram[2]:
@@ -138,14 +138,14 @@ def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
 
 
 def is_magic(data: bytes, at: int) -> bool:
-    """Whether a frame may begin there, or the data end."""
+    """Whether a frame may begin there or the data end there."""
     return at >= len(data) or data[at] in (MAGIC, MAGIC_1)
 
 
 def frame_end(data: bytes, at: int) -> int:
-    """Where the frame that may begin there ends; 0 if none does, or not all of it is there.
+    """Where the frame that begins there ends; 0 if none begins there or it is truncated.
 
-    Nothing else says how long a frame is: a decoder reads no byte behind the magic before it has asked here.
+    This is the only place that computes a frame's length. A decoder asks it before reading anything behind the magic.
     """
     if at + _OVERHEAD_1 > len(data) or data[at] not in (MAGIC, MAGIC_1):
         return 0
@@ -160,12 +160,12 @@ def decode_either(datagram: bytes, refused: Counter[str]) -> list[Frame]:
 
 
 def first_heartbeats(datagram: bytes) -> list[Frame]:
-    """The MAVLink 1 heartbeats of a datagram: a PX4 speaks that until it hears MAVLink 2."""
+    """The MAVLink 1 heartbeats of a datagram: PX4 sends these until it hears MAVLink 2."""
     return [frame for frame in decode_1(datagram, Counter()) if frame.msg_id == HEARTBEAT]
 
 
 def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
-    """The valid MAVLink 1 frames of one datagram; what is refused is counted by reason."""
+    """The valid MAVLink 1 frames of one datagram; refused ones are counted by reason."""
     frames: list[Frame] = []
     at = 0
     while at < len(datagram):
@@ -190,7 +190,7 @@ def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
 
 
 def _checked(data: bytes, length: int, refused: Counter[str]) -> Frame | None:
-    """One frame of known extent, or None if it is refused."""
+    """One frame of known length, or None if it is refused."""
     _, _, _, _, sequence, system_id, component_id, id_low, id_high = _HEADER.unpack_from(data)
     msg_id = id_low | id_high << 16
     layout = _LAYOUTS.get(msg_id)
@@ -204,7 +204,7 @@ def _checked(data: bytes, length: int, refused: Counter[str]) -> Frame | None:
         return None
     if length == full_length:
         fields = packing.unpack_from(data, 10)
-    else:  # trailing zeros are not sent, and fields added by a newer dialect are not ours
+    else:  # MAVLink 2 omits trailing zeros; a newer dialect may add fields, which are ignored
         fields = packing.unpack(data[10 : 10 + min(length, full_length)].ljust(full_length, b"\0"))
     if msg_id == LOCAL_POSITION_NED and not isfinite(sum(fields)):
         refused["not finite"] += 1
@@ -213,7 +213,7 @@ def _checked(data: bytes, length: int, refused: Counter[str]) -> Frame | None:
 
 
 def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int, system_id: int = STATION_SYSTEM_ID) -> bytes:
-    """One frame, from the station unless said otherwise; `fields` in wire order."""
+    """One frame, by default from the station; `fields` in wire order."""
     layout = _LAYOUTS[msg_id]
     payload = layout.packing.pack(*fields).rstrip(b"\0") or b"\0"
     header = _HEADER.pack(
@@ -249,7 +249,7 @@ def statustext(severity: int, text: str) -> tuple[Any, ...]:
 def command_long(
     command: int, *, target_system: int, confirmation: int = 0, parameters: tuple[float, ...] = ()
 ) -> tuple[Any, ...]:
-    """Fields of COMMAND_LONG to the autopilot (component 1) of one vehicle; parameters left out are 0."""
+    """Fields of COMMAND_LONG to the autopilot (component 1) of one vehicle; omitted parameters are 0."""
     padded = (*parameters, *(0.0 for _ in range(7 - len(parameters))))
     return (*padded, command, target_system, 1, confirmation)
 
@@ -276,7 +276,7 @@ def is_set_point(frame: bytes) -> bool:
 
 IGNORE_ALL_BUT_VELOCITY_AND_ACCELERATION = 0x0C07
 IGNORE_ALL_BUT_ACCELERATION = 0x0C3F
-"""type_mask of a set-point of which only the acceleration counts: the other bits set are ignore bits."""
+"""type_mask values: each bit set makes the vehicle ignore a field."""
 
 
 def acceleration_set_point(*, key_ms: int, target_system: int, north_m_s2: float, east_m_s2: float) -> tuple[Any, ...]:

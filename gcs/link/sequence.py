@@ -1,33 +1,33 @@
 """Loss, lateness and duplication from MAVLink's 8-bit sequence numbers."""
 
 _KEPT = 128
-"""Numbers behind the newest of which it is known whether they have come."""
+"""How far back the sequence counter remembers which frames arrived."""
 _SEEN = (1 << _KEPT) - 1
 NEW, LATE, DUPLICATE = 0, 1, 2
 _NS_PER_S = 1_000_000_000
 _NO_DOUBT = 100.0 * _NS_PER_S
-"""With fewer frames expected than 100, the next number is the next frame."""
+"""While fewer than 100 frames are expected, the next number is the next frame."""
 _STEADY_NS = _NS_PER_S // 2
-"""A longer pause says nothing of the rate,"""
+"""A pause longer than this says nothing about the rate."""
 _RATE_NS = _NS_PER_S
-"""which is measured over times like this."""
+"""The rate is measured over intervals of this length."""
 _AHEAD, _LEAST_AHEAD = 127, 32
-"""A frame may be newer by so many than time lets expect, as the newest may have come late itself. The more frames have
-been overtaken by, the fewer, but not less than the second figure."""
+"""A frame may be this much newer than its time suggests, because the newest one may itself have been late. How far
+frames have lately been overtaken reduces this allowance, down to the second figure."""
 _MOST = 0xFFFFFFFF
-"""What the tick record holds; a log whose clock jumps by centuries seems to have lost more."""
+"""The largest count that the tick record holds: a log whose clock jumps by centuries seems to have lost more."""
 _FORGET = 1.0 / 512
 _RUN, _RUN_STEP = 8, 4
-"""Late frames in a row, each newer by no more than that than the one before, that show that they are not late."""
+"""This many late frames in a row, each newer than the last by at most the second figure, are not late after all."""
 
 
 class SequenceCounter:
-    """Counts frames of one sender: received, lost, late (came after a newer one) and duplicate.
+    """Counts the frames of one sender: received, lost, late (received after a newer one) and duplicate.
 
-    A number holds 8 bits of the count. The rest is told from time: a frame is not much newer than the frames' rate lets
-    expect since the newest came, or else older. So a swapped pair is one late frame and not 254 lost ones, and what is
-    lost in an outage of a minute is counted whole. What is overtaken by more than 223 frames is miscounted. A late
-    frame is taken back from the lost ones.
+    A sequence number holds 8 bits of the count; time gives the rest. A frame is at most a little newer than the rate of
+    frames suggests since the newest one, otherwise it is older. So a swapped pair is one late frame, not 254 lost ones,
+    and the losses of an outage of a minute are counted in full. A frame overtaken by more than 223 others is
+    miscounted. A late frame no longer counts as lost.
     """
 
     __slots__ = (
@@ -51,7 +51,7 @@ class SequenceCounter:
         self.restart()
 
     def add(self, sequence: int, time_ns: int) -> int:
-        """Count a frame received at a time; NEW if it is newer than all before it, LATE, or DUPLICATE."""
+        """Count a frame received at a time: NEW if it is newer than all before it, else LATE or DUPLICATE."""
         self.received += 1
         step = (sequence - self._last) & 0xFF
         self._last = sequence
@@ -63,7 +63,7 @@ class SequenceCounter:
         since_ns = max(0, time_ns - self._newest_ns)  # in a log the clock may have been set back
         expected = self._rate_hz * since_ns
         if step == 1 and (sequence - self._newest) & 0xFF == 1 and self._run == 0 and expected < _NO_DOUBT:
-            # the next one: what follows would come to the same, and most frames end here
+            # Most frames are simply the next one; the general case below would give the same.
             self._lag *= 1.0 - _FORGET
             self._seen = (self._seen << 1 | 1) & _SEEN
             self._newest += 1
@@ -77,7 +77,7 @@ class SequenceCounter:
         if ahead <= 0 and 0 < step <= _RUN_STEP:
             self._run += 1
             if self._run == _RUN:
-                self.lost -= ahead + 255  # whether any of them are is not known
+                self.lost -= ahead + 255  # nobody knows whether any of these are lost
                 ahead += 256
         else:
             self._run = 0
@@ -100,14 +100,14 @@ class SequenceCounter:
         return LATE
 
     def restart(self) -> None:
-        """The sender has begun anew: its next frame is its newest."""
+        """Take the next frame as the first: the sender has restarted."""
         self._newest = -1
         self._newest_ns = self._rate_ns = self._rate_count = self._run = self._last = 0
-        self._seen = 0  # bit k: the number `newest - k` has come
+        self._seen = 0  # bit k: frame number `newest - k` has arrived
         self._rate_hz = self._lag = 0.0
 
     def _note_rate(self, time_ns: int) -> None:
-        """Frames sent in a second, from the newest ones at times without a pause; rates change by command."""
+        """Update the rate of frames sent, from times without a pause; a command may change it at once."""
         steady = time_ns - self._newest_ns < _STEADY_NS
         since_ns = time_ns - self._rate_ns
         if steady and since_ns < _RATE_NS:

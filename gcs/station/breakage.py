@@ -1,8 +1,7 @@
-"""When a flight is ended because the formation is broken: a collision, or a spacing error past the limit.
+"""Ends a flight whose formation is broken: after a collision, or a spacing error beyond the limit.
 
-A vehicle that comes back, from its pilot, from its failsafe or from silence, may be far from its place, and so is every
-vehicle behind it from the place that it now gives them. Their errors say nothing of the loop until they have had the
-time to come back.
+A vehicle that returns from its pilot, its failsafe or silence may be far from its place. Then the vehicles behind it
+are as far from theirs, which depend on it. Their errors say nothing about the loop until they have had time to return.
 """
 
 from collections.abc import Sequence
@@ -17,12 +16,12 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.station.monitor import VehicleState
 
 _TIME_CONSTANTS = 3.0
-"""After so many an error has decayed to a twentieth."""
+"""After this many time constants an error has decayed to a twentieth."""
 _AWAY = (Mode.LOST, Mode.FAILSAFE)
 
 
 class Breakage:
-    """Judges every tick of a flight, and remembers who is on the way back."""
+    """Judges every tick of a flight, and remembers which vehicles are returning."""
 
     def __init__(self, plan: FlightPlan) -> None:
         n = len(plan.formation.system_ids)
@@ -32,7 +31,7 @@ class Breakage:
         self._away = [False] * n
         self._judged_from_s = [-inf] * n
         self._behind: list[list[int]] = [[row] for row in range(n)]
-        """Each vehicle with all that follow it, directly or not."""
+        """Each vehicle with all that follow it, directly or through others."""
         for row in range(n - 1, 0, -1):
             self._behind[int(plan.formation.predecessor[row])] += self._behind[row]
 
@@ -45,7 +44,7 @@ class Breakage:
         nearest_m: Sequence[float],
         time_s: float,
     ) -> str:
-        """Why the flight has to end at this tick; empty if it may go on."""
+        """Why the flight must end at this tick; empty if it may continue."""
         ids = self._plan.formation.system_ids
         closest_m = min((distance for distance in nearest_m if not isnan(distance)), default=nan)
         if closest_m < self._safety.collision_distance_m:
@@ -64,7 +63,7 @@ class Breakage:
         return ""
 
     def _come_back(self, row: int, controls: Sequence[VehicleControl], time_s: float) -> None:
-        """Give a vehicle and all behind it their time, once it is known how far they have to go."""
+        """Give a vehicle and all behind it time to return, once their distances are known."""
         distances_m = [self._way_m(controls[other]) for other in self._behind[row]]
         if not isfinite(distances_m[0]):
             return
@@ -76,14 +75,14 @@ class Breakage:
             self._judged_from_s[other] = max(self._judged_from_s[other], until_s)
 
     def _way_m(self, control: VehicleControl) -> float:
-        """The spacing error, and how far the velocity error carries until it has decayed; NaN while unknown."""
+        """The spacing error plus the distance covered while the velocity error decays; NaN while unknown."""
         spacing_m = hypot(*control.spacing_error_m)
         carried_m = hypot(*control.velocity_error_m_s) / self._decay_1_s if self._decay_1_s > 0 else 0.0
         return carried_m + (0.0 if isnan(spacing_m) else spacing_m)  # the leader has no spacing error
 
 
 def slowest_decay_1_s(plan: FlightPlan) -> float:
-    """Decay rate, without delay, of the slowest gains of the schedule: those that a vehicle comes back with."""
+    """Decay rate, without delay, of the slowest gains of the schedule, with which a vehicle returns."""
     model = plan.model
     closed_loop = model.A + model.B @ plan.gains[-1]
     loops = [closed_loop]
@@ -94,11 +93,11 @@ def slowest_decay_1_s(plan: FlightPlan) -> float:
 
 
 def recovery_time_s(plan: FlightPlan, decay_1_s: float, way_m: float, speed_m_s: float) -> float:
-    """How long a vehicle may take to come back over a distance, before its spacing error is judged.
+    """Time that a vehicle has to return over a distance before its spacing error is judged again.
 
-    Three time constants of the slowest gains, and as many more as it takes from there to the spacing error limit. With
-    limits of acceleration and speed also twice the time in which these alone cover the distance: to speed up and to
-    slow down again, and to fly it with what the formation's own speed leaves. None for gains that do not decay.
+    Three time constants of the slowest gains, plus the time in which the error decays to the spacing error limit.
+    Limits of acceleration and speed add twice the time that the distance takes under them alone: to speed up and slow
+    down, and to cover it with the speed that the formation's own speed leaves. 0 for gains that do not decay.
     """
     if decay_1_s <= 0:
         return 0.0

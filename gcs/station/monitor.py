@@ -1,15 +1,15 @@
-"""The monitor: from measured loop delays to modes, and what is done before the margin is reached.
+"""The monitor turns measured loop delays into modes, and acts before the delay margin is reached.
 
-`monitored` is the whole decision for one vehicle, as a pure function. A change of gains is blended in over time, so
+`monitored` is the whole decision for one vehicle, as a pure function. Gains are blended over time when they change, so
 that commands do not jump.
 
-What is done, in this order, as headroom goes:
+As headroom shrinks, the monitor acts in this order:
 
 1. CRITICAL: the vehicle's gains change to the next slower set of the schedule, which has a larger margin.
-2. Slowest set and still CRITICAL: the whole formation is opened to `open_factor` times its spacing.
-3. Slowest set and no headroom: vehicles are released to their failsafe, those farthest down the tree first.
+2. Still CRITICAL on the slowest set: the whole formation opens to `open_factor` times its spacing.
+3. No headroom on the slowest set: vehicles are released to their failsafe, those farthest down the tree first.
 
-As the link returns it is undone in the reverse order.
+When the link recovers, these actions are undone in the reverse order.
 """
 
 from dataclasses import dataclass, replace
@@ -32,12 +32,12 @@ class VehicleState:
     gain_set: int = 0
     """Place in the schedule, 0 the fastest."""
     former_set: int = 0
-    """The set flown before the last change; blended out until `changed_s` + blend_s."""
+    """The set before the last change; blended out until `changed_s` + `blend_s`."""
     changed_s: float = -1e9
     pressed_s: float | None = None
-    """Since when headroom has called for the slower side."""
+    """Since when headroom has been low enough for slower gains; None if it is not."""
     eased_s: float | None = None
-    """Since when headroom has allowed the faster side."""
+    """Since when headroom has been high enough for faster gains; None if it is not."""
     released: bool = False
 
 
@@ -55,8 +55,8 @@ class Observation(NamedTuple):
 def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> VehicleState:
     """The state after one tick.
 
-    h is the headroom against the margin of the set flown, h+ that against the next faster set; hold and ease are
-    `policy.hold_s` and `policy.ease_s`; a condition "for hold" has lasted that long. First row that fits:
+    h is the headroom of the set flown, h+ that of the next faster set. "For hold" and "for ease" mean that the
+    condition has lasted `policy.hold_s` or `policy.ease_s`. The first row that fits applies:
 
     ==================  ====================================================  ============================
     from                when                                                  to
@@ -79,8 +79,8 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
     RECOVERING          gains blended in: fastest set / slower set            NOMINAL / CAUTION
     ==================  ====================================================  ============================
 
-    While gains are being blended no other change of gains is made. With `policy.act` off the modes are the same, but
-    the set stays the fastest and nothing is released.
+    Gains do not change again while they are being blended. With `policy.act` off the modes are the same, but the gains
+    stay the fastest set and no vehicle is released.
     """
     if not seen.flying:
         return replace(VehicleState(), mode=Mode.FAILSAFE if seen.failsafe else Mode.WAITING)
@@ -98,7 +98,7 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
 
 
 def _is_calm(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> bool:
-    """NOMINAL with enough headroom, or with an unknown one, and nothing being counted: most ticks of most flights."""
+    """NOMINAL with enough or unknown headroom and no condition lasting: most ticks of most flights."""
     nominal = state.mode is Mode.NOMINAL and state.pressed_s is None and state.eased_s is None
     return nominal and not headroom(seen.loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
 
@@ -111,12 +111,12 @@ def _by_headroom(
     own = headroom(seen.loop_delay_s, margins_s[state.gain_set])
     faster = headroom(seen.loop_delay_s, margins_s[max(state.gain_set - 1, 0)])
     if state.released:
-        faster = own  # what it has to come back to is the slowest set
+        faster = own  # it returns to the slowest set
     last_resort = state.gain_set == slowest and state.mode is Mode.CRITICAL and not state.released
     limit = 0.0 if last_resort else policy.critical_headroom
     pressed_s = _since(state.pressed_s, own < limit, now_s)
     eased_s = _since(state.eased_s, faster > policy.caution_headroom + policy.hysteresis, now_s)
-    if (pressed_s, eased_s) != (state.pressed_s, state.eased_s):  # a copy costs more than all the rest
+    if (pressed_s, eased_s) != (state.pressed_s, state.eased_s):  # a copy costs more than all other steps
         state = replace(state, pressed_s=pressed_s, eased_s=eased_s)
     blending = now_s < state.changed_s + policy.blend_s
     if not blending and _lasted(state.pressed_s, policy.hold_s, now_s) and not state.released:
@@ -136,7 +136,7 @@ def _by_headroom(
 
 
 def _calm_mode(state: VehicleState, own: float, *, blending: bool, policy: Monitor, now_s: float) -> Mode:
-    """The mode when the gains stay as they are."""
+    """The mode when the gains do not change."""
     if state.released:
         return Mode.FAILSAFE
     fastest = state.gain_set == 0
@@ -184,8 +184,8 @@ class FleetView(NamedTuple):
 class FormationMonitor:
     """The monitor of a whole formation: one state for each vehicle, and how far the formation is opened.
 
-    `separable` says that every vehicle's loop has a margin of its own, as in a leader-follower tree; otherwise the
-    worst loop delay counts for all, and all change gains together.
+    `separable`: every vehicle's loop has its own margin, as in a leader-follower tree. Otherwise the largest loop delay
+    counts for all vehicles, and all change gains together.
     """
 
     def __init__(
@@ -204,12 +204,12 @@ class FormationMonitor:
         self._settled = [Blend(gain_set, gain_set, 1.0) for gain_set in range(len(margins_s))]
 
     def update(self, view: FleetView) -> list[tuple[int, VehicleState, VehicleState]]:
-        """Judge a tick; returns the vehicles whose mode, gain set or release changed, with both states."""
+        """Judge a tick; returns row, old and new state of each vehicle whose mode, gain set or release changed."""
         if view.flying:
             self._delays_s[self._judged % len(self._delays_s)] = view.loop_delay_s
             self._judged += 1
         else:
-            self._judged = 0  # before the flight telemetry is slow, which says nothing of the loop that is not closed
+            self._judged = 0  # before the flight telemetry is slow and the loop is not closed
         delays_s = self._judged_delay_s()
         changes: list[tuple[int, VehicleState, VehicleState]] = []
         states: list[VehicleState] = []
@@ -220,7 +220,7 @@ class FormationMonitor:
             after = monitored(before, seen, self.margins_s, self._policy)
             if after is not before:
                 if after.released and not before.released and row != self._next_to_release():
-                    after = replace(after, mode=Mode.CRITICAL, released=False)  # somebody behind goes first
+                    after = replace(after, mode=Mode.CRITICAL, released=False)  # a vehicle behind goes first
                 if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
                     changes.append((row, before, after))
             states.append(after)
@@ -250,7 +250,7 @@ class FormationMonitor:
         return [nan if any(map(isnan, judged)) else max(judged)] * len(judged)
 
     def _next_to_release(self) -> int:
-        """The vehicle that may be released now: the CRITICAL one farthest down the tree."""
+        """The vehicle that may be released now: the CRITICAL one farthest down the tree; -1 if there is none."""
         for row in range(len(self.states) - 1, -1, -1):
             state = self.states[row]
             if not state.released and state.mode is Mode.CRITICAL:
@@ -258,9 +258,9 @@ class FormationMonitor:
         return -1
 
     def _open(self, time_s: float, *, flying: bool) -> None:
-        """Open the formation, free of jumps, while somebody is CRITICAL or gone on the slowest gains."""
+        """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it."""
         slowest, troubled = len(self.margins_s) - 1, (Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST)
-        settled_s = time_s - self._policy.blend_s  # just changed, the slowest gains have still to show what they can do
+        settled_s = time_s - self._policy.blend_s  # gives the slowest gains time to take effect
         wide = self._policy.act and any(
             s.gain_set == slowest and s.mode in troubled and s.changed_s < settled_s for s in self.states
         )
