@@ -9,8 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
+from gains.core._bracketing import met_end, peaks
 from gains.core.arrays import FloatArray
-from gains.core.bracketing import met_end, peaks
 
 # Where no α is asked for, it counts as kept down to this share of its value without delay.
 ALPHA_KEPT = 0.99
