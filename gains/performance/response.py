@@ -55,7 +55,7 @@ class Response:
         """a / u at jω, from wanted to real acceleration: (s + g) / (lag s² + s + g)."""
         s, g = 1j * omega, self.velocity_gain_1_s
         if g == 0.0:  # a root at 0 cancels
-            return 1.0 / (self.lag_s * s + 1.0)
+            return np.reciprocal(self.lag_s * s + 1.0)
         return (s + g) / (self.lag_s * s**2 + s + g)
 
 

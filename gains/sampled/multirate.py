@@ -41,6 +41,9 @@ _MOST_COMMANDS = 20
 _LOOKS, _LOOKS_MARGIN = 6, 40
 # the margin is searched up to this many continuous margins, and slower periods more
 _SEARCHED_MARGINS, _SEARCHED_PERIODS = 3.0, 10.0
+# Margins of more of the slower periods are those of one rate: measured, two parts in 10^4 at most are left to the order
+# of the loop delays, and the search, with eigenvalues of ever larger maps, would take minutes.
+_MOST_PERIODS = 30.0
 # the radius at a margin is this far below one at most
 _RESOLUTION = 1e-13
 # a local maximum of the radius is refined when its sample is above this
@@ -179,9 +182,10 @@ def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timi
 def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
     """The least (mean) loop delay (s) at which the loop loses stability; 0 if at once, `inf` if none is found.
 
-    Where the slower period is a multiple of the faster one it is that of `gains.sampled.constant`, exact. Else the
-    least loop delay is raised in small steps, peaks refined: a search, not a proof, up to three
-    times the margin of the continuous loop and ten of the slower periods. Arguments as of `multirate_growth_rate`.
+    Where the slower period is a multiple of the faster one it is that of `gains.sampled.constant`, exact; where the
+    margin is long against both, that of the slower period alone, see `hardly_sampled`. Else the least loop delay is
+    raised in small steps, peaks refined: a search, not a proof, up to three times the margin of the continuous loop and
+    ten of the slower periods. Arguments as of `multirate_growth_rate`.
 
     Raises
     ------
@@ -202,6 +206,8 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
         return sampled_delay_margin(A, B, K, period_s=timing.held_s)
     plant, entry, feedback = checked_loop(A, B, K)
     continuous_s = delay_margin(plant, entry @ feedback)
+    if hardly_sampled(timing, near_s=continuous_s):
+        return sampled_delay_margin(A, B, K, period_s=timing.held_s)
     return lifted_margin(held_blocks(plant, entry, feedback, period_s=timing.common_s), timing, near_s=continuous_s)
 
 
@@ -258,6 +264,19 @@ def lifted_growth(plants: Sequence[LiftedPlant], timing: Timing, *, delay_s: flo
     return float(np.log(radius)) / timing.common_s if radius > 0.0 else -inf
 
 
+def hardly_sampled(timing: Timing, *, near_s: float) -> bool:
+    """Whether a margin near this is so long against the periods that only the mean loop delay and the mean time for
+    which a command is held count.
+
+    Examples
+    --------
+    >>> from gains.sampled.multirate import Timing, hardly_sampled
+    >>> [hardly_sampled(Timing(0.02, 0.03), near_s=near_s) for near_s in (0.3, 3.0)]
+    [False, True]
+    """
+    return _MOST_PERIODS * timing.held_s < near_s < inf
+
+
 def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: float) -> float:
     """As `multirate_delay_margin`, likewise; `near_s` is the margin of the continuous loop.
 
@@ -276,12 +295,12 @@ def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: floa
     last_s = _SEARCHED_MARGINS * known_s + _SEARCHED_PERIODS * timing.held_s
     step_s = max(timing.held_s / _LOOKS, known_s / _LOOKS_MARGIN)
     looks = (timing.spread_s + np.arange(0.0, last_s, step_s)).tolist()
-    margins_s: list[float] = []
+    least_s = inf
     for plant in plants:
-        # without feedback one look tells
-        found_s = _first_unstable(partial(_radius, plant, timing), looks if plant.K.any() else looks[:1])
-        margins_s.append(found_s)
-    return min(margins_s)
+        # without feedback one look tells; beyond the margin of another plant none does
+        seen = [look for look in looks if look < least_s + step_s] if plant.K.any() else looks[:1]
+        least_s = min(least_s, _first_unstable(partial(_radius, plant, timing), seen))
+    return least_s
 
 
 def _radius(plant: LiftedPlant, timing: Timing, delay_s: float) -> float:

@@ -20,7 +20,7 @@ the second order of the step.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from math import ceil, inf
@@ -35,7 +35,7 @@ from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.sampled._crossings import block_delay_margin
 from gains.sampled._loop import HeldPlant, block_radius, matrix_exponentials
-from gains.sampled.multirate import Timing, lifted_growth, lifted_margin
+from gains.sampled.multirate import Timing, hardly_sampled, lifted_growth, lifted_margin
 
 # an instant this close to a step (in steps) is that of the step
 _SAME_INSTANT = 1e-9
@@ -125,7 +125,11 @@ class OnboardLoop:
         plants, rates = self.plants(), self.timing.rates
         if rates.commands == 1:
             return min(block_delay_margin(plant) for plant in plants)
-        return lifted_margin([SteppedPlant(plant) for plant in plants], rates, near_s=self.continuous_margin_s())
+        continuous_s = self.continuous_margin_s()
+        if hardly_sampled(rates, near_s=continuous_s):  # a command held for T stands for a delay of T / 2
+            one_rate = replace(self, timing=replace(self.timing, telemetry_s=None))
+            return one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0
+        return lifted_margin([SteppedPlant(plant) for plant in plants], rates, near_s=continuous_s)
 
     def growth_1_s(self, delay_s: float) -> float:
         """Exponential rate of the slowest motion of the loop as flown: negative when stable."""

@@ -1,4 +1,4 @@
-"""The phases of a flight, as a pure function. What the station thinks of each vehicle is in `gcs.station.monitor`."""
+"""The phases of a flight, as a pure function. The mode of each vehicle is up to `gcs.station.monitor`."""
 
 from enum import StrEnum
 
@@ -6,12 +6,12 @@ from scenarios.schema import Link, Scenario
 
 
 class Phase(StrEnum):
-    """Where the flight stands."""
+    """How far a flight has come."""
 
-    CONNECTING = "connecting"  # until every vehicle is heard, its clock known, armed and guided
-    IDENTIFYING = "identifying"  # vehicles with autopilots show how they answer to set-points
+    CONNECTING = "connecting"  # until every vehicle is heard, armed and guided, and its clock is known
+    IDENTIFYING = "identifying"  # vehicles with autopilots show how they respond to set-points
     FLYING = "flying"
-    ENDING = "ending"  # no more set-points; until every vehicle is seen to hold its velocity
+    ENDING = "ending"  # no more set-points, until every vehicle is seen to hold or land
     ENDED = "ended"
 
 
@@ -20,9 +20,8 @@ def next_phase(
 ) -> Phase:
     """The phase that follows.
 
-    CONNECTING goes to FLYING when all are ready, by way of IDENTIFYING unless all are identified; all three go to
-    ENDING when the flight is to stop, for whatever reason; ENDING goes to ENDED when all vehicles hold, or after
-    `END_PATIENCE_S`.
+    CONNECTING is followed by FLYING once all are ready, or by IDENTIFYING if they are not identified yet. A stop for
+    whatever reason leads from all three to ENDING. ENDED follows when all vehicles hold, or after `END_PATIENCE_S`.
     """
     match phase:
         case Phase.CONNECTING | Phase.IDENTIFYING | Phase.FLYING if stop:
@@ -37,20 +36,20 @@ def next_phase(
             return phase
 
 
-CONNECT_PATIENCE_S, START_PATIENCE_S = 20.0, 360.0
-"""How long it may take until all vehicles are ready: those that are simulated, and those with an autopilot."""
+START_PATIENCE_S = 360.0
+"""How long vehicles with autopilots may take until all are ready."""
+_LEAST_PATIENCE_S = {"double_integrator": 20.0, "autopilot": START_PATIENCE_S}
 _ROUND_TRIPS = 40.0
-"""Or so many round trips: commands are answered one after the other, and sent again after three without an answer."""
+"""On slow links a start-up may take this many round trips: commands await each other's answers and are repeated."""
 
 
 def patience_s(scenario: Scenario) -> float:
-    """How long a flight may take to begin. Until then scenario time is that since the station's start less this."""
-    least_s = START_PATIENCE_S if scenario.dynamics == "autopilot" else CONNECT_PATIENCE_S
-    return max(least_s, _ROUND_TRIPS * longest_round_trip_s(scenario))
+    """How long a flight may take to begin. Until then scenario time is the time since the station's start less this."""
+    return max(_LEAST_PATIENCE_S[scenario.dynamics], _ROUND_TRIPS * longest_round_trip_s(scenario))
 
 
 def longest_round_trip_s(scenario: Scenario) -> float:
-    """The longest time that a question and its answer are on the links of a scenario, without jitter."""
+    """The longest round trip on the links of a scenario, without jitter."""
     links = (scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles)
     return max(_longest_s(up) + _longest_s(down) for up, down in links)
 
@@ -60,4 +59,4 @@ def _longest_s(link: Link) -> float:
 
 
 END_PATIENCE_S = 6.0
-"""How long the station waits to see that the vehicles hold: their time-outs, a heartbeat and a slow link fit in."""
+"""How long the station waits until the vehicles hold: their time-outs plus a heartbeat over a slow link."""

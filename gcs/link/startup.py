@@ -1,172 +1,114 @@
-"""What the station has learned of one vehicle with an autopilot while it starts: kind, estimator, place, altitude.
+"""How one vehicle is made ready to fly: what it lacks, and the message to send next.
 
-The vehicle's local frame has an origin of its own. Its place on the globe comes from GPS_GLOBAL_ORIGIN, or from
-HOME_POSITION, which has the home in both frames, or from a GLOBAL_POSITION_INT and the LOCAL_POSITION_NED nearest to
-it.
+Vehicles with autopilots have `gcs.autopilot.startup.AutopilotStartup`.
 """
 
-from math import cos, degrees, isfinite, radians
-from typing import Any
+from typing import Any, Protocol
 
 from gcs.link import mavlink
-from gcs.link.kinds import SET_MESSAGE_INTERVAL, TAKE_OFF, Kind, Seen, Step, kind_of, next_step
+from gcs.link.kinds import ARM_DISARM, LAUNCHED, SET_MESSAGE_INTERVAL, Command, Kind, Step, mode_command
+from gcs.link.upload import Upload
 
-EARTH_RADIUS_M = 6_378_137.0
-_SLOW_US = 200_000.0
-_TAKEN_OFF_SHARE = 0.95
-"""A vehicle has taken off at this part of the altitude it was told."""
-_TAKE_OFF_S, _SLOWEST_CLIMB_M_S = 15.0, 0.5
-"""A take-off is over after this, and the time that the altitude takes with this climb rate: it is told again, or, if
-the vehicle has left the ground, led to its altitude by set-points."""
-_LEFT_GROUND_M = 2.0
-
-Degrees = tuple[float, float]
-"""Latitude and longitude."""
+_READY = Step("")
 
 
-class Startup:
-    """Start-up of one vehicle; `altitude_m` is the one it takes off to."""
+class Startup(Protocol):
+    """The part of the conversation with a vehicle that depends on its kind."""
 
-    def __init__(self, *, altitude_m: float, telemetry_interval_us: float) -> None:
-        self.kind: Kind | None = None
-        self.refusal = ""
-        """Why it cannot be flown; empty if it can or is not known."""
-        self.altitude_m = altitude_m
-        self.relative_altitude_m: float | None = None
-        self.airborne = False
-        self.origin: Degrees | None = None
-        self.origin_altitude_m = 0.0
-        """Above sea level; only with an origin."""
-        self._origin_said = False
-        self._sea_level_m = 0.0
-        self._flags: int | None = None
-        self._local: tuple[int, float, float, float, float, float] | None = None
-        """Newest local position: boot time in ms, north, east, down, and velocities north and east."""
-        self._took_off_ns: int | None = None
-        self._telemetry_interval_us = telemetry_interval_us
-        self._rates: dict[float, float] = {}
-        self._accepted: set[float] = set()
+    @property
+    def kind(self) -> Kind: ...
 
-    def heartbeat(self, autopilot: int, vehicle_type: int) -> None:
-        """Recognise the vehicle."""
-        if self.kind is not None or self.refusal:
-            return
-        found = kind_of(autopilot, vehicle_type)
-        if not isinstance(found, Kind):
-            self.refusal = found or ""
-            return
-        self.kind = found
-        self._rates = {
-            float(mavlink.LOCAL_POSITION_NED): self._telemetry_interval_us,
-            float(mavlink.GLOBAL_POSITION_INT): _SLOW_US,
-            float(found.estimator_message): 2.0 * _SLOW_US,
-            float(mavlink.GPS_GLOBAL_ORIGIN): 5.0 * _SLOW_US,
-        }
-
-    def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
-        """Take in a message that is of interest while starting; others are left alone."""
-        match msg_id:
-            case mavlink.LOCAL_POSITION_NED:
-                self._local = fields[:6]
-            case mavlink.GLOBAL_POSITION_INT:
-                self._global(fields)
-            case mavlink.EKF_STATUS_REPORT:
-                self._flags = fields[5]
-            case mavlink.ESTIMATOR_STATUS:
-                self._flags = fields[9]
-            case mavlink.GPS_GLOBAL_ORIGIN:
-                self.origin, self._origin_said = (fields[0] * 1e-7, fields[1] * 1e-7), True
-                self.origin_altitude_m = fields[2] * 1e-3
-            case mavlink.HOME_POSITION if not self._origin_said and isfinite(sum(fields[3:6])):
-                self.origin = shifted((fields[0] * 1e-7, fields[1] * 1e-7), -fields[3], -fields[4])
-                self.origin_altitude_m = fields[2] * 1e-3 + fields[5]
-            case _:
-                pass
-
-    def _global(self, fields: tuple[Any, ...]) -> None:
-        boot_ms, latitude, longitude, altitude_mm, relative_mm = fields[:5]
-        if latitude == longitude == 0:
-            return  # what is sent before a position is known
-        self.relative_altitude_m = relative_mm * 1e-3
-        self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
-        if self._local is not None and not self._origin_said and not self.airborne:
-            local_ms, north, east, down, v_north, v_east = self._local
-            since_s = (boot_ms - local_ms) * 1e-3
-            place = latitude * 1e-7, longitude * 1e-7
-            if abs(since_s) < 1.0:
-                self.origin = shifted(place, -north - v_north * since_s, -east - v_east * since_s)
-                self.origin_altitude_m = altitude_mm * 1e-3 + down
-
-    def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:
-        """Note that a command was accepted."""
-        if command == SET_MESSAGE_INTERVAL:
-            self._accepted.add(parameters[0])
-        elif command == TAKE_OFF:
-            self._took_off_ns = now_ns
-
-    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
-        """Note that a command was refused: an origin that is not sent is found in another way.
-
-        A take-off told twice is refused by a vehicle that had heard it the first time, and whose answer was lost.
-        """
-        if command == SET_MESSAGE_INTERVAL and parameters[0] == mavlink.GPS_GLOBAL_ORIGIN:
-            self._accepted.add(parameters[0])
-        elif command == TAKE_OFF and repeated:
-            self._took_off_ns = now_ns
+    @property
+    def refusal(self) -> str:
+        """Why the vehicle must not be flown; empty if nothing speaks against it."""
+        ...
 
     @property
     def is_half_way_up(self) -> bool:
-        """Whether it has reached half of the altitude it takes off to, at least."""
-        return (self.relative_altitude_m or 0.0) >= 0.5 * self.altitude_m
+        """Whether it has climbed to half of its take-off altitude or more."""
+        ...
 
-    def forget_rates(self) -> None:
-        """The vehicle seems to have started anew."""
-        self._accepted.clear()
-        self._took_off_ns = None
+    def recognise(self, autopilot: int, vehicle_type: int) -> Kind:
+        """The kind of vehicle, as far as its heartbeats show it."""
+        ...
 
-    @property
-    def rates_set(self) -> bool:
-        return bool(self._rates) and self._accepted >= self._rates.keys()
+    def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
+        """Take in a message from the vehicle; those that say nothing about the start-up are ignored."""
+        ...
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
-        """The next step towards a vehicle that takes set-points in the air."""
-        if self.kind is None:
-            return Step(self.refusal or "sends no heartbeat of an autopilot")
-        due = next(((m, us) for m, us in self._rates.items() if m not in self._accepted), None)
-        patience_ns = (_TAKE_OFF_S + self.altitude_m / _SLOWEST_CLIMB_M_S) * 1e9
-        took_off = self._took_off_ns is not None and now_ns - self._took_off_ns < patience_ns
-        self._see_altitude(armed=armed, taking_off=took_off)
-        seen = Seen(
-            interval_due=due,
-            clock_known=clock_known,
-            position_heard=self._local is not None,
-            estimator_flags=self._flags,
-            origin_known=self.origin is not None,
-            custom_mode=custom_mode,
-            armed=armed,
-            took_off=took_off,
-            airborne=self.airborne,
-            relative_altitude_m=self.relative_altitude_m,
-            sea_level_m=self._sea_level_m,
+        """The next step towards a vehicle that takes set-points."""
+        ...
+
+    def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
+        """Message id and fields of the parameter message that is due, if one is."""
+        ...
+
+    def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:
+        """Note that the vehicle accepted a command."""
+        ...
+
+    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
+        """Note that the vehicle refused a command, which may have been sent before."""
+        ...
+
+    def begin_anew(self) -> None:
+        """Forget what the vehicle was told: it seems to have restarted."""
+        ...
+
+
+class LaunchedStartup:
+    """Start-up of a vehicle without an autopilot: telemetry rate, parameters of its own loop if any, GUIDED, armed."""
+
+    kind = LAUNCHED
+    is_half_way_up = False
+
+    def __init__(self, telemetry_hz: float, parameters: dict[str, float] | None = None) -> None:
+        interval_us = round(1e6 / telemetry_hz)  # vehicles take whole numbers
+        self._rate_command: Command = SET_MESSAGE_INTERVAL, (float(mavlink.LOCAL_POSITION_NED), interval_us)
+        self._rate_set = False
+        self._upload = Upload(parameters or {})
+
+    @property
+    def refusal(self) -> str:
+        return self._upload.refusal
+
+    def recognise(self, autopilot: int, vehicle_type: int) -> Kind:  # noqa: ARG002 - it is what the scenario says
+        return LAUNCHED
+
+    def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
+        if msg_id == mavlink.PARAM_VALUE:
+            self._upload.take(fields)
+
+    def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:  # noqa: ARG002
+        guided, uploaded = custom_mode == LAUNCHED.guided_mode, self._upload.done
+        if self._rate_set and clock_known and uploaded and guided and armed:
+            return _READY
+        command = None
+        if not self._rate_set:
+            command = self._rate_command
+        elif not guided:
+            command = mode_command(LAUNCHED, LAUNCHED.guided_mode)
+        elif uploaded and not armed:
+            command = ARM_DISARM, (1.0,)
+        lacks = (
+            ("does not accept the telemetry rate", not self._rate_set),
+            ("does not answer TIMESYNC", not clock_known),
+            (self._upload.missing, not uploaded),
+            ("does not enter GUIDED", not guided),
+            ("does not arm", not armed),
         )
-        return next_step(self.kind, seen, altitude_m=self.altitude_m)
+        return Step(self.refusal or next((text for text, lacking in lacks if lacking), ""), command)
 
-    def _see_altitude(self, *, armed: bool, taking_off: bool) -> None:
-        """In the air it takes set-points, wherever it is found; while it takes off they would end that too low."""
-        enough_m = _TAKEN_OFF_SHARE * self.altitude_m if taking_off else _LEFT_GROUND_M
-        self.airborne = armed and (self.airborne or (self.relative_altitude_m or 0.0) > enough_m)
+    def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
+        return self._upload.next(now_ns, target_system=target_system, rtt_ns=rtt_ns)
 
+    def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:  # noqa: ARG002
+        self._rate_set = self._rate_set or command == SET_MESSAGE_INTERVAL
 
-def shifted(place: Degrees, north_m: float, east_m: float) -> Degrees:
-    """A place so far north and east of another, on a flat earth."""
-    latitude, longitude = place
-    return (
-        latitude + degrees(north_m / EARTH_RADIUS_M),
-        longitude + degrees(east_m / EARTH_RADIUS_M / cos(radians(latitude))),
-    )
+    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
+        """Nothing to note: the same step is tried again."""
 
-
-def between(start: Degrees, end: Degrees) -> tuple[float, float]:
-    """How far (m) `end` is north and east of `start`, on a flat earth."""
-    north = radians(end[0] - start[0]) * EARTH_RADIUS_M
-    return north, radians(end[1] - start[1]) * EARTH_RADIUS_M * cos(radians(start[0]))
+    def begin_anew(self) -> None:
+        self._rate_set = False
+        self._upload.begin_anew()

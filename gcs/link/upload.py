@@ -1,7 +1,7 @@
-"""Parameters for one vehicle: uploaded, read back, compared, before it may be armed.
+"""Parameters of one vehicle: uploaded, read back and compared before it may be armed.
 
-PARAM_SET is answered by PARAM_VALUE, the value that then holds. When every one has been answered, each is asked for
-again with PARAM_REQUEST_READ. What is not answered is sent again; many are under way at once, as links may be slow.
+A vehicle answers PARAM_SET with PARAM_VALUE, the value that then holds. Once all are set, each is read back with
+PARAM_REQUEST_READ. Unanswered messages are repeated. Links may be slow, so many are under way at once.
 """
 
 import struct
@@ -12,9 +12,9 @@ from typing import Any
 from gcs.link import mavlink
 
 PATIENCE_NS = 1_000_000_000
-"""An answer is waited for at least this long, and at least three round trips."""
+"""An answer may take this long or three round trips, whichever is longer."""
 ATTEMPTS = 3
-"""How often a vehicle may answer with another value than it was told: the first may have been on its way already."""
+"""A vehicle is refused at its third wrong value: the first may have been on its way before the value was set."""
 _LONG_AGO_NS = -(1 << 62)
 _FLOAT = struct.Struct("<f")
 
@@ -35,31 +35,31 @@ class _Item:
 
 
 class Upload:
-    """The parameters one vehicle is to have; `next` and `take` bring it there."""
+    """The parameters that one vehicle is to hold; `next` and `take` bring it there."""
 
     def __init__(self, wanted: dict[str, float]) -> None:
         self._items = {name: _Item(float32(value)) for name, value in wanted.items()}
-        self.done = False
+        self.done = not wanted
         """Whether every parameter has been read back and is right."""
         self.refusal = ""
         """Why the vehicle must not be armed; empty if nothing speaks against it."""
 
     @property
     def missing(self) -> str:
-        """What keeps it from being done, in words."""
+        """What keeps the upload from being complete, in words."""
         for name, item in self._items.items():
             if item.stage is not _Stage.COMPARED:
                 return self.refusal or f"does not answer to parameter {name}"
         return ""
 
     def begin_anew(self) -> None:
-        """The vehicle seems to have started anew, and to have forgotten what it was told."""
-        self.done = False
+        """Upload everything again: the vehicle seems to have restarted."""
+        self.done = not self._items
         for item in self._items.values():
             item.stage, item.sent_ns = _Stage.TO_SET, _LONG_AGO_NS
 
     def next(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
-        """Message id and fields of the next frame to be sent, if one is due: all are set before one is read back."""
+        """Message id and fields of the frame that is due, if any. All parameters are set before any is read back."""
         if self.done or self.refusal:
             return None
         stage = min(item.stage for item in self._items.values())
@@ -79,7 +79,7 @@ class Upload:
         item = self._items.get(name)
         if item is None or item.sent_ns == _LONG_AGO_NS or item.stage is _Stage.COMPARED:
             return
-        item.sent_ns = _LONG_AGO_NS  # what comes next is due at once
+        item.sent_ns = _LONG_AGO_NS  # its next message is due at once
         if value == item.value:
             item.stage = _Stage(item.stage + 1)
             self.done = all(other.stage is _Stage.COMPARED for other in self._items.values())
@@ -87,7 +87,7 @@ class Upload:
         item.wrong += 1
         item.stage = _Stage.TO_SET
         if item.wrong >= ATTEMPTS:
-            self.refusal = f"parameter {name} reads {value:.9g} after {item.value:.9g} was set: it is not armed"
+            self.refusal = f"holds {value:.9g} in parameter {name} after {item.value:.9g} was set: it is not armed"
 
 
 def float32(value: float) -> float:

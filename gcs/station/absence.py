@@ -1,4 +1,4 @@
-"""Vehicles that the formation cannot count on: those not heard, and those that are taken over."""
+"""Vehicles that the formation cannot count on: those that are lost, and those that somebody else flies."""
 
 from collections.abc import Sequence
 
@@ -9,20 +9,20 @@ COMPLETED = "completed: duration reached"
 
 
 def absences(vehicles: Sequence[RemoteVehicle], silent: Sequence[bool]) -> list[str]:
-    """Why each vehicle is flown around, "" if it is not."""
+    """Why the others fly around each vehicle; "" for one that takes part."""
     return [
         LOST if gone else TAKEN_OVER if vehicle.taken_over else ""
         for vehicle, gone in zip(vehicles, silent, strict=True)
     ]
 
 
-def told(was: str, now: str) -> str:
-    """What is said when that changes."""
+def describe_change(was: str, now: str) -> str:
+    """The text of the event when a vehicle's absence changes."""
     return now or ("is heard again" if was == LOST else "is given back")
 
 
 def end_reason(vehicles: Sequence[RemoteVehicle], absent: Sequence[str]) -> str:
-    """Why the flight ends when its time has come, or when nobody is left."""
+    """Why a flight ends whose duration is over, or that has no vehicle left."""
     if all(reason == LOST for reason in absent):
         return "lost: all vehicles"
     kinds = (("lost", LOST), ("taken over", TAKEN_OVER))

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gcs.control.law import Blend
+from gcs.control.loop_delay import headroom
 from gcs.control.tick import Mode
 from scenarios.schema import Monitor
 
@@ -49,11 +50,6 @@ class Observation(NamedTuple):
     guided: bool
     failsafe: bool
     loop_delay_s: float
-
-
-def headroom(loop_delay_s: float, delay_margin_s: float) -> float:
-    """1 - loop delay / margin; NaN while the loop delay is unknown, minus infinity if there is no margin."""
-    return 1.0 - loop_delay_s / delay_margin_s if delay_margin_s > 0 else float("-inf")
 
 
 def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> VehicleState:

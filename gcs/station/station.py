@@ -5,29 +5,27 @@ or in virtual time, with the same bytes.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable
 from math import isfinite, nan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from gcs.autopilot.copters import Copters
 from gcs.control.history import StateHistory
-from gcs.control.law import VehicleControl, distances_m, formation_control
+from gcs.control.law import distances_m
 from gcs.control.limits import SetPointLimits
-from gcs.control.onboard_stream import Stream, law_of, set_point, upload_of
+from gcs.control.loop_delay import Repetitions
 from gcs.control.phases import Phase, next_phase, patience_s
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.kinds import Goal
-from gcs.link.startup import Startup
 from gcs.link.vehicle import SILENCE_S, RemoteVehicle
 from gcs.plan.flight_plan import FlightPlan
-from gcs.station.absence import absences, end_reason, told
+from gcs.station.absence import absences, describe_change, end_reason
 from gcs.station.breakage import Breakage
+from gcs.station.fleet_kind import fleet_of
 from gcs.station.monitor import FleetView, FormationMonitor
-from gcs.station.tick_rows import Repetitions, Reported, Tick, VehicleTick, tick_rows
+from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
 from scenarios.schema import NS_PER_S
 
 AUTOPILOT_COMPONENT = 1
@@ -49,35 +47,21 @@ class Station:
     def __init__(self, plan: FlightPlan, *, start_ns: int) -> None:
         scenario = plan.scenario
         rates = scenario.rates
-        autopilots = scenario.dynamics == "autopilot"
         self.plan = plan
         self.phase = Phase.CONNECTING
         self.end_reason = ""
         self.events: list[Event] = []
         self.frames: list[tuple[bytes, int]] = []
-        """Frames received since the driver last took them, with their receive time."""
+        """Frames received since the driver last took them, each with the time at which it was received."""
         self.counters: Counter[str] = Counter()
-        self.vehicles = [
-            RemoteVehicle(
-                system_id,
-                telemetry_hz=rates.telemetry_hz,
-                report=self._reporter(system_id),
-                startup=Startup(altitude_m=scenario.altitude_m, telemetry_interval_us=round(1e6 / rates.telemetry_hz))
-                if autopilots
-                else None,
-                land=scenario.at_end == "land",
-                upload=upload_of(plan, system_id),
-            )
-            for system_id in plan.formation.system_ids
-        ]
+        self._fleet = fleet_of(plan, self._report)
+        self.vehicles = self._fleet.vehicles
         n = len(self.vehicles)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
         self._history = StateHistory(n)
-        self._law = law_of(plan, [False] * n)
-        self._stream = Stream(plan) if scenario.control.loop == "onboard" else None
+        self._law = self._fleet.loop.law([False] * n)
         self._breakage = Breakage(plan)
         self._limits = SetPointLimits.of(scenario.limits)
-        self._control = formation_control if self._stream is None else self._stream.control
         self._period_ns = round(NS_PER_S / rates.control_hz)
         self._monitor = FormationMonitor(
             n,
@@ -86,7 +70,6 @@ class Station:
             separable=plan.separable,
             period_s=self._period_ns / NS_PER_S,
         )
-        self._copters = Copters(plan, self.vehicles, self._report) if autopilots else None
         self.patience_s = patience_s(scenario)
         self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
         self._start_ns = start_ns
@@ -94,7 +77,7 @@ class Station:
         self._flight_start_ns: int | None = None
         self._next_tick_ns = start_ns
         self._next_heartbeat_ns = start_ns
-        # Requests are spread over the interval, half a period off the ticks, so that they do not wait for set-points.
+        # Requests are spread evenly, half a period off the ticks, so that they do not wait behind set-points.
         self._next_timesync_ns = start_ns + self._period_ns // 2
         self._timesync_spacing_ns = max(1, self._timesync_ns // n)
         self._timesync_row = 0
@@ -110,11 +93,11 @@ class Station:
 
     @property
     def next_event_ns(self) -> int:
-        """When `step` next has something to do of its own accord."""
+        """When `step` next has something to do even if nothing is received."""
         return min(self._next_tick_ns, self._next_heartbeat_ns, self._next_timesync_ns)
 
     def request_stop(self, reason: str) -> None:
-        """End the flight at the next tick: the vehicles are told to hold, and seen to."""
+        """End the flight at the next tick: the vehicles are commanded to hold, and awaited until they do."""
         self._stop = self._stop or reason
 
     def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
@@ -141,26 +124,26 @@ class Station:
         return outgoing, tick
 
     def complete(self, tick: Tick, sent_ns: int) -> TickArray:
-        """The rows of a tick, now that it is known when its set-points were sent: ages, loop delays, headroom."""
+        """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom."""
         rows, self._loop_delay_s = tick_rows(tick, sent_ns)
         return rows
 
     def scenario_time_s(self, now_ns: int) -> float:
-        """Time since the formation flight began; before that, time since the start minus the patience, below 0."""
+        """Time since the formation flight began; before that, time since the start minus `patience_s`, negative."""
         if self._flight_start_ns is None:
             return (now_ns - self._start_ns) / NS_PER_S - self.patience_s
         return (now_ns - self._flight_start_ns) / NS_PER_S
 
     def is_another(self, system_id: int, datagram: Datagram) -> bool:
-        """Whether a frame claims the system id of a vehicle that is known to speak from another address."""
+        """Whether a frame claims the system id of a vehicle that is known to send from another address."""
         row = self._row.get(system_id)
         return row is not None and self.vehicles[row].is_elsewhere(datagram.address, datagram.received_ns)
 
     # -- receive ---------------------------------------------------------------------------------------------------
 
     def _receive(self, datagram: Datagram, outgoing: list[Outgoing]) -> None:
-        if self._copters is not None and datagram.data[:1] == b"\xfe":
-            frames = mavlink.first_heartbeats(datagram.data)  # answered in MAVLink 2, it goes on with that
+        if self._fleet.speaks_mavlink_1_first and datagram.data[:1] == b"\xfe":
+            frames = mavlink.first_heartbeats(datagram.data)  # once answered in MAVLink 2, the vehicle uses that
         else:
             frames = mavlink.decode(datagram.data, self.counters)
         for frame in frames:
@@ -201,17 +184,14 @@ class Station:
                     self._timesync_reply(row, vehicle, tc1_ns, ts1_ns, datagram.received_ns)
             case mavlink.HEARTBEAT:
                 vehicle.heartbeat(fields, datagram.received_ns)
-            case mavlink.PARAM_VALUE if vehicle.upload is not None:
-                vehicle.upload.take(fields)
             case mavlink.COMMAND_ACK:
                 vehicle.acknowledge(fields, datagram.received_ns)
             case mavlink.STATUSTEXT:
                 text = fields[1].split(b"\0")[0].decode(errors="replace")
-                self.events.append(Event(self.scenario_time_s(self._now_ns), "statustext", text, vehicle.system_id))
+                self._report("statustext", text, vehicle.system_id)
             case _:
                 pass
-        if vehicle.startup is not None:
-            vehicle.startup.take(frame.msg_id, fields)
+        vehicle.startup.take(frame.msg_id, fields)
 
     def _position(
         self, row: int, vehicle: RemoteVehicle, frame: mavlink.Frame, datagram: Datagram, outgoing: list[Outgoing]
@@ -221,11 +201,11 @@ class Station:
         sample_ns = clock.sampled_ns(boot_ms, datagram.received_ns, newest=vehicle.newest)
         if sample_ns is None:
             if not clock.exchange_due:
-                self._telemetry_ns[row] = datagram.received_ns  # it is heard, before the first exchange
+                self._telemetry_ns[row] = datagram.received_ns  # heard before the first exchange
             elif self._now_ns - clock.asked_ns >= self._period_ns:
                 self._exchange(vehicle, outgoing)
             return
-        origin_north, origin_east, origin_down = self._copters.frame_ned_m[row] if self._copters else (0.0, 0.0, 0.0)
+        origin_north, origin_east, origin_down = self._fleet.frame_ned_m[row]
         if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             return
         self._telemetry_ns[row] = datagram.received_ns  # only what is new: a replay does not make up for silence
@@ -240,25 +220,26 @@ class Station:
             self._fresh_rtt_s[row].append(rtt_ns * 1e-9)
         if vehicle.clock.jumps != jumps:
             self._history.forget(row)
-            vehicle.forget_rates()
-            self.events.append(Event(self.scenario_time_s(self._now_ns), "vehicle", CLOCK_JUMPED, vehicle.system_id))
+            vehicle.begin_anew()
+            self._report("vehicle", CLOCK_JUMPED, vehicle.system_id)
 
     # -- the control tick ------------------------------------------------------------------------------------------
 
     def _tick(self, outgoing: list[Outgoing]) -> Tick:
         due_ns = self._next_tick_ns
         behind = (self._now_ns - due_ns) // self._period_ns
-        self._next_tick_ns = due_ns + (behind + 1) * self._period_ns  # ticks that were slept through are left out
+        self._next_tick_ns = due_ns + (behind + 1) * self._period_ns  # missed ticks are skipped
         self._decide(due_ns, outgoing)
-        if self._copters is not None and self.phase is Phase.CONNECTING:
-            self._copters.locate(self._history)
+        if self.phase is Phase.CONNECTING:
+            self._fleet.locate(self._history)
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
-        controls = self._control(
+        nominal_m_s = self.plan.scenario.nominal_velocity_at(time_s)
+        controls = self._fleet.loop.control(
             self._history,
             self._law,
             self._monitor.blends(time_s),
-            nominal_velocity_m_s=self.plan.scenario.nominal_velocity_at(time_s),
+            nominal_velocity_m_s=nominal_m_s,
             opening=self._monitor.opening,
         )
         controls = [c._replace(command_m_s2=self._limits.command(c.command_m_s2)) for c in controls]
@@ -274,9 +255,17 @@ class Station:
         ):
             north, east = control.command_m_s2
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
-            fields = self._set_point(row, control, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
+            fields = self._fleet.set_point(
+                row,
+                control,
+                self.phase,
+                commanded=commanded,
+                nominal_velocity_m_s=nominal_m_s,
+                key_ms=key_ms,
+                due_ns=due_ns,
+            )
             if fields is not None:
-                fields = self._limits.set_point(fields)  # the last thing done to anything that leaves
+                fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
             margin_s = self.plan.margins_s[monitored.gain_set]
             fresh_s = self._fresh_rtt_s[row]
@@ -286,7 +275,7 @@ class Station:
                 VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, margin_s, repeated_s)
             )
         for vehicle in self.vehicles:
-            frame = vehicle.converse(self._now_ns)
+            frame = vehicle.next_frame(self._now_ns)
             if frame is not None and vehicle.address is not None:
                 outgoing.append(Outgoing(frame, vehicle.address))
         tick = Tick(self._tick_count, time_s, due_ns, key_ms, seen)
@@ -302,9 +291,9 @@ class Station:
         if absent != self._absent:
             for vehicle, now, was in zip(self.vehicles, absent, self._absent, strict=True):
                 if now != was and flying:
-                    self._report("vehicle", told(was, now), vehicle.system_id)
+                    self._report("vehicle", describe_change(was, now), vehicle.system_id)
             self._absent = absent
-            self._law = law_of(self.plan, [why != "" for why in absent])
+            self._law = self._fleet.loop.law([why != "" for why in absent])
         view = FleetView(
             time_s=self.scenario_time_s(due_ns),
             flying=flying,
@@ -332,9 +321,11 @@ class Station:
     def _next_phase(self, due_ns: int) -> None:
         waited_s = (due_ns - self._phase_since_ns) / NS_PER_S
         if self.phase is Phase.CONNECTING:
-            self._lose_patience(due_ns, waited_s)
+            self.request_stop(self._fleet.startup_failure(due_ns, self._start_ns))
         if self.phase is Phase.IDENTIFYING:
-            self._identify(due_ns)
+            self.request_stop(self._fleet.identify(due_ns, self._history))
+            self.plan = self._fleet.plan
+            self._monitor.margins_s = self.plan.margins_s
         if self.phase is Phase.FLYING and (waited_s >= self.plan.scenario.duration_s or all(self._absent)):
             self.request_stop(end_reason(self.vehicles, self._absent))
         phase = next_phase(
@@ -345,7 +336,7 @@ class Station:
             stop=bool(self._stop),
             all_holding=all(v.ended for v in self.vehicles if v.address is not None),
             waited_s=waited_s,
-            identified=self._copters is None or self._copters.identified,
+            identified=self._fleet.identified,
         )
         if phase is self.phase:
             return
@@ -354,48 +345,11 @@ class Station:
             self._flight_start_ns = due_ns
         if phase is Phase.ENDING:
             self.end_reason = self._stop
+            # A broken formation is left to its failsafe, if that holds the vehicles: what broke may be the link.
+            alone = self._stop.startswith("broken") and self._fleet.holds_when_left_alone
             for vehicle in self.vehicles:
-                # A formation that broke is left to its own failsafe: what broke may be the link. That of an autopilot
-                # may be to fly on.
-                alone = self._stop.startswith("broken") and self._copters is None
                 vehicle.goal = None if alone else Goal.END
         self._report("phase", str(phase))
-
-    def _lose_patience(self, due_ns: int, waited_s: float) -> None:
-        if self._copters is not None:
-            reason = self._copters.impatience(due_ns, self._start_ns)
-            if reason:
-                self.request_stop(reason)
-        elif any(vehicle.refused for vehicle in self.vehicles):
-            refusals = [f"vehicle {v.system_id}: {v.missing}" for v in self.vehicles if v.refused]
-            self.request_stop("refused: " + "; ".join(refusals))
-        elif waited_s > self.patience_s:
-            unready = "; ".join(f"vehicle {v.system_id} {v.missing}" for v in self.vehicles if not v.ready)
-            self.request_stop(f"not ready: {unready}")
-
-    def _identify(self, due_ns: int) -> None:
-        assert self._copters is not None
-        reason = self._copters.identify(due_ns, self._history)
-        if reason:
-            self.request_stop(reason)
-        self.plan = self._copters.plan
-        self._monitor.margins_s = self.plan.margins_s
-
-    def _set_point(
-        self, row: int, control: VehicleControl, *, commanded: bool, key_ms: int, due_ns: int
-    ) -> tuple[Any, ...] | None:
-        """Fields of the set-point that a vehicle is sent at this tick, if any."""
-        if self._copters is not None:
-            return self._copters.set_point(row, control, self.phase, commanded=commanded, key_ms=key_ms, due_ns=due_ns)
-        if not commanded:
-            return None
-        if self._stream is not None:
-            velocity = self.plan.scenario.nominal_velocity_at(self.scenario_time_s(due_ns))
-            return set_point(self.vehicles[row], control, velocity, key_ms=key_ms)
-        north, east = control.command_m_s2
-        return mavlink.acceleration_set_point(
-            key_ms=key_ms, target_system=self.vehicles[row].system_id, north_m_s2=north, east_m_s2=east
-        )
 
     # -- small things ----------------------------------------------------------------------------------------------
 
@@ -415,15 +369,9 @@ class Station:
             outgoing.append(Outgoing(vehicle.encode(msg_id, fields), vehicle.address))
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
-        """Say over the link what has changed: for others on it, and in the telemetry log."""
+        """Announce a change on the link, for others who listen and for the telemetry log."""
         fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
         self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
 
     def _report(self, kind: str, text: str, system_id: int | None = None) -> None:
         self.events.append(Event(self.scenario_time_s(self._now_ns), kind, text, system_id))
-
-    def _reporter(self, system_id: int) -> Callable[[str, str], None]:
-        def report(kind: str, text: str) -> None:
-            self._report(kind, text, system_id)
-
-        return report

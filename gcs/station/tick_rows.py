@@ -1,20 +1,18 @@
-"""Filling the rows of the tick record from what the station holds."""
+"""Packs the rows of the tick record from what the station knows at a tick."""
 
 import struct
-from math import ceil, nan
+from math import nan
 from typing import NamedTuple
 
 import numpy as np
 
 from gcs.control.law import VehicleControl
+from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.control.tick import TICK, TickArray
 from gcs.link.vehicle import RemoteVehicle
-from gcs.station.monitor import VehicleState, headroom
-from scenarios.schema import NS_PER_S, Rates
+from gcs.station.monitor import VehicleState
 
 _CODES = {"<i8": "q", "<u4": "I", "<f8": "d", "|u1": "B", "|b1": "?"}
-_SAME_RATE = 1e-4
-"""Rates whose ratio is this close to a whole number are in this ratio."""
 _ROW = struct.Struct("<" + "".join(_CODES[np.dtype(TICK[name]).str] for name in TICK.names or ()))
 
 
@@ -28,26 +26,25 @@ class Reported(NamedTuple):
     received_ns: int = 0
     """The kernel's stamp."""
     bound_s: float = nan
-    """Most that the instant at which it was sampled can be wrong."""
+    """The largest error of the instant at which it was sampled."""
 
 
 class VehicleTick(NamedTuple):
-    """One vehicle at one control tick, all but when its set-point was sent."""
+    """One vehicle at one control tick, before its set-point is sent."""
 
     vehicle: RemoteVehicle
     monitored: VehicleState
     control: VehicleControl
     reported: Reported
     rtt_s: float
-    """The oldest round trip that has ended and is in no earlier tick; NaN if there is none."""
+    """The oldest completed round trip that no earlier tick holds; NaN if there is none."""
     nearest_m: float
     """NaN while unknown."""
     commanded: bool
     margin_s: float
     """Delay margin of the gains flown."""
     repeated_s: float
-    """How long ago the first command was computed from the state that this one is from, as far as telemetry that is
-    slower than control makes it. A repetition changes nothing, and the loop is no later for it."""
+    """See `gcs.control.loop_delay.Repetitions`."""
 
 
 class Tick(NamedTuple):
@@ -60,25 +57,8 @@ class Tick(NamedTuple):
     vehicles: list[VehicleTick]
 
 
-class Repetitions:
-    """How long each vehicle's set-points have repeated themselves for want of a newer state."""
-
-    def __init__(self, rates: Rates, vehicles: int) -> None:
-        ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
-        self._longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
-        self._first: list[tuple[int, int]] = [(0, 0)] * vehicles
-
-    def repeated_s(self, row: int, used_ns: int, due_ns: int) -> float:
-        """Since when, at a tick, the same state has been used, in s; no longer than telemetry at its rate makes it."""
-        if self._longest_ns == 0:
-            return 0.0
-        if self._first[row][0] != used_ns:
-            self._first[row] = used_ns, due_ns
-        return min(due_ns - self._first[row][1], self._longest_ns) * 1e-9
-
-
 def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
-    """The rows of a tick whose set-points were handed over at `sent_ns`, and the loop delay of each vehicle in s."""
+    """The rows of a tick whose set-points were handed over at `sent_ns`, and each vehicle's loop delay in s."""
     packed: list[bytes] = []
     delays_s: list[float] = []
     for seen in tick.vehicles:
@@ -90,11 +70,10 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
         down_s = down_bound_s = nan
         if clock.down_ns is not None:
             down_s, down_bound_s = clock.down_ns * 1e-9, clock.down_bound_ns * 1e-9
-        used_s = (sent_ns - control.used_ns) * 1e-9 if control.used_ns > 0 else nan
         offset_s = bound_s = nan
         if estimate.samples > 0:
             offset_s, bound_s = estimate.offset_at_ns(sent_ns) * 1e-9, estimate.bound_at_ns(sent_ns) * 1e-9
-        loop_s = used_s + down_s - repeated_s
+        loop_s = loop_delay_s(control.used_ns, sent_ns, down_s, repeated_s)
         delays_s.append(loop_s)
         packed.append(
             _ROW.pack(

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.link import mavlink
 from gcs.link.datagram import Address, Outgoing
+from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from gcs.runs.summary import spread_with_status
-from gcs.station.monitor import headroom
 from scenarios.schema import NS_PER_S
 
 SYSTEM_ID = 254
@@ -45,7 +46,7 @@ class WatchedVehicle:
     """One vehicle as it is seen from aside: what it sent, and how late that was."""
 
     def __init__(self, system_id: int) -> None:
-        self.remote = RemoteVehicle(system_id, telemetry_hz=1.0, report=lambda _kind, _text: None)
+        self.remote = RemoteVehicle(system_id, startup=LaunchedStartup(1.0))
         self.remote.goal = None  # nothing is wanted of it
         self.rtt_s = array("d")
         self.age_s = array("d")
@@ -95,14 +96,15 @@ class WatchedVehicle:
     def look(self, now_ns: int) -> None:
         """Note how old the newest state is, and how late a command computed from it would act."""
         clock = self.remote.clock
-        age_s = down_s = nan
-        if self.states and clock.estimate.samples:
-            age_s = (now_ns - clock.estimate.to_station_ns(self.boot_ns)) * 1e-9
-            down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
-        elif self.states:
-            age_s, down_s = (now_ns - self.boot_ns - self.least_delay_ns) * 1e-9, 0.0
+        age_s, down_s, sampled_ns = nan, 0.0, 0
+        if self.states:
+            sampled_ns = self.boot_ns + self.least_delay_ns
+            if clock.estimate.samples:
+                sampled_ns = clock.estimate.to_station_ns(self.boot_ns)
+                down_s = nan if clock.down_ns is None else clock.down_ns * 1e-9
+            age_s = (now_ns - sampled_ns) * 1e-9
         self.age_s.append(age_s)
-        self.loop_delay_s.append(age_s + down_s)
+        self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s))
 
     def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> Figures:
         """The figures as plain types, of the whole time or of the last so many looks; an unknown is None."""

@@ -9,32 +9,31 @@ so errors are those against the formation as designed. A tick's lateness is told
 """
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import partial
 from math import nan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from gains.formation.model import FormationModel
-from gcs.autopilot.copters import locate
 from gcs.control.history import StateHistory
-from gcs.control.law import Blend, FeedbackLaw, distances_m, feedback_law, formation_control
-from gcs.control.onboard_stream import Stream, law_of
+from gcs.control.law import Blend, distances_m
+from gcs.control.loop_delay import Repetitions
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Mode, TickArray
 from gcs.link import mavlink
-from gcs.link.startup import Startup
-from gcs.plan.formation import Formation, plan_formation
+from gcs.link.vehicle import SILENCE_S, ignored
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import plan_formation
+from gcs.plan.onboard import timing_of
 from gcs.plan.planner import flight_plan
+from gcs.station.fleet_kind import fleet_of
 from gcs.station.monitor import VehicleState
-from gcs.station.station import SILENCE_S
-from gcs.station.tick_rows import Repetitions, Reported, Tick, VehicleTick, tick_rows
+from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
 from gcs.watch.links import Watch, WatchedVehicle
 from scenarios.schema import NS_PER_S, Scenario
 
 Frames = list[tuple[int, mavlink.Frame]]
-Laws = Callable[[Sequence[bool]], FeedbackLaw]
 Events = list[dict[str, object]]
 
 _TOLD = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
@@ -124,14 +123,13 @@ def _told(frame: mavlink.Frame) -> tuple[int, str] | None:
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 
-def _errors_of(scenario: Scenario, formation: Formation) -> tuple[Laws, Any]:
-    """The law around lost vehicles, and the function that forms the errors by it, as the station has them."""
-    if scenario.control.loop == "onboard":  # what is streamed, and so how old it is, depends on the gains
-        _, plan = flight_plan(scenario)
-        return partial(law_of, plan), Stream(plan).control
+def _plan(scenario: Scenario) -> FlightPlan:
+    """The plan by which the errors are formed, with gains only where it takes them to know how old the errors are."""
+    if timing_of(scenario) is not None:  # the states that a streamed command needs depend on the gains
+        return flight_plan(scenario)[1]
+    formation = plan_formation(scenario)
     model = FormationModel(tuple(formation.predecessor.tolist()))
-    no_gains = (np.zeros((model.inputs, model.states)),)  # only the errors are wanted
-    return partial(feedback_law, formation, no_gains), formation_control
+    return FlightPlan(scenario, formation, np.zeros((model.inputs, model.states)), nan)
 
 
 class _Replay:
@@ -139,22 +137,17 @@ class _Replay:
 
     def __init__(self, scenario: Scenario, margins_s: tuple[float, ...], outline: _Outline) -> None:
         self._scenario, self._margins_s, self._outline = scenario, margins_s, outline
-        self._formation = plan_formation(scenario)
-        ids = self._formation.system_ids
+        self._fleet = fleet_of(_plan(scenario), ignored)
+        ids = self._fleet.plan.formation.system_ids
         self._repetitions = Repetitions(scenario.rates, len(ids))
         self.watch = Watch(ids)
         self._vehicles = [self.watch.vehicles[system_id] for system_id in ids]
         self._row = {system_id: row for row, system_id in enumerate(ids)}
-        self._starts: list[Startup | None] = [None] * len(ids)
-        if scenario.dynamics == "autopilot":
-            self._starts = [Startup(altitude_m=scenario.altitude_m, telemetry_interval_us=1.0) for _ in ids]
-        for vehicle, startup in zip(self._vehicles, self._starts, strict=True):
-            vehicle.remote.startup = startup
-        self._frame_ned_m = [(0.0, 0.0, 0.0)] * len(ids)
+        for vehicle, remote in zip(self._vehicles, self._fleet.vehicles, strict=True):
+            vehicle.remote, remote.goal = remote, None
         self._history = StateHistory(len(ids))
-        self._laws, self._control = _errors_of(scenario, self._formation)
         self._lost = [False] * len(ids)
-        self._law = self._laws(self._lost)
+        self._law = self._fleet.loop.law(self._lost)
         self._telemetry_ns = [0] * len(ids)
         self._reported = [Reported()] * len(ids)
         self._states = [VehicleState()] * len(ids)
@@ -242,9 +235,8 @@ class _Replay:
             self._event(time_ns, "mode", f"{state.mode.name} -> {told}", system_id)
 
     def _take_telemetry(self, row: int, vehicle: WatchedVehicle, time_ns: int, frame: mavlink.Frame) -> None:
-        startup, clock = self._starts[row], vehicle.remote.clock
-        if startup is not None:
-            startup.take(frame.msg_id, frame.fields)
+        clock = vehicle.remote.clock
+        vehicle.remote.startup.take(frame.msg_id, frame.fields)
         if clock.jumps > self._jumps[row]:
             self._jumps[row] = clock.jumps
             self._history.forget(row)
@@ -262,7 +254,7 @@ class _Replay:
             return
         else:
             sample_ns = boot_ms * 1_000_000 + vehicle.least_delay_ns
-        origin_north, origin_east, origin_down = self._frame_ned_m[row]
+        origin_north, origin_east, origin_down = self._fleet.frame_ned_m[row]
         if self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             self._telemetry_ns[row] = time_ns
             self._reported[row] = Reported(
@@ -274,11 +266,11 @@ class _Replay:
         time_s = (due_ns - self._start_ns) / NS_PER_S
         flying = bool(commands) and time_s >= 0
         if not flying:
-            locate(self._starts, self._frame_ned_m, self._history)
+            self._fleet.locate(self._history)
         lost = [flying and sent_ns - heard_ns > SILENCE_S * NS_PER_S for heard_ns in self._telemetry_ns]
         if lost != self._lost:
-            self._lost, self._law = lost, self._laws(lost)
-        controls = self._control(
+            self._lost, self._law = lost, self._fleet.loop.law(lost)
+        controls = self._fleet.loop.control(
             self._history,
             self._law,
             [_NO_BLEND] * len(lost),

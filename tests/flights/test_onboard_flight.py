@@ -115,7 +115,7 @@ def test_a_gain_that_a_vehicle_does_not_take_ends_the_start_in_one_line_and_noth
     broken[2, 2] = 2e4  # beyond what it takes
     station = Station(replace(plan, gain=broken), start_ns=START_NS)
     assert list(fly_lockstep(station.plan, station=station, vehicles=fleet))
-    assert station.end_reason.startswith("refused: vehicle 2: parameter FORM_KP_NN reads 0 after 20000")
+    assert station.end_reason.startswith("refused: vehicle 2 holds 0 in parameter FORM_KP_NN after 20000")
     assert not vehicle(fleet, 2).flight.armed
     assert fleet.vehicle(2).counters["refused_parameter_value"] > 0
 

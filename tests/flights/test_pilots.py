@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from gcs.station.station import Station
 from scenarios.schema import ClockJump, Link, Outage, Scenario, VehicleLinks
@@ -176,8 +177,8 @@ def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) 
     vehicle = station.vehicles[2]
     assert vehicle.taken_over
     vehicle.address = ("elsewhere", 3)
-    vehicle.forget_rates()
-    told = [vehicle.converse(station.next_event_ns + k * SECOND // 50) for k in range(500)]
+    vehicle.begin_anew()
+    told = [vehicle.next_frame(station.next_event_ns + k * SECOND // 50) for k in range(500)]
     numbers = {parse(frame).command for frame in told if frame is not None}
     assert numbers <= {SET_MESSAGE_INTERVAL}
 
@@ -270,7 +271,7 @@ def test_a_pilot_within_a_second_of_an_answer_is_seen_by_the_next_heartbeat() ->
 
 
 def test_a_heartbeat_from_before_a_command_does_not_undo_what_its_answer_said() -> None:
-    vehicle = RemoteVehicle(3, telemetry_hz=50.0, report=lambda _kind, _text: None)
+    vehicle = RemoteVehicle(3, startup=LaunchedStartup(50.0))
     vehicle.address = ("127.0.0.1", 3)
 
     def heartbeat(mode: int, *, armed: bool, at_s: float) -> tuple[int, bool]:
@@ -279,7 +280,7 @@ def test_a_heartbeat_from_before_a_command_does_not_undo_what_its_answer_said() 
 
     def answered(at_s: float) -> None:
         now_ns = round(at_s * SECOND)
-        frame = vehicle.converse(now_ns)
+        frame = vehicle.next_frame(now_ns)
         assert frame is not None
         vehicle.acknowledge((parse(frame).command, 0, 0, 0, 255, 190), now_ns)
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gcs.drive.mirror import Mirror
+from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from scenarios.files import load
 from sim_vehicles.drive.relay_udp import Peers
@@ -36,7 +37,7 @@ def hostile(rng: np.random.Generator, messages: list[int], source: int) -> list[
 
 @pytest.mark.parametrize("commands", [False, True])
 def test_a_mirror_under_fire_counts_and_goes_on(other: socket.socket, commands: bool) -> None:
-    vehicle = RemoteVehicle(1, telemetry_hz=1.0, report=lambda _kind, _text: None)
+    vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
     vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
     rng = np.random.default_rng(4)
     with Mirror(*other.getsockname(), commands=commands) as mirror:

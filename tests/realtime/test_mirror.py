@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from gcs.drive.guard import Guard
 from gcs.drive.mirror import Mirror
 from gcs.link import mavlink
+from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from gcs.runs.files import read_ticks
 from gcs.watch.tlog import read_tlog
@@ -165,7 +166,7 @@ def test_mavsdk_on_a_mirror_finds_all_vehicles_and_where_they_fly(tmp_path: Path
 
 
 def test_what_is_garbled_or_in_a_vehicles_name_is_not_passed_on() -> None:
-    vehicle = RemoteVehicle(1, telemetry_hz=1.0, report=lambda _kind, _text: None)
+    vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
     vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
@@ -190,7 +191,7 @@ def test_what_is_garbled_or_in_a_vehicles_name_is_not_passed_on() -> None:
 
 
 def test_a_display_that_connects_in_flight_does_not_slow_the_telemetry_that_is_flown_with() -> None:
-    vehicle = RemoteVehicle(1, telemetry_hz=1.0, report=lambda _kind, _text: None)
+    vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
     vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
     mav = dialect.MAVLink(None, srcSystem=255)
     stream, long = dialect.MAVLink_request_data_stream_message, dialect.MAVLink_command_long_message
@@ -214,7 +215,7 @@ def test_a_display_that_connects_in_flight_does_not_slow_the_telemetry_that_is_f
 
 
 def test_on_a_signed_link_the_other_station_gets_signed_frames_and_is_heard_only_if_it_signs() -> None:
-    vehicle = RemoteVehicle(1, telemetry_hz=1.0, report=lambda _kind, _text: None)
+    vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
     vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
     ours, theirs = Guard(Key(KEY), epoch_ns=EPOCH_NS, stamps=Stamps()), a_sender(system=255)
     good = mavlink.encode(mavlink.COMMAND_LONG, mavlink.command_long(1, target_system=1), sequence=0)

@@ -1,6 +1,6 @@
 """Fly random experiments in virtual time and check that invariants hold: `python3 make.py soak --flights 1000`.
 
-Each flight is drawn from the seed and its number (`soak_scenarios.py`), flown through the product's own driver with
+Each flight is drawn from the seed and its number (`soak_experiments.py`), flown through the product's own driver with
 real bytes (`soak_flight.py`) and checked (`soak_checks.py`). What breaks an invariant is written to a folder, and flown
 again with `--only NUMBER` or `--fly FILE`. Exit code 1 if one is broken.
 """
@@ -9,15 +9,17 @@ import argparse
 import os
 import sys
 import time  # noqa: TID251 - it tells how long it will take
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 
-from tests.soak.soak_checks import Result, judge
-from tests.soak.soak_scenarios import Experiment, experiment
+from tests.soak.soak_experiments import Experiment, experiment
+from tests.soak.soak_judge import Result, judge
 
+warnings.simplefilter("error")
 BATCH = 8
 """Flights that a process takes at a time."""
 

@@ -6,34 +6,28 @@ how; where theory promises nothing (a clock that was set, a link that is random)
 
 import json
 import math
-import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from gains.core.errors import DisagreementError, GainsError, SolverError
 from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import CLOCK_JUMPED, Mode
 from gcs.drive.flown import margins_of
-from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.planner import flight_plan
 from gcs.runs.grade import instants, true_loop_delays_s
 from gcs.runs.summary import summarise
-from gcs.stress.measure import fly_trial
-from gcs.stress.trial import Trial, sparse_gain
 from scenarios.schema import Link, Scenario
 from sim_vehicles.links.truth import SAMPLED
-from tests.soak.soak_flight import Flown, Stretch, fly
-from tests.soak.soak_scenarios import Experiment
+from tests.soak.soak_flight import Flown, Stretch
 
 ALWAYS = ("time_s", "due_ns", "sent_ns")
 WHEN_COMMANDED = (
     "telemetry_age_s", "north_m", "east_m", "velocity_north_m_s", "velocity_east_m_s", "velocity_error_north_m_s",
     "velocity_error_east_m_s", "command_north_m_s2", "command_east_m_s2", "up_delay_s", "sample_bound_s",
-    "clock_offset_s", "clock_offset_bound_s",
 )  # fmt: skip
+OF_CLOCKS = ("clock_offset_s", "clock_offset_bound_s")
+"""Known of a vehicle that is commanded unless its clock was set: then from the next exchange on."""
 COUNTS = ("received", "late", "duplicate")
 """These never go back; what was lost does when it comes late."""
 LEAST_CHANGE = 1e-6
@@ -46,47 +40,6 @@ class Broken:
 
     invariant: str
     text: str
-
-
-@dataclass(frozen=True)
-class Result:
-    """What came of one experiment."""
-
-    broken: tuple[Broken, ...] = ()
-    refused: str = ""
-    """The scenario was not flown, and by what reason."""
-    ended: str = ""
-    """How the flight ended: the kind of its end, or what was judged of its margin."""
-
-
-def judge(experiment: Experiment) -> Result:
-    """Fly an experiment and check everything."""
-    try:
-        _, plan = flight_plan(experiment.scenario)
-    except DisagreementError as error:
-        return Result((Broken("independent methods agree", str(error)),))
-    except GainsError as error:
-        if isinstance(error, SolverError) and (experiment.scenario.control.gains or experiment.scenario.control.blocks):
-            return Result((Broken("given gains are flown", str(error)),))
-        return Result(refused=f"{type(error).__name__}: {str(error)[:60]}")
-    except Exception:  # noqa: BLE001 - whatever it is, it is what the soak looks for
-        return Result((_raised(experiment),))
-    try:
-        if experiment.margin_ratio is not None:
-            broken, ended = _margin_kept(plan, experiment.margin_ratio)
-        else:
-            flown = fly(experiment, plan)
-            broken = list(checked(flown))
-            if experiment.twice and fly(experiment, plan).sha256 != flown.sha256:
-                broken.append(Broken("the same bytes twice", "a second flight differs"))
-            ended = flown.stretches[-1].station.end_reason.split(":")[0]
-    except Exception:  # noqa: BLE001
-        return Result((_raised(experiment),))
-    return Result(tuple(broken), ended=ended)
-
-
-def _raised(experiment: Experiment) -> Broken:
-    return Broken("no exception", traceback.format_exc())
 
 
 def checked(flown: Flown) -> Iterator[Broken]:
@@ -103,6 +56,8 @@ def checked(flown: Flown) -> Iterator[Broken]:
             yield Broken("commands within limits", f"{np.nanmax(commands):g} m/s² in the ticks, limit {limit:g}")
     for stretch, after in zip(flown.stretches, [*flown.stretches[1:], None], strict=True):
         yield from _rows_complete(flown, stretch)
+        yield from _commands_explained(flown, stretch)
+        yield from _repetitions_true(flown, stretch)
         yield from _clocks_bounded(flown, stretch, sampled)
         yield from _loop_delay_true(flown, stretch, until_ns=2**62 if after is None else after.start_ns)
         yield from _ends_true(flown, stretch)
@@ -129,18 +84,45 @@ def _rows_complete(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
     for name in ALWAYS:
         if not np.isfinite(ticks[name]).all():
             yield incomplete(f"{name} is not finite")
-    commanded = ticks[ticks["commanded"]]
-    for name in WHEN_COMMANDED:
-        if not np.isfinite(commanded[name]).all():
-            k = int(np.flatnonzero(~np.isfinite(commanded[name]))[0])
-            yield incomplete(f"{name} = {commanded[name][k]} at {commanded['time_s'][k]:.3f} s, where it is commanded")
-    if np.isfinite(ticks["command_north_m_s2"][~ticks["commanded"]]).any():
-        yield incomplete("a command where none was sent")
     for name in COUNTS:
         if (np.diff(ticks[name].astype(np.int64), axis=0) < 0).any():
             yield incomplete(f"{name} goes back")
     if not np.isin(ticks["mode"], [int(mode) for mode in Mode]).all():
         yield incomplete("a mode that there is none of")
+
+
+def _commands_explained(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
+    """Whoever is commanded is known, and nobody else has a command."""
+
+    def incomplete(text: str) -> Broken:
+        return Broken("rows complete", text)
+
+    ticks = stretch.ticks
+    commanded = ticks[ticks["commanded"]]
+    for name in WHEN_COMMANDED:
+        if not np.isfinite(commanded[name]).all():
+            k = int(np.flatnonzero(~np.isfinite(commanded[name]))[0])
+            yield incomplete(f"{name} = {commanded[name][k]} at {commanded['time_s'][k]:.3f} s, where it is commanded")
+    never_set = commanded[~np.isin(commanded["system_id"], list(flown.steps_ns))]
+    for name in OF_CLOCKS:
+        if not np.isfinite(never_set[name]).all():
+            yield incomplete(f"{name} is unknown of a vehicle that is commanded and whose clock nobody has set")
+    if np.isfinite(ticks["command_north_m_s2"][~ticks["commanded"]]).any():
+        yield incomplete("a command where none was sent")
+
+
+def _repetitions_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
+    """A set-point repeats itself only while no newer state has come, for less than a period of telemetry."""
+    rates, ticks = flown.plan.scenario.rates, stretch.ticks
+    repeated_s = ticks["repeated_s"]
+    # by a rounded period in ns at most
+    if not ((repeated_s >= 0.0) & (repeated_s < 1.0 / rates.telemetry_hz + 1e-9)).all():
+        yield Broken("repetitions", f"{repeated_s.min():g} to {repeated_s.max():g} s of {1.0 / rates.telemetry_hz:g} s")
+    if rates.telemetry_hz >= rates.control_hz and repeated_s.any():
+        yield Broken("repetitions", "though telemetry is no slower than control")
+    newer = np.diff(ticks["sample_boot_ms"].astype(np.int64), axis=0) != 0
+    if flown.plan.scenario.control.loop == "ground" and repeated_s[1:][newer & ticks["commanded"][1:]].any():
+        yield Broken("repetitions", "of a set-point from a state that was not used before")
 
 
 def _clocks_bounded(flown: Flown, stretch: Stretch, sampled: dict[tuple[int, int], int]) -> Iterator[Broken]:
@@ -186,7 +168,8 @@ def _loop_delay_true(flown: Flown, stretch: Stretch, *, until_ns: int) -> Iterat
         return
     ticks = stretch.ticks.ravel()
     known = (flown.truth["time_ns"] >= stretch.start_ns) & (flown.truth["time_ns"] < until_ns)
-    error_s = np.abs(ticks["loop_delay_s"] - true_loop_delays_s(ticks, flown.truth[known]))
+    age_s = ticks["loop_delay_s"] + ticks["repeated_s"]
+    error_s = np.abs(age_s - true_loop_delays_s(ticks, flown.truth[known]))
     if scenario.control.loop == "onboard":
         error_s -= np.repeat(np.nanmax(stretch.ticks["sample_bound_s"], axis=1, initial=0.0), len(scenario.vehicles))
         error_s -= ticks["down_bound_s"]
@@ -260,7 +243,7 @@ def _ends_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
         true_m, off_m = errors[system_id]
         if true_m + off_m < scenario.safety.spacing_error_limit_m:
             yield Broken("verdict", f"{reason}; in truth {true_m:.2f} m (± {off_m:.2f} m)")
-    if reason.startswith("completed"):
+    if reason.startswith("completed") and errors:  # one vehicle alone has settled by its velocity
         fraction = scenario.safety.settled_fraction
         bands_m = {v.system_id: fraction * math.hypot(*v.offset_ne_m) for v in scenario.vehicles if v.offset_ne_m}
         beyond = [i for i, (true_m, off_m) in errors.items() if true_m - off_m > bands_m[i]]
@@ -319,26 +302,3 @@ def _extrapolated_m(flown: Flown, stretch: Stretch, at_end: np.ndarray[Any, Any]
         wrong_m = fastest * float(row["sample_bound_s"]) + 0.01
         found[int(row["system_id"])] = strongest * age_s**2 + wrong_m if math.isfinite(age_s) else math.inf
     return found
-
-
-def _margin_kept(plan: FlightPlan, ratio: float) -> tuple[list[Broken], str]:
-    """Errors die away below nine tenths of the plan's margin, and grow above eleven tenths.
-
-    Judged by the growth rate that a campaign's probe fits to a flight in virtual time, at the loop delay it had.
-    """
-    scenario = plan.scenario
-    margin_s = plan.delay_margin_s
-    wanted_s = ratio * min(margin_s, 2.0) - 0.5 / scenario.rates.control_hz
-    if wanted_s <= 0.0:
-        return [], "margin: below half a period"
-    delayed = scenario.with_link_delay(up_s=wanted_s / 2.0, down_s=wanted_s / 2.0)
-    found = fly_trial(Trial(delayed, sparse_gain(plan.gain), margin_s, "probe"))
-    if found.error is not None:
-        return [Broken("no exception", found.error)], ""
-    if found.growth_1_s is None or found.loop_delay_s is None:
-        return [], "margin: no growth could be fitted"
-    share, growth = found.loop_delay_s / margin_s, found.growth_1_s
-    text = f"grows by {growth:.4f} 1/s (± {found.growth_error_1_s}) at {share:.3f} of the margin of {margin_s:.4f} s"
-    if (share < 0.9 and growth > 0.0) or (share > 1.1 and growth < 0.0):
-        return [Broken("margin", text)], ""
-    return [], "margin: stable below" if share < 0.9 else "margin: unstable above" if share > 1.1 else "margin: near it"

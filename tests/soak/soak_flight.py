@@ -29,7 +29,8 @@ from sim_vehicles.drive.guard import signed_links
 from sim_vehicles.links.truth import DTYPE, Row
 from sim_vehicles.services.clock import BootClock
 from tests.flights.test_fuzz import TO_VEHICLES, any_message, changed, noise
-from tests.soak.soak_scenarios import AUTOPILOT_START_S, Experiment, Fault
+from tests.soak.soak_experiments import Experiment, Fault
+from tests.soak.soak_scenarios import AUTOPILOT_START_S
 
 CONNECT_S = 25.0
 """Longest start of vehicles without an autopilot. A flight that has not ended in its time is told to."""
@@ -75,7 +76,7 @@ class Flown:
     plan: FlightPlan
     stretches: list[Stretch]
     truth: np.ndarray[Any, Any]
-    """Records of sim_vehicles.links.truth.DTYPE."""
+    """Records of sim_vehicles.truth.DTYPE."""
     clocks: dict[int, BootClock]
     """Of the vehicles, at the start."""
     steps_ns: dict[int, int]

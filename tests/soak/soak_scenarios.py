@@ -1,24 +1,16 @@
-"""Random experiments for `soak.py`: a valid scenario, and what goes wrong in flight.
+"""Random scenarios for `soak.py`.
 
 Every part of the schema is drawn by one function here, through `whole`, which fails when a key of the schema is not
 drawn: who adds a key adds it here. Bounds that matter are read from the schema.
 """
 
-import json
 import math
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any, Literal, Self
 
-import annotated_types
 import numpy as np
-from pydantic import BaseModel
 
-from scenarios import files, schema
+from scenarios import schema
 from scenarios.schema import Scenario
-
-Rng = np.random.Generator
-Part = dict[str, Any]
+from tests.soak.soak_draws import Part, Rng, between, chance, most_of, one_of, some, spread, whole
 
 VEHICLE_TICKS = 6_000
 """Most control and telemetry ticks of all vehicles of a flight, apart from what the shortest flight needs."""
@@ -28,112 +20,7 @@ AUTOPILOT_START_S = 25.0
 """Take-off and identification, for the budget."""
 
 
-@dataclass(frozen=True)
-class Fault:
-    """Something that goes wrong in flight. Times are since the vehicles' start.
-
-    silence           nothing passes to or from these vehicles
-    killed            the same, for good
-    station replaced  the station dies at `from_s`; another one starts at `until_s`
-    garbage           hostile datagrams reach both ends of these vehicles' links, and the station from a stranger
-    clock step        the boot clocks of these vehicles are set by `by_s` at `from_s`
-    """
-
-    kind: Literal["silence", "killed", "station replaced", "garbage", "clock step"]
-    from_s: float
-    until_s: float = math.inf
-    system_ids: tuple[int, ...] = ()
-    by_s: float = 0.0
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """One flight of the soak: all that it depends on."""
-
-    scenario: Scenario
-    faults: tuple[Fault, ...] = ()
-    signed: bool = False
-    twice: bool = False
-    """Flown a second time, which must give the same bytes."""
-    margin_ratio: float | None = None
-    """The loop delay is brought to this multiple of the plan's margin, and stability is judged."""
-
-    def save(self, file: Path) -> None:
-        """Write the scenario, and the rest beside it."""
-        file.write_text(files.dump(self.scenario), encoding="utf-8")
-        rest = asdict(self) | {"scenario": file.name}
-        file.with_suffix(".json").write_text(json.dumps(rest, indent=2) + "\n", encoding="utf-8")
-
-    @classmethod
-    def load(cls, file: Path) -> Self:
-        """Read what `save` wrote."""
-        rest = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
-        faults = tuple(Fault(**fault | {"system_ids": tuple(fault["system_ids"])}) for fault in rest.pop("faults"))
-        return cls(**rest | {"scenario": files.load(file), "faults": faults})
-
-
-def experiment(seed: int, number: int) -> Experiment:
-    """Flight `number` of a soak's seed."""
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
-    if chance(rng, 0.2):
-        return _margin_experiment(rng, f"soak-{seed}-{number}")
-    scenario = valid(_scenario(rng, f"soak-{seed}-{number}"))
-    faults = _faults(rng, scenario) if chance(rng, 0.5) else ()
-    return Experiment(scenario, faults, signed=chance(rng, 0.15), twice=chance(rng, 0.1))
-
-
-def valid(drawn: Part) -> Scenario:
-    """The scenario as its own TOML text gives it back."""
-    scenario = Scenario.model_validate_json(json.dumps(drawn))
-    read = files.parse(files.dump(scenario), Path(f"{scenario.name}.toml"))
-    assert read == scenario, "a scenario is not read back as it was written"
-    return read
-
-
-def whole(model: type[BaseModel], **keys: Any) -> Part:
-    """One part of a scenario: every key of the schema has to be drawn, None leaves it out."""
-    unknown = model.model_fields.keys() ^ keys.keys()
-    assert not unknown, f"{Path(__file__).name} and the schema's {model.__name__} differ in the keys {sorted(unknown)}"
-    return {name: value for name, value in keys.items() if value is not None}
-
-
-# -- drawing numbers ---------------------------------------------------------------------------------------------------
-
-
-def chance(rng: Rng, probability: float) -> bool:
-    return bool(rng.random() < probability)
-
-
-def between(rng: Rng, least: float, most: float) -> float:
-    """Uniform, to four decimals."""
-    return round(float(rng.uniform(least, most)), 4)
-
-
-def spread(rng: Rng, least: float, most: float) -> float:
-    """Log-uniform, to four digits."""
-    return float(f"{math.exp(rng.uniform(math.log(least), math.log(most))):.4g}")
-
-
-def one_of(rng: Rng, *values: Any) -> Any:
-    return values[int(rng.integers(len(values)))]
-
-
-def some(rng: Rng, probability: float, value: Any) -> Any:
-    """The value or nothing; it is drawn in any case."""
-    return value if chance(rng, probability) else None
-
-
-def most_of(model: type[BaseModel], key: str) -> float:
-    """The largest number that the schema takes for a key."""
-    [most] = [bound.le for bound in model.model_fields[key].metadata if isinstance(bound, annotated_types.Le)]
-    assert isinstance(most, int | float)
-    return float(most)
-
-
-# -- the parts of a scenario -------------------------------------------------------------------------------------------
-
-
-def _scenario(rng: Rng, name: str) -> Part:
+def random_scenario(rng: Rng, name: str) -> Part:
     autopilot = chance(rng, 0.2)
     count = int(min(MOST_VEHICLES, 1 + rng.poisson(3.0)))
     onboard = not autopilot and chance(rng, 0.3)
@@ -144,7 +31,7 @@ def _scenario(rng: Rng, name: str) -> Part:
     pitch_m = spread(rng, 8.0, 40.0) if autopilot else spread(rng, 15.0, 300.0)
     speed_m_s = spread(rng, 1.2, 5.0) if autopilot else spread(rng, 15.0, 120.0)
     limits = _limits(rng, speed_m_s)
-    vehicles = _vehicles(rng, count, pitch_m, speed_m_s, autopilot=autopilot)
+    vehicles = random_vehicles(rng, count, pitch_m, speed_m_s, autopilot=autopilot)
     control = _control(rng, vehicles, rates, onboard=onboard, autopilot=autopilot)
     if control.get("method", "inclusion") == "inclusion" or control.get("blocks"):
         for vehicle in vehicles:
@@ -172,7 +59,7 @@ def _scenario(rng: Rng, name: str) -> Part:
     )
 
 
-def _vehicles(rng: Rng, count: int, pitch_m: float, speed_m_s: float, *, autopilot: bool) -> list[Part]:
+def random_vehicles(rng: Rng, count: int, pitch_m: float, speed_m_s: float, *, autopilot: bool) -> list[Part]:
     """A tree of any shape whose places are on a grid, so that no two are in one place."""
     ids = rng.choice(np.arange(1, 251), size=count, replace=False).tolist() if chance(rng, 0.5) else range(1, count + 1)
     side = max(2, math.ceil(1.5 * math.sqrt(count)))
@@ -249,12 +136,20 @@ def _onboard(rng: Rng, control_hz: float) -> Part:
     )
 
 
-def _fixed_gains(rng: Rng, *, stable: bool) -> Part:
-    own = spread(rng, 0.2, 6.0)
-    front, spacing = round(own * between(rng, 0.0, 0.5), 5), round(own * own * spread(rng, 0.02, 0.6), 6)
+def fixed_gains(rng: Rng, *, stable: bool, own_1_s: float) -> Part:
+    """Gains that are stable without delay, or any."""
+    front_1_s, spacing_1_s2 = own_1_s * rng.uniform(0.0, 0.5), own_1_s**2 * spread(rng, 0.02, 0.6)
+    any_gains = [one_of(rng, -1.0, 1.0) * spread(rng, 1e-3, 1e5) for _ in range(3)]
     if not stable:
-        own, spacing = one_of(rng, (-own, spacing), (own, -spacing), (1e5, 1e5))
-    return whole(schema.FixedGains, K1=-own, K2=front, K3=spacing)
+        own_1_s, front_1_s, spacing_1_s2 = one_of(
+            rng,
+            (-own_1_s, front_1_s, spacing_1_s2),
+            (own_1_s, front_1_s, -spacing_1_s2),
+            (own_1_s, front_1_s, 0.0),
+            any_gains,
+            any_gains,
+        )
+    return whole(schema.FixedGains, K1=round(-own_1_s, 5), K2=round(front_1_s, 5), K3=round(spacing_1_s2, 6))
 
 
 def _control(rng: Rng, vehicles: list[Part], rates: Part, *, onboard: bool, autopilot: bool) -> Part:
@@ -271,14 +166,14 @@ def _control(rng: Rng, vehicles: list[Part], rates: Part, *, onboard: bool, auto
         alpha=some(rng, 0.2, spread(rng, 0.01, 0.9)) if required else None,
         decay_rate_1_s=some(rng, 0.2, spread(rng, 0.01, 2.0)) if required else None,
         string_peak_max=one_of(rng, 1.0, 1.0, between(rng, 1.0, 2.0)),
-        gains=_fixed_gains(rng, stable=chance(rng, 0.95)) if way == "gains" else None,
+        gains=fixed_gains(rng, stable=chance(rng, 0.93), own_1_s=spread(rng, 0.2, 6.0)) if way == "gains" else None,
         blocks=_blocks(rng, vehicles) if way == "blocks" else None,
     )
 
 
 def _blocks(rng: Rng, vehicles: list[Part]) -> list[Part]:
     """Stable gains on the tree, and weak ones on other pairs."""
-    gains = _fixed_gains(rng, stable=True)
+    gains = fixed_gains(rng, stable=True, own_1_s=spread(rng, 0.2, 6.0))
     follows = {vehicle["system_id"]: vehicle.get("follows") for vehicle in vehicles}
     pairs: dict[tuple[int, int], tuple[float, float]] = {}
     for own, ahead in follows.items():
@@ -446,67 +341,3 @@ def _response(rng: Rng) -> Part:
         lag_s=spread(rng, 0.05, 0.5),
         velocity_gain_1_s=one_of(rng, 0.0, 2.0, spread(rng, 0.5, 4.0)),
     )
-
-
-# -- faults, and flights that judge the margin -------------------------------------------------------------------------
-
-
-def _faults(rng: Rng, scenario: Scenario) -> tuple[Fault, ...]:
-    ids = sorted(vehicle.system_id for vehicle in scenario.vehicles)
-    start_s = AUTOPILOT_START_S if scenario.dynamics == "autopilot" else 1.0
-    faults: list[Fault] = []
-    while not faults or (chance(rng, 0.4) and len(faults) < 4):
-        kind = one_of(rng, "silence", "silence", "killed", "station replaced", "garbage", "garbage", "clock step")
-        hit = tuple(system_id for system_id in ids if chance(rng, 0.5)) or (ids[-1],)
-        from_s = between(rng, 0.0, start_s + scenario.duration_s)
-        until_s = round(from_s + spread(rng, 0.05, 6.0), 4)
-        by_s = one_of(rng, spread(rng, 0.001, 1000.0), -spread(rng, 0.001, 30.0))
-        match kind:
-            case "killed":
-                faults.append(Fault(kind, from_s, system_ids=hit))
-            case "clock step":
-                faults.append(Fault(kind, from_s, system_ids=hit, by_s=by_s))
-            case _:
-                faults.append(Fault(kind, from_s, until_s, hit))
-    return tuple(sorted(faults, key=lambda fault: fault.from_s))
-
-
-def _margin_experiment(rng: Rng, name: str) -> Experiment:
-    """Given or designed gains on constant links and free of limits: what the plan's margin claims to hold for."""
-    onboard = chance(rng, 0.25)
-    drawn = _scenario(rng, name)
-    count = min(len(drawn["vehicles"]), 6)
-    control_hz = one_of(rng, 10.0, 25.0, 50.0, 50.0, 100.0)
-    rates = whole(schema.Rates, control_hz=control_hz, telemetry_hz=control_hz, timesync_hz=10.0)
-    speed_m_s, pitch_m = 100.0, 100.0
-    vehicles = _vehicles(rng, count, pitch_m, speed_m_s, autopilot=False)
-    for vehicle in vehicles:
-        vehicle.pop("hears", None)
-    own = spread(rng, 0.5, 4.0)
-    given = whole(schema.FixedGains, K1=-own, K2=round(0.3 * own, 5), K3=round(own * own * spread(rng, 0.05, 0.4), 6))
-    designed = chance(rng, 0.3)
-    drawn |= {
-        "duration_s": 20.0,
-        "altitude_m": 1000.0,
-        "vehicles": vehicles,
-        "nominal_velocity": [whole(schema.NominalVelocity, from_s=0.0, velocity_ne_m_s=(speed_m_s, 0.0))],
-        "limits": {},
-        "rates": rates,
-        "control": {"loop": "onboard" if onboard else "ground"}
-        | (
-            {"delay_margin_s": round(0.05 + 1.0 / control_hz + spread(rng, 0.1, 0.8), 4)}
-            if designed
-            else {"gains": given}
-        ),
-        "onboard": whole(
-            schema.Onboard, sensor_hz=control_hz, rate_hz=2.0 * control_hz, position_noise_m=0.0, velocity_noise_m_s=0.0
-        ),
-        "links": {},
-        "clocks": {"drift_max_ppm": 20.0},
-        "safety": {"setpoint_timeout_s": 30.0, "heartbeat_timeout_s": 30.0, "collision_distance_m": 0.0},
-        "monitor": {"act": False, "time_scales": [1.0]},
-        "dynamics": "double_integrator",
-    }
-    drawn.pop("response", None)
-    ratio = one_of(rng, between(rng, 0.3, 0.9), between(rng, 1.1, 1.6))
-    return Experiment(valid(drawn), margin_ratio=ratio)

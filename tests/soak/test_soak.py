@@ -13,9 +13,10 @@ from pydantic import BaseModel
 from gcs.plan.planner import flight_plan
 from scenarios import files, schema
 from scenarios.schema import Clocks, Control, FixedGains, Limits
-from tests.soak.soak_checks import checked, judge
+from tests.soak.soak_checks import checked
+from tests.soak.soak_experiments import Experiment, experiment, whole
 from tests.soak.soak_flight import Flown, fly
-from tests.soak.soak_scenarios import Experiment, experiment, whole
+from tests.soak.soak_judge import judge
 from tests.support.paths import SCENARIOS
 
 SEED, PARTS, FLIGHTS = 20, 20, 10

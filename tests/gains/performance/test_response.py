@@ -156,6 +156,11 @@ def test_a_lag_makes_spacing_errors_grow_more_as_a_delay_of_its_length_does() ->
     assert with_lag > 1.05 * string_peak(gains, 0.2)
 
 
+def test_a_constant_set_point_is_answered_in_full() -> None:
+    for response in RESPONSES:
+        assert response.transfer(np.zeros(1)).tolist() == [1.0]
+
+
 @pytest.mark.parametrize(("lag_s", "gain"), [(0.0, 1.0), (math.nan, 1.0), (0.1, -1.0), (0.1, math.inf)])
 def test_a_response_that_is_none_is_refused(lag_s: float, gain: float) -> None:
     with pytest.raises(BadModelError):

@@ -156,6 +156,17 @@ def test_the_mean_loop_delay_hides_next_to_nothing_of_the_rates() -> None:
         assert multirate_delay_margin(*FOLLOWER, Timing(0.05, telemetry_s)) == pytest.approx(even_s, abs=3e-4)
 
 
+def test_a_margin_long_against_the_periods_is_that_of_the_mean_loop_delay() -> None:
+    """A part in 10^4 is left to the order of the loop delays; at 100,000 periods the map of a search has no end."""
+    timing = Timing(1.0 / 59.91, 1.0 / 124.5)
+    margin_s = multirate_delay_margin(*FOLLOWER, timing)
+    assert margin_s > 30.0 * timing.held_s
+    for factor, stable in ((1.0 - 2e-4, True), (1.0 + 2e-4, False)):
+        assert (multirate_growth_rate(*FOLLOWER, timing, delay_s=factor * margin_s) < 0.0) == stable
+    weak = multirate_delay_margin([[0.0]], [[1.0]], [[-1e-3]], timing)
+    assert weak == pytest.approx(500.0 * np.pi - timing.held_s / 2.0, rel=1e-6)
+
+
 def test_slower_telemetry_costs_margin() -> None:
     margins_s = [multirate_delay_margin(*FOLLOWER, Timing(0.1, 0.1 * k)) for k in (1, 1.5, 2, 3, 6)]
     assert all(faster > slower for faster, slower in pairwise(margins_s))

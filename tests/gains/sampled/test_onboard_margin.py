@@ -93,6 +93,15 @@ def test_growth_changes_sign_at_the_margin(timing: OnboardTiming) -> None:
     assert all(loop.growth_1_s(part * margin_s) < 0.0 for part in np.linspace(0.0, 0.99, 25))
 
 
+@pytest.mark.parametrize("telemetry_s", [0.025, 0.013])
+def test_a_margin_long_against_uneven_periods_is_where_growth_changes_sign(telemetry_s: float) -> None:
+    loop = onboard_loop(CHAIN, PRINTED, OnboardTiming(0.02, 4, 2, telemetry_s))
+    margin_s = loop.sampled_margin_s()
+    assert margin_s > 30.0 * loop.timing.rates.held_s
+    # two parts in 10^4 were measured to be left to the order of the loop delays
+    assert loop.growth_1_s(margin_s * (1.0 - 3e-4)) < 0.0 < loop.growth_1_s(margin_s * (1.0 + 3e-4))
+
+
 def test_sampled_margin_goes_to_the_continuous_one_with_the_period() -> None:
     fine = onboard_loop(CHAIN, PRINTED, OnboardTiming(0.0002))
     assert fine.sampled_margin_s() == pytest.approx(fine.continuous_margin_s(), rel=1e-4)

@@ -70,7 +70,7 @@ def test_a_vehicle_that_reads_otherwise_is_refused_in_one_line_after_some_attemp
         assert not upload.refusal
         assert upload.next(attempt * 20 * MS, target_system=1, rtt_ns=0) is not None
         upload.take((told, 1, 0, b"FORM_A".ljust(16, b"\0"), 9))
-    assert upload.refusal.startswith("parameter FORM_A reads")
+    assert upload.refusal.startswith("holds ")
     assert "\n" not in upload.missing
     assert not upload.done
     assert upload.next(10**12, target_system=1, rtt_ns=0) is None

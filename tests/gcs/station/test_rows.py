@@ -6,6 +6,7 @@ import pytest
 from gcs.control.law import VehicleControl
 from gcs.control.tick import TICK, Mode
 from gcs.link.clocks import ClockEstimate
+from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from gcs.station.monitor import VehicleState
 from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
@@ -13,12 +14,8 @@ from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
 S = 1_000_000_000
 
 
-def ignored(kind: str, text: str) -> None:
-    """Nothing is told in these tests."""
-
-
 def test_every_column_holds_what_its_name_says() -> None:
-    vehicle = RemoteVehicle(7, telemetry_hz=50.0, report=ignored)
+    vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0))
     vehicle.clock.estimate = ClockEstimate(samples=9, offset_ns=3 * S, skew=0.0, bound_ns=5000, reference_ns=10 * S)
     vehicle.clock.down_ns, vehicle.clock.down_bound_ns = 30_000_000, 4000
     for sequence in (1, 2, 5, 4, 4):
@@ -58,7 +55,7 @@ def test_every_column_holds_what_its_name_says() -> None:
 
 
 def test_what_is_not_known_is_not_a_number() -> None:
-    vehicle = RemoteVehicle(7, telemetry_hz=50.0, report=ignored)
+    vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0))
     nan, pair = np.nan, (np.nan, np.nan)
     nothing = VehicleControl(0, (nan, nan, nan, nan), pair, pair, pair, 0)
     seen = VehicleTick(vehicle, VehicleState(), nothing, Reported(), nan, nan, False, 0.4, 0.0)

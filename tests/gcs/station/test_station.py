@@ -85,7 +85,7 @@ def test_an_acknowledgement_of_another_command_is_not_taken_for_ours() -> None:
     station.step([peer.heartbeat(S)], S)
     station.step([peer.datagram(peer.link.command_ack_encode(400, 0), S)], S + 20 * MS)
     assert not station.vehicles[1].armed
-    assert not station.vehicles[1].rates_set
+    assert station.vehicles[1].missing == "does not accept the telemetry rate"
 
 
 def test_timesync_request_of_a_vehicle_is_answered_with_the_receive_time() -> None:
@@ -113,7 +113,7 @@ def test_what_a_link_reorders_or_repeats_is_no_refusal_and_is_told_once_of_each_
             station.step([first, third, second_one, third], second * S)
     assert not station.counters
     told = [(event.system_id, event.text) for event in station.events if event.kind == "link"]
-    texts = "its frames arrive out of order", "frames of it arrive more than once"
+    texts = "its frames arrive out of order", "its frames arrive more than once"
     assert told == [(system_id, text) for system_id in (2, 3) for text in texts]
 
 

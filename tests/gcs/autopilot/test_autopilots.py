@@ -1,11 +1,12 @@
-"""What the station tells a vehicle of each kind next, as a table; and what it refuses to fly."""
+"""The next start-up step for each kind of autopilot, as a table, and what is refused."""
 
 import math
 
 import pytest
 
-from gcs.link.kinds import ARDUCOPTER, PX4_COPTER, Kind, Seen, commanded_mode, kind_of, mode_command, next_step
-from gcs.link.startup import Startup, between, shifted
+from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER, Seen, kind_of, next_step
+from gcs.autopilot.startup import AutopilotStartup, between, shifted
+from gcs.link.kinds import UNRECOGNISED, Kind, commanded_mode, mode_command
 
 ALTITUDE_M = 20.0
 GOOD = 0x33F
@@ -25,36 +26,36 @@ BEFORE = Seen(
 OFFBOARD = 6 << 16
 
 
-def told(kind: Kind, seen: Seen) -> tuple[str, tuple[int, tuple[float, ...]] | None]:
+def advised(kind: Kind, seen: Seen) -> tuple[str, tuple[int, tuple[float, ...]] | None]:
     step = next_step(kind, seen, altitude_m=ALTITUDE_M)
     return step.missing, step.command
 
 
 def test_arducopter_goes_guided_arms_takes_off_and_is_ready_in_this_order() -> None:
     seen = BEFORE
-    assert told(ARDUCOPTER, seen) == ("does not enter GUIDED", (176, (1.0, 4.0)))
+    assert advised(ARDUCOPTER, seen) == ("does not enter GUIDED", (176, (1.0, 4.0)))
     seen = seen._replace(custom_mode=4)
-    assert told(ARDUCOPTER, seen) == ("does not arm", (400, (1.0,)))
+    assert advised(ARDUCOPTER, seen) == ("does not arm", (400, (1.0,)))
     seen = seen._replace(armed=True)
-    assert told(ARDUCOPTER, seen) == ("does not take off", (22, (0.0,) * 6 + (20.0,)))
+    assert advised(ARDUCOPTER, seen) == ("does not take off", (22, (0.0,) * 6 + (20.0,)))
     seen = seen._replace(took_off=True, relative_altitude_m=7.31)
-    assert told(ARDUCOPTER, seen) == ("climbs to 20 m, is at 7.3 m", None)
-    assert told(ARDUCOPTER, seen._replace(airborne=True)) == ("", None)
+    assert advised(ARDUCOPTER, seen) == ("climbs to 20 m, is at 7.3 m", None)
+    assert advised(ARDUCOPTER, seen._replace(airborne=True)) == ("", None)
 
 
 def test_px4_arms_takes_off_to_an_altitude_above_the_sea_and_enters_offboard_in_the_air() -> None:
     seen = BEFORE._replace(custom_mode=4 << 16 | 3 << 24)
-    assert told(PX4_COPTER, seen) == ("does not arm", (400, (1.0,)))
+    assert advised(PX4_COPTER, seen) == ("does not arm", (400, (1.0,)))
     seen = seen._replace(armed=True)
-    _, command = told(PX4_COPTER, seen)
+    _, command = advised(PX4_COPTER, seen)
     assert command is not None
     assert (command[0], command[1][6]) == (22, 604.0)
     assert all(math.isnan(value) for value in command[1][3:6])  # numbers would be a place to fly to
     seen = seen._replace(took_off=True, custom_mode=4 << 16 | 2 << 24)
-    assert told(PX4_COPTER, seen)[1] is None
+    assert advised(PX4_COPTER, seen)[1] is None
     seen = seen._replace(airborne=True, custom_mode=4 << 16 | 3 << 24)
-    assert told(PX4_COPTER, seen) == ("does not enter OFFBOARD", (176, (1.0, 6.0, 0.0)))
-    assert told(PX4_COPTER, seen._replace(custom_mode=OFFBOARD)) == ("", None)
+    assert advised(PX4_COPTER, seen) == ("does not enter OFFBOARD", (176, (1.0, 6.0, 0.0)))
+    assert advised(PX4_COPTER, seen._replace(custom_mode=OFFBOARD)) == ("", None)
 
 
 @pytest.mark.parametrize(
@@ -62,7 +63,7 @@ def test_px4_arms_takes_off_to_an_altitude_above_the_sea_and_enters_offboard_in_
 )
 def test_nothing_is_armed_before_the_estimator_has_a_position(flags: int, ready: bool) -> None:
     for kind in (ARDUCOPTER, PX4_COPTER):
-        missing, command = told(kind, BEFORE._replace(estimator_flags=flags))
+        missing, command = advised(kind, BEFORE._replace(estimator_flags=flags))
         assert (command is not None) == ready
         assert ready or missing == f"has no position yet (estimator flags 0x{flags:x})"
 
@@ -79,20 +80,20 @@ def test_nothing_is_armed_before_the_estimator_has_a_position(flags: int, ready:
     ],
 )
 def test_what_is_missing_is_named(change: dict[str, object], words: str) -> None:
-    assert told(ARDUCOPTER, BEFORE._replace(**change))[0] == words  # pyright: ignore[reportArgumentType]
+    assert advised(ARDUCOPTER, BEFORE._replace(**change))[0] == words  # pyright: ignore[reportArgumentType]
 
 
 def test_a_vehicle_found_flying_is_not_told_to_take_off() -> None:
-    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
-    startup.heartbeat(3, 2)
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+    startup.recognise(3, 2)
     startup.take(33, (1000, -353632620, 1491652370, 596_000, 12_000, 0, 0, 0, 0))
     startup.next(custom_mode=4, armed=True, clock_known=True, now_ns=0)
     assert startup.airborne
 
 
 def test_a_take_off_whose_answer_was_lost_counts_although_the_second_is_refused() -> None:
-    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
-    startup.heartbeat(3, 2)
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+    startup.recognise(3, 2)
     startup.refused(22, (0.0,) * 7, 0, repeated=True)
     startup.take(33, (1000, -353632620, 1491652370, 589_000, 5_000, 0, 0, 0, 0))
     startup.next(custom_mode=4, armed=True, clock_known=True, now_ns=0)
@@ -110,10 +111,10 @@ def test_what_cannot_be_flown_is_refused_by_name(autopilot: int, vehicle_type: i
 
 
 def test_a_vehicle_that_does_not_know_its_type_yet_is_waited_for() -> None:
-    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
-    startup.heartbeat(3, 0)
-    assert (startup.kind, startup.refusal) == (None, "")
-    startup.heartbeat(3, 13)
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+    startup.recognise(3, 0)
+    assert (startup.kind, startup.refusal) == (UNRECOGNISED, "")
+    startup.recognise(3, 13)
     assert startup.kind is ARDUCOPTER
 
 
@@ -125,7 +126,7 @@ def test_a_mode_command_is_read_back_as_its_mode(kind: Kind) -> None:
 
 def test_origin_from_a_moving_vehicle_takes_the_time_between_both_positions_into_account() -> None:
     origin = (47.397742, 8.545594)
-    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.take(32, (10_000, 100.0, -40.0, -5.0, 12.0, -3.0, 0.0))
     place = shifted(origin, 100.0 + 0.5 * 12.0, -40.0 - 0.5 * 3.0)
     startup.take(33, (10_500, round(place[0] * 1e7), round(place[1] * 1e7), 500_000, 5_000, 0, 0, 0, 0))
@@ -134,7 +135,7 @@ def test_origin_from_a_moving_vehicle_takes_the_time_between_both_positions_into
 
 
 def test_the_origin_a_vehicle_says_wins_over_home_and_over_one_that_is_computed() -> None:
-    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.take(242, (470000000, 80000000, 400_000, 3.0, 4.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0))
     assert startup.origin is not None
     assert between(startup.origin, (47.0, 8.0)) == pytest.approx((3.0, 4.0), abs=1e-3)
@@ -145,7 +146,7 @@ def test_the_origin_a_vehicle_says_wins_over_home_and_over_one_that_is_computed(
 
 
 def test_a_position_of_zeros_is_none() -> None:
-    startup = Startup(altitude_m=ALTITUDE_M, telemetry_interval_us=2e4)
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.take(32, (10_000, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     startup.take(33, (10_000, 0, 0, 0, 0, 0, 0, 0, 0))
     assert startup.origin is None

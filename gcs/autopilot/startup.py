@@ -1,0 +1,172 @@
+"""Start-up of one vehicle with an autopilot: its kind, estimator, rates, take-off and the origin of its local frame.
+
+The origin's place on the globe comes from GPS_GLOBAL_ORIGIN, from HOME_POSITION, which gives the home in both frames,
+or from a GLOBAL_POSITION_INT and the newest LOCAL_POSITION_NED.
+"""
+
+from math import cos, degrees, isfinite, radians
+from typing import Any
+
+from gcs.autopilot.kinds import Seen, kind_of, next_step
+from gcs.link import mavlink
+from gcs.link.kinds import SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
+
+EARTH_RADIUS_M = 6_378_137.0
+_SLOW_US = 200_000.0
+_TAKEN_OFF_FRACTION = 0.95
+"""A take-off is complete at this fraction of the commanded altitude."""
+_TAKE_OFF_S, _SLOWEST_CLIMB_M_S = 15.0, 0.5
+"""A take-off may last this long plus the climb at this rate. Then it is commanded again or, if the vehicle has left the
+ground, set-points lead it to its altitude."""
+_LEFT_GROUND_M = 2.0
+
+Degrees = tuple[float, float]
+"""Latitude and longitude."""
+
+
+class AutopilotStartup:
+    """Start-up of one vehicle, which takes off to `altitude_m`; see `gcs.link.startup.Startup`."""
+
+    def __init__(self, *, altitude_m: float, telemetry_hz: float) -> None:
+        self.kind = UNRECOGNISED
+        self.refusal = ""
+        self.altitude_m = altitude_m
+        self.relative_altitude_m: float | None = None
+        self.airborne = False
+        self.origin: Degrees | None = None
+        self.origin_altitude_m = 0.0
+        """Above sea level; only with an origin."""
+        self._origin_said = False
+        self._sea_level_m = 0.0
+        self._flags: int | None = None
+        self._local: tuple[int, float, float, float, float, float] | None = None
+        """Newest local position: boot time in ms, north, east, down, and velocities north and east."""
+        self._took_off_ns: int | None = None
+        self._telemetry_interval_us = round(1e6 / telemetry_hz)
+        self._rates: dict[float, float] = {}
+        self._accepted: set[float] = set()
+
+    def recognise(self, autopilot: int, vehicle_type: int) -> Kind:
+        """The kind of vehicle, as far as its heartbeats show it."""
+        if self.kind is not UNRECOGNISED or self.refusal:
+            return self.kind
+        found = kind_of(autopilot, vehicle_type)
+        if not isinstance(found, Kind):
+            self.refusal = found or ""
+            return self.kind
+        self.kind = found
+        self._rates = {
+            float(mavlink.LOCAL_POSITION_NED): self._telemetry_interval_us,
+            float(mavlink.GLOBAL_POSITION_INT): _SLOW_US,
+            float(found.estimator_message): 2.0 * _SLOW_US,
+            float(mavlink.GPS_GLOBAL_ORIGIN): 5.0 * _SLOW_US,
+        }
+        return found
+
+    def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
+        """Take in a message from the vehicle; those that say nothing about the start-up are ignored."""
+        match msg_id:
+            case mavlink.LOCAL_POSITION_NED:
+                self._local = fields[:6]
+            case mavlink.GLOBAL_POSITION_INT:
+                self._global(fields)
+            case mavlink.EKF_STATUS_REPORT:
+                self._flags = fields[5]
+            case mavlink.ESTIMATOR_STATUS:
+                self._flags = fields[9]
+            case mavlink.GPS_GLOBAL_ORIGIN:
+                self.origin, self._origin_said = (fields[0] * 1e-7, fields[1] * 1e-7), True
+                self.origin_altitude_m = fields[2] * 1e-3
+            case mavlink.HOME_POSITION if not self._origin_said and isfinite(sum(fields[3:6])):
+                self.origin = shifted((fields[0] * 1e-7, fields[1] * 1e-7), -fields[3], -fields[4])
+                self.origin_altitude_m = fields[2] * 1e-3 + fields[5]
+            case _:
+                pass
+
+    def _global(self, fields: tuple[Any, ...]) -> None:
+        boot_ms, latitude, longitude, altitude_mm, relative_mm = fields[:5]
+        if latitude == longitude == 0:
+            return  # sent before a position is known
+        self.relative_altitude_m = relative_mm * 1e-3
+        self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
+        if self._local is not None and not self._origin_said and not self.airborne:
+            local_ms, north, east, down, v_north, v_east = self._local
+            since_s = (boot_ms - local_ms) * 1e-3
+            place = latitude * 1e-7, longitude * 1e-7
+            if abs(since_s) < 1.0:
+                self.origin = shifted(place, -north - v_north * since_s, -east - v_east * since_s)
+                self.origin_altitude_m = altitude_mm * 1e-3 + down
+
+    def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:
+        """Note that a command was accepted."""
+        if command == SET_MESSAGE_INTERVAL:
+            self._accepted.add(parameters[0])
+        elif command == TAKE_OFF:
+            self._took_off_ns = now_ns
+
+    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
+        """Note that a command was refused.
+
+        An origin that is not sent is found in another way. A vehicle that refuses a repeated take-off is taking off
+        already, and its first answer was lost.
+        """
+        if command == SET_MESSAGE_INTERVAL and parameters[0] == mavlink.GPS_GLOBAL_ORIGIN:
+            self._accepted.add(parameters[0])
+        elif command == TAKE_OFF and repeated:
+            self._took_off_ns = now_ns
+
+    @property
+    def is_half_way_up(self) -> bool:
+        """Whether it has climbed to half of its take-off altitude or more."""
+        return (self.relative_altitude_m or 0.0) >= 0.5 * self.altitude_m
+
+    def begin_anew(self) -> None:
+        """Forget what the vehicle was told: it seems to have restarted."""
+        self._accepted.clear()
+        self._took_off_ns = None
+
+    def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> None:
+        """None: an autopilot's parameters are its owner's."""
+
+    def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
+        """The next step towards a vehicle that takes set-points in the air."""
+        if self.kind is UNRECOGNISED:
+            return Step(self.refusal or "sends no heartbeat of an autopilot")
+        due = next(((m, us) for m, us in self._rates.items() if m not in self._accepted), None)
+        patience_ns = (_TAKE_OFF_S + self.altitude_m / _SLOWEST_CLIMB_M_S) * 1e9
+        took_off = self._took_off_ns is not None and now_ns - self._took_off_ns < patience_ns
+        self._see_altitude(armed=armed, taking_off=took_off)
+        seen = Seen(
+            interval_due=due,
+            clock_known=clock_known,
+            position_heard=self._local is not None,
+            estimator_flags=self._flags,
+            origin_known=self.origin is not None,
+            custom_mode=custom_mode,
+            armed=armed,
+            took_off=took_off,
+            airborne=self.airborne,
+            relative_altitude_m=self.relative_altitude_m,
+            sea_level_m=self._sea_level_m,
+        )
+        return next_step(self.kind, seen, altitude_m=self.altitude_m)
+
+    def _see_altitude(self, *, armed: bool, taking_off: bool) -> None:
+        """A vehicle found in the air takes set-points at once; during a take-off they would end the climb too early."""
+        enough_m = _TAKEN_OFF_FRACTION * self.altitude_m if taking_off else _LEFT_GROUND_M
+        self.airborne = armed and (self.airborne or (self.relative_altitude_m or 0.0) > enough_m)
+
+
+def shifted(place: Degrees, north_m: float, east_m: float) -> Degrees:
+    """The place that lies so far north and east of another, on a flat earth."""
+    latitude, longitude = place
+    return (
+        latitude + degrees(north_m / EARTH_RADIUS_M),
+        longitude + degrees(east_m / EARTH_RADIUS_M / cos(radians(latitude))),
+    )
+
+
+def between(start: Degrees, end: Degrees) -> tuple[float, float]:
+    """How far `end` lies north and east of `start` in m, on a flat earth."""
+    north = radians(end[0] - start[0]) * EARTH_RADIUS_M
+    return north, radians(end[1] - start[1]) * EARTH_RADIUS_M * cos(radians(start[0]))

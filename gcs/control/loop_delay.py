@@ -1,0 +1,59 @@
+"""Loop delay, the quantity that the whole project is about, and headroom.
+
+The loop delay of a command counts from the instant at which the vehicle's state was sampled to the instant at which the
+command computed from it acts:
+
+    loop delay = up + waiting + computing + down - repetition
+
+* *up*: the telemetry's way to the station. *Waiting*: for the control tick. *Computing*: until the set-point has been
+  handed to the kernel. Together they are the age of the state when the set-point leaves.
+* *down*: the command's way to the vehicle. It is not measured for each set-point: it is that of the newest TIMESYNC
+  request, so jitter makes the two differ.
+* *repetition*: when telemetry is slower than control, several commands rest on one state. They repeat each other, and
+  the loop is no later for that: its margin already counts the period of the telemetry. What lost telemetry adds to
+  this is delay.
+* With the loop on the ground the state is the vehicle's newest. With loops on board it is the oldest among the newest
+  states that the streamed command needs (`VehicleControl.used_ns`).
+
+Error: up and down rest on the estimated offset of the vehicle's clock. Their sum is wrong by at most `sample_bound_s`
++ `down_bound_s` of the tick record, plus the millisecond in which `time_boot_ms` counts. With one offset for both the
+error cancels, as it makes the state look older by what it makes the way down look shorter.
+"""
+
+from math import ceil, nan
+
+from scenarios.schema import NS_PER_S, Rates
+
+_SAME_RATE = 1e-4
+"""A ratio of rates this close to a whole number, relatively, counts as that number."""
+
+
+def loop_delay_s(used_ns: int, sent_ns: int, down_s: float, repeated_s: float = 0.0) -> float:
+    """Loop delay of a command sent at `sent_ns` from a state sampled at `used_ns`; NaN while either way is unknown.
+
+    Both instants are on the station's clock; `used_ns` is 0 while there is no state.
+    """
+    return (sent_ns - used_ns) * 1e-9 + down_s - repeated_s if used_ns > 0 else nan
+
+
+def headroom(delay_s: float, delay_margin_s: float) -> float:
+    """1 - loop delay / margin; NaN while the loop delay is unknown, minus infinity if there is no margin."""
+    return 1.0 - delay_s / delay_margin_s if delay_margin_s > 0 else float("-inf")
+
+
+class Repetitions:
+    """How long each vehicle's set-points have rested on the same state because telemetry is slower than control."""
+
+    def __init__(self, rates: Rates, vehicles: int) -> None:
+        ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
+        self._longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
+        self._first: list[tuple[int, int]] = [(0, 0)] * vehicles
+        """Of each vehicle the state used last, by its instant, and the tick that used it first."""
+
+    def repeated_s(self, row: int, used_ns: int, due_ns: int) -> float:
+        """Time from the first tick that used a state to the tick due now, at most one period of the telemetry."""
+        if self._longest_ns == 0:
+            return 0.0
+        if self._first[row][0] != used_ns:
+            self._first[row] = used_ns, due_ns
+        return min(due_ns - self._first[row][1], self._longest_ns) * 1e-9

@@ -1,0 +1,143 @@
+"""Where the loop around each vehicle is closed, and so what the station computes, uploads and sends.
+
+`loop_of` chooses once; nothing else in the station asks for the scenario's `loop`. With the loop on board, a vehicle
+feeds back its own errors and the station streams the rest: K_ij e_j of the other vehicles. All errors streamed to a
+vehicle are those of one instant, that of the oldest among the newest states it needs. So nothing is extrapolated, and
+its loop delay counts from that instant.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from gains.sampled.onboard import own_part
+from gcs.control.history import StateHistory
+from gcs.control.law import Blend, FeedbackLaw, VehicleControl, VehicleLaw, command_at, feedback_law, formation_control
+from gcs.link import mavlink
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.onboard import own_parameters
+
+Vector = tuple[float, float]
+
+
+class Loop(Protocol):
+    """What depends on where the loop is closed."""
+
+    def law(self, lost: Sequence[bool]) -> FeedbackLaw:
+        """What the station computes of each vehicle's command, around lost vehicles."""
+        ...
+
+    def control(
+        self,
+        history: StateHistory,
+        law: FeedbackLaw,
+        blends: Sequence[Blend],
+        *,
+        nominal_velocity_m_s: Vector,
+        opening: float = 1.0,
+    ) -> list[VehicleControl]:
+        """Errors of every vehicle, and the acceleration it is sent; as `gcs.control.law.formation_control`."""
+        ...
+
+    def set_point(
+        self, system_id: int, control: VehicleControl, *, nominal_velocity_m_s: Vector, key_ms: int
+    ) -> tuple[Any, ...]:
+        """Fields of the set-point that carries a command."""
+        ...
+
+    def parameters(self, system_id: int) -> dict[str, float]:
+        """The parameters that a vehicle must hold before it is armed."""
+        ...
+
+
+def loop_of(plan: FlightPlan) -> Loop:
+    """The loop that a plan is made for."""
+    return OnboardLoop(plan) if plan.scenario.control.loop == "onboard" else GroundLoop(plan)
+
+
+class GroundLoop:
+    """The station closes every loop: it sends each vehicle its whole command."""
+
+    def __init__(self, plan: FlightPlan) -> None:
+        self._plan = plan
+        self.control = formation_control
+
+    def law(self, lost: Sequence[bool]) -> FeedbackLaw:
+        return feedback_law(self._plan.formation, _gains(self._plan, lost), lost)
+
+    def set_point(
+        self, system_id: int, control: VehicleControl, *, nominal_velocity_m_s: Vector, key_ms: int
+    ) -> tuple[Any, ...]:
+        del nominal_velocity_m_s  # the acceleration is all that these vehicles follow
+        north, east = control.command_m_s2
+        return mavlink.acceleration_set_point(key_ms=key_ms, target_system=system_id, north_m_s2=north, east_m_s2=east)
+
+    def parameters(self, system_id: int) -> dict[str, float]:
+        del system_id
+        return {}
+
+
+class OnboardLoop:
+    """Vehicles close loops of their own: the station uploads their gains and streams what they cannot know."""
+
+    def __init__(self, plan: FlightPlan) -> None:
+        self._plan = plan
+        own, model = own_part(plan.model, plan.gain), plan.model
+        self._opened_m_s2 = [(0.0, 0.0)] * model.vehicles
+        """K_ii^p times the offset: what the vehicle's own loop commands too much of when the spacing is doubled."""
+        for i in model.followers:
+            on_spacing = own[model.input_slice(i), model.spacing_slice(i)]
+            north, east = (on_spacing @ plan.formation.offset_ne_m[i]).tolist()
+            self._opened_m_s2[i] = north, east
+
+    def law(self, lost: Sequence[bool]) -> FeedbackLaw:
+        streamed = tuple(K - own_part(self._plan.model, K) for K in _gains(self._plan, lost))
+        return feedback_law(self._plan.formation, streamed, lost)
+
+    def control(
+        self,
+        history: StateHistory,
+        law: FeedbackLaw,
+        blends: Sequence[Blend],
+        *,
+        nominal_velocity_m_s: Vector,
+        opening: float = 1.0,
+    ) -> list[VehicleControl]:
+        controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_velocity_m_s, opening=opening)
+        for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
+            control = controls[row]
+            used_ns = _oldest_needed(history, own)
+            if own is not None and used_ns not in (0, control.sample_ns):
+                command = command_at(history, own, row, used_ns, blend, nominal_velocity_m_s, opening)
+                control = control._replace(command_m_s2=command, used_ns=used_ns)
+            north, east = control.command_m_s2
+            more_north, more_east = self._opened_m_s2[row]
+            command = north + (opening - 1.0) * more_north, east + (opening - 1.0) * more_east
+            controls[row] = control._replace(command_m_s2=command)
+        return controls
+
+    def set_point(
+        self, system_id: int, control: VehicleControl, *, nominal_velocity_m_s: Vector, key_ms: int
+    ) -> tuple[Any, ...]:
+        return mavlink.velocity_set_point(
+            key_ms=key_ms,
+            target_system=system_id,
+            velocity_ned_m_s=(*nominal_velocity_m_s, 0.0),
+            acceleration_ne_m_s2=control.command_m_s2,
+        )
+
+    def parameters(self, system_id: int) -> dict[str, float]:
+        formation = self._plan.formation
+        return own_parameters(formation, self._plan.gain, formation.system_ids.index(system_id))
+
+
+def _gains(plan: FlightPlan, lost: Sequence[bool]) -> tuple[Any, ...]:
+    """The gain schedule, or what replaces it while a vehicle is lost."""
+    return plan.around_loss if any(lost) and plan.around_loss else plan.gains
+
+
+def _oldest_needed(history: StateHistory, law: VehicleLaw | None) -> int:
+    """The instant of the oldest among the newest states that a law needs; 0 if it needs none or one is unknown."""
+    if law is None:
+        return 0
+    newest = [history.newest(term.source) for term in law.terms if any(map(any, term.gains))]
+    return min((0 if report is None else report[0] for report in newest), default=0)

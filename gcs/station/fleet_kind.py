@@ -1,0 +1,133 @@
+"""What differs between vehicles without and with autopilots, chosen once when the station is built.
+
+`fleet_of` chooses; nothing else in the station asks for the scenario's `dynamics`. Where the loop is closed is
+another choice, see `gcs.control.loops`.
+"""
+
+from typing import Any, Protocol
+
+from gcs.autopilot.fleet import AutopilotFleet
+from gcs.control.history import StateHistory
+from gcs.control.law import VehicleControl
+from gcs.control.loops import Loop, Vector, loop_of
+from gcs.control.phases import Phase, patience_s
+from gcs.link.startup import LaunchedStartup
+from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
+from gcs.plan.flight_plan import FlightPlan
+from scenarios.schema import NS_PER_S
+
+
+class FleetKind(Protocol):
+    """The vehicles of one flight, in the order of the formation, and all that depends on their kind."""
+
+    @property
+    def plan(self) -> FlightPlan:
+        """The flight plan; once the vehicles are identified, with the margins that they have."""
+        ...
+
+    @property
+    def vehicles(self) -> list[RemoteVehicle]: ...
+
+    @property
+    def loop(self) -> Loop: ...
+
+    @property
+    def frame_ned_m(self) -> list[tuple[float, float, float]]:
+        """Where each vehicle's local frame begins, in that of the first vehicle."""
+        ...
+
+    @property
+    def speaks_mavlink_1_first(self) -> bool:
+        """Whether a vehicle may speak MAVLink 1 until it hears MAVLink 2."""
+        ...
+
+    @property
+    def holds_when_left_alone(self) -> bool:
+        """Whether a vehicle without set-points holds its velocity; the failsafe of an autopilot may be to fly on."""
+        ...
+
+    @property
+    def identified(self) -> bool:
+        """Whether the response of every vehicle is known."""
+        ...
+
+    def startup_failure(self, due_ns: int, start_ns: int) -> str:
+        """Why the start has to be given up: a vehicle cannot be flown, or its time is up. Empty to go on waiting."""
+        ...
+
+    def locate(self, history: StateHistory) -> None:
+        """Update `frame_ned_m` as the origins of the vehicles' frames become known."""
+        ...
+
+    def identify(self, due_ns: int, history: StateHistory) -> str:
+        """Advance the identification by one tick; returns why it failed, if it has."""
+        ...
+
+    def set_point(
+        self,
+        row: int,
+        control: VehicleControl,
+        phase: Phase,
+        *,
+        commanded: bool,
+        nominal_velocity_m_s: Vector,
+        key_ms: int,
+        due_ns: int,
+    ) -> tuple[Any, ...] | None:
+        """Fields of the set-point that a vehicle is sent at this tick, if any."""
+        ...
+
+
+def fleet_of(plan: FlightPlan, report: Report) -> FleetKind:
+    """The fleet that a plan is made for; `report` takes events of its vehicles as (kind, text, system id)."""
+    return (AutopilotFleet if plan.scenario.dynamics == "autopilot" else LaunchedFleet)(plan, report)
+
+
+class LaunchedFleet:
+    """Vehicles without autopilots: in the air from the beginning, in one frame, responding at once."""
+
+    speaks_mavlink_1_first = False
+    holds_when_left_alone = True
+    identified = True
+
+    def __init__(self, plan: FlightPlan, report: Report) -> None:
+        scenario = plan.scenario
+        self.plan = plan
+        self.loop = loop_of(plan)
+        self.vehicles = [
+            RemoteVehicle(
+                system_id,
+                startup=LaunchedStartup(scenario.rates.telemetry_hz, self.loop.parameters(system_id)),
+                report=report,
+                land=scenario.at_end == "land",
+            )
+            for system_id in plan.formation.system_ids
+        ]
+        self.frame_ned_m = [(0.0, 0.0, 0.0)] * len(self.vehicles)
+        self._patience_ns = patience_s(scenario) * NS_PER_S
+
+    def startup_failure(self, due_ns: int, start_ns: int) -> str:
+        late = [v for v in self.vehicles if not v.ready] if due_ns - start_ns > self._patience_ns else []
+        return refusals(self.vehicles) or in_words("not ready: ", late)
+
+    def locate(self, history: StateHistory) -> None:
+        """Nothing to do: all frames are the same."""
+
+    def identify(self, due_ns: int, history: StateHistory) -> str:  # noqa: ARG002 - nothing is to be found
+        return ""
+
+    def set_point(
+        self,
+        row: int,
+        control: VehicleControl,
+        phase: Phase,  # noqa: ARG002 - they take set-points in formation flight only
+        *,
+        commanded: bool,
+        nominal_velocity_m_s: Vector,
+        key_ms: int,
+        due_ns: int,  # noqa: ARG002
+    ) -> tuple[Any, ...] | None:
+        if not commanded:
+            return None
+        system_id = self.vehicles[row].system_id
+        return self.loop.set_point(system_id, control, nominal_velocity_m_s=nominal_velocity_m_s, key_ms=key_ms)

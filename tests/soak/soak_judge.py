@@ -1,0 +1,107 @@
+"""One experiment of the soak flown and judged: refused, or flown and checked by `soak_checks.py`."""
+
+import re
+import traceback
+from dataclasses import dataclass
+
+from gains.core.errors import DisagreementError, GainsError, SolverError
+from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_actions
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.stress.measure import fly_trial
+from gcs.stress.trial import Trial, sparse_gain
+from tests.soak.soak_checks import Broken, checked
+from tests.soak.soak_experiments import Experiment
+from tests.soak.soak_flight import fly
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of one experiment."""
+
+    broken: tuple[Broken, ...] = ()
+    refused: str = ""
+    """Why the scenario was not flown, without its numbers."""
+    ended: str = ""
+    """How the flight ended: the kind of its end, or what was judged of its margin."""
+
+
+class RefusalError(Exception):
+    """A scenario that is refused before take-off, as it has to be."""
+
+
+def judge(experiment: Experiment) -> Result:
+    """Fly an experiment and check everything."""
+    try:
+        plan = _plan(experiment)
+        if experiment.margin_ratio is not None:
+            return _margin_kept(plan, experiment.margin_ratio)
+        return _flown(experiment, plan)
+    except RefusalError as refused:
+        return Result(refused=str(refused))
+    except DisagreementError as error:
+        return Result((Broken("independent methods agree", str(error)),))
+    except Exception:  # noqa: BLE001 - whatever it is, it is what the soak looks for
+        return Result((Broken("no exception", traceback.format_exc()),))
+
+
+def _plan(experiment: Experiment) -> FlightPlan:
+    """The plan as `gcs fly` makes it."""
+    scenario = experiment.scenario
+    if (refusal := bad_start(scenario) or endless_link(scenario)) is not None:
+        raise RefusalError(_kind_of(refusal))
+    try:
+        _, plan = flight_plan(scenario)
+    except DisagreementError:
+        raise
+    except GainsError as error:
+        if isinstance(error, SolverError) and (scenario.control.gains or scenario.control.blocks):
+            raise
+        raise RefusalError(f"{type(error).__name__}: {_kind_of(str(error))}") from None
+    if (unstable := unstable_loop(plan)) is None:
+        return plan
+    if not experiment.allow_unstable:
+        raise RefusalError(_kind_of(unstable))
+    return without_actions(plan)
+
+
+def _kind_of(refusal: str) -> str:
+    """The first words of a refusal, without its numbers."""
+    return " ".join(re.sub(r"[-+±]?\d[\d.e+-]*j?", "#", refusal).replace(" ±", "").split()[:10])
+
+
+def _flown(experiment: Experiment, plan: FlightPlan) -> Result:
+    flown = fly(experiment, plan)
+    broken = list(checked(flown))
+    if experiment.twice and fly(experiment, plan).sha256 != flown.sha256:
+        broken.append(Broken("the same bytes twice", "a second flight differs"))
+    return Result(tuple(broken), ended=flown.stretches[-1].station.end_reason.split(":")[0])
+
+
+def _margin_kept(plan: FlightPlan, ratio: float) -> Result:
+    """Errors die away below nine tenths of the plan's margin, and grow above eleven tenths, and where there is none.
+
+    Judged by the growth rate that a campaign's probe fits to a flight in virtual time, at the loop delay it had.
+    """
+    margin_s, timing = plan.delay_margin_s, plan.timing
+    # what a state waits for the next tick, in the mean
+    wanted_s = ratio * min(margin_s, 2.0) - 0.5 * min(timing.control_s, timing.telemetry_s)
+    if margin_s == 0.0:
+        wanted_s = 0.0
+    elif wanted_s <= 0.0:
+        return Result(ended="margin: below half a period")
+    delayed = plan.scenario.with_link_delay(up_s=wanted_s / 2.0, down_s=wanted_s / 2.0)
+    found = fly_trial(Trial(delayed, sparse_gain(plan.gain), margin_s, "probe"))
+    if found.error is not None:
+        return Result((Broken("no exception", found.error),))
+    if found.growth_1_s is None or found.loop_delay_s is None:
+        return Result(ended=f"margin: no growth could be fitted{' to an unstable loop' if margin_s == 0.0 else ''}")
+    share = found.loop_delay_s / margin_s if margin_s > 0.0 else 2.0
+    growth, error = found.growth_1_s, found.growth_error_1_s
+    text = f"grows by {growth:.4f} 1/s (± {error}) at {share:.3f} of the margin of {margin_s:.4f} s"
+    # an integrator left to itself has no margin either, and its errors stay what they are
+    stays = -3.0 * (error or 0.0) - 1e-6 if margin_s == 0.0 else 0.0
+    if (share < 0.9 and growth > 0.0) or (share > 1.1 and growth < stays):
+        return Result((Broken("margin", text),))
+    where = "stable below" if share < 0.9 else "near it" if share <= 1.1 else "unstable above"
+    return Result(ended=f"margin: {where if margin_s > 0.0 else 'none, and unstable'}")
