@@ -50,8 +50,9 @@ class Requirement:
         and at half the margin, on board, where the delay has no end, at every delay. 1 lets no error grow down the
         chain and costs little α. Not limited if None.
     loop
-        The loop that is flown. On board the tree takes any delay, so that `delay_margin_s` limits a vehicle's own
-        gains alone: they are those that would take it if a ground station closed every loop.
+        The loop that is flown. On board a pattern without cycles takes any delay, so that `delay_margin_s` limits a
+        vehicle's own gains: they are those that would take it if a ground station closed their loops. On a pattern
+        with cycles the onboard loop must take it as well.
 
     Raises
     ------

@@ -37,6 +37,7 @@ from gains.performance.behaviour import (
 )
 from gains.performance.robust import Certificate, certify, robustness
 from gains.sampled.constant import sampled_delay_margin
+from gains.sampled.onboard import OnboardTiming
 
 PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
 # The certificate proves this share of α: at α itself the proof is on the edge of existence.
@@ -118,6 +119,7 @@ def design(
     period_s: float,
     method: GraphMethod,
     pattern: Pattern | None = None,
+    onboard: OnboardTiming | None = None,
 ) -> GraphDesign: ...
 
 
@@ -128,6 +130,7 @@ def design(
     period_s: float,
     method: Literal["inclusion"] | GraphMethod = "inclusion",
     pattern: Pattern | None = None,
+    onboard: OnboardTiming | None = None,
 ) -> Design | GraphDesign:
     """Return the gains that meet the requirement and are the best in what it leaves open.
 
@@ -142,8 +145,9 @@ def design(
         Period of the control loop: sample, hold.
     method
         The inclusion principle, or a method of the graph route, see `gains.design.graph`.
-    pattern
-        For the graph route, who may use whose output; the leader-follower pattern (4.6) if not given.
+    pattern, onboard
+        For the graph route: who may use whose output, the leader-follower pattern (4.6) if not given; and the timing of
+        the onboard loop, if that is flown.
 
     Raises
     ------
@@ -167,7 +171,7 @@ def design(
     """
     if method != "inclusion":
         links = leader_follower(formation) if pattern is None else pattern
-        return graph_design(formation, links, requirement, method=method, period_s=period_s)
+        return graph_design(formation, links, requirement, method=method, period_s=period_s, onboard=onboard)
     wanted = Requirement() if requirement is None else requirement
     _check_period(period_s)
     gains = required_gains(wanted, period_s)

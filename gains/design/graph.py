@@ -7,6 +7,11 @@ gains K_p / s² does the same things s times slower, so that its continuous dela
 rate s times smaller, exactly. The margin that is asked for is the sampled one, found by a few steps of a fixed-point
 iteration on s, as it is the continuous one less half a period to first order.
 
+The margin asked for is that of the loop that is flown. On board only the errors of other vehicles are late, and gains
+may rise without bound while the margin lasts; a pattern without cycles takes every delay. So there the vehicles' own
+gains must have the margin too, as if a ground station closed their loops, which is what bounds inclusion gains on
+board. Both margins change with the time scale as that of the ground loop does.
+
 What a slower or faster loop cannot give, its shape may: for the LQR route several ratios of the weights of spacing and
 velocity errors are tried, and the best in what the requirement leaves open is kept.
 
@@ -33,6 +38,7 @@ from gains.formation.model import FormationModel
 from gains.formation.pattern import Link, Pattern, Plant, checked_pattern_gain, formation_plant
 from gains.performance.robust import SolverFacts, disturbance_bound
 from gains.sampled.constant import sampled_delay_margin
+from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
 
 GraphMethod = Literal["graph-dk", "graph-lqr"]
 
@@ -98,7 +104,10 @@ class GraphDesign:
 
 @dataclass(frozen=True, eq=False)
 class _Base:
-    """A stabilising gain for one axis, with what does not depend on the time scale."""
+    """A stabilising gain for one axis, with what does not depend on the time scale.
+
+    `margin_s` is the continuous margin that a requirement bounds.
+    """
 
     K: FloatArray
     margin_s: float
@@ -114,6 +123,7 @@ def graph_design(
     *,
     method: GraphMethod,
     period_s: float,
+    onboard: OnboardTiming | None = None,
 ) -> GraphDesign:
     """Return a gain with the pattern that meets the requirement, the best in what it leaves open.
 
@@ -128,6 +138,9 @@ def graph_design(
         Where the base gain comes from.
     period_s
         Period of the control loop: sample, hold.
+    onboard
+        Timing of the onboard loop, if that is flown: its margin is then asked for, and that of the vehicles' own gains
+        late by themselves. The margins reported are those of the ground loop in any case.
 
     Raises
     ------
@@ -155,11 +168,17 @@ def graph_design(
     single = FormationModel(formation.predecessors, axes=1)
     plant, narrow = formation_plant(single), _narrowed(pattern, single)
     check_stabilisable(plant, narrow)
-    bases = list(_lqr_bases(plant, narrow, single) if method == "graph-lqr" else _dk_bases(plant, narrow))
+    found = _lqr_gains(plant, narrow, single) if method == "graph-lqr" else _dk_gains(plant, narrow)
+    loop = _FlownLoop(single, period_s, onboard)
+    bases = [base for gain in found if (base := _base(loop, *gain)).margin_s > 0.0]
+    if not bases:
+        raise InfeasibleError(
+            "no gains on this pattern leave each vehicle stable by its own errors alone, as the onboard loop wants"
+        )
     if wanted.delay_margin_s is not None:
-        base, scale = _at_margin(single, bases, wanted, period_s)
+        base, scale = _at_margin(loop, bases, wanted)
     else:
-        base, scale = _slowest(single, bases, wanted, period_s)
+        base, scale = _slowest(loop, bases, wanted)
     gain = time_scaled(single, base.K, scale)
     return _assess(
         formation, narrow, gain, period_s=period_s, requirement=wanted, method=method, loss=base.cost_loss,
@@ -223,7 +242,11 @@ def _narrowed(pattern: Pattern, single: FormationModel) -> Pattern:
     return Pattern(pattern.blocks, inputs, outputs)
 
 
-def _lqr_bases(plant: Plant, pattern: Pattern, single: FormationModel) -> Iterable[_Base]:
+_Found = tuple[FloatArray, float | None, SolverFacts | None]
+"""A base gain, its loss of cost and what the solver did."""
+
+
+def _lqr_gains(plant: Plant, pattern: Pattern, single: FormationModel) -> Iterable[_Found]:
     from gains.design.lqr import Weights
     from gains.design.structured_lqr import structured_lqr
 
@@ -232,25 +255,46 @@ def _lqr_bases(plant: Plant, pattern: Pattern, single: FormationModel) -> Iterab
         for i in single.followers:
             weight[single.spacing_slice(i)] = ratio
         found = structured_lqr(plant, pattern, Weights(np.diag(weight), np.eye(single.inputs)))
-        yield _base(plant, found.K, cost_loss=found.loss, solver=None)
+        yield found.K, found.loss, None
 
 
-def _dk_bases(plant: Plant, pattern: Pattern) -> Iterable[_Base]:
+def _dk_gains(plant: Plant, pattern: Pattern) -> Iterable[_Found]:
     from gains.design.dk_iteration import dk_iteration
 
     found = dk_iteration(plant, pattern)
-    yield _base(plant, found.K, cost_loss=None, solver=found.solver)
+    yield found.K, None, found.solver
 
 
-def _base(plant: Plant, K: FloatArray, *, cost_loss: float | None, solver: SolverFacts | None) -> _Base:
-    return _Base(K, delay_margin(plant.A, plant.B @ K), -abscissa(plant.closed_loop(K)), cost_loss, solver)
+def _base(loop: "_FlownLoop", K: FloatArray, loss: float | None, solver: SolverFacts | None) -> _Base:
+    return _Base(K, loop.continuous_margin_s(K), -abscissa(loop.model.A + loop.model.B @ K), loss, solver)
 
 
-def _at_margin(
-    single: FormationModel, bases: Sequence[_Base], wanted: Requirement, period_s: float
-) -> tuple[_Base, float]:
+@dataclass(frozen=True)
+class _FlownLoop:
+    """Where the loop is closed: the margins of a gain for one axis that a requirement bounds."""
+
+    model: FormationModel
+    period_s: float
+    onboard: OnboardTiming | None
+
+    def continuous_margin_s(self, K: FloatArray) -> float:
+        A, B = self.model.A, self.model.B
+        if self.onboard is None:
+            return delay_margin(A, B @ K)
+        own_s = delay_margin(A, B @ own_part(self.model, K))
+        return min(own_s, onboard_loop(self.model, K, self.onboard).continuous_margin_s())
+
+    def sampled_margin_s(self, K: FloatArray) -> float:
+        A, B = self.model.A, self.model.B
+        if self.onboard is None:
+            return float(sampled_delay_margin(A, B, K, period_s=self.period_s))
+        own_s = sampled_delay_margin(A, B, own_part(self.model, K), period_s=self.period_s)
+        return float(min(own_s, onboard_loop(self.model, K, self.onboard).sampled_margin_s()))
+
+
+def _at_margin(loop: _FlownLoop, bases: Sequence[_Base], wanted: Requirement) -> tuple[_Base, float]:
     """The most robust base that meets everything else, brought to the wanted margin."""
-    margin_s = wanted.delay_margin_s
+    margin_s, single, period_s = wanted.delay_margin_s, loop.model, loop.period_s
     assert margin_s is not None
     reached: list[tuple[float, float, _Base, float]] = []
     for base in bases:
@@ -265,7 +309,7 @@ def _at_margin(
         )
     _, _, base, scale = max(fitting, key=lambda entry: entry[0])
     for _ in range(_SCALING_STEPS):
-        found_s = sampled_delay_margin(single.A, single.B, time_scaled(single, base.K, scale), period_s=period_s)
+        found_s = loop.sampled_margin_s(time_scaled(single, base.K, scale))
         if margin_s <= found_s <= margin_s * (1.0 + _SPARE):
             return base, scale
         scale *= (margin_s * (1.0 + _SPARE / 2.0) + period_s / 2.0) / (found_s + period_s / 2.0)
@@ -275,10 +319,9 @@ def _at_margin(
     )
 
 
-def _slowest(
-    single: FormationModel, bases: Sequence[_Base], wanted: Requirement, period_s: float
-) -> tuple[_Base, float]:
+def _slowest(loop: _FlownLoop, bases: Sequence[_Base], wanted: Requirement) -> tuple[_Base, float]:
     """The base and time scale of largest margin that reach the wanted robustness and decay rate."""
+    single, period_s = loop.model, loop.period_s
 
     def good(base: _Base, scale: float) -> bool:
         return _meets(_alpha(single, base, scale), base.decay_rate_1_s / scale, wanted)
@@ -292,7 +335,7 @@ def _slowest(
         scale = _last_good(lambda s, base=base: good(base, s), low, low * float(_SCALES[1] / _SCALES[0]))
         if best is None or base.margin_s * scale > best[0]:
             best = base.margin_s * scale, base, scale
-    if best is None or sampled_delay_margin(single.A, single.B, _scaled(single, best), period_s=period_s) == 0.0:
+    if best is None or loop.sampled_margin_s(time_scaled(single, best[1].K, best[2])) == 0.0:
         flown = [(base, float(scale)) for base in bases for scale in _SCALES if base.margin_s * scale > period_s / 2.0]
         alpha = max(_alpha(single, base, scale) for base, scale in flown)
         decay = max(base.decay_rate_1_s / scale for base, scale in flown)
@@ -301,10 +344,6 @@ def _slowest(
             f"{_reached(alpha, decay, wanted)} at most; lower that, or period_s, or add links"
         )
     return best[1], best[2]
-
-
-def _scaled(single: FormationModel, best: tuple[float, _Base, float]) -> FloatArray:
-    return time_scaled(single, best[1].K, best[2])
 
 
 def _last_good(good: Callable[[float], bool], low: float, high: float) -> float:

@@ -110,13 +110,15 @@ def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
     return BlockMargin(analysis.delay_margin_s, first.omega_rad_s if first else float("nan"))
 
 
-def behaviour(gains: Gains, delay_s: float) -> Behaviour:
+def behaviour(gains: Gains, delay_s: float, *, own_delay_s: float | None = None) -> Behaviour:
     """Behaviour of a formation whose leader and followers have the gains K1, K2, K3, each of shape (axes, axes).
 
     Parameters
     ----------
     delay_s
         Constant delay of all feedback for the figures with delay.
+    own_delay_s
+        That of a vehicle's own errors, where only those of the vehicle in front are late by `delay_s`.
 
     Examples
     --------
@@ -129,14 +131,15 @@ def behaviour(gains: Gains, delay_s: float) -> Behaviour:
     (0.5, 0.5)
     """
     roots = np.linalg.eigvals(subsystem_loop(*gains))
-    late = [rightmost_root([(A0, 0.0), (A1, delay_s)]) for A0, A1 in (leader_block(gains), follower_block(gains))]
+    own_s = delay_s if own_delay_s is None else own_delay_s
+    late = [rightmost_root([(A0, 0.0), (A1, own_s)]) for A0, A1 in (leader_block(gains), follower_block(gains))]
     return Behaviour(
         decay_rate_1_s=float(-roots.real.max()),
         damping=min(_damping(root) for root in roots.tolist()),
         decay_rate_delayed_1_s=float(-max(root.real for root in late)),
         damping_delayed=_damping(late[1]),
         string_peak=string_peak(gains, 0.0),
-        string_peak_delayed=string_peak(gains, delay_s),
+        string_peak_delayed=string_peak(gains, own_s, front_delay_s=delay_s),
         delay_s=delay_s,
     )
 

@@ -86,7 +86,8 @@ class FlownFormation:
         return np.concatenate([[0.0], np.geomspace(self._slowest * 10.0**-_DECADES_BELOW, highest, _FREQUENCIES)])
 
     def singular_value(self, omega: FloatArray, delay_s: float) -> FloatArray:
-        return np.linalg.svd(self.characteristic(omega, delay_s), compute_uv=False)[:, -1]
+        sigma = np.linalg.svd(self.characteristic(omega, delay_s), compute_uv=False)
+        return sigma[:, -1].astype(np.float64)
 
     def characteristic(self, omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
         """jωI − A − B h (K_own e^{−jωτ_own} + K_others e^{−jω(τ + T/2)}), shape (k, n, n); h are the responses.
@@ -103,10 +104,9 @@ class FlownFormation:
     @cached_property
     def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A, B K_own and B K_others."""
-        K, axes = self.K, self.model.axes
         model = self._model
-        if model is not self.model:
-            K = K[::axes, ::axes]
+        step = self.model.axes // model.axes
+        K = self.K[::step, ::step]
         own = own_part(model, K)
         return model.A, model.B @ own, model.B @ (K - own)
 

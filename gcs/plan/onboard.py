@@ -6,14 +6,16 @@ station computes the second and sends it as the acceleration of SET_POSITION_TAR
 autopilots understand it, with the formation's velocity v_d as the velocity.
 """
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gains.core.requirement import plain
 from gains.formation.model import FormationModel
+from gains.performance.behaviour import behaviour
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
-from gcs.plan.design import Design, GainSet, OnboardPart
+from gcs.plan.design import Behaviour, Design, GainSet, OnboardPart
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation
 from scenarios.schema import Scenario
@@ -67,7 +69,17 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
         slower=tuple(zip(gains[1:], sampled_s[1:], strict=True)),
         around_loss=() if plan.separable else (own,) * len(gains),
     )
-    return design.with_schedule(schedule, loop="onboard", onboard=onboard), flown
+    step_s = 1.0 / plan.scenario.onboard.rate_hz
+    return _with_behaviour(design, step_s).with_schedule(schedule, loop="onboard", onboard=onboard), flown
+
+
+def _with_behaviour(design: Design, step_s: float) -> Design:
+    """The design with the behaviour of inclusion gains in the loop that is flown, at the delay of the ground loop's."""
+    if design.inclusion_gains is None or design.behaviour is None:
+        return design
+    own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
+    found = behaviour((own, front, spacing), design.behaviour.delay_s, own_delay_s=step_s / 2.0)
+    return design.model_copy(update={"behaviour": Behaviour.model_validate(plain(asdict(found)))})
 
 
 def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, float]:

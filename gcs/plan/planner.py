@@ -20,7 +20,7 @@ from gcs.plan.at_delay import with_figures_at_delay
 from gcs.plan.design import Block, Design, GainSet, ResponsePart, VehicleResponse
 from gcs.plan.flight_plan import FlightPlan, loop_timing
 from gcs.plan.formation import Formation, plan_formation
-from gcs.plan.onboard import onboard_plan
+from gcs.plan.onboard import onboard_plan, timing_of
 from gcs.plan.responses import Responses, given_responses, margins_with
 from scenarios.schema import Scenario
 
@@ -164,9 +164,10 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
     else:
         assert control.method != "inclusion"
         wanted = _requirement(scenario)
-        found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
+        onboard = timing_of(scenario)
+        found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s, onboard=onboard)
         short_s = (wanted.delay_margin_s or 0.0) - sampled_margin(model, found.K, None, timing=timing)
-        if timing.commands > 1 and short_s > 0.0:
+        if onboard is None and timing.commands > 1 and short_s > 0.0:
             wanted = replace(wanted, delay_margin_s=(wanted.delay_margin_s or 0.0) + _MORE * short_s)
             found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
     scales = scenario.monitor.time_scales

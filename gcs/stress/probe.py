@@ -23,20 +23,34 @@ What would hide the loop is taken out:
   `past_limits` says when they do.
 """
 
+from math import ceil, isfinite
+
 import numpy as np
 
 from gains.core.arrays import FloatArray
 from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import TickArray
 from gcs.plan.flight_plan import FlightPlan
+from gcs.stress.axes import has_constant_links
 from scenarios.schema import Limits, Link, Safety, Scenario, Vehicle
 
 PROBE_S = 20.0
+"""How long a probe is flown, if that is enough."""
+_RANDOM_LOOP_DELAYS, _LONGEST_S = 66.0, 120.0
+"""On links that lose or delay at random a probe shows a mean rate, the better the more loop delays it lasts; up to so
+many seconds."""
 _SPEED_MIN_M_S = 1e-3
 """The kinematics are singular at speed 0 only."""
 _DIRECTION_NE = np.array([1.0, -0.8])
 """Of a probe's error: no diagonal, as gains that couple north and east have modes in just these; and near one, as two
 modes that are nearly the same are told apart badly where both are large."""
+
+
+def probe_duration_s(plan: FlightPlan) -> float:
+    """How long a probe is flown: on random links so many loop delays at the margin, where that is more."""
+    if has_constant_links(plan.scenario) or not isfinite(plan.delay_margin_s):
+        return PROBE_S
+    return max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
 
 
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
@@ -47,7 +61,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     The error is in the position of a follower (m) and in the velocity of the leader (m/s), whose position is not
     controlled; in `_DIRECTION_NE`, and different for each vehicle.
     """
-    scenario, place = plan.scenario, plan.formation.place_ne_m()
+    scenario, place, duration_s = plan.scenario, plan.formation.place_ne_m(), probe_duration_s(plan)
     row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
     vehicles: list[Vehicle] = []
@@ -67,12 +81,12 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         "vehicles": tuple(vehicles),
         "nominal_velocity": scenario.nominal_velocity[:1],
         "limits": Limits(speed_min_m_s=_SPEED_MIN_M_S),
-        "duration_s": PROBE_S,
+        "duration_s": duration_s,
         "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
         "safety": scenario.safety.model_copy(
             update={
-                "setpoint_timeout_s": 2.0 * PROBE_S,
-                "heartbeat_timeout_s": 2.0 * PROBE_S,
+                "setpoint_timeout_s": 2.0 * duration_s,
+                "heartbeat_timeout_s": 2.0 * duration_s,
                 "spacing_error_limit_m": Safety().spacing_error_limit_m,
             }
         ),

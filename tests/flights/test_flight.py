@@ -253,7 +253,8 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
     control = scenario.control.model_copy(
         update={"delay_margin_s": None, "gains": FixedGains(K1=-20.0, K2=0.0, K3=150.0)}
     )
-    plan, design = planned("chain3", control=control, monitor=Monitor(act=False))
+    # within limits the errors end in a small cycle, inside the band of those that count as settled
+    plan, design = planned("chain3", control=control, monitor=Monitor(act=False), limits=Limits())
     assert design.margins_s[0] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
     _, summary = flown(plan, design)
     assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design.margins_s[0]
@@ -311,18 +312,25 @@ def test_a_wide_start_is_flown_at_three_g_and_comes_together() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limit_m", "acts", "verdict", "most_m"),
-    [(10.0, True, "unstable", 10.5), (300.0, True, "stable", 40.0), (300.0, False, "unstable", 310.0)],
+    ("limit_m", "acts", "reason"),
+    [
+        (10.0, True, "broken: spacing error of vehicle 5 is 10 m, limit 10 m"),
+        (300.0, True, "completed: duration reached"),
+        (300.0, False, "broken: spacing error of vehicle 5 is 301 m, limit 300 m"),
+    ],
 )
 def test_what_breaks_triangle5_far_above_its_margin_is_its_tolerance_or_a_station_that_may_not_act(
-    limit_m: float, acts: bool, verdict: str, most_m: float
+    limit_m: float, acts: bool, reason: str
 ) -> None:
     """With time to change to slower gains the monitor saves it: what scenarios/triangle5.toml says of its limit."""
     plan, design = planned("triangle5", monitor=Monitor(act=acts))
     late = plan.scenario.with_link_delay(up_s=0.4, down_s=0.4)
     safety = late.safety.model_copy(update={"spacing_error_limit_m": limit_m})
     ticks, summary = flown(replace(plan, scenario=late.model_copy(update={"safety": safety})), design)
-    assert summary["verdict"] == verdict
-    while_flown = ticks[ticks["mode"] != Mode.FAILSAFE]
-    error = np.hypot(while_flown["spacing_error_north_m"], while_flown["spacing_error_east_m"])
-    assert np.nanmax(error) < most_m
+    assert summary["reason"] == reason
+    saved = limit_m == 300.0 and acts
+    assert summary["verdict"] == ("stable" if saved else "unstable")
+    if saved:
+        error = np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])
+        assert np.nanmax(error) == pytest.approx(29.0, abs=1.0)
+        assert 11.0 < summary["settling_time_s"] < 15.0

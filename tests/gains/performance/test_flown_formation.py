@@ -92,7 +92,8 @@ def test_a_leader_with_one_follower_is_the_loop_that_is_known_in_closed_form() -
     pair, gains = FormationModel((-1, 0)), ScalarGains(3.4, 0.6, 5.6, 0.0)
     K = pair.overlapping_gain(-gains.k1 * np.eye(2), gains.k2 * np.eye(2), gains.k3 * np.eye(2))
     answer = Response(0.05, 1.5)
-    for loop, step_s, margin_s in (("ground", 0.0, 0.3), ("onboard", STEP_S, inf)):
+    flown_where: list[tuple[Loop, float, float]] = [("ground", 0.0, 0.3), ("onboard", STEP_S, inf)]
+    for loop, step_s, margin_s in flown_where:
         for response, responses in ((None, None), (answer, (answer, answer))):
             matrix = FlownFormation(pair, K, margin_s, PERIOD_S, loop, step_s, responses)
             formula = FlownLoop(gains, margin_s, PERIOD_S, loop, step_s, response)

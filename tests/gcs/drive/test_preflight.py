@@ -125,7 +125,7 @@ def test_vehicles_that_start_in_collision_or_past_the_limit_are_found_before_tak
         assert "read vehicles 2 and 3 3 m apart, wanted at least safety.collision_distance_m = 5 m" in line
     assert flight_plan(load(near))[1].delay_margin_s > 0.29  # designed all the same
     far = chain_file(tmp_path, ("[-242.79, 243.09]", "[-2242.79, 243.09]"))
-    assert "read vehicle 3 with a spacing error of 1974" in complaint(capsys, monkeypatch, "fly", str(far))
+    assert "read vehicle 3 with a spacing error of 1998" in complaint(capsys, monkeypatch, "fly", str(far))
 
 
 def test_a_link_slower_than_the_flight_waits_for_is_found_before_take_off(

@@ -17,6 +17,7 @@ from gcs.stress.free_response import FreeResponse, fly_calm, response_paired
 from gcs.stress.growth import CHANNELS
 from gcs.stress.measure import fly_trial
 from gcs.stress.onset import Loop
+from gcs.stress.probe import in_place
 from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
 from scenarios.schema import Limits, Link, VehicleLinks
@@ -192,3 +193,16 @@ def test_loss_is_predicted_by_the_effective_delay_and_not_by_the_median() -> Non
     assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=0.05)
     assert without.growth_1_s is not None
     assert outcome.growth_1_s - without.growth_1_s > 0.2
+
+
+def test_a_probe_lasts_as_many_loop_delays_whatever_the_margin_if_links_are_random() -> None:
+    """Its rate is a mean over the delays drawn: 20 s at a margin of 1.5 s left it wrong by the whole curve's range."""
+
+    def duration_s(margin_s: float, **coordinates: float) -> float:
+        plan = replace(plan_with(**coordinates), delay_margin_s=margin_s)
+        return in_place(plan, (1,), amplitude=1e-3).duration_s
+
+    assert duration_s(0.3, jitter=0.02) == 20.0
+    assert duration_s(1.5, jitter=0.02) == duration_s(1.5, loss=0.03) == 99.0
+    assert duration_s(30.0, jitter=0.02) == 120.0
+    assert duration_s(1.5) == duration_s(np.inf, jitter=0.02) == 20.0
