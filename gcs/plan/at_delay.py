@@ -129,13 +129,13 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
     first = np.array(design.K)
     if design.loop == "onboard":
         own = own_part(model, first)
-        flown = own + entry.streamed_share * (first - own)
+        gain = own + entry.streamed_share * (first - own)
     else:
-        flown = time_scaled(model, first, entry.time_scale)
+        gain = time_scaled(model, first, entry.time_scale)
     answers = _responses(design)
     return FlownFormation(
         model,
-        flown,
+        gain,
         delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
         period_s=design.period_s,
         loop=design.loop,

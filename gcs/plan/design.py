@@ -49,7 +49,7 @@ class Behaviour(_Part):
     damping_delayed: float | None
     string_peak: float | None
     string_peak_delayed: float | None
-    delay_s: float | None
+    delay_s: float
 
 
 class Proof(_Part):

@@ -69,18 +69,17 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
         slower=tuple(zip(gains[1:], sampled_s[1:], strict=True)),
         around_loss=() if plan.separable else (own,) * len(gains),
     )
-    parts = {"loop": "onboard", "onboard": onboard} | _onboard_behaviour(design, plan.scenario)
-    return design.with_schedule(schedule, **parts), flown
+    step_s = 1.0 / plan.scenario.onboard.rate_hz
+    return _with_behaviour(design, step_s).with_schedule(schedule, loop="onboard", onboard=onboard), flown
 
 
-def _onboard_behaviour(design: Design, scenario: Scenario) -> dict[str, Behaviour]:
-    """The behaviour of inclusion gains in the onboard loop, at the delay the design chose for the ground loop."""
-    if design.behaviour is None or design.inclusion_gains is None:
-        return {}
+def _with_behaviour(design: Design, step_s: float) -> Design:
+    """The design with the behaviour of inclusion gains in the loop that is flown, at the delay of the ground loop's."""
+    if design.inclusion_gains is None or design.behaviour is None:
+        return design
     own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
-    step_s = 1.0 / scenario.onboard.rate_hz
-    found = behaviour((own, front, spacing), design.behaviour.delay_s or 0.0, own_delay_s=step_s / 2.0)
-    return {"behaviour": Behaviour.model_validate(plain(asdict(found)))}
+    found = behaviour((own, front, spacing), design.behaviour.delay_s, own_delay_s=step_s / 2.0)
+    return design.model_copy(update={"behaviour": Behaviour.model_validate(plain(asdict(found)))})
 
 
 def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, float]:

@@ -123,8 +123,8 @@ def test_the_scenario_s_graph_design_is_that_of_its_loop() -> None:
     assert found.delay_margin_s == pytest.approx(plan.delay_margin_s)
     assert 0.3 <= plan.delay_margin_s < 1.0
     assert found.onboard is not None
-    assert found.requirement is not None
     assert (found.onboard.ground_delay_margin_s or 1.0) < 0.25
+    assert found.requirement is not None
     assert found.requirement.loop == "onboard"
 
 
@@ -135,13 +135,15 @@ def test_behaviour_at_a_delay_is_that_of_the_onboard_loop() -> None:
     found, plan = flight_plan(scenario)
     told = found.behaviour
     assert told is not None
-    gains, delay_s = ScalarGains(3.4, 0.9, 5.6, 0.0), told.delay_s or 0.0
+    assert told.decay_rate_delayed_1_s is not None
+    assert told.string_peak_delayed is not None
+    gains, delay_s = ScalarGains(3.4, 0.9, 5.6, 0.0), told.delay_s
     timing = timing_of(scenario)
     assert timing is not None
     sampled = onboard_loop(plan.model, plan.gain, timing).growth_1_s(delay_s)
     assert told.decay_rate_delayed_1_s == pytest.approx(-sampled, rel=0.02)
     assert told.string_peak_delayed == pytest.approx(growth(gains, delay_s), abs=2e-3)
-    assert (told.string_peak_delayed or 0.0) > 1.005
+    assert told.string_peak_delayed > 1.005
     ground, _ = flight_plan(scenario.model_copy(update={"control": given.model_copy(update={"loop": "ground"})}))
     assert ground.behaviour is not None
-    assert abs((ground.behaviour.decay_rate_delayed_1_s or 0.0) - (told.decay_rate_delayed_1_s or 0.0)) > 0.2
+    assert abs((ground.behaviour.decay_rate_delayed_1_s or 0.0) - told.decay_rate_delayed_1_s) > 0.2
