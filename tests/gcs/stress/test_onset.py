@@ -18,7 +18,7 @@ def tree_loops(period_s: float = 0.02) -> list[Loop]:
     return loops_of(TREE, (1, 2, 3, 4, 5), K, timing=Timing(period_s, period_s))
 
 
-def test_every_vehicle_of_a_tree_is_a_loop_of_its_own_and_followers_are_alike() -> None:
+def test_every_vehicle_of_a_tree_is_its_own_loop() -> None:
     loops = tree_loops()
     assert sorted(loop.system_ids for loop in loops) == [(1,), (2,), (3,), (4,), (5,)]
     leader, follower = distinct(loops)
@@ -47,7 +47,7 @@ def test_models_meet_the_closed_formulas_at_a_short_period() -> None:
         assert loop.growth_continuous_1_s(at_s) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_critical_loop_is_the_one_that_grows_most_at_its_own_delay() -> None:
+def test_the_critical_loop_grows_most_at_its_own_delay() -> None:
     loops = tree_loops()
     delays = {1: 0.25, 2: 0.25, 3: 0.25, 4: 0.28, 5: 0.27}
     assert critical_loop(loops, delays).system_ids == (4,)
@@ -73,7 +73,7 @@ def test_zero_of_a_bent_curve(half_width_s: float, allowed_s: float) -> None:
     assert zero.slope_1_s2 == pytest.approx(8.0, rel=1e-6)
 
 
-def test_the_error_of_the_zero_is_that_of_the_rates_over_the_slope() -> None:
+def test_the_zeros_error_is_the_rates_error_over_the_slope() -> None:
     rng = np.random.default_rng(5)
     noise, delays = 0.05, np.linspace(0.28, 0.32, 5)
     off: list[float] = []
@@ -85,7 +85,7 @@ def test_the_error_of_the_zero_is_that_of_the_rates_over_the_slope() -> None:
     assert 0.7 < float(np.std(off)) < 1.4
 
 
-def test_flights_over_a_kink_are_said_to_lie_on_no_parabola_and_the_error_says_so() -> None:
+def test_flights_over_a_kink_show_a_misfit_and_larger_error() -> None:
     """As the sampled loop has at whole numbers of periods: slopes of 18 and 14 1/s², seen of a graph-dk design."""
     for half_width_s, smooth in ((0.004, False), (0.0002, False), (0.004, True)):
         delays = 0.2 + half_width_s * np.linspace(-1.0, 0.8, 5)
