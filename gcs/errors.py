@@ -1,4 +1,4 @@
-"""Errors that a user is shown: one line with what was read and what was wanted."""
+"""The error that a user is shown as one line."""
 
 
 class InputError(Exception):

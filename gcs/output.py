@@ -1,4 +1,4 @@
-"""Standard output that may go away: a reader that has enough, as `head`, a closed terminal, a full disk."""
+"""Standard output that may go away: its reader has enough, as `head`, the terminal closes, or the disk is full."""
 
 import errno
 import io
@@ -10,22 +10,22 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Of an OSError: nothing more can be written there."""
+"""Numbers of an OSError after which nothing more can be written."""
 _GONE = (*DISK_FULL, errno.EPIPE, errno.EIO, errno.EBADF)
 _STANDARD = (0, 1, 2)
 
 
 def open_what_is_closed() -> None:
-    """Open nothing in place of standard files that are closed: a socket that got such a number would be printed to."""
+    """Open /dev/null for closed standard files: otherwise a socket may get such a number, and be printed to."""
     for number in _STANDARD:
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the least number that is free
+            os.open(os.devnull, os.O_RDWR)  # gets the least free number, which is this one
 
 
 def outlive_readers() -> None:
-    """From now on what is printed is dropped once nobody takes it any more, and no print raises."""
+    """From now on no print raises: once nobody reads the output, it is dropped."""
     if sys.stdout is sys.__stdout__:
         sys.stdout = _unfailing(1, sys.stdout)
     if sys.stderr is sys.__stderr__:
@@ -47,7 +47,7 @@ class _Unfailing(io.FileIO):
 
 
 def _unfailing(number: int, former: TextIO | None) -> io.TextIOWrapper:
-    """In place of the former, which is None if the file was closed at the start."""
+    """A replacement for a standard file; `former` is None if it was closed at the start."""
     return io.TextIOWrapper(
         io.BufferedWriter(_Unfailing(number, "w", closefd=False)),
         encoding="utf-8" if former is None else former.encoding,

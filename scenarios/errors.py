@@ -1,10 +1,10 @@
-"""The error that scenario files raise, apart from what reads them: whoever only names it need not wait for that."""
+"""The error of scenario files, in a module of its own so that naming it does not import what reads them."""
 
 from pathlib import Path
 
 
 class ScenarioError(Exception):
-    """A scenario that cannot be flown."""
+    """The scenario cannot be flown: one line with file, key, what was read and what was wanted."""
 
     def __init__(self, file: Path, key: str, read: object, wanted: str) -> None:
         shown = " ".join(repr(read).split())

@@ -1,6 +1,6 @@
 """Read a scenario file strictly, and write one.
 
-The one error is ScenarioError: file, key, what was read, what was wanted, in one line.
+Every fault is a ScenarioError: one line with file, key, what was read and what was wanted.
 """
 
 import csv
@@ -26,7 +26,7 @@ TRACE_COLUMN = "delay_s"
 
 
 def load(path: Path) -> Scenario:
-    """The scenario in a TOML file, checked whole.
+    """The scenario in a TOML file, fully checked.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def parse(text: str, file: Path) -> Scenario:
     except ValueError as error:  # a TOMLDecodeError, or a number of thousands of digits
         raise ScenarioError(file, "file", str(error), "valid TOML") from None
     try:
-        # TOML arrays become Python lists; strict validation from JSON text takes them as tuples.
+        # TOML arrays become Python lists, which strict validation accepts as tuples only from JSON text.
         scenario = Scenario.model_validate_json(_json(data))
     except ValidationError as errors:
         raise _at_line(file, text, data, *_first_error(errors, data)) from None
@@ -64,7 +64,7 @@ def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path
     Raises
     ------
     ScenarioError
-        If it cannot be flown so.
+        If the scenario cannot be flown with this loop.
     """
     control = scenario.control.model_copy(update={"loop": loop})
     changed = scenario.model_copy(update={"control": control})
@@ -81,18 +81,18 @@ def dump(scenario: Scenario) -> str:
 
 
 def fingerprint(scenario: Scenario) -> str:
-    """Sixteen hexadecimal digits that tell scenarios apart: vehicles, links, seed and everything else in them."""
+    """Sixteen hexadecimal digits that identify a scenario with all of its keys."""
     return hashlib.sha256(scenario.model_dump_json(exclude_none=True).encode()).hexdigest()[:16]
 
 
 def _json(data: dict[str, Any]) -> str:
     import json
 
-    return json.dumps(data, default=str)  # a TOML date becomes a string, which no key of the schema takes as a number
+    return json.dumps(data, default=str)  # a TOML date becomes a string, which no numeric key accepts
 
 
 def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object, wanted: str) -> ScenarioError:
-    """The error with the line of the file, and vehicles by their system ids."""
+    """The error, with the line in the file and the system id in place of a vehicle's index."""
     line, key = line_of(text, location_of(key.split(" (", maxsplit=1)[0])), named(key, data)
     if line is not None:
         key = f"{key[:-1]}, line {line})" if key.endswith(")") else f"{key} (line {line})"
@@ -100,11 +100,11 @@ def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object
 
 
 def _first_error(errors: ValidationError, data: dict[str, Any]) -> tuple[str, object, str]:
-    """The first of pydantic's findings: key, what was read, what was wanted."""
+    """The first of pydantic's errors: key, what was read, what was wanted."""
     found = errors.errors()
     first = next(
         (e for e in found if e["type"] == "extra_forbidden"), found[0]
-    )  # a misspelt key explains a missing one
+    )  # a misspelt key explains the missing one
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
     if first["type"] == "extra_forbidden":
         name = str(first["loc"][-1])
@@ -144,7 +144,7 @@ def _value_at(data: Any, location: tuple[int | str, ...]) -> object:
 
 
 def _contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
-    """What no single key can show: (key, what was read, what was wanted)."""
+    """Faults that no single key shows: (key, what was read, what was wanted)."""
     yield from _formation_contradictions(scenario)
     yield from _velocity_contradictions(scenario)
     yield from _links_contradictions(scenario)
@@ -349,7 +349,7 @@ def _jitter_contradictions(key: str, jitter: Jitter) -> Iterator[tuple[str, obje
 
 
 def _with_traces(scenario: Scenario, file: Path) -> Scenario:
-    """The scenario with the delays themselves in place of the names of trace files: it stays whole when it is moved."""
+    """The scenario with delays in place of the names of trace files, so that it is complete without them."""
 
     def read(key: str, link: Link | None) -> Link | None:
         if link is None or link.jitter is None or link.jitter.trace_file is None:

@@ -1,4 +1,4 @@
-"""Where in a scenario file something is, and what a key wants, in words for who wrote the file."""
+"""Where in a scenario file a key stands, and what its value must be, in words for the author of the file."""
 
 import re
 from collections import Counter
@@ -12,12 +12,12 @@ _PART = re.compile(r"([\w-]+)|\[(\d+)\]")
 
 
 def location_of(key: str) -> Location:
-    """The place that a key as "vehicles[1].follows" names."""
+    """The location that a key such as "vehicles[1].follows" names."""
     return tuple(name or int(number) for name, number in _PART.findall(key))
 
 
 def line_of(text: str, location: Location) -> int | None:
-    """The line of a TOML text, from 1, that holds a place or, where it has none of its own, the part around it."""
+    """The line of a TOML text, from 1, of a location, or of the part around it if it has no line of its own."""
     lines: dict[Location, int] = {}
     tables: Counter[Location] = Counter()
     table: Location = ()
@@ -40,7 +40,7 @@ def line_of(text: str, location: Location) -> int | None:
 
 
 def named(key: str, data: Mapping[str, Any]) -> str:
-    """A key with a vehicle called by its system id, as "vehicle 2: follows" for "vehicles[1].follows"."""
+    """A key with a vehicle's system id in place of its index: "vehicle 2: follows" for "vehicles[1].follows"."""
     match location_of(key):
         case ("vehicles", int(k), *_):
             kind, whole = "vehicle", data.get("vehicles")
@@ -78,9 +78,9 @@ _WANTED = {
     "model_attributes_type": "a table of keys",
     "dict_type": "a table of keys",
 }
-"""Of the errors that pydantic finds with the types of the schema."""
+"""What was wanted, by the type of pydantic's error."""
 
 
 def wanted_of(error: Mapping[str, Any]) -> str:
-    """What was wanted where pydantic found an error, in plain words."""
+    """What was wanted at one of pydantic's errors, in plain words."""
     return _WANTED[error["type"]].format(**error.get("ctx", {}))

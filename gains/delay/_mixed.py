@@ -112,7 +112,7 @@ def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_
     >>> count_unstable_roots([([[-1]], 2.0)])
     2
     """
-    checked = [DelayedTerm(matrix, delay_s, 0) for matrix, delay_s in terms]
+    checked = [DelayedTerm(np.asarray(matrix, dtype=np.float64), delay_s, 0) for matrix, delay_s in terms]
     blocks, delays_s = distinct_blocks(*_checked(checked)), np.array([term.known_s for term in checked])
     count = 0
     for block in blocks:

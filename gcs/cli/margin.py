@@ -1,6 +1,6 @@
-"""`gcs margin`: how much delay any linear loop takes, read from a JSON model or a scenario and printed.
+"""What `gcs margin` reads and prints: the delay margin of a JSON model or of a scenario's loop.
 
-The mathematics is `gains.margin.loop_margin`.
+The mathematics is in `gains.margin.loop_margin`.
 """
 
 from fractions import Fraction
@@ -14,8 +14,8 @@ from gains.core.errors import BadModelError
 from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
 from gains.margin.model_file import DelayModel, HeldModel, Term, parse_model
 
-# rows of a table on the terminal
 _ROWS = 20
+"""Most rows of a table."""
 
 
 class ModelFileError(BadModelError):
@@ -23,7 +23,7 @@ class ModelFileError(BadModelError):
 
 
 def margin_of_file(file: Path) -> dict[str, Any]:
-    """What `gcs margin` prints, as plain types; an unbounded number is None.
+    """The margin of a JSON model as plain types; an unbounded number is None.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def margin_of_file(file: Path) -> dict[str, Any]:
 
 
 def margin_of_scenario(file: Path) -> dict[str, Any]:
-    """The same for the loop that a scenario flies: the continuous model in full, and the margin as flown.
+    """The margin of the loop that a scenario flies: of the continuous model, and as flown, sampled and held.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def margin_of_scenario(file: Path) -> dict[str, Any]:
 
 
 def margin_of_model(model: DelayModel | HeldModel) -> dict[str, Any]:
-    """The result for one model; exceptions of the analyses as they are."""
+    """The margin of one model as plain types."""
     found = loop_margin(model)
     if isinstance(found, LoopAtGivenDelays):
         return _plain_at_given_delays(found)
@@ -117,7 +117,7 @@ def _plain_crossing(crossing: MarginCrossing) -> dict[str, Any]:
 
 
 def print_margin(result: dict[str, Any]) -> None:
-    """The result as a short table on the terminal."""
+    """Print the verdict, the crossings and the notes."""
     from rich.table import Table
 
     from gcs.views.console import plain_console
@@ -133,7 +133,7 @@ def print_margin(result: dict[str, Any]) -> None:
         for crossing in result["crossings"][:_ROWS]:
             way = {1: "right: unstable", -1: "left: stable", 0: "touch"}[crossing["direction"]]
             delay_s = as_known(crossing["delay_s"], crossing["delay_error_s"] or 0.0)
-            # both are known to about as many digits
+            # both have about the same relative error
             share = (crossing["delay_error_s"] or 0.0) / max(crossing["delay_s"], 1e-300)
             omega = as_known(crossing["omega_rad_s"], share * crossing["omega_rad_s"])
             table.add_row(omega, delay_s, way)
@@ -173,14 +173,14 @@ def _margin_line(margin_s: float | None, error_s: float) -> str:
 
 
 def _end(result: dict[str, Any], end_s: float | None) -> str:
-    """One end of a window, with the digits that are known of the crossing there."""
+    """One end of a window, with as many digits as are known of the crossing there."""
     if end_s is None:
         return "any delay"
     error_s = 0.0
     for crossing in result["crossings"]:
         turns = (end_s - crossing["delay_s"]) / crossing.get("repeats_every_s", inf)
         if abs(turns - round(turns)) * crossing.get("repeats_every_s", end_s) <= 1e-9 * end_s:
-            # an error of the frequency counts once more with every turn
+            # every further turn adds the error of the frequency once
             error_s = max(error_s, (crossing["delay_error_s"] or 0.0) * (1.0 + abs(turns)))
     return f"{as_known(end_s, error_s)} s"
 

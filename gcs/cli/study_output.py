@@ -20,7 +20,7 @@ _WHOLE_CORE = 0.95
 
 
 def print_comparison(scenario: Scenario, routes: list[Route], grown: list[DesignCost]) -> None:
-    """The tables on the terminal."""
+    """Print each route's figures side by side, and what designs cost as the formation grows."""
     console = plain_console()
     title = f"{scenario.name}: designed for what it asks for, flown over its links"
     table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="")
@@ -44,7 +44,7 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Design
 
 
 def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
-    """For each rate the largest formation that is carried, and the one that is not."""
+    """Print, for each rate, the largest formation that is carried and the next, which is not."""
     console = plain_console()
     table = Table(box=box.SIMPLE_HEAD, title=f"{scenario.name}: what its links carry", title_justify="left")
     for heading in ("Hz", "UAVs", "loop delay, ms\np50  p99", "margin\nms", "byte/s", "lost, %\nup  down", ""):
@@ -78,6 +78,7 @@ def _row(load: Load) -> list[str]:
 
 
 def print_benchmark(result: dict[str, Any]) -> None:
+    """Print how much faster than real time flights are, and the station's share of its period."""
     how = "compiled" if result["compiled"] else "interpreted"
     print(f"{result['vehicles']} vehicles at {result['control_hz']:g} Hz, one core, hot path {how}")
     print(
@@ -102,7 +103,7 @@ def print_benchmark(result: dict[str, Any]) -> None:
 
 
 def print_real_time(result: dict[str, Any]) -> None:
-    """How punctual the station was, then the errors of what it measured."""
+    """Print how punctual the station was, and the errors of its measurements."""
     control = result["control"]
     late = control["lateness_s"]
     print(f"{result['reason']}; load {result['load_average']:.1f}, {result['steal_share']:.1%} taken by the host")

@@ -1,1 +1,1 @@
-"""Questions answered by designing and flying: comparison of routes, the source's figures, link capacity, speed."""
+"""Questions answered by designing and flying: design routes compared, the source's figures, link capacity, speed."""

@@ -1,8 +1,8 @@
-"""How fast flights are computed: virtual time against real time, and what the station takes of its control period."""
+"""How fast flights are computed: virtual time against real time, and the station's share of its control period."""
 
 import os
 import tempfile
-import time  # noqa: TID251 - the time it takes is what is measured; nothing flown depends on it
+import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -17,13 +17,13 @@ from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
 
 _COLUMN = 10
-"""Vehicles behind one another in a large formation; the columns follow one leader."""
+"""Vehicles behind one another in a large formation, whose columns follow one leader."""
 _SPACING_M = 100.0
 
 
 @dataclass
 class _Timed:
-    """Vehicles whose own computing time is added up."""
+    """Vehicles, with their own run time summed."""
 
     vehicles: Vehicles
     taken_s: float = 0.0
@@ -36,7 +36,7 @@ class _Timed:
 
 
 def with_vehicles(scenario: Scenario, count: int) -> Scenario:
-    """The scenario with as many vehicles as wanted, in place, in columns behind one leader."""
+    """The scenario with this many vehicles, in place, in columns behind one leader."""
     velocity = scenario.nominal_velocity[0].velocity_ne_m_s
     vehicles = [Vehicle(system_id=1, position_ne_m=(0.0, 0.0), velocity_ne_m_s=velocity)]
     for k in range(count - 1):
@@ -55,9 +55,9 @@ def with_vehicles(scenario: Scenario, count: int) -> Scenario:
 
 
 def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool = False) -> dict[str, Any]:
-    """Fly `seconds` of a scenario `repeat` times in virtual time; figures of the fastest and of the median flight.
+    """Fly `seconds` of a scenario `repeat` times in virtual time: figures of the fastest and of the median flight.
 
-    With `signed` as many signed flights are flown in turn with the others, and `signed` says what they cost.
+    With `signed`, unsigned and signed flights alternate, and the result's `signed` is the cost of signing.
     """
     _, plan = flight_plan(_without_solver(scenario, seconds))
     flights: list[dict[str, float]] = []
@@ -84,7 +84,7 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool =
 
 
 def _cost(signed: list[dict[str, float]], plain: list[dict[str, float]]) -> dict[str, float]:
-    """How many times as long a signed flight takes as one that is not, and its station: best and median."""
+    """Run time of signed flights over that of unsigned ones, for all and for the station: best and median."""
     names = {"time_ratio": "s_per_tick", "station_time_ratio": "station_s_per_tick"}
     return {
         f"{ratio}{suffix}": pick(flight[name] for flight in signed) / pick(flight[name] for flight in plain)
@@ -94,7 +94,7 @@ def _cost(signed: list[dict[str, float]], plain: list[dict[str, float]]) -> dict
 
 
 def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]:
-    """Fly `seconds` of a scenario over UDP: how punctual the station was, and its latencies against the truth."""
+    """Fly `seconds` of a scenario over UDP: the station's punctuality, and its latencies against the truth."""
     from gcs.drive.realtime_flight import fly_real_time
     from gcs.runs.grade import grade
     from gcs.runs.summary import finish

@@ -1,8 +1,8 @@
 """`gcs capacity`: how many vehicles, at which rate, a scenario's links carry before the margin is gone.
 
-Every rate is flown in virtual time with growing formations, over the scenario's own links and channels, until the loop
-delay takes the margin of the gains designed for that rate, or the formation no longer flies. What a link loses is drawn
-at random, so each formation is flown with several seeds, and holds if it does with all of them.
+For each rate, growing formations fly in virtual time over the scenario's own links and channels, until the loop delay
+exceeds the margin of the gains designed for that rate, or the formation no longer flies. Losses are random, so each
+formation flies with several seeds, and is carried only if it holds with all of them.
 """
 
 from dataclasses import dataclass
@@ -20,31 +20,31 @@ from gcs.studies.benchmark import with_vehicles
 from scenarios.schema import Scenario
 
 _START_ERROR_M = 2.0
-"""Every second vehicle begins so far aside of its place."""
+"""Initial displacement of every second vehicle."""
 _DECAYED = 0.1
-"""A formation that is steered has brought its errors down to this share in the last third of a flight."""
+"""A controlled formation has reduced its errors to this share in the last third of a flight."""
 FEWEST = 2
 
 
 @dataclass(frozen=True)
 class Load:
-    """One flight: a formation at a rate, and what became of its margin.
+    """One flight of a formation at a rate, and what was left of its margin.
 
     Attributes
     ----------
     headroom_p01
         Least headroom, 1 − loop delay / margin, of all but the worst hundredth of the ticks.
     station_bytes_s
-        MAVLink bytes that the station sends and receives, both together, in a second of flight.
+        MAVLink bytes per second that the station sends and receives, summed.
     lost_up, lost_down
-        Shares of the datagrams from and to the vehicles that the links lost, in truth.
+        True shares of the datagrams from and to the vehicles that the links lost.
     error_end_m
-        Largest spacing error of all vehicles, at the median of the last third of the flight: a single set-point that is
-        lost moves it for seconds.
+        Largest spacing error of all vehicles, as the median over the last third of the flight: a single lost set-point
+        affects it for seconds.
     reason
         How the flight ended.
     holds
-        Errors came down to a tenth of what they were at the start, and 99 of 100 ticks had headroom.
+        Errors fell to a tenth of their initial size, and 99 of 100 ticks had headroom.
     """
 
     rate_hz: float
@@ -64,7 +64,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Capacity:
-    """The largest formation that one rate carries, and the next, that it does not; None where there is none."""
+    """The largest formation carried at one rate, and the smallest tried that was not; None if there is none."""
 
     rate_hz: float
     most: Load | None
@@ -74,7 +74,7 @@ class Capacity:
 
 @dataclass
 class _Counted:
-    """Vehicles behind links, with the bytes at the station's end counted."""
+    """Vehicles behind links, with the station's bytes counted."""
 
     vehicles: Vehicles
     bytes_both_ways: int = 0
@@ -90,13 +90,13 @@ def capacity(
 ) -> list[Capacity]:
     """The capacity of each rate, up to `most` vehicles: doubled until one fails, then halved in between.
 
-    Each formation is flown with the scenario's seed and those that follow it. Near the margin errors go slowly, so that
-    the flights of `seconds` are long.
+    Each formation flies with the scenario's seed and those that follow it. Near the margin errors decay slowly, so the
+    flights of `seconds` are long.
 
     Raises
     ------
     InputError
-        If the scenario's gains are of its own formation only, or its vehicles take off first.
+        If the scenario gives gains as blocks of its own formation, or its vehicles take off first.
     """
     blocks = len(scenario.control.blocks)
     if blocks:
@@ -128,7 +128,7 @@ def _capacity_of(scenario: Scenario, rate_hz: float, most: int, seeds: int) -> C
 
 
 def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int) -> Load:
-    """The first flight that does not hold, or of those that do the one of least headroom."""
+    """The first flight that does not hold; if all do, the one of least headroom."""
     loads: list[Load] = []
     for seed in range(scenario.seed, scenario.seed + seeds):
         loads.append(fly_loaded(scenario.model_copy(update={"seed": seed}), rate_hz, vehicles))
@@ -138,7 +138,7 @@ def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int) ->
 
 
 def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
-    """Fly so many vehicles, with telemetry and control at the rate, and measure.
+    """Fly this many vehicles with telemetry and control at the rate, and measure.
 
     Raises
     ------

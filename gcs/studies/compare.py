@@ -1,11 +1,11 @@
 """`gcs compare`: the design routes side by side, computed and flown.
 
-Each route designs for the scenario's requirement, with the information that it may use, and flies the scenario in
-virtual time from its own initial states. Robustness and string peak are measured alike for all: on the whole formation.
+Each route designs for the requirement with the information it may use, and flies the scenario in virtual time
+from the same initial states. Robustness and string peak are computed for all routes on the whole formation.
 """
 
 import json
-import time  # noqa: TID251 - how long a design takes is one of the figures; nothing flown depends on it
+import time  # noqa: TID251 - design time is one of the figures; nothing flown depends on it
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -35,21 +35,21 @@ REPORT_FILE, RESULT_FILE = "compare.html", "compare.json"
 
 @dataclass(frozen=True)
 class Route:
-    """One route's figures; None where there is none, with the reason in `failed`.
+    """The figures of one route; None where there is none, with the reason in `failed`.
 
     Attributes
     ----------
     overshoot
-        Largest spacing error against its initial direction, as a share of the initial error; the most of all vehicles.
+        Largest spacing error opposite to its initial direction, as a share of the initial error, over all vehicles.
     effort_m2_s3
         Integral of the squared commands of all vehicles over the flight.
     alpha
         1 / ‖(sI − A − BK)^{-1}‖∞ of the whole formation.
     string_peak
-        Largest growth of a spacing error from one follower to the next behind it over all frequencies, for a
+        Largest growth of a spacing error from one follower to the one behind it, over all frequencies, for a
         disturbance of the leader, without delay.
     links, numbers_used
-        Pairs of vehicles of which one uses the other's state, and how many of its errors are used in all.
+        Pairs of vehicles in which one uses the other's errors, and the number of errors used in all.
     """
 
     method: Method
@@ -81,7 +81,7 @@ def compare(scenario: Scenario) -> tuple[list[Route], Flights]:
         update = {"method": method, "gains": None, "blocks": ()}
         control = Control.model_validate(scenario.control.model_dump() | update)
         vehicles = scenario.vehicles
-        if method == "inclusion":  # it has no use for what is heard besides
+        if method == "inclusion":  # it uses nothing that a vehicle `hears`
             vehicles = tuple(vehicle.model_copy(update={"hears": ()}) for vehicle in vehicles)
         try:
             if method == "graph-dk" and 2 * len(vehicles) - 1 > LARGEST_STATES:
@@ -129,20 +129,20 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
 
 
 def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
-    """How far spacing errors go to the other side, as a share of what they began with."""
+    """The largest overshoot of a spacing error, as a share of its initial size."""
     shares: list[float] = []
     for system_id in plan.formation.system_ids[1:]:
         own = flown[flown["system_id"] == system_id]
         error = np.stack([own["spacing_error_north_m"], own["spacing_error_east_m"]], axis=1)
         error = error[np.isfinite(error).all(axis=1)]
         first = float(np.linalg.norm(error[0])) if len(error) else 0.0
-        if first > 0.1:  # less than the noise of a start is no initial error
+        if first > 0.1:  # smaller ones are noise of the start
             shares.append(max(0.0, float(-(error @ error[0]).min()) / first**2))
     return max(shares, default=None)
 
 
 def _information(model: FormationModel, K: FloatArray) -> tuple[int, int]:
-    """Pairs (i, j), j's errors used by i, and how many of these errors per axis."""
+    """The number of pairs (i, j) in which i uses errors of j, and the number of these errors per axis."""
     links = numbers = 0
     for i in range(model.vehicles):
         for j in range(model.vehicles):
@@ -156,7 +156,7 @@ def _information(model: FormationModel, K: FloatArray) -> tuple[int, int]:
 def string_peak(model: FormationModel, K: FloatArray) -> float | None:
     """Largest |E_i / E_j| over frequencies for a follower i behind a follower j, the leader's command disturbed.
 
-    None without two followers in a row. The same search as for a single follower, `gains.performance.string_stability`.
+    None without two followers in a row. Uses the search of `gains.performance.string_stability`.
     """
     single = FormationModel(model.predecessors, axes=1)
     narrow = K[:: model.axes, :: model.axes]
@@ -177,7 +177,7 @@ def string_peak(model: FormationModel, K: FloatArray) -> float | None:
 def write_comparison(
     folder: Path, scenario: Scenario, routes: list[Route], flights: Flights, grown: list[DesignCost]
 ) -> None:
-    """compare.json, the figures, and the page compare.html."""
+    """Write compare.json, the figures, and the page compare.html."""
     from gcs.studies.compare_figures import errors_figure, sizes_figure
     from gcs.views.page import data_uri, rendered
 
@@ -206,7 +206,7 @@ def write_comparison(
 
 
 def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
-    """The table: what is compared, and each route's figure."""
+    """The rows of the table: what is compared, and the figure of each route."""
     kinds: list[tuple[str, str, str, float]] = [
         ("verdict of the flight", "verdict", "", 1.0),
         ("settling time, s", "settling_time_s", ".2f", 1.0),
@@ -229,7 +229,7 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
         texts = [
             str(v or UNKNOWN) if not form else number_text(None if v is None else factor * v, form) for v in values
         ]
-        if name.startswith("delay_margin"):  # of a route that was flown, none is no limit
+        if name.startswith("delay_margin"):  # None means no limit for a route that was flown
             texts = [
                 "no limit" if v is None and not r.failed else t for v, r, t in zip(values, routes, texts, strict=True)
             ]

@@ -1,6 +1,6 @@
-"""What a design costs as the formation grows: time and free gains, of both routes and of centralised designs."""
+"""The cost of a design as the formation grows: time and free gains, for all routes and for centralised designs."""
 
-import time  # noqa: TID251 - the time it takes is what is measured; nothing flown depends on it
+import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
@@ -19,19 +19,19 @@ RATIO = "times inclusion of 5"
 _REFERENCE = ("inclusion", 5)
 _SIZES = (3, 5, 10, 20, 40, 80, 200)
 _LONGEST_S = 10.0
-"""A method that would take longer, should its time grow with the cube of the size, is not tried on more vehicles."""
+"""A method is not tried on more vehicles if, growing with the cube of their number, it would take longer."""
 _DK_STATES = LARGEST_STATES // 2
 _REPEATED_BELOW_S = 1.0
 _REPEATS = 5
 _PERIOD_S = 0.02
 _WANTED = Requirement(delay_margin_s=0.3)
 _GAIN_BOUND = 30.0
-"""Of the centralised LMI, for both of its matrices."""
+"""Bound of both matrices of the centralised LMI."""
 
 
 @dataclass(frozen=True)
 class DesignCost:
-    """What a design costs for a chain of so many vehicles: time and the number of free gains of one axis."""
+    """The cost of a design for a chain of vehicles: its time, and the number of free gains per axis."""
 
     method: str
     vehicles: int
@@ -40,13 +40,13 @@ class DesignCost:
 
 
 def design_costs() -> list[DesignCost]:
-    """Costs for chains of growing length; times are medians of several designs where one is quick.
+    """Costs for chains of growing length; times of quick designs are medians of several.
 
-    The decentralised routes meet a sampled margin of 0.3 s at 50 Hz and certify it. The centralised designs, each
-    solved once, are asked for no margin: the LQR is one Riccati equation, the LMI one semidefinite programme.
+    The decentralised routes meet a sampled margin of 0.3 s at 50 Hz and certify it. The centralised designs
+    have no margin to meet: the LQR solves one Riccati equation, the LMI one semidefinite programme.
     """
     found: list[DesignCost] = []
-    _inclusion(3)  # what is imported at first use is not part of a design
+    _inclusion(3)  # imports at first use are not part of a design
     methods: dict[str, Callable[[int], int]] = {
         "inclusion": _inclusion,
         "graph-lqr": lambda vehicles: _graph(vehicles, "graph-lqr", two_way=False),
@@ -67,13 +67,13 @@ def design_costs() -> list[DesignCost]:
 
 
 def ratios(costs: list[DesignCost]) -> list[float]:
-    """Time of each design over that of five vehicles by inclusion, in the same run; empty for no designs."""
+    """Time of each design over that of inclusion for five vehicles in the same run; empty for no designs."""
     reference_s = [cost.design_s for cost in costs if (cost.method, cost.vehicles) == _REFERENCE]
     return [cost.design_s / reference_s[0] for cost in costs]
 
 
 def left_out(costs: list[DesignCost]) -> list[str]:
-    """For each method that was not tried on all sizes, one line that says from where on, and why."""
+    """One line for each method that was not tried on all sizes, with the first size left out and the reason."""
     largest = {cost.method: cost.vehicles for cost in costs}
     tried = {method: _SIZES.index(vehicles) + 1 for method, vehicles in largest.items()}
     return [
@@ -128,6 +128,6 @@ def _centralised_lqr(vehicles: int) -> int:
 
 
 def _centralised_lmi(vehicles: int) -> int:
-    # one axis: with two, that do not act on each other, the unknowns would be four times as many for the same gains
+    # one axis: the two are independent, and both at once would have four times the unknowns for the same gains
     plant = formation_plant(_chain(vehicles, axes=1))
     return centralised_lmi(plant, gain_bound=_GAIN_BOUND, lyapunov_bound=_GAIN_BOUND).K.size

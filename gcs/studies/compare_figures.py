@@ -11,11 +11,11 @@ from gcs.studies.compare_cost import DesignCost
 
 _COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#777777", "#b8860b")
 _FLOOR_M = 1e-3
-"""Less than this is rounding of the telemetry."""
+"""Smaller values are rounding of the telemetry."""
 
 
 def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
-    """The largest spacing error, and the largest command, of all vehicles over time."""
+    """The largest spacing error and the largest command of all vehicles over time."""
     figure, (above, below) = figure_of(2, (9.0, 6.0), heights=(1.4, 1.0))
     for (method, ticks), colour in zip(flights, _COLOURS, strict=False):
         flown = ticks[(ticks["time_s"] >= 0.0) & ticks["commanded"]]

@@ -1,7 +1,7 @@
-"""`gcs thesis`: the figures and numbers of the source, computed, beside what it prints.
+"""`gcs thesis`: the figures and numbers of the source as printed and as computed.
 
 Source: P. R. Sahoo, "Decentralized Control Design Approaches for Formation Control of Unmanned Aerial Vehicles", M.Tech
-thesis, NIT Rourkela, 2012. Numbers that contradict it are found by two methods that share nothing.
+thesis, NIT Rourkela, 2012. Each number that contradicts it is found by two independent methods.
 """
 
 from collections.abc import Iterator
@@ -44,7 +44,7 @@ SINGLE = FormationModel((-1, 0, 1), axes=1)
 
 @dataclass(frozen=True)
 class Claim:
-    """One number or statement: where it stands, what is printed, what is computed and how, and a second way."""
+    """One number or statement: its place, what is printed, what is computed, and a second, independent way."""
 
     place: str
     subject: str
@@ -56,7 +56,7 @@ class Claim:
 
 
 def claims() -> list[Claim]:
-    """All of them, in the order of the source."""
+    """All claims, in the order of the source."""
     return [
         *_modelling(),
         *_inclusion(),
@@ -70,7 +70,7 @@ def claims() -> list[Claim]:
 
 
 def late_neighbours(K: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatArray]:
-    """(A0, A1) of (5.2): own errors at once, those of others late."""
+    """(A0, A1) of (5.2): own errors are fed back at once, those of others late."""
     own, others = split_own(pattern, K)
     return CHAIN.A + CHAIN.B @ own, CHAIN.B @ others
 
@@ -184,13 +184,13 @@ def _list(numbers: list[float]) -> str:
 
 
 def _middle_block() -> float:
-    """Block (2, 2) of A Y + Y A' + B L + L'B': zero, as the spacing error drives nothing of itself and has no input."""
+    """Block (2, 2) of A Y + Y A' + B L + L'B': zero, as the spacing error does not drive itself and has no input."""
     A, B = CHAIN.A[2:6, 2:6], CHAIN.B[2:6]
     return float(np.abs(A[:2, :2]).max() + np.abs(B[:2]).max())
 
 
 def _least_eigenvalue() -> float:
-    """The least over random Y, L of the largest eigenvalue of the drift of one subsystem (3.25), per axis."""
+    """The minimum over random Y, L of the largest eigenvalue of the drift of one subsystem (3.25), per axis."""
     A = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
     B = np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
     rng = np.random.default_rng(2012)
@@ -291,7 +291,7 @@ def _delay() -> Iterator[Claim]:
 
 
 def _splits(K: FloatArray) -> Iterator[tuple[str, float]]:
-    """Margins with each choice of what is late among own and others' velocity and spacing errors."""
+    """The margin for each choice of which are late: own and others' velocity and spacing errors."""
     kinds = {"own velocity": 0, "own spacing": 1, "others' velocity": 2, "others' spacing": 3}
     masks = [np.zeros(K.shape, dtype=bool) for _ in kinds]
     for i, j in product(range(CHAIN.vehicles), range(CHAIN.vehicles)):
@@ -328,7 +328,7 @@ def _comparison() -> Iterator[Claim]:
 
 
 def write_page(folder: Path, found: list[Claim]) -> Path:
-    """The page thesis.md with all claims and figures in a folder."""
+    """Write thesis.md, with all claims, and the figures to a folder."""
     from gcs.studies.thesis_figures import formation_figure, responses_figure
 
     formation_figure(folder / "inclusion.png", "inclusion")
@@ -347,8 +347,8 @@ _PAGE = """# The source, reproduced
 
 P. R. Sahoo, *Decentralized Control Design Approaches for Formation Control of Unmanned Aerial Vehicles*, M.Tech
 thesis, National Institute of Technology Rourkela, 2012. This page and its figures come from `gcs thesis --out DIR`.
-Every number that contradicts the source is found in two ways that share nothing. Initial states and the gains of
-chapters 3 and 4 are not printed there: the states are ours, the gains are designed to what is printed of them.
+Every number that contradicts the source is found in two independent ways. The source does not print initial states, or
+the gains of chapters 3 and 4: the states are ours, and the gains are designed to its stated requirements.
 
 | where | what | published | computed | second way | verdict |
 | --- | --- | --- | --- | --- | --- |
@@ -358,8 +358,8 @@ chapters 3 and 4 are not printed there: the states are ours, the gains are desig
 
 Snapshots of the five vehicles and the distances V1-V2 and V2-V3 of the nonlinear vehicles, flown over MAVLink in
 virtual time without link delay: two sets of initial states, and the course with heading -60, 0 and +60 degrees. (The
-course is printed with the heading -60 degrees in all three legs, a slip.) Distances are between states as reported,
-up to 20 ms and so 6 ft apart.
+source prints the heading -60 degrees for all three legs, a slip.) Distances are between reported states, whose times
+differ by up to 20 ms: 6 ft at this speed.
 
 ![inclusion](inclusion.png)
 
@@ -369,8 +369,8 @@ up to 20 ms and so 6 ft apart.
 
 ## Figures 5.2-5.4: printed gains, neighbours' information late
 
-The nonlinear model with h = 0.17 s, as published; and with 0.9 s, which by the published margin of 0.19 s should not
-hold, and 1.1 s, which is beyond the computed one.
+The nonlinear model with h = 0.17 s, as published; with 0.9 s, which the published margin of 0.19 s rules out; and with
+1.1 s, which is beyond the computed margin.
 
 ![responses](responses.png)
 """

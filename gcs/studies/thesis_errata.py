@@ -1,4 +1,4 @@
-"""Statements of the source that a computation contradicts, beside those about its numbers in `gcs.studies.thesis`."""
+"""Computations that contradict statements of the source; `gcs.studies.thesis` has those about its numbers."""
 
 from itertools import product
 
@@ -13,7 +13,7 @@ from gcs.studies.thesis_flights import printed_gains
 
 SINGLE = FormationModel((-1, 0, 1), axes=1)
 PUBLISHED_S = (0.185, 0.195)
-"""What rounds to the published 0.19 s."""
+"""The values that round to the published 0.19 s."""
 
 
 def controllable_dimensions(restriction: Restriction) -> tuple[int, int]:
@@ -30,7 +30,7 @@ def controllable_dimensions(restriction: Restriction) -> tuple[int, int]:
 
 
 def s_procedure_counterexample() -> tuple[bool, bool, bool]:
-    """Of F = G = −1: whether F > 0 wherever G ≤ 0, whether some τ ≥ 0 has F − τG > 0, and F + τG > 0."""
+    """For F = G = −1: whether F > 0 wherever G ≤ 0, whether F − τG > 0 for some τ ≥ 0, and whether F + τG > 0."""
     F = G = -1.0
     some = np.linspace(0.0, 100.0, 1001)
     return not (G <= 0.0) or F > 0.0, bool((F - some * G > 0.0).any()), bool((F + some * G > 0.0).any())
@@ -49,9 +49,9 @@ def first_crossing(own: float, late: float, sign: float) -> float:
 
 
 def subset_margins() -> FloatArray:
-    """Delay margins with every choice of which of the twelve scalar gains printed are late; 4,095 of them.
+    """The delay margin for each of the 4,095 choices of which of the twelve printed scalar gains are late.
 
-    One axis: the blocks are multiples of the identity but for entries of 0.0053 at most.
+    One axis: the blocks are multiples of the identity, except for entries of at most 0.0053.
     """
     K = printed_gains()[::2, ::2]
     places = np.argwhere(np.abs(K) > 0.1)
@@ -65,7 +65,7 @@ def subset_margins() -> FloatArray:
             now, delayed = SINGLE.A + SINGLE.B @ (K - late), SINGLE.B @ late
             try:
                 margins.append(delay_margin(now, delayed))
-            except np.linalg.LinAlgError:  # a resolvent that is singular on the axis
+            except np.linalg.LinAlgError:  # the resolvent is singular on the axis
                 margins.append(frequency_sweep_margin(now, delayed))
     return np.array(margins)
 

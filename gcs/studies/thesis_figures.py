@@ -1,4 +1,4 @@
-"""The figures of the source, drawn from our flights, as PNG files."""
+"""The source's figures, drawn from our flights, as PNG files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The flights behind the figures of the source: by our station, and of its chapter 5 by the nonlinear model."""
+"""The flights behind the source's figures: with our station, and for chapter 5 with the nonlinear model."""
 
 from functools import cache
 from pathlib import Path
@@ -27,7 +27,7 @@ CHAIN = FormationModel((-1, 0, 1))
 
 @cache
 def printed_gains() -> FloatArray:
-    """K of section 5.2.2, with the slip "0.5003" mended, from scenarios/thesis_gains.toml."""
+    """K of section 5.2.2, with the slip "0.5003" corrected, from scenarios/thesis_gains.toml."""
     return flight_plan(_scenario("thesis_gains"))[1].gain
 
 
@@ -37,7 +37,7 @@ def _scenario(name: str) -> Scenario:
 
 @cache
 def late_flight(delay_s: float) -> tuple[FloatArray, FloatArray]:
-    """Times and errors of the nonlinear flight with the printed gains; 20 s, with initial errors of our own choice."""
+    """Times and errors of the nonlinear flight with the printed gains: 20 s, with initial errors of our choice."""
     start = np.zeros(CHAIN.states)
     start[CHAIN.velocity_slice(0)] = (2.0, -1.0)
     start[CHAIN.spacing_slice(1)], start[CHAIN.spacing_slice(2)] = (10.0, 5.0), (-6.0, 8.0)
@@ -47,12 +47,12 @@ def late_flight(delay_s: float) -> tuple[FloatArray, FloatArray]:
 
 
 def nonlinear_response(delay_s: float) -> tuple[float, float]:
-    """Growth rate (1/s) of the errors' envelope in the second half, and when they stay within 2 % of their largest."""
+    """Growth rate (1/s) of the errors' envelope, and the time from which they stay within 2 % of their largest."""
     time_s, errors = late_flight(delay_s)
     size = np.linalg.norm(errors, axis=1)
     outside = np.flatnonzero(size > 0.02 * size.max())
     settled_s = float(time_s[min(outside[-1] + 1, len(time_s) - 1)])
-    # largest of each second, while it is above rounding
+    # the largest of each second, as long as it is above rounding
     whole = int(time_s[-1])
     envelope = size[: whole * 1000].reshape(whole, 1000).max(axis=1)
     kept = (envelope > 1e-9 * envelope.max()) & (np.arange(whole) >= whole // 4)
@@ -61,8 +61,10 @@ def nonlinear_response(delay_s: float) -> tuple[float, float]:
 
 
 def flown(name: str, method: str) -> tuple[TickArray, float | None]:
-    """A flight of one of the triangle's scenarios without link delay, by inclusion at α = 0.93 or by the D-K iteration
-    at the delay margin that this has; with its settling time."""
+    """Fly one of the triangle's scenarios without link delay: its ticks and settling time.
+
+    The gains are those of inclusion at α = 0.93, or of a graph method at the same delay margin.
+    """
     scenario = _scenario(name)
     control = scenario.control.model_copy(update={"delay_margin_s": None, "alpha": ALPHA})
     if method != "inclusion":

@@ -1,4 +1,4 @@
-"""Three vehicles of the source's chapter 5 from its nonlinear model, neighbours' information late: eq. (5.1).
+"""The source's nonlinear model of chapter 5, with late information from neighbours: eq. (5.1).
 
 X' = V cos ψ, Y' = V sin ψ, ψ' = ω, V' = a with (a, ω) = M(ξ) u, eqs. (2.2)-(2.6), integrated by RK4 with M in every
 stage; u_i(t) = K_ii x_i(t) + sum of K_ij x_j(t − h), held for one step of 1 ms. It shares no code with the vehicles of
@@ -16,9 +16,9 @@ STEP_S = 1e-3
 def fly_with_late_neighbours(
     formation: FormationModel, K: FloatArray, start: FloatArray, *, delay_s: float, speed_m_s: float, duration_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Times (k,) and errors e (k, states) of a formation that begins with errors `start` (states,), heading north.
+    """Times (k,) and errors e (k, states) of a formation that starts with errors `start` (states,), heading north.
 
-    Before the flight the errors are what they are at its start.
+    Before the start the errors are constant.
     """
     steps, lag = round(duration_s / STEP_S), round(delay_s / STEP_S)
     own = np.zeros_like(K)
@@ -39,7 +39,7 @@ def fly_with_late_neighbours(
 
 
 def _states(formation: FormationModel, errors: FloatArray, nominal: FloatArray) -> FloatArray:
-    """Rows (X, Y, ψ, V) with these errors, the wanted spacing taken as zero: it cancels."""
+    """Rows (X, Y, ψ, V) with these errors; the wanted spacing is zero, as it cancels."""
     rows: list[FloatArray] = []
     for i, ahead in enumerate(formation.predecessors):
         velocity = nominal + errors[formation.velocity_slice(i)]

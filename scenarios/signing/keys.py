@@ -1,6 +1,6 @@
 """Key files of MAVLink 2 signing: 32 secret bytes that nobody but their owner may read.
 
-KeyFileError(Exception)    a key file, or the file of timestamps beside it, that cannot be used, in one line
+KeyFileError(Exception)    a key file, or the file of timestamps beside it, cannot be used: one line
 """
 
 import hashlib
@@ -15,7 +15,7 @@ _MOST_BYTES = 1024
 
 
 class KeyFileError(Exception):
-    """A key file that cannot be used. The line names the file and never anything that is in it."""
+    """A key file cannot be used. The line names the file, and shows nothing of its contents."""
 
 
 class Key:
@@ -35,15 +35,15 @@ class Key:
 
 
 def read_key(file: Path) -> Key:
-    """The key in a file, in one of the three forms that are in use.
+    """The key in a file, in one of the three common forms.
 
     32 raw bytes, as pymavlink takes them; 64 hexadecimal digits, as `make_key` writes them; or one line of text, a
-    passphrase, whose SHA-256 is the key, as MAVProxy, Mission Planner and QGroundControl have it.
+    passphrase whose SHA-256 is the key, as in MAVProxy, Mission Planner and QGroundControl.
 
     Raises
     ------
     KeyFileError
-        If it cannot be read, holds none of these, is not the user's own, or if anyone else may read or write it.
+        If it cannot be read, holds none of these, belongs to another user, or others may read or write it.
     """
     try:
         with file.open("rb") as opened:
@@ -64,7 +64,7 @@ def _secret(data: bytes, file: Path) -> bytes:
         text = data.decode().strip()
     except UnicodeDecodeError:
         text = ""
-    if not (text.isprintable() and text):  # 32 random bytes are not text: 1 in 10^14 would be
+    if not (text.isprintable() and text):  # 32 random bytes are text in only 1 of 10^14 cases
         if len(data) == KEY_BYTES:
             return data
     elif len(text) == 2 * KEY_BYTES and all(digit in "0123456789abcdefABCDEF" for digit in text):
@@ -76,12 +76,12 @@ def _secret(data: bytes, file: Path) -> bytes:
 
 
 def make_key(file: Path) -> None:
-    """Write a new random key, as hexadecimal digits, to a file that must not be there yet.
+    """Write a new random key, as hexadecimal digits, to a new file.
 
     Raises
     ------
     KeyFileError
-        If it is there, or cannot be written.
+        If the file exists, or cannot be written.
     """
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -90,5 +90,5 @@ def make_key(file: Path) -> None:
     except OSError as error:
         raise KeyFileError(f"{file}: {error.strerror}, wanted a file that can be written") from None
     with os.fdopen(descriptor, "w") as opened:
-        os.fchmod(descriptor, 0o600)  # whatever the umask says
+        os.fchmod(descriptor, 0o600)  # whatever the umask
         opened.write(secrets.token_hex(KEY_BYTES) + "\n")

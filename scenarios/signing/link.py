@@ -1,17 +1,17 @@
-"""MAVLink 2 signing: what one system sends over one link is signed, and what reaches it there is verified.
+"""MAVLink 2 signing: signs what one system sends over one link, and verifies what it receives there.
 
-A layer outside of stations and vehicles: they are given frames that were verified, without their signatures, and so
-have no state that anything else could change. After the MAVLink guide, "Message Signing".
+This is a layer outside stations and vehicles. They get verified frames without signatures, so nothing else can change
+their state. After the MAVLink guide, "Message Signing".
 
-Decisions where the guide leaves some:
+Decisions that the guide leaves open:
 
-* A timestamp must be newer than all accepted ones of its stream (system, component, link id), as the guide demands. A
-  frame that was overtaken on its way is thus refused: there is no window in which older ones are taken. It is counted
-  apart, as `overtaken`, when its timestamp is among the last `REMEMBERED` and was not seen: jitter, not an attack.
-* A stream heard for the first time may be one minute behind. One known from before a restart is not new.
-* Nothing is looked up, noted or adopted before the signature has been verified.
-* No unsigned message is excepted, RADIO_STATUS neither: nothing here reads it.
-* SETUP_SIGNING is refused even if rightly signed: keys are not taken from a link.
+* A timestamp must be newer than all accepted ones of its stream (system, component, link id), as the guide demands.
+  There is no window for older ones, so a frame that was overtaken on its way is refused. It is counted separately, as
+  `overtaken`, if its timestamp is among the last `REMEMBERED` and was not seen: that is jitter, not an attack.
+* A stream heard for the first time may be one minute behind. A stream known from before a restart is not new.
+* No state is read or changed before the signature has been verified.
+* No unsigned message is accepted, not even RADIO_STATUS, which nothing here reads.
+* SETUP_SIGNING is refused even with a valid signature: keys are not accepted from a link.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ HEADER, CHECKSUM, SIGNATURE = 10, 2, 13
 SETUP_SIGNING = 256
 
 EPOCH_NS = 1_420_070_400 * 10**9
-"""2015-01-01, since when timestamps count, in ns since 1970."""
+"""2015-01-01, the zero of timestamps, in ns since 1970."""
 TICK_NS = 10_000
 MINUTE = 6_000_000
 LARGEST = 2**48 - 1
@@ -42,7 +42,7 @@ REPLAYED, OVERTAKEN, TOO_OLD, SETUP = "replayed", "overtaken", "too old", "SETUP
 TOO_MANY = "too many signing streams"
 
 _FLAG_IN_CHECKSUM = tuple(mcrf4xx(b"\0\1" + bytes(8 + n)) ^ mcrf4xx(bytes(10 + n)) for n in range(256))
-"""By what the flag SIGNED changes the checksum of a frame with a payload of n bytes: the checksum is linear."""
+"""How the flag SIGNED changes the checksum of a frame with n bytes of payload; the checksum is linear."""
 
 
 class SignedLink:
@@ -51,11 +51,11 @@ class SignedLink:
     Parameters
     ----------
     crc_extra
-        What the checksum of each message id ends with.
+        The byte that ends the checksummed data of each message id.
     epoch_ns
         The time, in ns since 1970, at which the clock of `now_ns` is 0.
     owner
-        System id of whose end this is, where several keep their timestamps together.
+        System id of this end, where several ends share one memory of timestamps.
     """
 
     def __init__(
@@ -74,14 +74,14 @@ class SignedLink:
         self._link_id = bytes([link_id])
         self._stamps = stamps
         self._streams = 1 << 32 | owner << 24
-        """With system, component and link id below: a stream that is heard."""
+        """High bits of the number of a received stream; system, component and link id are the low bits."""
         self._own = 1 << 33 | owner << 24 | link_id
         self._timestamp = stamps.known.get(self._own, 0)
         stamps.keep(self._own, self._timestamp)
         self._recent: dict[int, _Recent] = {}
 
     def sign(self, frame: bytes, now_ns: int) -> bytes:
-        """An unsigned frame of ours as a signed one, newer than whatever this end has sent or heard."""
+        """Sign one of our frames, with a timestamp newer than any that this end has sent or heard."""
         assert (frame[0], frame[2]) == (MAGIC, 0)
         timestamp = min(LARGEST, max(self._timestamp + 1, (now_ns + self._offset_ns) // TICK_NS))
         self._timestamp = timestamp
@@ -96,10 +96,10 @@ class SignedLink:
         refused: Counter[str],
         unwanted: Callable[[int], str] | None = None,
     ) -> bytes:
-        """The good frames of a datagram, without their signatures; the others are counted by reason.
+        """The valid frames of a datagram, without their signatures; the others are counted by reason.
 
-        `unwanted` may give another reason to refuse the genuine frames of a system id, as that they are copies from
-        elsewhere: one that came first would make the frame itself a replay.
+        `unwanted` may give another reason to refuse genuine frames of a system id, for example that they are copies: a
+        copy that came first would make the frame itself count as a replay.
         """
         good: list[bytes] = []
         at, end = 0, len(datagram)
@@ -128,7 +128,7 @@ class SignedLink:
         return b"".join(good)
 
     def _fault(self, frame: bytes) -> str:
-        """Why a frame is not from a sender with the key. What its checksum says serves only to name that."""
+        """Why a frame is not from a holder of the key, or "". The checksum only helps to name the reason."""
         number = frame[7] | frame[8] << 8 | frame[9] << 16
         if frame[2] & ~SIGNED or number == SETUP_SIGNING or number not in self._crc_extra:
             return FLAGS if frame[2] & ~SIGNED else SETUP if number == SETUP_SIGNING else UNKNOWN
@@ -139,7 +139,7 @@ class SignedLink:
         return WRONG if frame[2] else UNSIGNED
 
     def _staleness(self, frame: bytes, now_ns: int) -> str:
-        """Why a verified frame is too old. One that is not is the newest of its stream from now on."""
+        """Why a verified frame is too old, or "": then it is the newest of its stream from now on."""
         stream = self._streams | frame[5] << 16 | frame[6] << 8 | frame[-13]
         timestamp = int.from_bytes(frame[-12:-6], "little")
         newest = self._stamps.known.get(stream, -1)
@@ -165,19 +165,19 @@ class SignedLink:
 
 
 def _toggled(frame: bytes) -> bytes:
-    """A frame without signature, said to be signed if it was not and the other way round; its checksum is as right."""
+    """A frame without its signature, with the flag SIGNED inverted and the checksum adjusted for that."""
     checksum = int.from_bytes(frame[-CHECKSUM:], "little") ^ _FLAG_IN_CHECKSUM[frame[1]]
     return frame[:2] + bytes([frame[2] ^ SIGNED]) + frame[3:-CHECKSUM] + checksum.to_bytes(2, "little")
 
 
 class _Recent:
-    """The last accepted timestamps of a stream, at least REMEMBERED of them once there were as many."""
+    """The last accepted timestamps of a stream: at least REMEMBERED of them, if there were as many."""
 
     __slots__ = ("_after", "_newer", "_older")
 
     def __init__(self, newest: int) -> None:
         self._after = newest
-        """What is newer than this, and was seen, is remembered."""
+        """All seen timestamps newer than this are remembered."""
         self._newer: set[int] = set()
         self._older: set[int] = set()
 
@@ -188,7 +188,7 @@ class _Recent:
         self._newer.add(timestamp)
 
     def was_overtaken(self, timestamp: int) -> bool:
-        """Whether an older timestamp has not been seen; from now on it has."""
+        """Whether an older timestamp has not been seen; marks it as seen."""
         if timestamp <= self._after or timestamp in self._newer or timestamp in self._older:
             return False
         self._older.add(timestamp)

@@ -1,7 +1,7 @@
-"""The newest signing timestamps, kept in a memory that may be a file: what was heard once is refused after a restart.
+"""The newest signing timestamps, in memory that may be a file, so that replays are refused after a restart too.
 
-A file is mapped, so a timestamp is kept as soon as it is accepted, and survives the end of the process however it
-comes. If the machine itself goes down, those of the last seconds may be lost.
+The file is mapped: a timestamp is stored as soon as it is accepted, and survives any end of the process. If the machine
+itself goes down, those of the last seconds may be lost.
 """
 
 import fcntl
@@ -14,13 +14,13 @@ from scenarios.signing.keys import KeyFileError
 
 _MAGIC = b"MAVLink stamps 1"
 _ENTRY = Struct("<QQ")
-"""Timestamp and stream, in this order: as long as an entry is not whole, it is of stream 0, which is none."""
+"""Timestamp and stream, in this order: an incomplete entry still has stream 0, which means no entry."""
 MOST_STREAMS = 4095
 SIZE = len(_MAGIC) + _ENTRY.size * MOST_STREAMS
 
 
 class Stamps:
-    """Timestamps by stream. A stream is any number above 0; memory is SIZE bytes, that of the process if not given."""
+    """Timestamps by stream, a number above 0. `memory` is SIZE bytes, by default the process's own."""
 
     def __init__(self, memory: bytearray | mmap.mmap | None = None) -> None:
         self.memory = bytearray(SIZE) if memory is None else memory
@@ -35,7 +35,7 @@ class Stamps:
             self.known[stream] = timestamp
 
     def keep(self, stream: int, timestamp: int) -> bool:
-        """Note a stream's newest timestamp; False if there are too many streams for another one."""
+        """Store a stream's newest timestamp; False if there is no room for another stream."""
         at = self._places.get(stream)
         if at is None:
             if len(self._places) >= MOST_STREAMS:
@@ -47,7 +47,7 @@ class Stamps:
 
 
 def open_stamps(file: Path) -> Stamps:
-    """The timestamps in a file, which is made if it is not there; they are this process's until it ends.
+    """The timestamps in a file, created if missing and locked until this process ends.
 
     Raises
     ------
@@ -70,5 +70,5 @@ def open_stamps(file: Path) -> Stamps:
         elif len(found) != SIZE or found[: len(_MAGIC)] != _MAGIC:
             os.close(descriptor)
             raise KeyFileError(f"{file}: read no timestamps, wanted a file that this program made, or none")
-    # The descriptor stays open: the lock is on it.
+    # The descriptor stays open, as it holds the lock.
     return Stamps(mmap.mmap(descriptor, SIZE))

@@ -21,7 +21,7 @@ def test_every_scenario_in_the_repository_is_valid_and_survives_writing(file: Pa
     assert parse(dump(scenario), FILE) == scenario
 
 
-def test_a_fingerprint_survives_writing_and_tells_links_seeds_and_scenarios_apart() -> None:
+def test_a_fingerprint_identifies_links_seed_and_scenario() -> None:
     given = [load(file) for file in sorted(SCENARIOS.glob("*.toml"))]
     assert all(fingerprint(parse(dump(scenario), Path("again"))) == fingerprint(scenario) for scenario in given)
     first = given[0]
@@ -111,7 +111,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("old", "new", "key", "wanted"), BAD.values(), ids=BAD)
-def test_bad_scenario_is_refused_with_file_key_and_what_was_wanted(old: str, new: str, key: str, wanted: str) -> None:
+def test_a_bad_scenario_names_file_key_and_what_was_wanted(old: str, new: str, key: str, wanted: str) -> None:
     assert old in TRIANGLE
     with pytest.raises(ScenarioError) as error:
         parse(TRIANGLE.replace(old, new, 1), FILE)
@@ -137,7 +137,7 @@ def test_bad_scenario_is_refused_with_file_key_and_what_was_wanted(old: str, new
         ("delay_margin_s = 0.3", "delay_margin_s = 0.0", "read 0.0, wanted a number greater than 0"),
     ],
 )
-def test_what_was_wanted_is_said_in_plain_words_with_the_line(old: str, new: str, wanted: str) -> None:
+def test_errors_say_what_was_wanted_with_the_line(old: str, new: str, wanted: str) -> None:
     changed = TRIANGLE.replace(old, new, 1)
     with pytest.raises(ScenarioError) as error:
         parse(changed, FILE)
@@ -147,7 +147,7 @@ def test_what_was_wanted_is_said_in_plain_words_with_the_line(old: str, new: str
     assert f"line {number})" in told
 
 
-def test_a_vehicle_is_named_by_its_system_id_and_its_line_is_told() -> None:
+def test_errors_name_the_system_id_and_the_line() -> None:
     lines = TRIANGLE.splitlines()
     at = [k for k, line in enumerate(lines) if line.startswith("system_id")][4]
     lines.insert(at + 1, "colour = 1")

@@ -37,14 +37,14 @@ def verdict(link: SignedLink, frame: bytes, now_ns: int = NOW_NS) -> str:
     return next(iter(refused), "")
 
 
-def test_a_frame_that_pymavlink_signed_is_passed_on_as_the_frame_that_pymavlink_does_not_sign() -> None:
+def test_a_verified_frame_equals_pymavlinks_unsigned_frame() -> None:
     refused: Counter[str] = Counter()
     good = a_link().verify(position(a_sender()), NOW_NS, refused)
     assert good == position(a_sender(key=None))
     assert not refused
 
 
-def test_a_checksum_that_is_wrong_although_the_frame_is_genuine_stays_wrong() -> None:
+def test_a_genuine_frames_wrong_checksum_stays_wrong() -> None:
     """As of a sender to which the message is another one: its definition is part of the checksum."""
     sender = a_sender()
     frame = position(sender)
@@ -66,7 +66,7 @@ def test_a_frame_that_is_signed_here_is_good_for_pymavlink() -> None:
     assert (receiver.signing.goodsig_count, receiver.signing.timestamp) == (3, NOW + 2)
 
 
-def test_timestamps_sent_never_stand_still_or_go_back_and_follow_what_is_heard() -> None:
+def test_sent_timestamps_always_increase_and_follow_those_heard() -> None:
     link = a_link()
     plain = position(a_sender(key=None))
     sent = [link.sign(plain, now_ns) for now_ns in (NOW_NS, NOW_NS, NOW_NS - 10**9, NOW_NS + 10**9)]
@@ -147,7 +147,7 @@ def test_what_is_refused_is_counted_by_reason_and_stops_nobody(made: Any, reason
     assert verdict(link, good) == ""
 
 
-def test_one_refused_frame_does_not_keep_the_next_of_its_datagram_from_being_heard() -> None:
+def test_a_refused_frame_does_not_hide_the_next_one() -> None:
     sender = a_sender()
     frames = [position(sender, k) for k in range(3)]
     refused: Counter[str] = Counter()
@@ -175,14 +175,14 @@ def test_replayed_and_overtaken_frames_are_both_refused_and_told_apart() -> None
     assert reasons == ["", "", over, again, again, again, "", over, over, again]
 
 
-def test_of_an_old_frame_it_is_not_said_that_it_was_overtaken() -> None:
+def test_an_old_frame_does_not_count_as_overtaken() -> None:
     link, sender = a_link(), a_sender()
     never_sent, *frames = [position(sender) for _ in range(3 * REMEMBERED)]
     assert {verdict(link, frame) for frame in frames} == {""}
     assert verdict(link, never_sent) == "replayed"
 
 
-def test_each_system_component_and_link_id_has_timestamps_of_its_own() -> None:
+def test_timestamps_are_per_system_component_and_link_id() -> None:
     link = a_link()
     ahead = position(a_sender(timestamp=NOW + 1000))
     assert verdict(link, ahead) == ""
@@ -202,7 +202,7 @@ def test_two_owners_keep_their_timestamps_in_one_memory_without_touching() -> No
     assert [verdict(one, frame), verdict(two, frame), verdict(one, frame)] == ["", "", "replayed"]
 
 
-def test_a_forged_frame_from_the_future_silences_pymavlink_and_not_us() -> None:
+def test_a_forged_future_frame_silences_pymavlink_not_us() -> None:
     genuine, forger = a_sender(), a_sender(key=OTHER_KEY, timestamp=NOW + 10**10)
     ours, theirs = a_link(), a_sender(system=255)
     assert verdict(ours, position(genuine)) == ""
@@ -226,7 +226,7 @@ def test_after_a_restart_what_was_heard_before_it_is_refused() -> None:
     assert verdict(forgetful, frames[0]) == ""  # which is why they are kept
 
 
-def test_after_a_restart_with_a_clock_that_went_back_what_is_sent_is_still_newer() -> None:
+def test_timestamps_increase_after_a_restart_with_an_earlier_clock() -> None:
     memory = Stamps()
     plain = position(a_sender(key=None))
     last = a_link(stamps=memory).sign(plain, NOW_NS)
@@ -234,7 +234,7 @@ def test_after_a_restart_with_a_clock_that_went_back_what_is_sent_is_still_newer
 
 
 @given(bit=st.integers(0, 8 * (12 + 24 + 13) - 1), behind=st.integers(0, 1000))
-def test_with_any_bit_flipped_a_frame_is_refused_and_nothing_has_changed(bit: int, behind: int) -> None:
+def test_a_frame_with_any_flipped_bit_changes_nothing(bit: int, behind: int) -> None:
     stamps = Stamps()
     link, sender = a_link(stamps=stamps), a_sender(timestamp=NOW - behind)
     before, frame = position(sender), position(sender)
@@ -261,7 +261,7 @@ def test_any_bytes_are_refused_and_nothing_has_changed(data: bytes) -> None:
 
 
 @given(order=st.lists(st.integers(0, 40), max_size=120))
-def test_in_any_order_each_frame_is_passed_on_once_at_most_and_only_forwards(order: list[int]) -> None:
+def test_in_any_order_each_frame_passes_at_most_once(order: list[int]) -> None:
     link, sender = a_link(), a_sender()
     frames = [position(sender) for _ in range(41)]
     reasons = [verdict(link, frames[k]) for k in order]
@@ -276,7 +276,7 @@ def test_in_any_order_each_frame_is_passed_on_once_at_most_and_only_forwards(ord
         seen.add(k)
 
 
-def test_a_key_in_a_message_is_refused_by_the_codecs_too_and_cannot_be_sent() -> None:
+def test_codecs_neither_accept_nor_send_a_key() -> None:
     plain = dialect.MAVLink_setup_signing_message(1, 1, list(KEY), 0).pack(a_sender(key=None))
     refused: Counter[str] = Counter()
     assert mavlink.decode(plain, refused) == []
@@ -285,7 +285,7 @@ def test_a_key_in_a_message_is_refused_by_the_codecs_too_and_cannot_be_sent() ->
         mavlink.encode(mavlink.SETUP_SIGNING, (0, 1, 1, *KEY), sequence=0)
 
 
-def test_more_streams_than_are_kept_are_refused_and_the_known_ones_are_heard() -> None:
+def test_too_many_streams_are_refused_known_ones_still_heard() -> None:
     link, sender = a_link(), a_sender()
     reasons = Counter[str]()
     for component in range(2):

@@ -32,7 +32,7 @@ def gcs(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
 
 
-def test_the_three_forms_of_a_key_are_read_as_other_tools_read_them(tmp_path: Path) -> None:
+def test_three_forms_of_a_key_read_as_elsewhere(tmp_path: Path) -> None:
     forms = {
         SECRET: SECRET,
         SECRET.hex().encode() + b"\n": SECRET,
@@ -57,7 +57,7 @@ def test_any_32_bytes_that_are_no_text_are_the_key(tmp_path_factory: pytest.Temp
 
 
 @pytest.mark.parametrize("data", [b"", b"\n", b"too short", b"\0" * 31, b"\0" * 33, b"a\nb" * 10, b"p" * 2000])
-def test_what_is_no_key_is_refused_in_one_line_that_does_not_show_it(tmp_path: Path, data: bytes) -> None:
+def test_a_bad_key_is_one_line_that_hides_it(tmp_path: Path, data: bytes) -> None:
     with pytest.raises(KeyFileError, match="wanted 32 bytes, 64 hexadecimal digits, or a passphrase") as caught:
         read_key(a_file(tmp_path, data))
     assert "\n" not in str(caught.value)
@@ -104,7 +104,7 @@ def test_a_key_does_not_show_itself() -> None:
         pickle.dumps(key)
 
 
-def test_timestamps_in_a_file_are_there_again_and_belong_to_one_process(tmp_path: Path) -> None:
+def test_stored_timestamps_return_and_belong_to_one_process(tmp_path: Path) -> None:
     file = tmp_path / "stamps"
     program = (
         "import os, sys; from pathlib import Path; from scenarios.signing.stamps import open_stamps\n"
@@ -148,7 +148,7 @@ def test_the_command_makes_a_key_and_says_nothing_of_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("program", ["gcs.cli.main", "sim_vehicles.drive.cli"])
-def test_a_key_that_others_may_read_is_one_line_and_exit_code_2(tmp_path: Path, program: str) -> None:
+def test_a_readable_key_is_one_line_and_exit_code_2(tmp_path: Path, program: str) -> None:
     file = a_file(tmp_path, SECRET, 0o644)
     scenario = SCENARIOS / "chain3.toml"
     fly = [*(["fly"] if program == "gcs.cli.main" else []), str(scenario), "--key", str(file)]

@@ -98,13 +98,13 @@ def test_the_estimator_says_when_it_has_a_position(flavour: Flavour, message: st
 
 
 @pytest.mark.parametrize(("flavour", "refused"), [("ardupilot", 4), ("px4", 1)])
-def test_arming_is_refused_until_ready_and_then_as_often_as_the_scenario_says(flavour: Flavour, refused: int) -> None:
+def test_arming_is_refused_until_ready_and_then_as_configured(flavour: Flavour, refused: int) -> None:
     vehicle = copter(flavour, ready_after_s=10.0, arming_refusals=2)
     answers = [result(vehicle, arm(), at_s) for at_s in (9.0, 10.5, 11.0, 11.5)]
     assert answers == [refused, refused, refused, 0]
 
 
-def test_guided_and_take_off_need_position_arming_and_mode_in_ardupilot() -> None:
+def test_ardupilot_needs_position_arming_and_mode_to_take_off() -> None:
     vehicle = copter(ready_after_s=10.0)
     take_off = command(22, 0, 0, 0, 0, 0, 0, 20)
     assert result(vehicle, mode(4), 5.0) == 4
@@ -115,7 +115,7 @@ def test_guided_and_take_off_need_position_arming_and_mode_in_ardupilot() -> Non
     assert result(vehicle, take_off, 15.0) == 4  # it has left the ground
 
 
-def test_px4_takes_off_to_an_altitude_above_sea_level_and_then_holds() -> None:
+def test_px4_takes_off_above_sea_level_and_holds() -> None:
     vehicle = copter("px4")
     assert result(vehicle, take_off_px4(20.0 - GROUND_M), 5.0) == 1  # below the ground
     assert result(vehicle, take_off_px4(20.0, 0.0), 5.05) == 2  # at latitude and longitude 0
@@ -146,7 +146,7 @@ def test_px4_leaves_offboard_a_second_after_the_last_set_point() -> None:
     assert (vehicle.craft.mode, vehicle.craft.failsafe) == (PX4_HOLD, True)
 
 
-def test_ardupilot_stops_three_seconds_after_the_last_set_point_and_stays_guided() -> None:
+def test_ardupilot_stops_three_seconds_after_its_last_set_point() -> None:
     vehicle, at_s = airborne()
     tell(vehicle, setpoint(mask=VELOCITY_ACCELERATION, velocity=(3.0, 0.0)), at_s)
     vehicle.step([], START + round((at_s + 3.0) * SECOND))
@@ -156,7 +156,7 @@ def test_ardupilot_stops_three_seconds_after_the_last_set_point_and_stays_guided
     assert vehicle.craft.mode == 4
 
 
-def test_a_set_point_ends_a_guided_take_off_where_it_is() -> None:
+def test_a_set_point_ends_a_guided_take_off() -> None:
     vehicle = copter()
     for k, data in enumerate((mode(4), arm(), command(22, 0, 0, 0, 0, 0, 0, 20))):
         assert result(vehicle, data, 5.0 + 0.1 * k) == 0
@@ -211,7 +211,7 @@ def integrated(
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_the_response_to_a_set_point_is_the_lag_of_the_scenario(flavour: Flavour) -> None:
+def test_a_copter_responds_with_the_scenarios_lag(flavour: Flavour) -> None:
     vehicle, at_s = airborne(flavour, lag_s=0.3, velocity_gain_1_s=1.5)
     start_m = vehicle.craft.motion.north_m
     tell(vehicle, setpoint(0.7, 0.0, velocity=(1.2, 0.0), mask=VELOCITY_ACCELERATION), at_s)
@@ -222,7 +222,7 @@ def test_the_response_to_a_set_point_is_the_lag_of_the_scenario(flavour: Flavour
     assert found == pytest.approx(expected.tolist(), abs=1e-6)  # RK4 with steps of 10 ms against a lag of 300 ms
 
 
-def test_acceleration_and_speed_keep_to_their_limits_whichever_way_they_point() -> None:
+def test_acceleration_and_speed_limits_hold_in_every_direction() -> None:
     vehicle, at_s = airborne(acceleration_max_m_s2=2.0, speed_max_m_s=6.0)
     accelerations: list[float] = []
     speeds: list[float] = []
@@ -234,7 +234,7 @@ def test_acceleration_and_speed_keep_to_their_limits_whichever_way_they_point() 
     assert max(speeds) == pytest.approx(6.0, abs=1e-6)
 
 
-def test_each_vehicle_counts_from_an_origin_of_its_own_and_says_where_it_is() -> None:
+def test_each_copter_reports_its_own_local_origin() -> None:
     flown = of_copters()
     for own in flown.vehicles:
         vehicle = multicopter(flown, own, START)

@@ -46,7 +46,7 @@ def listed(vehicle: Shell[Craft], at_s: float = 5.0) -> list[tuple[Any, int]]:
 
 
 @pytest.mark.parametrize("kind", VEHICLES)
-def test_a_list_gives_every_parameter_once_and_does_not_flood_the_link(kind: str) -> None:
+def test_a_list_sends_each_parameter_once_without_flooding(kind: str) -> None:
     sent = listed(VEHICLES[kind]())
     values = [m for m, _ in sent]
     assert len(values) >= 3
@@ -69,7 +69,7 @@ def test_a_list_asked_for_again_begins_again_and_ends(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", VEHICLES)
-def test_each_is_read_by_name_and_by_index_as_it_was_listed(kind: str) -> None:
+def test_parameters_read_by_name_and_index_as_listed(kind: str) -> None:
     vehicle = VEHICLES[kind]()
     for wanted, _ in listed(vehicle):
         for request in (ask(wanted.param_id), ask(index=wanted.param_index)):
@@ -78,7 +78,7 @@ def test_each_is_read_by_name_and_by_index_as_it_was_listed(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", VEHICLES)
-def test_a_value_that_is_set_is_answered_read_and_listed_for_the_rest_of_the_flight(kind: str) -> None:
+def test_a_set_value_is_acknowledged_read_and_listed(kind: str) -> None:
     vehicle = VEHICLES[kind]()
     (answer,) = told(vehicle, put(TIMEOUT[kind], 2.7))
     assert answer.param_value == pytest.approx(2.7, rel=1e-7)
@@ -89,7 +89,7 @@ def test_a_value_that_is_set_is_answered_read_and_listed_for_the_rest_of_the_fli
 
 @pytest.mark.parametrize("kind", VEHICLES)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -1.0, 0.0, 1e30])
-def test_what_is_not_finite_or_out_of_range_is_answered_by_the_value_that_holds(kind: str, value: float) -> None:
+def test_an_invalid_value_is_answered_with_the_present_one(kind: str, value: float) -> None:
     vehicle = VEHICLES[kind]()
     (before,) = told(vehicle, ask(TIMEOUT[kind]))
     (answer,) = told(vehicle, put(TIMEOUT[kind], value))
@@ -98,7 +98,7 @@ def test_what_is_not_finite_or_out_of_range_is_answered_by_the_value_that_holds(
 
 
 @pytest.mark.parametrize("request_frame", [ask("NOT_THERE"), ask(index=9999), ask(index=-2), put("NOT_THERE", 1.0)])
-def test_an_unknown_name_or_index_is_an_error_that_changes_nothing(request_frame: bytes) -> None:
+def test_an_unknown_parameter_is_an_error_without_effect(request_frame: bytes) -> None:
     vehicle = a_vehicle()
     before = [m.to_dict() for m, _ in listed(vehicle)]
     (error,) = told(vehicle, request_frame, 11.0)
@@ -126,7 +126,7 @@ def test_another_vehicle_s_parameters_are_not_answered() -> None:
     assert vehicle.counters["ignored_not_addressed"] == 1
 
 
-def test_the_time_that_was_set_is_the_time_after_which_it_helps_itself() -> None:
+def test_a_time_out_set_in_flight_triggers_the_failsafe() -> None:
     for name, deadline_s in (("GUID_TIMEOUT", 1.5), ("FS_GCS_TIMEOUT", 0.5)):
         vehicle = a_vehicle()
         vehicle.step([(put(name, deadline_s), START)], START)
@@ -138,7 +138,7 @@ def test_the_time_that_was_set_is_the_time_after_which_it_helps_itself() -> None
             assert [(m.text, t) for m, t in texts] == [("failsafe: station heartbeat stopped", START + 500_000_000)]
 
 
-def test_a_shorter_time_set_in_flight_does_not_end_in_the_past() -> None:
+def test_a_shorter_time_out_does_not_end_in_the_past() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     now = START + 900_000_000

@@ -77,7 +77,7 @@ def test_nobody_who_does_not_ask_is_sent_more_than_telemetry(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", VEHICLES)
 @pytest.mark.parametrize("greeting", [command(512, 148), command(520, 1)], ids=["message", "capabilities"])
-def test_whoever_asks_for_the_version_is_reported_all_that_health_is_read_from(kind: str, greeting: bytes) -> None:
+def test_a_version_request_starts_the_health_reports(kind: str, greeting: bytes) -> None:
     vehicle = VEHICLES[kind]()
     sent = sent_after(vehicle, greeting, 5.0, 10.0)
     (version,) = named(sent, "AUTOPILOT_VERSION")
@@ -137,7 +137,7 @@ def test_home_is_where_it_stood_in_both_frames(kind: str, request_frame: bytes) 
 
 @pytest.mark.parametrize("kind", VEHICLES)
 @pytest.mark.parametrize("list_kind", [0, 1, 2], ids=["mission", "fence", "rally"])
-def test_every_list_is_empty_can_be_cleared_and_takes_no_items(kind: str, list_kind: int) -> None:
+def test_every_list_is_empty_clearable_and_read_only(kind: str, list_kind: int) -> None:
     vehicle = VEHICLES[kind]()
 
     def answer(message: dialect.MAVLink_message) -> Any:
@@ -181,7 +181,7 @@ def test_data_streams_begin_change_and_stop(kind: str) -> None:
     assert not [m for m in sent_after(vehicle, stream(77, 50), 9.0, 9.1) if m.get_type() == "COMMAND_ACK"]
 
 
-def test_a_stream_of_sixty_thousand_a_second_is_one_of_a_thousand() -> None:
+def test_a_stream_request_is_limited_to_1000_hz() -> None:
     assert len(named(sent_after(VEHICLES["double_integrator"](), stream(10, 65_535), 5.0, 5.1), "ATTITUDE")) == 100
 
 
@@ -210,7 +210,7 @@ def test_intervals_are_set_told_and_reset(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", VEHICLES)
-def test_the_start_up_of_qgroundcontrol_is_answered_in_all_of_its_steps(kind: str) -> None:
+def test_every_start_up_step_of_qgroundcontrol_is_answered(kind: str) -> None:
     vehicle = VEHICLES[kind]()
     parameters: dict[str, Any] = {}
     results: dict[tuple[int, int], int] = {}
@@ -260,7 +260,7 @@ def test_a_mode_set_the_old_way_is_flown(kind: str) -> None:
     assert not named(sent, "COMMAND_ACK")
 
 
-def test_a_take_off_command_launches_a_plain_vehicle_which_then_waits_for_set_points_without_end() -> None:
+def test_a_launched_double_integrator_waits_forever_for_set_points() -> None:
     vehicle = VEHICLES["double_integrator"]()
     for data in (arm(), mode(4)):
         vehicle.step([(data, START)], START)
@@ -318,7 +318,7 @@ def hovering(kind: str) -> tuple[Shell[Copter], int]:
 
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
-def test_what_is_ignored_may_be_nan_and_what_counts_may_not(kind: str) -> None:
+def test_only_ignored_fields_may_be_nan(kind: str) -> None:
     vehicle, now = hovering(kind)
     nan, at = math.nan, now
     for k in range(60):
@@ -349,7 +349,7 @@ def test_a_climb_shows_alike_in_all_reports(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
-def test_a_copter_turns_to_the_yaw_it_is_given_and_flies_forward_along_it(kind: str) -> None:
+def test_a_copter_turns_to_the_commanded_yaw(kind: str) -> None:
     vehicle, now = hovering(kind)
     for k in range(100):
         at = now + k * 50 * MS
@@ -364,7 +364,7 @@ def test_a_copter_turns_to_the_yaw_it_is_given_and_flies_forward_along_it(kind: 
 
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
-def test_a_copter_flies_home_when_it_is_told_to_and_lands_there(kind: str) -> None:
+def test_a_copter_returns_home_and_lands(kind: str) -> None:
     vehicle, now = hovering(kind)
     for k in range(50):
         at = now + k * 50 * MS

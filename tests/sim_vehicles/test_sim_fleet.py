@@ -54,7 +54,7 @@ def _unnumbered(frame: bytes) -> bytes:
     return message.pack(dialect.MAVLink(None, 255, 190))
 
 
-def test_the_same_scenario_flies_the_same_bytes_at_the_same_instants() -> None:
+def test_the_same_scenario_gives_the_same_bytes_and_instants() -> None:
     first = flight(Fleet(scenario(COUNT, up_s=0.02, down_s=0.03), START))
     second = flight(Fleet(scenario(COUNT, up_s=0.02, down_s=0.03), START))
     other = flight(Fleet(scenario(COUNT, seed=2, up_s=0.02, down_s=0.03), START))
@@ -120,7 +120,7 @@ def test_the_true_state_is_known_at_any_time() -> None:
     assert state.north_m == pytest.approx(40.0 * 0.4 + 0.16)
 
 
-def test_the_truth_says_when_states_were_sampled_and_set_points_acted() -> None:
+def test_the_truth_logs_sampling_and_acting_instants() -> None:
     rows: list[Row] = []
     fleet = Fleet(scenario(COUNT, up_s=0.02, down_s=0.03), START, record=rows.append)
     out = flight(fleet)
@@ -138,7 +138,7 @@ def test_the_truth_says_when_states_were_sampled_and_set_points_acted() -> None:
         assert all(row[3] >= row[5] for row in links)
 
 
-def test_only_commands_count_as_those_of_a_station_not_its_heartbeats_and_questions() -> None:
+def test_heartbeats_and_questions_do_not_count_as_commands() -> None:
     fleet = Fleet(scenario(2, down_s=0.1), START)
     fleet.step([(2, heartbeat(), START + SECOND), (1, b"noise", START + 2 * SECOND)], START + 3 * SECOND)
     fleet.step([(1, pack(dialect.MAVLink_timesync_message(0, 5)), START + 3 * SECOND)], START + 4 * SECOND)

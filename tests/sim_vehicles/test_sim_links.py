@@ -21,7 +21,7 @@ def times(out: list[Entry]) -> list[tuple[bytes, int]]:
     return [(entry[3], entry[0]) for entry in out]
 
 
-def test_a_datagram_comes_out_exactly_its_delay_later_and_not_before() -> None:
+def test_a_datagram_leaves_exactly_its_delay_later() -> None:
     link = Link(schema.Link(delay_s=0.0123))
     assert link.next_due_ns == NEVER_NS
     link.send(b"a", 5)
@@ -33,7 +33,7 @@ def test_a_datagram_comes_out_exactly_its_delay_later_and_not_before() -> None:
 
 
 @given(st.lists(st.integers(0, 50), max_size=40), st.lists(st.integers(0, 80), max_size=10))
-def test_all_come_out_once_in_order_of_time_and_of_entry(entered: list[int], looks: list[int]) -> None:
+def test_datagrams_leave_once_in_order_of_time_and_entry(entered: list[int], looks: list[int]) -> None:
     link = Link(schema.Link(delay_s=10e-9))
     for number, time_ns in enumerate(entered):
         link.send(bytes([number]), time_ns)
@@ -81,14 +81,14 @@ def test_a_ramp_is_exact_at_given_instants() -> None:
     }
 
 
-def test_before_its_time_begins_a_link_has_its_first_delay_and_no_outage() -> None:
+def test_before_link_time_zero_the_first_delay_applies_without_outage() -> None:
     points = (DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=1.0, delay_s=0.5))
     link = Link(schema.Link(delay_points=points, outages=(Outage(from_s=0.0, until_s=9.0),)))
     link.send(b"early", 5 * SECOND)
     assert times(link.due(NEVER_NS)) == [(b"early", 5 * SECOND + 20 * MS)]
 
 
-def test_an_outage_drops_from_its_first_instant_until_before_its_last() -> None:
+def test_an_outage_includes_its_start_not_its_end() -> None:
     rows: list[Row] = []
     link = Link(
         schema.Link(outages=(Outage(from_s=1.0, until_s=2.0), Outage(from_s=3.0, until_s=4.0))), record=rows.append

@@ -61,7 +61,7 @@ def test_the_delay_is_cut_off_at_zero() -> None:
     assert np.mean(found == 0.0) == pytest.approx(share, abs=4 * math.sqrt(share * (1 - share) / SAMPLES))
 
 
-def test_a_trace_is_replayed_in_its_order_and_again_from_its_beginning() -> None:
+def test_a_delay_trace_repeats_in_its_order() -> None:
     trace = (0.01, 0.02, 0.05, 0.03, 0.0)
     link = schema.Link(delay_s=0.001, jitter=Jitter(distribution="trace", trace_s=trace), reordering=True)
     found = [round(delay_s - 0.001, 9) for delay_s in delays_s(link, count=300)]
@@ -86,7 +86,7 @@ def test_independent_loss_duplication_and_corruption_have_their_probabilities(wa
     assert sum(bool(entry[4] & CORRUPTED) for entry in arrived) / len(arrived) == pytest.approx(wanted, abs=error)
 
 
-def test_bursts_have_the_stationary_loss_and_the_mean_length_of_a_gilbert_elliott_channel() -> None:
+def test_bursts_follow_the_gilbert_elliott_model() -> None:
     p, r = 0.02, 0.2
     rows: list[Row] = []
     burst = LossBursts(to_bad_probability=p, to_good_probability=r)
@@ -106,7 +106,7 @@ def test_bursts_have_the_stationary_loss_and_the_mean_length_of_a_gilbert_elliot
     assert lengths.max() > 10  # independent loss of 9 % would make one of 11 in 10^11
 
 
-def test_losses_in_the_good_and_in_the_bad_state_are_those_given() -> None:
+def test_good_and_bad_state_lose_at_their_rates() -> None:
     burst = LossBursts(
         to_bad_probability=0.1, to_good_probability=0.1, loss_good_probability=0.02, loss_bad_probability=0.6
     )
@@ -152,7 +152,7 @@ RESTLESS = schema.Link(
 )
 
 
-def test_the_seed_alone_decides_and_each_direction_has_draws_of_its_own() -> None:
+def test_the_seed_decides_and_directions_draw_independently() -> None:
     first = drawn_by(RESTLESS, seed=1, others=0)
     assert first == drawn_by(RESTLESS, seed=1, others=0)
     assert first != drawn_by(RESTLESS, seed=2, others=0)
@@ -168,7 +168,7 @@ def test_other_vehicles_traffic_does_not_change_a_links_draws() -> None:
     [{"loss_probability": 0.5}, {"duplicate_probability": 0.0}, {"corrupt_probability": 0.0}],
     ids=lambda change: next(iter(change)),
 )
-def test_one_effect_more_or_less_leaves_the_draws_of_the_others(change: dict[str, float]) -> None:
+def test_an_added_effect_leaves_the_other_draws(change: dict[str, float]) -> None:
     """Delays of what arrives in both cases are equal: every datagram takes the same draws, used or not."""
     link = RESTLESS.model_copy(update={"reordering": True})
     by_number: Callable[[schema.Link], dict[int, int]] = lambda own: {  # noqa: E731 - two lines that are one

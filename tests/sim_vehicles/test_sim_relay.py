@@ -72,7 +72,7 @@ def test_no_datagram_makes_the_relay_stumble(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("kind", [LINK_UP, LINK_DOWN])
-def test_a_relayed_datagram_meets_the_fate_it_would_meet_on_the_scenarios_own_link(kind: int) -> None:
+def test_a_relayed_datagram_has_the_fate_of_a_simulated_one(kind: int) -> None:
     sent = [Passing(START + k * 2 * MS, kind, 2, frame(2, k)) for k in range(500)]
     rows: list[Row] = []
     came = through(Relay(wild(), START, record=rows.append), sent)
@@ -93,7 +93,7 @@ def test_how_often_the_relay_is_called_changes_nothing() -> None:
     assert sorted(rare) == sorted(often)
 
 
-def test_a_flood_that_a_link_cannot_hold_is_dropped_and_counted() -> None:
+def test_a_flood_beyond_capacity_is_dropped_and_counted() -> None:
     relay = Relay(scenario(1, up_s=10.0), START)
     came = through(relay, (Passing(START, LINK_UP, 1, frame(1, k)) for k in range(CAPACITY + 500)), every_ns=SECOND)
     assert len(came) == CAPACITY
@@ -160,7 +160,7 @@ def ended(process: subprocess.Popen[str]) -> str:
 
 
 @pytest.mark.realtime
-def test_peers_speak_through_the_links_both_ways_and_the_truth_is_written(tmp_path: Path) -> None:
+def test_relayed_vehicles_and_station_communicate_and_truth_is_logged(tmp_path: Path) -> None:
     with ExitStack() as opened:
         station, one, two, stranger = (opened.enter_context(a_socket()) for _ in range(4))
         port, process = opened.enter_context(running(scenario(2, up_s=0.03, down_s=0.01), station, tmp_path))
@@ -249,7 +249,7 @@ def received(own: socket.socket) -> tuple[bytes, tuple[str, int]] | None:
 
 
 @pytest.mark.realtime
-def test_strangers_at_many_addresses_take_no_memory_beyond_the_stated_bound() -> None:
+def test_strangers_take_no_memory_beyond_the_bound() -> None:
     with a_socket() as station:
         peers = Peers([("127.0.0.1", port := free_port())], station.getsockname(), silence_ns=0)
         try:

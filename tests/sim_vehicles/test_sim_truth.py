@@ -32,7 +32,7 @@ def test_what_is_left_out_of_a_record_is_zero(tmp_path: Path) -> None:
     assert read_truth(tmp_path / "truth").tolist() == [ROWS[0]]
 
 
-def test_a_flushed_batch_is_in_the_file_though_the_log_is_never_closed(tmp_path: Path) -> None:
+def test_a_flushed_batch_survives_without_close(tmp_path: Path) -> None:
     log = TruthLog(tmp_path / "truth")
     log.record(ROWS[0])
     log.flush()

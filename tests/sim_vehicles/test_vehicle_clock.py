@@ -16,13 +16,13 @@ clocks = st.builds(BootClock, times, times, st.integers(-(10**7), 10**7))
 
 
 @given(clocks, times)
-def test_host_time_is_the_first_nanosecond_at_which_the_clock_shows_it(clock: BootClock, boot_ns: int) -> None:
+def test_host_time_is_the_first_nanosecond_of_a_boot_time(clock: BootClock, boot_ns: int) -> None:
     host_ns = clock.host_ns(boot_ns)
     assert clock.boot_ns(host_ns) >= boot_ns
     assert clock.boot_ns(host_ns - 1) < boot_ns
 
 
-def test_a_clock_is_drawn_from_the_seed_and_the_system_id_within_the_bounds() -> None:
+def test_seed_and_system_id_draw_a_clock_within_its_bounds() -> None:
     bounds = Clocks(offset_max_s=50.0, drift_max_ppm=30.0)
     drawn = [BootClock.draw(bounds, seed, system_id, START) for seed in (1, 2) for system_id in range(1, 51)]
     assert len({(clock.offset_ns, clock.drift_ppb) for clock in drawn}) == 100

@@ -50,7 +50,7 @@ def test_it_presents_itself_as_a_disarmed_copter() -> None:
     assert heartbeat.system_status == dialect.MAV_STATE_STANDBY
 
 
-def test_arming_and_guided_show_in_the_heartbeat_and_flight_as_active() -> None:
+def test_the_heartbeat_shows_arming_guided_and_flight() -> None:
     vehicle = a_vehicle()
     assert result(vehicle, guided()) == dialect.MAV_RESULT_ACCEPTED
     assert result(vehicle, arm()) == dialect.MAV_RESULT_ACCEPTED
@@ -63,7 +63,7 @@ def test_arming_and_guided_show_in_the_heartbeat_and_flight_as_active() -> None:
     assert [change.text for change in vehicle.changes][:3] == ["GUIDED", "armed", "flying"]
 
 
-def test_it_stays_on_the_launcher_until_armed_guided_and_given_a_set_point() -> None:
+def test_the_launcher_holds_it_until_armed_guided_and_commanded() -> None:
     vehicle = a_vehicle()
     start = vehicle.craft.state_at(START)
     vehicle.step([(setpoint(1.0), START)], START)
@@ -80,7 +80,7 @@ def test_it_stays_on_the_launcher_until_armed_guided_and_given_a_set_point() -> 
     assert state[:2] == pytest.approx((41.0, 19.0))
 
 
-def test_on_the_launcher_it_can_be_disarmed_but_in_flight_it_cannot() -> None:
+def test_it_disarms_on_the_launcher_but_not_in_flight() -> None:
     vehicle = a_vehicle()
     assert result(vehicle, arm()) == dialect.MAV_RESULT_ACCEPTED
     assert result(vehicle, command(400, 0)) == dialect.MAV_RESULT_ACCEPTED
@@ -105,7 +105,7 @@ def test_a_commanded_hold_flies_straight_on_and_is_no_failsafe(hold: int) -> Non
 
 
 @pytest.mark.parametrize("wish", [command(21), command(20), mode(9), mode(6)], ids=["21", "20", "LAND", "RTL"])
-def test_landing_and_return_are_refused_with_a_word_to_who_asks(wish: bytes) -> None:
+def test_landing_and_return_are_refused_with_a_text(wish: bytes) -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     ack, told = answers(vehicle, wish, START + SECOND // 2)
@@ -182,7 +182,7 @@ def test_command_int_is_answered_like_command_long() -> None:
     assert vehicle.craft.flight.armed
 
 
-def test_a_timesync_request_is_answered_with_the_clock_at_its_arrival() -> None:
+def test_timesync_replies_carry_the_clock_at_arrival() -> None:
     vehicle = a_vehicle()
     arrival = START + 123_456_789
     request = pack(dialect.MAVLink_timesync_message(0, -987654321))
@@ -221,7 +221,7 @@ def test_velocity_and_acceleration_together_are_feed_forward_and_feedback() -> N
     assert vehicle.craft.state_at(START + SECOND // 2).velocity_ne_m_s() == pytest.approx((expected, 9.0), abs=1e-6)
 
 
-def test_a_set_point_that_is_late_acts_at_once_and_does_not_change_the_past() -> None:
+def test_a_late_set_point_never_changes_the_past() -> None:
     """A kernel stamp can lie a little before a state that has already been reported."""
     vehicle = a_vehicle()
     take_off(vehicle)

@@ -142,7 +142,7 @@ def test_several_frames_in_one_datagram_are_all_obeyed() -> None:
     [b"\0\0\0", setpoint(9.0)[:20], mavlink1(setpoint(9.0)), b"\xfd"],
     ids=["zeros", "cut short", "MAVLink 1", "magic only"],
 )
-def test_good_frames_before_a_broken_tail_are_obeyed_and_the_next_datagram_is_not_harmed(tail: bytes) -> None:
+def test_a_broken_tail_harms_neither_earlier_frames_nor_later_datagrams(tail: bytes) -> None:
     vehicle = in_flight()
     vehicle.step([(setpoint(1.0) + tail, START), (setpoint(2.0), START)], START)
     assert vehicle.counters["setpoints"] == 3
@@ -150,7 +150,7 @@ def test_good_frames_before_a_broken_tail_are_obeyed_and_the_next_datagram_is_no
     assert vehicle.craft.state_at(START + SECOND).velocity_ne_m_s()[0] == pytest.approx(42.0)
 
 
-def test_a_signed_frame_is_taken_by_a_vehicle_without_a_key() -> None:
+def test_a_vehicle_without_a_key_accepts_signed_frames() -> None:
     signing = dialect.MAVLink(None, 255, 190)
     signing.signing.secret_key, signing.signing.sign_outgoing = b"k" * 32, True
     frame = dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0).pack(signing)

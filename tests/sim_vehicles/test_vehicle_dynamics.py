@@ -112,9 +112,7 @@ commands = st.builds(Command, numbers, numbers, numbers, numbers, st.sampled_fro
 
 
 @given(commands, st.floats(1.0, 100.0), st.floats(0.001, 1.0))
-def test_any_command_keeps_the_state_finite_and_the_speed_within_its_limits(
-    command: Command, speed: float, duration_s: float
-) -> None:
+def test_any_command_keeps_state_finite_and_speed_limited(command: Command, speed: float, duration_s: float) -> None:
     bounds, start = bounds_of(Limits(speed_min_m_s=1.0, speed_max_m_s=100.0)), State(0.0, 0.0, 0.5, speed)
     state = advance(start, command, bounds, duration_s)
     assert all(map(math.isfinite, state))

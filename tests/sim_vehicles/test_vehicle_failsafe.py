@@ -38,7 +38,7 @@ def stream_setpoints(vehicle: Shell[DoubleIntegrator], begin_ns: int, end_ns: in
 
 
 @pytest.mark.parametrize("late_ns", [0, 1, 777 * MS])
-def test_set_points_stop_and_it_holds_at_the_exact_instant_however_late_it_is_stepped(late_ns: int) -> None:
+def test_without_set_points_it_holds_at_the_exact_instant(late_ns: int) -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     vehicle.step([(setpoint(2.0, 1.0), START + 300 * MS)], START + 300 * MS)
@@ -52,7 +52,7 @@ def test_set_points_stop_and_it_holds_at_the_exact_instant_however_late_it_is_st
     assert shown(vehicle.step([], deadline + 2 * SECOND)) == (5, dialect.MAV_STATE_CRITICAL)
 
 
-def test_a_set_point_on_the_deadline_is_in_time_and_one_after_it_is_not() -> None:
+def test_a_set_point_on_the_deadline_is_still_in_time() -> None:
     for late_ns, in_failsafe in ((0, False), (1, True)):
         vehicle = a_vehicle()
         take_off(vehicle)
@@ -62,7 +62,7 @@ def test_a_set_point_on_the_deadline_is_in_time_and_one_after_it_is_not() -> Non
         assert vehicle.counters["ignored_in_failsafe"] == int(in_failsafe)
 
 
-def test_the_stations_heartbeat_stops_and_it_holds_though_set_points_still_come() -> None:
+def test_without_heartbeats_it_holds_despite_set_points() -> None:
     vehicle = a_vehicle()
     vehicle.step([(heartbeat(), START)], START)
     take_off(vehicle)
@@ -80,7 +80,7 @@ def test_only_a_stations_heartbeat_counts() -> None:
     assert texts(sent) == [("failsafe: station heartbeat stopped", START + 3 * SECOND)]
 
 
-def test_a_silent_station_has_the_full_time_from_the_beginning_of_the_flight() -> None:
+def test_a_silent_stations_time_starts_with_the_flight() -> None:
     vehicle = a_vehicle()
     vehicle.step([(heartbeat(), START)], START + 100 * SECOND)
     take_off(vehicle, START + 100 * SECOND)
@@ -95,14 +95,14 @@ def test_on_the_launcher_there_is_no_failsafe() -> None:
     assert shown(sent) == (4, dialect.MAV_STATE_STANDBY)
 
 
-def test_a_commanded_hold_waits_for_heartbeats_but_not_for_set_points() -> None:
+def test_a_commanded_hold_needs_heartbeats_not_set_points() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     sent = vehicle.step([(mode(5), START + SECOND // 2)], START + 5 * SECOND)
     assert texts(sent) == [("failsafe: station heartbeat stopped", START + 3500 * MS)]
 
 
-def test_in_failsafe_it_ignores_set_points_until_guided_is_commanded_again() -> None:
+def test_in_failsafe_it_ignores_set_points_until_guided_again() -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     now = START + 2 * SECOND

@@ -21,7 +21,7 @@ def own_request(vehicle: Shell[Craft]) -> int:
 
 
 @every_kind
-def test_who_only_watches_the_link_does_not_pass_for_a_station(make: Make) -> None:
+def test_a_watching_system_is_not_the_station(make: Make) -> None:
     """`gcs monitor` asks and answers TIMESYNC. Were that the station's voice, its vehicles would never end."""
     vehicle = make()
     vehicle.step([(heartbeat(), START + SECOND)], START + SECOND)
@@ -34,7 +34,7 @@ def test_who_only_watches_the_link_does_not_pass_for_a_station(make: Make) -> No
 
 
 @every_kind
-def test_only_what_is_obeyed_and_changes_the_vehicle_is_a_command(make: Make) -> None:
+def test_only_obeyed_changes_count_as_commands(make: Make) -> None:
     vehicle = make()
     vehicle.step([(arm(), START + SECOND)], START + SECOND)
     assert vehicle.authority.commanded_ns == START + SECOND
@@ -45,7 +45,7 @@ def test_only_what_is_obeyed_and_changes_the_vehicle_is_a_command(make: Make) ->
 
 
 @every_kind
-def test_a_heartbeat_of_another_than_its_station_is_counted_as_such(make: Make) -> None:
+def test_heartbeats_of_other_stations_are_counted(make: Make) -> None:
     vehicle = make()
     vehicle.step([(arm(), START + SECOND)], START + SECOND)
     other = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(MONITOR)
@@ -55,7 +55,7 @@ def test_a_heartbeat_of_another_than_its_station_is_counted_as_such(make: Make) 
 
 
 @every_kind
-def test_what_it_sends_is_numbered_in_the_order_in_which_it_is_sent(make: Make) -> None:
+def test_frames_are_numbered_in_the_order_sent(make: Make) -> None:
     """Commands are answered first and then followed by what they ask for or by words; nothing seems overtaken."""
     vehicle = make()
     asked = [

@@ -109,7 +109,7 @@ def test_a_damaged_file_of_a_run_is_named_by_replay(
 
 
 @pytest.mark.parametrize("what", DAMAGED)
-def test_a_design_that_is_none_is_named_by_replay_and_monitor(
+def test_replay_and_monitor_name_a_file_without_design(
     what: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     design = run / "other.json"
@@ -129,7 +129,7 @@ def test_a_truth_log_that_is_none_is_named_by_grade(
     assert TRUTH_FILE in complaint(capsys, monkeypatch, "grade", str(run))
 
 
-def test_ticks_of_vehicles_that_are_not_in_the_scenario_are_refused(
+def test_ticks_of_unknown_vehicles_are_refused(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (run / SCENARIO_FILE).read_text(encoding="utf-8")
@@ -143,7 +143,7 @@ def test_a_mirror_to_the_stations_own_port_is_refused(listens: str, mirror: str)
         mirroring(f"{mirror}:{link.address[1]}", link, None, commands=False)
 
 
-def test_a_picture_is_a_png_of_a_time_that_the_recording_has(
+def test_a_picture_is_a_png_within_the_recording(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def told(*options: str) -> str:

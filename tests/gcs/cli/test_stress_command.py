@@ -32,7 +32,7 @@ def test_onset_of_instability_is_measured_at_the_sampled_margin(tmp_path: Path) 
     assert "https://" not in page
 
 
-def test_a_campaign_killed_in_the_middle_is_resumed_without_losing_or_repeating_a_flight(tmp_path: Path) -> None:
+def test_a_resumed_campaign_neither_loses_nor_repeats_a_flight(tmp_path: Path) -> None:
     out, log = tmp_path / "out", tmp_path / "out" / "trials.jsonl"
     arguments = (SCENARIOS / "chain3.toml", "--delay", "0.1:0.3:3", "--out", out, "--workers", "2", "--json")
     process = subprocess.Popen(stress_command(*arguments), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

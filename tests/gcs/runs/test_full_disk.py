@@ -32,7 +32,7 @@ def disk_full_at(size: int) -> Generator[None]:
 
 
 @pytest.mark.parametrize("part", [0, 1, 200, 700])
-def test_the_log_of_ticks_ends_with_its_last_whole_tick_and_without_a_gap(part: int, tmp_path: Path) -> None:
+def test_the_tick_log_ends_with_its_last_whole_tick(part: int, tmp_path: Path) -> None:
     ticks = ticks_of(THREE, start_s=0.0, count=60)
     writer = prepare(tmp_path, THREE)
     for rows in ticks[:20]:
@@ -67,7 +67,7 @@ def test_events_wait_until_they_can_be_written(tmp_path: Path) -> None:
     assert [event["kind"] for event in unwritten] == ["end"]
 
 
-def test_a_flight_whose_last_event_and_summary_cannot_be_written_is_summed_up_all_the_same(tmp_path: Path) -> None:
+def test_a_flight_is_summarised_though_its_summary_cannot_be_written(tmp_path: Path) -> None:
     writer = prepare(tmp_path, THREE)
     for rows in ticks_of(THREE, start_s=0.0, count=50):
         writer.tick(rows)
@@ -84,7 +84,7 @@ def test_a_flight_whose_last_event_and_summary_cannot_be_written_is_summed_up_al
     assert json.loads((tmp_path / "summary.json").read_text())["duration_s"] == summary["duration_s"]
 
 
-def test_a_campaign_ends_in_one_line_and_keeps_what_it_had(tmp_path: Path) -> None:
+def test_a_failed_campaign_ends_in_one_line_and_keeps_trials(tmp_path: Path) -> None:
     one, two = (Outcome(id=name, kind="own", seed=1, coordinates={}, real_time=False) for name in ("one", "two"))
     store = Store(tmp_path)
     store.add(one)

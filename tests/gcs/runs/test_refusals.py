@@ -8,7 +8,7 @@ from gcs.runs.record import RunWriter
 from gcs.runs.refusals import REFUSED, VEHICLES_FILE, Refusals, counts_of, in_words, refused_by_vehicles
 
 
-def test_each_reason_is_told_once_and_all_counts_at_the_end() -> None:
+def test_each_reason_is_reported_once_counts_at_the_end() -> None:
     refusals, counters = Refusals(), Counter[str]()
     assert refusals.news(counters) == {}
     told: list[tuple[int, dict[str, int]]] = []

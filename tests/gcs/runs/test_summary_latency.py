@@ -7,7 +7,7 @@ from gcs.runs.summary import summarise
 from tests.support.flown_run import DESIGN, line, ticks_of
 
 
-def test_each_estimate_bears_its_status_and_samples_and_an_unknown_is_none() -> None:
+def test_each_estimate_has_status_and_samples_unknown_is_none() -> None:
     scenario = line(2)
     ticks = ticks_of(scenario, start_s=0.0, count=200).ravel()
     ticks["commanded"] = True

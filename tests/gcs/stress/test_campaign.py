@@ -72,7 +72,7 @@ def test_an_interrupted_campaign_goes_on_where_it_was(tmp_path: Path) -> None:
     assert same(outcomes) == same([fly_trial(trial) for trial in wanted])
 
 
-def test_the_same_trial_at_two_places_is_flown_once_and_stands_at_both(tmp_path: Path) -> None:
+def test_a_trial_at_two_coordinates_is_flown_once(tmp_path: Path) -> None:
     [trial] = trials(1)
     fly, store = Here(), Store(tmp_path)
     outcomes = run_campaign([trial, replace(trial, coordinates=(("x", 1.0),))], store, fly)
@@ -112,7 +112,7 @@ def test_a_trial_that_raises_is_recorded_and_the_others_fly(tmp_path: Path) -> N
     assert left == [2, 1, 0]
 
 
-def test_the_table_has_a_row_for_each_trial_and_a_column_for_each_axis(tmp_path: Path) -> None:
+def test_the_table_has_trials_as_rows_axes_as_columns(tmp_path: Path) -> None:
     outcomes = [fly_trial(trial) for trial in trials(2, bad=1)]
     table = pq.read_table(write_parquet(outcomes, tmp_path)).to_pydict()
     assert table["id"] == [outcome.id for outcome in outcomes]
@@ -121,7 +121,7 @@ def test_the_table_has_a_row_for_each_trial_and_a_column_for_each_axis(tmp_path:
     assert len(table["trace_m"][0]) == 4
 
 
-def test_a_flight_ended_by_ctrl_c_does_not_count_as_flown(tmp_path: Path) -> None:
+def test_a_flight_ended_by_ctrl_c_is_not_stored(tmp_path: Path) -> None:
     [trial] = trials(1)
 
     def interrupted(wanted: Sequence[Trial]) -> Iterator[Outcome]:

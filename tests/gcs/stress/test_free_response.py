@@ -63,7 +63,7 @@ def modelled(loop: CoupledBlock, response: FreeResponse, before: FloatArray) -> 
     "coordinates",
     [{"delay": 0.15, "jitter": 0.03}, {"delay": 0.15, "loss": 0.4}, {"delay": 0.25, "jitter": 0.01, "loss": 0.2}],
 )
-def test_a_loop_on_random_links_is_its_linear_model_through_the_delays_drawn(coordinates: dict[str, float]) -> None:
+def test_a_loop_on_random_links_follows_its_linear_model(coordinates: dict[str, float]) -> None:
     """Two independent ways, to the last digits of telemetry, though the links push the vehicles by metres."""
     plan = plan_with(**coordinates)
     [_, follower] = plan_loops(plan)
@@ -97,7 +97,7 @@ class Reported:
         return float(cubic(time_s)), float(np.interp(time_s, self.time_s[pair], self.velocity_m_s[pair]))
 
 
-def test_a_coupled_loop_on_links_that_differ_is_its_linear_model_with_the_stations_one_instant() -> None:
+def test_a_coupled_loop_on_unequal_links_follows_its_linear_model() -> None:
     """The leader uses the follower's spacing, which it hears 60 ms later than itself: the station carries it forward.
 
     In absolute positions along one axis, from the instants at which states were sampled and commands acted. A model of
@@ -156,7 +156,7 @@ def test_effective_delay_of_regular_commands_is_their_loop_delay() -> None:
     assert effective_delay_s(commands, held_s=PERIOD_S) == pytest.approx(0.130, abs=1e-12)
 
 
-def test_every_second_command_lost_adds_half_a_period_to_the_effective_delay() -> None:
+def test_losing_every_second_command_adds_half_a_period() -> None:
     acted_ns = 1_000_000_000 + 40_000_000 * np.arange(50, dtype=np.int64)
     commands = np.stack([acted_ns, acted_ns - 130_000_000], axis=1)
     assert effective_delay_s(commands, held_s=PERIOD_S) == pytest.approx(0.140, abs=1e-12)
@@ -179,7 +179,7 @@ def test_a_probe_measures_the_loop_whatever_limits_the_vehicles_have(coordinates
     assert (one.past_limits, other.past_limits) == ("jitter" in coordinates, False)
 
 
-def test_loss_is_predicted_by_the_effective_delay_and_not_by_the_median() -> None:
+def test_the_effective_delay_predicts_loss_the_median_does_not() -> None:
     """A third of the datagrams lost each way: the median of the loop delays knows nothing of commands that never came.
 
     The effective delay is right to first order in the variation, here to 0.05 1/s; the median is off by 0.2.

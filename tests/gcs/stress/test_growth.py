@@ -35,7 +35,7 @@ def test_one_oscillation_is_found_whatever_its_rate_frequency_and_size(
     assert found.frequency_rad_s == pytest.approx(frequency, abs=1e-4)
 
 
-def test_the_slower_of_two_modes_is_reported_though_the_faster_begins_larger() -> None:
+def test_the_slower_mode_is_reported_though_it_starts_smaller() -> None:
     found = fit_growth(motion((-0.3 + 4j, 1.0), (-1.5 + 2j, 3.0)), start_s=0.0)
     assert found is not None
     assert found.growth_1_s == pytest.approx(-0.3, abs=1e-6)
@@ -61,7 +61,7 @@ def test_the_error_says_how_far_noise_has_moved_the_rate() -> None:
     assert np.median(errors) < 0.002  # the motion is 35 times the noise, for 20 s
 
 
-def test_noise_that_outlasts_the_motion_is_not_taken_for_a_mode() -> None:
+def test_noise_after_the_motion_is_not_a_mode() -> None:
     """Rounding of the telemetry stays when a fast motion is gone: 1e-4 of it, here for nine tenths of the time."""
     found = fit_growth(motion((-3.0 + 4j, 1.0), noise=1e-4), start_s=0.0)
     assert found is not None
@@ -69,7 +69,7 @@ def test_noise_that_outlasts_the_motion_is_not_taken_for_a_mode() -> None:
     assert found.end_s < 3.0
 
 
-def test_nothing_that_moves_and_too_short_a_motion_have_no_rate() -> None:
+def test_no_motion_or_a_short_one_has_no_rate() -> None:
     assert fit_growth(motion((-0.1 + 4j, 0.0)), start_s=0.0) is None
     assert fit_growth(motion((-0.1 + 4j, 1.0), seconds=0.2), start_s=0.0) is None
     assert fit_growth(motion((-0.1 + 4j, 1.0)), start_s=5.0, end_s=5.1) is None
@@ -78,7 +78,7 @@ def test_nothing_that_moves_and_too_short_a_motion_have_no_rate() -> None:
 
 
 @pytest.mark.parametrize("growth", [-0.3, 0.0, 0.4])
-def test_rate_of_a_motion_through_varying_delays_is_its_mean_rate_and_the_error_is_of_the_right_size(
+def test_growth_through_varying_delays_is_the_mean_rate(
     growth: float,
 ) -> None:
     """A rate that wanders, over many seeds: no modes to fit."""

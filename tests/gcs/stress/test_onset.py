@@ -24,7 +24,7 @@ def test_zero_of_a_bent_curve(half_width_s: float, allowed_s: float) -> None:
     assert zero.slope_1_s2 == pytest.approx(8.0, rel=1e-6)
 
 
-def test_the_error_of_the_zero_is_that_of_the_rates_over_the_slope() -> None:
+def test_the_zeros_error_is_the_rates_error_over_the_slope() -> None:
     rng = np.random.default_rng(5)
     noise, delays = 0.05, np.linspace(0.28, 0.32, 5)
     off: list[float] = []
@@ -36,7 +36,7 @@ def test_the_error_of_the_zero_is_that_of_the_rates_over_the_slope() -> None:
     assert 0.7 < float(np.std(off)) < 1.4
 
 
-def test_flights_over_a_kink_are_said_to_lie_on_no_parabola_and_the_error_says_so() -> None:
+def test_flights_over_a_kink_show_a_misfit_and_larger_error() -> None:
     """As the sampled loop has at whole numbers of periods: slopes of 18 and 14 1/s², seen of a graph-dk design."""
     for half_width_s, smooth in ((0.004, False), (0.0002, False), (0.004, True)):
         delays = 0.2 + half_width_s * np.linspace(-1.0, 0.8, 5)

@@ -23,7 +23,7 @@ def test_axis_is_a_range_or_a_list() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "a", "0:1", "0:1:x", "0:1:0", "-0.1:0.1:3", "0:61:2", "nan", "0:inf:3"])
-def test_axis_that_cannot_be_used_is_refused_with_what_was_read(text: str) -> None:
+def test_a_bad_axis_is_refused_with_what_was_read(text: str) -> None:
     with pytest.raises(AxisError, match="wanted FROM:TO:COUNT"):
         parse_axis("delay", text)
 
@@ -35,7 +35,7 @@ def test_axis_of_a_vehicle_names_a_vehicle_of_the_scenario(text: str) -> None:
 
 
 @given(total_ms=st.integers(0, 2000), period_ms=st.sampled_from([2, 5, 10, 20, 50, 200]))
-def test_total_delay_is_split_into_whole_periods_up_and_the_rest_down(total_ms: int, period_ms: int) -> None:
+def test_the_up_link_takes_whole_periods_of_the_delay(total_ms: int, period_ms: int) -> None:
     period_s = period_ms * 1e-3
     up_s, down_s = split_delay(total_ms * 1e-3, period_s)
     assert up_s + down_s == pytest.approx(total_ms * 1e-3, abs=1e-9)

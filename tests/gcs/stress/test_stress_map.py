@@ -16,7 +16,7 @@ from tests.support.stress_pair import SCENARIO, pair_plan
 DELAY_JITTER = (Axis("delay", (0.02, 0.25)), Axis("jitter", (0.0, 0.05)))
 
 
-def test_flights_on_the_guaranteed_line_are_stable_and_it_ends_before_the_margin() -> None:
+def test_flights_on_the_guaranteed_line_are_stable() -> None:
     study = Study(pair_plan())
     line = guaranteed_line(study, DELAY_JITTER)
     assert line is not None
@@ -39,7 +39,7 @@ def test_nothing_is_guaranteed_where_no_delay_is_the_longest(axes: tuple[Axis, A
     assert guaranteed_line(Study(plan), axes) is None
 
 
-def test_two_vehicles_of_a_tree_break_at_the_sides_of_a_rectangle() -> None:
+def test_two_loops_of_a_tree_break_along_a_rectangle() -> None:
     """The sides are the sampled margins less the waiting, as near as half a period for the hold is."""
     study = Study(pair_plan())
     axes = (Axis("delay_1", (0.1, 0.5)), Axis("delay_2", (0.1, 0.5)))
@@ -72,7 +72,5 @@ def test_loops_of_several_vehicles_have_no_such_rectangle() -> None:
         ([0.0], [-0.01, 0.01]),
     ],
 )
-def test_each_value_of_an_axis_lies_in_a_cell_that_ends_halfway_to_the_next(
-    values: list[float], edges: list[float]
-) -> None:
+def test_cells_of_the_map_end_halfway_between_values(values: list[float], edges: list[float]) -> None:
     assert cell_edges(np.array(values)) == pytest.approx(edges)

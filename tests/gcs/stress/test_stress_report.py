@@ -48,7 +48,7 @@ def junit_counts(file: Path) -> dict[str, int]:
     return found
 
 
-def test_sweep_and_onset_agree_with_the_margin_and_leave_a_page_of_their_own(tmp_path: Path) -> None:
+def test_sweep_and_onset_agree_with_the_margin(tmp_path: Path) -> None:
     out, junit = tmp_path / "out", tmp_path / "ci" / "junit.xml"
     options = ["--delay", "0,0.25", "--assert-onset", "0.005", "--junit", str(junit), "--out", str(out)]
     result = json.loads(run(tmp_path, *options, "--json"))
@@ -99,7 +99,7 @@ def found_with(plan: FlightPlan, folder: Path) -> Onset:
     return onset
 
 
-def test_a_margin_that_is_not_that_of_the_gains_flown_is_found_out(tmp_path: Path) -> None:
+def test_a_margin_that_the_gains_lack_is_exposed(tmp_path: Path) -> None:
     """The gains flown are 1.25 times those that the margin was computed for: it breaks sooner, and is found there."""
     plan = pair_plan()
     onset = found_with(replace(plan, gain=1.25 * plan.gain), tmp_path)
@@ -128,7 +128,7 @@ def test_assert_onset_fails_where_the_margin_does_not_hold(tmp_path: Path) -> No
     assert "not met" in (out / "report.html").read_text(encoding="utf-8")
 
 
-def test_map_of_random_links_flies_probes_and_the_scenarios_own_states_with_each_seed(tmp_path: Path) -> None:
+def test_a_map_flies_probes_and_own_trials_per_seed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ["--delay", "0,0.4", "--jitter", "0,0.01", "--seeds", "2", "--out", str(out), "--json"]
     result = json.loads(run(tmp_path, *options))
@@ -146,7 +146,7 @@ def printed_replay(output: str) -> list[str]:
     return line.split()[3:]
 
 
-def test_the_printed_command_flies_the_failing_trial_again_to_the_last_bit_with_a_recording(tmp_path: Path) -> None:
+def test_the_printed_command_reflies_a_trial_to_the_last_bit(tmp_path: Path) -> None:
     """At 0.5 s of link delay and with jitter: the tick log's hash is part of what is compared."""
     out = tmp_path / "out"
     output = run(tmp_path, "--delay", "0.1,0.5", "--jitter", "0.01", "--out", str(out))
@@ -161,7 +161,7 @@ def test_the_printed_command_flies_the_failing_trial_again_to_the_last_bit_with_
     assert (summary["scenario"], summary["verdict"]) == ("pair", "unstable")
 
 
-def test_both_flights_of_a_probe_on_random_links_are_left_and_a_replay_that_differs_is_told(tmp_path: Path) -> None:
+def test_both_flights_of_a_pair_are_kept_and_differences_reported(tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = json.loads(run(tmp_path, "--delay", "0.1", "--loss", "0.1", "--out", str(out), "--json"))
     [probe] = [point["id"] for point in result["points"] if point["kind"] == "probe"]
@@ -181,7 +181,7 @@ def test_a_sweep_over_two_vehicles_links_names_both_axes(tmp_path: Path) -> None
     assert result["noise"] is None
 
 
-def test_a_rate_whose_period_is_no_whole_number_of_microseconds_is_flown(tmp_path: Path) -> None:
+def test_a_rate_with_a_fractional_period_is_flown(tmp_path: Path) -> None:
     result = json.loads(run(tmp_path, "--rate", "30", "--out", str(tmp_path / "out"), "--json"))
     for point in result["points"]:
         assert point["verdict"] == "stable"
@@ -191,7 +191,7 @@ def test_a_rate_whose_period_is_no_whole_number_of_microseconds_is_flown(tmp_pat
 
 
 @pytest.mark.realtime
-def test_a_trial_in_real_time_has_the_noise_of_the_machine_on_record(tmp_path: Path) -> None:
+def test_a_real_time_trial_records_the_machines_noise(tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ["--delay", "0.1", "--jitter", "0.005", "--real-time", "--out", str(out), "--json"]
     result = json.loads(run(tmp_path, *options, duration_s=2.0))

@@ -58,7 +58,7 @@ def test_flown_growth_is_that_of_the_sampled_model(name: str, delay_s: float) ->
         ((6.5, 1.2, -4.0, -0.7), (1.2, 6.5, -0.7, -4.0)),  # the slow mode is along one diagonal, and has to be moved
     ],
 )
-def test_a_follower_whose_gains_couple_north_and_east_is_measured_as_well(
+def test_a_follower_with_coupled_axes_is_measured(
     own: tuple[tuple[float, ...], tuple[float, ...]],
 ) -> None:
     """With half the modes the fit is off by 6e-2; an error along the other diagonal shows a mode that is 0.7 off."""
@@ -69,7 +69,7 @@ def test_a_follower_whose_gains_couple_north_and_east_is_measured_as_well(
 
 
 @pytest.mark.parametrize("telemetry_hz", [25.0, 100.0])
-def test_growth_with_telemetry_at_another_rate_is_that_of_the_model_at_the_effective_delay(telemetry_hz: float) -> None:
+def test_growth_with_slower_telemetry_matches_the_effective_delay(telemetry_hz: float) -> None:
     """A state used at two ticks is late by two delays; the model at their median is off by 0.09."""
     study = study_of("chain3")
     rates = study.plan.scenario.rates.model_copy(update={"telemetry_hz": telemetry_hz})
@@ -87,7 +87,7 @@ def test_the_leaders_loop_can_be_probed_too() -> None:
     assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=1e-3)
 
 
-def test_a_probe_has_the_loop_delay_that_the_critical_vehicle_has_in_the_scenario() -> None:
+def test_a_probe_has_the_critical_vehicles_loop_delay() -> None:
     trial = study_of("triangle5").trial("probe", {"delay": 0.2}, seed=1)
     outcome = fly_trial(trial)
     scenario = trial.scenario.model_copy(update={"duration_s": 1.0, "clocks": Clocks(drift_max_ppm=0.0)})
@@ -111,9 +111,7 @@ def test_vehicles_ahead_of_the_probed_one_do_not_move() -> None:
 
 
 @given(up_ms=st.integers(0, 400), down_ms=st.integers(0, 400), waiting_us=st.integers(0, 19_999))
-def test_waiting_is_kept_by_moving_delay_and_the_loop_delay_is_as_wanted(
-    up_ms: int, down_ms: int, waiting_us: int
-) -> None:
+def test_moving_delay_between_links_keeps_waiting_and_loop_delay(up_ms: int, down_ms: int, waiting_us: int) -> None:
     period_s, waiting_s = 0.02, waiting_us * 1e-6
     up, down = with_waiting(
         Link(delay_s=up_ms * 1e-3), Link(delay_s=down_ms * 1e-3), period_s=period_s, waiting_s=waiting_s
@@ -142,7 +140,7 @@ def test_the_same_trial_has_the_same_outcome() -> None:
     assert first == second
 
 
-def test_growth_too_fast_for_a_metre_of_error_is_measured_with_less() -> None:
+def test_fast_growth_is_measured_with_a_smaller_error() -> None:
     outcome = fly_trial(pair_trial(0.5))
     assert outcome.amplitude_m is not None
     assert outcome.amplitude_m < 1.0

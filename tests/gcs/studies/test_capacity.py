@@ -21,7 +21,7 @@ def short() -> Scenario:
     return load(RADIO).model_copy(update={"duration_s": 40.0})
 
 
-def test_traffic_is_that_of_the_messages_and_what_is_too_much_is_lost(short: Scenario) -> None:
+def test_traffic_is_counted_and_its_excess_is_lost(short: Scenario) -> None:
     light = fly_loaded(short, 10.0, 3)
     # at most a report of 40 bytes up and a set-point of 65 down in each tenth of a second (MAVLink cuts trailing zeros
     # off), heartbeats and TIMESYNC besides, and all of it in proportion to the vehicles
@@ -46,7 +46,7 @@ def test_the_largest_formation_holds_and_the_next_does_not(short: Scenario) -> N
     assert fly_loaded(short, 20.0, found.most.vehicles) == found.most
 
 
-def test_a_formation_is_as_good_as_its_worst_draw_of_losses(short: Scenario) -> None:
+def test_a_formation_counts_with_its_worst_losses(short: Scenario) -> None:
     alone = [fly_loaded(short.model_copy(update={"seed": short.seed + k}), 10.0, 3) for k in range(3)]
     assert all(load.holds for load in alone)
     assert len({load.lost_down for load in alone}) == 3

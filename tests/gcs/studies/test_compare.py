@@ -18,7 +18,7 @@ SCENARIO = SCENARIOS / "chain3.toml"
 CHAIN = FormationModel((-1, 0, 1))
 
 
-def test_string_peak_of_the_formation_is_that_of_one_follower_behind_another() -> None:
+def test_formation_string_peak_equals_that_of_two_followers() -> None:
     found = design(CHAIN, period_s=0.02)
     K = CHAIN.overlapping_gain(found.K1, found.K2, 1.4 * found.K3)
     k1, k2, k3 = -found.K1[0, 0], found.K2[0, 0], 1.4 * found.K3[0, 0]

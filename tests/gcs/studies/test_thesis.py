@@ -19,7 +19,7 @@ from gcs.studies.thesis import late_neighbours
 from gcs.studies.thesis_flights import CHAIN, nonlinear_response, printed_gains
 
 
-def test_printed_gains_take_a_second_of_their_neighbours_delay_and_not_the_published_0_19() -> None:
+def test_printed_gains_tolerate_a_second_not_the_published_0_19() -> None:
     # both numbers by sweep and spectrum in the project's restatement of the source
     assert delay_margin(*late_neighbours(printed_gains(), bidirectional(CHAIN))) == pytest.approx(1.00796, abs=5e-6)
     assert delay_margin(CHAIN.A, CHAIN.B @ printed_gains()) == pytest.approx(0.077736, abs=5e-7)
@@ -61,7 +61,7 @@ def test_the_s_procedure_holds_with_plus_and_fails_with_minus() -> None:
         assert (quadratic[0][quadratic[1] <= 0.0] > 0.0).all()
 
 
-def test_the_sweep_wants_the_least_modulus_above_one_and_the_angle_with_a_minus() -> None:
+def test_the_sweep_needs_least_modulus_above_one_and_negative_angle() -> None:
     # x' = -2 x + x(t - tau) is stable at every delay, x' = -x - 2 x(t - tau) up to 2 pi / (3 sqrt 3)
     assert delay_margin([[-2.0]], [[1.0]]) == math.inf
     assert errata.pencil_moduli(-2.0, 1.0)[0] == pytest.approx(2.0)
