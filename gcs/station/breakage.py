@@ -2,6 +2,8 @@
 
 A vehicle that returns from its pilot, its failsafe or silence may be far from its place. Then the vehicles behind it
 are as far from theirs, which depend on it. Their errors say nothing about the loop until they have had time to return.
+That time is granted anew only to a vehicle that has been within the limit since, or that its pilot flew: a formation
+that diverges while its vehicles keep falling into their failsafe is broken.
 """
 
 from collections.abc import Sequence
@@ -13,6 +15,7 @@ from gains.core.arrays import FloatArray
 from gcs.control.law import VehicleControl
 from gcs.control.tick import Mode
 from gcs.plan.flight_plan import FlightPlan
+from gcs.station.absence import TAKEN_OVER
 from gcs.station.monitor import VehicleState
 
 _TIME_CONSTANTS = 3.0
@@ -30,6 +33,9 @@ class Breakage:
         self._decay_1_s = slowest_decay_1_s(plan)
         self._away = [False] * n
         self._judged_from_s = [-inf] * n
+        self._has_returned = [True] * n
+        """Whether the vehicle has been within the limit since it was last granted time to return."""
+        self._piloted = [False] * n
         self._behind: list[list[int]] = [[row] for row in range(n)]
         """Each vehicle with all that follow it, directly or through others."""
         for row in range(n - 1, 0, -1):
@@ -53,11 +59,13 @@ class Breakage:
         for row, (state, why) in enumerate(zip(states, absent, strict=True)):
             if why or state.released or state.mode in _AWAY:
                 self._away[row] = True
+                self._piloted[row] |= why == TAKEN_OVER
             elif self._away[row]:
                 self._come_back(row, controls, time_s)
         limit_m = self._safety.spacing_error_limit_m
         for row, control in enumerate(controls):
             error_m = hypot(*control.spacing_error_m)
+            self._has_returned[row] |= not self._away[row] and not error_m > limit_m  # the leader has no spacing error
             if error_m > limit_m and not self._away[row] and time_s >= self._judged_from_s[row]:
                 return f"broken: spacing error of vehicle {ids[row]} is {error_m:.0f} m, limit {limit_m:g} m"
         return ""
@@ -68,6 +76,9 @@ class Breakage:
         if not isfinite(distances_m[0]):
             return
         self._away[row] = False
+        if not (self._has_returned[row] or self._piloted[row]):
+            return
+        self._has_returned[row] = self._piloted[row] = False
         way_m = max(distance for distance in distances_m if isfinite(distance))
         speed_m_s = hypot(*self._plan.scenario.nominal_velocity_at(time_s))
         until_s = time_s + recovery_time_s(self._plan, self._decay_1_s, way_m, speed_m_s)

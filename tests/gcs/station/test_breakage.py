@@ -11,6 +11,7 @@ from gcs.control.tick import Mode
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.summary import verdict
+from gcs.station.absence import TAKEN_OVER
 from gcs.station.breakage import Breakage, recovery_time_s, slowest_decay_1_s
 from gcs.station.monitor import VehicleState
 from gcs.station.station import Station
@@ -65,6 +66,33 @@ def test_one_that_has_not_come_back_in_its_time_ends_the_flight_and_so_do_those_
     assert judged(3.0 + 0.99 * allowed_s, Mode.NOMINAL, (far_m, far_m)) == ""
     reason = judged(3.0 + 1.01 * allowed_s, Mode.NOMINAL, (0.0, far_m))
     assert reason == f"broken: spacing error of vehicle 3 is {far_m:.0f} m, limit 30 m"
+
+
+def test_a_vehicle_that_keeps_failing_gets_no_new_time() -> None:
+    """Only one that has been back within the limit does, or one that its pilot flew."""
+    plan = plan_for(three())
+    limit_m = plan.scenario.safety.spacing_error_limit_m
+
+    def end_of(error_m: float, again_m: float, why: str = "") -> str:
+        """The end of a flight in which vehicle 2 falls into its failsafe, or is taken over, every 2 s for 600 s."""
+        breakage = Breakage(plan)
+        for tick in range(600):
+            away = tick % 2 == 0
+            mode = Mode.FAILSAFE if away and not why else Mode.NOMINAL
+            states = [VehicleState(Mode.NOMINAL), VehicleState(mode), VehicleState(Mode.NOMINAL)]
+            errors_m = (nan, again_m if tick % 4 == 3 else error_m, 0.0)
+            controls = [
+                VehicleControl(1, (0.0, 0.0, 0.0, 0.0), (here_m, 0.0), (0.0, 0.0), (0.0, 0.0), 1) for here_m in errors_m
+            ]
+            absent = ["", why if away else "", ""]
+            reason = breakage.judge(controls, states, absent, np.full((3, 3), 100.0), [100.0] * 3, float(tick))
+            if reason:
+                return reason
+        return ""
+
+    assert end_of(2.0 * limit_m, 2.0 * limit_m).startswith("broken: spacing error of vehicle 2")
+    assert end_of(2.0 * limit_m, 0.0) == ""
+    assert end_of(2.0 * limit_m, 2.0 * limit_m, why=TAKEN_OVER) == ""
 
 
 def test_the_time_is_what_the_slowest_gains_need_and_the_limits_more() -> None:
