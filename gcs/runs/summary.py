@@ -123,9 +123,10 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: list
             jumps[event["system_id"]].append(event["time_s"])
     loop_delay = flown["loop_delay_s"][flown["commanded"]]
     headroom = flown["headroom"][flown["commanded"]]
+    headroom_end, logged = _headroom_end(flown), not any(text.startswith(TICKS_FILE) for text in not_logged)
     return {
         "scenario": scenario.name,
-        "verdict": verdict(reason, settled, logged=not any(text.startswith(TICKS_FILE) for text in not_logged)),
+        "verdict": verdict(reason, settled, headroom_end=headroom_end, logged=logged),
         "reason": reason,
         "fleet": said[FLEET][-1] if said[FLEET] else STARTED,
         "not_logged": not_logged,
@@ -136,6 +137,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: list
         "loop_delay_s": _spread(loop_delay),
         "at_loop_delay": figures_at(design, scenario, _slowest_median_s(flown)).model_dump(),
         "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
+        "headroom_end": headroom_end,
         "settling_time_s": settled,
         "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,
         "duration_s": _number(flown["time_s"].max()) if flown.size else 0.0,
@@ -165,13 +167,16 @@ Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Times (s) and the norm of the spacing error (m) of one follower."""
 
 
-def verdict(reason: str, settling_time_s: float | None, *, logged: bool = True) -> str:
+def verdict(
+    reason: str, settling_time_s: float | None, *, headroom_end: float | None = None, logged: bool = True
+) -> str:
     """ "stable", "unstable", "aborted" or "unknown".
 
-    Stable: flown to the end of its duration, and every spacing error had settled by then. Unstable: a limit was broken,
-    or a spacing error had not settled, be it that it grows, circles in a limit cycle or shrinks too slowly for the
-    scenario's duration. Aborted: ended early for any other reason. Unknown: flown to the end, but not all of it is in
-    the log of ticks.
+    Stable: flown to the end of its duration, every spacing error had settled by then, and the loop delay was within
+    the margin at the end. Unstable: a limit was broken; or a spacing error had not settled, be it that it grows,
+    circles in a limit cycle or shrinks too slowly for the scenario's duration; or the errors were small, but the loop
+    delay was past the margin at the end: there they grow slowly, or limits hold them in a small cycle. Aborted: ended
+    early for any other reason. Unknown: flown to the end, but not all of it is in the log of ticks.
     """
     if reason.startswith("broken"):
         return "unstable"
@@ -179,7 +184,20 @@ def verdict(reason: str, settling_time_s: float | None, *, logged: bool = True) 
         return "aborted"
     if not logged:
         return "unknown"
-    return "unstable" if settling_time_s is None else "stable"
+    return "unstable" if settling_time_s is None or (headroom_end or 0.0) < 0.0 else "stable"
+
+
+def _headroom_end(flown: TickArray) -> float | None:
+    """The least of the vehicles' median headrooms in the last quarter of the flight; None where unknown."""
+    if not flown.size:
+        return None
+    late = flown[flown["commanded"] & (flown["time_s"] >= 0.75 * flown["time_s"].max())]
+    medians = [float(np.median(own[np.isfinite(own)])) for own in _headrooms(late) if np.isfinite(own).any()]
+    return min(medians, default=None)
+
+
+def _headrooms(rows: TickArray) -> list[NDArray[np.float64]]:
+    return [rows["headroom"][rows["system_id"] == system_id] for system_id in np.unique(rows["system_id"])]
 
 
 def _error(flown: TickArray, system_id: int) -> Errors:

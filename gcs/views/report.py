@@ -170,11 +170,13 @@ def print_flight(summary: dict[str, Any], console: Console) -> None:
 
 
 def _reason(summary: dict[str, Any]) -> str:
-    """How the flight ended; of one that was flown to its end unsettled, what was left of the errors."""
+    """How the flight ended; of one that was flown to its end and is not stable, why."""
     errors = [(v["spacing_error_final_m"], v["spacing_error_max_m"]) for v in summary["vehicles"]]
     known = [(final_m, most_m) for final_m, most_m in errors if final_m is not None and most_m is not None]
     if summary["verdict"] != "unstable" or not summary["reason"].startswith("completed") or not known:
         return summary["reason"]
+    if summary["settling_time_s"] is not None:
+        return f"errors are small after {summary['duration_s']:.1f} s, but the loop delay is past the margin"
     final_m, most_m = (max(column) for column in zip(*known, strict=True))
     return f"not settled in {summary['duration_s']:.1f} s; {final_m:.2f} m left of errors of up to {most_m:.2f} m"
 

@@ -253,12 +253,26 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
     control = scenario.control.model_copy(
         update={"delay_margin_s": None, "gains": FixedGains(K1=-20.0, K2=0.0, K3=150.0)}
     )
-    # within limits the errors end in a small cycle, inside the band of those that count as settled
     plan, design = planned("chain3", control=control, monitor=Monitor(act=False), limits=Limits())
     assert design.margins_s[0] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
     _, summary = flown(plan, design)
     assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design.margins_s[0]
     assert (summary["verdict"], summary["settling_time_s"]) == ("unstable", None)
+    # limits hold the errors in a cycle so small that they count as settled
+    _, limited = flown(*planned("chain3", control=control, monitor=Monitor(act=False)))
+    assert limited["settling_time_s"] is not None
+    assert (limited["verdict"], limited["reason"]) == ("unstable", "completed: duration reached")
+    output = io.StringIO()
+    print_flight(limited, Console(file=output, width=200))
+    assert "errors are small after" in output.getvalue()
+    assert "but the loop delay is past the margin" in output.getvalue()
+
+
+def test_errors_that_still_grow_slowly_past_the_margin_are_not_stable() -> None:
+    links = load(SCENARIOS / "thesis_delay.toml").with_link_delay(up_s=0.55, down_s=0.55).links
+    _, summary = flown(*planned("thesis_delay", links=links))
+    assert summary["headroom_end"] < 0.0
+    assert summary["verdict"] == "unstable"
 
 
 FIXED_WING = (
