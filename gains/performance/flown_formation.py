@@ -57,7 +57,7 @@ class FlownFormation:
     >>> from gains.performance.flown_formation import FlownFormation
     >>> lone = FlownFormation(FormationModel((-1,), axes=1), np.array([[-1.0]]), np.pi / 2, period_s=0.0)
     >>> [round(lone.alpha(delay_s), 3) for delay_s in (0.0, 1.0, 1.5)]
-    [1.0, 0.43, 0.059]
+    [1.0, 0.43, 0.039]
     """
 
     model: FormationModel

@@ -185,7 +185,7 @@ def delay_text(summary: dict[str, Any]) -> str:
     """Loop delay against the margin."""
     delay, margin_s = summary["loop_delay_s"], summary["delay_margin_s"]
     margin = "no limit" if summary["loop"] == "onboard" and margin_s is None else f"margin {_ms(margin_s)}"
-    flown_s = [vehicle.get("delay_margin_s", {}).get("max") for vehicle in summary["vehicles"]]
+    flown_s = [vehicle.get("delay_margin_s", {}).get("max") for vehicle in summary.get("vehicles", [])]
     slowest_s = max((s for s in flown_s if s is not None), default=0.0)
     if margin_s is not None and slowest_s > margin_s:
         margin += f", up to {_ms(slowest_s)} with slower gains"

@@ -29,7 +29,7 @@ from gcs.stress.study import NoOnset, Study, find_onset
 from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load, parse, with_loop
-from scenarios.schema import FixedGains, Link, Outage, Scenario, VehicleLinks
+from scenarios.schema import FixedGains, Limits, Link, Outage, Scenario, VehicleLinks
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import ACTED, DTYPE, SAMPLED
 from sim_vehicles.services.mavlink import STATUS_CRITICAL
@@ -251,7 +251,7 @@ def test_control_rates_are_varied_together_with_those_on_board() -> None:
 
 def test_ticks_of_the_formation_opened_by_the_station_keep_the_wider_spacing() -> None:
     """The vehicles' own spacing stays as it was uploaded; the rest is streamed."""
-    _, plan = flight_plan(onboard("chain3", duration_s=25.0))
+    _, plan = flight_plan(onboard("chain3", duration_s=25.0, limits=Limits()))
     station = Station(plan, start_ns=START_NS)
     rows: list[TickArray] = []
     for ticks in fly_lockstep(plan, station=station):
