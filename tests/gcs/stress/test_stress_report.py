@@ -50,7 +50,7 @@ def junit_counts(file: Path) -> dict[str, int]:
 
 def test_sweep_and_onset_agree_with_the_margin(tmp_path: Path) -> None:
     out, junit = tmp_path / "out", tmp_path / "ci" / "junit.xml"
-    options = ["--delay", "0,0.25", "--assert-onset", "1e-10", "--junit", str(junit), "--out", str(out)]
+    options = ["--delay", "0,0.25", "--assert-onset", "0.005", "--junit", str(junit), "--out", str(out)]
     result = json.loads(run(tmp_path, *options, "--json"))
     onset = result["onset"]
     assert result["passed"]
@@ -118,7 +118,7 @@ def margin_of(plan: FlightPlan) -> float:
 def test_assert_onset_fails_where_the_margin_does_not_hold(tmp_path: Path) -> None:
     """Telemetry rounds positions to float32: no flight agrees with the margin to one part in ten thousand million."""
     out, junit = tmp_path / "out", tmp_path / "junit.xml"
-    options = ["--assert-onset", "0.005", "--junit", str(junit), "--out", str(out)]
+    options = ["--assert-onset", "1e-10", "--junit", str(junit), "--out", str(out)]
     output = run(tmp_path, *options, code=1)
     assert "1e-08% is allowed" in output
     assert junit_counts(junit) == {"tests": 1, "failures": 1, "errors": 0, "skipped": 0}
