@@ -169,7 +169,7 @@ def take_over_and_say_so(port: int) -> None:
 def test_a_vehicle_holds_when_its_client_is_killed(tmp_path: Path) -> None:
     with fleet(files.load(SCENARIOS / "triangle5.toml"), tmp_path) as port:
         # as a module: a file would not find the package that it is in
-        command = [sys.executable, "-m", "tests.test_mavsdk", str(port)]
+        command = [sys.executable, "-m", "tests.clients.test_mavsdk", str(port)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=SCENARIOS.parent) as process:
             assert process.stdout is not None
             said = next((line for line in process.stdout if line.startswith("{")), "")

@@ -1,9 +1,12 @@
 """The documentation says what the code does: generated parts, figures, commands, links."""
 
+import contextlib
 import dataclasses
 import doctest
 import re
+import select
 import shutil
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +17,7 @@ import pytest
 from docs.generate import blocks, figures, measurements, reference
 from docs.generate.fields import described, found_fields
 from docs.generate.keys import schema
-from docs.generate.runner import Runner
+from docs.generate.runner import CommandError, Runner
 from docs.generate.sessions import Step, steps_of
 from gcs.cli.margin import margin_of_file, margin_of_scenario
 from gcs.drive.lockstep import START_NS, fly_lockstep
@@ -186,8 +189,24 @@ def test_what_a_page_says_to_type_works(name: str, folder: Path, monkeypatch: py
 @pytest.mark.xdist_group("realtime")
 @pytest.mark.parametrize("name", [n for n in SESSIONS if any(step.realtime for step in steps_of(PAGES[n]))])
 def test_what_a_page_says_to_type_works_in_real_time(name: str, folder: Path) -> None:
-    steps = steps_of(PAGES[name])
-    shell([step for step in steps if step.realtime or step.file or "gcs key" in step.text], folder)
+    steps = [step for step in steps_of(PAGES[name]) if step.realtime or step.file or "gcs key" in step.text]
+    for tries_left in reversed(range(20)):
+        try:
+            shell(steps, folder)
+            return
+        except CommandError as error:  # the pages use the usual port, which another test may have for a moment
+            if "Address already in use" not in str(error) or not tries_left:
+                raise
+            wait_until_free(14550)
+
+
+def wait_until_free(port: int) -> None:
+    """Wait until nobody on this machine listens at a UDP port."""
+    for _ in range(600):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return
+        select.select([], [], [], 0.1)
 
 
 @pytest.mark.parametrize("name", PAGES)
