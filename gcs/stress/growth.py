@@ -26,6 +26,8 @@ _MOST_SAMPLES = 300
 """More samples are thinned out: accuracy comes from the length of the window, cost from the number of samples."""
 _ENVELOPE_S = 1.0
 _FEWEST_ENVELOPE = 4
+_PARTS = 8
+"""Parts of a window whose slopes show how far its mean growth rate is left to chance."""
 _FEWEST_SIGNS = 3
 """Fewest changes of sign that give a frequency: one full cycle."""
 _LONGEST_HANKEL = 120
@@ -65,8 +67,8 @@ class Motion:
 class Growth:
     """Rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
 
-    `error_1_s` is the standard error: the larger of that from the misfit and half the difference between the first and
-    the second half of the window. The window is `start_s` to `end_s` of the motion's time. The frequency is None if the
+    `error_1_s` is the standard error. Of a fitted mode it is the larger of that from the misfit and half the difference
+    between the first and the second half of the window. The window is `start_s` to `end_s` of the motion's time. The frequency is None if the
     motion does not oscillate.
     """
 
@@ -132,8 +134,8 @@ def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: 
 def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Growth | None:
     """The growth rate of a motion under varying delays: the slope of the logarithm of its norm over all channels.
 
-    Such a motion has a mean rate but no modes; a fit would find spurious ones. The window is that of `fit_growth`, and
-    the standard error half the difference between its halves. The frequency follows from the changes of sign.
+    Such a motion has a mean rate but no modes; a fit would find spurious ones. The window is that of `fit_growth`. The
+    frequency follows from the changes of sign.
     """
     time_s, values = _window(motion, start_s, end_s)
     scale = np.sqrt((values**2).mean(axis=0)) if len(values) else np.zeros(0)
@@ -165,11 +167,16 @@ def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Gro
 
 
 def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
-    """The slope of a logarithm over time, with half the difference between its halves as the error."""
-    slopes = [float(np.polyfit(t, y, 1)[0]) for t, y in _whole_and_halves(time_s, level)]
+    """The slope of a logarithm over time; its standard error is that of the mean slope of `_PARTS` parts.
+
+    Random delays make the logarithm a random walk with drift. The slopes of its parts are then independent.
+    """
+    parts = min(_PARTS, time_s.size // 2)
+    split = zip(np.array_split(time_s, parts), np.array_split(level, parts), strict=True)
+    slopes = [np.polyfit(t, y, 1)[0] for t, y in split]
     return Growth(
-        growth_1_s=slopes[0],
-        error_1_s=abs(slopes[1] - slopes[2]) / 2.0,
+        growth_1_s=float(np.polyfit(time_s, level, 1)[0]),
+        error_1_s=float(np.std(slopes, ddof=1)) / parts**0.5,
         frequency_rad_s=None,
         start_s=float(time_s[0]),
         end_s=float(time_s[-1]),
@@ -187,11 +194,6 @@ def _frequency(time_s: FloatArray, values: FloatArray) -> float | None:
         if crossed_s.size >= _FEWEST_SIGNS:
             found.append(np.pi * (crossed_s.size - 1) / float(np.ptp(crossed_s)))
     return float(np.median(found)) if found else None
-
-
-def _whole_and_halves(time_s: FloatArray, level: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    half = time_s.size // 2
-    return [(time_s, level), (time_s[:half], level[:half]), (time_s[half:], level[half:])]
 
 
 def _window(motion: Motion, start_s: float, end_s: float) -> tuple[FloatArray, FloatArray]:

@@ -121,14 +121,22 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         raise _no_limit(study, run, tolerance=tolerance)
     if predicted_s <= 0.0:
         raise NoOnset(f"the predicted margin is {predicted_s:g} s: there is no delay at which it is stable")
-    seed = study.plan.scenario.seed
+    first_seed = study.plan.scenario.seed
     centre_s, width_s = predicted_s - study.plan.timing.faster_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
     flights: dict[str, Outcome] = {}
-    noisy = study.real_time or not has_constant_links(study.plan.scenario)  # closer flights would show only noise
+    random_links = not has_constant_links(study.plan.scenario)
+    noisy = study.real_time or random_links  # closer flights would show only noise
     for round_number in range(1, _ROUNDS + 1):
         spread = centre_s + width_s * np.linspace(-1.0, 1.0, _FLIGHTS_A_ROUND)
         links_s = dict.fromkeys(round(float(delay_s), 6) for delay_s in np.maximum(spread, 0.0))
-        flown = run([study.trial("probe", {"delay": link_s}, seed=seed) for link_s in links_s])
+        # On random links each flight draws its own delays: with the same ones all rates would be off alike, and their
+        # scatter would not show it.
+        seeds = range(first_seed + len(flights), first_seed + len(flights) + len(links_s))
+        trials = [
+            study.trial("probe", {"delay": link_s}, seed=seed if random_links else first_seed)
+            for link_s, seed in zip(links_s, seeds, strict=True)
+        ]
+        flown = run(trials)
         flights |= {outcome.id: outcome for outcome in flown}
         near = [o for o in flights.values() if abs((o.link_delay_s or 0.0) - centre_s) <= 1.001 * width_s]
         zero = locate_zero(points_of(near))
