@@ -1,4 +1,4 @@
-"""The scenario's limits, applied to every set-point that is sent, for whatever vehicle and by whatever computed."""
+"""The scenario's limits, applied to every set-point that is sent, whatever computed it."""
 
 from dataclasses import dataclass
 from math import hypot

@@ -1,4 +1,4 @@
-"""Flies a plan to its end and returns its log: in virtual time, or in real time as `gcs fly` does."""
+"""Flies a plan to its end, in virtual time or in real time as `gcs fly` does, and returns its log."""
 
 from dataclasses import dataclass
 from pathlib import Path

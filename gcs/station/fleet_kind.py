@@ -1,7 +1,7 @@
-"""What differs between vehicles without and with autopilots, chosen once when the station is built.
+"""What depends on the kind of vehicles, double integrators or multicopters with autopilots.
 
-`fleet_of` chooses; nothing else in the station asks for the scenario's `dynamics`. Where the loop is closed is
-another choice, see `gcs.control.loops`.
+`fleet_of` chooses once, when the station is built; nothing else in the station reads the scenario's `dynamics`. Where
+the loop is closed is another choice, see `gcs.control.loops`.
 """
 
 from typing import Any, Protocol
@@ -52,7 +52,7 @@ class FleetKind(Protocol):
         ...
 
     def startup_failure(self, due_ns: int, start_ns: int) -> str:
-        """Why the start has to be given up: a vehicle cannot be flown, or its time is up. Empty to go on waiting."""
+        """Why the flight cannot begin: a vehicle cannot be flown, or its time is up. Empty while it still may."""
         ...
 
     def locate(self, history: StateHistory) -> None:
@@ -84,7 +84,7 @@ def fleet_of(plan: FlightPlan, report: Report) -> FleetKind:
 
 
 class LaunchedFleet:
-    """Vehicles without autopilots: in the air from the beginning, in one frame, responding at once."""
+    """Double integrators: in the air from the beginning, in one frame, responding at once."""
 
     speaks_mavlink_1_first = False
     holds_when_left_alone = True
@@ -113,7 +113,7 @@ class LaunchedFleet:
     def locate(self, history: StateHistory) -> None:
         """Nothing to do: all frames are the same."""
 
-    def identify(self, due_ns: int, history: StateHistory) -> str:  # noqa: ARG002 - nothing is to be found
+    def identify(self, due_ns: int, history: StateHistory) -> str:  # noqa: ARG002 - their response is known
         return ""
 
     def set_point(

@@ -97,7 +97,7 @@ class Station:
         return min(self._next_tick_ns, self._next_heartbeat_ns, self._next_timesync_ns)
 
     def request_stop(self, reason: str) -> None:
-        """End the flight at the next tick: the vehicles are commanded to hold, and awaited until they do."""
+        """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
         self._stop = self._stop or reason
 
     def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
@@ -129,7 +129,7 @@ class Station:
         return rows
 
     def scenario_time_s(self, now_ns: int) -> float:
-        """Time since the formation flight began; before that, time since the start minus `patience_s`, negative."""
+        """Time since the formation flight began; before that negative, the time since the start minus `patience_s`."""
         if self._flight_start_ns is None:
             return (now_ns - self._start_ns) / NS_PER_S - self.patience_s
         return (now_ns - self._flight_start_ns) / NS_PER_S
@@ -369,7 +369,7 @@ class Station:
             outgoing.append(Outgoing(vehicle.encode(msg_id, fields), vehicle.address))
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
-        """Announce a change on the link, for others who listen and for the telemetry log."""
+        """Announce a change on the link, for other listeners and the telemetry log."""
         fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
         self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
 

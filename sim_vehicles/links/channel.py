@@ -1,4 +1,4 @@
-"""Limited bandwidth, of one link or shared by many: a drop-tail queue with one sender."""
+"""Limited bandwidth, of one link or shared by several: a drop-tail queue with one sender."""
 
 from collections import deque
 

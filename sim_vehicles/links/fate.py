@@ -1,8 +1,8 @@
 """What happens to one datagram on a link: a pure function of the link, the time and the random draws.
 
-A link's schema is compiled once into a frozen `Behaviour`, with all times in ns. Each link has two random streams: one
+A link's schema is converted once into a frozen `Behaviour`, with all times in ns. Each link has two random streams: one
 decides loss, duplication and corruption, the other the jitter. Every datagram takes the same number of draws from both,
-used or not. So more loss leaves the delays unchanged, and no link's traffic shifts the draws of another.
+used or not. So more loss leaves the delays unchanged, and one link's traffic does not shift the draws of another.
 """
 
 from bisect import bisect_right
@@ -18,7 +18,7 @@ from sim_vehicles.links.truth import CORRUPTED, LOST, OUTAGE, PASSED
 
 MOST_FLIPS = 4
 _BLOCK = 128
-"""Datagrams whose draws are made at once: numpy takes as long for one as for a hundred."""
+"""Datagrams whose draws are made together: numpy takes as long for one as for a hundred."""
 
 
 class Draws(NamedTuple):
@@ -70,7 +70,6 @@ class Behaviour:
 
 
 def behaviour_of(link: schema.Link) -> Behaviour:
-    """Compile a link's schema."""
     points = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
     points_ns = tuple((_ns(time_s), _ns(delay_s)) for time_s, delay_s in points)
     bursts = link.loss_bursts
@@ -127,7 +126,7 @@ def delay_at(link: Behaviour, time_ns: int) -> int:
 
 
 def flipped(data: bytes, flips: tuple[float, ...]) -> bytes:
-    """The datagram with bits flipped at these fractions of its length; equal places flip once."""
+    """The datagram with bits flipped at these fractions of its length; a place named twice flips once."""
     changed = bytearray(data)
     for place in {int(part * len(data) * 8) for part in flips} if data else ():
         changed[place // 8] ^= 1 << place % 8

@@ -1,4 +1,4 @@
-"""Parameters that show ground stations a vehicle which was set up. They have no effect.
+"""Parameters that make a vehicle look set up to ground stations. They have no effect.
 
 Without them QGroundControl warns: it looks for a frame, calibrated sensors, a mapped radio and a battery.
 """

@@ -1,8 +1,8 @@
 """A simulated multicopter that behaves like ArduCopter or PX4 as seen from outside.
 
 It boots, sends heartbeats, then telemetry, then gets a position. It can be armed, takes off to an altitude, follows
-velocity and acceleration set-points with a lag, and lands. The fleet flies it in place of a double integrator if the
-scenario's dynamics are `autopilot`.
+velocity and acceleration set-points with a lag, and lands. The fleet flies it if the scenario has `dynamics =
+"autopilot"`.
 """
 
 import math
@@ -59,7 +59,7 @@ def multicopter(
 
 
 class Copter:
-    """The craft in the shell: motion, and the autopilot's modes."""
+    """The craft in the shell: its motion and the autopilot's modes."""
 
     def __init__(self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio) -> None:
         start_ns = radio.start_ns

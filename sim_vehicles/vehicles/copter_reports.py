@@ -1,9 +1,9 @@
-"""The reports of a simulated multicopter: from its state to frames."""
+"""The reports of a simulated multicopter."""
 
 import math
 from typing import NamedTuple
 
-from sim_vehicles.services import mavlink, services
+from sim_vehicles.services import mavlink, messages
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.vehicles.copter_dynamics import Motion
 from sim_vehicles.vehicles.copter_rules import Rules
@@ -28,7 +28,7 @@ class Facts(NamedTuple):
 
 
 def reported(rules: Rules) -> tuple[int, ...]:
-    """The messages that it sends on request, besides those of every vehicle."""
+    """The messages that can be requested from it, besides those of every vehicle."""
     return (
         mavlink.LOCAL_POSITION,
         mavlink.GLOBAL_POSITION,
@@ -41,24 +41,26 @@ def reported(rules: Rules) -> tuple[int, ...]:
 def report(message_id: int, encoder: mavlink.Encoder, rules: Rules, facts: Facts, boot_ms: int) -> bytes | None:
     """The frame of one of its messages; None if there is nothing to send yet."""
     motion, (origin_north_m, origin_east_m, origin_up_m) = facts.motion, facts.origin_neu_m
-    frame: bytes | None = None
     if message_id == mavlink.HEARTBEAT:
-        frame = encoder.heartbeat(_base_mode(facts), facts.mode, _status(facts), rules.autopilot)
-    elif message_id == rules.estimator_message:
-        frame = encoder.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if facts.ready else NOT_READY_FLAGS)
-    elif message_id == mavlink.GLOBAL_POSITION or message_id in services.EXTRA:
-        frame = services.report(message_id, encoder, _condition(facts, boot_ms))
-    elif message_id == mavlink.LOCAL_POSITION and facts.ready:
-        north, east = motion.north_m - origin_north_m, motion.east_m - origin_east_m
-        down = origin_up_m - motion.altitude_m
-        frame = encoder.local_position(boot_ms, north, east, down, motion[2:4], -motion.climb_m_s)
+        return encoder.heartbeat(_base_mode(facts), facts.mode, _status(facts), rules.autopilot)
+    if message_id == mavlink.LOCAL_POSITION and facts.ready:
+        down_m = origin_up_m - motion.altitude_m
+        position = motion.north_m - origin_north_m, motion.east_m - origin_east_m, down_m
+        return encoder.local_position(boot_ms, position, (*motion[2:4], -motion.climb_m_s))
+    if message_id == rules.estimator_message:
+        flags = READY_FLAGS if facts.ready else NOT_READY_FLAGS
+        message = messages.estimator_flags(message_id, boot_ms * 1000, flags)
+    elif message_id == mavlink.GLOBAL_POSITION or message_id in messages.EXTRA:
+        message = messages.report(message_id, _condition(facts, boot_ms))
     elif message_id == mavlink.GLOBAL_ORIGIN and facts.ready:
-        frame = encoder.global_origin(*degrees(origin_north_m, origin_east_m), ORIGIN_ALTITUDE_M + origin_up_m)
+        message = messages.global_origin(degrees(origin_north_m, origin_east_m), ORIGIN_ALTITUDE_M + origin_up_m)
     elif message_id == mavlink.HOME_POSITION and facts.ready:
         north, east = facts.home_ne_m
         local = north - origin_north_m, east - origin_east_m, origin_up_m
-        frame = encoder.home_position(*degrees(north, east), ORIGIN_ALTITUDE_M, local)
-    return frame
+        message = messages.home_position(degrees(north, east), local)
+    else:
+        return None
+    return encoder.pack(message)
 
 
 def _base_mode(facts: Facts) -> int:
@@ -71,13 +73,13 @@ def _status(facts: Facts) -> int:
     return mavlink.STATUS_STANDBY if facts.landed else mavlink.STATUS_ACTIVE
 
 
-def _condition(facts: Facts, boot_ms: int) -> services.Condition:
-    """What it reports to other ground stations; it leans into its acceleration."""
+def _condition(facts: Facts, boot_ms: int) -> messages.Condition:
+    """What it reports to other ground stations; it tilts to accelerate."""
     motion = facts.motion
     cosine, sine = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
     north, east = motion.acceleration_north_m_s2 / GRAVITY_M_S2, motion.acceleration_east_m_s2 / GRAVITY_M_S2
     roll_rad, pitch_rad = math.atan(cosine * east - sine * north), -math.atan(cosine * north + sine * east)
-    return services.Condition(
+    return messages.Condition(
         boot_ms,
         degrees(motion.north_m, motion.east_m),
         ORIGIN_ALTITUDE_M + motion.altitude_m,

@@ -26,9 +26,9 @@ from sim_vehicles.vehicles.setpoints import (
 
 TEMPORARILY_REJECTED, FAILED = 1, 4
 PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
-"""The parameter with the altitude above the ground, in m, for a take-off command that names none."""
+"""The parameter with the altitude above ground, in m, of a take-off command without an altitude."""
 GROUND_DISARM_S = 10.0
-"""Both disarm if they have not taken off this long after arming."""
+"""Both autopilots disarm if they have not taken off this long after arming."""
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
