@@ -92,7 +92,7 @@ def _fly(
 ) -> None:
     from sim_vehicles.drive.fleet import Fleet
     from sim_vehicles.drive.guard import open_links
-    from sim_vehicles.drive.udp import Ports, fly
+    from sim_vehicles.drive.udp import Ports, run
 
     system_ids = tuple(sorted(v.system_id for v in scenario.vehicles))
     epoch_ns = time.time_ns() - time.monotonic_ns()
@@ -101,7 +101,7 @@ def _fly(
         ports = Ports(system_ids, options.station)
     except OSError as error:
         raise _AddressError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
-    opened.callback(ports.close)
+    opened.callback(ports.sockets.close)
     start_ns = time.monotonic_ns()
     fleet = Fleet(scenario, start_ns, record=log.record if log else None, signed=signed)
     say = _Lines(start_ns)
@@ -110,10 +110,15 @@ def _fly(
         say.openness([options.station], "others may send from there and nothing is signed; see --key")
     say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
     stop = _stop_rule(signals, start_ns, options, say, fleet)
+
+    def look(now_ns: int) -> bool:
+        say.news(fleet.take_changes(), ports.sockets, log)
+        return stop(now_ns, fleet.commanded_ns)
+
     if not stop(start_ns, start_ns):
-        fly(fleet, ports, stop=stop, tell=_teller(say, log, ports.sockets))
+        run(ports.sockets, lambda now: ports.send(fleet.step(ports.receive(), now)), lambda: fleet.next_event_ns, look)
     say.changes(fleet.take_changes())
-    counters = fleet.counters + ports.counters
+    counters = fleet.counters + ports.sockets.counters
     say.summary(counters, log)
     if options.counters:
         with contextlib.suppress(OSError):  # the flight is over, and the summary has been printed
@@ -127,7 +132,8 @@ def _links_only(
     options: argparse.Namespace,
     opened: contextlib.ExitStack,
 ) -> None:
-    from sim_vehicles.drive.relay_udp import Peers, relay
+    from sim_vehicles.drive.relay_udp import Peers
+    from sim_vehicles.drive.udp import run
     from sim_vehicles.links.relay import Relay
 
     try:
@@ -143,7 +149,13 @@ def _links_only(
     ports = ", ".join(map(_shown, options.vehicle_port))
     say.openness(options.vehicle_port, "links pass on what anybody sends; only stations and vehicles can sign")
     say.line(f"the links of {scenario.name}, from vehicles at {ports}, to {_shown(options.station)}")
-    relay(links, peers, stop=_stop_rule(signals, start_ns, options, say), tell=_teller(say, log, peers.sockets))
+    stop = _stop_rule(signals, start_ns, options, say)
+
+    def look(now_ns: int) -> bool:
+        say.news(peers.take_changes(), peers.sockets, log)
+        return stop(now_ns, links.last_heard_ns)
+
+    run(peers.sockets, lambda now: peers.send(links.step(peers.receive(), now)), lambda: links.next_event_ns, look)
     say.summary(links.counters + peers.sockets.counters, log)
 
 
@@ -171,16 +183,6 @@ def _stop_rule(
     return stop
 
 
-def _teller(say: "_Lines", log: "TruthLog | None", sockets: "Sockets") -> Callable[[list["Change"]], None]:
-    def tell(changes: list["Change"]) -> None:
-        say.changes(changes)
-        say.lateness(sockets)
-        if log:
-            log.flush()
-
-    return tell
-
-
 class _Lines:
     """Prints lines for a person, on the terminal or in the log of the parent process."""
 
@@ -202,6 +204,13 @@ class _Lines:
         for host, port in addresses:
             if not ip_address(host).is_loopback:
                 self.line(f"warning: {host}:{port} is open: {why}")
+
+    def news(self, changes: list["Change"], sockets: "Sockets", log: "TruthLog | None") -> None:
+        """What has happened since the last call; the truth of that time is written out."""
+        self.changes(changes)
+        self.lateness(sockets)
+        if log:
+            log.flush()
 
     def changes(self, changes: list["Change"]) -> None:
         for change in changes:
