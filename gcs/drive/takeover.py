@@ -61,7 +61,7 @@ class Presence:
             there,
             lambda system_id: (
                 mavlink.PARAM_EXT_REQUEST_READ,
-                mavlink.param_ext_request_read(_SCENARIO, target_system=system_id),
+                mavlink.param_request_read(_SCENARIO, target_system=system_id),
             ),
             _scenario_of,
         )
