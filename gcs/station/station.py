@@ -24,7 +24,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import absences, describe_change, end_reason
 from gcs.station.breakage import Breakage
 from gcs.station.fleet_kind import fleet_of
-from gcs.station.monitor import FleetView, FormationMonitor
+from gcs.station.monitor import FormationMonitor, Observation
 from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
 from scenarios.schema import NS_PER_S
 
@@ -63,12 +63,9 @@ class Station:
         self._breakage = Breakage(plan)
         self._limits = SetPointLimits.of(scenario.limits)
         self._period_ns = round(NS_PER_S / rates.control_hz)
+        period_s = self._period_ns / NS_PER_S
         self._monitor = FormationMonitor(
-            n,
-            plan.margins_s,
-            plan.scenario.monitor,
-            separable=plan.separable,
-            period_s=self._period_ns / NS_PER_S,
+            n, plan.margins_s, scenario.monitor, separable=plan.separable, period_s=period_s
         )
         self.patience_s = patience_s(scenario)
         self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
@@ -294,15 +291,12 @@ class Station:
                     self._report("vehicle", describe_change(was, now), vehicle.system_id)
             self._absent = absent
             self._law = self._fleet.loop.law([why != "" for why in absent])
-        view = FleetView(
-            time_s=self.scenario_time_s(due_ns),
-            flying=flying,
-            silent=silent,
-            guided=[vehicle.guided for vehicle in self.vehicles],
-            failsafe=[vehicle.critical for vehicle in self.vehicles],
-            loop_delay_s=self._loop_delay_s,
-        )
-        for row, before, after in self._monitor.update(view):
+        time_s = self.scenario_time_s(due_ns)
+        fleet = [
+            Observation(time_s, flying, gone, vehicle.guided, vehicle.critical, delay_s)
+            for vehicle, gone, delay_s in zip(self.vehicles, silent, self._loop_delay_s, strict=True)
+        ]
+        for row, before, after in self._monitor.update(fleet):
             vehicle = self.vehicles[row]
             if flying:
                 vehicle.goal = None if after.released else Goal.FLY
