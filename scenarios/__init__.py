@@ -1,1 +1,1 @@
-"""What an experiment is. `schema` has the keys of a scenario, `files` reads and checks them, `signing` signs links."""
+"""What an experiment is. `schema` has its keys, `files` reads and checks them, `signing` signs links."""

@@ -17,8 +17,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 
 from scenarios.errors import ScenarioError
+from scenarios.link_schema import Jitter, Link, Links, Outage
+from scenarios.part import MOST
 from scenarios.places import line_of, location_of, named, wanted_of
-from scenarios.schema import MOST, Jitter, Link, Links, Outage, Scenario
+from scenarios.schema import Scenario
 
 TRACE_DELAYS = 100_000
 """Most delays of a trace."""

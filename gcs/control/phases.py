@@ -2,7 +2,8 @@
 
 from enum import StrEnum
 
-from scenarios.schema import Link, Scenario
+from scenarios.link_schema import Link
+from scenarios.schema import Scenario
 
 
 class Phase(StrEnum):

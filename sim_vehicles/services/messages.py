@@ -182,10 +182,10 @@ def report(message_id: int, at: Condition) -> Message:
         return dialect.MAVLink_sys_status_message(present, present, health, 100, _FULL_MV, -1, 100, *(0,) * 6)
     if message_id == GPS_RAW:
         course = round(math.degrees(math.atan2(east, north)) % 360.0 * 100.0) % 36_000
-        fix: tuple[int, ...] = (dialect.GPS_FIX_TYPE_NO_FIX, 0, 0, 0, *(_UNKNOWN,) * 4, 0)
+        fix = [dialect.GPS_FIX_TYPE_NO_FIX, 0, 0, 0, *[_UNKNOWN] * 4, 0]
         if at.has_position:
             speed = min(_UNKNOWN - 1, round(speed_m_s * 100.0))
-            fix = dialect.GPS_FIX_TYPE_3D_FIX, latitude, longitude, altitude, 80, 120, speed, course, 12
+            fix = [dialect.GPS_FIX_TYPE_3D_FIX, latitude, longitude, altitude, 80, 120, speed, course, 12]
         return dialect.MAVLink_gps_raw_int_message(at.time_boot_ms * 1000, *fix)
     landed = dialect.MAV_LANDED_STATE_IN_AIR if at.flying else dialect.MAV_LANDED_STATE_ON_GROUND
     hud = speed_m_s, speed_m_s, round(heading_deg) % 360, 50, at.altitude_m, -down
