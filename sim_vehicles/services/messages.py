@@ -171,10 +171,10 @@ def report(message_id: int, at: Condition) -> Message:
     altitude = _clipped(at.altitude_m * 1e3, _INT32)
     if message_id == dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT:
         relative = _clipped((at.altitude_m - ORIGIN_ALTITUDE_M) * 1e3, _INT32)
-        velocity = (_clipped(speed * 1e2, _INT16) for speed in at.velocity_ned_m_s)
+        v_north, v_east, v_down = (_clipped(speed * 1e2, _INT16) for speed in at.velocity_ned_m_s)
         heading = round(heading_deg * 1e2) % 36_000
         return dialect.MAVLink_global_position_int_message(
-            at.time_boot_ms, latitude, longitude, altitude, relative, *velocity, heading
+            at.time_boot_ms, latitude, longitude, altitude, relative, v_north, v_east, v_down, heading
         )
     if message_id == SYS_STATUS:  # the battery is always full
         health = _GEOFENCE | (_ALL_SENSORS if at.has_position else _SENSORS)
