@@ -51,36 +51,37 @@ def run(arguments: list[str]) -> int:
     with _signals() as signals, contextlib.ExitStack() as opened:
         # imported after parsing, so that --help and a mistyped option answer at once
         from scenarios.errors import ScenarioError
-        from scenarios.files import load
         from scenarios.signing.keys import KeyFileError
-        from sim_vehicles.links.truth import TruthLog
 
         try:
-            scenario = load(options.scenario)
-        except ScenarioError as error:
-            return _complain(str(error))
-        log = None
-        if options.truth:
-            try:
-                log = TruthLog(options.truth)
-            except (OSError, ValueError) as error:
-                return _complain(f"--truth: {error}, wanted a new file, or a truth log to go on with")
-            opened.callback(log.close)
-        if options.counters:
-            try:
-                options.counters.open("ab").close()
-            except OSError as error:
-                return _complain(f"--counters: {options.counters}: {error.strerror}, wanted a file that can be written")
-        try:
-            run_it = _links_only if options.links_only else _fly
-            run_it(scenario, log, signals, options, opened)
-        except (_AddressError, KeyFileError) as error:
+            _run(options, signals, opened)
+        except (_UsageError, ScenarioError, KeyFileError) as error:
             return _complain(str(error))
     return INTERRUPTED if signal.SIGINT in signals else SUCCESS
 
 
-class _AddressError(Exception):
-    """An address that was given cannot be used."""
+class _UsageError(Exception):
+    """A file or an address that was given cannot be used."""
+
+
+def _run(options: argparse.Namespace, signals: list[int], opened: contextlib.ExitStack) -> None:
+    from scenarios.files import load
+    from sim_vehicles.links.truth import TruthLog
+
+    scenario, log = load(options.scenario), None
+    if options.truth:
+        try:
+            log = TruthLog(options.truth)
+        except (OSError, ValueError) as error:
+            raise _UsageError(f"--truth: {error}, wanted a new file, or a truth log to go on with") from None
+        opened.callback(log.close)
+    if options.counters:
+        try:
+            options.counters.open("ab").close()
+        except OSError as error:
+            text = f"--counters: {options.counters}: {error.strerror}, wanted a file that can be written"
+            raise _UsageError(text) from None
+    (_links_only if options.links_only else _fly)(scenario, log, signals, options, opened)
 
 
 def _fly(
@@ -100,7 +101,7 @@ def _fly(
     try:
         ports = Ports(system_ids, options.station)
     except OSError as error:
-        raise _AddressError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
+        raise _UsageError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
     opened.callback(ports.sockets.close)
     start_ns = time.monotonic_ns()
     fleet = Fleet(scenario, start_ns, record=log.record if log else None, signed=signed)
@@ -141,7 +142,7 @@ def _links_only(
     except OSError as error:
         ports = ", ".join(map(_shown, options.vehicle_port))
         text = f"--vehicle-port {ports}, --station {_shown(options.station)}: {error.strerror or error}"
-        raise _AddressError(text) from None
+        raise _UsageError(text) from None
     opened.callback(peers.sockets.close)
     start_ns = time.monotonic_ns()
     links = Relay(scenario, start_ns, record=log.record if log else None)
@@ -264,32 +265,18 @@ def _parser() -> argparse.ArgumentParser:
         prog="sim-vehicles", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenario", type=Path, metavar="SCENARIO", help="scenario file (TOML)")
-    parser.add_argument(
-        "--station",
-        type=_address,
-        default=("127.0.0.1", 14550),
-        metavar="HOST:PORT",
-        help="where the station listens (127.0.0.1:14550)",
-    )
-    parser.add_argument("--key", type=Path, metavar="FILE", help="sign, and accept only what is signed with this key")
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="write the truth log, or continue one")
-    parser.add_argument("--counters", type=Path, metavar="FILE", help="write the counters as JSON at the end")
-    parser.add_argument(
-        "--stop-after-silence",
-        type=_seconds,
-        default=math.inf,
-        metavar="SECONDS",
-        help="end when no station has commanded a vehicle for this long (never)",
-    )
-    parser.add_argument(
-        "--parent",
-        type=int,
-        metavar="PID",
-        help="the parent process; with --stop-after-silence: silence counts only after it has ended",
-    )
-    parser.add_argument(
-        "--duration", type=_seconds, default=math.inf, metavar="SECONDS", help="end after this time (never)"
-    )
+    silence = "end when no station has commanded a vehicle for this long (never)"
+    parent = "the parent process; with --stop-after-silence: silence counts only after it has ended"
+    for name, kind, default, metavar, text in (
+        ("--station", _address, ("127.0.0.1", 14550), "HOST:PORT", "where the station listens (127.0.0.1:14550)"),
+        ("--key", Path, None, "FILE", "sign, and accept only what is signed with this key"),
+        ("--truth", Path, None, "FILE", "write the truth log, or continue one"),
+        ("--counters", Path, None, "FILE", "write the counters as JSON at the end"),
+        ("--stop-after-silence", _seconds, math.inf, "SECONDS", silence),
+        ("--parent", int, None, "PID", parent),
+        ("--duration", _seconds, math.inf, "SECONDS", "end after this time (never)"),
+    ):
+        parser.add_argument(name, type=kind, default=default, metavar=metavar, help=text)
     parser.add_argument(
         "--links-only", action="store_true", help="simulate no vehicles; put the links in front of other vehicles"
     )

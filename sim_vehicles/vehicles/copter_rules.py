@@ -126,9 +126,9 @@ def parameters(rules: Rules, system_id: int) -> Parameters:
         timeout(rules.ground_disarm_parameter, GROUND_DISARM_S),
     ]
     if rules is PX4:
-        known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *setup_parameters.of_px4()]
+        known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *setup_parameters.PX4]
     else:
-        known += setup_parameters.of_ardupilot()
+        known += setup_parameters.ARDUPILOT
     return Parameters(known, bytewise=rules.parameters_bytewise)
 
 

@@ -10,11 +10,10 @@ from collections.abc import Mapping
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import Record
-from sim_vehicles.services import mavlink, messages
+from sim_vehicles.services import mavlink, messages, setup_parameters
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.parameters import Parameters, of_vehicle
 from sim_vehicles.services.services import whole
-from sim_vehicles.services.setup_parameters import of_ardupilot
 from sim_vehicles.vehicles.dynamics import (
     COAST,
     VELOCITY_GAIN_1_S,
@@ -65,7 +64,9 @@ class DoubleIntegrator:
     ) -> None:
         self.flight = FlightMode(scenario.safety)
         formation = [] if onboard is None else formation_parameters()
-        self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot(), *formation])
+        self.parameters = Parameters(
+            [*of_vehicle(own.system_id, scenario.safety), *setup_parameters.ARDUPILOT, *formation]
+        )
         self.reports_from_ns = radio.start_ns
         self._radio = radio
         self._onboard = onboard
