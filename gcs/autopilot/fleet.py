@@ -7,8 +7,7 @@ from gcs.autopilot.manoeuvre import Identification
 from gcs.autopilot.startup import AutopilotStartup, between
 from gcs.autopilot.velocity_targets import VelocityTargets
 from gcs.control.history import StateHistory
-from gcs.control.law import VehicleControl
-from gcs.control.loops import Vector, loop_of
+from gcs.control.loops import Order, loop_of
 from gcs.control.phases import START_PATIENCE_S, Phase
 from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
 from gcs.plan.flight_plan import FlightPlan
@@ -97,26 +96,15 @@ class AutopilotFleet:
             self.plan, self._identification = found, None
         return ""
 
-    def set_point(
-        self,
-        row: int,
-        control: VehicleControl,
-        phase: Phase,
-        *,
-        commanded: bool,
-        nominal_velocity_m_s: Vector,
-        key_ms: int,
-        due_ns: int,
-    ) -> tuple[Any, ...] | None:
-        del nominal_velocity_m_s  # these vehicles follow velocities integrated from their commands
-        vehicle, command = self.vehicles[row], control.command_m_s2
+    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
+        vehicle, (control, commanded, _, key_ms, due_ns) = self.vehicles[row], order
+        command, known = control.command_m_s2, control.sample_ns > 0
         if vehicle.taken_over and vehicle.kind.guided_first:
             self._targets.rest(row)
             return None
         others = vehicle.taken_over and phase in (Phase.IDENTIFYING, Phase.FLYING)
         if (phase is Phase.CONNECTING and self.starts[row].airborne) or others:
             return self._targets.hover(row, key_ms=key_ms)  # PX4 enters OFFBOARD only while set-points arrive
-        known = control.sample_ns > 0
         if phase is Phase.IDENTIFYING and self._identification is not None:
             command, commanded = self._identification.command(due_ns), True
             known = known or self._targets.steers(row)  # a clock that jumped does not interrupt the manoeuvre

@@ -24,7 +24,6 @@ class SetPointLimits:
 
     @classmethod
     def of(cls, limits: Limits) -> "SetPointLimits":
-        """The limits of a scenario."""
         return cls(limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, limits.speed_max_m_s or LARGEST_COMMAND_M_S2)
 
     def command(self, wanted_m_s2: Vector) -> Vector:

@@ -52,7 +52,6 @@ class Mirror:
         self.close()
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
     def forward(self, frames: Iterable[bytes], now_ns: int) -> None:

@@ -69,7 +69,6 @@ class ClockEstimate(NamedTuple):
     reference_ns: int
 
     def offset_at_ns(self, time_ns: int) -> int:
-        """The offset at a time of the station's clock."""
         return self.offset_ns + round(self.skew * (time_ns - self.reference_ns))
 
     def bound_at_ns(self, time_ns: int) -> float:

@@ -210,7 +210,6 @@ def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int, system_id: in
 
 
 def heartbeat() -> tuple[Any, ...]:
-    """Fields of the station's HEARTBEAT."""
     return (0, dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, dialect.MAV_STATE_ACTIVE, 3)
 
 

@@ -73,7 +73,6 @@ class Upload:
         return None
 
     def take(self, fields: tuple[Any, ...]) -> None:
-        """Take in a PARAM_VALUE."""
         value, _, _, field, _ = fields
         name = field.partition(b"\0")[0].decode("ascii", "replace")
         item = self._items.get(name)

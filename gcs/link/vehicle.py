@@ -97,7 +97,6 @@ class RemoteVehicle:
 
     @property
     def end_mode(self) -> int:
-        """The mode in which the vehicle is to end."""
         return self.kind.land_mode if self._land else self.kind.hold_mode
 
     @property
@@ -218,7 +217,6 @@ class RemoteVehicle:
         return mode == kind.hold_mode and self.custom_mode == kind.take_off_mode and self.startup.is_half_way_up
 
     def acknowledge(self, fields: tuple[Any, ...], now_ns: int) -> None:
-        """Take in a COMMAND_ACK."""
         command, result, *_, target_system, _ = fields
         waiting = self._command
         if waiting is None or waiting.command != command or target_system not in (0, mavlink.STATION_SYSTEM_ID):

@@ -8,8 +8,7 @@ from typing import Any, Protocol
 
 from gcs.autopilot.fleet import AutopilotFleet
 from gcs.control.history import StateHistory
-from gcs.control.law import VehicleControl
-from gcs.control.loops import Loop, Vector, loop_of
+from gcs.control.loops import Loop, Order, loop_of
 from gcs.control.phases import Phase, patience_s
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
@@ -63,17 +62,7 @@ class FleetKind(Protocol):
         """Advance the identification by one tick; returns why it failed, if it has."""
         ...
 
-    def set_point(
-        self,
-        row: int,
-        control: VehicleControl,
-        phase: Phase,
-        *,
-        commanded: bool,
-        nominal_velocity_m_s: Vector,
-        key_ms: int,
-        due_ns: int,
-    ) -> tuple[Any, ...] | None:
+    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
         """Fields of the set-point that a vehicle is sent at this tick, if any."""
         ...
 
@@ -116,18 +105,6 @@ class LaunchedFleet:
     def identify(self, due_ns: int, history: StateHistory) -> str:  # noqa: ARG002 - their response is known
         return ""
 
-    def set_point(
-        self,
-        row: int,
-        control: VehicleControl,
-        phase: Phase,  # noqa: ARG002 - they take set-points in formation flight only
-        *,
-        commanded: bool,
-        nominal_velocity_m_s: Vector,
-        key_ms: int,
-        due_ns: int,  # noqa: ARG002
-    ) -> tuple[Any, ...] | None:
-        if not commanded:
-            return None
-        system_id = self.vehicles[row].system_id
-        return self.loop.set_point(system_id, control, nominal_velocity_m_s=nominal_velocity_m_s, key_ms=key_ms)
+    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
+        del phase  # they take set-points in formation flight only
+        return self.loop.set_point(self.vehicles[row].system_id, order) if order.commanded else None

@@ -14,6 +14,7 @@ from gcs.control.history import StateHistory
 from gcs.control.law import distances_m
 from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
+from gcs.control.loops import Order
 from gcs.control.phases import Phase, next_phase, patience_s
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
@@ -252,15 +253,8 @@ class Station:
         ):
             north, east = control.command_m_s2
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
-            fields = self._fleet.set_point(
-                row,
-                control,
-                self.phase,
-                commanded=commanded,
-                nominal_velocity_m_s=nominal_m_s,
-                key_ms=key_ms,
-                due_ns=due_ns,
-            )
+            order = Order(control, commanded, nominal_m_s, key_ms, due_ns)
+            fields = self._fleet.set_point(row, order, self.phase)
             if fields is not None:
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)

@@ -36,12 +36,10 @@ their system ids, and the station hears each vehicle from a port of its own."""
 
 
 def main() -> None:
-    """Entry point."""
     sys.exit(run(sys.argv[1:]))
 
 
 def run(arguments: list[str]) -> int:
-    """Run the command with its arguments and return the exit code."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.links_only != bool(options.vehicle_port):

@@ -93,7 +93,6 @@ class Fleet:
 
     @property
     def system_ids(self) -> tuple[int, ...]:
-        """The vehicles, ascending."""
         return tuple(self._members)
 
     @property

@@ -79,7 +79,6 @@ class Sockets:
         return number
 
     def close(self) -> None:
-        """Close all sockets."""
         self._epoll.close()
         for own in self._sockets.values():
             own.close()
@@ -95,7 +94,6 @@ class Sockets:
             pass
 
     def receive(self) -> list[Received]:
-        """Everything that has arrived."""
         begin_ns = time.monotonic_ns()
         to_monotonic_ns = self._clocks.to_monotonic_ns()
         received: list[Received] = []
@@ -171,7 +169,6 @@ class Ports:
         return [(system_ids[number], data, time_ns) for number, data, time_ns, _ in self.sockets.receive()]
 
     def send(self, datagrams: list[Datagram]) -> None:
-        """Send to the station."""
         for system_id, data, due_ns in datagrams:
             self.sockets.send(self._file_numbers[system_id], data, due_ns)
 

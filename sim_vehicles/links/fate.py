@@ -149,7 +149,6 @@ class Stream:
         self._block: list[Draws] = []
 
     def next(self) -> Draws:
-        """The draws of the next datagram."""
         if not self._block:
             uniform: list[list[float]] = self._fates.random((_BLOCK, 4 + MOST_FLIPS)).tolist()
             delays = self._delays(_BLOCK)

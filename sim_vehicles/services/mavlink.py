@@ -225,11 +225,7 @@ class Encoder:
         return self.frame(LOCAL_POSITION, payload)
 
     def heartbeat(
-        self,
-        base_mode: int,
-        custom_mode: int,
-        system_status: int,
-        autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        self, base_mode: int, custom_mode: int, system_status: int, autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
     ) -> bytes:
         """HEARTBEAT of a quadrotor, by default an ArduCopter."""
         kind = dialect.MAV_TYPE_QUADROTOR, autopilot
@@ -240,7 +236,6 @@ class Encoder:
         return self.frame(TIMESYNC, _TIMESYNC.unpacker.pack(tc1, ts1))
 
     def command_ack(self, command: int, result: int, requester: tuple[int, int]) -> bytes:
-        """COMMAND_ACK to the (system, component) that asked."""
         system, component = requester
         message = dialect.MAVLink_command_ack_message
         return self.pack(message(command, result, target_system=system, target_component=component))
@@ -260,7 +255,6 @@ class Encoder:
         return b"\xfd" + body + mcrf4xx(body + CRC_EXTRA[number]).to_bytes(2, "little")
 
     def pack(self, message: Message) -> bytes:
-        """The frame of any pymavlink message."""
         frame = message.pack(self._pymavlink)
         self._pymavlink.seq = (self._pymavlink.seq + 1) & 0xFF
         return frame

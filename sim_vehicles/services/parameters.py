@@ -94,7 +94,6 @@ class Parameters:
         return self._listed < len(self._names)
 
     def next_of_list(self, encoder: Encoder) -> bytes:
-        """The next parameter of the list."""
         self._listed += 1
         return self._frame(self._names[self._listed - 1], encoder)
 

@@ -72,7 +72,6 @@ class Services:
         self._reports_from_ns = reports_from_ns
 
     def answer(self, request: Request, counters: Counter[str], time_ns: int) -> list[bytes]:
-        """The frames that answer a request at once."""
         if isinstance(request, messages.Mission):
             return [self._encoder.pack(messages.mission_answer(request))]
         if isinstance(request, messages.FileTransfer):

@@ -119,7 +119,6 @@ RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
 
 
 def parameters(rules: Rules, system_id: int) -> Parameters:
-    """The parameters of a multicopter with this autopilot."""
     known = [
         fixed(rules.system_id_parameter, system_id),
         timeout(rules.setpoint_timeout_parameter, rules.setpoint_timeout_s),

@@ -94,7 +94,6 @@ class DoubleIntegrator:
         return max(time_ns, self._state_ns)
 
     def hear_heartbeat(self, time_ns: int) -> None:
-        """A station's heartbeat arrived."""
         self.flight.hear_heartbeat(max(time_ns, self._state_ns))
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
@@ -169,7 +168,6 @@ class DoubleIntegrator:
         return result
 
     def change_mode(self, mode: int | None, time_ns: int) -> Answer:
-        """Change the mode on command."""
         if mode is None:
             return mavlink.DENIED, ""
         if mode in (mavlink.MODE_LAND, mavlink.MODE_RETURN):
@@ -185,7 +183,6 @@ class DoubleIntegrator:
     # What happens by itself
 
     def happen(self, time_ns: int) -> None:
-        """Enter the failsafe."""
         self._advance(time_ns)
         self.flight.fail()
         self._command = self._alone()

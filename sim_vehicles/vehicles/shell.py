@@ -61,7 +61,6 @@ class Radio:
         """Frames sent in this step, with their instants."""
 
     def send(self, frame: bytes, time_ns: int) -> None:
-        """Send a frame that the encoder made."""
         self.out.append((frame, time_ns))
 
     def say(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
@@ -69,7 +68,6 @@ class Radio:
         self.send(self.encoder.statustext(severity, text), time_ns)
 
     def tell(self, time_ns: int, text: str) -> None:
-        """Note a change."""
         self.changes.append(Change(time_ns, self.system_id, text))
 
     def acted(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
