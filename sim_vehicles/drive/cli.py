@@ -71,7 +71,7 @@ def _run(options: argparse.Namespace, signals: list[int], opened: contextlib.Exi
         try:
             log = TruthLog(options.truth)
         except (OSError, ValueError) as error:
-            raise _UsageError(f"--truth: {error}, wanted a new file, or a truth log to go on with") from None
+            raise _UsageError(f"--truth: {error}, wanted a new file, or a truth log to continue") from None
         opened.callback(log.close)
     if options.counters:
         try:
