@@ -86,7 +86,7 @@ def test_a_made_key_is_random_private_and_never_written_over(tmp_path: Path) -> 
     assert stat.S_IMODE((tmp_path / "one").stat().st_mode) == 0o600
     one = read_key(tmp_path / "one").secret
     assert one != read_key(tmp_path / "two").secret
-    with pytest.raises(KeyFileError, match="is there already"):
+    with pytest.raises(KeyFileError, match="exists already"):
         make_key(tmp_path / "one")
     assert read_key(tmp_path / "one").secret == one
 
