@@ -70,37 +70,44 @@ def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s
 
 
 def _step(motion: Motion, target: Target, limits: schema.Autopilot, h: float) -> Motion:
-    """A Runge-Kutta step. Position, velocity and acceleration are complex numbers: north + 1j east."""
-    p, v, a = (complex(*motion[k : k + 2]) for k in (0, 2, 4))
-    half, sixth = 0.5 * h, h / 6.0
-    j1 = _jerk(v, a, target, limits, 0.0)
-    a2, v2 = a + half * j1, v + half * a
-    j2 = _jerk(v2, a2, target, limits, half)
-    a3, v3 = a + half * j2, v + half * a2
-    j3 = _jerk(v3, a3, target, limits, half)
-    a4, v4 = a + h * j3, v + h * a3
-    j4 = _jerk(v4, a4, target, limits, h)
-    p += sixth * (v + 2.0 * (v2 + v3) + v4)
-    v += sixth * (a + 2.0 * (a2 + a3) + a4)
-    a += sixth * (j1 + 2.0 * (j2 + j3) + j4)
-    v = _shortened(v, limits.speed_max_m_s)
-    altitude, climb = _climbed(motion.altitude_m, motion.climb_m_s, target, limits, h)
-    yaw = _turned(motion.yaw_rad, target, h)
-    return Motion(p.real, p.imag, v.real, v.imag, a.real, a.imag, altitude, climb, yaw)
+    north, east, v_n, v_e, a_n, a_e, altitude, climb, _ = motion
+    half = 0.5 * h
+    # v' = a and lag a' = w - a; the position is the integral of the velocity
+    j1n, j1e = _jerk(v_n, v_e, a_n, a_e, target, limits, 0.0)
+    a2n, a2e, v2n, v2e = a_n + half * j1n, a_e + half * j1e, v_n + half * a_n, v_e + half * a_e
+    j2n, j2e = _jerk(v2n, v2e, a2n, a2e, target, limits, half)
+    a3n, a3e, v3n, v3e = a_n + half * j2n, a_e + half * j2e, v_n + half * a2n, v_e + half * a2e
+    j3n, j3e = _jerk(v3n, v3e, a3n, a3e, target, limits, half)
+    a4n, a4e, v4n, v4e = a_n + h * j3n, a_e + h * j3e, v_n + h * a3n, v_e + h * a3e
+    j4n, j4e = _jerk(v4n, v4e, a4n, a4e, target, limits, h)
+    sixth = h / 6.0
+    north += sixth * (v_n + 2.0 * (v2n + v3n) + v4n)
+    east += sixth * (v_e + 2.0 * (v2e + v3e) + v4e)
+    v_n += sixth * (a_n + 2.0 * (a2n + a3n) + a4n)
+    v_e += sixth * (a_e + 2.0 * (a2e + a3e) + a4e)
+    a_n += sixth * (j1n + 2.0 * (j2n + j3n) + j4n)
+    a_e += sixth * (j1e + 2.0 * (j2e + j3e) + j4e)
+    speed = math.hypot(v_n, v_e)
+    if speed > limits.speed_max_m_s:
+        v_n, v_e = v_n * limits.speed_max_m_s / speed, v_e * limits.speed_max_m_s / speed
+    altitude, climb = _climbed(altitude, climb, target, limits, h)
+    return Motion(north, east, v_n, v_e, a_n, a_e, altitude, climb, _turned(motion.yaw_rad, target, h))
 
 
-def _jerk(v: complex, a: complex, target: Target, limits: schema.Autopilot, since_s: float) -> complex:
-    """a' = (w - a) / lag, `since_s` after the velocity target was set."""
-    w = complex(target.acceleration_north_m_s2, target.acceleration_east_m_s2)
-    if target.velocity_gain_1_s:
-        v_set = complex(target.velocity_north_m_s, target.velocity_east_m_s) + target.growth * since_s * w
-        w += target.velocity_gain_1_s * (v_set - v)
-    return (_shortened(w, limits.acceleration_max_m_s2) - a) / limits.lag_s
-
-
-def _shortened(vector: complex, longest: float) -> complex:
-    size = math.hypot(vector.real, vector.imag)
-    return vector * longest / size if size > longest else vector
+def _jerk(
+    v_n: float, v_e: float, a_n: float, a_e: float, target: Target, limits: schema.Autopilot, since_s: float
+) -> tuple[float, float]:
+    gain, grown = target.velocity_gain_1_s, target.growth * since_s
+    w_n, w_e = target.acceleration_north_m_s2, target.acceleration_east_m_s2
+    if gain:
+        w_n, w_e = (
+            w_n + gain * (target.velocity_north_m_s + grown * w_n - v_n),
+            w_e + gain * (target.velocity_east_m_s + grown * w_e - v_e),
+        )
+    size = math.hypot(w_n, w_e)
+    if size > limits.acceleration_max_m_s2:
+        w_n, w_e = w_n * limits.acceleration_max_m_s2 / size, w_e * limits.acceleration_max_m_s2 / size
+    return (w_n - a_n) / limits.lag_s, (w_e - a_e) / limits.lag_s
 
 
 def _climbed(altitude: float, climb: float, target: Target, limits: schema.Autopilot, h: float) -> tuple[float, float]:
