@@ -1,1 +1,1 @@
-"""What an experiment is: the schema of a scenario file, and how it is read and written; signing of links."""
+"""What an experiment is. `schema` has its keys, `files` reads and checks them, `signing` signs links."""

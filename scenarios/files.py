@@ -17,8 +17,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 
 from scenarios.errors import ScenarioError
+from scenarios.link_schema import Jitter, Link, Links, Outage
+from scenarios.part import MOST
 from scenarios.places import line_of, location_of, named, wanted_of
-from scenarios.schema import MOST, Jitter, Link, Links, Outage, Scenario
+from scenarios.schema import Scenario
 
 TRACE_DELAYS = 100_000
 """Most delays of a trace."""
@@ -45,7 +47,7 @@ def parse(text: str, file: Path) -> Scenario:
     try:
         data = tomllib.loads(text)
     except RecursionError:
-        raise ScenarioError(file, "file", "lists within lists too deep to follow", "valid TOML") from None
+        raise ScenarioError(file, "file", "lists nested too deeply", "valid TOML") from None
     except ValueError as error:  # a TOMLDecodeError, or a number of thousands of digits
         raise ScenarioError(file, "file", str(error), "valid TOML") from None
     try:
@@ -167,7 +169,7 @@ def _control_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, s
         wanted = f"either blocks, or gains, or a requirement ({', '.join(requirements)})"
         yield "control.blocks", f"{len(control.blocks)} blocks", wanted
     if scenario.dynamics == "autopilot" and (control.method != "inclusion" or control.blocks):
-        wanted = "inclusion without blocks, with dynamics autopilot: margins with a lag are those of its gains"
+        wanted = "inclusion without blocks, with dynamics autopilot: only for its gains are margins computed with a lag"
         yield "control.method", control.method, wanted
     if control.gains is not None and control.method != "inclusion":
         yield "control.method", control.method, "inclusion, with gains given; a graph's gains are given as blocks"
@@ -176,9 +178,9 @@ def _control_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, s
     for k, vehicle in enumerate(scenario.vehicles):
         for other in vehicle.hears:
             if other not in vehicles or other in (vehicle.system_id, vehicle.follows):
-                yield f"vehicles[{k}].hears", other, f"{known}, neither its own nor that it follows"
+                yield f"vehicles[{k}].hears", other, f"{known}, but not itself and not the vehicle it follows"
         if vehicle.hears and (control.method == "inclusion" or control.blocks):
-            wanted = "nothing, without control.method graph-lqr or graph-dk; blocks say themselves who is heard"
+            wanted = "no hears, unless control.method is graph-lqr or graph-dk without blocks"
             yield f"vehicles[{k}].hears", list(vehicle.hears), wanted
 
 
@@ -216,7 +218,7 @@ def _onboard_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, s
         return
     own, control_hz = scenario.onboard, scenario.rates.control_hz
     if scenario.dynamics == "autopilot":
-        wanted = "ground, with dynamics autopilot: no autopilot at hand has the other loop"
+        wanted = "ground, with dynamics autopilot: no supported autopilot can close this loop on board"
         yield "control.loop", scenario.control.loop, wanted
     if own.sensor_hz % control_hz:
         yield "onboard.sensor_hz", own.sensor_hz, f"a whole multiple of rates.control_hz = {control_hz:g}"
@@ -230,19 +232,23 @@ def _formation_contradictions(scenario: Scenario) -> Iterator[tuple[str, object,
     leaders = [v.system_id for v in vehicles if v.follows is None]
     for k, vehicle in enumerate(vehicles):
         if vehicle.system_id in system_ids[:k]:
-            yield f"vehicles[{k}].system_id", vehicle.system_id, "another number for each vehicle"
+            yield f"vehicles[{k}].system_id", vehicle.system_id, "a different number for each vehicle"
         if vehicle.follows is not None and vehicle.follows not in system_ids:
             yield f"vehicles[{k}].follows", vehicle.follows, "the system_id of a vehicle of this scenario"
         if (vehicle.follows is None) != (vehicle.offset_ne_m is None):
-            wanted = "offset_ne_m with follows, and neither for the leader"
+            wanted = "both follows and offset_ne_m, or neither for the leader"
             yield f"vehicles[{k}].offset_ne_m", vehicle.offset_ne_m, wanted
         if vehicle.offset_ne_m == (0.0, 0.0):
-            yield f"vehicles[{k}].offset_ne_m", vehicle.offset_ne_m, "a distance to the vehicle in front"
+            yield f"vehicles[{k}].offset_ne_m", vehicle.offset_ne_m, "an offset other than zero"
     try:
         TopologicalSorter({v.system_id: [] if v.follows is None else [v.follows] for v in vehicles}).prepare()
     except CycleError as error:
         cycle = " follows ".join(str(system_id) for system_id in reversed(error.args[1]))
-        yield "vehicles.follows", f"a cycle: {cycle}", "a tree: every vehicle follows, in the end, the leader"
+        yield (
+            "vehicles.follows",
+            f"a cycle: {cycle}",
+            "a tree: every vehicle follows the leader, directly or through others",
+        )
     if len(leaders) != 1:
         yield "vehicles.follows", f"vehicles without it: {leaders}", "exactly one vehicle without it, the leader"
 
@@ -250,10 +256,10 @@ def _formation_contradictions(scenario: Scenario) -> Iterator[tuple[str, object,
 def _autopilot_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
     times_s = [jump.at_s for jump in scenario.autopilot.clock_jumps]
     if times_s != sorted(times_s):
-        yield "autopilot.clock_jumps", times_s, "times that do not go back"
+        yield "autopilot.clock_jumps", times_s, "times that do not decrease"
     if scenario.dynamics == "autopilot":
         if scenario.altitude_m == 0:
-            yield "altitude_m", scenario.altitude_m, "an altitude to take off to, with dynamics autopilot"
+            yield "altitude_m", scenario.altitude_m, "an altitude above 0 to take off to, with dynamics autopilot"
         return
     for k, vehicle in enumerate(scenario.vehicles):
         if vehicle.flavour is not None:
@@ -287,11 +293,11 @@ def _links_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str
         if system_id not in system_ids:
             yield f"links.vehicles[{k}].system_id", system_id, "the system_id of a vehicle of this scenario"
         if system_id in own[:k]:
-            yield f"links.vehicles[{k}].system_id", system_id, "one entry for each vehicle"
+            yield f"links.vehicles[{k}].system_id", system_id, "one entry per vehicle"
     names = [channel.name for channel in links.channels]
     for k, channel in enumerate(links.channels):
         if channel.name in names[:k]:
-            yield f"links.channels[{k}].name", channel.name, "another name for each channel"
+            yield f"links.channels[{k}].name", channel.name, "a different name for each channel"
         if (channel.queue_bytes is None) == (channel.queue_datagrams is None):
             read = "neither" if channel.queue_bytes is None else "both"
             yield f"links.channels[{k}]", read, "either queue_bytes or queue_datagrams"
@@ -318,9 +324,9 @@ def _link_contradictions(key: str, link: Link) -> Iterator[tuple[str, object, st
         yield f"{key}.delay_s", link.delay_s, "either delay_s or delay_points"
     for k, time_s in enumerate(times_s):
         if k and time_s < times_s[k - 1]:
-            yield f"{key}.delay_points[{k}].at_s", time_s, "times that do not go back"
+            yield f"{key}.delay_points[{k}].at_s", time_s, "times that do not decrease"
         if times_s[max(k - 2, 0) : k] == [time_s, time_s]:
-            yield f"{key}.delay_points[{k}].at_s", time_s, "two points at one time, a step, and no more"
+            yield f"{key}.delay_points[{k}].at_s", time_s, "at most two points at one time, which make a step"
     if link.loss_bursts is not None and link.loss_probability:
         yield f"{key}.loss_probability", link.loss_probability, "either loss_probability or loss_bursts"
     last = Outage(from_s=0.0, until_s=1e-9)
@@ -328,7 +334,11 @@ def _link_contradictions(key: str, link: Link) -> Iterator[tuple[str, object, st
         if outage.until_s <= outage.from_s:
             yield f"{key}.outages[{k}].until_s", outage.until_s, f"more than from_s = {outage.from_s:g}"
         if k and outage.from_s < last.until_s:
-            yield f"{key}.outages[{k}].from_s", outage.from_s, f"at least until_s = {last.until_s:g} of the one before"
+            yield (
+                f"{key}.outages[{k}].from_s",
+                outage.from_s,
+                f"at least until_s = {last.until_s:g} of the outage before",
+            )
         last = outage
     if link.jitter is not None:
         yield from _jitter_contradictions(f"{key}.jitter", link.jitter)

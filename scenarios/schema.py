@@ -3,41 +3,33 @@
 Units are part of each key's name. Positions and velocities are in the horizontal plane of one local NED frame,
 as pairs (north, east). All vehicles fly at one altitude: the formation control is planar.
 
-Numbers are bounded where the messages (single precision) and the clocks (nanoseconds) can still tell them apart.
+The docstring below a key is its description in `scenario.schema.json` and in the reference. `scenarios.link_schema` has
+the keys of `[links]`.
 """
 
 from collections.abc import Callable
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-MOST = 1e6
-Number = Annotated[float, Field(ge=-MOST, le=MOST)]
-Position = tuple[Number, Number]
-Speed = Annotated[float, Field(ge=-1e4, le=1e4)]
-Velocity = tuple[Speed, Speed]
-SystemId = Annotated[int, Field(ge=1, le=250)]
-Positive = Annotated[float, Field(gt=0, le=MOST)]
-NotNegative = Annotated[float, Field(ge=0, le=MOST)]
-Factor = Annotated[float, Field(ge=1, le=1000)]
-Headroom = Annotated[float, Field(ge=-1000, lt=1)]
-Rate = Annotated[float, Field(ge=1, le=500)]
-Probability = Annotated[float, Field(ge=0, le=1)]
-Flavour = Literal["ardupilot", "px4"]
+from scenarios.link_schema import Link, Links
+from scenarios.part import (
+    Factor,
+    Flavour,
+    Headroom,
+    NotNegative,
+    Number,
+    Part,
+    Position,
+    Positive,
+    Rate,
+    SystemId,
+    Velocity,
+)
+
 NS_PER_S = 1_000_000_000
 DRIFT_MAX_PPM = 1000.0
 """Most that a vehicle's clock may drift. What the station says of clocks, and the bounds it gives, hold up to this."""
-
-
-class Part(BaseModel):
-    """Base of every part of a scenario: unknown keys, wrong types, NaN and infinities are refused.
-
-    The docstring under a key is its description in `scenario.schema.json` and in the reference of the documentation.
-    """
-
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
 
 
 class Vehicle(Part):
@@ -73,17 +65,17 @@ class Limits(Part):
     """Limits of every vehicle. Omitted ones are off, except the minimum speed: the kinematics are singular at zero."""
 
     speed_min_m_s: Positive = 1.0
-    """Least ground speed."""
+    """Minimum ground speed."""
     speed_max_m_s: Positive | None = None
-    """Greatest ground speed."""
+    """Maximum ground speed."""
     acceleration_max_m_s2: Positive | None = None
-    """Greatest horizontal acceleration."""
+    """Maximum horizontal acceleration."""
     turn_rate_max_rad_s: Positive | None = None
-    """Greatest rate at which the heading changes."""
+    """Maximum rate at which the heading changes."""
 
 
 class Rates(Part):
-    """How often things happen, in Hz."""
+    """Rates of control, telemetry and clock exchanges."""
 
     control_hz: Rate = 50.0
     """Control ticks of the station; every vehicle is sent one set-point per tick."""
@@ -126,8 +118,8 @@ class Control(Part):
 
     method: Literal["inclusion", "graph-dk", "graph-lqr"] = "inclusion"
     """`inclusion`: every vehicle uses its own errors and the velocity error of the vehicle in front. `graph-lqr`
-    (structured LQR) and `graph-dk` (the source's D-K type iteration): it uses all errors of these two vehicles and of
-    those it `hears`."""
+    (structured LQR) and `graph-dk` (the D-K type iteration of the thesis): it uses all errors of these two vehicles and
+    of those it `hears`."""
     loop: Literal["ground", "onboard"] = "ground"
     """`ground`: the station closes every loop, so all feedback is late. `onboard`: every vehicle feeds back its own
     errors at once, and the station streams only what depends on other vehicles (thesis eq. 5.1). On board,
@@ -163,150 +155,6 @@ class Onboard(Part):
     """Standard deviation of the measured relative velocity on each axis."""
 
 
-class Jitter(Part):
-    """A random delay drawn for each datagram and added to the link's delay; their sum is at least 0.
-
-    uniform      from -scale_s to +scale_s: mean 0, standard deviation scale_s / sqrt(3)
-    normal       mean 0, standard deviation scale_s
-    exponential  from 0 up: mean and standard deviation scale_s
-    gamma        from 0 up: mean shape * scale_s, standard deviation sqrt(shape) * scale_s
-    trace        measured delays in their order, starting at a place drawn for each link and wrapping around
-    """
-
-    distribution: Literal["uniform", "normal", "exponential", "gamma", "trace"]
-    """Kind of the distribution."""
-    scale_s: Positive | None = None
-    """Scale of the distribution; needed by all but `trace`."""
-    shape: Positive | None = None
-    """Shape of the gamma distribution; needed by `gamma` only."""
-    trace_file: str | None = None
-    """File of measured delays, relative to the scenario file: one delay in s per line, or CSV with a column `delay_s`.
-    It is read with the scenario, which from then on holds the delays themselves in `trace_s`."""
-    trace_s: tuple[NotNegative, ...] | None = None
-    """The measured delays, in place of `trace_file`."""
-
-
-class LossBursts(Part):
-    """Gilbert-Elliott loss: a link starts good and may change between good and bad with every datagram that enters.
-
-    The link is bad for p / (p + r) of the datagrams; a burst lasts 1 / r datagrams on average.
-    """
-
-    to_bad_probability: Probability
-    """p: probability that a good link is bad for the next datagram."""
-    to_good_probability: Annotated[float, Field(gt=0, le=1)]
-    """r: probability that a bad link is good for the next datagram."""
-    loss_good_probability: Probability = 0.0
-    """Probability that a good link loses a datagram."""
-    loss_bad_probability: Probability = 1.0
-    """Probability that a bad link loses a datagram."""
-
-
-class DelayPoint(Part):
-    """The constant part of a link's delay at one time; linear between points. Two points at one time make a step."""
-
-    at_s: NotNegative
-    """Link time of the point."""
-    delay_s: NotNegative
-    """Delay at that time."""
-
-
-class Outage(Part):
-    """A time during which everything that enters the link is lost."""
-
-    from_s: NotNegative
-    """Link time at which the outage begins."""
-    until_s: Positive
-    """Link time at which it is over."""
-
-
-class Link(Part):
-    """One direction of a radio link. Times are link times, see `links.times_from`.
-
-    A datagram meets, in this order: an outage or a full channel queue, which drops it; the channel, which takes time to
-    send it; loss, or flipped bits; and the delay with its jitter, after which it arrives.
-    """
-
-    delay_s: NotNegative = 0.0
-    """Constant one-way delay."""
-    delay_points: tuple[DelayPoint, ...] = ()
-    """A delay that changes over time, in place of `delay_s`. A datagram gets the delay of the time at which it
-    enters."""
-    jitter: Jitter | None = None
-    """Random delay on top of the constant one."""
-    reordering: bool = False
-    """Whether a datagram may overtake an earlier one. If not, it waits for the earlier one."""
-    loss_probability: Probability = 0.0
-    """Probability that a datagram is lost, independently of the others."""
-    loss_bursts: LossBursts | None = None
-    """Loss in bursts, in addition to `loss_probability`."""
-    duplicate_probability: Probability = 0.0
-    """Probability that a datagram which arrives does so twice. The second copy has its own jitter."""
-    corrupt_probability: Probability = 0.0
-    """Probability that a datagram arrives with one to four of its bits flipped."""
-    outages: tuple[Outage, ...] = ()
-    """Times without any connection."""
-    channel: str | None = None
-    """Name of the entry of `links.channels` that this link uses; without it the bandwidth is unlimited."""
-
-
-class VehicleLinks(Part):
-    """The links of one vehicle, where they differ from those of the others."""
-
-    system_id: SystemId
-    """The vehicle."""
-    up: Link | None = None
-    """Its link to the station; replaces `links.up` as a whole."""
-    down: Link | None = None
-    """Its link from the station; replaces `links.down` as a whole."""
-
-
-class Channel(Part):
-    """A limited bandwidth: one datagram is sent at a time; the others wait in order of arrival.
-
-    A datagram takes size * bits_per_byte / bandwidth_bit_s. One that finds the queue full is dropped; an idle channel
-    takes a datagram of any size.
-    """
-
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
-    """Name by which links refer to the channel."""
-    bandwidth_bit_s: Annotated[float, Field(ge=1, le=1e12)]
-    """Bits sent per second."""
-    bits_per_byte: Annotated[int, Field(ge=8, le=16)] = 8
-    """Bits on the air per byte of the datagram. A serial radio adds a start and a stop bit (8N1): 10."""
-    queue_bytes: Annotated[int, Field(ge=0, le=10**9)] | None = None
-    """Most bytes that wait, not counting the datagram being sent; unlimited if omitted."""
-    queue_datagrams: Annotated[int, Field(ge=0, le=10_000)] | None = None
-    """Most datagrams that wait, not counting the one being sent; unlimited if omitted."""
-    shared: bool = True
-    """True: one channel for all vehicles whose links name it. False: each vehicle has a channel of its own."""
-    half_duplex: bool = False
-    """True: up and down share the bandwidth and the queue. False: each direction has its own."""
-
-
-class Links(Part):
-    """Emulated links: up is vehicle to station, down is station to vehicle."""
-
-    up: Link = Link()
-    """From each vehicle to the station."""
-    down: Link = Link()
-    """From the station to each vehicle."""
-    vehicles: tuple[VehicleLinks, ...] = ()
-    """Vehicles whose links differ."""
-    channels: tuple[Channel, ...] = ()
-    """Limited bandwidths that links may use."""
-    times_from: Literal["flight", "start"] = "flight"
-    """What link time, which outages and delay points refer to, counts from. `flight`: the station's first set-point
-    enters a link; before that the first delay point applies and there is no outage. `start`: the vehicles start."""
-
-    def of(self, system_id: int) -> tuple[Link, Link]:
-        """The (up, down) links of one vehicle."""
-        for own in self.vehicles:
-            if own.system_id == system_id:
-                return own.up or self.up, own.down or self.down
-        return self.up, self.down
-
-
 class Clocks(Part):
     """Boot clocks of the vehicles. Offset and drift of each are drawn from the seed within these bounds."""
 
@@ -333,10 +181,10 @@ class Safety(Part):
 
 
 class Monitor(Part):
-    """When the station acts on a shrinking headroom (1 - loop delay / margin), and how."""
+    """When and how the station acts on a shrinking headroom (1 - loop delay / margin)."""
 
     act: bool = True
-    """False: the modes are shown and nothing is done."""
+    """False: the modes are shown, but the station takes no action."""
     caution_headroom: Headroom = 0.3
     """A vehicle with less headroom is in CAUTION."""
     critical_headroom: Headroom = 0.15
@@ -351,11 +199,7 @@ class Monitor(Part):
     """How long a condition must last before the monitor returns to faster gains."""
     blend_s: Positive = 1.0
     """How long a change of gains takes."""
-    time_scales: Annotated[tuple[Factor, ...], Field(min_length=1, max_length=8)] = (
-        1.0,
-        2.0,
-        4.0,
-    )
+    time_scales: Annotated[tuple[Factor, ...], Field(min_length=1, max_length=8)] = (1.0, 2.0, 4.0)
     """The gain schedule: the design slowed down in time by each factor, which multiplies its delay margin by it."""
     open_factor: Factor = 1.5
     """When even the slowest gains have too little headroom, every spacing is multiplied by this."""
@@ -375,22 +219,23 @@ class ClockJump(Part):
 class Autopilot(Part):
     """A simulated multicopter, with `dynamics = "autopilot"`: how it starts, and how it responds to set-points.
 
-    It stands on the ground at its position until it is told to take off. It wants the acceleration of the set-point
-    plus `velocity_gain_1_s` times its velocity error; its real acceleration follows with a first-order lag.
+    It stands on the ground at its position until it is commanded to take off. The acceleration it aims at is that of
+    the set-point plus `velocity_gain_1_s` times its velocity error; its actual acceleration follows with a first-order
+    lag.
     """
 
     flavour: Flavour = "ardupilot"
-    """Whose modes, numbers and rules it follows: ArduCopter's or PX4's."""
+    """Whose modes, messages and rules it follows: ArduCopter's or PX4's."""
     lag_s: Positive = 0.15
-    """Time constant from the wanted to the real acceleration."""
+    """Time constant of that lag."""
     velocity_gain_1_s: Positive = 2.0
-    """Gain from velocity error to wanted acceleration."""
+    """Gain from velocity error to acceleration."""
     acceleration_max_m_s2: Positive = 5.0
-    """Greatest acceleration."""
+    """Maximum acceleration."""
     speed_max_m_s: Positive = 12.0
-    """Greatest horizontal speed."""
+    """Maximum horizontal speed."""
     climb_max_m_s: Positive = 2.5
-    """Greatest climb rate."""
+    """Maximum climb rate."""
     telemetry_after_s: NotNegative = 1.0
     """Time after start-up during which it sends only heartbeats."""
     ready_after_s: NotNegative = 2.0
@@ -434,7 +279,7 @@ class Scenario(Part):
     limits: Limits = Limits()
     """What the vehicles can do."""
     rates: Rates = Rates()
-    """How often things happen."""
+    """How often the station and the vehicles compute and send."""
     control: Control = Control()
     """How the gains are found, and where the loop is closed."""
     onboard: Onboard = Onboard()
@@ -446,16 +291,16 @@ class Scenario(Part):
     safety: Safety = Safety()
     """Time-outs and limits."""
     monitor: Monitor = Monitor()
-    """What the station does when headroom shrinks."""
+    """When and how the station acts on a shrinking headroom."""
     dynamics: Literal["double_integrator", "autopilot"] = "double_integrator"
-    """`double_integrator`: the source's UAVs, which follow an acceleration at once and are launched in the air.
+    """`double_integrator`: the UAVs of the thesis, which follow an acceleration at once and are launched in the air.
     `autopilot`: multicopters with an autopilot, which start on the ground."""
     autopilot: Autopilot = Autopilot()
     """The simulated multicopters, with `dynamics = "autopilot"`."""
     response: Response | None = None
     """How the vehicles respond to set-points, if that is known beforehand."""
     at_end: Literal["hold", "land"] = "hold"
-    """What vehicles with an autopilot are told when the flight ends."""
+    """What vehicles with an autopilot are commanded to do when the flight ends."""
 
     def leader_first(self) -> tuple[Vehicle, ...]:
         """Vehicles ordered so that each comes after the one it follows, by system id within a rank."""

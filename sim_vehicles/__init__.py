@@ -1,0 +1,1 @@
+"""Simulated UAVs behind emulated links, as MAVLink systems of their own. Begin at `drive.fleet`."""

@@ -1,1 +1,1 @@
-"""ArduPilot and PX4: the start of their flights, identification of their response, their pilots."""
+"""Vehicles with ArduPilot or PX4: start-up, identification of their response, set-points. Begin at `fleet`."""

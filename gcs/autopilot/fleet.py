@@ -4,21 +4,20 @@ from math import hypot
 from typing import Any
 
 from gcs.autopilot.manoeuvre import Identification
-from gcs.autopilot.pilots import Pilots
 from gcs.autopilot.startup import AutopilotStartup, between
+from gcs.autopilot.velocity_targets import VelocityTargets
 from gcs.control.history import StateHistory
-from gcs.control.law import VehicleControl
-from gcs.control.loops import Vector, loop_of
+from gcs.control.loops import Order, loop_of
 from gcs.control.phases import START_PATIENCE_S, Phase
 from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
 from gcs.plan.flight_plan import FlightPlan
 from scenarios.schema import NS_PER_S
 
 PATIENCE_S = 120.0
-"""How long a vehicle may take from its first heartbeat until it is in the air and takes set-points, or stay silent."""
+"""Longest time from a vehicle's first heartbeat until it takes set-points in the air; longest silence in between."""
 _UNANNOUNCED_S = 3.0
 _FRAME_RESOLUTION_M = 0.005
-"""Half of the last digit of a latitude: an origin that moves by less has not moved."""
+"""Half of the last digit of a latitude: an origin that seems to move by less has not moved."""
 
 
 class AutopilotFleet:
@@ -42,7 +41,7 @@ class AutopilotFleet:
         self._report = report
         self._lacks = [("", 0)] * len(ids)
         """What each vehicle lacks, and since when; 0 once that has been reported."""
-        self._pilots = Pilots(self.vehicles, self.starts, period_s=1.0 / scenario.rates.control_hz)
+        self._targets = VelocityTargets(self.vehicles, self.starts, period_s=1.0 / scenario.rates.control_hz)
         self._identification = Identification(plan, self.vehicles, report) if plan.responses is None else None
 
     @property
@@ -63,7 +62,7 @@ class AutopilotFleet:
         return in_words("not ready: ", [vehicle for vehicle in self.vehicles if late(vehicle)])
 
     def _report_lacks(self, due_ns: int) -> None:
-        """Report what a vehicle has lacked for so long that somebody would ask."""
+        """Report what a vehicle has lacked for longer than a start-up step usually takes."""
         for row, vehicle in enumerate(self.vehicles):
             lacks, _, _ = vehicle.missing.partition(",")  # without how far it has climbed
             before, since_ns = self._lacks[row]
@@ -74,7 +73,7 @@ class AutopilotFleet:
                 self._report("start", lacks or "is ready", vehicle.system_id)
 
     def locate(self, history: StateHistory) -> None:
-        """What a vehicle reported in a frame that has moved since is forgotten."""
+        """States reported in a frame that has moved since are forgotten."""
         first = self.starts[0]
         for row, startup in enumerate(self.starts):
             if first.origin is None or startup.origin is None:
@@ -97,32 +96,21 @@ class AutopilotFleet:
             self.plan, self._identification = found, None
         return ""
 
-    def set_point(
-        self,
-        row: int,
-        control: VehicleControl,
-        phase: Phase,
-        *,
-        commanded: bool,
-        nominal_velocity_m_s: Vector,
-        key_ms: int,
-        due_ns: int,
-    ) -> tuple[Any, ...] | None:
-        del nominal_velocity_m_s  # these vehicles follow velocities integrated from their commands
-        vehicle, command = self.vehicles[row], control.command_m_s2
+    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
+        vehicle, (control, commanded, _, key_ms, due_ns) = self.vehicles[row], order
+        command, known = control.command_m_s2, control.sample_ns > 0
         if vehicle.taken_over and vehicle.kind.guided_first:
-            self._pilots.rest(row)
+            self._targets.rest(row)
             return None
         others = vehicle.taken_over and phase in (Phase.IDENTIFYING, Phase.FLYING)
         if (phase is Phase.CONNECTING and self.starts[row].airborne) or others:
-            return self._pilots.hover(row, key_ms=key_ms)  # PX4 enters OFFBOARD only while set-points arrive
-        known = control.sample_ns > 0
+            return self._targets.hover(row, key_ms=key_ms)  # PX4 enters OFFBOARD only while set-points arrive
         if phase is Phase.IDENTIFYING and self._identification is not None:
             command, commanded = self._identification.command(due_ns), True
-            known = known or self._pilots.steers(row)  # a clock that jumped does not interrupt the manoeuvre
+            known = known or self._targets.steers(row)  # a clock that jumped does not interrupt the manoeuvre
         if not commanded or not known:
-            self._pilots.rest(row)
+            self._targets.rest(row)
             return None
         if not vehicle.guided:
-            self._pilots.rest(row)  # set-points show it that a station is there; they start from its own velocity
-        return self._pilots.accelerate(row, command, control.state[2:4], key_ms=key_ms, now_ns=due_ns)
+            self._targets.rest(row)  # set-points show it that a station is there; they start from its own velocity
+        return self._targets.accelerate(row, command, control.state[2:4], key_ms=key_ms, now_ns=due_ns)

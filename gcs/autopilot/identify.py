@@ -2,8 +2,8 @@
 
 All vehicles are commanded the same acceleration at the same time: forwards, backwards for twice as long, and forwards
 again. So they keep their distances and end at their initial velocity. The model of `gains.performance.response` is
-fitted to the velocity they report. The instant at which a command acted follows from its sending time and the measured
-way down, the instant of a sample from the vehicle's clock. So the response found does not include the link's delay.
+fitted to the velocity they report. A command acts at its sending time plus the measured delay down; the instant of a
+sample comes from the vehicle's clock. So the response found does not include the link's delay.
 """
 
 from collections.abc import Callable, Sequence

@@ -43,7 +43,7 @@ PX4_COPTER = Kind(
 
 
 def kind_of(autopilot: int, vehicle_type: int) -> Kind | str | None:
-    """The kind of vehicle that a HEARTBEAT shows, or why it cannot be flown; None if it does not know yet itself."""
+    """The kind of vehicle that a HEARTBEAT shows, or why it cannot be flown; None while it does not know itself."""
     if vehicle_type == _NOT_YET_KNOWN:
         return None  # ArduPilot before its motors are set up
     if vehicle_type == _FIXED_WING and autopilot == ARDUPILOT:

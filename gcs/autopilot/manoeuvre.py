@@ -6,15 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gains.performance.response import Response, sampled_margin
-from gcs.autopilot.identify import (
-    LONGEST_S,
-    MISFIT_MAX,
-    PROFILE,
-    Identified,
-    amplitude_m_s2,
-    identify,
-    manoeuvre_m_s2,
-)
+from gcs.autopilot.identify import LONGEST_S, MISFIT_MAX, PROFILE, Identified, amplitude_m_s2, identify, manoeuvre_m_s2
 from gcs.control.history import StateHistory
 from gcs.link.vehicle import RemoteVehicle, Report
 from gcs.plan.flight_plan import FlightPlan

@@ -47,7 +47,6 @@ class AutopilotStartup:
         self._accepted: set[float] = set()
 
     def recognise(self, autopilot: int, vehicle_type: int) -> Kind:
-        """The kind of vehicle, as far as its heartbeats show it."""
         if self.kind is not UNRECOGNISED or self.refusal:
             return self.kind
         found = kind_of(autopilot, vehicle_type)
@@ -64,7 +63,6 @@ class AutopilotStartup:
         return found
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
-        """Take in a message from the vehicle; those that say nothing about the start-up are ignored."""
         match msg_id:
             case mavlink.LOCAL_POSITION_NED:
                 self._local = fields[:6]
@@ -98,17 +96,15 @@ class AutopilotStartup:
                 self.origin_altitude_m = altitude_mm * 1e-3 + down
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:
-        """Note that a command was accepted."""
         if command == SET_MESSAGE_INTERVAL:
             self._accepted.add(parameters[0])
         elif command == TAKE_OFF:
             self._took_off_ns = now_ns
 
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
-        """Note that a command was refused.
+        """A message rate for the origin may be refused: other messages show it too.
 
-        An origin that is not sent is found in another way. A vehicle that refuses a repeated take-off is taking off
-        already, and its first answer was lost.
+        A vehicle that refuses a repeated take-off is taking off already, and its first answer was lost.
         """
         if command == SET_MESSAGE_INTERVAL and parameters[0] == mavlink.GPS_GLOBAL_ORIGIN:
             self._accepted.add(parameters[0])
@@ -117,11 +113,9 @@ class AutopilotStartup:
 
     @property
     def is_half_way_up(self) -> bool:
-        """Whether it has climbed to half of its take-off altitude or more."""
         return (self.relative_altitude_m or 0.0) >= 0.5 * self.altitude_m
 
     def begin_anew(self) -> None:
-        """Forget what the vehicle was told: it seems to have restarted."""
         self._accepted.clear()
         self._took_off_ns = None
 
@@ -129,7 +123,6 @@ class AutopilotStartup:
         """None: an autopilot's parameters are its owner's."""
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
-        """The next step towards a vehicle that takes set-points in the air."""
         if self.kind is UNRECOGNISED:
             return Step(self.refusal or "sends no heartbeat of an autopilot")
         due = next(((m, us) for m, us in self._rates.items() if m not in self._accepted), None)

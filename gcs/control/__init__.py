@@ -1,1 +1,5 @@
-"""The control tick: states at one instant, the control law, limits, loop delay, phases, the tick record."""
+"""The control tick: from the newest states to commands, and what is known of their delay.
+
+Begin at `law`, the control law. `loops` says what depends on where the loop is closed, `loop_delay` defines loop delay
+and headroom, `tick` the columns of the tick record.
+"""

@@ -34,7 +34,6 @@ class StateHistory:
 
     @property
     def complete(self) -> bool:
-        """Whether every vehicle has reported."""
         return all(self._reports)
 
     def newest(self, vehicle: int) -> Report | None:

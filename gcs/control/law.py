@@ -51,7 +51,7 @@ FeedbackLaw = tuple[VehicleLaw | None, ...]
 
 
 def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequence[bool]) -> FeedbackLaw:
-    """The law of a schedule of gain matrices K, flown around lost vehicles.
+    """The law of a schedule of gain matrices K, without the lost vehicles.
 
     Each K is (inputs, states) in the order of `gains.formation.model.FormationModel`.
 
@@ -100,7 +100,7 @@ def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequ
 
 
 class Blend(NamedTuple):
-    """The gains one vehicle is flown with: the fraction `share` of the set flown, the rest of the former set."""
+    """The gains of one vehicle: `share` of the set `flown`, and 1 - `share` of the set `former`."""
 
     flown: int = 0
     former: int = 0

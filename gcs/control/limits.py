@@ -1,4 +1,4 @@
-"""The scenario's limits, applied to every set-point that is sent, for whatever vehicle and by whatever computed."""
+"""The scenario's limits, applied to every set-point that is sent, whatever computed it."""
 
 from dataclasses import dataclass
 from math import hypot
@@ -24,7 +24,6 @@ class SetPointLimits:
 
     @classmethod
     def of(cls, limits: Limits) -> "SetPointLimits":
-        """The limits of a scenario."""
         return cls(limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, limits.speed_max_m_s or LARGEST_COMMAND_M_S2)
 
     def command(self, wanted_m_s2: Vector) -> Vector:

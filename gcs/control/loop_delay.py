@@ -5,19 +5,19 @@ command computed from it acts:
 
     loop delay = up + waiting + computing + down - repetition
 
-* *up*: the telemetry's way to the station. *Waiting*: for the control tick. *Computing*: until the set-point has been
-  handed to the kernel. Together they are the age of the state when the set-point leaves.
-* *down*: the command's way to the vehicle. It is not measured for each set-point: it is that of the newest TIMESYNC
-  request, so jitter makes the two differ.
-* *repetition*: when telemetry is slower than control, several commands rest on one state. They repeat each other, and
-  the loop is no later for that: its margin already counts the period of the telemetry. What lost telemetry adds to
-  this is delay.
+* *up*: the delay of the telemetry. *Waiting*: for the control tick. *Computing*: until the set-point has been handed
+  to the kernel. Together they are the age of the state when the set-point is sent.
+* *down*: the delay of the set-point. It is not measured for each set-point but taken from the newest TIMESYNC request,
+  so jitter makes the two differ.
+* *repetition*: when telemetry is slower than control, several commands are computed from one state. The repetition
+  does not count as delay, because the margin already accounts for the telemetry period. What lost telemetry adds to
+  that period does count.
 * With the loop on the ground the state is the vehicle's newest. With loops on board it is the oldest among the newest
   states that the streamed command needs (`VehicleControl.used_ns`).
 
-Error: up and down rest on the estimated offset of the vehicle's clock. Their sum is wrong by at most `sample_bound_s`
-+ `down_bound_s` of the tick record, plus the millisecond in which `time_boot_ms` counts. With one offset for both the
-error cancels, as it makes the state look older by what it makes the way down look shorter.
+Error: up and down depend on the estimated offset of the vehicle's clock. Their sum is wrong by at most `sample_bound_s`
++ `down_bound_s` of the tick record, plus the millisecond in which `time_boot_ms` counts. If both use the same offset,
+its error cancels: it lengthens one by as much as it shortens the other.
 """
 
 from math import ceil, nan
@@ -42,13 +42,13 @@ def headroom(delay_s: float, delay_margin_s: float) -> float:
 
 
 class Repetitions:
-    """How long each vehicle's set-points have rested on the same state because telemetry is slower than control."""
+    """How long each vehicle's set-points have repeated the same state because telemetry is slower than control."""
 
     def __init__(self, rates: Rates, vehicles: int) -> None:
         ticks = ceil(rates.control_hz / rates.telemetry_hz * (1.0 - _SAME_RATE)) - 1
         self._longest_ns = max(0, ticks) * round(NS_PER_S / rates.control_hz)
         self._first: list[tuple[int, int]] = [(0, 0)] * vehicles
-        """Of each vehicle the state used last, by its instant, and the tick that used it first."""
+        """For each vehicle the instant of the state used last, and the tick that used it first."""
 
     def repeated_s(self, row: int, used_ns: int, due_ns: int) -> float:
         """Time from the first tick that used a state to the tick due now, at most one period of the telemetry."""

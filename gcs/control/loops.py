@@ -7,7 +7,7 @@ its loop delay counts from that instant.
 """
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from gains.sampled.onboard import own_part
 from gcs.control.history import StateHistory
@@ -17,6 +17,18 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.onboard import own_parameters
 
 Vector = tuple[float, float]
+
+
+class Order(NamedTuple):
+    """What a set-point is made from: one vehicle at one tick."""
+
+    control: VehicleControl
+    commanded: bool
+    """Whether the vehicle is to follow the control law at this tick."""
+    nominal_velocity_m_s: Vector
+    key_ms: int
+    """The set-point's time_boot_ms."""
+    due_ns: int
 
 
 class Loop(Protocol):
@@ -38,9 +50,7 @@ class Loop(Protocol):
         """Errors of every vehicle, and the acceleration it is sent; as `gcs.control.law.formation_control`."""
         ...
 
-    def set_point(
-        self, system_id: int, control: VehicleControl, *, nominal_velocity_m_s: Vector, key_ms: int
-    ) -> tuple[Any, ...]:
+    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
         """Fields of the set-point that carries a command."""
         ...
 
@@ -64,12 +74,11 @@ class GroundLoop:
     def law(self, lost: Sequence[bool]) -> FeedbackLaw:
         return feedback_law(self._plan.formation, _gains(self._plan, lost), lost)
 
-    def set_point(
-        self, system_id: int, control: VehicleControl, *, nominal_velocity_m_s: Vector, key_ms: int
-    ) -> tuple[Any, ...]:
-        del nominal_velocity_m_s  # the acceleration is all that these vehicles follow
-        north, east = control.command_m_s2
-        return mavlink.acceleration_set_point(key_ms=key_ms, target_system=system_id, north_m_s2=north, east_m_s2=east)
+    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
+        north, east = order.control.command_m_s2
+        return mavlink.acceleration_set_point(
+            key_ms=order.key_ms, target_system=system_id, north_m_s2=north, east_m_s2=east
+        )
 
     def parameters(self, system_id: int) -> dict[str, float]:
         del system_id
@@ -115,14 +124,12 @@ class OnboardLoop:
             controls[row] = control._replace(command_m_s2=command)
         return controls
 
-    def set_point(
-        self, system_id: int, control: VehicleControl, *, nominal_velocity_m_s: Vector, key_ms: int
-    ) -> tuple[Any, ...]:
+    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
         return mavlink.velocity_set_point(
-            key_ms=key_ms,
+            key_ms=order.key_ms,
             target_system=system_id,
-            velocity_ned_m_s=(*nominal_velocity_m_s, 0.0),
-            acceleration_ne_m_s2=control.command_m_s2,
+            velocity_ned_m_s=(*order.nominal_velocity_m_s, 0.0),
+            acceleration_ne_m_s2=order.control.command_m_s2,
         )
 
     def parameters(self, system_id: int) -> dict[str, float]:

@@ -2,7 +2,8 @@
 
 from enum import StrEnum
 
-from scenarios.schema import Link, Scenario
+from scenarios.link_schema import Link
+from scenarios.schema import Scenario
 
 
 class Phase(StrEnum):
@@ -44,7 +45,7 @@ _ROUND_TRIPS = 40.0
 
 
 def patience_s(scenario: Scenario) -> float:
-    """How long a flight may take to begin. Until then scenario time is the time since the station's start less this."""
+    """How long a flight may take to begin. Until it does, scenario time is the time since the start minus this."""
     return max(_LEAST_PATIENCE_S[scenario.dynamics], _ROUND_TRIPS * longest_round_trip_s(scenario))
 
 

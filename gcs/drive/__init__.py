@@ -1,1 +1,4 @@
-"""Drivers in real time (UDP) and in virtual time (lockstep). The only sockets and clocks of the station."""
+"""What runs a station: `udp` in real time, `lockstep` in virtual time. The station's only sockets and clocks.
+
+`fly` is the whole of `gcs fly` after the options; `preflight` holds the checks before take-off.
+"""

@@ -1,4 +1,4 @@
-"""Flies a plan to its end and returns its log: in virtual time, or in real time as `gcs fly` does."""
+"""Flies a plan to its end, in virtual time or in real time as `gcs fly` does, and returns its log."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +48,6 @@ def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, w
 
 
 def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:
-    """Fly a plan in virtual time."""
     station, records = Station(plan, start_ns=START_NS), list[tuple[int, ...]]()
     writer = prepared_folder(plan, folder) if folder is not None else None
     rows: list[TickArray] = []

@@ -47,7 +47,6 @@ class Guard:
         return verified
 
     def sent(self, outgoing: list[Outgoing], now_ns: int) -> list[Outgoing]:
-        """The datagrams with their signatures."""
         return [Outgoing(self._link.sign(data, now_ns), address) for data, address in outgoing]
 
 

@@ -44,7 +44,6 @@ class LinkLosses:
         self.lost = {LINK_UP: 0, LINK_DOWN: 0}
 
     def record(self, row: Row) -> None:
-        """Take one record of the truth."""
         kind = row[0]
         if kind in (LINK_UP, LINK_DOWN):
             self.entered[kind] += 1
@@ -74,11 +73,7 @@ def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
 
 
 def fly_lockstep(
-    plan: FlightPlan,
-    *,
-    station: Station | None = None,
-    vehicles: Vehicles | None = None,
-    guard: Guard | None = None,
+    plan: FlightPlan, *, station: Station | None = None, vehicles: Vehicles | None = None, guard: Guard | None = None
 ) -> Iterator[TickArray]:
     """Fly a plan in virtual time; yields the rows (a fresh copy) of each control tick.
 

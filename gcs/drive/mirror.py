@@ -52,7 +52,6 @@ class Mirror:
         self.close()
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
     def forward(self, frames: Iterable[bytes], now_ns: int) -> None:
@@ -68,9 +67,9 @@ class Mirror:
     def passed_on(self, vehicles: list[RemoteVehicle], now_ns: int) -> list[Outgoing]:
         """Frames of the other station that may pass, each to the vehicle it is addressed to, or to all.
 
-        They go only to vehicles already in flight: one never commanded before would take the other station for its own.
-        Requests that change the rate of the telemetry used for control are refused: displays ask for a few positions a
-        second when they connect.
+        They go only to vehicles already in flight: one that was never commanded would accept the other station as its
+        own. Requests that change the rate of the telemetry used for control are refused: displays ask for a few
+        positions a second when they connect.
         """
         own = {vehicle.system_id: vehicle.address if vehicle.guided else None for vehicle in vehicles}
         outgoing: list[Outgoing] = []

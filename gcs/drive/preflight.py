@@ -1,6 +1,6 @@
-"""Checks before take-off: what in a scenario or its plan would make any flight of it end badly.
+"""Checks before take-off: whether a scenario or its plan can fly at all.
 
-A finding is one line: the scenario's key, what was read there and what was wanted. None if there is none.
+A fault is one line: the scenario's key, what was read and what was wanted. None if there is no fault.
 """
 
 from dataclasses import replace

@@ -13,7 +13,7 @@ from gcs.runs.refusals import VEHICLES_FILE
 
 VEHICLES_LOG = "vehicles.log"
 ORPHAN_S = 60.0
-"""How long vehicles whose station was killed wait for another one."""
+"""How long vehicles whose station was killed fly on and wait for another one."""
 _AT_ONCE_S = 0.1
 _STOP_PATIENCE_S = 5.0
 

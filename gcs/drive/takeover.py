@@ -1,4 +1,4 @@
-"""Vehicles that are present before the flight: which experiment they fly, taking them over, ending them.
+"""Takes over vehicles that are already there before the flight, if they fly the same experiment.
 
 Simulated vehicles whose station was killed fly on for a while. Only a flight with the same scenario, links and seed may
 take them over: otherwise its verdict would be about another experiment. Each vehicle names what it flies in the
@@ -21,8 +21,8 @@ TAKEN_OVER = "taken over: they were there already"
 CONNECTED = "not started here (--connect)"
 _SCENARIO = "SCENARIO"
 _SHUTDOWN, _KEEP, _SHUT_DOWN = 246, 0.0, 2.0
-"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: nothing, which as a command still restarts
-an orphan's time to live; and shutdown."""
+"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: do nothing, which as a command restarts the
+minute that vehicles without a station fly on; and shut down."""
 _HEARTBEAT_PERIOD_S = 1.2
 """Vehicles already in flight are heard within this time."""
 _ASK_AGAIN_NS = NS_PER_S // 4
@@ -33,7 +33,7 @@ _ROUND_TRIPS = 4.0
 Make = Callable[[int], tuple[int, tuple[object, ...]]]
 """The message (id and fields) for a vehicle."""
 Answer = Callable[[mavlink.Frame], str]
-"""What a frame answers, "" if nothing."""
+"""The answer in a frame; "" if it is none."""
 
 
 class Presence:
@@ -57,11 +57,11 @@ class Presence:
         """
         self._listen(self._link.bound_ns + round(_HEARTBEAT_PERIOD_S * NS_PER_S))
         there = sorted(self._addresses)
-        said = self._converse(
+        said = self._ask(
             there,
             lambda system_id: (
                 mavlink.PARAM_EXT_REQUEST_READ,
-                mavlink.param_ext_request_read(_SCENARIO, target_system=system_id),
+                mavlink.param_request_read(_SCENARIO, target_system=system_id),
             ),
             _scenario_of,
         )
@@ -78,7 +78,7 @@ class Presence:
 
     def _command(self, system_ids: list[int], wanted: float) -> list[int]:
         """The vehicles that acknowledged the command."""
-        said = self._converse(
+        said = self._ask(
             system_ids,
             lambda system_id: (
                 mavlink.COMMAND_LONG,
@@ -88,8 +88,8 @@ class Presence:
         )
         return sorted(said)
 
-    def _converse(self, system_ids: Iterable[int], make: Make, answer: Answer) -> dict[int, str]:
-        """Each vehicle's answer to a message, which is repeated until the answer arrives or patience ends."""
+    def _ask(self, system_ids: Iterable[int], make: Make, answer: Answer) -> dict[int, str]:
+        """Each vehicle's answer to a message, which is repeated until the answer arrives or time is up."""
         said: dict[int, str] = {}
         left = set(system_ids)
         patience_s = max(_LEAST_PATIENCE_S, _ROUND_TRIPS * longest_round_trip_s(self._scenario))

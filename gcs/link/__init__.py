@@ -1,1 +1,4 @@
-"""The conversation with one vehicle: MAVLink codec, sequence numbers, clocks, start-up of autopilots."""
+"""The conversation with one vehicle. Begin at `vehicle`.
+
+It uses the codec (`mavlink`), sequence numbers, clocks, and what depends on the kind of vehicle (`kinds`, `startup`).
+"""

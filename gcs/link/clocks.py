@@ -38,7 +38,7 @@ _LONG_AGO_NS = -(1 << 62)
 DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
 """Rate difference of two clocks beyond which a change of offset is a jump, not drift."""
 DOUBTS = 3
-"""This many doubtful exchanges, with none in between that fits the line, are taken for a jump."""
+"""This many doubtful exchanges, with none between them that fits the line, are reported as a jump."""
 _UNUSUAL = 1.5
 """A sample this many times farther from the line than any in the window is an outlier, not jitter."""
 _READING_NS = 1000
@@ -69,7 +69,6 @@ class ClockEstimate(NamedTuple):
     reference_ns: int
 
     def offset_at_ns(self, time_ns: int) -> int:
-        """The offset at a time of the station's clock."""
         return self.offset_ns + round(self.skew * (time_ns - self.reference_ns))
 
     def bound_at_ns(self, time_ns: int) -> float:
@@ -99,7 +98,7 @@ class VehicleClock:
         """Its largest error."""
         self.unmatched = 0
         self.backdated_ns = 0
-        """The most by which the vehicle dates its replies back."""
+        """The most by which the timestamps of the vehicle's replies are too early."""
         self.lost = False
         """Whether the clock is known to have jumped, but not yet by how much."""
         self.asked_ns = 0

@@ -1,4 +1,4 @@
-"""What the conversation with a vehicle has to know of its kind, as data."""
+"""What the conversation with a vehicle depends on: its kind, as data."""
 
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -27,12 +27,12 @@ class Kind:
 
     name: str
     guided_mode: int
-    """Takes set-points."""
+    """The mode in which it takes set-points."""
     hold_mode: int
-    """Stays where it is, without a pilot."""
+    """The mode in which it stays where it is, without a pilot."""
     land_mode: int
     take_off_mode: int = -1
-    """Takes off, if not in the guided mode; it then holds."""
+    """The mode in which it takes off and then holds; -1 if that is the guided mode."""
     guided_name: str = "GUIDED"
     estimator_message: int = 0
     """The message that says whether the vehicle knows its position."""
@@ -41,19 +41,19 @@ class Kind:
     guided_first: bool = True
     """It becomes guided on the ground, before it is armed; otherwise only in the air, while set-points arrive."""
     altitude_above_sea: bool = False
-    """The altitude of a take-off command is above sea level, not above home."""
+    """Its take-off command takes an altitude above sea level, not above home."""
     stays_guided: bool = False
     """Without set-points it stops but stays guided. If it leaves the guided mode, somebody wanted that."""
     velocity_grows: bool = False
     """Between set-points its velocity target grows with the acceleration."""
     timesync_backdated_ns: int = 0
-    """The most by which it dates its TIMESYNC replies back."""
+    """The most by which the timestamps of its TIMESYNC replies are too early."""
     packed_modes: bool = False
-    """A mode has a main and a sub number: separate parameters of DO_SET_MODE, packed into one in HEARTBEAT."""
+    """A mode has a main and a sub number: two parameters of DO_SET_MODE, packed into one number in HEARTBEAT."""
 
 
 LAUNCHED = Kind("launched UAV", guided_mode=4, hold_mode=5, land_mode=5, piloted=False)
-"""The simulated vehicles without an autopilot."""
+"""The simulated double integrators."""
 UNRECOGNISED = replace(LAUNCHED, name="unrecognised vehicle", piloted=True)
 """A vehicle with an autopilot before its heartbeat has shown which."""
 

@@ -34,11 +34,10 @@ HOME_POSITION = 242
 STATUSTEXT = 253
 
 MAGIC, MAGIC_1 = 0xFD, 0xFE
-_OVERHEAD_1 = 8
-_HEADER = struct.Struct("<BBBBBBBHB")
+_HEADER, _HEADER_1 = struct.Struct("<BBBBBBBHB"), 6
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
-_OVERHEAD = 12
+_OVERHEAD, _OVERHEAD_1 = 12, 8
 _SET_POINT_ID = SET_POSITION_TARGET_LOCAL_NED.to_bytes(3, "little")
 
 
@@ -108,29 +107,48 @@ def message_name(msg_id: int) -> str:
 
 
 def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:
-    """The valid frames of one datagram; refused ones are counted by reason, and nothing is raised.
+    """The valid MAVLink 2 frames of one datagram; refused ones are counted by reason, and nothing is raised.
 
     Each datagram is parsed on its own, so a truncated frame cannot swallow the next datagram. A position used for
     control is refused if it contains NaN or infinity, which a checksum does not show.
     """
     end = len(datagram)
     if end >= _OVERHEAD and datagram[0] == MAGIC and end == _OVERHEAD + datagram[1] and not datagram[2]:
-        frame = _checked(datagram, datagram[1], refused)  # the usual case: one unsigned frame
+        frame = _checked(datagram, refused)  # the usual case: one unsigned frame
         return [] if frame is None else [frame]
+    return _decode(datagram, MAGIC, refused)
+
+
+def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
+    """The valid MAVLink 1 frames of one datagram; refused ones are counted by reason."""
+    return _decode(datagram, MAGIC_1, refused)
+
+
+def decode_either(datagram: bytes, refused: Counter[str]) -> list[Frame]:
+    """The valid frames of a datagram of MAVLink 1 or of MAVLink 2."""
+    return decode_1(datagram, refused) if datagram[:1] == b"\xfe" else decode(datagram, refused)
+
+
+def first_heartbeats(datagram: bytes) -> list[Frame]:
+    """The MAVLink 1 heartbeats of a datagram: PX4 sends these until it hears MAVLink 2."""
+    return [frame for frame in decode_1(datagram, Counter()) if frame.msg_id == HEARTBEAT]
+
+
+def _decode(datagram: bytes, magic: int, refused: Counter[str]) -> list[Frame]:
     frames: list[Frame] = []
     at = 0
-    while at < end:
-        if datagram[at] != MAGIC:
-            refused["not MAVLink 2"] += 1
+    while at < len(datagram):
+        if datagram[at] != magic:
+            refused["not MAVLink 2" if magic == MAGIC else "not MAVLink 1"] += 1
             break
         stop = frame_end(datagram, at)
         if not stop:
             refused["truncated"] += 1
             break
-        if datagram[at + 2] & ~_SIGNED:
+        if magic == MAGIC and datagram[at + 2] & ~_SIGNED:
             refused["unknown flags"] += 1
         else:
-            frame = _checked(datagram[at:stop], datagram[at + 1], refused)
+            frame = _checked(datagram[at:stop], refused)
             if frame is not None:
                 frames.append(frame)
         at = stop
@@ -154,58 +172,27 @@ def frame_end(data: bytes, at: int) -> int:
     return stop if stop <= len(data) else 0
 
 
-def decode_either(datagram: bytes, refused: Counter[str]) -> list[Frame]:
-    """The valid frames of a datagram of MAVLink 1 or of MAVLink 2."""
-    return decode_1(datagram, refused) if datagram[:1] == b"\xfe" else decode(datagram, refused)
-
-
-def first_heartbeats(datagram: bytes) -> list[Frame]:
-    """The MAVLink 1 heartbeats of a datagram: PX4 sends these until it hears MAVLink 2."""
-    return [frame for frame in decode_1(datagram, Counter()) if frame.msg_id == HEARTBEAT]
-
-
-def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
-    """The valid MAVLink 1 frames of one datagram; refused ones are counted by reason."""
-    frames: list[Frame] = []
-    at = 0
-    while at < len(datagram):
-        stop = frame_end(datagram, at) if datagram[at] == MAGIC_1 else 0
-        if not stop:
-            refused["not MAVLink 1" if datagram[at] != MAGIC_1 else "truncated"] += 1
-            break
-        data = datagram[at:stop]
-        at = stop
-        layout = _LAYOUTS.get(data[5])
-        if layout is None:
-            refused["unknown message"] += 1
-        elif mcrf4xx(data[1:-2] + layout.crc_extra) != int.from_bytes(data[-2:], "little"):
-            refused["bad checksum"] += 1
-        else:
-            fields = layout.packing.unpack(data[6:-2][: layout.length].ljust(layout.length, b"\0"))
-            if data[5] == LOCAL_POSITION_NED and not isfinite(sum(fields)):
-                refused["not finite"] += 1
-            else:
-                frames.append(Frame(data[5], data[3], data[4], data[2], fields, data))
-    return frames
-
-
-def _checked(data: bytes, length: int, refused: Counter[str]) -> Frame | None:
-    """One frame of known length, or None if it is refused."""
-    _, _, _, _, sequence, system_id, component_id, id_low, id_high = _HEADER.unpack_from(data)
-    msg_id = id_low | id_high << 16
+def _checked(data: bytes, refused: Counter[str]) -> Frame | None:
+    """One frame of the right length, or None if it is refused."""
+    if data[0] == MAGIC:
+        _, length, _, _, sequence, system_id, component_id, id_low, id_high = _HEADER.unpack_from(data)
+        msg_id, begin = id_low | id_high << 16, _HEADER.size
+    else:
+        _, length, sequence, system_id, component_id, msg_id = data[:_HEADER_1]
+        begin = _HEADER_1
     layout = _LAYOUTS.get(msg_id)
     if layout is None:
         refused["SETUP_SIGNING" if msg_id == SETUP_SIGNING else "unknown message"] += 1
         return None
     packing, full_length, crc_extra = layout
-    body_end = 10 + length
-    if mcrf4xx(data[1:body_end] + crc_extra) != data[body_end] | data[body_end + 1] << 8:
+    end = begin + length
+    if mcrf4xx(data[1:end] + crc_extra) != data[end] | data[end + 1] << 8:
         refused["bad checksum"] += 1
         return None
     if length == full_length:
-        fields = packing.unpack_from(data, 10)
+        fields = packing.unpack_from(data, begin)
     else:  # MAVLink 2 omits trailing zeros; a newer dialect may add fields, which are ignored
-        fields = packing.unpack(data[10 : 10 + min(length, full_length)].ljust(full_length, b"\0"))
+        fields = packing.unpack(data[begin : begin + min(length, full_length)].ljust(full_length, b"\0"))
     if msg_id == LOCAL_POSITION_NED and not isfinite(sum(fields)):
         refused["not finite"] += 1
         return None
@@ -216,23 +203,13 @@ def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int, system_id: in
     """One frame, by default from the station; `fields` in wire order."""
     layout = _LAYOUTS[msg_id]
     payload = layout.packing.pack(*fields).rstrip(b"\0") or b"\0"
-    header = _HEADER.pack(
-        MAGIC,
-        len(payload),
-        0,
-        0,
-        sequence & 0xFF,
-        system_id,
-        STATION_COMPONENT_ID,
-        msg_id & 0xFFFF,
-        msg_id >> 16,
-    )
+    source = system_id, STATION_COMPONENT_ID
+    header = _HEADER.pack(MAGIC, len(payload), 0, 0, sequence & 0xFF, *source, msg_id & 0xFFFF, msg_id >> 16)
     body = header + payload
     return body + mcrf4xx(body[1:] + layout.crc_extra).to_bytes(2, "little")
 
 
 def heartbeat() -> tuple[Any, ...]:
-    """Fields of the station's HEARTBEAT."""
     return (0, dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, dialect.MAV_STATE_ACTIVE, 3)
 
 
@@ -250,8 +227,8 @@ def command_long(
     command: int, *, target_system: int, confirmation: int = 0, parameters: tuple[float, ...] = ()
 ) -> tuple[Any, ...]:
     """Fields of COMMAND_LONG to the autopilot (component 1) of one vehicle; omitted parameters are 0."""
-    padded = (*parameters, *(0.0 for _ in range(7 - len(parameters))))
-    return (*padded, command, target_system, 1, confirmation)
+    padding = (0.0,) * (7 - len(parameters))
+    return (*parameters, *padding, command, target_system, 1, confirmation)
 
 
 def param_set(name: str, value: float, *, target_system: int) -> tuple[Any, ...]:
@@ -260,12 +237,7 @@ def param_set(name: str, value: float, *, target_system: int) -> tuple[Any, ...]
 
 
 def param_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
-    """Fields of PARAM_REQUEST_READ by name."""
-    return (-1, target_system, 1, name.encode())
-
-
-def param_ext_request_read(name: str, *, target_system: int) -> tuple[Any, ...]:
-    """Fields of PARAM_EXT_REQUEST_READ by name."""
+    """Fields of PARAM_REQUEST_READ, or of PARAM_EXT_REQUEST_READ, by name."""
     return (-1, target_system, 1, name.encode())
 
 

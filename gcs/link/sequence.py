@@ -12,13 +12,14 @@ _STEADY_NS = _NS_PER_S // 2
 _RATE_NS = _NS_PER_S
 """The rate is measured over intervals of this length."""
 _AHEAD, _LEAST_AHEAD = 127, 32
-"""A frame may be this much newer than its time suggests, because the newest one may itself have been late. How far
-frames have lately been overtaken reduces this allowance, down to the second figure."""
+"""A frame may be this much newer than its time suggests, because the newest one may itself have been late. The farther
+frames have lately been overtaken, the smaller this allowance is, down to the second figure."""
 _MOST = 0xFFFFFFFF
 """The largest count that the tick record holds: a log whose clock jumps by centuries seems to have lost more."""
 _FORGET = 1.0 / 512
 _RUN, _RUN_STEP = 8, 4
-"""This many late frames in a row, each newer than the last by at most the second figure, are not late after all."""
+"""This many late frames in a row, each newer than the last by at most the second figure, are new after all: a very late
+frame was taken for a new one."""
 
 
 class SequenceCounter:
@@ -107,13 +108,11 @@ class SequenceCounter:
         self._rate_hz = self._lag = 0.0
 
     def _note_rate(self, time_ns: int) -> None:
-        """Update the rate of frames sent, from times without a pause; a command may change it at once."""
+        """Update the rate of frames sent, from times without a pause."""
         steady = time_ns - self._newest_ns < _STEADY_NS
         since_ns = time_ns - self._rate_ns
         if steady and since_ns < _RATE_NS:
             return
         if steady:
-            rate_hz = (self._newest - self._rate_count) * _NS_PER_S / since_ns
-            changed = abs(rate_hz - self._rate_hz) > 0.2 * rate_hz
-            self._rate_hz = rate_hz if changed else self._rate_hz + 0.25 * (rate_hz - self._rate_hz)
+            self._rate_hz = (self._newest - self._rate_count) * _NS_PER_S / since_ns
         self._rate_count, self._rate_ns = self._newest, time_ns

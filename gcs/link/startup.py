@@ -1,6 +1,6 @@
-"""How one vehicle is made ready to fly: what it lacks, and the message to send next.
+"""The start-up of one vehicle: what it lacks until it can be flown, and the message to send next.
 
-Vehicles with autopilots have `gcs.autopilot.startup.AutopilotStartup`.
+`gcs.autopilot.startup` has that of vehicles with an autopilot.
 """
 
 from typing import Any, Protocol
@@ -20,7 +20,7 @@ class Startup(Protocol):
 
     @property
     def refusal(self) -> str:
-        """Why the vehicle must not be flown; empty if nothing speaks against it."""
+        """Why the vehicle must not be flown; empty if it may."""
         ...
 
     @property
@@ -33,7 +33,7 @@ class Startup(Protocol):
         ...
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
-        """Take in a message from the vehicle; those that say nothing about the start-up are ignored."""
+        """Take in a message from the vehicle; only some concern the start-up."""
         ...
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
@@ -58,7 +58,7 @@ class Startup(Protocol):
 
 
 class LaunchedStartup:
-    """Start-up of a vehicle without an autopilot: telemetry rate, parameters of its own loop if any, GUIDED, armed."""
+    """Start-up of a double integrator: telemetry rate, parameters of the loop on board if any, GUIDED, armed."""
 
     kind = LAUNCHED
     is_half_way_up = False

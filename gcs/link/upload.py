@@ -1,7 +1,7 @@
 """Parameters of one vehicle: uploaded, read back and compared before it may be armed.
 
 A vehicle answers PARAM_SET with PARAM_VALUE, the value that then holds. Once all are set, each is read back with
-PARAM_REQUEST_READ. Unanswered messages are repeated. Links may be slow, so many are under way at once.
+PARAM_REQUEST_READ. Unanswered messages are repeated. Links may be slow, so many parameters are sent at once.
 """
 
 import struct
@@ -42,7 +42,7 @@ class Upload:
         self.done = not wanted
         """Whether every parameter has been read back and is right."""
         self.refusal = ""
-        """Why the vehicle must not be armed; empty if nothing speaks against it."""
+        """Why the vehicle must not be armed; empty if it may."""
 
     @property
     def missing(self) -> str:
@@ -73,7 +73,6 @@ class Upload:
         return None
 
     def take(self, fields: tuple[Any, ...]) -> None:
-        """Take in a PARAM_VALUE."""
         value, _, _, field, _ = fields
         name = field.partition(b"\0")[0].decode("ascii", "replace")
         item = self._items.get(name)

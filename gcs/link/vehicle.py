@@ -31,8 +31,8 @@ _ACCEPTED, _IN_PROGRESS = 0, 5
 _NS = 1_000_000_000
 _FORGET_NUMBERS_NS = 3 * _NS
 SILENCE_S = 1.5
-"""A vehicle without telemetry for this long is lost: it gets no more set-points, and the others fly around it. One that
-sends nothing at all for this long may be found at another address."""
+"""A vehicle without telemetry for this long is lost: it is sent no more set-points, and the others fly without it. One
+that sends nothing at all for this long may be accepted from another address."""
 _SILENT_NS = 3 * _NS
 """A vehicle that sends nothing for this long, not even heartbeats, is not ready."""
 
@@ -42,7 +42,7 @@ Report = Callable[[str, str, int], None]
 
 
 def ignored(kind: str, text: str, system_id: int) -> None:
-    """Takes events that nobody wants to know."""
+    """A `Report` that drops every event."""
 
 
 @dataclass
@@ -56,9 +56,9 @@ class _Waiting:
 
 
 class RemoteVehicle:
-    """What is known of one vehicle; `next_frame` brings it to the state that the station wants.
+    """What is known of one vehicle; `next_frame` gives the frames that bring it to the state the station wants.
 
-    `startup` holds what depends on the kind of vehicle; `land` says whether the vehicle lands at the end or holds.
+    `startup` holds what depends on the kind of vehicle. At the end the vehicle lands if `land` is set, else it holds.
     """
 
     def __init__(self, system_id: int, *, startup: Startup, report: Report = ignored, land: bool = False) -> None:
@@ -83,7 +83,7 @@ class RemoteVehicle:
         self.first_heard_ns: int | None = None
         self._has_been_guided = self._take_off_sent = False
         self._doubtful_ns = 0
-        """When the first heartbeat after a long silence arrived. It may be an old one: its number does not show it."""
+        """When the first heartbeat after a long silence arrived. It may be a replay: its number does not show that."""
         self._land = land
         self._now_ns = 0
         self._report = report
@@ -97,7 +97,6 @@ class RemoteVehicle:
 
     @property
     def end_mode(self) -> int:
-        """The mode in which the vehicle is to end."""
         return self.kind.land_mode if self._land else self.kind.hold_mode
 
     @property
@@ -140,7 +139,7 @@ class RemoteVehicle:
         return self.address not in {None, address} and received_ns - self.heard_ns <= SILENCE_S * _NS
 
     def may_speak_from(self, address: Address, msg_id: int, received_ns: int) -> bool:
-        """Whether a frame from an address can be this vehicle's. Its first heartbeat, or one after silence, sets it."""
+        """Whether a frame from an address can be from this vehicle; a heartbeat sets it at first and after silence."""
         if self.address == address:
             return True
         return msg_id == mavlink.HEARTBEAT and not self.is_elsewhere(address, received_ns)
@@ -191,7 +190,7 @@ class RemoteVehicle:
         """Notice from a reported mode that somebody else has taken the vehicle over, or given it back.
 
         A mode that no command of the station leads to is somebody's choice, unless the vehicle reports a failsafe. On
-        the ground, before arming, whoever stands there may set any mode.
+        the ground, before arming, anybody may set any mode.
         """
         kind, before = self.kind, self.custom_mode
         if mode == kind.guided_mode:
@@ -218,7 +217,6 @@ class RemoteVehicle:
         return mode == kind.hold_mode and self.custom_mode == kind.take_off_mode and self.startup.is_half_way_up
 
     def acknowledge(self, fields: tuple[Any, ...], now_ns: int) -> None:
-        """Take in a COMMAND_ACK."""
         command, result, *_, target_system, _ = fields
         waiting = self._command
         if waiting is None or waiting.command != command or target_system not in (0, mavlink.STATION_SYSTEM_ID):
@@ -311,7 +309,7 @@ class RemoteVehicle:
 
 
 def in_words(what: str, vehicles: Sequence[RemoteVehicle]) -> str:
-    """What holds of some vehicles, with what each lacks; empty if there are none."""
+    """A line that says what each vehicle lacks, beginning with `what`; empty if there are none."""
     return what + "; ".join(f"vehicle {v.system_id} {v.missing}" for v in vehicles) if vehicles else ""
 
 

@@ -22,7 +22,8 @@ from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.onboard import own_part
 from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, GainSet
 from gcs.plan.formation import plan_formation
-from scenarios.schema import Jitter, Link, Scenario
+from scenarios.link_schema import Jitter, Link
+from scenarios.schema import Scenario
 
 
 def expected_loop_delay_s(scenario: Scenario) -> float:

@@ -1,4 +1,4 @@
-"""Vehicles that the formation cannot count on: those that are lost, and those that somebody else flies."""
+"""Which vehicles are absent from the formation: those that are lost, and those that somebody else flies."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ COMPLETED = "completed: duration reached"
 
 
 def absences(vehicles: Sequence[RemoteVehicle], silent: Sequence[bool]) -> list[str]:
-    """Why the others fly around each vehicle; "" for one that takes part."""
+    """Why each vehicle is absent; "" for one that takes part."""
     return [
         LOST if gone else TAKEN_OVER if vehicle.taken_over else ""
         for vehicle, gone in zip(vehicles, silent, strict=True)
@@ -22,7 +22,7 @@ def describe_change(was: str, now: str) -> str:
 
 
 def end_reason(vehicles: Sequence[RemoteVehicle], absent: Sequence[str]) -> str:
-    """Why a flight ends whose duration is over, or that has no vehicle left."""
+    """Why a flight ends: its duration is over, or no vehicle is left."""
     if all(reason == LOST for reason in absent):
         return "lost: all vehicles"
     kinds = (("lost", LOST), ("taken over", TAKEN_OVER))

@@ -1,9 +1,9 @@
 """Ends a flight whose formation is broken: after a collision, or a spacing error beyond the limit.
 
-A vehicle that returns from its pilot, its failsafe or silence may be far from its place. Then the vehicles behind it
-are as far from theirs, which depend on it. Their errors say nothing about the loop until they have had time to return.
-That time is granted anew only to a vehicle that has been within the limit since, or that its pilot flew: a formation
-that diverges while its vehicles keep falling into their failsafe is broken.
+A vehicle that returns from its pilot, its failsafe or silence may be far from its place. The vehicles behind it are
+then as far from theirs, which are relative to it. Their errors say nothing about the loop until they have had time to
+return. A vehicle is granted this time again only if it has been within the limit since, or if its pilot flew it: a
+formation that diverges while its vehicles keep entering their failsafe is broken.
 """
 
 from collections.abc import Sequence

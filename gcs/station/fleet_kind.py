@@ -1,15 +1,14 @@
-"""What differs between vehicles without and with autopilots, chosen once when the station is built.
+"""What depends on the kind of vehicles, double integrators or multicopters with autopilots.
 
-`fleet_of` chooses; nothing else in the station asks for the scenario's `dynamics`. Where the loop is closed is
-another choice, see `gcs.control.loops`.
+`fleet_of` chooses once, when the station is built; nothing else in the station reads the scenario's `dynamics`. Where
+the loop is closed is another choice, see `gcs.control.loops`.
 """
 
 from typing import Any, Protocol
 
 from gcs.autopilot.fleet import AutopilotFleet
 from gcs.control.history import StateHistory
-from gcs.control.law import VehicleControl
-from gcs.control.loops import Loop, Vector, loop_of
+from gcs.control.loops import Loop, Order, loop_of
 from gcs.control.phases import Phase, patience_s
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
@@ -52,7 +51,7 @@ class FleetKind(Protocol):
         ...
 
     def startup_failure(self, due_ns: int, start_ns: int) -> str:
-        """Why the start has to be given up: a vehicle cannot be flown, or its time is up. Empty to go on waiting."""
+        """Why the flight cannot begin: a vehicle cannot be flown, or its time is up. Empty while it still may."""
         ...
 
     def locate(self, history: StateHistory) -> None:
@@ -63,17 +62,7 @@ class FleetKind(Protocol):
         """Advance the identification by one tick; returns why it failed, if it has."""
         ...
 
-    def set_point(
-        self,
-        row: int,
-        control: VehicleControl,
-        phase: Phase,
-        *,
-        commanded: bool,
-        nominal_velocity_m_s: Vector,
-        key_ms: int,
-        due_ns: int,
-    ) -> tuple[Any, ...] | None:
+    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
         """Fields of the set-point that a vehicle is sent at this tick, if any."""
         ...
 
@@ -84,7 +73,7 @@ def fleet_of(plan: FlightPlan, report: Report) -> FleetKind:
 
 
 class LaunchedFleet:
-    """Vehicles without autopilots: in the air from the beginning, in one frame, responding at once."""
+    """Double integrators: in the air from the beginning, in one frame, responding at once."""
 
     speaks_mavlink_1_first = False
     holds_when_left_alone = True
@@ -113,21 +102,9 @@ class LaunchedFleet:
     def locate(self, history: StateHistory) -> None:
         """Nothing to do: all frames are the same."""
 
-    def identify(self, due_ns: int, history: StateHistory) -> str:  # noqa: ARG002 - nothing is to be found
+    def identify(self, due_ns: int, history: StateHistory) -> str:  # noqa: ARG002 - their response is known
         return ""
 
-    def set_point(
-        self,
-        row: int,
-        control: VehicleControl,
-        phase: Phase,  # noqa: ARG002 - they take set-points in formation flight only
-        *,
-        commanded: bool,
-        nominal_velocity_m_s: Vector,
-        key_ms: int,
-        due_ns: int,  # noqa: ARG002
-    ) -> tuple[Any, ...] | None:
-        if not commanded:
-            return None
-        system_id = self.vehicles[row].system_id
-        return self.loop.set_point(system_id, control, nominal_velocity_m_s=nominal_velocity_m_s, key_ms=key_ms)
+    def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
+        del phase  # they take set-points in formation flight only
+        return self.loop.set_point(self.vehicles[row].system_id, order) if order.commanded else None

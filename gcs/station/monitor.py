@@ -12,6 +12,7 @@ As headroom shrinks, the monitor acts in this order:
 When the link recovers, these actions are undone in the reverse order.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isnan, nan
 from typing import NamedTuple
@@ -46,6 +47,7 @@ class Observation(NamedTuple):
 
     time_s: float
     flying: bool
+    """Whether the formation is flown; the same for all vehicles."""
     silent: bool
     guided: bool
     failsafe: bool
@@ -169,18 +171,6 @@ def _lasted(since_s: float | None, wanted_s: float, now_s: float) -> bool:
     return since_s is not None and now_s - since_s >= wanted_s
 
 
-class FleetView(NamedTuple):
-    """What the station knows of all vehicles at a tick, in the order of the formation."""
-
-    time_s: float
-    flying: bool
-    silent: list[bool]
-    guided: list[bool]
-    failsafe: list[bool]
-    loop_delay_s: list[float]
-    """NaN where unknown."""
-
-
 class FormationMonitor:
     """The monitor of a whole formation: one state for each vehicle, and how far the formation is opened.
 
@@ -203,21 +193,19 @@ class FormationMonitor:
         """Ticks of this flight so far."""
         self._settled = [Blend(gain_set, gain_set, 1.0) for gain_set in range(len(margins_s))]
 
-    def update(self, view: FleetView) -> list[tuple[int, VehicleState, VehicleState]]:
+    def update(self, fleet: Sequence[Observation]) -> list[tuple[int, VehicleState, VehicleState]]:
         """Judge a tick; returns row, old and new state of each vehicle whose mode, gain set or release changed."""
-        if view.flying:
-            self._delays_s[self._judged % len(self._delays_s)] = view.loop_delay_s
+        time_s, flying, *_ = fleet[0]
+        if flying:
+            self._delays_s[self._judged % len(self._delays_s)] = [seen.loop_delay_s for seen in fleet]
             self._judged += 1
         else:
             self._judged = 0  # before the flight telemetry is slow and the loop is not closed
         delays_s = self._judged_delay_s()
         changes: list[tuple[int, VehicleState, VehicleState]] = []
         states: list[VehicleState] = []
-        for row, before in enumerate(self.states):
-            seen = Observation(
-                view.time_s, view.flying, view.silent[row], view.guided[row], view.failsafe[row], delays_s[row]
-            )
-            after = monitored(before, seen, self.margins_s, self._policy)
+        for row, (before, seen, delay_s) in enumerate(zip(self.states, fleet, delays_s, strict=True)):
+            after = monitored(before, Observation(*seen[:5], delay_s), self.margins_s, self._policy)
             if after is not before:
                 if after.released and not before.released and row != self._next_to_release():
                     after = replace(after, mode=Mode.CRITICAL, released=False)  # a vehicle behind goes first
@@ -225,7 +213,7 @@ class FormationMonitor:
                     changes.append((row, before, after))
             states.append(after)
         self.states = states
-        self._open(view.time_s, flying=view.flying)
+        self._open(time_s, flying=flying)
         return changes
 
     def blends(self, time_s: float) -> list[Blend]:

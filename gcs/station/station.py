@@ -14,6 +14,7 @@ from gcs.control.history import StateHistory
 from gcs.control.law import distances_m
 from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
+from gcs.control.loops import Order
 from gcs.control.phases import Phase, next_phase, patience_s
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
 from gcs.link import mavlink
@@ -24,7 +25,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.station.absence import absences, describe_change, end_reason
 from gcs.station.breakage import Breakage
 from gcs.station.fleet_kind import fleet_of
-from gcs.station.monitor import FleetView, FormationMonitor
+from gcs.station.monitor import FormationMonitor, Observation
 from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
 from scenarios.schema import NS_PER_S
 
@@ -63,12 +64,9 @@ class Station:
         self._breakage = Breakage(plan)
         self._limits = SetPointLimits.of(scenario.limits)
         self._period_ns = round(NS_PER_S / rates.control_hz)
+        period_s = self._period_ns / NS_PER_S
         self._monitor = FormationMonitor(
-            n,
-            plan.margins_s,
-            plan.scenario.monitor,
-            separable=plan.separable,
-            period_s=self._period_ns / NS_PER_S,
+            n, plan.margins_s, scenario.monitor, separable=plan.separable, period_s=period_s
         )
         self.patience_s = patience_s(scenario)
         self._timesync_ns = round(NS_PER_S / min(rates.timesync_hz, rates.control_hz))
@@ -97,7 +95,7 @@ class Station:
         return min(self._next_tick_ns, self._next_heartbeat_ns, self._next_timesync_ns)
 
     def request_stop(self, reason: str) -> None:
-        """End the flight at the next tick: the vehicles are commanded to hold, and awaited until they do."""
+        """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
         self._stop = self._stop or reason
 
     def step(self, datagrams: list[Datagram], now_ns: int) -> tuple[list[Outgoing], Tick | None]:
@@ -129,7 +127,7 @@ class Station:
         return rows
 
     def scenario_time_s(self, now_ns: int) -> float:
-        """Time since the formation flight began; before that, time since the start minus `patience_s`, negative."""
+        """Time since the formation flight began; before that negative, the time since the start minus `patience_s`."""
         if self._flight_start_ns is None:
             return (now_ns - self._start_ns) / NS_PER_S - self.patience_s
         return (now_ns - self._flight_start_ns) / NS_PER_S
@@ -255,15 +253,8 @@ class Station:
         ):
             north, east = control.command_m_s2
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
-            fields = self._fleet.set_point(
-                row,
-                control,
-                self.phase,
-                commanded=commanded,
-                nominal_velocity_m_s=nominal_m_s,
-                key_ms=key_ms,
-                due_ns=due_ns,
-            )
+            order = Order(control, commanded, nominal_m_s, key_ms, due_ns)
+            fields = self._fleet.set_point(row, order, self.phase)
             if fields is not None:
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
@@ -294,15 +285,12 @@ class Station:
                     self._report("vehicle", describe_change(was, now), vehicle.system_id)
             self._absent = absent
             self._law = self._fleet.loop.law([why != "" for why in absent])
-        view = FleetView(
-            time_s=self.scenario_time_s(due_ns),
-            flying=flying,
-            silent=silent,
-            guided=[vehicle.guided for vehicle in self.vehicles],
-            failsafe=[vehicle.critical for vehicle in self.vehicles],
-            loop_delay_s=self._loop_delay_s,
-        )
-        for row, before, after in self._monitor.update(view):
+        time_s = self.scenario_time_s(due_ns)
+        fleet = [
+            Observation(time_s, flying, gone, vehicle.guided, vehicle.critical, delay_s)
+            for vehicle, gone, delay_s in zip(self.vehicles, silent, self._loop_delay_s, strict=True)
+        ]
+        for row, before, after in self._monitor.update(fleet):
             vehicle = self.vehicles[row]
             if flying:
                 vehicle.goal = None if after.released else Goal.FLY
@@ -369,7 +357,7 @@ class Station:
             outgoing.append(Outgoing(vehicle.encode(msg_id, fields), vehicle.address))
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
-        """Announce a change on the link, for others who listen and for the telemetry log."""
+        """Announce a change on the link, for other listeners and the telemetry log."""
         fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
         self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenarios.schema import Jitter, Link, Scenario, VehicleLinks
+from scenarios.link_schema import Jitter, Link, VehicleLinks
+from scenarios.schema import Scenario
 
 
 class AxisError(Exception):

@@ -44,7 +44,8 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.effective_delay import commands_of, commands_on_board, effective_delay_s
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
-from scenarios.schema import Limits, Link, Safety, Scenario, Vehicle
+from scenarios.link_schema import Link
+from scenarios.schema import Limits, Safety, Scenario, Vehicle
 
 PROBE_S = 20.0
 """How long a probe is flown, if that is enough."""

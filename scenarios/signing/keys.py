@@ -86,7 +86,7 @@ def make_key(file: Path) -> None:
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError:
-        raise KeyFileError(f"{file}: is there already, wanted a new file: a key is not written over") from None
+        raise KeyFileError(f"{file}: exists already, wanted a new file: a key is never overwritten") from None
     except OSError as error:
         raise KeyFileError(f"{file}: {error.strerror}, wanted a file that can be written") from None
     with os.fdopen(descriptor, "w") as opened:

@@ -59,14 +59,7 @@ class SignedLink:
     """
 
     def __init__(
-        self,
-        key: Key,
-        *,
-        link_id: int,
-        crc_extra: Mapping[int, bytes],
-        epoch_ns: int,
-        stamps: Stamps,
-        owner: int = 0,
+        self, key: Key, *, link_id: int, crc_extra: Mapping[int, bytes], epoch_ns: int, stamps: Stamps, owner: int = 0
     ) -> None:
         self._key = key
         self._crc_extra = crc_extra
@@ -90,11 +83,7 @@ class SignedLink:
         return signed + self._signature(signed)
 
     def verify(
-        self,
-        datagram: bytes,
-        now_ns: int,
-        refused: Counter[str],
-        unwanted: Callable[[int], str] | None = None,
+        self, datagram: bytes, now_ns: int, refused: Counter[str], unwanted: Callable[[int], str] | None = None
     ) -> bytes:
         """The valid frames of a datagram, without their signatures; the others are counted by reason.
 

@@ -62,7 +62,7 @@ def open_stamps(file: Path) -> Stamps:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(descriptor)
-        raise KeyFileError(f"{file}: another process uses it, wanted a key of one's own for each") from None
+        raise KeyFileError(f"{file}: another process uses it, wanted a separate key for each process") from None
     with os.fdopen(descriptor, "r+b", buffering=0, closefd=False) as opened:
         found = opened.read(SIZE + 1)
         if not found:

@@ -1,1 +1,1 @@
-"""The fleet, a function of datagrams and time; the command `sim-vehicles`, its UDP sockets and its signing."""
+"""What runs the vehicles: `fleet` as a function of datagrams and time, `udp` in real time, `cli` as a command."""

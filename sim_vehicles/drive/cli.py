@@ -36,12 +36,10 @@ their system ids, and the station hears each vehicle from a port of its own."""
 
 
 def main() -> None:
-    """Entry point."""
     sys.exit(run(sys.argv[1:]))
 
 
 def run(arguments: list[str]) -> int:
-    """Run the command with its arguments and return the exit code."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.links_only != bool(options.vehicle_port):
@@ -51,36 +49,37 @@ def run(arguments: list[str]) -> int:
     with _signals() as signals, contextlib.ExitStack() as opened:
         # imported after parsing, so that --help and a mistyped option answer at once
         from scenarios.errors import ScenarioError
-        from scenarios.files import load
         from scenarios.signing.keys import KeyFileError
-        from sim_vehicles.links.truth import TruthLog
 
         try:
-            scenario = load(options.scenario)
-        except ScenarioError as error:
-            return _complain(str(error))
-        log = None
-        if options.truth:
-            try:
-                log = TruthLog(options.truth)
-            except (OSError, ValueError) as error:
-                return _complain(f"--truth: {error}, wanted a new file, or a truth log to go on with")
-            opened.callback(log.close)
-        if options.counters:
-            try:
-                options.counters.open("ab").close()
-            except OSError as error:
-                return _complain(f"--counters: {options.counters}: {error.strerror}, wanted a file that can be written")
-        try:
-            run_it = _links_only if options.links_only else _fly
-            run_it(scenario, log, signals, options, opened)
-        except (_AddressError, KeyFileError) as error:
+            _run(options, signals, opened)
+        except (_UsageError, ScenarioError, KeyFileError) as error:
             return _complain(str(error))
     return INTERRUPTED if signal.SIGINT in signals else SUCCESS
 
 
-class _AddressError(Exception):
-    """An address that was given cannot be used."""
+class _UsageError(Exception):
+    """A file or an address that was given cannot be used."""
+
+
+def _run(options: argparse.Namespace, signals: list[int], opened: contextlib.ExitStack) -> None:
+    from scenarios.files import load
+    from sim_vehicles.links.truth import TruthLog
+
+    scenario, log = load(options.scenario), None
+    if options.truth:
+        try:
+            log = TruthLog(options.truth)
+        except (OSError, ValueError) as error:
+            raise _UsageError(f"--truth: {error}, wanted a new file, or a truth log to continue") from None
+        opened.callback(log.close)
+    if options.counters:
+        try:
+            options.counters.open("ab").close()
+        except OSError as error:
+            text = f"--counters: {options.counters}: {error.strerror}, wanted a file that can be written"
+            raise _UsageError(text) from None
+    (_links_only if options.links_only else _fly)(scenario, log, signals, options, opened)
 
 
 def _fly(
@@ -92,7 +91,7 @@ def _fly(
 ) -> None:
     from sim_vehicles.drive.fleet import Fleet
     from sim_vehicles.drive.guard import open_links
-    from sim_vehicles.drive.udp import Ports, fly
+    from sim_vehicles.drive.udp import Ports, run
 
     system_ids = tuple(sorted(v.system_id for v in scenario.vehicles))
     epoch_ns = time.time_ns() - time.monotonic_ns()
@@ -100,8 +99,8 @@ def _fly(
     try:
         ports = Ports(system_ids, options.station)
     except OSError as error:
-        raise _AddressError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
-    opened.callback(ports.close)
+        raise _UsageError(f"--station {_shown(options.station)}: {error.strerror or error}") from None
+    opened.callback(ports.sockets.close)
     start_ns = time.monotonic_ns()
     fleet = Fleet(scenario, start_ns, record=log.record if log else None, signed=signed)
     say = _Lines(start_ns)
@@ -110,10 +109,15 @@ def _fly(
         say.openness([options.station], "others may send from there and nothing is signed; see --key")
     say.line(f"{len(scenario.vehicles)} vehicles of {scenario.name}, to {_shown(options.station)}{how}")
     stop = _stop_rule(signals, start_ns, options, say, fleet)
+
+    def look(now_ns: int) -> bool:
+        say.news(fleet.take_changes(), ports.sockets, log)
+        return stop(now_ns, fleet.commanded_ns)
+
     if not stop(start_ns, start_ns):
-        fly(fleet, ports, stop=stop, tell=_teller(say, log, ports.sockets))
+        run(ports.sockets, lambda now: ports.send(fleet.step(ports.receive(), now)), lambda: fleet.next_event_ns, look)
     say.changes(fleet.take_changes())
-    counters = fleet.counters + ports.counters
+    counters = fleet.counters + ports.sockets.counters
     say.summary(counters, log)
     if options.counters:
         with contextlib.suppress(OSError):  # the flight is over, and the summary has been printed
@@ -127,7 +131,8 @@ def _links_only(
     options: argparse.Namespace,
     opened: contextlib.ExitStack,
 ) -> None:
-    from sim_vehicles.drive.relay_udp import Peers, relay
+    from sim_vehicles.drive.relay_udp import Peers
+    from sim_vehicles.drive.udp import run
     from sim_vehicles.links.relay import Relay
 
     try:
@@ -135,7 +140,7 @@ def _links_only(
     except OSError as error:
         ports = ", ".join(map(_shown, options.vehicle_port))
         text = f"--vehicle-port {ports}, --station {_shown(options.station)}: {error.strerror or error}"
-        raise _AddressError(text) from None
+        raise _UsageError(text) from None
     opened.callback(peers.sockets.close)
     start_ns = time.monotonic_ns()
     links = Relay(scenario, start_ns, record=log.record if log else None)
@@ -143,7 +148,13 @@ def _links_only(
     ports = ", ".join(map(_shown, options.vehicle_port))
     say.openness(options.vehicle_port, "links pass on what anybody sends; only stations and vehicles can sign")
     say.line(f"the links of {scenario.name}, from vehicles at {ports}, to {_shown(options.station)}")
-    relay(links, peers, stop=_stop_rule(signals, start_ns, options, say), tell=_teller(say, log, peers.sockets))
+    stop = _stop_rule(signals, start_ns, options, say)
+
+    def look(now_ns: int) -> bool:
+        say.news(peers.take_changes(), peers.sockets, log)
+        return stop(now_ns, links.last_heard_ns)
+
+    run(peers.sockets, lambda now: peers.send(links.step(peers.receive(), now)), lambda: links.next_event_ns, look)
     say.summary(links.counters + peers.sockets.counters, log)
 
 
@@ -171,16 +182,6 @@ def _stop_rule(
     return stop
 
 
-def _teller(say: "_Lines", log: "TruthLog | None", sockets: "Sockets") -> Callable[[list["Change"]], None]:
-    def tell(changes: list["Change"]) -> None:
-        say.changes(changes)
-        say.lateness(sockets)
-        if log:
-            log.flush()
-
-    return tell
-
-
 class _Lines:
     """Prints lines for a person, on the terminal or in the log of the parent process."""
 
@@ -202,6 +203,13 @@ class _Lines:
         for host, port in addresses:
             if not ip_address(host).is_loopback:
                 self.line(f"warning: {host}:{port} is open: {why}")
+
+    def news(self, changes: list["Change"], sockets: "Sockets", log: "TruthLog | None") -> None:
+        """What has happened since the last call; the truth of that time is written out."""
+        self.changes(changes)
+        self.lateness(sockets)
+        if log:
+            log.flush()
 
     def changes(self, changes: list["Change"]) -> None:
         for change in changes:
@@ -255,32 +263,18 @@ def _parser() -> argparse.ArgumentParser:
         prog="sim-vehicles", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenario", type=Path, metavar="SCENARIO", help="scenario file (TOML)")
-    parser.add_argument(
-        "--station",
-        type=_address,
-        default=("127.0.0.1", 14550),
-        metavar="HOST:PORT",
-        help="where the station listens (127.0.0.1:14550)",
-    )
-    parser.add_argument("--key", type=Path, metavar="FILE", help="sign, and accept only what is signed with this key")
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="write the truth log, or continue one")
-    parser.add_argument("--counters", type=Path, metavar="FILE", help="write the counters as JSON at the end")
-    parser.add_argument(
-        "--stop-after-silence",
-        type=_seconds,
-        default=math.inf,
-        metavar="SECONDS",
-        help="end when no station has commanded a vehicle for this long (never)",
-    )
-    parser.add_argument(
-        "--parent",
-        type=int,
-        metavar="PID",
-        help="the parent process; with --stop-after-silence: silence counts only after it has ended",
-    )
-    parser.add_argument(
-        "--duration", type=_seconds, default=math.inf, metavar="SECONDS", help="end after this time (never)"
-    )
+    silence = "end when no station has commanded a vehicle for this long (never)"
+    parent = "the parent process; with --stop-after-silence: silence counts only after it has ended"
+    for name, kind, default, metavar, text in (
+        ("--station", _address, ("127.0.0.1", 14550), "HOST:PORT", "where the station listens (127.0.0.1:14550)"),
+        ("--key", Path, None, "FILE", "sign, and accept only what is signed with this key"),
+        ("--truth", Path, None, "FILE", "write the truth log, or continue one"),
+        ("--counters", Path, None, "FILE", "write the counters as JSON at the end"),
+        ("--stop-after-silence", _seconds, math.inf, "SECONDS", silence),
+        ("--parent", int, None, "PID", parent),
+        ("--duration", _seconds, math.inf, "SECONDS", "end after this time (never)"),
+    ):
+        parser.add_argument(name, type=kind, default=default, metavar=metavar, help=text)
     parser.add_argument(
         "--links-only", action="store_true", help="simulate no vehicles; put the links in front of other vehicles"
     )

@@ -44,10 +44,11 @@ class _Member:
 class Fleet:
     """The vehicles and links of a scenario.
 
-    Vehicles do not affect each other, so each is brought up to date only when a datagram of its own can leave, in order
-    of that time and of system id. Nothing is late for it, since everything it does has its exact instant. There are two
-    exceptions: in a shared channel one vehicle's datagrams delay another's, and a sensor sees another vehicle. Then
-    events run in order of time, at one instant first the station's datagrams and then the vehicles by system id.
+    Vehicles do not affect each other, so each is brought up to date only when one of its datagrams can leave, in order
+    of that time and of system id. Nothing comes too late for it, since everything it does has its exact instant. There
+    are two exceptions: in a shared channel one vehicle's datagrams delay another's, and a sensor sees another vehicle.
+    Then events run in order of time, at the same instant first the station's datagrams and then the vehicles by system
+    id.
 
     `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and the vehicles
     get only what could be verified.
@@ -92,7 +93,6 @@ class Fleet:
 
     @property
     def system_ids(self) -> tuple[int, ...]:
-        """The vehicles, ascending."""
         return tuple(self._members)
 
     @property
@@ -110,7 +110,7 @@ class Fleet:
 
     @property
     def shut_down_ns(self) -> int:
-        """When the last vehicle was told to shut down; NEVER_NS unless all were."""
+        """When the last vehicle was told to shut down; NEVER_NS until all have been."""
         told_ns = [member.vehicle.services.shut_down_ns for member in self._members.values()]
         return NEVER_NS if None in told_ns else max(ns for ns in told_ns if ns is not None)
 

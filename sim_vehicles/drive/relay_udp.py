@@ -4,17 +4,14 @@ A vehicle's datagrams go through its up link to the station, from a socket of th
 to that socket go through the down link to the address from which the vehicle last sent.
 """
 
-import time  # noqa: TID251 - this is the real-time driver
-from collections.abc import Callable
-
 from scenarios.schema import NS_PER_S
-from sim_vehicles.drive.udp import LONGEST_WAIT_NS, Received, Sockets, undisturbed
-from sim_vehicles.links.relay import Passing, Relay, holds_key, sender
+from sim_vehicles.drive.udp import Received, Sockets
+from sim_vehicles.links.relay import Passing, holds_key, sender
 from sim_vehicles.links.truth import LINK_DOWN, LINK_UP
 from sim_vehicles.vehicles.shell import Change
 
 MOST_PEERS = 1000
-"""Addresses that vehicles may send from in all; a restarted vehicle may have a new one."""
+"""Most addresses from which vehicles are accepted; a restarted vehicle may have a new one."""
 SILENCE_NS = 3 * NS_PER_S // 2
 """A vehicle silent for this long may have been restarted, and may send from another address."""
 
@@ -32,8 +29,7 @@ class Peers:
         self, vehicle_ports: list[tuple[str, int]], station: tuple[str, int], *, silence_ns: int = SILENCE_NS
     ) -> None:
         self.sockets = Sockets()
-        self.changes: list[Change] = []
-        """Vehicles found; a reader may clear it."""
+        self._changes: list[Change] = []
         self._station = station
         self._silence_ns = silence_ns
         self._station_side: dict[int, int] = {}
@@ -77,6 +73,11 @@ class Peers:
                 file_number, address = self._addresses[system_id]
                 self.sockets.send(file_number, data, due_ns, address)
 
+    def take_changes(self) -> list[Change]:
+        """The vehicles found since the last call."""
+        changes, self._changes = self._changes, []
+        return changes
+
     def _vehicle(self, datagram: Received) -> int | None:
         """The vehicle that sent a datagram to one of our ports, or None if that is unknown or refused."""
         place = datagram.file_number, datagram.address
@@ -94,7 +95,7 @@ class Peers:
                 return None
             self._peers[place] = system_id
             text = f"found at {datagram.address[0]}:{datagram.address[1]}"
-            self.changes.append(Change(datagram.time_ns, system_id, text))
+            self._changes.append(Change(datagram.time_ns, system_id, text))
         self._addresses[system_id], self._heard_ns[system_id] = place, datagram.time_ns
         return system_id
 
@@ -108,26 +109,3 @@ class Peers:
             self._station_side[system_id] = number
             self._system_ids[number] = system_id
         return True
-
-
-def relay(
-    links: Relay,
-    peers: Peers,
-    *,
-    stop: Callable[[int, int], bool],
-    tell: Callable[[list[Change]], None],
-) -> None:
-    """Run the links in real time until `stop(now_ns, last_heard_ns)`; `stop` and `tell` as for `udp.fly`."""
-    next_look_ns = 0
-    with undisturbed():
-        while True:
-            peers.sockets.wait(min(links.next_event_ns, next_look_ns))
-            # The clock before the sockets: every datagram that came by then is among those received.
-            now_ns = time.monotonic_ns()
-            peers.send(links.step(peers.receive(), now_ns))
-            if now_ns >= next_look_ns:
-                next_look_ns = now_ns + LONGEST_WAIT_NS
-                tell(peers.changes)
-                peers.changes = []
-                if stop(now_ns, links.last_heard_ns):
-                    return

@@ -16,8 +16,7 @@ from collections.abc import Callable, Generator, Iterator
 from typing import NamedTuple
 
 from scenarios.schema import NS_PER_S
-from sim_vehicles.drive.fleet import Datagram, Fleet
-from sim_vehicles.vehicles.shell import Change
+from sim_vehicles.drive.fleet import Datagram
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
 """How long the loop polls the clock instead of sleeping before a due time: with few vehicles, waking up is most of the
@@ -80,7 +79,6 @@ class Sockets:
         return number
 
     def close(self) -> None:
-        """Close all sockets."""
         self._epoll.close()
         for own in self._sockets.values():
             own.close()
@@ -96,7 +94,6 @@ class Sockets:
             pass
 
     def receive(self) -> list[Received]:
-        """Everything that has arrived."""
         begin_ns = time.monotonic_ns()
         to_monotonic_ns = self._clocks.to_monotonic_ns()
         received: list[Received] = []
@@ -162,22 +159,9 @@ class Ports:
         try:
             self._file_numbers = {system_id: self.sockets.add(connect=station) for system_id in system_ids}
         except OSError:
-            self.close()
+            self.sockets.close()
             raise
         self._system_ids = {number: system_id for system_id, number in self._file_numbers.items()}
-
-    @property
-    def counters(self) -> Counter[str]:
-        """The sockets' counters."""
-        return self.sockets.counters
-
-    def close(self) -> None:
-        """Close all sockets."""
-        self.sockets.close()
-
-    def wait(self, until_ns: int) -> None:
-        """Sleep until a time, or until a datagram has arrived."""
-        self.sockets.wait(until_ns)
 
     def receive(self) -> list[Datagram]:
         """Everything that has arrived, with the instants at which it reached this host."""
@@ -185,7 +169,6 @@ class Ports:
         return [(system_ids[number], data, time_ns) for number, data, time_ns, _ in self.sockets.receive()]
 
     def send(self, datagrams: list[Datagram]) -> None:
-        """Send to the station."""
         for system_id, data, due_ns in datagrams:
             self.sockets.send(self._file_numbers[system_id], data, due_ns)
 
@@ -208,28 +191,23 @@ class _Clocks:
         return self._offset_ns
 
 
-def fly(
-    fleet: Fleet,
-    ports: Ports,
-    *,
-    stop: Callable[[int, int], bool],
-    tell: Callable[[list[Change]], None],
+def run(
+    sockets: Sockets, step: Callable[[int], None], next_event_ns: Callable[[], int], look: Callable[[int], bool]
 ) -> None:
-    """Run the vehicles in real time until `stop(now_ns, commanded_ns)`.
+    """Call `step(now_ns)` whenever a datagram has arrived or an event is due, until `look(now_ns)` is true.
 
-    About ten times a second, `stop` is called, and `tell` with the changes since its last call.
+    `look` is called about ten times a second.
     """
     next_look_ns = 0
     with undisturbed():
         while True:
-            ports.wait(min(fleet.next_event_ns, next_look_ns))
+            sockets.wait(min(next_event_ns(), next_look_ns))
             # Read the clock before the sockets, so that every datagram that came by then is among those received.
             now_ns = time.monotonic_ns()
-            ports.send(fleet.step(ports.receive(), now_ns))
+            step(now_ns)
             if now_ns >= next_look_ns:
                 next_look_ns = now_ns + LONGEST_WAIT_NS
-                tell(fleet.take_changes())
-                if stop(now_ns, fleet.commanded_ns):
+                if look(now_ns):
                     return
 
 

@@ -1,1 +1,1 @@
-"""Emulated links: delay, jitter, loss and shared channels; and the truth log of what happened on them."""
+"""Emulated links. `fate` decides what happens to a datagram, `links` carries it, `truth` records what happened."""

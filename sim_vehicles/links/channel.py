@@ -1,15 +1,15 @@
-"""Limited bandwidth, of one link or shared by many: a drop-tail queue with one sender."""
+"""Limited bandwidth, of one link or shared by several: a drop-tail queue with one sender."""
 
 from collections import deque
 
-from scenarios import schema
+from scenarios import link_schema
 from scenarios.schema import NS_PER_S
 
 
 class Channel:
     """Sends one datagram at a time, in order of arrival; those of one instant in order of `send`."""
 
-    def __init__(self, channel: schema.Channel) -> None:
+    def __init__(self, channel: link_schema.Channel) -> None:
         self._ns_per_byte = channel.bits_per_byte * NS_PER_S / channel.bandwidth_bit_s
         self._most_bytes = channel.queue_bytes
         self._most_datagrams = channel.queue_datagrams

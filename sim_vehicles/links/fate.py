@@ -1,8 +1,8 @@
 """What happens to one datagram on a link: a pure function of the link, the time and the random draws.
 
-A link's schema is compiled once into a frozen `Behaviour`, with all times in ns. Each link has two random streams: one
+A link's schema is converted once into a frozen `Behaviour`, with all times in ns. Each link has two random streams: one
 decides loss, duplication and corruption, the other the jitter. Every datagram takes the same number of draws from both,
-used or not. So more loss leaves the delays unchanged, and no link's traffic shifts the draws of another.
+used or not. So more loss leaves the delays unchanged, and one link's traffic does not shift the draws of another.
 """
 
 from bisect import bisect_right
@@ -12,13 +12,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from scenarios import schema
+from scenarios import link_schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import CORRUPTED, LOST, OUTAGE, PASSED
 
 MOST_FLIPS = 4
 _BLOCK = 128
-"""Datagrams whose draws are made at once: numpy takes as long for one as for a hundred."""
+"""Datagrams whose draws are made together: numpy takes as long for one as for a hundred."""
 
 
 class Draws(NamedTuple):
@@ -69,8 +69,7 @@ class Behaviour:
         return len(self.points_ns) > 1 or bool(self.outages_ns)
 
 
-def behaviour_of(link: schema.Link) -> Behaviour:
-    """Compile a link's schema."""
+def behaviour_of(link: link_schema.Link) -> Behaviour:
     points = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
     points_ns = tuple((_ns(time_s), _ns(delay_s)) for time_s, delay_s in points)
     bursts = link.loss_bursts
@@ -88,9 +87,9 @@ def behaviour_of(link: schema.Link) -> Behaviour:
     )
 
 
-def constant(link: schema.Link) -> bool:
+def constant(link: link_schema.Link) -> bool:
     """Whether the link only delays, by its constant delay_s."""
-    plain = schema.Link(delay_s=link.delay_s, reordering=link.reordering, channel=link.channel)
+    plain = link_schema.Link(delay_s=link.delay_s, reordering=link.reordering, channel=link.channel)
     return link == plain and link.channel is None
 
 
@@ -127,7 +126,7 @@ def delay_at(link: Behaviour, time_ns: int) -> int:
 
 
 def flipped(data: bytes, flips: tuple[float, ...]) -> bytes:
-    """The datagram with bits flipped at these fractions of its length; equal places flip once."""
+    """The datagram with bits flipped at these fractions of its length; a place named twice flips once."""
     changed = bytearray(data)
     for place in {int(part * len(data) * 8) for part in flips} if data else ():
         changed[place // 8] ^= 1 << place % 8
@@ -143,14 +142,13 @@ class _Delays(Protocol):
 class Stream:
     """The draws of one link, datagram by datagram."""
 
-    def __init__(self, link: schema.Link, seed: int, key: tuple[int, int]) -> None:
+    def __init__(self, link: link_schema.Link, seed: int, key: tuple[int, int]) -> None:
         fates, delays = np.random.SeedSequence(seed, spawn_key=key).spawn(2)
         self._fates = np.random.default_rng(fates)
         self._delays = _delays_of(link.jitter, np.random.default_rng(delays))
         self._block: list[Draws] = []
 
     def next(self) -> Draws:
-        """The draws of the next datagram."""
         if not self._block:
             uniform: list[list[float]] = self._fates.random((_BLOCK, 4 + MOST_FLIPS)).tolist()
             delays = self._delays(_BLOCK)
@@ -162,7 +160,7 @@ class Stream:
         return self._block.pop()
 
 
-def _delays_of(jitter: schema.Jitter | None, rng: np.random.Generator) -> _Delays:
+def _delays_of(jitter: link_schema.Jitter | None, rng: np.random.Generator) -> _Delays:
     if jitter is None:
         return lambda count: [(0.0, 0.0)] * count
     if jitter.distribution == "trace":
@@ -198,13 +196,13 @@ def _replayed(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:
     return drawn
 
 
-def _least_jitter_ns(jitter: schema.Jitter | None) -> int:
+def _least_jitter_ns(jitter: link_schema.Jitter | None) -> int:
     match jitter:
-        case schema.Jitter(distribution="uniform", scale_s=float(scale_s)):
+        case link_schema.Jitter(distribution="uniform", scale_s=float(scale_s)):
             return -_ns(scale_s)
-        case schema.Jitter(distribution="normal"):
+        case link_schema.Jitter(distribution="normal"):
             return -(2**63)
-        case schema.Jitter(distribution="trace", trace_s=(_, *_) as trace_s):
+        case link_schema.Jitter(distribution="trace", trace_s=(_, *_) as trace_s):
             return _ns(min(trace_s))
         case _:
             return 0

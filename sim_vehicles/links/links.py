@@ -7,7 +7,7 @@ waits for bandwidth. A link that only delays by a constant draws no random numbe
 import heapq
 from collections import Counter
 
-from scenarios import schema
+from scenarios import link_schema, schema
 from sim_vehicles.links.channel import Channel
 from sim_vehicles.links.fate import Stream, behaviour_of, constant, flipped, outcome
 from sim_vehicles.links.truth import (
@@ -48,7 +48,7 @@ class Link:
 
     def __init__(
         self,
-        link: schema.Link,
+        link: link_schema.Link,
         *,
         capacity: int = CAPACITY,
         seed: int = 0,
@@ -194,7 +194,7 @@ class LinkSet:
             total["link_down_dropped"] += down.dropped
         return total
 
-    def _made(self, link: schema.Link, system_id: int, kind: int) -> Link:
+    def _made(self, link: link_schema.Link, system_id: int, kind: int) -> Link:
         made = Link(
             link, seed=self._seed, system_id=system_id, kind=kind, channel=self._channel(link.channel, system_id, kind),
             record=self._record,

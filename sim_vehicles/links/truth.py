@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 SAMPLED, ACTED, LINK_UP, LINK_DOWN = 1, 2, 3, 4
-KINDS = {SAMPLED: "SAMPLED", ACTED: "ACTED", LINK_UP: "LINK_UP", LINK_DOWN: "LINK_DOWN"}
+KINDS = SAMPLED, ACTED, LINK_UP, LINK_DOWN
 
 DTYPE = np.dtype(
     [
@@ -120,6 +120,6 @@ def read_truth(path: Path) -> npt.NDArray[np.void]:
         raise ValueError(f"{path} is not a truth log")
     count = (len(data) - len(_MAGIC)) // DTYPE.itemsize
     records = np.frombuffer(data, DTYPE, count, len(_MAGIC))
-    if (unknown := np.flatnonzero(~np.isin(records["kind"], list(KINDS)))).size:
+    if (unknown := np.flatnonzero(~np.isin(records["kind"], KINDS))).size:
         raise ValueError(f"{path}: record {unknown[0] + 1} of {count} is of no known kind")
     return records

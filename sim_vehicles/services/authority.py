@@ -10,10 +10,10 @@ from sim_vehicles.services.mavlink import (
     COMMAND_INTERVAL,
     COMMAND_REQUEST,
     Command,
-    Message,
+    Read,
     Setpoint,
 )
-from sim_vehicles.services.service_messages import DataStream, ParameterSet, SetMode
+from sim_vehicles.services.messages import DataStream, ParameterSet, SetMode
 
 _QUESTIONS = frozenset((COMMAND_CAPABILITIES, COMMAND_GET_HOME, COMMAND_GET_INTERVAL, COMMAND_REQUEST))
 
@@ -34,7 +34,7 @@ class Authority:
         self._heard_ns = 0
         self._refused: set[int] = set()
 
-    def obeys(self, source: int, message: Message, time_ns: int) -> bool:
+    def obeys(self, source: int, message: Read, time_ns: int) -> bool:
         """Whether to act on a message to this vehicle; a command makes its sender the station."""
         if not isinstance(message, Setpoint | Command | ParameterSet | SetMode | DataStream):
             return True
@@ -56,7 +56,7 @@ class Authority:
         return self.station is None or time_ns - self._heard_ns > self._silence_ns
 
     def refusal(self, source: int, counters: Counter[str]) -> str:
-        """The text that reports a refused system, at its first refusal only; else an empty string."""
+        """Count a refusal; returns the text that reports it at the first refusal of a system, else an empty string."""
         counters["refused_not_the_station"] += 1
         if source in self._refused:
             return ""

@@ -1,27 +1,24 @@
-"""The vehicles' side of MAVLink 2: datagrams to typed messages, and reports to frames.
+"""The vehicles' side of MAVLink 2: datagrams to messages, and messages to frames.
 
 Each datagram is split into frames on its own: with pymavlink's stream parser a truncated frame would swallow the next
-datagram. Its message tables, and its decoder for all but the frequent messages, do the rest. Refused frames are counted
-by reason, never raised.
+datagram. pymavlink's message tables do the rest, and its decoder all but the frequent messages. Refused frames are
+counted by reason; nothing is raised.
 """
 
 import struct
 from collections import Counter
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from sim_vehicles.services.service_messages import REQUESTS, Request, request
+from sim_vehicles.services.messages import REQUESTS, Message, Request
 
 MAGIC_1, MAGIC_2 = dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2
 HEADER_BYTES, CHECKSUM_BYTES, SIGNATURE_BYTES = dialect.HEADER_LEN_V2, 2, dialect.MAVLINK_SIGNATURE_BLOCK_LEN
 SIGNED = dialect.MAVLINK_IFLAG_SIGNED
 
 COMPONENT_AUTOPILOT = dialect.MAV_COMP_ID_AUTOPILOT1
-OUR_COMPONENTS = (0, COMPONENT_AUTOPILOT)
-"""Target components that mean this vehicle: all, or the autopilot."""
 UINT32 = 0xFFFFFFFF
 TYPE_GCS = dialect.MAV_TYPE_GCS
 MODE_STABILIZE, MODE_GUIDED, MODE_LOITER, MODE_BRAKE = 0, 4, 5, 17
@@ -52,8 +49,6 @@ COMMAND_LONG, COMMAND_INT = dialect.MAVLINK_MSG_ID_COMMAND_LONG, dialect.MAVLINK
 TIMESYNC = dialect.MAVLINK_MSG_ID_TIMESYNC
 AUTOPILOT_VERSION = dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION
 HOME_POSITION = dialect.MAVLINK_MSG_ID_HOME_POSITION
-EKF_STATUS = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
-ESTIMATOR_STATUS = dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS
 GLOBAL_ORIGIN = dialect.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
 MESSAGE_INTERVAL = dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL
 
@@ -66,22 +61,18 @@ _LOCAL_POSITION = dialect.MAVLink_local_position_ned_message
 _SETPOINT = dialect.MAVLink_set_position_target_local_ned_message
 _TIMESYNC = dialect.MAVLink_timesync_message
 _DECODER = dialect.MAVLink(None)
-_CAPABILITIES = (
-    dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-    | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
-    | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-)
-_BYTEWISE = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
-_C_CAST = dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+
+
+Triple = tuple[float, float, float]
+"""North, east, down."""
 
 
 class Setpoint(NamedTuple):
-    """SET_POSITION_TARGET_LOCAL_NED as it came; vectors are north, east, down."""
+    """SET_POSITION_TARGET_LOCAL_NED as received."""
 
     time_boot_ms: int
-    velocity_ned_m_s: tuple[float, float, float]
-    acceleration_ned_m_s2: tuple[float, float, float]
+    velocity_ned_m_s: Triple
+    acceleration_ned_m_s2: Triple
     yaw_rad: float
     yaw_rate_rad_s: float
     type_mask: int
@@ -106,12 +97,6 @@ class Command(NamedTuple):
     """Parameters 5 to 7 are x, y and z of a COMMAND_INT."""
 
 
-class Heartbeat(NamedTuple):
-    """HEARTBEAT of another system."""
-
-    vehicle_type: int
-
-
 class Timesync(NamedTuple):
     """TIMESYNC; target_system is 0 if the sender named none."""
 
@@ -120,19 +105,20 @@ class Timesync(NamedTuple):
     target_system: int
 
 
+Heartbeat = dialect.MAVLink_heartbeat_message
 Asked = Setpoint | Command | Request
 """A message that asks one vehicle for something."""
-Message = Heartbeat | Timesync | Asked
+Read = Heartbeat | Timesync | Asked
 
 
-def read_datagram(data: bytes, counters: Counter[str]) -> list[tuple[int, Message]]:
+def read_datagram(data: bytes, counters: Counter[str]) -> list[tuple[int, Read]]:
     """The messages of a datagram that a vehicle may act on, each with the system id of its source.
 
     Everything else is counted: `refused_empty`, `refused_mavlink1`, `refused_garbage` (no frame starts where one
     should), `refused_truncated`, `refused_incompatible` (unknown flags), `refused_unknown` (message id not in the
     dialect), `refused_setup_signing`, `refused_crc`, and `ignored_message` (valid, but nothing for a vehicle).
     """
-    messages: list[tuple[int, Message]] = []
+    messages: list[tuple[int, Read]] = []
     begin, end = 0, len(data)
     if not data:
         counters["refused_empty"] += 1
@@ -156,6 +142,12 @@ def read_datagram(data: bytes, counters: Counter[str]) -> list[tuple[int, Messag
             _append(messages, data[begin:after], checked - begin, counters)
         begin = after
     return messages
+
+
+def is_for(message: Asked, system_id: int) -> bool:
+    """Whether a message is addressed to this vehicle: to its autopilot, or to all of its components."""
+    # SET_MODE names no component
+    return message.target_system == system_id and getattr(message, "target_component", 0) in (0, COMPONENT_AUTOPILOT)
 
 
 def in_version_1(frame: bytes) -> bytes:
@@ -183,7 +175,7 @@ def _refusal(data: bytes, begin: int, checked: int) -> str:
     return ""
 
 
-def _append(messages: list[tuple[int, Message]], frame: bytes, checked: int, counters: Counter[str]) -> None:
+def _append(messages: list[tuple[int, Read]], frame: bytes, checked: int, counters: Counter[str]) -> None:
     """Decode one frame with a valid checksum; `checked` is the end of its payload."""
     number = frame[7] | frame[8] << 8 | frame[9] << 16
     # Most traffic is these two messages, so they are decoded without pymavlink's objects.
@@ -195,10 +187,11 @@ def _append(messages: list[tuple[int, Message]], frame: bytes, checked: int, cou
         target = frame[HEADER_BYTES + 16] if checked > HEADER_BYTES + 16 else 0
         tc1, ts1 = _values(_TIMESYNC.unpacker, frame, checked)
         messages.append((frame[5], Timesync(tc1, ts1, target)))
-    elif number in (HEARTBEAT, COMMAND_LONG, COMMAND_INT):
-        messages.append((frame[5], _decode(number, frame)))
-    elif number in REQUESTS:
-        messages.append((frame[5], request(number, (frame[5], frame[6]), frame[HEADER_BYTES:checked])))
+    elif number in (COMMAND_LONG, COMMAND_INT):
+        messages.append((frame[5], _command(frame)))
+    elif number == HEARTBEAT or number in REQUESTS:
+        decoded: Any = _DECODER.decode(bytearray(frame))
+        messages.append((frame[5], decoded))
     else:
         counters["ignored_message"] += 1
 
@@ -211,136 +204,47 @@ def _values(packing: struct.Struct, frame: bytes, checked: int) -> tuple[Any, ..
     return packing.unpack(frame[HEADER_BYTES:checked].ljust(size, b"\0"))
 
 
-def _decode(number: int, frame: bytes) -> Message:
-    decoded: Any = _DECODER.decode(bytearray(frame))
-    if number == HEARTBEAT:
-        return Heartbeat(decoded.type)
-    long = number == COMMAND_LONG
-    return Command(
-        (frame[5], frame[6]),
-        decoded.target_system,
-        decoded.target_component,
-        decoded.command,
-        decoded.param1,
-        decoded.param2,
-        decoded.param3,
-        *((decoded.param5, decoded.param6, decoded.param7) if long else (decoded.x, decoded.y, decoded.z)),
-    )
+def _command(frame: bytes) -> Command:
+    asked: Any = _DECODER.decode(bytearray(frame))
+    is_long = asked.id == COMMAND_LONG
+    last = (asked.param5, asked.param6, asked.param7) if is_long else (asked.x, asked.y, asked.z)
+    target = asked.target_system, asked.target_component
+    return Command((frame[5], frame[6]), *target, asked.command, asked.param1, asked.param2, asked.param3, *last)
 
 
 class Encoder:
     """Makes one vehicle's frames, with sequence numbers in the order of the calls."""
 
     def __init__(self, system_id: int) -> None:
+        self.system_id = system_id
         self._pymavlink = dialect.MAVLink(None, srcSystem=system_id, srcComponent=COMPONENT_AUTOPILOT)
 
-    def local_position(
-        self,
-        time_boot_ms: int,
-        north_m: float,
-        east_m: float,
-        down_m: float,
-        velocity_ne_m_s: tuple[float, float],
-        velocity_down_m_s: float = 0.0,
-    ) -> bytes:
-        """LOCAL_POSITION_NED."""
-        velocity = (*velocity_ne_m_s, velocity_down_m_s)
-        payload = _LOCAL_POSITION.unpacker.pack(time_boot_ms, north_m, east_m, down_m, *velocity)
+    def local_position(self, time_boot_ms: int, position: Triple, velocity: Triple) -> bytes:
+        """LOCAL_POSITION_NED in m and m/s."""
+        payload = _LOCAL_POSITION.unpacker.pack(time_boot_ms, *position, *velocity)
         return self.frame(LOCAL_POSITION, payload)
 
-    def global_position(
-        self,
-        *,
-        time_boot_ms: int,
-        latitude_deg: float,
-        longitude_deg: float,
-        altitude_m: float,
-        relative_altitude_m: float,
-        velocity_ne_m_s: tuple[float, float],
-        velocity_down_m_s: float = 0.0,
-        heading_deg: float,
-    ) -> bytes:
-        """GLOBAL_POSITION_INT, with each value clipped to its field."""
-        north, east = velocity_ne_m_s
-        return self.pack(
-            dialect.MAVLink_global_position_int_message(
-                time_boot_ms,
-                _clipped(latitude_deg * 1e7, 2**31 - 1),
-                _clipped(longitude_deg * 1e7, 2**31 - 1),
-                _clipped(altitude_m * 1e3, 2**31 - 1),
-                _clipped(relative_altitude_m * 1e3, 2**31 - 1),
-                _clipped(north * 1e2, 2**15 - 1),
-                _clipped(east * 1e2, 2**15 - 1),
-                _clipped(velocity_down_m_s * 1e2, 2**15 - 1),
-                round(heading_deg * 1e2) % 36000,
-            )
-        )
-
     def heartbeat(
-        self,
-        base_mode: int,
-        custom_mode: int,
-        system_status: int,
-        autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        self, base_mode: int, custom_mode: int, system_status: int, autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
     ) -> bytes:
         """HEARTBEAT of a quadrotor, by default an ArduCopter."""
-        return self.pack(
-            dialect.MAVLink_heartbeat_message(
-                dialect.MAV_TYPE_QUADROTOR,
-                autopilot,
-                base_mode,
-                custom_mode,
-                system_status,
-                3,
-            )
-        )
+        kind = dialect.MAV_TYPE_QUADROTOR, autopilot
+        return self.pack(dialect.MAVLink_heartbeat_message(*kind, base_mode, custom_mode, system_status, 3))
 
     def timesync(self, tc1: int, ts1: int) -> bytes:
         """TIMESYNC, a request if tc1 is 0."""
         return self.frame(TIMESYNC, _TIMESYNC.unpacker.pack(tc1, ts1))
 
     def command_ack(self, command: int, result: int, requester: tuple[int, int]) -> bytes:
-        """COMMAND_ACK to the (system, component) that asked."""
-        return self.pack(
-            dialect.MAVLink_command_ack_message(
-                command, result, target_system=requester[0], target_component=requester[1]
-            )
-        )
+        system, component = requester
+        message = dialect.MAVLink_command_ack_message
+        return self.pack(message(command, result, target_system=system, target_component=component))
 
     def statustext(self, severity: int, text: str) -> bytes:
         """STATUSTEXT in one chunk."""
         encoded = text.encode("ascii")
         assert len(encoded) <= 50
         return self.pack(dialect.MAVLink_statustext_message(severity, encoded))
-
-    def autopilot_version(self, version: tuple[int, int, int], *, parameters_bytewise: bool) -> dialect.MAVLink_message:
-        """AUTOPILOT_VERSION: capabilities, the version as a development version, and zeros for the rest."""
-        major, minor, patch = version
-        encoding = _BYTEWISE if parameters_bytewise else _C_CAST
-        none: Sequence[int] = (0,) * 8
-        uid = self._pymavlink.srcSystem
-        return dialect.MAVLink_autopilot_version_message(
-            _CAPABILITIES | encoding, major << 24 | minor << 16 | patch << 8, 0, 0, 0, none, none, none, 0, 0, uid
-        )
-
-    def home_position(
-        self,
-        latitude_deg: float,
-        longitude_deg: float,
-        altitude_m: float,
-        local_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> bytes:
-        """HOME_POSITION, on the globe and in the local frame."""
-        return self.pack(
-            dialect.MAVLink_home_position_message(
-                _clipped(latitude_deg * 1e7, 2**31 - 1),
-                _clipped(longitude_deg * 1e7, 2**31 - 1),
-                _clipped(altitude_m * 1e3, 2**31 - 1),
-                *local_ned_m,
-                (1.0, 0.0, 0.0, 0.0),
-                *(0.0, 0.0, 0.0),
-            )
-        )
 
     def frame(self, number: int, payload: bytes) -> bytes:
         """The frame of a frequent message, without pymavlink's objects; `number` is below 256."""
@@ -350,24 +254,7 @@ class Encoder:
         mav.seq = (mav.seq + 1) & 0xFF
         return b"\xfd" + body + mcrf4xx(body + CRC_EXTRA[number]).to_bytes(2, "little")
 
-    def estimator_flags(self, message_id: int, time_us: int, flags: int) -> bytes:
-        """EKF_STATUS_REPORT or ESTIMATOR_STATUS; the flags mean the same in both."""
-        if message_id == EKF_STATUS:
-            return self.pack(dialect.MAVLink_ekf_status_report_message(flags, *(0.1,) * 5))
-        assert message_id == ESTIMATOR_STATUS
-        return self.pack(dialect.MAVLink_estimator_status_message(time_us, flags, *(0.1,) * 8))
-
-    def global_origin(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> bytes:
-        """GPS_GLOBAL_ORIGIN: the origin of this vehicle's local frame."""
-        degrees = _clipped(latitude_deg * 1e7, 2**31 - 1), _clipped(longitude_deg * 1e7, 2**31 - 1)
-        return self.pack(dialect.MAVLink_gps_global_origin_message(*degrees, round(altitude_m * 1e3)))
-
-    def pack(self, message: dialect.MAVLink_message) -> bytes:
-        """The frame of any pymavlink message."""
+    def pack(self, message: Message) -> bytes:
         frame = message.pack(self._pymavlink)
         self._pymavlink.seq = (self._pymavlink.seq + 1) & 0xFF
         return frame
-
-
-def _clipped(value: float, largest: int) -> int:
-    return max(-largest, min(largest, round(value)))

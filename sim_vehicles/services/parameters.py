@@ -7,19 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from scenarios.schema import Safety
+from sim_vehicles.services import messages
 from sim_vehicles.services.mavlink import Encoder
-from sim_vehicles.services.service_messages import (
-    BY_NAME,
-    DOES_NOT_EXIST,
-    INT32,
-    PARAMETER_VALUE,
-    REAL32,
-    ParameterList,
-    ParameterRead,
-    ParameterSet,
-    parameter_error,
-    parameter_value,
-)
+from sim_vehicles.services.messages import ParameterList, ParameterRead, ParameterSet
 
 LIST_INTERVAL_US = 20_000
 """Time between two parameters of a list: with 37 bytes each, a third of a 57,600 bit/s radio."""
@@ -27,6 +17,9 @@ LONGEST_NAME = 16
 TIMEOUT_S = (0.1, 120.0)
 
 _FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
+_PARAMETER_VALUE = struct.Struct("<4sHH16sB")
+"""PARAM_VALUE with the value as four bytes: an integer sent as its bytes may look like a NaN, which a float may not
+preserve."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +64,7 @@ class Parameters:
     def answer(
         self, message: ParameterList | ParameterRead | ParameterSet, encoder: Encoder, counters: Counter[str]
     ) -> list[bytes]:
-        """Frames to be sent at once. A list only starts, or restarts, here; `next_of_list` sends it.
+        """The frames to send at once. A list only starts, or restarts, here; `next_of_list` sends it.
 
         PARAM_SET is answered with the value that then holds: the old one if the new one is not finite, of another type,
         or out of range, which counts as `refused_parameter_value`. An unknown name counts as `refused_parameter_name`.
@@ -79,15 +72,15 @@ class Parameters:
         if isinstance(message, ParameterList):
             self._listed = 0
             return []
-        name = message.name
-        if isinstance(message, ParameterRead) and message.number != BY_NAME:
-            name = self._names[message.number] if 0 <= message.number < len(self._names) else ""
+        name = message.param_id
+        if isinstance(message, ParameterRead) and message.param_index != -1:  # not by name
+            name = self._names[message.param_index] if 0 <= message.param_index < len(self._names) else ""
         parameter = self._known.get(name)
         if parameter is None:
             counters["refused_parameter_name"] += 1
-            return [encoder.pack(parameter_error(message, DOES_NOT_EXIST))]
+            return [encoder.pack(messages.parameter_error(message))]
         if isinstance(message, ParameterSet):
-            value = self._read(message)
+            value = self._read(parameter.whole, message)
             # NaN fails the comparison
             if parameter.low <= value <= parameter.high and value == (round(value) if parameter.whole else value):
                 self._values[name] = value
@@ -101,24 +94,27 @@ class Parameters:
         return self._listed < len(self._names)
 
     def next_of_list(self, encoder: Encoder) -> bytes:
-        """The next parameter of the list."""
         self._listed += 1
         return self._frame(self._names[self._listed - 1], encoder)
 
     def _frame(self, name: str, encoder: Encoder) -> bytes:
-        kind = INT32 if self._known[name].whole else REAL32
-        value = self._values[name]
-        data = _INT.pack(int(value)) if self.bytewise and kind == INT32 else _FLOAT.pack(value)
-        payload = parameter_value(name, data, kind, self._names.index(name), len(self._names))
-        return encoder.frame(PARAMETER_VALUE, payload)
+        whole, value = self._known[name].whole, self._values[name]
+        data = _INT.pack(int(value)) if self.bytewise and whole else _FLOAT.pack(value)
+        place = len(self._names), self._names.index(name)
+        payload = _PARAMETER_VALUE.pack(data, *place, name.encode("ascii"), _kind(whole))
+        return encoder.frame(messages.PARAMETER_VALUE, payload)
 
-    def _read(self, message: ParameterSet) -> float:
+    def _read(self, whole: bool, message: ParameterSet) -> float:
         """The value that a message sets; NaN if it is not valid."""
-        whole = self._known[message.name].whole
-        if self.bytewise and message.kind != (INT32 if whole else REAL32):
+        if self.bytewise and message.param_type != _kind(whole):
             return math.nan
-        value = float((_INT if self.bytewise and whole else _FLOAT).unpack(message.value)[0])
+        data = messages.payload_of(message)[:4].ljust(4, b"\0")
+        value = float((_INT if self.bytewise and whole else _FLOAT).unpack(data)[0])
         return value if math.isfinite(value) else math.nan
+
+
+def _kind(whole: bool) -> int:
+    return messages.INT32 if whole else messages.REAL32
 
 
 def of_vehicle(system_id: int, safety: Safety) -> list[Parameter]:

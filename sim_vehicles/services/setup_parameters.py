@@ -1,11 +1,11 @@
-"""Parameters that show ground stations a vehicle which was set up. They have no effect.
+"""Parameters that make a vehicle look set up to ground stations. They have no effect.
 
 Without them QGroundControl warns: it looks for a frame, calibrated sensors, a mapped radio and a battery.
 """
 
 from sim_vehicles.services.parameters import Parameter
 
-_ARDUPILOT: dict[str, float] = {
+_ARDUPILOT_VALUES: dict[str, float] = {
     "ARMING_CHECK": 1,
     "FRAME_CLASS": 1,
     "FRAME_TYPE": 1,
@@ -22,7 +22,7 @@ _ARDUPILOT: dict[str, float] = {
         for end, pulse in (("MIN", 1000), ("TRIM", 1500), ("MAX", 2000))
     },
 }
-_PX4: dict[str, float] = {
+_PX4_VALUES: dict[str, float] = {
     "SYS_AUTOSTART": 4001,
     "SYS_HAS_MAG": 1,
     "CAL_ACC0_ID": 1,
@@ -34,17 +34,7 @@ _PX4: dict[str, float] = {
     "COM_RC_IN_MODE": 1,
     **{f"RC_MAP_{stick}": channel for channel, stick in enumerate(("ROLL", "PITCH", "THROTTLE", "YAW"), 1)},
 }
-
-
-def of_ardupilot() -> list[Parameter]:
-    """The parameters of ArduCopter."""
-    return _parameters(_ARDUPILOT)
-
-
-def of_px4() -> list[Parameter]:
-    """The parameters of PX4."""
-    return _parameters(_PX4)
-
-
-def _parameters(values: dict[str, float]) -> list[Parameter]:
-    return [Parameter(name, value, whole=isinstance(value, int)) for name, value in values.items()]
+ARDUPILOT, PX4 = (
+    [Parameter(name, value, whole=isinstance(value, int)) for name, value in values.items()]
+    for values in (_ARDUPILOT_VALUES, _PX4_VALUES)
+)

@@ -1,4 +1,5 @@
-"""Simulated vehicles: one MAVLink shell, and the crafts it carries: double integrators and multicopters.
+"""Simulated vehicles: one MAVLink system (`shell`), and what flies in it: double integrators and multicopters.
 
-A double integrator may have a loop on board; a multicopter behaves like ArduCopter or PX4.
+A double integrator may close a loop on board (`onboard`); a multicopter behaves like ArduCopter or PX4
+(`copter_rules`).
 """

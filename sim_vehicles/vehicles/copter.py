@@ -1,8 +1,8 @@
 """A simulated multicopter that behaves like ArduCopter or PX4 as seen from outside.
 
 It boots, sends heartbeats, then telemetry, then gets a position. It can be armed, takes off to an altitude, follows
-velocity and acceleration set-points with a lag, and lands. The fleet flies it in place of a double integrator if the
-scenario's dynamics are `autopilot`.
+velocity and acceleration set-points with a lag, and lands. The fleet flies it if the scenario has `dynamics =
+"autopilot"`.
 """
 
 import math
@@ -14,11 +14,10 @@ import numpy as np
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import Record
-from sim_vehicles.services import mavlink
+from sim_vehicles.services import mavlink, messages
 from sim_vehicles.services.clock import NEVER_NS, BootClock
-from sim_vehicles.services.earth import ORIGIN_ALTITUDE_M
+from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.vehicles.copter_dynamics import Motion, Target, advance
-from sim_vehicles.vehicles.copter_reports import Facts, report, reported
 from sim_vehicles.vehicles.copter_rules import (
     FAILED,
     PX4_TAKEOFF_ALTITUDE,
@@ -38,6 +37,10 @@ TAKEN_OFF_M = 0.3
 HOME_M = 0.5
 """Distance to home at which a return becomes a landing."""
 SINK_FAST_M_S, SINK_M_S, SINK_SLOWLY_BELOW_M = 1.5, 0.7, 5.0
+REPORTED = mavlink.LOCAL_POSITION, mavlink.GLOBAL_POSITION, mavlink.GLOBAL_ORIGIN, mavlink.HOME_POSITION
+"""With the estimator's, the messages that can be requested besides those of every vehicle."""
+READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
+"""Estimator flags when all is well; and with attitude only, constant position mode, uninitialised."""
 _ACCEPTED: Answer = mavlink.ACCEPTED, ""
 
 
@@ -59,7 +62,7 @@ def multicopter(
 
 
 class Copter:
-    """The craft in the shell: motion, and the autopilot's modes."""
+    """The craft in the shell: its motion and the autopilot's modes."""
 
     def __init__(self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio) -> None:
         start_ns = radio.start_ns
@@ -67,7 +70,7 @@ class Copter:
         self.rules = RULES[own.flavour or scenario.autopilot.flavour]
         self.version = self.rules.version
         self.parameters = parameters(self.rules, own.system_id)
-        self.intervals_us: Mapping[int, int] = dict.fromkeys(reported(self.rules), 0)
+        self.intervals_us: Mapping[int, int] = dict.fromkeys((*REPORTED, self.rules.estimator_message), 0)
         self.reports_from_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
         self.mode = self.rules.first_mode
         self.armed = self.failsafe = False
@@ -253,9 +256,47 @@ class Copter:
 
     def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None:
         """The frame of one of its messages; None for a position that it does not have yet."""
-        state = self.mode, self.armed, self.landed, self.failsafe, self.home_ne_m
-        facts = Facts(self.motion, self.origin_neu_m, *state, self._ready(time_ns))
-        return report(message_id, self._radio.encoder, self.rules, facts, boot_ms & mavlink.UINT32)
+        encoder, motion, ready = self._radio.encoder, self.motion, self._ready(time_ns)
+        origin_north_m, origin_east_m, origin_up_m = self.origin_neu_m
+        boot_ms &= mavlink.UINT32
+        if message_id == mavlink.HEARTBEAT:
+            base_mode = mavlink.BASE_MODE_CUSTOM | (mavlink.BASE_MODE_ARMED if self.armed else 0)
+            status = mavlink.STATUS_STANDBY if self.landed else mavlink.STATUS_ACTIVE
+            status = mavlink.STATUS_CRITICAL if self.failsafe else status
+            return encoder.heartbeat(base_mode, self.mode, status, self.rules.autopilot)
+        if message_id == mavlink.LOCAL_POSITION and ready:
+            down_m = origin_up_m - motion.altitude_m
+            position = motion.north_m - origin_north_m, motion.east_m - origin_east_m, down_m
+            return encoder.local_position(boot_ms, position, (*motion[2:4], -motion.climb_m_s))
+        if message_id == self.rules.estimator_message:
+            message = messages.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if ready else NOT_READY_FLAGS)
+        elif message_id == mavlink.GLOBAL_POSITION or message_id in messages.EXTRA:
+            message = messages.report(message_id, self._condition(boot_ms, has_position=ready))
+        elif message_id == mavlink.GLOBAL_ORIGIN and ready:
+            message = messages.global_origin(degrees(origin_north_m, origin_east_m), ORIGIN_ALTITUDE_M + origin_up_m)
+        elif message_id == mavlink.HOME_POSITION and ready:
+            north, east = self.home_ne_m
+            local = north - origin_north_m, east - origin_east_m, origin_up_m
+            message = messages.home_position(degrees(north, east), local)
+        else:
+            return None
+        return encoder.pack(message)
+
+    def _condition(self, boot_ms: int, *, has_position: bool) -> messages.Condition:
+        """What it reports to other ground stations; it tilts to accelerate."""
+        motion = self.motion
+        cosine, sine = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
+        north, east = motion.acceleration_north_m_s2 / GRAVITY_M_S2, motion.acceleration_east_m_s2 / GRAVITY_M_S2
+        roll_rad, pitch_rad = math.atan(cosine * east - sine * north), -math.atan(cosine * north + sine * east)
+        return messages.Condition(
+            boot_ms,
+            degrees(motion.north_m, motion.east_m),
+            ORIGIN_ALTITUDE_M + motion.altitude_m,
+            (*motion[2:4], -motion.climb_m_s),
+            (roll_rad, pitch_rad, motion.yaw_rad),
+            flying=not self.landed,
+            has_position=has_position,
+        )
 
     # Motion
 

@@ -14,9 +14,9 @@ from scenarios import schema
 LONGEST_STEP_S = 0.01
 CLIMB_LAG_S = 0.3
 CLIMB_GAIN_1_S = 0.8
-"""Gain by which a take-off slows down towards its altitude."""
+"""Climb rate per remaining height of a take-off."""
 PLACE_GAIN_1_S = 0.3
-"""Gain by which a flight to a place slows down towards it."""
+"""Speed per remaining distance of a flight to a place."""
 YAW_RATE_MAX_RAD_S = 1.5
 
 
@@ -35,7 +35,7 @@ class Motion(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What the autopilot tries to reach. The velocity target integrates `growth` times the acceleration."""
+    """What the autopilot steers to. The velocity target integrates `growth` times the acceleration."""
 
     acceleration_north_m_s2: float = 0.0
     acceleration_east_m_s2: float = 0.0
@@ -50,7 +50,7 @@ class Target(NamedTuple):
     yaw_rate_rad_s: float = 0.0
     """Turn to `yaw_rad`; without one, turn at this rate."""
     place_ne_m: tuple[float, float] | None = None
-    """Fly to this place, with a velocity that follows from the distance left."""
+    """Fly to this place; the velocity follows from the remaining distance."""
 
 
 def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s: float) -> tuple[Motion, Target]:
@@ -121,14 +121,14 @@ def _climbed(altitude: float, climb: float, target: Target, limits: schema.Autop
 
 
 def _towards(motion: Motion, target: Target, place_ne_m: tuple[float, float], speed_max_m_s: float) -> Target:
-    """The target with the velocity towards a place."""
+    """The target, with the velocity that leads to a place."""
     north, east = place_ne_m[0] - motion.north_m, place_ne_m[1] - motion.east_m
     gain = min(PLACE_GAIN_1_S, speed_max_m_s / max(math.hypot(north, east), 1e-9))
     return target._replace(velocity_north_m_s=gain * north, velocity_east_m_s=gain * east)
 
 
 def _turned(yaw_rad: float, target: Target, h: float) -> float:
-    """The yaw a step later, from -pi to pi, turning the shorter way."""
+    """The yaw a step later, from -pi to pi; it turns the shorter way."""
     turn = target.yaw_rate_rad_s * h
     if target.yaw_rad is not None:
         turn = math.remainder(target.yaw_rad - yaw_rad, math.tau)

@@ -26,9 +26,9 @@ from sim_vehicles.vehicles.setpoints import (
 
 TEMPORARILY_REJECTED, FAILED = 1, 4
 PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
-"""The parameter with the altitude above the ground, in m, for a take-off command that names none."""
+"""The parameter with the altitude above ground, in m, of a take-off command without an altitude."""
 GROUND_DISARM_S = 10.0
-"""Both disarm if they have not taken off this long after arming."""
+"""Both autopilots disarm if they have not taken off this long after arming."""
 
 
 def px4_mode(main: int, sub: int = 0) -> int:
@@ -119,16 +119,15 @@ RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
 
 
 def parameters(rules: Rules, system_id: int) -> Parameters:
-    """The parameters of a multicopter with this autopilot."""
     known = [
         fixed(rules.system_id_parameter, system_id),
         timeout(rules.setpoint_timeout_parameter, rules.setpoint_timeout_s),
         timeout(rules.ground_disarm_parameter, GROUND_DISARM_S),
     ]
     if rules is PX4:
-        known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *setup_parameters.of_px4()]
+        known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *setup_parameters.PX4]
     else:
-        known += setup_parameters.of_ardupilot()
+        known += setup_parameters.ARDUPILOT
     return Parameters(known, bytewise=rules.parameters_bytewise)
 
 

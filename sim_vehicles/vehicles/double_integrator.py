@@ -1,7 +1,7 @@
-"""The double integrator: a UAV that flies the commanded acceleration at once, and speaks ArduCopter's modes.
+"""The double integrator: a UAV that follows the commanded acceleration at once, with the modes of ArduCopter.
 
-It starts on the launcher, which holds it at its initial state while it reports its initial position and velocity. It
-flies from the instant at which, armed and in GUIDED, it accepts a take-off command or its first set-point.
+It starts on a launcher, where it reports its initial position and velocity without moving. It flies from the instant at
+which, armed and in GUIDED, it accepts a take-off command or its first set-point.
 """
 
 import math
@@ -10,17 +10,10 @@ from collections.abc import Mapping
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import Record
-from sim_vehicles.services import mavlink
-from sim_vehicles.services.earth import (
-    GRAVITY_M_S2,
-    ORIGIN_ALTITUDE_M,
-    ORIGIN_LATITUDE_DEG,
-    ORIGIN_LONGITUDE_DEG,
-    degrees,
-)
+from sim_vehicles.services import mavlink, messages, setup_parameters
+from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.parameters import Parameters, of_vehicle
-from sim_vehicles.services.services import Condition, report, whole
-from sim_vehicles.services.setup_parameters import of_ardupilot
+from sim_vehicles.services.services import whole
 from sim_vehicles.vehicles.dynamics import (
     COAST,
     VELOCITY_GAIN_1_S,
@@ -55,10 +48,10 @@ def launched(
 
 
 class DoubleIntegrator:
-    """The craft in the shell: motion, modes, and the loop on board."""
+    """The craft in the shell: its motion, modes and loop on board."""
 
     version: tuple[int, int, int] = (4, 6, 0)
-    """Of the ArduCopter whose messages and modes it speaks."""
+    """The version of ArduCopter whose messages and modes it has."""
     intervals_us: Mapping[int, int] = {
         mavlink.LOCAL_POSITION: 250_000,
         mavlink.GLOBAL_POSITION: 1_000_000,
@@ -71,7 +64,9 @@ class DoubleIntegrator:
     ) -> None:
         self.flight = FlightMode(scenario.safety)
         formation = [] if onboard is None else formation_parameters()
-        self.parameters = Parameters([*of_vehicle(own.system_id, scenario.safety), *of_ardupilot(), *formation])
+        self.parameters = Parameters(
+            [*of_vehicle(own.system_id, scenario.safety), *setup_parameters.ARDUPILOT, *formation]
+        )
         self.reports_from_ns = radio.start_ns
         self._radio = radio
         self._onboard = onboard
@@ -99,7 +94,6 @@ class DoubleIntegrator:
         return max(time_ns, self._state_ns)
 
     def hear_heartbeat(self, time_ns: int) -> None:
-        """A station's heartbeat arrived."""
         self.flight.hear_heartbeat(max(time_ns, self._state_ns))
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
@@ -166,7 +160,7 @@ class DoubleIntegrator:
         return result
 
     def _take_off(self, time_ns: int) -> int:
-        """Leave the launcher at its altitude and velocity there, whatever altitude the command asks for."""
+        """Leave the launcher with the initial altitude and velocity, whatever altitude the command asks for."""
         result = self.flight.take_off(time_ns)
         if result == mavlink.ACCEPTED:
             self._state_ns = time_ns
@@ -174,7 +168,6 @@ class DoubleIntegrator:
         return result
 
     def change_mode(self, mode: int | None, time_ns: int) -> Answer:
-        """Change the mode on command."""
         if mode is None:
             return mavlink.DENIED, ""
         if mode in (mavlink.MODE_LAND, mavlink.MODE_RETURN):
@@ -190,7 +183,6 @@ class DoubleIntegrator:
     # What happens by itself
 
     def happen(self, time_ns: int) -> None:
-        """Enter the failsafe."""
         self._advance(time_ns)
         self.flight.fail()
         self._command = self._alone()
@@ -199,7 +191,7 @@ class DoubleIntegrator:
         self._radio.say(time_ns, text)
 
     def _alone(self) -> Command:
-        """The command without set-points: that of the loop on board, if it may fly, else straight on."""
+        """The command without set-points: that of the loop on board, if it may fly, else constant velocity."""
         onboard = self._onboard
         if onboard is None:
             return COAST
@@ -220,7 +212,7 @@ class DoubleIntegrator:
             self._command = onboard.command()
 
     def report(self, message_id: int, time_ns: int, boot_ms: int) -> bytes | None:
-        """A report, or a step of its own loop, which says nothing."""
+        """A report; or a step of the loop on board, which sends nothing."""
         if message_id == STEP:
             self._step_onboard(time_ns, boot_ms)
             return None
@@ -230,20 +222,21 @@ class DoubleIntegrator:
             flight = self.flight
             return encoder.heartbeat(flight.base_mode, flight.mode, flight.system_status)
         if message_id == mavlink.HOME_POSITION:
-            return encoder.home_position(ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG, ORIGIN_ALTITUDE_M)
+            return encoder.pack(messages.home_position())
         self._advance(time_ns)
         if message_id == mavlink.LOCAL_POSITION:
             state = self._state
-            return encoder.local_position(boot_ms, state[0], state[1], -self._altitude_m, state.velocity_ne_m_s())
-        return report(message_id, encoder, self._condition(boot_ms))
+            position = state[0], state[1], -self._altitude_m
+            return encoder.local_position(boot_ms, position, (*state.velocity_ne_m_s(), 0.0))
+        return encoder.pack(messages.report(message_id, self._condition(boot_ms)))
 
-    def _condition(self, boot_ms: int) -> Condition:
+    def _condition(self, boot_ms: int) -> messages.Condition:
         """What it reports to other ground stations; in flight its roll is that of a coordinated turn."""
         state, roll_rad = self._state, 0.0
         if self.flight.flying:
             _, _, turn_rate_rad_s, _ = rates(state.yaw_rad, state.speed_m_s, self._command, self._bounds)
             roll_rad = math.atan2(state.speed_m_s * turn_rate_rad_s, GRAVITY_M_S2)
-        return Condition(
+        return messages.Condition(
             boot_ms,
             degrees(state.north_m, state.east_m),
             ORIGIN_ALTITUDE_M + self._altitude_m,

@@ -1,4 +1,4 @@
-"""When a double integrator obeys set-points: arming, modes, the start of the flight, the failsafe. No bytes, no motion.
+"""When a double integrator obeys set-points: arming, modes, the start of the flight, the failsafe.
 
 on the launcher ──first set-point or take-off, armed, GUIDED──► flying (GUIDED) ◄──commanded──► flying (LOITER, BRAKE)
                                                                       │                             │
@@ -37,7 +37,7 @@ class FlightMode:
         self.mode = MODE_STABILIZE
         self.flying = False
         self.failsafe = ""
-        """Which stream stopped; empty if none."""
+        """Which stream stopped; empty outside the failsafe."""
         self.deadline_ns = NEVER_NS
         """When the failsafe begins unless a station is heard before."""
         self._setpoint_timeout_ns = round(safety.setpoint_timeout_s * NS_PER_S)
@@ -88,7 +88,7 @@ class FlightMode:
         return ""
 
     def take_off(self, now_ns: int) -> int:
-        """Begin the flight on command; returns the MAV_RESULT. Set-points are missed only after the first has come."""
+        """Begin the flight on command; returns the MAV_RESULT. The set-point time-out begins with the first."""
         if self.flying or not self.armed or self.mode != MODE_GUIDED:
             return DENIED
         self.flying = True
@@ -97,7 +97,7 @@ class FlightMode:
         return ACCEPTED
 
     def arm(self, wanted: bool) -> int:
-        """Arm or disarm; returns the MAV_RESULT. In flight it never disarms, even forced: it would fall."""
+        """Arm or disarm; returns the MAV_RESULT. In flight it never disarms, not even if forced: it would fall."""
         if not wanted and self.flying:
             return DENIED
         self.armed = wanted

@@ -2,14 +2,13 @@
 
     u = K_p (Z_ahead^p - Z^p - d) + K_v (Z^v - v_d) + w
 
-A step computes the first two terms and holds them. The spacing comes from a sensor that measures the vehicle ahead
-every few steps; between measurements it is extrapolated with the measured relative velocity. v_d and w, which the
-vehicle cannot know by itself, are the velocity and the acceleration of the set-points: w acts from the instant at which
-it arrives, v_d from the next step.
+Each step computes the first two terms and holds them. The spacing comes from a sensor that measures the vehicle ahead
+every few steps; between measurements it is extrapolated with the measured relative velocity. The set-points bring what
+the vehicle cannot know by itself: v_d as their velocity and w as their acceleration. w acts when it arrives, v_d from
+the next step.
 
-When set-points stop, w is dropped and the other terms stay in force. What the station computed from other vehicles is
-stale, but the measured spacing is not, and a vehicle that only coasted would drift between others that keep their
-places.
+When set-points stop, w is dropped and the other terms stay in force: what the station computed from other vehicles is
+stale, but the measured spacing is not, and a vehicle that only coasted would drift among others that keep their places.
 """
 
 import math
@@ -76,7 +75,7 @@ class OnboardLoop:
         self._nominal_m_s, self._streamed_m_s2 = velocity_m_s, acceleration_m_s2
 
     def drop_stream(self) -> None:
-        """Drop w: set-points have stopped, or another pilot takes over."""
+        """Drop w: set-points have stopped, or the mode has changed."""
         self._streamed_m_s2 = 0.0, 0.0
 
     def step(self, time_ns: int, boot_ms: int, own: State) -> None:

@@ -1,4 +1,4 @@
-"""What a set-point says: which of its vectors count, and in which frame."""
+"""How a set-point is read: which of its vectors count, and in which frame."""
 
 import math
 

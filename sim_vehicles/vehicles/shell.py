@@ -1,4 +1,4 @@
-"""The MAVLink system of every simulated vehicle: bytes and time in, bytes and time out.
+"""The MAVLink system of every simulated vehicle: datagrams and times in, frames and times out.
 
 The shell reads datagrams, obeys one station, answers TIMESYNC, commands and requests, and reports on a schedule. The
 `Craft` in it knows how the vehicle moves and which set-points and modes it accepts. Everything happens at its exact
@@ -14,23 +14,23 @@ from sim_vehicles.links.truth import ACTED, SAMPLED, Record
 from sim_vehicles.services import mavlink
 from sim_vehicles.services.authority import Authority
 from sim_vehicles.services.clock import BootClock
+from sim_vehicles.services.messages import PARAMETER_VALUE, ParameterSet, SetMode
 from sim_vehicles.services.parameters import Parameters
 from sim_vehicles.services.schedule import Schedule
-from sim_vehicles.services.service_messages import PARAMETER_VALUE, ParameterSet, SetMode
 from sim_vehicles.services.services import Services
 from sim_vehicles.vehicles.dynamics import State
 
 TIMESYNC_INTERVAL_US = 10_000_000
 HEARTBEAT_INTERVAL_US = 1_000_000
 LONGEST_HISTORY = 1000
-"""Most changes kept unread: a hostile sender can cause any number of them."""
+"""Most unread changes that are kept: a hostile sender can cause any number of them."""
 
 Answer = tuple[int, str]
 """The MAV_RESULT of a command, and the STATUSTEXT sent with it, "" for none."""
 
 
 class Change(NamedTuple):
-    """An event that is shown to people, such as "failsafe: set-points stopped"."""
+    """An event for people to read, such as "failsafe: set-points stopped"."""
 
     time_ns: int
     system_id: int
@@ -38,11 +38,11 @@ class Change(NamedTuple):
 
 
 class Radio:
-    """What the shell and the craft share: the clock, the counters, what is sent, and the changes.
+    """What the shell and the craft share: the clock, the counters, the frames sent, and the changes.
 
-    `counters` counts what came in: `heartbeats`, `commands`, `timesync_requests`, `timesync_replies`, `setpoints`, and
-    by reason what was not obeyed: `refused_...` is wrong in itself, `ignored_...` is well formed but not for this
-    vehicle, or not now.
+    `counters` counts received messages: `heartbeats`, `commands`, `timesync_requests`, `timesync_replies`, `setpoints`,
+    and by reason those not obeyed: `refused_...` are invalid, `ignored_...` are valid but not for this vehicle, or not
+    now.
     """
 
     def __init__(
@@ -61,7 +61,6 @@ class Radio:
         """Frames sent in this step, with their instants."""
 
     def send(self, frame: bytes, time_ns: int) -> None:
-        """Send a frame that the encoder made."""
         self.out.append((frame, time_ns))
 
     def say(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
@@ -69,7 +68,6 @@ class Radio:
         self.send(self.encoder.statustext(severity, text), time_ns)
 
     def tell(self, time_ns: int, text: str) -> None:
-        """Note a change."""
         self.changes.append(Change(time_ns, self.system_id, text))
 
     def acted(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
@@ -208,7 +206,7 @@ class Shell(Generic[Flown]):
                 self._take_heartbeat(source, message, time_ns)
             elif isinstance(message, mavlink.Timesync):
                 self._take_timesync(message, time_ns)
-            elif message.target_system != self.system_id or message.target_component not in mavlink.OUR_COMPONENTS:
+            elif not mavlink.is_for(message, self.system_id):
                 counters["ignored_not_addressed"] += 1
             elif authority.obeys(source, message, time_ns):
                 self._obey(message, self.craft.acts_at(time_ns))
@@ -218,7 +216,7 @@ class Shell(Generic[Flown]):
                 self.radio.say(time_ns, text, mavlink.SEVERITY_WARNING)
 
     def _take_heartbeat(self, source: int, heartbeat: mavlink.Heartbeat, time_ns: int) -> None:
-        if heartbeat.vehicle_type != mavlink.TYPE_GCS:
+        if heartbeat.type != mavlink.TYPE_GCS:
             self.counters["ignored_heartbeat"] += 1
         elif not self.authority.hears(source, time_ns):
             self.counters["ignored_not_the_station"] += 1

@@ -12,7 +12,8 @@ from gcs.control.tick import CLOCK_JUMPED
 from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
-from scenarios.schema import ClockJump, Link, Links, Rates, Scenario, Vehicle
+from scenarios.link_schema import Link, Links
+from scenarios.schema import ClockJump, Rates, Scenario, Vehicle
 from sim_vehicles.drive.fleet import Fleet
 from tests.flights.test_flight_copters import COPTERS5, TRUTH, Flight, fly
 from tests.support.sim_client import parse

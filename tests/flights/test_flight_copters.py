@@ -19,7 +19,8 @@ from gcs.runs.summary import verdict
 from gcs.station.absence import TAKEN_OVER
 from gcs.station.station import Event, Station
 from scenarios.files import load
-from scenarios.schema import ClockJump, Link, Links, Outage, Response, Scenario, VehicleLinks
+from scenarios.link_schema import Link, Links, Outage, VehicleLinks
+from scenarios.schema import ClockJump, Response, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.copter_rules import RULES

@@ -21,7 +21,8 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.station.station import Station
 from scenarios.files import load
-from scenarios.schema import DelayPoint, Jitter, Link, Links, Monitor, Safety
+from scenarios.link_schema import DelayPoint, Jitter, Link, Links
+from scenarios.schema import Monitor, Safety
 from tests.support.paths import SCENARIOS
 
 TRIANGLE = load(SCENARIOS / "triangle5.toml")

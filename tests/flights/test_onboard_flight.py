@@ -29,7 +29,8 @@ from gcs.stress.study import NoOnset, Study, find_onset
 from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load, parse, with_loop
-from scenarios.schema import FixedGains, Limits, Link, Outage, Scenario, VehicleLinks
+from scenarios.link_schema import Link, Outage, VehicleLinks
+from scenarios.schema import FixedGains, Limits, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import ACTED, DTYPE, SAMPLED
 from sim_vehicles.services.mavlink import STATUS_CRITICAL

@@ -11,7 +11,8 @@ from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from gcs.station.station import Station
-from scenarios.schema import ClockJump, Link, Outage, Scenario, VehicleLinks
+from scenarios.link_schema import Link, Outage, VehicleLinks
+from scenarios.schema import ClockJump, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.copter_rules import RULES

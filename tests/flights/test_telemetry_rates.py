@@ -15,7 +15,8 @@ from gcs.runs.summary import summarise
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from scenarios.files import load
-from scenarios.schema import Control, FixedGains, Link, Outage, Response, Scenario
+from scenarios.link_schema import Link, Outage
+from scenarios.schema import Control, FixedGains, Response, Scenario
 from tests.support.paths import SCENARIOS
 
 GAINS = Control(gains=FixedGains(K1=-3.4079559741115664, K2=0.6308727089934395, K3=5.608081773264997))

@@ -11,7 +11,8 @@ from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
 from scenarios.files import dump, load
-from scenarios.schema import DelayPoint, Jitter, Link, Links, Monitor, Scenario
+from scenarios.link_schema import DelayPoint, Jitter, Link, Links
+from scenarios.schema import Monitor, Scenario
 from tests.support.paths import SCENARIOS
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]

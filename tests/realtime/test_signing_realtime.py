@@ -115,7 +115,7 @@ def test_vehicles_that_cannot_start_as_others_have_their_timestamps_end_the_flig
     options = ("--listen", f"127.0.0.1:{free_port()}", "--key", key_file, "--out", tmp_path / "run", "--json")
     out, _ = fly(short(tmp_path, "chain3", 1.0), *options).communicate(timeout=PATIENCE_S)
     summary = json.loads(out)
-    said = f"{tmp_path}/key.vehicles: another process uses it, wanted a key of one's own for each"
+    said = f"{tmp_path}/key.vehicles: another process uses it, wanted a separate key for each process"
     assert (summary["verdict"], summary["reason"]) == ("aborted", f"vehicles ended: sim-vehicles: {said}")
     assert len(held.known) == 0
 

@@ -26,7 +26,7 @@ def station() -> Generator[socket.socket]:
 def ports(station: socket.socket) -> Generator[Ports]:
     opened = Ports((1, 7), station.getsockname())
     yield opened
-    opened.close()
+    opened.sockets.close()
 
 
 def test_each_vehicle_has_a_port_and_answers_come_back_to_it(station: socket.socket, ports: Ports) -> None:
@@ -37,7 +37,7 @@ def test_each_vehicle_has_a_port_and_answers_come_back_to_it(station: socket.soc
     station.sendto(b"to one", addresses[b"one"])
     received: set[tuple[int, bytes]] = set()
     while len(received) < 2:
-        ports.wait(time.monotonic_ns() + 5000 * MS)
+        ports.sockets.wait(time.monotonic_ns() + 5000 * MS)
         received |= {(system_id, data) for system_id, data, _ in ports.receive()}
     assert received == {(1, b"to one"), (7, b"to seven")}
     assert ports.receive() == []
@@ -66,7 +66,7 @@ def test_only_the_station_is_listened_to(station: socket.socket, ports: Ports) -
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(b"obey me", address)
     station.sendto(b"station", address)
-    ports.wait(time.monotonic_ns() + 5000 * MS)
+    ports.sockets.wait(time.monotonic_ns() + 5000 * MS)
     assert [data for _, data, _ in ports.receive()] == [b"station"]
 
 
@@ -74,7 +74,7 @@ def test_it_waits_until_the_instant_and_not_less(ports: Ports) -> None:
     late_ns: list[int] = []
     for _ in range(20):
         until_ns = time.monotonic_ns() + 3 * MS + MS // 10
-        ports.wait(until_ns)
+        ports.sockets.wait(until_ns)
         late_ns.append(time.monotonic_ns() - until_ns)
     assert min(late_ns) >= 0
     # The best, because a loaded host puts off most. A time-out rounded up to whole milliseconds is never below 0.9 ms.
@@ -86,7 +86,7 @@ def test_a_datagram_ends_the_wait(station: socket.socket, ports: Ports) -> None:
     _, address = station.recvfrom(100)
     station.sendto(b"wake up", address)
     begin_ns = time.monotonic_ns()
-    ports.wait(begin_ns + 5000 * MS)
+    ports.sockets.wait(begin_ns + 5000 * MS)
     assert time.monotonic_ns() - begin_ns < 4000 * MS
     assert [data for _, data, _ in ports.receive()] == [b"wake up"]
 
@@ -96,9 +96,9 @@ def test_a_dead_station_is_counted_and_a_new_one_on_its_port_is_found(station: s
     station.close()
     for _ in range(3):
         ports.send([(1, b"anyone?", 0)])
-        ports.wait(time.monotonic_ns() + 5000 * MS)  # woken by the refusal
+        ports.sockets.wait(time.monotonic_ns() + 5000 * MS)  # woken by the refusal
         assert ports.receive() == []
-    assert ports.counters["send_refused"] + ports.counters["receive_refused"] >= 3
+    assert ports.sockets.counters["send_refused"] + ports.sockets.counters["receive_refused"] >= 3
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as restarted:
         restarted.bind(address)
         restarted.settimeout(5.0)

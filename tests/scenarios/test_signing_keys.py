@@ -86,7 +86,7 @@ def test_a_made_key_is_random_private_and_never_written_over(tmp_path: Path) -> 
     assert stat.S_IMODE((tmp_path / "one").stat().st_mode) == 0o600
     one = read_key(tmp_path / "one").secret
     assert one != read_key(tmp_path / "two").secret
-    with pytest.raises(KeyFileError, match="is there already"):
+    with pytest.raises(KeyFileError, match="exists already"):
         make_key(tmp_path / "one")
     assert read_key(tmp_path / "one").secret == one
 
@@ -144,7 +144,7 @@ def test_the_command_makes_a_key_and_says_nothing_of_it(tmp_path: Path) -> None:
     assert len(read_key(file).secret) == 32
     again = gcs("key", file)
     assert (again.returncode, again.stdout) == (2, "")
-    assert again.stderr == f"{file}: is there already, wanted a new file: a key is not written over\n"
+    assert again.stderr == f"{file}: exists already, wanted a new file: a key is never overwritten\n"
 
 
 @pytest.mark.parametrize("program", ["gcs.cli.main", "sim_vehicles.drive.cli"])

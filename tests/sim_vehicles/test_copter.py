@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from scenarios.schema import Autopilot, ClockJump, Flavour, Scenario
+from scenarios.part import Flavour
+from scenarios.schema import Autopilot, ClockJump, Scenario
 from sim_vehicles.vehicles.copter import Copter, multicopter
 from sim_vehicles.vehicles.shell import Shell
 from tests.support.sim_client import MS, SECOND, START, arm, command, mode, parse_all, scenario, setpoint

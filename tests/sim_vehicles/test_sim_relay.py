@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from scenarios import schema
+from scenarios import link_schema, schema
 from scenarios.files import dump
-from scenarios.schema import Jitter, Links
+from scenarios.link_schema import Jitter, Links
 from sim_vehicles.drive.relay_udp import MOST_PEERS, Peers
 from sim_vehicles.links.links import CAPACITY, LinkSet
 from sim_vehicles.links.relay import Passing, Relay, sender
@@ -24,7 +24,7 @@ from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, L
 from sim_vehicles.services.clock import NEVER_NS
 from tests.support.sim_client import MS, SECOND, START, heartbeat, scenario, setpoint
 
-WILD = schema.Link(
+WILD = link_schema.Link(
     delay_s=0.02,
     jitter=Jitter(distribution="uniform", scale_s=0.005),
     reordering=True,
@@ -101,8 +101,8 @@ def test_a_flood_beyond_capacity_is_dropped_and_counted() -> None:
 
 
 def test_the_links_time_begins_with_the_stations_first_set_point() -> None:
-    ramp = schema.Link(
-        delay_points=(schema.DelayPoint(at_s=0.0, delay_s=0.1), schema.DelayPoint(at_s=1.0, delay_s=0.3))
+    ramp = link_schema.Link(
+        delay_points=(link_schema.DelayPoint(at_s=0.0, delay_s=0.1), link_schema.DelayPoint(at_s=1.0, delay_s=0.3))
     )
     late = scenario(1).model_copy(update={"links": Links(up=ramp, down=ramp)})
     sent = [
@@ -261,7 +261,8 @@ def test_strangers_take_no_memory_beyond_the_bound() -> None:
                 admitted += len(peers.receive())
             assert admitted + peers.sockets.counters["refused_peer"] == MOST_PEERS + 50
             # The kernel may give a port twice; then it is a known peer.
-            assert len(peers.changes) == min(MOST_PEERS, len(peers.changes)) > MOST_PEERS * 3 // 4
-            assert len({change.system_id for change in peers.changes}) <= 250
+            found = peers.take_changes()
+            assert len(found) == min(MOST_PEERS, len(found)) > MOST_PEERS * 3 // 4
+            assert len({change.system_id for change in found}) <= 250
         finally:
             peers.sockets.close()

@@ -205,5 +205,6 @@ def test_the_frames_read_are_those_pymavlink_reads(frames: list[bytes]) -> None:
     assert len(read) == len(expected)
     for (source, ours), theirs in zip(read, expected, strict=True):
         assert source == theirs.get_srcSystem()
-        for field in set(ours._fields) & set(theirs.get_fieldnames()):
+        own = ours._fields if isinstance(ours, tuple) else ours.get_fieldnames()
+        for field in set(own) & set(theirs.get_fieldnames()):
             assert getattr(ours, field) == getattr(theirs, field)

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from scenarios import schema
+from scenarios import link_schema, schema
 from scenarios.schema import Scenario
 from tests.soak.soak_draws import Part, Rng, between, chance, most_of, one_of, some, spread, whole
 
@@ -197,7 +197,7 @@ def _jitter(rng: Rng) -> Part:
     scale_s = spread(rng, 1e-4, 0.05)
     trace = [round(value, 5) for value in rng.exponential(scale_s, size=int(rng.integers(1, 20))).tolist()]
     return whole(
-        schema.Jitter,
+        link_schema.Jitter,
         distribution=kind,
         scale_s=scale_s if kind != "trace" else None,
         shape=spread(rng, 0.3, 5.0) if kind == "gamma" else None,
@@ -209,11 +209,13 @@ def _jitter(rng: Rng) -> Part:
 def _link(rng: Rng, channels: list[str], duration_s: float, *, calm: bool) -> Part:
     delay_s = one_of(rng, 0.0, between(rng, 0.0, 0.05), between(rng, 0.0, 0.15), spread(rng, 1e-4, 1.0))
     at_s = sorted(between(rng, 0.0, duration_s) for _ in range(int(rng.integers(1, 5))))
-    points = [whole(schema.DelayPoint, at_s=time_s, delay_s=between(rng, 0.0, 0.15)) for time_s in dict.fromkeys(at_s)]
+    points = [
+        whole(link_schema.DelayPoint, at_s=time_s, delay_s=between(rng, 0.0, 0.15)) for time_s in dict.fromkeys(at_s)
+    ]
     from_s = between(rng, 0.0, duration_s)
-    outage = whole(schema.Outage, from_s=from_s, until_s=round(from_s + spread(rng, 0.05, 5.0), 4))
+    outage = whole(link_schema.Outage, from_s=from_s, until_s=round(from_s + spread(rng, 0.05, 5.0), 4))
     bursts = whole(
-        schema.LossBursts,
+        link_schema.LossBursts,
         to_bad_probability=spread(rng, 0.001, 0.2),
         to_good_probability=spread(rng, 0.05, 1.0),
         loss_good_probability=one_of(rng, 0.0, 0.02),
@@ -222,7 +224,7 @@ def _link(rng: Rng, channels: list[str], duration_s: float, *, calm: bool) -> Pa
     moving, bursty = chance(rng, 0.15), chance(rng, 0.2)
     often = 0.0 if calm else 1.0
     return whole(
-        schema.Link,
+        link_schema.Link,
         delay_s=0.0 if moving and not calm else delay_s,
         delay_points=points if moving and not calm else None,
         jitter=some(rng, 0.5 * often, _jitter(rng)),
@@ -241,12 +243,12 @@ def _links(rng: Rng, system_ids: list[int], duration_s: float) -> Part:
     names = [] if calm or chance(rng, 0.75) else ["a", "b"][: int(rng.integers(1, 3))]
     channels = [_channel(rng, name) for name in names]
     return whole(
-        schema.Links,
+        link_schema.Links,
         up=_link(rng, names, duration_s, calm=calm),
         down=_link(rng, names, duration_s, calm=calm),
         vehicles=[
             whole(
-                schema.VehicleLinks,
+                link_schema.VehicleLinks,
                 system_id=system_id,
                 up=some(rng, 0.7, _link(rng, names, duration_s, calm=calm)),
                 down=some(rng, 0.7, _link(rng, names, duration_s, calm=calm)),
@@ -262,7 +264,7 @@ def _links(rng: Rng, system_ids: list[int], duration_s: float) -> Part:
 def _channel(rng: Rng, name: str) -> Part:
     bytes_count = chance(rng, 0.5)
     return whole(
-        schema.Channel,
+        link_schema.Channel,
         name=name,
         bandwidth_bit_s=spread(rng, 19_200.0, 1e7),
         bits_per_byte=one_of(rng, 8, 10),

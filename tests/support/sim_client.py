@@ -4,7 +4,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from scenarios.schema import Clocks, Limits, Link, Links, NominalVelocity, Safety, Scenario, Vehicle
+from scenarios.link_schema import Link, Links
+from scenarios.schema import Clocks, Limits, NominalVelocity, Safety, Scenario, Vehicle
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator, launched
 from sim_vehicles.vehicles.shell import Shell
 

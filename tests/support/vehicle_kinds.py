@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 
-from scenarios.schema import Autopilot, Flavour
+from scenarios.part import Flavour
+from scenarios.schema import Autopilot
 from sim_vehicles.vehicles.copter import Copter, multicopter
 from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.support.sim_client import START, a_vehicle, scenario

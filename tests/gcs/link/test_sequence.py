@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterable
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -87,3 +88,27 @@ def test_reordering_within_the_window_is_never_loss(seed: int) -> None:
     assert (counter.lost, counter.duplicate) == (0, 0)
     newest = np.maximum.accumulate(order)
     assert counter.late == int((np.array(order) < newest).sum())
+
+
+@pytest.mark.parametrize("lost_between", [0, 2])
+def test_after_a_very_late_frame_only_eight_good_ones_count_as_late(lost_between: int) -> None:
+    numbers = [*range(300), 150, *range(300, 600, lost_between + 1)]  # 150 is taken for 256 + 150
+    counter = counted(numbers, [20.0 * max(n, 299) for n in numbers])
+    assert (counter.late, counter.duplicate) == (8, 0)
+
+
+def test_a_burst_that_time_does_not_show_is_counted_once_reordering_has_ended() -> None:
+    rng = np.random.default_rng(4)
+    arrival_ms = 20.0 * np.arange(1000) + rng.uniform(0.0, 2000.0, 1000)  # overtaken by up to a hundred
+    arrival_ms[0] = 0.0
+    order = np.argsort(arrival_ms)
+    steady = np.arange(1000, 3000)
+    numbers = [*order.tolist(), *steady.tolist(), 3100]
+    times_ms = [*arrival_ms[order].tolist(), *(2000.0 + 20.0 * steady).tolist(), 2000.0 + 20.0 * 3000]
+    assert counted(numbers, times_ms).lost == 100
+
+
+def test_a_pause_of_the_sender_does_not_spoil_the_count_of_the_next_outage() -> None:
+    before, after = np.arange(260), np.arange(1260, 1400)  # 50 frames a second; a pause of 1.9 s after 250
+    times_ms = [20.0 * n + 1900.0 * (n >= 250) for n in [*before.tolist(), *after.tolist()]]
+    assert counted([*before.tolist(), *after.tolist()], times_ms).lost == 1000

@@ -16,7 +16,8 @@ from gcs.runs.summary import summarise
 from gcs.views.report import print_design
 from gcs.views.table import FlightState, plain_line
 from scenarios.files import load, with_loop
-from scenarios.schema import DelayPoint, Jitter, Link, Links, Rates, VehicleLinks
+from scenarios.link_schema import DelayPoint, Jitter, Link, Links, VehicleLinks
+from scenarios.schema import Rates
 from tests.support.paths import ROOT
 
 TRIANGLE = load(ROOT / "scenarios/triangle5.toml")

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gcs.control.tick import Mode
-from gcs.station.monitor import FleetView, FormationMonitor, Observation, VehicleState, monitored
+from gcs.station.monitor import FormationMonitor, Observation, VehicleState, monitored
 from scenarios.schema import Monitor
 
 MARGINS_S = (0.3, 0.6, 1.2)
@@ -164,9 +164,8 @@ def formation(n: int, *, separable: bool = True) -> FormationMonitor:
     return FormationMonitor(n, MARGINS_S, POLICY, separable=separable, period_s=0.02)
 
 
-def view(k: int, delays_s: list[float]) -> FleetView:
-    n = len(delays_s)
-    return FleetView(0.02 * k, True, [False] * n, [True] * n, [False] * n, delays_s)
+def view(k: int, delays_s: list[float]) -> list[Observation]:
+    return [Observation(0.02 * k, True, False, True, False, delay_s) for delay_s in delays_s]
 
 
 def test_one_late_vehicle_changes_its_own_gains_only_in_a_tree() -> None:
@@ -197,7 +196,7 @@ def test_share_of_the_new_gains_rises_without_a_jump() -> None:
 def test_delays_before_the_flight_are_not_judged() -> None:
     monitor = formation(1)
     for k in range(100):  # slow telemetry of a vehicle that is getting ready
-        monitor.update(view(k, [2.0])._replace(flying=False))
+        monitor.update([seen._replace(flying=False) for seen in view(k, [2.0])])
     for k in range(100, 200):
         monitor.update(view(k, [0.05]))
         assert monitor.states[0].mode is Mode.NOMINAL

@@ -19,7 +19,8 @@ from gcs.stress.growth import CHANNELS
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
-from scenarios.schema import Limits, Link, VehicleLinks
+from scenarios.link_schema import Link, VehicleLinks
+from scenarios.schema import Limits
 from tests.support.stress_pair import SCENARIO, pair_plan
 
 PERIOD_S = 0.02

@@ -12,7 +12,7 @@ from gcs.stress.axes import (
     parse_vehicle_axis,
     split_delay,
 )
-from scenarios.schema import Jitter, Link
+from scenarios.link_schema import Jitter, Link
 from tests.support.stress_pair import SCENARIO
 
 

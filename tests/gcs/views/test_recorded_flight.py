@@ -19,7 +19,8 @@ from gcs.views.observer import record_run
 from gcs.views.report import delay_text
 from gcs.views.viewer import ViewerError, screenshot, vulkan_missing
 from scenarios.files import dump, load
-from scenarios.schema import DelayPoint, Link, Scenario, VehicleLinks
+from scenarios.link_schema import DelayPoint, Link, VehicleLinks
+from scenarios.schema import Scenario
 from tests.gcs.views.test_recording import read_back
 from tests.support.paths import SCENARIOS
 

@@ -14,7 +14,8 @@ from gcs.link import mavlink
 from gcs.watch.links import SYSTEM_ID, Requests, Watch
 from gcs.watch.table import links_table
 from scenarios.files import load
-from scenarios.schema import Jitter, Link, Links, Scenario
+from scenarios.link_schema import Jitter, Link, Links
+from scenarios.schema import Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import SAMPLED, Row
 from tests.support.paths import SCENARIOS

@@ -1,7 +1,7 @@
-"""Set-points for vehicles with autopilots: a velocity, the acceleration that goes with it, and a climb to hold height.
+"""Set-points for vehicles with autopilots: a velocity, its acceleration, and a climb rate that keeps the altitude.
 
-The control law commands accelerations; an autopilot holds velocities. So each vehicle has a velocity target, the
-integral of its commands, and both are sent.
+The control law commands accelerations; an autopilot tracks velocities. So each vehicle has a velocity target, the
+integral of its commanded accelerations, and is sent both.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from gcs.link.vehicle import RemoteVehicle
 _CLIMB_GAIN_1_S = 0.5
 _CLIMB_MAX_M_S = 1.0
 _RESET_M_S = 5.0
-"""A velocity target this far from the vehicle's velocity is of no use; a new one starts from that velocity."""
+"""A velocity target this far from the vehicle's velocity is dropped; a new one starts from that velocity."""
 _Vector = tuple[float, float]
 
 
@@ -27,7 +27,7 @@ class _Target:
     since_ns: int
 
 
-class Pilots:
+class VelocityTargets:
     """The velocity targets of all vehicles."""
 
     def __init__(

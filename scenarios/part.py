@@ -1,0 +1,33 @@
+"""What all parts of a scenario are made of: the base of a part, and numbers with bounds.
+
+Numbers are bounded where the messages (single precision) and the clocks (nanoseconds) can still tell them apart.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+MOST = 1e6
+Number = Annotated[float, Field(ge=-MOST, le=MOST)]
+Position = tuple[Number, Number]
+Speed = Annotated[float, Field(ge=-1e4, le=1e4)]
+Velocity = tuple[Speed, Speed]
+SystemId = Annotated[int, Field(ge=1, le=250)]
+Positive = Annotated[float, Field(gt=0, le=MOST)]
+NotNegative = Annotated[float, Field(ge=0, le=MOST)]
+Factor = Annotated[float, Field(ge=1, le=1000)]
+Headroom = Annotated[float, Field(ge=-1000, lt=1)]
+Rate = Annotated[float, Field(ge=1, le=500)]
+Probability = Annotated[float, Field(ge=0, le=1)]
+Flavour = Literal["ardupilot", "px4"]
+
+
+class Part(BaseModel):
+    """Base of every part of a scenario: unknown keys, wrong types, NaN and infinities are refused.
+
+    The docstring under a key is its description in `scenario.schema.json` and in the reference of the documentation.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
