@@ -38,7 +38,7 @@ def design(
     if (unstable := unstable_loop(plan)) is not None:
         refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
     if as_json:
-        print_json(result.to_dict())
+        print_json(result)
     else:
         from gcs.views.report import print_design
 
@@ -56,10 +56,10 @@ def margin(
     as_json: AsJson = False,
 ) -> None:
     """How much delay any linear loop takes, or that of a scenario: stability windows, margin, crossings."""
-    from gcs.cli.margin import margin_of_file, margin_of_scenario, print_margin
+    from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario, print_margin
 
-    result = margin_of_scenario(model_file) if model_file.suffix == ".toml" else margin_of_file(model_file)
+    found = margin_of_scenario(model_file) if model_file.suffix == ".toml" else margin_of_file(model_file)
     if as_json:
-        print_json(result)
+        print_json(margin_fields(found))
     else:
-        print_margin(result)
+        print_margin(found)

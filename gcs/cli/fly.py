@@ -2,7 +2,7 @@
 
 import contextlib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -27,6 +27,9 @@ from gcs.cli.options import (
 )
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+
+if TYPE_CHECKING:
+    from gcs.runs.summary_record import Summary
 
 LISTEN = "127.0.0.1:14550"
 
@@ -112,10 +115,10 @@ def fly(
     raise typer.Exit(_exit_code(summary))
 
 
-def _exit_code(summary: dict[str, Any]) -> int:
-    if summary["reason"].startswith("interrupted"):
+def _exit_code(summary: "Summary") -> int:
+    if summary.reason.startswith("interrupted"):
         return INTERRUPTED
-    return 0 if summary["verdict"] == "stable" and not summary["not_logged"] else FAILED
+    return 0 if summary.verdict == "stable" and not summary.not_logged else FAILED
 
 
 def key(file: Annotated[Path, typer.Argument(metavar="FILE", help="a new file")]) -> None:

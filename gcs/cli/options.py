@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import asdict
 from enum import Enum
 from ipaddress import ip_address
 from pathlib import Path
@@ -41,8 +42,12 @@ KeyFile = Annotated[
 
 
 def print_json(result: Any) -> None:
-    """Print a result as `--json` asks for it."""
-    typer.echo(json.dumps(result, indent=2, allow_nan=False))
+    """Print a result as `--json` asks for it; records in it are written with their fields."""
+    typer.echo(json.dumps(result, indent=2, allow_nan=False, default=_fields))
+
+
+def _fields(record: Any) -> Any:
+    return record.to_dict() if hasattr(record, "to_dict") else asdict(record)
 
 
 def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":

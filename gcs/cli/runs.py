@@ -1,13 +1,16 @@
 """`gcs grade`, `view` and `recover`: what is done with the folder of a run."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gcs.cli.exit_codes import FAILED
 from gcs.cli.options import AsJson, RunFolder, out_file, print_json, within
 from gcs.errors import InputError
+
+if TYPE_CHECKING:
+    from gcs.runs.grade import Grade
 
 
 def grade(run: RunFolder, as_json: AsJson = False) -> None:
@@ -21,24 +24,19 @@ def grade(run: RunFolder, as_json: AsJson = False) -> None:
         print_grade(result)
 
 
-def print_grade(result: dict[str, Any]) -> None:
+def print_grade(result: "Grade") -> None:
     """Print the errors of each quantity in a line of its own."""
-    kinds = {
-        "loop_delay": "loop delay, measured",
-        "rtt": "round trip, measured",
-        "link_delay": "link delay, applied upwards",
-    }
-    print(f"errors against the truth, {result['vehicles']} vehicles, ms")
-    for name, title in kinds.items():
-        own = result[name]
-        p50, p99, largest = (_ms(own[f"error_{part}_s"]) for part in ("p50", "p99", "max"))
-        print(f"{title:<28} p50 {p50}  p99 {p99}  max {largest}  of {own['samples']}")
+    from gcs.views.console import ms_text
 
-
-def _ms(value_s: float | None) -> str:
-    from gcs.views.report import UNKNOWN
-
-    return UNKNOWN if value_s is None else f"{1e3 * value_s:.3f}"
+    print(f"errors against the truth, {result.vehicles} vehicles, ms")
+    for title, own in (
+        ("loop delay, measured", result.loop_delay),
+        ("round trip, measured", result.rtt),
+        ("link delay, applied upwards", result.link_delay),
+    ):
+        errors_s = own.error_p50_s, own.error_p99_s, own.error_max_s
+        p50, p99, largest = (ms_text(error_s, ".3f", unit="") for error_s in errors_s)
+        print(f"{title:<28} p50 {p50}  p99 {p99}  max {largest}  of {own.samples}")
 
 
 def view(

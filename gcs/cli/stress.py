@@ -4,7 +4,6 @@ The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
 """
 
 import contextlib
-import json
 import os
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from gcs.output import outlive_readers
 if TYPE_CHECKING:
     from gcs.plan.design import Design
     from gcs.stress.campaign import Fly
+    from gcs.stress.report import CampaignResult
     from gcs.stress.study import Onset, Study
     from gcs.stress.trial import Outcome
 
@@ -142,7 +142,7 @@ def stress(
         from gcs.cli.stress_output import print_result
 
         print_result(result, folder)
-    raise typer.Exit(0 if result["passed"] else FAILED)
+    raise typer.Exit(0 if result.passed else FAILED)
 
 
 def _check(options: StressOptions, out: Path | None, trial: str) -> None:
@@ -161,8 +161,8 @@ def _check(options: StressOptions, out: Path | None, trial: str) -> None:
             raise InputError(f"{name}: read {value:g}, wanted a part between 0 and 1, as 0.02")
 
 
-def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple[dict[str, Any], Path]:
-    """Fly the campaign; returns its result as plain types, and the folder that holds it."""
+def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> "tuple[CampaignResult, Path]":
+    """Fly the campaign; returns its result, and the folder that holds it."""
     from gcs.drive.fly import new_folder
     from gcs.runs.record import write_whole
     from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
@@ -207,8 +207,8 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
         write_parquet(outcomes, folder)
     allowed = options.assert_onset
     result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, no_onset=no_onset, allowed=allowed)
-    write_whole(folder / RESULT_FILE, json.dumps(result, indent=2, allow_nan=False).encode())
-    write_report(folder, result, study=study, axes=axes, sweep=sweep, onset=onset)
+    write_whole(folder / RESULT_FILE, result.to_json().encode())
+    write_report(folder, result, study=study, axes=axes)
     return result, folder
 
 

@@ -3,7 +3,7 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,10 @@ from gcs.cli.exit_codes import FAILED, INTERRUPTED
 from gcs.cli.options import AsJson, KeyFile, listening, opened_guard, print_json
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+
+if TYPE_CHECKING:
+    from gcs.watch.links import MonitorReport
+    from gcs.watch.rebuild_report import ReplayReport
 
 _TIMESYNC_HZ = 10.0
 ComparedMargin = Annotated[
@@ -128,25 +132,23 @@ def replay(
         _print_replay(result)
 
 
-def _print_replay(result: dict[str, Any]) -> None:
+def _print_replay(report: "ReplayReport") -> None:
     """Print what was read of the log, its links, and the flight if the formation is known."""
     from gcs.views.console import plain_console
     from gcs.views.report import delay_text, print_flight
     from gcs.watch.table import links_table
 
-    console = plain_console()
-    log = result["log"]
-    left_out = "".join(f"; {count} {reason}" for reason, count in log["left_out"].items())
-    console.print(f"log      {log['file']}: {log['frames']} frames in {log['duration_s']:.1f} s{left_out}")
-    if not result["links"]:
+    console, log = plain_console(), report.log
+    left_out = "".join(f"; {count} {reason}" for reason, count in log.left_out.items())
+    console.print(f"log      {log.file}: {log.frames} frames in {log.duration_s:.1f} s{left_out}")
+    if not report.links:
         console.print("no vehicle in this log")
-    elif "flight" in result:
-        print_flight(result["flight"], console)
+    elif report.flight is not None:
+        print_flight(report.flight, console)
     else:
-        console.print(links_table(result["links"], console.width))
-    if "recorded" in result:
-        recorded = result["recorded"]
-        console.print(f"recorded {recorded['verdict']}: {delay_text(recorded)}")
+        console.print(links_table(report.links, console.width))
+    if report.recorded is not None:
+        console.print(f"recorded {report.recorded.verdict}: {delay_text(report.recorded)}")
 
 
 def _refuse_both(margin: float | None, design: Path | None) -> None:
@@ -154,9 +156,9 @@ def _refuse_both(margin: float | None, design: Path | None) -> None:
         raise InputError("read --margin and --design, wanted one of them")
 
 
-def _exit_code(report: dict[str, Any]) -> int:
-    bad = {"not heard", "past the margin"} & {vehicle["status"] for vehicle in report["vehicles"]}
-    return FAILED if bad or not report["vehicles"] else 0
+def _exit_code(report: "MonitorReport") -> int:
+    bad = {"not heard", "past the margin"} & {vehicle.status for vehicle in report.vehicles}
+    return FAILED if bad or not report.vehicles else 0
 
 
 def _compared_with(scenario_file: Path | None, margin: float | None, design: Path | None) -> tuple[Any, Any, str]:

@@ -13,7 +13,6 @@ import numpy as np
 
 from gains.core.requirement import plain
 from gains.design.graph import time_scaled
-from gains.formation.model import FormationModel
 from gains.performance.delayed_alpha import ALPHA_KEPT
 from gains.performance.flown_formation import FlownFormation
 from gains.performance.flown_loop import FlownLoop
@@ -81,7 +80,7 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
     """α and the string peak of a design's gain set at a loop delay (s)."""
     loops = [] if delay_s is None else _flown_loops(design, scenario, gain_set)
     if delay_s is None or not loops:
-        return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
+        return FiguresAtDelay(loop_delay_s=delay_s, alpha=None, has_string_verdict=False, string_peak=None)
     chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
     return FiguresAtDelay(
         loop_delay_s=delay_s,
@@ -125,8 +124,7 @@ def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
 def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> FlownFormation:
     """The formation with the gains of an entry of a graph design's schedule."""
     formation = plan_formation(scenario)
-    model = FormationModel(tuple(formation.predecessor.tolist()))
-    first = np.array(design.K)
+    model, first = formation.model, np.array(design.K)
     if design.loop == "onboard":
         own = own_part(model, first)
         gain = own + entry.streamed_share * (first - own)

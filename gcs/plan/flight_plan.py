@@ -41,9 +41,10 @@ class FlightPlan:
         """The delay margins of the gain schedule."""
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
 
-    @cached_property
+    @property
     def model(self) -> FormationModel:
-        return FormationModel(tuple(self.formation.predecessor.tolist()))
+        """The formation's error model."""
+        return self.formation.model
 
     @property
     def timing(self) -> Timing:

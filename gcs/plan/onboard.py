@@ -12,7 +12,6 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.requirement import plain
-from gains.formation.model import FormationModel
 from gains.performance.behaviour import behaviour
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
 from gcs.plan.design import Behaviour, Design, GainSet, OnboardPart
@@ -89,8 +88,8 @@ def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, f
     to it; FORM_KP_xy and FORM_KV_xy are the gains from spacing and velocity error in y to acceleration in x. FORM_LOOP,
     the last, switches the loop on.
     """
-    model = FormationModel(tuple(formation.predecessor.tolist()))
-    ahead = int(formation.predecessor[row])
+    model = formation.model
+    ahead = model.predecessors[row]
     rows, north_east = model.input_slice(row), enumerate(formation.offset_ne_m[row].tolist())
     on_spacing = K[rows, model.spacing_slice(row)] if ahead >= 0 else np.zeros((2, 2))
     on_velocity = K[rows, model.velocity_slice(row)]

@@ -40,9 +40,9 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
         If the scenario's requirement cannot be met.
     """
     formation = plan_formation(scenario)
-    model = FormationModel(tuple(formation.predecessor.tolist()))
+    model = formation.model
     if scenario.control.method != "inclusion" or scenario.control.blocks:
-        return _flown_loop(*_graph_plan(scenario, formation, model))
+        return _flown_loop(*_graph_plan(scenario, formation))
     responses = given_responses(scenario)
     found = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
     schedule = _schedule(scenario, model, found)
@@ -153,13 +153,13 @@ def _requirement(scenario: Scenario) -> Requirement:
     )
 
 
-def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel) -> tuple[Design, FlightPlan]:
+def _graph_plan(scenario: Scenario, formation: Formation) -> tuple[Design, FlightPlan]:
     """Design and plan on an information pattern, designed or given block by block."""
-    control, timing = scenario.control, loop_timing(scenario)
+    control, timing, model = scenario.control, loop_timing(scenario), formation.model
     period_s = timing.held_s
-    pattern = _pattern(scenario, formation, model)
+    pattern = _pattern(scenario, formation)
     if control.blocks:
-        found = evaluate_graph_gain(model, pattern, _given_gain(scenario, formation, model), period_s=period_s)
+        found = evaluate_graph_gain(model, pattern, _given_gain(scenario, formation), period_s=period_s)
     else:
         assert control.method != "inclusion"
         wanted = _requirement(scenario)
@@ -182,7 +182,7 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
         around_loss=() if control.loop == "onboard" else _around_loss(model, found.delay_margin_s, scales, period_s),
     )
     schedule = [
-        _entry(scale, entry, blocks=_blocks(entry.K, formation, model, pattern))
+        _entry(scale, entry, blocks=_blocks(entry.K, formation, pattern))
         for scale, entry in zip(scales, [found, *slower], strict=True)
     ]
     ids = formation.system_ids
@@ -191,27 +191,26 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
     return _with_responses(Design.model_validate(found.to_dict() | parts), plan, given_responses(scenario))
 
 
-def _pattern(scenario: Scenario, formation: Formation, model: FormationModel) -> Pattern:
+def _pattern(scenario: Scenario, formation: Formation) -> Pattern:
     """Who may use whose errors."""
-    row = {system_id: k for k, system_id in enumerate(formation.system_ids)}
-    tree = leader_follower(model)
+    row, tree = formation.row, leader_follower(formation.model)
     if scenario.control.blocks:
         none = without_links(tree, tree.links)
-        return with_links(none, [(row[block.vehicle], row[block.of]) for block in scenario.control.blocks])
-    return with_links(tree, [(row[v.system_id], row[heard]) for v in scenario.vehicles for heard in v.hears])
+        return with_links(none, [(row(block.vehicle), row(block.of)) for block in scenario.control.blocks])
+    return with_links(tree, [(row(v.system_id), row(heard)) for v in scenario.vehicles for heard in v.hears])
 
 
-def _given_gain(scenario: Scenario, formation: Formation, model: FormationModel) -> FloatArray:
-    row = {system_id: k for k, system_id in enumerate(formation.system_ids)}
+def _given_gain(scenario: Scenario, formation: Formation) -> FloatArray:
+    model, row = formation.model, formation.row
     K = np.zeros((model.inputs, model.states))
     for block in scenario.control.blocks:
-        K[model.input_slice(row[block.vehicle]), model.output_slice(row[block.of])] = block.gain
+        K[model.input_slice(row(block.vehicle)), model.output_slice(row(block.of))] = block.gain
     return K
 
 
-def _blocks(K: FloatArray, formation: Formation, model: FormationModel, pattern: Pattern) -> list[Block]:
+def _blocks(K: FloatArray, formation: Formation, pattern: Pattern) -> list[Block]:
     """The gain matrix block by block, as a scenario gives it."""
-    ids = formation.system_ids
+    ids, model = formation.system_ids, formation.model
     return [
         Block(vehicle=ids[i], of=ids[j], gain=K[model.input_slice(i), model.output_slice(j)].tolist())
         for i, j in pattern.links

@@ -8,7 +8,6 @@ acts; both are in the truth by the time_boot_ms that the messages bear.
 import itertools
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gcs.control.tick import TickArray
 from gcs.errors import InputError
+from gcs.published import Published
 from gcs.runs.files import read_ticks
 from gcs.runs.record import TRUTH_FILE
 from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
@@ -26,7 +26,26 @@ Truth = NDArray[np.void]
 _TIMESYNC = 111
 
 
-def grade(folder: Path) -> dict[str, Any]:
+class Graded(Published):
+    """How far measurements are from the truth; with no sample, the errors are None and not 0."""
+
+    status: str
+    samples: int
+    error_p50_s: float | None
+    error_p99_s: float | None
+    error_max_s: float | None
+
+
+class Grade(Published):
+    """The errors of a run's loop delays and round trips, and how punctual its emulated links were."""
+
+    vehicles: int
+    loop_delay: Graded
+    rtt: Graded
+    link_delay: Graded
+
+
+def grade(folder: Path) -> Grade:
     """Grade a run: the loop delays and round trips it measured, and how punctual its emulated links were.
 
     Raises
@@ -47,12 +66,12 @@ def grade(folder: Path) -> dict[str, Any]:
     trip_errors_s = np.concatenate([_trip_errors_s(ticks, truth, system_id) for system_id in system_ids])
     left = truth[(truth["kind"] == LINK_UP) & (truth["fate"] & DROPPED == 0)]
     late_s = (left["time_ns"] - left["due_ns"]) * 1e-9
-    return {
-        "vehicles": len(system_ids),
-        "loop_delay": graded(flown["loop_delay_s"] + flown["repeated_s"], true_loop_delays_s(flown, truth)),
-        "rtt": graded(trip_errors_s, np.zeros(len(trip_errors_s))),
-        "link_delay": graded(late_s, np.zeros(len(late_s))),
-    }
+    return Grade(
+        vehicles=len(system_ids),
+        loop_delay=graded(flown["loop_delay_s"] + flown["repeated_s"], true_loop_delays_s(flown, truth)),
+        rtt=graded(trip_errors_s, np.zeros(len(trip_errors_s))),
+        link_delay=graded(late_s, np.zeros(len(late_s))),
+    )
 
 
 def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:
@@ -140,17 +159,12 @@ def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
     return found
 
 
-def graded(measured_s: FloatArray, true_s: FloatArray) -> dict[str, Any]:
-    """How far measurements are from the truth; with no sample, the figures are None and not 0."""
+def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
+    """The errors of measurements where both they and the truth are known."""
     both = np.isfinite(measured_s) & np.isfinite(true_s)
     error_s = np.abs(measured_s - true_s)[both]
     if not error_s.size:
-        return {"status": "unknown", "samples": 0, "error_p50_s": None, "error_p99_s": None, "error_max_s": None}
+        return Graded(status="unknown", samples=0, error_p50_s=None, error_p99_s=None, error_max_s=None)
     p50, p99 = np.percentile(error_s, [50, 99]).tolist()
-    return {
-        "status": "measured",
-        "samples": int(error_s.size),
-        "error_p50_s": p50,
-        "error_p99_s": p99,
-        "error_max_s": float(error_s.max()),
-    }
+    largest = float(error_s.max())
+    return Graded(status="measured", samples=error_s.size, error_p50_s=p50, error_p99_s=p99, error_max_s=largest)

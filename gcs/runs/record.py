@@ -10,12 +10,13 @@ import json
 import os
 import struct
 from collections.abc import Iterable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 
 SCENARIO_FILE = "scenario.toml"
 DESIGN_FILE = "design.json"
@@ -29,6 +30,8 @@ TRUTH_FILE = "truth.bin"
 MIRROR = "mirror"
 """Kind of the event that counts what a mirrored station sent."""
 RECORDING_FILE = "flight.rrd"
+UNFINISHED_FILE = RECORDING_FILE + ".part"
+"""The recording while it is written."""
 SUMMARY_FILE = "summary.json"
 NEW_DESIGN = "design"
 """Kind of the event that DESIGN_FILE has been written anew."""
@@ -58,7 +61,7 @@ class RunWriter:
             RecordLog(folder / name) for name in (TICKS_FILE, EVENTS_FILE, TLOG_FILE)
         )
         self._ended: set[str] = set()
-        self._waiting: list[bytes] = []
+        self._waiting: list[Event] = []
         """Events that could not be written yet."""
         self._time_s = -np.inf
         """Of the newest tick."""
@@ -67,22 +70,13 @@ class RunWriter:
         self._time_s = float(rows["time_s"][0])
         self._add(TICKS_FILE, self._ticks, rows.tobytes())
 
-    def event(
-        self,
-        *,
-        time_s: float,
-        kind: str,
-        text: str,
-        system_id: int | None = None,
-        counts: dict[str, int] | None = None,
-    ) -> None:
-        line: dict[str, Any] = {"time_s": round(time_s, 6), "kind": kind, "system_id": system_id, "text": text}
-        if counts is not None:
-            line["counts"] = counts
-        if len(self._waiting) < _MOST_WAITING or kind == END:
-            self._waiting.append((json.dumps(line) + "\n").encode())
+    def event(self, event: Event) -> None:
+        rounded = replace(event, time_s=round(event.time_s, 6))
+        if len(self._waiting) < _MOST_WAITING or event.kind == END:
+            self._waiting.append(rounded)
         with contextlib.suppress(OSError):
-            self._events.add(b"".join(self._waiting))
+            lines = (json.dumps(event_fields(waiting)) + "\n" for waiting in self._waiting)
+            self._events.add("".join(lines).encode())
             self._waiting.clear()
 
     def frames(self, frames: Iterable[tuple[bytes, int]]) -> None:
@@ -94,13 +88,13 @@ class RunWriter:
     def ended(self, name: str, error: OSError) -> None:
         """Note that a file of the run could not be written, and is not from now on."""
         self._ended.add(name)
-        self.event(time_s=self._time_s, kind=LOG_ENDED, text=f"{name}: {error.strerror}")
+        self.event(Event(time_s=self._time_s, kind=LOG_ENDED, text=f"{name}: {error.strerror}"))
 
-    def close(self) -> list[dict[str, Any]]:
-        """Close the files; gives the events that could not be written."""
+    def close(self) -> list[Event]:
+        """Close the files; returns the events that could not be written."""
         for log in (self._ticks, self._events, self._tlog):
             log.close()
-        return [json.loads(line) for line in self._waiting]
+        return self._waiting
 
     def _add(self, name: str, log: "RecordLog", data: bytes) -> None:
         if name in self._ended:
@@ -109,6 +103,14 @@ class RunWriter:
             log.add(data)
         except OSError as error:
             self.ended(name, error)
+
+
+def event_fields(event: Event) -> dict[str, Any]:
+    """The fields of a line of events.jsonl; `counts` only where the event has them."""
+    fields = asdict(event)
+    if event.counts is None:
+        del fields["counts"]
+    return fields
 
 
 class RecordLog:

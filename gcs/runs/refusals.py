@@ -1,10 +1,12 @@
 """What does not get in at the station, by reason, for the log of a run: each once, so that no attacker can fill it."""
 
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from pydantic import TypeAdapter
+
+from gcs.control.tick import Event
 
 VEHICLES_FILE = "vehicles.json"
 """What the simulated vehicles counted."""
@@ -48,20 +50,14 @@ def counted_by_vehicles(folder: Path) -> dict[str, int] | None:
 
 def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
     """What they refused, by reason."""
-    counters = counted_by_vehicles(folder)
-    prefix = "refused_"
-    return (
-        None
-        if counters is None
-        else {
-            name.removeprefix(prefix).replace("_", " "): count
-            for name, count in counters.items()
-            if name.startswith(prefix)
-        }
-    )
+    counters, prefix = counted_by_vehicles(folder), "refused_"
+    if counters is None:
+        return None
+    refused = {name.removeprefix(prefix): count for name, count in counters.items() if name.startswith(prefix)}
+    return {name.replace("_", " "): count for name, count in refused.items()}
 
 
-def counts_of(events: list[dict[str, Any]], kind: str = REFUSED) -> dict[str, int]:
-    """The newest counts in a run's events of a kind."""
-    told = [event["counts"] for event in events if event["kind"] == kind]
-    return told[-1] if told else {}
+def counts_of(events: Iterable[Event], kind: str) -> dict[str, int]:
+    """The newest counts in the events of a kind."""
+    counts = [event.counts for event in events if event.kind == kind and event.counts is not None]
+    return counts[-1] if counts else {}

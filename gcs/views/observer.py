@@ -25,8 +25,8 @@ from gcs.plan.design import Design
 from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
 from gcs.runs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE
 from gcs.runs.summary import finish
+from gcs.views.console import live_display
 from gcs.views.grid import WholeTicks
-from gcs.views.recording import Recording
 from gcs.views.table import Display, FlightState
 from scenarios.schema import Scenario
 
@@ -65,7 +65,8 @@ def main(argv: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, stop)
     outlive_readers()
     os.environ.setdefault("RUST_LOG", "off")  # Rerun would write over the table what is told in one line at the end
-    Recording.prepare()
+    import gcs.views.recording  # noqa: F401  # pyright: ignore[reportUnusedImport]
+
     os.nice(10)  # not before: the station waits until this is ready
     ready = arguments.folder / READY_FILE
     try:
@@ -85,10 +86,13 @@ def main(argv: list[str] | None = None) -> int:
 
 def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent, show_table: bool) -> None:
     """Follow the run in `folder` until it ends or is left alone."""
+    from gcs.views.recording import Recording  # Rerun is slow to import
+
     tail = RunTail(folder)
     whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])
     state = FlightState(scenario, design)
-    with Recording(folder, scenario, design) as recording, Display(state, shown=show_table) as display:
+    with Recording(folder, scenario, design) as recording, live_display(shown=show_table) as live:
+        display = Display(state, live, shown=show_table)
         news = table_due = send_due = time.monotonic()
         ended = False
         while not ended:
@@ -96,10 +100,10 @@ def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent,
             # Events before ticks: whatever was written before the "end" event is then read as well.
             events = tail.events()
             ticks = whole.add(tail.ticks())
-            ended = last_look or any(event["kind"] == "end" for event in events)
+            ended = last_look or any(event.kind == "end" for event in events)
             if ended:
                 ticks = np.concatenate([ticks, whole.rest()])
-            if any(event["kind"] == NEW_DESIGN for event in events):
+            if any(event.kind == NEW_DESIGN for event in events):
                 design = read_design(folder / DESIGN_FILE)
                 state.redesigned(design)
                 recording.redesigned(design)
@@ -121,6 +125,8 @@ def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent,
 
 def record_run(folder: Path) -> Path:
     """Make flight.rrd anew from the other files of a run that has ended, and return its path."""
+    from gcs.views.recording import Recording
+
     scenario, design = read_scenario(folder), read_design(folder / DESIGN_FILE)
     rows = read_ticks(folder)
     whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])

@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from gcs.interrupts import raised
-from gcs.runs.record import RECORDING_FILE
-from gcs.views.recording import TIMELINE, UNFINISHED_FILE, length_s, viewer_client
+from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 
 START_S = 20.0
 SETTLE_S = 20.0
@@ -49,6 +48,8 @@ def picture_time_s(recording: Path, wanted_s: float | None) -> float:
     ViewerError
         If the recording ends before, or holds no flight.
     """
+    from gcs.views.recording import length_s  # Rerun is slow to import, and the viewer itself does not need it
+
     try:
         end_s = length_s(recording)
     except (OSError, RuntimeError, ValueError):  # cut short, or of another version
@@ -71,6 +72,8 @@ def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 16
     ViewerError
         If there is no finished recording, or the viewer does not start: it needs a Vulkan driver, but no screen.
     """
+    from gcs.views.recording import TIMELINE
+
     recording = find_recording(folder_or_rrd)
     with _headless(width, height) as viewer:
         viewer.open(str(recording.resolve()))
@@ -119,6 +122,8 @@ def _headless(width: int, height: int) -> Generator[Any]:
     if vulkan_missing():
         raise ViewerError("no Vulkan driver to draw with; on Debian and Ubuntu: apt install mesa-vulkan-drivers")
     command = [_program(), "--headless", "--bind", "127.0.0.1", "--port", "0", "--window-size", f"{width}x{height}"]
+    from gcs.views.recording import viewer_client
+
     with raised(), tempfile.TemporaryFile() as log:
         environment = os.environ | {"RERUN_APP_ONLY": "true"}  # what the package sets when it starts a viewer itself
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)

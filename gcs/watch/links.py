@@ -11,17 +11,17 @@ from array import array
 from collections import Counter
 from collections.abc import Iterable
 from math import nan
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.link import mavlink
 from gcs.link.datagram import Address, Outgoing
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
-from gcs.runs.summary import spread_with_status
+from gcs.published import Published
+from gcs.runs.summary import estimate
+from gcs.runs.summary_record import Clock, Estimate
 from scenarios.schema import NS_PER_S
 
 SYSTEM_ID = 254
@@ -30,6 +30,8 @@ SILENT_NS = 3 * NS_PER_S
 """A vehicle not heard for this long counts as silent."""
 SAMPLE_NS = NS_PER_S // 10
 """Mean time between two looks at the ages of what was received."""
+LOWER_BOUND = "lower bound"
+"""Status of a delay measured against the fastest frame, for want of an exchange."""
 _GOLDEN = 0.6180339887498949
 _ASKED = 4096
 """Requests remembered: those of 250 vehicles at 10 Hz over 1.6 s, of five over 80 s."""
@@ -39,7 +41,38 @@ _AUTOPILOT, _NO_AUTOPILOT, _STATION = 1, 8, 6
 """Component id of an autopilot; MAV_AUTOPILOT_INVALID; MAV_TYPE_GCS."""
 _POSITIONS = (mavlink.LOCAL_POSITION_NED, mavlink.GLOBAL_POSITION_INT)
 
-Figures = dict[str, Any]
+
+class LinkFigures(Published):
+    """What is known of one vehicle's links. Without a TIMESYNC exchange, delays are lower bounds."""
+
+    system_id: int
+    status: str
+    telemetry_hz: float | None
+    rtt_s: Estimate
+    telemetry_age_s: Estimate
+    loop_delay_s: Estimate
+    headroom: float | None
+    received: int
+    lost: int
+    late: int
+    duplicate: int
+    clock: Clock
+
+
+class MonitorReport(Published):
+    """The links that `gcs monitor` watches, and what it sent itself."""
+
+    listening: str
+    duration_s: float
+    delay_margin_s: float | None
+    margin_of: str
+    """Where the margin is from."""
+    silent: bool
+    sent: dict[str, int]
+    send_errors: int
+    stations: tuple[int, ...]
+    refused: dict[str, int]
+    vehicles: tuple[LinkFigures, ...]
 
 
 class WatchedVehicle:
@@ -106,39 +139,37 @@ class WatchedVehicle:
         self.age_s.append(age_s)
         self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s))
 
-    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> Figures:
-        """The figures as plain types, of the whole time or of the last so many looks; an unknown is None."""
+    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> LinkFigures:
+        """The figures of the whole time, or of the last so many looks."""
         clock, frames = self.remote.clock, self.remote.frames
-        estimate = clock.estimate
-        measured = estimate.samples > 0
-        rtt_s = _spread(self.rtt_s, last)
+        known = clock.estimate if clock.estimate.samples else None
         age_s, loop_s = (_spread(looks[: self._judged], last) for looks in (self.age_s, self.loop_delay_s))
-        if not measured:
-            age_s["status"] = loop_s["status"] = "lower bound" if self.states else "unknown"
+        if known is None:
+            bounds = {"status": LOWER_BOUND if self.states else "unknown"}
+            age_s, loop_s = (looks.model_copy(update=bounds) for looks in (age_s, loop_s))
         span_s = (self.state_ns - self.first_state_ns) * 1e-9
-        worst_s = loop_s["p99"]
-        left = None if margin_s is None or worst_s is None else headroom(worst_s, margin_s)
-        return {
-            "system_id": self.remote.system_id,
-            "status": self._status(now_ns, worst_s, left),
-            "telemetry_hz": round((self.states - 1) / span_s, 3) if self.states > 1 and span_s > 0 else None,
-            "rtt_s": rtt_s,
-            "telemetry_age_s": age_s,
-            "loop_delay_s": loop_s,
-            "headroom": left if margin_s else None,
-            "received": frames.received,
-            "lost": frames.lost,
-            "late": frames.late,
-            "duplicate": frames.duplicate,
-            "clock": {
-                "status": "measured" if measured else "unknown",
-                "samples": len(self.rtt_s),
-                "offset_s": estimate.offset_at_ns(now_ns) * 1e-9 if measured else None,
-                "bound_s": estimate.bound_at_ns(now_ns) * 1e-9 if measured else None,
-                "skew_ppm": round(estimate.skew * 1e6, 3) if measured else None,
-                "jumps": clock.jumps,
-            },
-        }
+        left = None if margin_s is None or loop_s.p99 is None else headroom(loop_s.p99, margin_s)
+        return LinkFigures(
+            system_id=self.remote.system_id,
+            status=self._status(now_ns, loop_s.p99, left),
+            telemetry_hz=round((self.states - 1) / span_s, 3) if self.states > 1 and span_s > 0 else None,
+            rtt_s=_spread(self.rtt_s, last),
+            telemetry_age_s=age_s,
+            loop_delay_s=loop_s,
+            headroom=left if margin_s else None,
+            received=frames.received,
+            lost=frames.lost,
+            late=frames.late,
+            duplicate=frames.duplicate,
+            clock=Clock(
+                status="unknown" if known is None else "measured",
+                samples=len(self.rtt_s),
+                offset_s=None if known is None else known.offset_at_ns(now_ns) * 1e-9,
+                bound_s=None if known is None else known.bound_at_ns(now_ns) * 1e-9,
+                skew_ppm=None if known is None else round(known.skew * 1e6, 3),
+                jumps=clock.jumps,
+            ),
+        )
 
     def _status(self, now_ns: int, loop_delay_s: float | None, left: float | None) -> str:
         if not self.remote.heard_ns:
@@ -205,7 +236,7 @@ class Watch:
                 vehicle.look(now_ns)
         return self._look_ns
 
-    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> list[Figures]:
+    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> list[LinkFigures]:
         """The figures of each vehicle, in order of system id."""
         return [self.vehicles[system_id].figures(now_ns, margin_s, last) for system_id in sorted(self.vehicles)]
 
@@ -264,6 +295,5 @@ class Requests:
         return [Outgoing(mavlink.encode(mavlink.TIMESYNC, fields, sequence=sequence, system_id=SYSTEM_ID), address)]
 
 
-def _spread(values: "array[float]", last: int) -> dict[str, Any]:
-    seen: NDArray[np.float64] = np.array(values[-last:] if last else values, dtype=np.float64)
-    return spread_with_status(seen)
+def _spread(values: "array[float]", last: int) -> Estimate:
+    return estimate(np.array(values[-last:] if last else values, dtype=np.float64))

@@ -16,11 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gains.formation.model import FormationModel
 from gcs.control.history import StateHistory
 from gcs.control.law import Blend, distances_m
 from gcs.control.loop_delay import Repetitions
-from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Mode, TickArray
+from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.vehicle import SILENCE_S, ignored
 from gcs.plan.flight_plan import FlightPlan
@@ -34,7 +33,6 @@ from gcs.watch.links import Watch, WatchedVehicle
 from scenarios.schema import NS_PER_S, Scenario
 
 Frames = list[tuple[int, mavlink.Frame]]
-Events = list[dict[str, object]]
 
 _TOLD = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
 _LONGEST_GAP_NS = 10 * NS_PER_S
@@ -48,7 +46,7 @@ class Rebuilt:
     """What a log shows of a flight: rows and events as of a run, and its links."""
 
     ticks: TickArray
-    events: Events
+    events: list[Event]
     links: Watch
     own: bool
     """Whether the log is one of this station, so that its ticks and the flight's end are known."""
@@ -128,8 +126,7 @@ def _plan(scenario: Scenario) -> FlightPlan:
     if timing_of(scenario) is not None:  # the states that a streamed command needs depend on the gains
         return flight_plan(scenario)[1]
     formation = plan_formation(scenario)
-    model = FormationModel(tuple(formation.predecessor.tolist()))
-    return FlightPlan(scenario, formation, np.zeros((model.inputs, model.states)), nan)
+    return FlightPlan(scenario, formation, np.zeros((formation.model.inputs, formation.model.states)), nan)
 
 
 class _Replay:
@@ -162,7 +159,7 @@ class _Replay:
         self._grid_ns = self._newest_ns = 0
         self._open: _OpenTick | None = None
         self._rows: list[TickArray] = []
-        self._events: Events = []
+        self._events: list[Event] = []
 
     def take(self, time_ns: int, frame: mavlink.Frame) -> None:
         """Take in the next frame of the log."""
@@ -310,4 +307,4 @@ class _Replay:
 
     def _event(self, time_ns: int, kind: str, text: str, system_id: int | None = None) -> None:
         time_s = round((time_ns - self._start_ns) / NS_PER_S, 6)
-        self._events.append({"time_s": time_s, "kind": kind, "system_id": system_id, "text": text})
+        self._events.append(Event(time_s=time_s, kind=kind, system_id=system_id, text=text))

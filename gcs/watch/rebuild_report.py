@@ -1,17 +1,21 @@
 """`gcs replay`: what is asked of a log, and the summary made of it."""
 
 from dataclasses import dataclass
-from math import hypot, inf
+from math import hypot
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import PlainSerializer
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.plan.design import Design
+from gcs.published import Published
 from gcs.runs.files import read_design, read_summary
-from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
+from gcs.runs.record import DESIGN_FILE, END, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
 from gcs.runs.summary import summarise
+from gcs.runs.summary_record import Summary
+from gcs.watch.links import LinkFigures
 from gcs.watch.rebuild import Rebuilt, rebuild, watched
 from gcs.watch.tlog import TelemetryLog
 from scenarios import files
@@ -27,7 +31,7 @@ class Replayed:
     log_file: Path
     scenario: Scenario | None
     design: Design | None
-    recorded: dict[str, Any] | None
+    recorded: Summary | None
     """The summary of the run that the log is of."""
 
 
@@ -43,40 +47,61 @@ def found(run_or_file: Path) -> Replayed:
     return Replayed(log_file, scenario, design, recorded)
 
 
-def replay(log: TelemetryLog, replayed: Replayed) -> dict[str, Any]:
+def _compared(recorded: Summary) -> dict[str, Any]:
+    return recorded.model_dump(mode="json", include=set(_COMPARED))
+
+
+class LogContents(Published):
+    """What could be read of a log."""
+
+    file: str
+    frames: int
+    duration_s: float
+    left_out: dict[str, int]
+
+
+class ReplayReport(Published):
     """The summary of a log: of its links, and of the flight if the scenario is known."""
+
+    log: LogContents
+    delay_margin_s: float | None
+    stations: tuple[int, ...]
+    links: tuple[LinkFigures, ...]
+    flight: Summary | None = None
+    recorded: Annotated[Summary, PlainSerializer(_compared)] | None = None
+    """The summary that the station made of the same flight."""
+
+
+def replay(log: TelemetryLog, replayed: Replayed) -> ReplayReport:
+    """The summary of a log, with the figures that were recorded if it is in the folder of a run."""
     first_ns, last_ns = log.frames[0][0], log.frames[-1][0]
-    scenario, design = replayed.scenario, replayed.design
-    margin_s = None if design is None else design.delay_margin_s
-    margins_s = (inf,) if design is None else design.margins_s
-    rebuilt = None if scenario is None else rebuild(log.frames, scenario, margins_s)
+    scenario, design = replayed.scenario, replayed.design or Design(delay_margin_s=None)
+    rebuilt = None if scenario is None else rebuild(log.frames, scenario, design.margins_s)
     watch = watched(log.frames) if rebuilt is None else rebuilt.links
-    result: dict[str, Any] = {
-        "log": {
-            "file": str(replayed.log_file),
-            "frames": len(log.frames),
-            "duration_s": (last_ns - first_ns) * 1e-9,
-            "left_out": dict(log.counters + watch.counters),
-        },
-        "delay_margin_s": margin_s,
-        "stations": sorted(watch.stations),
-        "links": watch.figures(last_ns, margin_s),
+    parts = {
+        "flight": None if rebuilt is None or scenario is None else _flight(scenario, design, rebuilt),
+        "recorded": replayed.recorded,
     }
-    if rebuilt is not None and scenario is not None:
-        result["flight"] = _flight(scenario, design, rebuilt)
-    if replayed.recorded is not None:
-        result["recorded"] = {name: replayed.recorded.get(name) for name in _COMPARED}
-    return result
+    return ReplayReport(
+        log=LogContents(
+            file=str(replayed.log_file),
+            frames=len(log.frames),
+            duration_s=(last_ns - first_ns) * 1e-9,
+            left_out=dict(log.counters + watch.counters),
+        ),
+        delay_margin_s=design.delay_margin_s,
+        stations=tuple(sorted(watch.stations)),
+        links=tuple(watch.figures(last_ns, design.delay_margin_s)),
+        **{name: part for name, part in parts.items() if part is not None},
+    )
 
 
-def _flight(scenario: Scenario, design: Design | None, rebuilt: Rebuilt) -> dict[str, Any]:
-    reason = _reason(scenario, rebuilt)
-    ends = [{"time_s": 0.0, "kind": "end", "system_id": None, "text": reason}]
-    summary = summarise(scenario, design or Design(delay_margin_s=None), rebuilt.ticks, [*rebuilt.events, *ends])
-    if not rebuilt.own:
-        summary |= {"verdict": "not judged", "settling_time_s": None, "control": None}
-    del summary["files"]
-    return summary
+def _flight(scenario: Scenario, design: Design, rebuilt: Rebuilt) -> Summary:
+    end = Event(time_s=0.0, kind=END, text=_reason(scenario, rebuilt))
+    summary = summarise(scenario, design, rebuilt.ticks, [*rebuilt.events, end])
+    if rebuilt.own:
+        return summary
+    return summary.model_copy(update={"verdict": "not judged", "settling_time_s": None, "control": None})
 
 
 def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:

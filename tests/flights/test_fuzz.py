@@ -19,14 +19,14 @@ import numpy as np
 import pytest
 
 from gcs.control.phases import Phase
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.drive.guard import Guard
 from gcs.drive.lockstep import EPOCH_NS, START_NS
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
-from gcs.station.station import Event, Station
+from gcs.station.station import Station
 from gcs.watch.links import Requests, Watch
 from gcs.watch.rebuild_report import Replayed, replay
 from gcs.watch.tlog import parse_tlog

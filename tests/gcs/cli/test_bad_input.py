@@ -164,8 +164,8 @@ def test_brackets_and_colons_in_text_reach_the_terminal(capsys: pytest.CaptureFi
     """A verdict's reason can name a key of a scenario, and a log's name or a vehicle's word be anything."""
     scenario = line(2)
     summary = summarise(scenario, DESIGN, ticks_of(scenario, start_s=0.0, count=100), [])
-    summary["reason"] = "refused: give [response] in [/the scenario] :warning:"
-    print_summary(summary, Path("[bold]"))
+    reason = "refused: give [response] in [/the scenario] :warning:"
+    print_summary(summary.model_copy(update={"reason": reason}), Path("[bold]"))
     told = capsys.readouterr().out
     assert "verdict  aborted: refused: give [response] in [/the scenario] :warning:\n" in told
     assert "files    [bold]: " in told

@@ -45,7 +45,7 @@ def recorded(scenario: Scenario, folder: Path) -> Path:
     for rows in fly_lockstep(plan, station=station):
         writer.tick(rows)
     for event in station.events:
-        writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
+        writer.event(event)
     writer.close()
     record_run(folder)
     return folder
@@ -101,9 +101,10 @@ def test_a_margin_is_drawn_for_the_gains_each_vehicle_is_flown_with(tmp_path: Pa
     known = np.isfinite(headroom)
     np.testing.assert_allclose((100.0 * (1.0 - loops_ms / margins_ms))[known], headroom[known], rtol=1e-9, atol=1e-9)
     summary = finish(folder)
-    margins = {vehicle["system_id"]: vehicle["delay_margin_s"] for vehicle in summary["vehicles"]}
-    assert margins[2] == {"min": pytest.approx(0.3, abs=1e-4), "max": pytest.approx(slower_s, abs=1e-6)}
-    assert margins[3]["max"] == pytest.approx(0.3, abs=1e-4)
+    margins = {vehicle.system_id: vehicle.delay_margin_s for vehicle in summary.vehicles}
+    assert margins[2].min == pytest.approx(0.3, abs=1e-4)
+    assert margins[2].max == pytest.approx(slower_s, abs=1e-6)
+    assert margins[3].max == pytest.approx(0.3, abs=1e-4)
     assert "margin 300.0 ms, up to 610.0 ms with slower gains" in delay_text(summary)
 
 

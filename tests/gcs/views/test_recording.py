@@ -9,12 +9,12 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from gcs.control.tick import TICK, Mode, TickArray
+from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.design import Design
-from gcs.runs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE
+from gcs.runs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE, UNFINISHED_FILE
 from gcs.views.grid import WholeTicks
 from gcs.views.observer import record_run
-from gcs.views.recording import UNFINISHED_FILE, Recording
+from gcs.views.recording import Recording
 from gcs.views.scene import vehicle_colors
 from gcs.views.viewer import ViewerError, find_recording, view
 from tests.support.flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
@@ -118,7 +118,7 @@ def test_the_recording_starts_with_the_flight_and_earlier_events_stand_at_its_st
 def test_what_a_tick_says_of_several_vehicles_is_one_entry(tmp_path: Path) -> None:
     said = [("NOMINAL -> CAUTION", 4), ("NOMINAL -> CAUTION", 3), ("NOMINAL -> LOST", 2), ("NOMINAL -> CAUTION", 1)]
     with Recording(tmp_path, FIVE, DESIGN) as recording:
-        events = [{"time_s": 2.5, "kind": "mode", "system_id": system_id, "text": text} for text, system_id in said]
+        events = [Event(time_s=2.5, kind="mode", system_id=system_id, text=text) for text, system_id in said]
         recording.add(ticks_of(FIVE, start_s=0.0, count=5), events)
     [chunk] = RrdReader(tmp_path / RECORDING_FILE).stream().filter(content="/events")
     batch = chunk.to_record_batch()
