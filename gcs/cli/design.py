@@ -6,7 +6,16 @@ from typing import Annotated
 
 import typer
 
-from gcs.cli.options import AllowUnstable, AsJson, LoopOption, ScenarioFile, load_scenario, print_json, refuse_or_warn
+from gcs.cli.options import (
+    AllowUnstable,
+    AsJson,
+    LoopOption,
+    ScenarioFile,
+    answer,
+    load_scenario,
+    print_json,
+    refuse_or_warn,
+)
 
 
 class Method(Enum):
@@ -29,6 +38,7 @@ def design(
     """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
     from gcs.drive.preflight import unstable_loop
     from gcs.plan.planner import flight_plan
+    from gcs.views.report import print_design
 
     scenario = load_scenario(scenario_file, loop)
     if method is not None:
@@ -37,12 +47,7 @@ def design(
     result, plan = flight_plan(scenario)
     if (unstable := unstable_loop(plan)) is not None:
         refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
-    if as_json:
-        print_json(result)
-    else:
-        from gcs.views.report import print_design
-
-        print_design(result)
+    answer(result, print_design, as_json=as_json)
 
 
 def margin(

@@ -1,12 +1,13 @@
 """`gcs fly` and `gcs key`: what a flight is asked for, and what its exit code says."""
 
 import contextlib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gcs.cli.exit_codes import FAILED, INTERRUPTED
+from gcs.cli import FAILED, INTERRUPTED
 from gcs.cli.options import (
     AllowUnstable,
     AsJson,
@@ -14,12 +15,12 @@ from gcs.cli.options import (
     LoopOption,
     ScenarioFile,
     address,
+    answer,
     listening,
     load_scenario,
     mirroring,
     opened_guard,
     out_folder,
-    print_json,
     refuse,
     refuse_or_warn,
     warn_if_open,
@@ -67,6 +68,7 @@ def fly(
     from gcs.drive.fly import fly as fly_now
     from gcs.drive.takeover import CONNECTED, TAKEN_OVER, Presence
     from gcs.plan.planner import flight_plan
+    from gcs.views.report import print_design, print_summary
 
     outlive_readers()
     scenario = load_scenario(scenario_file, loop)
@@ -92,8 +94,6 @@ def fly(
         there = Presence(link, plan.scenario, guard)
         taken_over = there.taken_over() if connect is None else []
         if not as_json:
-            from gcs.views.report import print_design
-
             print_design(design)
         folder = out_folder(out) if out is not None else new_folder(scenario.name)
         options = FlyOptions(
@@ -106,12 +106,7 @@ def fly(
         summary = fly_now(plan, design, link, options, guard, to)
         if taken_over:
             there.shut_down()
-    if as_json:
-        print_json(summary)
-    else:
-        from gcs.views.report import print_summary
-
-        print_summary(summary, folder)
+    answer(summary, partial(print_summary, folder=folder), as_json=as_json)
     raise typer.Exit(_exit_code(summary))
 
 

@@ -8,8 +8,8 @@ import sys
 
 import typer
 
+from gcs.cli import BAD_INPUT, FAILED, INTERRUPTED
 from gcs.cli.design import design, margin
-from gcs.cli.exit_codes import BAD_INPUT, FAILED, INTERRUPTED
 from gcs.cli.fly import fly, key
 from gcs.cli.runs import grade, recover, view
 from gcs.cli.stress import stress

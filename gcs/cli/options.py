@@ -2,11 +2,12 @@
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
 from enum import Enum
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from gcs.drive.mirror import Mirror
     from gcs.drive.udp import StationSocket
     from scenarios.schema import Scenario
+
+
+Result = TypeVar("Result")
 
 
 class Loop(Enum):
@@ -43,11 +47,19 @@ KeyFile = Annotated[
 
 def print_json(result: Any) -> None:
     """Print a result as `--json` asks for it; records in it are written with their fields."""
-    typer.echo(json.dumps(result, indent=2, allow_nan=False, default=_fields))
+
+    def fields(record: Any) -> Any:
+        return record.to_dict() if hasattr(record, "to_dict") else asdict(record)
+
+    typer.echo(json.dumps(result, indent=2, allow_nan=False, default=fields))
 
 
-def _fields(record: Any) -> Any:
-    return record.to_dict() if hasattr(record, "to_dict") else asdict(record)
+def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> None:
+    """Print a result: as JSON, or in the way that `show` does."""
+    if as_json:
+        print_json(result)
+    else:
+        show(result)
 
 
 def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":

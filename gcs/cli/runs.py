@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gcs.cli.exit_codes import FAILED
-from gcs.cli.options import AsJson, RunFolder, out_file, print_json, within
+from gcs.cli import FAILED
+from gcs.cli.options import AsJson, RunFolder, answer, out_file, within
 from gcs.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,11 +17,7 @@ def grade(run: RunFolder, as_json: AsJson = False) -> None:
     """How true a flight's latencies were, and how punctual its emulated links: errors against the truth log."""
     from gcs.runs.grade import grade as graded
 
-    result = graded(run)
-    if as_json:
-        print_json(result)
-    else:
-        print_grade(result)
+    answer(graded(run), print_grade, as_json=as_json)
 
 
 def print_grade(result: "Grade") -> None:
@@ -75,11 +71,7 @@ def view(
 
 def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run that was killed")]) -> None:
     """Finish the files of a run whose processes were killed: ticks.parquet, summary.json, flight.rrd."""
-    from gcs.runs.summary import finish
-    from gcs.views.observer import record_run
+    from gcs.views.observer import recover_run
     from gcs.views.report import print_summary
 
-    finish(run)
-    record_run(run)
-    summary = finish(run)  # again: it lists the files
-    print_summary(summary, run)
+    print_summary(recover_run(run), run)

@@ -4,24 +4,26 @@ The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
 """
 
 import contextlib
+import itertools
 import os
 from collections.abc import Generator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gcs.cli.exit_codes import FAILED
+from gcs.cli import FAILED
 from gcs.cli.options import (
     AsJson,
     Loop,
     LoopOption,
     ScenarioFile,
+    answer,
     load_scenario,
     out_file,
     out_folder,
-    print_json,
     refuse,
 )
 from gcs.errors import InputError
@@ -30,6 +32,7 @@ from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
     from gcs.plan.design import Design
+    from gcs.stress.axes import Axis
     from gcs.stress.campaign import Fly
     from gcs.stress.report import CampaignResult
     from gcs.stress.study import Onset, Study
@@ -123,6 +126,7 @@ def stress(
     outlive_readers()
     if junit is not None:
         out_file("--junit", junit)
+    from gcs.cli.stress_output import print_result, write_junit
     from gcs.stress.campaign import CampaignError
 
     try:
@@ -133,15 +137,8 @@ def stress(
     except CampaignError as error:
         raise InputError(str(error)) from None
     if junit is not None:
-        from gcs.cli.stress_output import write_junit
-
         write_junit(result, junit)
-    if as_json:
-        print_json(result)
-    else:
-        from gcs.cli.stress_output import print_result
-
-        print_result(result, folder)
+    answer(result, partial(print_result, folder=folder), as_json=as_json)
     raise typer.Exit(0 if result.passed else FAILED)
 
 
@@ -228,29 +225,25 @@ def _study(options: StressOptions) -> "tuple[Study, Design]":
     return Study(plan, real_time=options.real_time), design
 
 
-def _axes(options: StressOptions, study: "Study") -> "list[Any]":
+def _axes(options: StressOptions, study: "Study") -> "list[Axis]":
     from gcs.stress.axes import AxisError, parse_axis, parse_vehicle_axis
 
-    axes: list[Any] = []
+    ids = study.plan.formation.system_ids
+    axes: list[Axis] = []
     for name, text in options.axes:
         try:
-            of_vehicle = name == "delay_of"
-            axes.append(
-                parse_vehicle_axis(text, study.plan.formation.system_ids) if of_vehicle else parse_axis(name, text)
-            )
+            axes.append(parse_vehicle_axis(text, ids) if name == "delay_of" else parse_axis(name, text))
         except AxisError as error:
             raise InputError(f"--{name.replace('_', '-')}: {error}") from None
     return axes
 
 
-@contextlib.contextmanager
-def _workers(options: StressOptions) -> "Generator[Fly]":
+def _workers(options: StressOptions) -> "contextlib.AbstractContextManager[Fly]":
     from gcs.stress.campaign import dask_workers, local_workers
 
     # flights in real time disturb each other: one at a time unless the user knows better
     count = options.workers or (1 if options.real_time else len(os.sched_getaffinity(0)))
-    with dask_workers(options.dask) if options.dask else local_workers(count) as fly:
-        yield fly
+    return dask_workers(options.dask) if options.dask else local_workers(count)
 
 
 @contextlib.contextmanager
@@ -276,13 +269,11 @@ def _progress(shown: bool) -> Generator[Any]:
 
         def begin(name: str, total: int | None) -> Any:
             task = bar.add_task(name, total=total)
-            count = 0
+            begun = itertools.count(1)
 
             def ended(_: "Outcome", left: int) -> None:
-                nonlocal count
-                count += 1
-                done = count if total is None else total - left
-                bar.update(task, completed=done, total=count + left if total is None else total)
+                done = next(begun) if total is None else total - left
+                bar.update(task, completed=done, total=done + left)
 
             return ended
 

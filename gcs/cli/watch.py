@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gcs.cli.exit_codes import FAILED, INTERRUPTED
-from gcs.cli.options import AsJson, KeyFile, listening, opened_guard, print_json
+from gcs.cli import FAILED, INTERRUPTED
+from gcs.cli.options import AsJson, KeyFile, answer, listening, opened_guard, print_json
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
-    from gcs.watch.links import MonitorReport
-    from gcs.watch.rebuild_report import ReplayReport
+    from gcs.watch.links import WatchReport
+    from gcs.watch.rebuild_report import RebuildReport
 
 _TIMESYNC_HZ = 10.0
 ComparedMargin = Annotated[
@@ -57,10 +57,10 @@ def monitor(
         # Imported after the socket is open: datagrams that come meanwhile keep their receive stamps.
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
-        from gcs.watch.live import MonitorOptions, monitor_links
+        from gcs.watch.live import WatchOptions, watch_links
 
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
-        options = MonitorOptions(
+        options = WatchOptions(
             margin_s=margin_s,
             margin_of=margin_of,
             timesync_hz=0.0 if silent else asked_hz,
@@ -69,7 +69,7 @@ def monitor(
         )
         watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
         with stop_signals() as stop_reason:
-            report = monitor_links(link, watch, options, stop_reason, guard)
+            report = watch_links(link, watch, options, stop_reason, guard)
             interrupted = bool(stop_reason())
     if as_json:
         print_json(report)
@@ -104,10 +104,10 @@ def replay(
     _refuse_both(margin, design)
     from gcs.plan.design import Design
     from gcs.runs.files import read_design
-    from gcs.watch import rebuild_report
+    from gcs.watch.rebuild_report import found, rebuild_report
     from gcs.watch.tlog import TlogError, read_tlog
 
-    there = rebuild_report.found(run)
+    there = found(run)
     given = None if design is None else read_design(design)
     try:
         log = read_tlog(there.log_file)
@@ -125,14 +125,10 @@ def replay(
         from gcs.plan.planner import flight_plan
 
         there = replace(there, design=flight_plan(there.scenario)[0])
-    result = rebuild_report.replay(log, there)
-    if as_json:
-        print_json(result)
-    else:
-        _print_replay(result)
+    answer(rebuild_report(log, there), _print_rebuilt, as_json=as_json)
 
 
-def _print_replay(report: "ReplayReport") -> None:
+def _print_rebuilt(report: "RebuildReport") -> None:
     """Print what was read of the log, its links, and the flight if the formation is known."""
     from gcs.views.console import plain_console
     from gcs.views.report import delay_text, print_flight
@@ -156,7 +152,7 @@ def _refuse_both(margin: float | None, design: Path | None) -> None:
         raise InputError("read --margin and --design, wanted one of them")
 
 
-def _exit_code(report: "MonitorReport") -> int:
+def _exit_code(report: "WatchReport") -> int:
     bad = {"not heard", "past the margin"} & {vehicle.status for vehicle in report.vehicles}
     return FAILED if bad or not report.vehicles else 0
 

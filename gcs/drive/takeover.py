@@ -57,7 +57,7 @@ class Presence:
         """
         self._listen(self._link.bound_ns + round(_HEARTBEAT_PERIOD_S * NS_PER_S))
         there = sorted(self._addresses)
-        said = self._converse(
+        said = self._ask(
             there,
             lambda system_id: (
                 mavlink.PARAM_EXT_REQUEST_READ,
@@ -78,7 +78,7 @@ class Presence:
 
     def _command(self, system_ids: list[int], wanted: float) -> list[int]:
         """The vehicles that acknowledged the command."""
-        said = self._converse(
+        said = self._ask(
             system_ids,
             lambda system_id: (
                 mavlink.COMMAND_LONG,
@@ -88,7 +88,7 @@ class Presence:
         )
         return sorted(said)
 
-    def _converse(self, system_ids: Iterable[int], make: Make, answer: Answer) -> dict[int, str]:
+    def _ask(self, system_ids: Iterable[int], make: Make, answer: Answer) -> dict[int, str]:
         """Each vehicle's answer to a message, which is repeated until the answer arrives or patience ends."""
         said: dict[int, str] = {}
         left = set(system_ids)

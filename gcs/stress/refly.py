@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gcs.runs.record import SCENARIO_FILE
-from gcs.runs.summary import finish
 from gcs.stress.campaign import CampaignError, Store, check_campaign
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, Trial
-from gcs.views.observer import record_run
+from gcs.views.observer import recover_run
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,7 @@ def refly(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Reflow
     outcome = fly_trial(again, run)
     runs = [run] if (run / SCENARIO_FILE).exists() else sorted(run.iterdir()) if run.is_dir() else []
     for flight in runs:
-        finish(flight)
-        record_run(flight)
-        finish(flight)  # again: it lists the files
+        recover_run(flight)
     return Reflown(outcome, runs, [] if again.real_time else _differences(outcome, stored))
 
 

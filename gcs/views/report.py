@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, ResponsePart
@@ -17,25 +18,27 @@ def print_design(design: Design, console: Console | None = None) -> None:
     """Gains, robustness, both margins, and the trade-off between robustness and margin."""
     console = console or plain_console()
     console.print(f"design   {design.method}, loop {design.loop}, period {design.period_s * 1e3:g} ms")
-    if design.inclusion_gains is None or design.behaviour is None:
-        _print_graph_design(design, console)
-        return
-    own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
-    console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
-    console.print("         u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike")
-    _print_margins(design, console)
-    console.print(_response(design.response), end="")
-    console.print(
-        f"alpha    {design.alpha:.4f} (robustness bound), decay {design.behaviour.decay_rate_1_s:.2f} 1/s without delay"
-    )
+    if design.inclusion_gains is not None and design.behaviour is not None:
+        own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
+        console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
+        law = "u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike"
+        console.print(f"         {law}")
+        _print_margins(design, console)
+        console.print(_response(design.response), end="")
+        bound, decay_1_s = "robustness bound", design.behaviour.decay_rate_1_s
+    else:
+        console.print(_blocks_table(design))
+        _print_margins(design, console)
+        bound, decay_1_s = "robustness bound of the whole formation", design.decay_rate_1_s
+    loss = "" if design.cost_loss is None else f"; costs {design.cost_loss:.1%} more than with all information"
+    console.print(f"alpha    {design.alpha:.4f} ({bound}), decay {decay_1_s:.2f} 1/s without delay{loss}")
     if design.at_loop_delay is not None:
         _print_figures_at_delay(design.at_loop_delay, console)
-    if not design.trade_off:
-        return
-    table = numbers_table("delay margin, ms", "largest alpha", title="the trade-off it sits on")
-    for point in design.trade_off:
-        table.add_row(ms_text(point.delay_margin_s, unit=""), f"{point.alpha:.3f}")
-    console.print(table)
+    if design.trade_off:
+        table = numbers_table("delay margin, ms", "largest alpha", title="the trade-off it sits on")
+        for point in design.trade_off:
+            table.add_row(ms_text(point.delay_margin_s, unit=""), f"{point.alpha:.3f}")
+        console.print(table)
 
 
 def _print_margins(design: Design, console: Console) -> None:
@@ -82,25 +85,17 @@ def _up_to(delay_s: float | None) -> str:
     return "at no loop delay" if delay_s == 0.0 else f"up to {ms_text(delay_s)} of it"
 
 
-def _print_graph_design(design: Design, console: Console) -> None:
+def _blocks_table(design: Design) -> Table:
     """The gain matrix by blocks: who uses whose errors, and how."""
     table = numbers_table("vehicle", "uses", "spacing error, 1/s²", "velocity error, 1/s")
     for block in design.blocks:
         *spacing, north, east = zip(*block.gain, strict=True)
         table.add_row(str(block.vehicle), str(block.of), _matrix(spacing), _matrix([north, east]))
-    console.print(table)
-    _print_margins(design, console)
-    loss = "" if design.cost_loss is None else f"; costs {design.cost_loss:.1%} more than with all information"
-    console.print(
-        f"alpha    {design.alpha:.4f} (robustness bound of the whole formation), decay "
-        f"{design.decay_rate_1_s:.2f} 1/s without delay{loss}"
-    )
-    if design.at_loop_delay is not None:
-        _print_figures_at_delay(design.at_loop_delay, console)
+    return table
 
 
 def _matrix(columns: Sequence[Sequence[float]]) -> str:
-    """A block as one number where it is that on each axis alike, else with all of its numbers."""
+    """A block: one number if it is the same on both axes and does not couple them, else all four."""
     if not columns:
         return UNKNOWN
     (a, c), (b, d) = columns
@@ -179,7 +174,7 @@ def delay_text(summary: Summary) -> str:
 
 
 def _response(response: ResponsePart | None) -> str:
-    """A line on how the vehicles answer, if they do not do so at once."""
+    """A line on how the vehicles respond to set-points; empty if they do at once."""
     if response is None:
         return ""
     if not response.vehicles:

@@ -59,7 +59,7 @@ class LinkFigures(Published):
     clock: Clock
 
 
-class MonitorReport(Published):
+class WatchReport(Published):
     """The links that `gcs monitor` watches, and what it sent itself."""
 
     listening: str

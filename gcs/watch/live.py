@@ -14,7 +14,7 @@ from gcs.drive.guard import Guard
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.link import mavlink
 from gcs.views.console import draw, live_display
-from gcs.watch.links import MonitorReport, Requests, Watch
+from gcs.watch.links import Requests, Watch, WatchReport
 from gcs.watch.table import plain_line, render
 from scenarios.schema import NS_PER_S
 
@@ -25,7 +25,7 @@ _WINDOW_LOOKS = 50
 
 
 @dataclass(frozen=True)
-class MonitorOptions:
+class WatchOptions:
     """How links are watched."""
 
     margin_s: float | None
@@ -37,20 +37,20 @@ class MonitorOptions:
     shown: bool
 
 
-def monitor_links(
+def watch_links(
     link: StationSocket,
     watch: Watch,
-    options: MonitorOptions,
+    options: WatchOptions,
     stop_reason: Callable[[], str],
     guard: Guard | None = None,
-) -> MonitorReport:
+) -> WatchReport:
     """Watch until the time is over or a reason to stop is given; returns the figures of the whole time."""
     requests = Requests(options.timesync_hz)
     start_ns = now_ns = clock_ns()
     end_ns = start_ns + round(options.seconds * NS_PER_S) if math.isfinite(options.seconds) else 1 << 62
 
-    def report(last: int = 0) -> MonitorReport:
-        return MonitorReport(
+    def report(last: int = 0) -> WatchReport:
+        return WatchReport(
             listening="{}:{}".format(*link.address),
             duration_s=round((now_ns - start_ns) / NS_PER_S, 3),
             delay_margin_s=options.margin_s,
@@ -84,7 +84,7 @@ def monitor_links(
     return report()
 
 
-def _show(live: Live | None, report: MonitorReport) -> None:
+def _show(live: Live | None, report: WatchReport) -> None:
     """A table on a terminal, else a line now and then."""
     if live is None:
         print(plain_line(report), flush=True)

@@ -76,10 +76,10 @@ class _OpenTick:
 
 def rebuild(frames: Frames, scenario: Scenario, margins_s: tuple[float, ...]) -> Rebuilt:
     """The flight of a scenario in a log; `margins_s` are those of the gain schedule, fastest first."""
-    replayed = _Replay(scenario, margins_s, _outline(frames, scenario))
+    flight = _Rebuilding(scenario, margins_s, _outline(frames, scenario))
     for time_ns, frame in frames:
-        replayed.take(time_ns, frame)
-    return replayed.finished()
+        flight.take(time_ns, frame)
+    return flight.finished()
 
 
 def watched(frames: Iterable[tuple[int, mavlink.Frame]]) -> Watch:
@@ -129,7 +129,7 @@ def _plan(scenario: Scenario) -> FlightPlan:
     return FlightPlan(scenario, formation, np.zeros((formation.model.inputs, formation.model.states)), nan)
 
 
-class _Replay:
+class _Rebuilding:
     """The station's picture of the vehicles, built up again."""
 
     def __init__(self, scenario: Scenario, margins_s: tuple[float, ...], outline: _Outline) -> None:

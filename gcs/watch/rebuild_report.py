@@ -25,7 +25,7 @@ _COMPARED = ("verdict", "loop", "delay_margin_s", "loop_delay_s", "headroom_min"
 
 
 @dataclass(frozen=True)
-class Replayed:
+class LogSource:
     """Where a log is, and what it is compared with as far as that is known."""
 
     log_file: Path
@@ -35,7 +35,7 @@ class Replayed:
     """The summary of the run that the log is of."""
 
 
-def found(run_or_file: Path) -> Replayed:
+def found(run_or_file: Path) -> LogSource:
     """The log, and what stands beside it in the folder of a run."""
     folder = run_or_file if run_or_file.is_dir() else run_or_file.parent
     log_file = folder / TLOG_FILE if run_or_file.is_dir() else run_or_file
@@ -44,7 +44,7 @@ def found(run_or_file: Path) -> Replayed:
     scenario = files.load(scenario_file) if own and scenario_file.exists() else None
     design = read_design(design_file) if own and design_file.exists() else None
     recorded = read_summary(summary_file) if own and summary_file.exists() else None
-    return Replayed(log_file, scenario, design, recorded)
+    return LogSource(log_file, scenario, design, recorded)
 
 
 def _compared(recorded: Summary) -> dict[str, Any]:
@@ -60,7 +60,7 @@ class LogContents(Published):
     left_out: dict[str, int]
 
 
-class ReplayReport(Published):
+class RebuildReport(Published):
     """The summary of a log: of its links, and of the flight if the scenario is known."""
 
     log: LogContents
@@ -72,19 +72,19 @@ class ReplayReport(Published):
     """The summary that the station made of the same flight."""
 
 
-def replay(log: TelemetryLog, replayed: Replayed) -> ReplayReport:
+def rebuild_report(log: TelemetryLog, source: LogSource) -> RebuildReport:
     """The summary of a log, with the figures that were recorded if it is in the folder of a run."""
     first_ns, last_ns = log.frames[0][0], log.frames[-1][0]
-    scenario, design = replayed.scenario, replayed.design or Design(delay_margin_s=None)
+    scenario, design = source.scenario, source.design or Design(delay_margin_s=None)
     rebuilt = None if scenario is None else rebuild(log.frames, scenario, design.margins_s)
     watch = watched(log.frames) if rebuilt is None else rebuilt.links
     parts = {
         "flight": None if rebuilt is None or scenario is None else _flight(scenario, design, rebuilt),
-        "recorded": replayed.recorded,
+        "recorded": source.recorded,
     }
-    return ReplayReport(
+    return RebuildReport(
         log=LogContents(
-            file=str(replayed.log_file),
+            file=str(source.log_file),
             frames=len(log.frames),
             duration_s=(last_ns - first_ns) * 1e-9,
             left_out=dict(log.counters + watch.counters),

@@ -8,14 +8,14 @@ from rich.text import Text
 
 from gcs.views.console import UNKNOWN, fitted_table, ms_text, not_shown, number_text
 from gcs.views.table import headroom_style
-from gcs.watch.links import LOWER_BOUND, LinkFigures, MonitorReport
+from gcs.watch.links import LOWER_BOUND, LinkFigures, WatchReport
 
 STATUS_STYLES = {"measured": "green", "past the margin": "bold red", "silent": "bold red", "not heard": "bold red"}
 _USUAL, _WIDE = 73, 140
 """Widths of terminals that more columns have room on."""
 
 
-def render(report: MonitorReport, *, width: int, height: int | None = None) -> RenderableType:
+def render(report: WatchReport, *, width: int, height: int | None = None) -> RenderableType:
     """The whole display, in at most `height` lines: what fits of the vehicles, the worst, and how many do not."""
     vehicles = report.vehicles
     room = len(vehicles) if height is None else max(1, height - 7)
@@ -26,7 +26,7 @@ def render(report: MonitorReport, *, width: int, height: int | None = None) -> R
     return Group(_headline(report), table, *not_shown(hidden), _footer(report))
 
 
-def plain_line(report: MonitorReport) -> str:
+def plain_line(report: WatchReport) -> str:
     """The links in one line of text."""
     vehicles = report.vehicles
     if not vehicles:
@@ -45,7 +45,7 @@ def _badness(figures: LinkFigures) -> tuple[bool, float]:
     return figures.status not in ("silent", "not heard"), 1.0 if figures.headroom is None else figures.headroom
 
 
-def _headline(report: MonitorReport) -> Text:
+def _headline(report: WatchReport) -> Text:
     line = Text.assemble(("links", "bold"), f" at {report.listening}  {report.duration_s:.1f} s", no_wrap=True)
     margin_s = report.delay_margin_s
     of = f"{ms_text(margin_s)} ({report.margin_of})" if margin_s is not None else "none given"
@@ -104,7 +104,7 @@ def links_table(vehicles: Sequence[LinkFigures], width: int) -> Table:
     return fitted_table(columns, map(row, vehicles), width=width, gap=1 if width >= _WIDE else 0)
 
 
-def _footer(report: MonitorReport) -> Text:
+def _footer(report: WatchReport) -> Text:
     text = "nothing is sent" if report.silent else f"sent {report.sent['TIMESYNC']} TIMESYNC requests, nothing else"
     if report.stations:
         text += f"; stations heard: {' '.join(map(str, report.stations))}"

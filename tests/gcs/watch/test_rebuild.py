@@ -13,7 +13,7 @@ from gcs.link import mavlink
 from gcs.plan.design import Design
 from gcs.runs.summary_record import Summary
 from gcs.watch.rebuild import rebuild
-from gcs.watch.rebuild_report import Replayed, replay
+from gcs.watch.rebuild_report import LogSource, rebuild_report
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
 from scenarios.schema import Scenario
@@ -22,7 +22,7 @@ from tests.support.known import known
 from tests.support.logged_flight import EPOCH_NS, flown, log_bytes
 from tests.support.paths import SCENARIOS
 
-pytestmark = pytest.mark.xdist_group("replay")  # they share flights
+pytestmark = pytest.mark.xdist_group("rebuild")  # they share flights
 
 FLIGHTS: dict[str, tuple[str, float, float | None]] = {
     "chain3": ("chain3", 6.0, None),
@@ -52,7 +52,7 @@ def both(flight: str) -> tuple[Summary, Summary]:
     """The summary of a flight, and the one made of its log."""
     scenario = scenario_of(flight)
     design, summary, _, entries = flown(scenario)
-    rebuilt = replay(parse_tlog(log_bytes(entries)), Replayed(Path("flight.tlog"), scenario, design, None))
+    rebuilt = rebuild_report(parse_tlog(log_bytes(entries)), LogSource(Path("flight.tlog"), scenario, design, None))
     assert rebuilt.flight is not None
     return summary, rebuilt.flight
 
@@ -142,7 +142,7 @@ def test_a_log_of_another_tool_gives_links_and_errors_and_no_verdict(requests: b
     scenario = scenario_of("chain3")
     data, ticks = overheard(requests=requests)
     log = parse_tlog(data)
-    result = replay(log, Replayed(Path("other.tlog"), scenario, Design(delay_margin_s=0.3), None))
+    result = rebuild_report(log, LogSource(Path("other.tlog"), scenario, Design(delay_margin_s=0.3), None))
     assert result.flight is not None
     assert (result.flight.verdict, result.flight.control) == ("not judged", None)
     for links in result.links:
@@ -164,7 +164,7 @@ def test_a_log_of_another_tool_gives_links_and_errors_and_no_verdict(requests: b
 
 def test_without_a_scenario_the_links_are_all_that_is_told() -> None:
     data, _ = overheard(requests=True)
-    result = replay(parse_tlog(data), Replayed(Path("other.tlog"), None, None, None))
+    result = rebuild_report(parse_tlog(data), LogSource(Path("other.tlog"), None, None, None))
     assert "flight" not in result.to_dict()
     assert [links.system_id for links in result.links] == [1, 2, 3]
     assert {links.headroom for links in result.links} == {None}
