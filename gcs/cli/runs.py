@@ -46,7 +46,7 @@ def view(
 
     Exit code 1 if a view of the picture reports a fault.
     """
-    from gcs.views.viewer import ViewerError, find_recording, picture_time_s, screenshot
+    from gcs.views.viewer import find_recording, picture_time_s, screenshot
     from gcs.views.viewer import view as open_viewer
 
     if at is not None:
@@ -55,15 +55,12 @@ def view(
         out_file("--picture", picture)
         if picture.suffix.lower() != ".png":
             raise InputError(f"--picture: read {picture}, wanted a name that ends in .png, as what is written is PNG")
-    try:
-        recording = find_recording(run)
-        if picture is None:
-            raise typer.Exit(open_viewer(recording))
-        time_s = picture_time_s(recording, at)
-        complaints = screenshot(recording, picture, time_s=time_s)
-        typer.echo(f"picture  {picture}: {recording} at {time_s:g} s")
-    except ViewerError as error:
-        raise InputError(str(error)) from None
+    recording = find_recording(run)
+    if picture is None:
+        raise typer.Exit(open_viewer(recording))
+    time_s = picture_time_s(recording, at)
+    complaints = screenshot(recording, picture, time_s=time_s)
+    typer.echo(f"picture  {picture}: {recording} at {time_s:g} s")
     for complaint in complaints:
         typer.echo(complaint, err=True)
     raise typer.Exit(FAILED if complaints else 0)

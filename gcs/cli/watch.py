@@ -105,14 +105,11 @@ def replay(
     from gcs.plan.design import Design
     from gcs.runs.files import read_design
     from gcs.watch.rebuild_report import found, rebuild_report
-    from gcs.watch.tlog import TlogError, read_tlog
+    from gcs.watch.tlog import read_tlog
 
     there = found(run)
     given = None if design is None else read_design(design)
-    try:
-        log = read_tlog(there.log_file)
-    except TlogError as error:
-        raise InputError(str(error)) from None
+    log = read_tlog(there.log_file)
     if scenario_file is not None:
         from scenarios.files import load
 

@@ -25,10 +25,14 @@ class Event:
     time_s: float
     kind: str
     system_id: int | None = None
-    """The vehicle that it is about, if any."""
     text: str
     counts: dict[str, int] | None = None
     """How often each thing named in the text happened, where it counts them."""
+
+    @property
+    def about(self) -> list[int]:
+        """The vehicle that it is about, in a list; empty if it is about none."""
+        return [] if self.system_id is None else [self.system_id]
 
 
 class Mode(IntEnum):

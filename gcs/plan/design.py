@@ -73,7 +73,7 @@ class Block(Published):
 
 
 class GainSet(Published):
-    """One entry of the gain schedule: its gains, or the share of what is streamed, and what they are good for."""
+    """One entry of the gain schedule: its gains, or the share of the stream it flies with, and its figures."""
 
     streamed_share: float = 1.0
     time_scale: float = 1.0
@@ -136,10 +136,10 @@ class FiguresAtExpectedDelay(FiguresAtDelay):
 
 
 class Design(Published):
-    """The gains of a scenario, what they are good for, and how that is known; fields as published in design.json.
+    """The gains of a scenario, their margins and other figures, and the proofs; fields as published in design.json.
 
-    Only the margins have to be there: what a method does not give, and what an older file lacks, keeps its default and
-    is not written. Of the margins in a schedule the first is that of the design.
+    Only the sampled margin is required: what a method does not give, and what an older file lacks, keeps its default
+    and is not written. The first margin of the schedule is that of the design.
     """
 
     K1_1_s: Matrix | None = None

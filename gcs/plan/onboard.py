@@ -36,12 +36,11 @@ def timing_of(scenario: Scenario) -> OnboardTiming | None:
 
 
 def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
-    """Design and plan of a ground loop, made those of the onboard loop with the same gains.
+    """Design and plan of the onboard loop, from those of a ground loop with the same gains.
 
-    Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. The
-    slower entries of the schedule leave the vehicles' own gains as they are and take a smaller share of what is
-    streamed: with none of it the formation is stable at every delay. That is what is flown around a lost vehicle, if
-    vehicles act on each other both ways.
+    Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. Slower
+    entries of the schedule keep the vehicles' own gains and reduce the share of the stream. Without any of it the
+    formation is stable at every delay: where vehicles act on each other both ways, that is flown around a lost one.
     """
     timing = timing_of(plan.scenario)
     assert timing is not None

@@ -28,7 +28,7 @@ _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
 
 _MORE = 1.1
-"""What the rates take of a margin asked for is asked for so many times more: it is a small part of the margin."""
+"""A design whose margin is too short at these rates is repeated for a margin larger by the shortage times this."""
 
 
 def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
@@ -59,7 +59,7 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
 
 
 def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
-    """Design and plan of a ground loop, made those of the scenario's loop, with the figures at its delay."""
+    """Design and plan of the scenario's loop, from those of its ground loop, with the figures at its delay."""
     if plan.scenario.control.loop == "onboard":
         design, plan = onboard_plan(design, plan)
     return with_figures_at_delay(design, plan.scenario), plan
@@ -81,9 +81,9 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
 
 
 def described(design: Design, plan: FlightPlan) -> Design:
-    """The design with the vehicles' responses in it: its margins become those with them.
+    """The design with the vehicles' responses, and its margins with them.
 
-    `delay_margin_at_once_s` is the margin that the same gains have on vehicles that answer at once.
+    `delay_margin_at_once_s` is the margin of the same gains on vehicles that respond at once.
     """
     assert plan.responses is not None
     every = plan.responses.in_order(plan.formation.system_ids)
@@ -118,7 +118,7 @@ def _with_margins(
 def _schedule(scenario: Scenario, model: FormationModel, found: InclusionDesign) -> list[tuple[float, InclusionDesign]]:
     """The design slowed down by the scenario's factors.
 
-    With K1 / s, K2 / s and K3 / s² the loop does the same things s times slower, so its delay margin is s times larger.
+    With K1 / s, K2 / s and K3 / s² the loop moves s times slower, so its delay margin is s times larger.
     """
     period_s = loop_timing(scenario).held_s
     return [
@@ -220,7 +220,7 @@ def _blocks(K: FloatArray, formation: Formation, pattern: Pattern) -> list[Block
 def _around_loss(
     model: FormationModel, delay_margin_s: float, scales: tuple[float, ...], period_s: float
 ) -> tuple[FloatArray, ...]:
-    """Inclusion gains of the same delay margin, as far as they can have it, slowed down by each factor."""
+    """Inclusion gains of the same delay margin, within limits, slowed down by each factor."""
     margin_s = min(max(delay_margin_s, _MARGINS_AROUND_LOSS_S[0]), _MARGINS_AROUND_LOSS_S[1])
     found = design(model, Requirement(delay_margin_s=margin_s, string_peak_max=1.0), period_s=period_s)
     K = model.overlapping_gain(found.K1, found.K2, found.K3)

@@ -1,6 +1,6 @@
-"""The files of a run's folder, each with its one reader: what is damaged, or of another kind, is told in one line.
+"""The one reader of each file in a run's folder.
 
-Raised everywhere here: gcs.errors.InputError.
+A file that is damaged, or of another kind, raises gcs.errors.InputError with one line.
 """
 
 from pathlib import Path
@@ -56,7 +56,7 @@ def read_ticks(folder: Path) -> TickArray:
 
 
 _ADDED = {"delay_margin_s": np.nan, "repeated_s": 0.0}
-"""Columns that older runs lack, and what is read for them."""
+"""Columns that older runs lack, and the values read instead."""
 
 
 def _from_parquet(file: Path) -> TickArray:

@@ -2,7 +2,7 @@
 
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
 loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
-acts; both are in the truth by the time_boot_ms that the messages bear.
+acts; both are found in the truth by the time_boot_ms of the messages.
 """
 
 import itertools
@@ -75,10 +75,10 @@ def grade(folder: Path) -> Grade:
 
 
 def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:
-    """Each measured round trip against that of the nearest reply which had left before the tick that logs it.
+    """The error of each measured round trip against the nearest true one whose reply had left before its tick.
 
-    Both are in order of time, and each reply is one round trip at most; of several that came between two ticks the
-    later ones are in the ticks after.
+    Both are in order of time and each reply counts once: of several replies between two ticks, later ticks log the
+    later ones.
     """
     rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
     due_ns, trip_s = true_round_trips(truth, system_id)
@@ -134,7 +134,7 @@ def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
 
 
 def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
-    """For each row that of the same tick whose state its loop delay counts from.
+    """For each row, the row of the same tick whose state its loop delay counts from.
 
     In the ground loop its own; in the onboard loop that of the oldest state that was needed, known by its age.
     """
@@ -149,7 +149,7 @@ def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
 
 
 def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
-    """(System id, time_boot_ms) to the first instant with that key."""
+    """The first instant (ns) of each (system id, time_boot_ms)."""
     own = truth[truth["kind"] == kind]
     found: dict[tuple[int, int], int] = {}
     for system_id, key, time_ns in zip(

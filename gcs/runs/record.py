@@ -40,12 +40,12 @@ END = "end"
 FLEET = "fleet"
 """Kind of the event that says where the vehicles are from, if the flight did not start them."""
 STARTED = "started by the station"
-"""Where those of other flights are from."""
+"""Origin of the vehicles in all other flights."""
 LOG_ENDED = "log"
-"""Kind of the event that a file could not be written from then on: its name and the reason."""
+"""Kind of the event that a file can no longer be written: its name and the reason."""
 _MOST_WAITING = 1000
 READY_FILE = ".observer-ready"
-"""There while an observer follows the run."""
+"""Exists while an observer follows the run."""
 
 
 class RunWriter:
@@ -86,7 +86,7 @@ class RunWriter:
             self._add(TLOG_FILE, self._tlog, entries)
 
     def ended(self, name: str, error: OSError) -> None:
-        """Note that a file of the run could not be written, and is not from now on."""
+        """Note that a file of the run could not be written; it is left as it is from now on."""
         self._ended.add(name)
         self.event(Event(time_s=self._time_s, kind=LOG_ENDED, text=f"{name}: {error.strerror}"))
 
@@ -114,7 +114,7 @@ def event_fields(event: Event) -> dict[str, Any]:
 
 
 class RecordLog:
-    """A file that grows by whole records: what a failed write has left of one is cut off."""
+    """A file that grows by whole records: a partly written one is cut off."""
 
     def __init__(self, file: Path) -> None:
         self.descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
@@ -136,7 +136,7 @@ class RecordLog:
 
 
 def write_whole(file: Path, data: bytes) -> None:
-    """Write a file in one step, for those who read it meanwhile; one that is there stays if that fails."""
+    """Replace a file in one step: nobody reads half of it, and the old one stays if writing fails."""
     part = file.with_name(file.name + ".new")
     try:
         part.write_bytes(data)

@@ -1,4 +1,4 @@
-"""What does not get in at the station, by reason, for the log of a run: each once, so that no attacker can fill it."""
+"""What the station refuses, by reason, for the log of a run: each reason once, so that no attacker can fill the log."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -9,17 +9,17 @@ from pydantic import TypeAdapter
 from gcs.control.tick import Event
 
 VEHICLES_FILE = "vehicles.json"
-"""What the simulated vehicles counted."""
+"""The counters of the simulated vehicles."""
 
 REFUSED = "refused"
 """Kind of the events: one when a reason is first met, and one at the end with how often each was."""
 _IGNORED = {"other component", "before a first heartbeat"}
-"""No strangers, though the station has no use for what they say."""
+"""Not refused, only of no use to the station."""
 _COUNTERS = TypeAdapter(dict[str, int])
 
 
 class Refusals:
-    """Remembers what has been told."""
+    """Remembers what was reported."""
 
     def __init__(self) -> None:
         self._told: dict[str, int] = {}
@@ -41,7 +41,7 @@ def in_words(counts: dict[str, int]) -> str:
 
 
 def counted_by_vehicles(folder: Path) -> dict[str, int] | None:
-    """What the vehicles of a run counted; None if they have not said."""
+    """The counters of a run's vehicles; None without their file."""
     try:
         return _COUNTERS.validate_json((folder / VEHICLES_FILE).read_bytes())
     except (OSError, ValueError):
@@ -49,7 +49,7 @@ def counted_by_vehicles(folder: Path) -> dict[str, int] | None:
 
 
 def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
-    """What they refused, by reason."""
+    """What a run's vehicles refused, by reason; None if that is not known."""
     counters, prefix = counted_by_vehicles(folder), "refused_"
     if counters is None:
         return None

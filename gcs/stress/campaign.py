@@ -17,6 +17,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from gcs.errors import InputError
 from gcs.interrupts import FROM_TERMINAL, held_back
 from gcs.output import DISK_FULL
 from gcs.runs.record import SCENARIO_FILE, RecordLog
@@ -33,16 +34,12 @@ Run = Callable[[Sequence[Trial]], list[Outcome]]
 """Returns the outcomes of trials in their order, flying those that are not stored."""
 
 
-class CampaignError(Exception):
-    """The campaign cannot continue: one line."""
-
-
 class Store:
     """The finished trials of a campaign's folder.
 
     Raises
     ------
-    CampaignError
+    InputError
         If another campaign has it open: both would fly the same trials.
     """
 
@@ -54,7 +51,7 @@ class Store:
             fcntl.flock(self._log.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._log.close()
-            raise CampaignError(f"{folder}: another gcs stress works there; wanted a folder of its own") from None
+            raise InputError(f"{folder}: another gcs stress works there; wanted a folder of its own") from None
         text = self.file.read_bytes()
         for line in text.splitlines():
             with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; its trial is flown again
@@ -68,13 +65,13 @@ class Store:
 
         Raises
         ------
-        CampaignError
+        InputError
             If it cannot be written.
         """
         try:
             self._log.add((outcome.to_json() + "\n").encode())
         except OSError as error:
-            raise CampaignError(f"{self.file}: {error.strerror}; {self.resume}") from None
+            raise InputError(f"{self.file}: {error.strerror}; {self.resume}") from None
         self.outcomes[outcome.id] = outcome
 
     @property
@@ -91,15 +88,15 @@ def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None
 
     Raises
     ------
-    CampaignError
+    InputError
         With what was read and what was wanted.
     """
     for name in (SCENARIO_FILE, TRIALS_FILE):
         if not (folder / name).is_file():
-            raise CampaignError(f"{flag}: read no {name} in {folder}, wanted the folder of a campaign")
+            raise InputError(f"{flag}: read no {name} in {folder}, wanted the folder of a campaign")
     file = folder / SCENARIO_FILE
     if scenario is not None and file.read_text(encoding="utf-8") != scenario:
-        raise CampaignError(f"{flag}: {folder} holds a campaign of another scenario or loop, wanted {file}")
+        raise InputError(f"{flag}: {folder} holds a campaign of another scenario or loop, wanted {file}")
 
 
 def run_campaign(
@@ -127,7 +124,7 @@ def run_campaign(
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
-        raise CampaignError(f"{error.filename}: {error.strerror}; {store.resume}") from None
+        raise InputError(f"{error.filename}: {error.strerror}; {store.resume}") from None
     # the same trial may have other coordinates in another sweep
     return [replace(store.outcomes[trial.id], coordinates=dict(trial.coordinates)) for trial in trials]
 
@@ -152,7 +149,7 @@ def local_workers(count: int) -> Generator[Fly]:
                 for future in as_completed(futures):
                     yield future.result()
             except BrokenProcessPool:
-                raise CampaignError(
+                raise InputError(
                     "a worker process was killed, perhaps for want of memory; try fewer --workers, with --resume"
                 ) from None
 
@@ -165,18 +162,18 @@ def dask_workers(address: str) -> Generator[Fly]:
 
     Raises
     ------
-    CampaignError
+    InputError
         If `distributed` is not installed or there is no scheduler at the address.
     """
     try:
         from distributed import Client
         from distributed import as_completed as dask_as_completed
     except ImportError:
-        raise CampaignError("--dask: the package distributed is not installed, wanted the extra [cluster]") from None
+        raise InputError("--dask: the package distributed is not installed, wanted the extra [cluster]") from None
     try:
         client = Client(address, timeout=10)
     except (OSError, ValueError) as error:
-        raise CampaignError(f"--dask: read {address!r} ({error}), wanted the address of a Dask scheduler") from None
+        raise InputError(f"--dask: read {address!r} ({error}), wanted the address of a Dask scheduler") from None
 
     def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
         # the id as key: a scheduler that still has the result for an earlier client returns it without a flight

@@ -4,8 +4,9 @@ import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gcs.errors import InputError
 from gcs.runs.record import SCENARIO_FILE
-from gcs.stress.campaign import CampaignError, Store, check_campaign
+from gcs.stress.campaign import Store, check_campaign
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, Trial
@@ -32,7 +33,7 @@ def refly(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Reflow
 
     Raises
     ------
-    CampaignError
+    InputError
         If not exactly one id begins so, or the trial was flown with another scenario.
     """
     stored = _stored(folder, wanted)
@@ -51,7 +52,7 @@ def _stored(folder: Path, wanted: str) -> Outcome:
     with contextlib.closing(Store(folder)) as store:
         found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
     if len(found) != 1:
-        raise CampaignError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
+        raise InputError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
     return found[0]
 
 
@@ -59,7 +60,7 @@ def _trial_of(study: Study, stored: Outcome, folder: Path) -> Trial:
     study = replace(study, real_time=stored.real_time)
     trial = study.trial(stored.kind, stored.coordinates, seed=stored.seed, probe=stored.probe)
     if trial.id != stored.id:
-        raise CampaignError(
+        raise InputError(
             f"--trial: {stored.id} was flown with another scenario or design; wanted {folder / SCENARIO_FILE}"
         )
     return trial

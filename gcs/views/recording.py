@@ -1,8 +1,8 @@
 """The Rerun recording of a run, and the screen made for it. The one file that knows Rerun.
 
-What is in it, on the timeline sim_time, which starts with the flight (what was before it is left out, but its events,
-which stand at 0): entities with one value for each vehicle, in the scenario's order, so that a tick costs much the
-same for two hundred vehicles as for two.
+All is on the timeline sim_time, which starts with the flight; of the time before, only the events are kept, at 0. An
+entity holds one value for each vehicle, in the scenario's order, so that a tick of two hundred vehicles costs about as
+much as a tick of two.
 
     formation/...   vehicles, trails, wanted places and links as seen from the leader, in m north, east, down of it
     ground/...      the same over the ground, local NED
@@ -10,7 +10,7 @@ same for two hundred vehicles as for two.
     delay/...       loop delay and round trip of each vehicle, and the margin of the gains it is flown with, in ms
     headroom/...    in %
     command/...     accelerations sent
-    modes/ID        what the station thinks of a vehicle;  events: what happened
+    modes/ID        the station's judgement of a vehicle;  events: what happened
 """
 
 import errno
@@ -235,8 +235,8 @@ class Recording:
         entries: list[tuple[Event, list[int]]] = []
         for _, same in itertools.groupby(events, key=lambda event: (event.time_s, event.kind, event.text)):
             group = list(same)
-            entries.append((group[0], [event.system_id for event in group if event.system_id is not None]))
-        times_s = np.array([max(float(event.time_s), 0.0) for event, _ in entries])
+            entries.append((group[0], [system_id for event in group for system_id in event.about]))
+        times_s = np.array([max(event.time_s, 0.0) for event, _ in entries])
         texts = [event_text(event, system_ids, self._before_s) for event, system_ids in entries]
         levels = [_event_level(event) for event, _ in entries]
         self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))

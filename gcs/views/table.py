@@ -21,9 +21,8 @@ from gcs.plan.design import Design
 from gcs.runs.refusals import REFUSED
 from gcs.views.console import UNKNOWN, draw, fitted_table, ms_text, not_shown, number_text
 from gcs.views.grid import unknown
+from gcs.views.scene import Floats, Newest
 from scenarios.schema import Scenario
-
-Floats = NDArray[np.float64]
 
 WINDOW_S = 5.0
 """What "the last seconds" are: percentiles and least headroom are taken over them."""
@@ -61,7 +60,7 @@ class FlightState:
         """What did not get in, in words."""
         self.time_s = np.nan
         self.before_s = patience_s(scenario)
-        """What scenario time lacks to the time since the station's start, until the flight begins at 0."""
+        """Until the flight begins at 0, scenario time plus this is the time since the station started."""
         self.skipped = 0
         """Ticks that were left out."""
         self.news: list[str] = []
@@ -70,6 +69,7 @@ class FlightState:
         self._named: list[int] = []
         self.system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
         self.newest = unknown(self.system_ids)
+        self._newest_rtt_s = Newest(len(self.system_ids))
         self.rtt_s = self.newest["rtt_s"]
         self._window: TickArray = np.empty((0, len(self.system_ids)), TICK)
 
@@ -108,8 +108,7 @@ class FlightState:
         self.skipped += int(np.sum(np.diff(numbers) - 1))
         self.newest = ticks[-1]
         self.time_s = float(ticks["time_s"][-1, 0])
-        for line in ticks["rtt_s"]:
-            self.rtt_s = np.where(np.isnan(line), self.rtt_s, line)
+        self.rtt_s = self._newest_rtt_s.fill(ticks["rtt_s"])[-1]
         window = np.concatenate([self._window, ticks])
         self._window = window[window["time_s"][:, 0] > self.time_s - WINDOW_S]
 
@@ -117,14 +116,14 @@ class FlightState:
         same = (event.kind, event.text, event.time_s // TOGETHER_S)
         if event.system_id is not None and self._named and same == self._last_event:
             self._named.append(event.system_id)
-            self.news[-1] = event_text(event, self._named, self.before_s)
+            self.news.pop()
         else:
-            self._named = [] if event.system_id is None else [event.system_id]
+            self._named = event.about
             self._last_event = same
-            self.news = [*self.news, event_text(event, self._named, self.before_s)][-EVENTS_SHOWN:]
+        self.news = [*self.news, event_text(event, self._named, self.before_s)][-EVENTS_SHOWN:]
 
     def figures(self) -> "Figures":
-        """The figures to be shown, one value for each vehicle; NaN where unknown."""
+        """The figures to be shown; NaN where unknown."""
         now = self.newest
         loop_delay_s = _quantiles(self._window["loop_delay_s"], (0.5, 0.99))
         spacings_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in self.scenario.vehicles]
@@ -272,17 +271,17 @@ def plain_line(state: FlightState) -> str:
 
 
 def time_text(time_s: float, before_s: float, form: str = "8.2f") -> str:
-    """Time of the flight; before it, time since the station's start, which scenario time is `before_s` short of."""
+    """Time of the flight; before it, time since the station started: scenario time plus `before_s`."""
     return f"start {time_s + before_s:+.2f} s" if time_s < 0.0 else f"{number_text(time_s, form)} s"
 
 
 def event_text(event: Event, system_ids: list[int], before_s: float) -> str:
-    """An event in one line of text, for the vehicles it says the same of; `before_s` as in `time_text`."""
+    """One line of text for an event that concerns these vehicles; `before_s` as in `time_text`."""
     named = " ".join(str(system_id) for system_id in system_ids[:NAMED_MAX])
     if len(system_ids) > NAMED_MAX:
         named += f" and {len(system_ids) - NAMED_MAX} more"
     who = f"vehicle{'s' * (len(system_ids) > 1)} {named}: " if system_ids else ""
-    kind = "" if event.kind == "vehicle" else f"{event.kind}  "  # else the word would stand there twice
+    kind = "" if event.kind == "vehicle" else f"{event.kind}  "  # or the word would appear twice
     return f"{time_text(event.time_s, before_s)}  {kind}{who}{event.text}"
 
 
@@ -298,10 +297,7 @@ class Display:
     def events(self, events: list[Event]) -> None:
         """Say each event once, where there is no picture to keep them on."""
         for event in events if self._says_lines else ():
-            print(
-                event_text(event, [] if event.system_id is None else [event.system_id], self._state.before_s),
-                flush=True,
-            )
+            print(event_text(event, event.about, self._state.before_s), flush=True)
 
     def show(self, *, last: bool = False) -> None:
         """Show the flight as it is now."""
@@ -328,7 +324,7 @@ def _quantiles(values: Floats, probabilities: tuple[float, ...]) -> Floats:
 
 
 def _worst(values: Floats) -> float:
-    return float(np.nanmax(values)) if not np.all(np.isnan(values)) else np.nan
+    return float(np.fmax.reduce(values, initial=np.nan))
 
 
 def _worst_headroom(state: FlightState, figures: Figures) -> str:

@@ -1,10 +1,10 @@
-"""What the frames on a link say of its vehicles' latencies, without a say in what they do.
+"""The latencies of vehicles, from the frames on their links; nothing is commanded.
 
 Pure: frames and times in, figures out. `gcs monitor` feeds it from a socket, `gcs replay` from a log.
 
-A TIMESYNC exchange counts whoever asked: this watch, or a ground station whose requests are on the same stream. Until
-one has been seen the vehicle's clock is unknown, and delays are told against the fastest of the last frames: what is
-measured then is a lower bound.
+A TIMESYNC exchange counts no matter who asked: this watch, or a ground station whose requests are on the same stream.
+Before the first one the vehicle's clock is unknown, and delays are measured against the fastest of the last frames:
+then they are lower bounds.
 """
 
 from array import array
@@ -25,18 +25,18 @@ from gcs.runs.summary_record import Clock, Estimate
 from scenarios.schema import NS_PER_S
 
 SYSTEM_ID = 254
-"""Whose name requests of a watch bear: vehicles number a station's frames, and this is none."""
+"""System id of the watch's requests. Not a station's: vehicles track the sequence numbers of theirs."""
 SILENT_NS = 3 * NS_PER_S
 """A vehicle not heard for this long counts as silent."""
 SAMPLE_NS = NS_PER_S // 10
-"""Mean time between two looks at the ages of what was received."""
+"""Mean time between two looks at how old the newest states are."""
 LOWER_BOUND = "lower bound"
 """Status of a delay measured against the fastest frame, for want of an exchange."""
 _GOLDEN = 0.6180339887498949
 _ASKED = 4096
 """Requests remembered: those of 250 vehicles at 10 Hz over 1.6 s, of five over 80 s."""
 _LEAST_NS = 10 * NS_PER_S
-"""The fastest frame is that of the last one or two of these; a clock that drifts by 20 ppm is off by 0.4 ms then."""
+"""The fastest frame is that of the last one to two such spans, in which a drift of 20 ppm adds up to 0.4 ms."""
 _AUTOPILOT, _NO_AUTOPILOT, _STATION = 1, 8, 6
 """Component id of an autopilot; MAV_AUTOPILOT_INVALID; MAV_TYPE_GCS."""
 _POSITIONS = (mavlink.LOCAL_POSITION_NED, mavlink.GLOBAL_POSITION_INT)
@@ -76,7 +76,7 @@ class WatchReport(Published):
 
 
 class WatchedVehicle:
-    """One vehicle as it is seen from aside: what it sent, and how late that was."""
+    """One vehicle as an onlooker sees it: what it sent, and how late that was."""
 
     def __init__(self, system_id: int) -> None:
         self.remote = RemoteVehicle(system_id, startup=LaunchedStartup(1.0))
@@ -84,22 +84,22 @@ class WatchedVehicle:
         self.rtt_s = array("d")
         self.age_s = array("d")
         self.loop_delay_s = array("d")
-        """At each look; NaN where unknown, or where nothing came for so long that it is silence and no latency."""
+        """At each look; NaN where it is unknown, and during a silence, which is not a latency."""
         self._judged = 0
-        """Looks up to the newest state: whether the later ones saw a latency is known when the next state comes."""
+        """Looks up to the newest state; whether later ones saw a latency or a silence, the next state shows."""
         self.states = 0
         """Position reports received."""
         self.first_state_ns = 0
         self.state_ns = 0
         """When the newest one was received."""
         self.boot_ns = 0
-        """Its instant on the vehicle's clock."""
+        """When it was sampled, on the vehicle's clock."""
         self._kind = mavlink.GLOBAL_POSITION_INT
         self._least_since_ns = 0
         self._least_ns: tuple[int, int] = (1 << 62, 1 << 62)
 
     def state(self, frame: mavlink.Frame, received_ns: int) -> None:
-        """Take in a position report; the local one counts where it is sent, as it is what formations fly by."""
+        """Take in a position report; local positions count where they are sent, as formations fly by them."""
         if frame.msg_id == mavlink.LOCAL_POSITION_NED != self._kind:
             self._kind, self.states = mavlink.LOCAL_POSITION_NED, 0
         boot_ns = self.remote.clock.boot_ns(frame.fields[0], received_ns)
@@ -123,7 +123,7 @@ class WatchedVehicle:
 
     @property
     def least_delay_ns(self) -> int:
-        """The least of reception minus boot time among the last frames: of the offset and the fastest frame's delay."""
+        """Least reception time minus boot time among the last frames: clock offset plus the least delay."""
         return min(self._least_ns)
 
     def look(self, now_ns: int) -> None:
@@ -203,7 +203,7 @@ class Watch:
         return now_ns
 
     def take(self, frame: mavlink.Frame, time_ns: int, address: Address | None = None) -> WatchedVehicle | None:
-        """Take in a frame received, or sent by a station, at a time; returns its vehicle if it tells something new."""
+        """Take in a frame of a vehicle or a station; returns its vehicle if it says something new."""
         vehicle = self._vehicle(frame)
         if vehicle is None:
             if frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0:
@@ -227,7 +227,7 @@ class Watch:
     def look(self, now_ns: int) -> int:
         """Look at the ages of all vehicles' states if that is due; returns when it is due next.
 
-        At uneven times, so that a telemetry rate cannot be in step with them.
+        Looks are unevenly spaced, so that no telemetry rate is in step with them.
         """
         if now_ns >= self._look_ns:
             self._looks += 1
@@ -268,7 +268,7 @@ class Watch:
 
 
 class Requests:
-    """TIMESYNC requests, spread over the addresses that vehicles send from: all vehicles behind one answer.
+    """TIMESYNC requests, in turn to each address that vehicles send from; all vehicles behind it answer.
 
     With a rate of 0 there are none.
     """

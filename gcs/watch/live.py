@@ -1,7 +1,7 @@
 """`gcs monitor`: the driver that watches the links of a socket and commands nothing.
 
-All that it sends are TIMESYNC requests, one at a time to each address that vehicles send from, under a system id that
-is not a station's. No heartbeat: a vehicle whose station has gone has to notice.
+It sends only TIMESYNC requests, under a system id that is not a station's. It sends no heartbeat: a vehicle whose
+station is gone has to notice.
 """
 
 import math
@@ -44,7 +44,7 @@ def watch_links(
     stop_reason: Callable[[], str],
     guard: Guard | None = None,
 ) -> WatchReport:
-    """Watch until the time is over or a reason to stop is given; returns the figures of the whole time."""
+    """Watch for the time asked or until there is a reason to stop; returns the figures of the whole time."""
     requests = Requests(options.timesync_hz)
     start_ns = now_ns = clock_ns()
     end_ns = start_ns + round(options.seconds * NS_PER_S) if math.isfinite(options.seconds) else 1 << 62

@@ -1,4 +1,4 @@
-"""`gcs replay`: what is asked of a log, and the summary made of it."""
+"""The summary of a telemetry log, as `gcs replay` shows it."""
 
 from dataclasses import dataclass
 from math import hypot
@@ -26,7 +26,7 @@ _COMPARED = ("verdict", "loop", "delay_margin_s", "loop_delay_s", "headroom_min"
 
 @dataclass(frozen=True)
 class LogSource:
-    """Where a log is, and what it is compared with as far as that is known."""
+    """A log, and what is known of its flight: None where there is nothing beside it."""
 
     log_file: Path
     scenario: Scenario | None
@@ -36,7 +36,7 @@ class LogSource:
 
 
 def found(run_or_file: Path) -> LogSource:
-    """The log, and what stands beside it in the folder of a run."""
+    """The log, and the files beside it if it is that of a run's folder."""
     folder = run_or_file if run_or_file.is_dir() else run_or_file.parent
     log_file = folder / TLOG_FILE if run_or_file.is_dir() else run_or_file
     own = log_file.name == TLOG_FILE

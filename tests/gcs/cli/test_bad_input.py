@@ -57,7 +57,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         (f"stress {CHAIN} --onset --out README.md", "--out: README.md: File exists, wanted a folder that can"),
         (f"stress {CHAIN} --onset --out {{run}}", "run is not empty, wanted a new or empty folder, or --resume"),
         (f"stress {CHAIN} --onset --junit {{run}}", "run: Is a directory, wanted a file that can be written"),
-        (f"stress {CHAIN} --onset --tolerance nan", "--tolerance: read nan, wanted a part between 0 and 1"),
+        (f"stress {CHAIN} --onset --tolerance nan", "--tolerance: read nan, wanted a fraction between 0 and 1"),
         (f"stress {CHAIN} --delay 0:x:3", "--delay: "),
         (f"stress {CHAIN} --delay 0:1:1000000000", "--delay: read '0:1:1000000000', wanted FROM:TO:COUNT or values"),
         (f"bench {CHAIN} --seconds 1e9", "86400"),

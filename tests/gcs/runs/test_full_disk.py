@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 from gcs.control.tick import Event
+from gcs.errors import InputError
 from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.summary import finish
-from gcs.stress.campaign import CampaignError, Store
+from gcs.stress.campaign import Store
 from gcs.stress.trial import Outcome
 from tests.support.flown_run import line, prepare, ticks_of
 
@@ -91,9 +92,7 @@ def test_a_failed_campaign_ends_in_one_line_and_keeps_trials(tmp_path: Path) -> 
     store.add(one)
     with (
         disk_full_at(store.file.stat().st_size + 20),
-        pytest.raises(
-            CampaignError, match=r"trials\.jsonl: File too large; 1 trials are stored; continue with --resume"
-        ),
+        pytest.raises(InputError, match=r"trials\.jsonl: File too large; 1 trials are stored; continue with --resume"),
     ):
         store.add(two)
     store.close()

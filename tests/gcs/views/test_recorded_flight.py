@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import read_design, read_ticks, write_design
 from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
@@ -17,7 +18,7 @@ from gcs.runs.summary import finish
 from gcs.station.station import Station
 from gcs.views.observer import record_run
 from gcs.views.report import delay_text
-from gcs.views.viewer import ViewerError, screenshot, vulkan_missing
+from gcs.views.viewer import screenshot, vulkan_missing
 from scenarios.files import dump, load
 from scenarios.schema import DelayPoint, Link, Scenario, VehicleLinks
 from tests.gcs.views.test_recording import read_back
@@ -125,5 +126,5 @@ def test_the_headless_viewer_opens_a_flight_and_no_view_reports_an_error(run: Pa
 def test_a_recording_cut_off_before_its_first_tick_is_told_in_one_line(run: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.rrd"
     cut.write_bytes((run / "flight.rrd").read_bytes()[:2000])
-    with pytest.raises(ViewerError, match=r"cut\.rrd: the viewer reads no flight in it; wanted a recording of a run"):
+    with pytest.raises(InputError, match=r"cut\.rrd: the viewer reads no flight in it; wanted a recording of a run"):
         screenshot(cut, tmp_path / "cut.png", time_s=0.0, width=800, height=500)

@@ -10,13 +10,14 @@ import pytest
 from rerun.chunk import RrdReader
 
 from gcs.control.tick import TICK, Event, Mode, TickArray
+from gcs.errors import InputError
 from gcs.plan.design import Design
 from gcs.runs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE, UNFINISHED_FILE
 from gcs.views.grid import WholeTicks
 from gcs.views.observer import record_run
 from gcs.views.recording import Recording
 from gcs.views.scene import vehicle_colors
-from gcs.views.viewer import ViewerError, find_recording, view
+from gcs.views.viewer import find_recording, view
 from tests.support.flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
 
 FIVE = line(5)
@@ -135,7 +136,7 @@ def test_without_a_screen_the_viewer_is_not_started(tmp_path: Path, monkeypatch:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(ViewerError, match="no screen here"):
+    with pytest.raises(InputError, match="no screen here"):
         view(tmp_path)
 
 
@@ -192,17 +193,17 @@ def test_every_vehicle_has_a_colour_of_its_own(count: int) -> None:
 
 
 def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ViewerError, match=r"nowhere: no such run folder or recording"):
+    with pytest.raises(InputError, match=r"nowhere: no such run folder or recording"):
         find_recording(tmp_path / "nowhere")
-    with pytest.raises(ViewerError, match=r"no flight\.rrd here"):
+    with pytest.raises(InputError, match=r"no flight\.rrd here"):
         find_recording(tmp_path)
     (tmp_path / UNFINISHED_FILE).touch()
-    with pytest.raises(ViewerError, match=r"the recording is not finished"):
+    with pytest.raises(InputError, match=r"the recording is not finished"):
         find_recording(tmp_path)
     (tmp_path / RECORDING_FILE).write_bytes(b"RRF2")
     assert find_recording(tmp_path) == find_recording(tmp_path / RECORDING_FILE) == tmp_path / RECORDING_FILE
     (tmp_path / RECORDING_FILE).write_bytes(b"")
-    with pytest.raises(ViewerError, match=r"flight\.rrd: read a file of another kind; wanted a recording of a run"):
+    with pytest.raises(InputError, match=r"flight\.rrd: read a file of another kind; wanted a recording of a run"):
         find_recording(tmp_path)
 
 
