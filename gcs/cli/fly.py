@@ -20,9 +20,9 @@ from gcs.cli.options import (
     load_scenario,
     mirroring,
     opened_guard,
-    out_folder,
     refuse,
     refuse_or_warn,
+    run_folder,
     warn_if_open,
     within,
 )
@@ -64,7 +64,7 @@ def fly(
     Exit code 1 if the flight is not stable, or not all of it could be logged.
     """
     from gcs.drive import preflight
-    from gcs.drive.fly import FlyOptions, new_folder
+    from gcs.drive.fly import FlyOptions
     from gcs.drive.fly import fly as fly_now
     from gcs.drive.takeover import CONNECTED, TAKEN_OVER, Presence
     from gcs.plan.planner import flight_plan
@@ -95,7 +95,7 @@ def fly(
         taken_over = there.taken_over() if connect is None else []
         if not as_json:
             print_design(design)
-        folder = out_folder(out) if out is not None else new_folder(scenario.name)
+        folder = run_folder(out, scenario.name)
         options = FlyOptions(
             folder=folder,
             show_table=not as_json,

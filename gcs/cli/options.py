@@ -108,6 +108,13 @@ def out_folder(out: Path, wanted: str = "a new or empty folder") -> Path:
     return out
 
 
+def run_folder(out: Path | None, name: str) -> Path:
+    """The folder that --out names, or a new one in runs/ with a name and the time."""
+    from gcs.drive.fly import new_folder
+
+    return new_folder(name) if out is None else out_folder(out)
+
+
 def out_file(option: str, file: Path) -> None:
     """Refuse a file that cannot be written, before the work whose result goes there; creates its folder."""
     try:

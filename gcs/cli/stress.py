@@ -83,9 +83,12 @@ def stress(
     tolerance: Annotated[
         float, typer.Option(metavar="FRACTION", help="half width of the last round of flights around the onset")
     ] = 0.02,
-    seeds: Annotated[int, typer.Option(metavar="N", help="flights at each point, each with a seed of its own")] = 1,
+    seeds: Annotated[
+        int, typer.Option(metavar="N", min=1, help="flights at each point, each with a seed of its own")
+    ] = 1,
     workers: Annotated[
-        int, typer.Option(metavar="N", show_default=False, help="processes; default all processors, 1 in real time")
+        int,
+        typer.Option(metavar="N", min=0, show_default=False, help="processes; default all processors, 1 in real time"),
     ] = 0,
     dask: Annotated[str, typer.Option(metavar="ADDRESS", help="fly on the workers of this Dask scheduler")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="resume the campaign in --out")] = False,
@@ -148,8 +151,6 @@ def _check(options: StressOptions, out: Path | None, trial: str) -> None:
         raise InputError("nothing to fly; wanted --onset, or an axis as --delay 0:0.6:13")
     if len(options.axes) > 2:
         raise InputError(f"read {len(options.axes)} axes, wanted one (a sweep) or two (a map)")
-    if options.seeds < 1 or options.workers < 0:
-        raise InputError("--seeds and --workers: wanted whole numbers from 1")
     for name, value in (("--tolerance", options.tolerance), ("--assert-onset", options.assert_onset)):
         if value is not None and not 0.0 < value < 1.0:
             raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, as 0.02")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from gcs.cli import FAILED
-from gcs.cli.options import AsJson, ScenarioFile, answer, load_scenario, out_folder, print_json
+from gcs.cli.options import AsJson, ScenarioFile, answer, load_scenario, print_json, run_folder
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
@@ -22,13 +22,12 @@ def compare(
     Exit code 1 if no route could be designed.
     """
     from gcs.cli.study_output import print_comparison
-    from gcs.drive.fly import new_folder
     from gcs.studies import compare as comparing
     from gcs.studies.compare_cost import design_costs
 
     outlive_readers()
     scenario = load_scenario(scenario_file)
-    folder = out_folder(out) if out is not None else new_folder(f"{scenario.name}-compare")
+    folder = run_folder(out, f"{scenario.name}-compare")
     routes, flights = comparing.compare(scenario)
     grown = design_costs() if sizes else []
     comparing.write_comparison(folder, scenario, routes, flights, grown)
@@ -45,10 +44,9 @@ def thesis(
     as_json: AsJson = False,
 ) -> None:
     """Reproduce the figures and numbers of the source, published and computed side by side."""
-    from gcs.drive.fly import new_folder
     from gcs.studies import thesis as source
 
-    folder = out_folder(out) if out is not None else new_folder("thesis")
+    folder = run_folder(out, "thesis")
     found = source.claims()
     page = source.write_page(folder, found)
     if as_json:

@@ -3,18 +3,19 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gcs.cli import FAILED, INTERRUPTED
-from gcs.cli.options import AsJson, KeyFile, answer, listening, opened_guard, print_json
+from gcs.cli.options import AsJson, KeyFile, answer, listening, load_scenario, opened_guard, print_json
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
     from gcs.watch.links import WatchReport
     from gcs.watch.rebuild_report import RebuildReport
+    from scenarios.schema import Scenario
 
 _TIMESYNC_HZ = 10.0
 ComparedMargin = Annotated[
@@ -111,9 +112,7 @@ def replay(
     given = None if design is None else read_design(design)
     log = read_tlog(there.log_file)
     if scenario_file is not None:
-        from scenarios.files import load
-
-        there = replace(there, scenario=load(scenario_file), design=None, recorded=None)
+        there = replace(there, scenario=load_scenario(scenario_file), design=None, recorded=None)
     if margin is not None:
         there = replace(there, design=Design(delay_margin_s=margin))
     elif given is not None:
@@ -154,13 +153,11 @@ def _exit_code(report: "WatchReport") -> int:
     return FAILED if bad or not report.vehicles else 0
 
 
-def _compared_with(scenario_file: Path | None, margin: float | None, design: Path | None) -> tuple[Any, Any, str]:
+def _compared_with(
+    scenario_file: Path | None, margin: float | None, design: Path | None
+) -> "tuple[Scenario | None, float | None, str]":
     """The scenario, the delay margin in s (None if none is known), and the source of that margin in words."""
-    scenario = None
-    if scenario_file is not None:
-        from scenarios.files import load
-
-        scenario = load(scenario_file)
+    scenario = None if scenario_file is None else load_scenario(scenario_file)
     if margin is not None:
         return scenario, margin, "given"
     if design is not None:

@@ -9,7 +9,7 @@ import contextlib
 import json
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -137,9 +137,16 @@ class RecordLog:
 
 def write_whole(file: Path, data: bytes) -> None:
     """Replace a file in one step: nobody reads half of it, and the old one stays if writing fails."""
+    with replacing(file) as part:
+        part.write_bytes(data)
+
+
+@contextlib.contextmanager
+def replacing(file: Path) -> Generator[Path]:
+    """A file to be written while entered, which then takes the place of another in one step."""
     part = file.with_name(file.name + ".new")
     try:
-        part.write_bytes(data)
+        yield part
         part.replace(file)
     except OSError:
         part.unlink(missing_ok=True)

@@ -29,6 +29,7 @@ from gcs.runs.record import (
     SUMMARY_FILE,
     TICKS_FILE,
     TRUTH_FILE,
+    replacing,
     write_whole,
 )
 from gcs.runs.refusals import REFUSED, counted_by_vehicles, counts_of, refused_by_vehicles
@@ -96,13 +97,8 @@ def _write_parquet(folder: Path, ticks: TickArray) -> None:
     import pyarrow.parquet as pq
 
     table = pa.table({name: np.ascontiguousarray(ticks[name]) for name in TICK.names or ()})
-    part = folder / (PARQUET_FILE + ".new")
-    try:
+    with replacing(folder / PARQUET_FILE) as part:
         pq.write_table(table, part, compression="zstd")
-        part.replace(folder / PARQUET_FILE)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
     (folder / TICKS_FILE).unlink(missing_ok=True)
 
 

@@ -20,7 +20,7 @@ from typing import Any
 from gcs.errors import InputError
 from gcs.interrupts import FROM_TERMINAL, held_back
 from gcs.output import DISK_FULL
-from gcs.runs.record import SCENARIO_FILE, RecordLog
+from gcs.runs.record import SCENARIO_FILE, RecordLog, replacing
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
 
@@ -193,9 +193,9 @@ def write_parquet(outcomes: Iterable[Outcome], folder: Path) -> Path:
     rows = [_row(outcome) for outcome in outcomes]
     names = dict.fromkeys(name for row in rows for name in row)
     table = pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
-    part = folder / (PARQUET_FILE + ".new")
-    pq.write_table(table, part, compression="zstd")
-    return part.replace(folder / PARQUET_FILE)
+    with replacing(folder / PARQUET_FILE) as part:
+        pq.write_table(table, part, compression="zstd")
+    return folder / PARQUET_FILE
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:

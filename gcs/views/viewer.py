@@ -85,11 +85,12 @@ def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 16
 
 def find_recording(folder_or_rrd: Path) -> Path:
     """The finished recording of a run folder, or the file itself."""
-    if folder_or_rrd.is_file():
-        return _begun_as_recording(folder_or_rrd)
-    recording = folder_or_rrd / RECORDING_FILE
+    recording = folder_or_rrd / RECORDING_FILE if folder_or_rrd.is_dir() else folder_or_rrd
     if recording.is_file():
-        return _begun_as_recording(recording)
+        with recording.open("rb") as opened:
+            if opened.read(len(_MAGIC)) != _MAGIC:
+                raise InputError(f"{recording}: read a file of another kind; {_WANTED}")
+        return recording
     if not folder_or_rrd.is_dir():
         raise InputError(f"{folder_or_rrd}: no such run folder or recording")
     if (folder_or_rrd / UNFINISHED_FILE).exists():
@@ -97,17 +98,10 @@ def find_recording(folder_or_rrd: Path) -> Path:
     raise InputError(f"{folder_or_rrd}: no {RECORDING_FILE} here; wanted a run folder or an .rrd file")
 
 
-def _begun_as_recording(file: Path) -> Path:
-    with file.open("rb") as opened:
-        if opened.read(len(_MAGIC)) != _MAGIC:
-            raise InputError(f"{file}: read a file of another kind; {_WANTED}")
-    return file
-
-
 def vulkan_missing() -> bool:
     """Whether no Vulkan driver is installed, which a picture without a screen needs."""
-    folders = (Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d"), Path("/usr/local/share/vulkan/icd.d"))
-    return not any(file.suffix == ".json" for folder in folders if folder.is_dir() for file in folder.iterdir())
+    folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+    return not any(any(Path(folder).glob("*.json")) for folder in folders)
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from gcs.runs.files import read_design, read_summary
 from gcs.runs.record import DESIGN_FILE, END, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
 from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
+from gcs.station.absence import COMPLETED
 from gcs.watch.links import LinkFigures
 from gcs.watch.rebuild import Rebuilt, rebuild, watched
 from gcs.watch.tlog import TelemetryLog
@@ -112,7 +113,7 @@ def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
     if not flown.size:
         return "nothing was flown"
     last = flown[flown["tick"] == flown["tick"][-1]]
-    if (broken := _broken(scenario, last)) is not None:
+    if broken := _broken(scenario, last):
         return broken
     left = sorted({vehicle.system_id for vehicle in scenario.vehicles} - set(last["system_id"].tolist()))
     if left:
@@ -120,17 +121,16 @@ def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
     end_s = float(last["time_s"][0])
     if end_s < scenario.duration_s - 1.5 / scenario.rates.control_hz:
         return f"interrupted: set-points end after {end_s:.1f} s of {scenario.duration_s:g} s"
-    return "completed: duration reached"
+    return COMPLETED
 
 
-def _broken(scenario: Scenario, last: TickArray) -> str | None:
-    """Which limit the last tick breaks, in the order in which the station looks."""
-    closest_m = float(np.fmin.reduce(last["nearest_m"]))
+def _broken(scenario: Scenario, last: TickArray) -> str:
+    """The first safety limit that the last tick violates."""
+    closest_m, limit_m = float(np.fmin.reduce(last["nearest_m"])), scenario.safety.spacing_error_limit_m
     if closest_m < scenario.safety.collision_distance_m:
         return f"broken: vehicles have collided, {closest_m:.1f} m apart"
     for row in last:
         error_m = hypot(row["spacing_error_north_m"], row["spacing_error_east_m"])
-        if error_m > scenario.safety.spacing_error_limit_m:
-            limit_m = scenario.safety.spacing_error_limit_m
+        if error_m > limit_m:
             return f"broken: spacing error of vehicle {row['system_id']} is {error_m:.0f} m, limit {limit_m:g} m"
-    return None
+    return ""
