@@ -1,8 +1,7 @@
 """`gcs design` and `gcs margin`: gains of a scenario, and the delay margin of any linear loop."""
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -18,18 +17,11 @@ from gcs.cli.options import (
 )
 
 
-class Method(Enum):
-    """How gains are found, as `control.method` of a scenario."""
-
-    INCLUSION = "inclusion"
-    GRAPH_DK = "graph-dk"
-    GRAPH_LQR = "graph-lqr"
-
-
 def design(
     scenario_file: ScenarioFile,
     method: Annotated[
-        Method | None, typer.Option(help="in place of the scenario's: inclusion principle, or a graph method")
+        Literal["inclusion", "graph-dk", "graph-lqr"] | None,
+        typer.Option(help="in place of the scenario's: inclusion principle, or a graph method"),
     ] = None,
     loop: LoopOption = None,
     allow_unstable: AllowUnstable = False,
@@ -42,7 +34,7 @@ def design(
 
     scenario = load_scenario(scenario_file, loop)
     if method is not None:
-        control = scenario.control.model_copy(update={"method": method.value, "gains": None, "blocks": ()})
+        control = scenario.control.model_copy(update={"method": method, "gains": None, "blocks": ()})
         scenario = scenario.model_copy(update={"control": control})
     result, plan = flight_plan(scenario)
     if (unstable := unstable_loop(plan)) is not None:

@@ -32,22 +32,8 @@ def help_without_command(context: typer.Context) -> None:
         typer.echo(context.get_help())
 
 
-for _command in (
-    fly,
-    design,
-    compare,
-    margin,
-    thesis,
-    bench,
-    capacity,
-    grade,
-    view,
-    recover,
-    key,
-    stress,
-    monitor,
-    replay,
-):
+_COMMANDS = (fly, design, compare, margin, thesis, bench, capacity, grade, view, recover, key, stress, monitor, replay)
+for _command in _COMMANDS:
     app.command()(_command)
 
 

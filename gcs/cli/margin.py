@@ -55,10 +55,7 @@ def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
 def margin_of_scenario(file: Path) -> ScenarioMargin:
     """The margin of the loop that a scenario flies.
 
-    Raises
-    ------
-    ModelFileError, scenarios.errors.ScenarioError, GainsError
-        One line with what was read and what was wanted.
+    Raises ModelFileError, scenarios.errors.ScenarioError, GainsError: one line with what was read and what was wanted.
     """
     from gains.sampled.onboard import own_part
     from gcs.plan.planner import flight_plan

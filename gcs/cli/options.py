@@ -4,10 +4,9 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
-from enum import Enum
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -23,13 +22,8 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 
-class Loop(Enum):
-    """Where the loop is closed, as `control.loop` of a scenario."""
-
-    GROUND = "ground"
-    ONBOARD = "onboard"
-
-
+Loop = Literal["ground", "onboard"]
+"""Where the loop is closed, as `control.loop` of a scenario."""
 ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file, as scenarios/triangle5.toml")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="run folder")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
@@ -65,15 +59,12 @@ def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> 
 def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":
     """The scenario in a file, with its loop closed elsewhere if `loop` is given.
 
-    Raises
-    ------
-    scenarios.errors.ScenarioError
-        If the file cannot be used, or not with this loop.
+    Raises scenarios.errors.ScenarioError if the file cannot be used, or not with this loop.
     """
     from scenarios.files import load, with_loop
 
     scenario = load(file)
-    return scenario if loop is None else with_loop(scenario, loop.value, file)
+    return scenario if loop is None else with_loop(scenario, loop, file)
 
 
 def within(option: str, value: float, least: float, most: float, unit: str = "") -> None:

@@ -34,10 +34,7 @@ _MORE = 1.1
 def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     """The design of a scenario, and the plan to fly it.
 
-    Raises
-    ------
-    gains.core.errors.GainsError
-        If the scenario's requirement cannot be met.
+    Raises gains.core.errors.GainsError if the scenario's requirement cannot be met.
     """
     formation = plan_formation(scenario)
     model = formation.model

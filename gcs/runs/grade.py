@@ -48,10 +48,7 @@ class Grade(Published):
 def grade(folder: Path) -> Grade:
     """Grade a run: the loop delays and round trips it measured, and how punctual its emulated links were.
 
-    Raises
-    ------
-    InputError
-        If the folder is not a run, or has no truth log.
+    Raises InputError if the folder is not a run, or has no truth log.
     """
     try:
         truth = read_truth(folder / TRUTH_FILE)

@@ -37,10 +37,7 @@ Run = Callable[[Sequence[Trial]], list[Outcome]]
 class Store:
     """The finished trials of a campaign's folder.
 
-    Raises
-    ------
-    InputError
-        If another campaign has it open: both would fly the same trials.
+    Raises InputError if another campaign has it open: both would fly the same trials.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -63,10 +60,7 @@ class Store:
     def add(self, outcome: Outcome) -> None:
         """Store an outcome; it is in the file when this returns.
 
-        Raises
-        ------
-        InputError
-            If it cannot be written.
+        Raises InputError if it cannot be written.
         """
         try:
             self._log.add((outcome.to_json() + "\n").encode())
@@ -86,10 +80,7 @@ class Store:
 def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None:
     """Refuse a folder that holds no campaign, or a campaign of another scenario; `scenario` is TOML.
 
-    Raises
-    ------
-    InputError
-        With what was read and what was wanted.
+    Raises InputError with what was read and what was wanted.
     """
     for name in (SCENARIO_FILE, TRIALS_FILE):
         if not (folder / name).is_file():
@@ -106,10 +97,7 @@ def run_campaign(
 
     `ended` is called with each outcome and the number of trials still to come.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        Also if Ctrl-C ended a flight in real time; that flight does not count as flown.
+    Raises KeyboardInterrupt also if Ctrl-C ended a flight in real time; that flight does not count as flown.
     """
     missing = {trial.id: trial for trial in trials if trial.id not in store.outcomes}
     left = len(missing)
@@ -160,10 +148,7 @@ def local_workers(count: int) -> Generator[Fly]:
 def dask_workers(address: str) -> Generator[Fly]:
     """While entered, fly trials on the workers of a Dask cluster, where this package is installed.
 
-    Raises
-    ------
-    InputError
-        If `distributed` is not installed or there is no scheduler at the address.
+    Raises InputError if `distributed` is not installed or there is no scheduler at the address.
     """
     try:
         from distributed import Client

@@ -31,10 +31,7 @@ def refly(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Reflow
     Its runs are left in `flights` beside the campaign's table. With `real_time` it is flown over UDP, even if it was
     first flown in virtual time.
 
-    Raises
-    ------
-    InputError
-        If not exactly one id begins so, or the trial was flown with another scenario.
+    Raises InputError if not exactly one id begins so, or the trial was flown with another scenario.
     """
     stored = _stored(folder, wanted)
     trial = _trial_of(study, stored, folder)

@@ -37,10 +37,7 @@ def view(folder_or_rrd: Path) -> int:
 def picture_time_s(recording: Path, wanted_s: float | None) -> float:
     """The scenario time of a picture: the one wanted, if the recording is that long, else ten seconds or its end.
 
-    Raises
-    ------
-    InputError
-        If the recording ends before, or holds no flight.
+    Raises InputError if the recording ends before, or holds no flight.
     """
     from gcs.views.recording import length_s  # Rerun is slow to import, and the viewer itself does not need it
 
@@ -61,10 +58,8 @@ def picture_time_s(recording: Path, wanted_s: float | None) -> float:
 def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 1600, height: int = 900) -> list[str]:
     """Write a picture of the recording's screen at a scenario time; returns what the views report as wrong.
 
-    Raises
-    ------
-    InputError
-        If there is no finished recording, or the viewer does not start: it needs a Vulkan driver, but no screen.
+    Raises InputError if there is no finished recording, or the viewer does not start: it needs a Vulkan driver, but no
+    screen.
     """
     from gcs.views.recording import TIMELINE
 
