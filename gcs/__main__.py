@@ -4,7 +4,7 @@ import contextlib
 import os
 import signal
 
-from gcs.cli.exit_codes import INTERRUPTED
+from gcs.cli import INTERRUPTED
 from gcs.interrupts import ending_signals
 from gcs.output import open_what_is_closed
 

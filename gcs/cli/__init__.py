@@ -1,1 +1,10 @@
-"""Every command: options, one-line errors, exit codes and what a terminal prints. The only room that knows Typer."""
+"""Every command: options, one-line errors and what a terminal prints. The only room that knows Typer.
+
+What the exit code of a command says is here; 0 is success.
+"""
+
+FAILED = 1
+"""The command did its work, and the answer is bad: unstable, past the margin, not the same."""
+BAD_INPUT = 2
+INTERRUPTED = 130
+"""Ended by Ctrl-C, SIGTERM or SIGHUP."""

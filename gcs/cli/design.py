@@ -1,26 +1,27 @@
 """`gcs design` and `gcs margin`: gains of a scenario, and the delay margin of any linear loop."""
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from gcs.cli.options import AllowUnstable, AsJson, LoopOption, ScenarioFile, load_scenario, print_json, refuse_or_warn
-
-
-class Method(Enum):
-    """How gains are found, as `control.method` of a scenario."""
-
-    INCLUSION = "inclusion"
-    GRAPH_DK = "graph-dk"
-    GRAPH_LQR = "graph-lqr"
+from gcs.cli.options import (
+    AllowUnstable,
+    AsJson,
+    LoopOption,
+    ScenarioFile,
+    answer,
+    load_scenario,
+    print_json,
+    refuse_or_warn,
+)
 
 
 def design(
     scenario_file: ScenarioFile,
     method: Annotated[
-        Method | None, typer.Option(help="in place of the scenario's: inclusion principle, or a graph method")
+        Literal["inclusion", "graph-dk", "graph-lqr"] | None,
+        typer.Option(help="in place of the scenario's: inclusion principle, or a graph method"),
     ] = None,
     loop: LoopOption = None,
     allow_unstable: AllowUnstable = False,
@@ -29,20 +30,16 @@ def design(
     """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
     from gcs.drive.preflight import unstable_loop
     from gcs.plan.planner import flight_plan
+    from gcs.views.report import print_design
 
     scenario = load_scenario(scenario_file, loop)
     if method is not None:
-        control = scenario.control.model_copy(update={"method": method.value, "gains": None, "blocks": ()})
+        control = scenario.control.model_copy(update={"method": method, "gains": None, "blocks": ()})
         scenario = scenario.model_copy(update={"control": control})
     result, plan = flight_plan(scenario)
     if (unstable := unstable_loop(plan)) is not None:
         refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
-    if as_json:
-        print_json(result.to_dict())
-    else:
-        from gcs.views.report import print_design
-
-        print_design(result)
+    answer(result, print_design, as_json=as_json)
 
 
 def margin(
@@ -56,10 +53,10 @@ def margin(
     as_json: AsJson = False,
 ) -> None:
     """How much delay any linear loop takes, or that of a scenario: stability windows, margin, crossings."""
-    from gcs.cli.margin import margin_of_file, margin_of_scenario, print_margin
+    from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario, print_margin
 
-    result = margin_of_scenario(model_file) if model_file.suffix == ".toml" else margin_of_file(model_file)
+    found = margin_of_scenario(model_file) if model_file.suffix == ".toml" else margin_of_file(model_file)
     if as_json:
-        print_json(result)
+        print_json(margin_fields(found))
     else:
-        print_margin(result)
+        print_margin(found)

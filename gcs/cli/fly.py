@@ -1,12 +1,13 @@
 """`gcs fly` and `gcs key`: what a flight is asked for, and what its exit code says."""
 
 import contextlib
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gcs.cli.exit_codes import FAILED, INTERRUPTED
+from gcs.cli import FAILED, INTERRUPTED
 from gcs.cli.options import (
     AllowUnstable,
     AsJson,
@@ -14,19 +15,22 @@ from gcs.cli.options import (
     LoopOption,
     ScenarioFile,
     address,
+    answer,
     listening,
     load_scenario,
     mirroring,
     opened_guard,
-    out_folder,
-    print_json,
     refuse,
     refuse_or_warn,
+    run_folder,
     warn_if_open,
     within,
 )
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+
+if TYPE_CHECKING:
+    from gcs.runs.summary_record import Summary
 
 LISTEN = "127.0.0.1:14550"
 
@@ -60,10 +64,11 @@ def fly(
     Exit code 1 if the flight is not stable, or not all of it could be logged.
     """
     from gcs.drive import preflight
-    from gcs.drive.fly import FlyOptions, new_folder
+    from gcs.drive.fly import FlyOptions
     from gcs.drive.fly import fly as fly_now
     from gcs.drive.takeover import CONNECTED, TAKEN_OVER, Presence
     from gcs.plan.planner import flight_plan
+    from gcs.views.report import print_design, print_summary
 
     outlive_readers()
     scenario = load_scenario(scenario_file, loop)
@@ -89,10 +94,8 @@ def fly(
         there = Presence(link, plan.scenario, guard)
         taken_over = there.taken_over() if connect is None else []
         if not as_json:
-            from gcs.views.report import print_design
-
             print_design(design)
-        folder = out_folder(out) if out is not None else new_folder(scenario.name)
+        folder = run_folder(out, scenario.name)
         options = FlyOptions(
             folder=folder,
             show_table=not as_json,
@@ -103,19 +106,14 @@ def fly(
         summary = fly_now(plan, design, link, options, guard, to)
         if taken_over:
             there.shut_down()
-    if as_json:
-        print_json(summary)
-    else:
-        from gcs.views.report import print_summary
-
-        print_summary(summary, folder)
+    answer(summary, partial(print_summary, folder=folder), as_json=as_json)
     raise typer.Exit(_exit_code(summary))
 
 
-def _exit_code(summary: dict[str, Any]) -> int:
-    if summary["reason"].startswith("interrupted"):
+def _exit_code(summary: "Summary") -> int:
+    if summary.reason.startswith("interrupted"):
         return INTERRUPTED
-    return 0 if summary["verdict"] == "stable" and not summary["not_logged"] else FAILED
+    return 0 if summary.verdict == "stable" and not summary.not_logged else FAILED
 
 
 def key(file: Annotated[Path, typer.Argument(metavar="FILE", help="a new file")]) -> None:

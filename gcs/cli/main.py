@@ -8,8 +8,8 @@ import sys
 
 import typer
 
+from gcs.cli import BAD_INPUT, FAILED, INTERRUPTED
 from gcs.cli.design import design, margin
-from gcs.cli.exit_codes import BAD_INPUT, FAILED, INTERRUPTED
 from gcs.cli.fly import fly, key
 from gcs.cli.runs import grade, recover, view
 from gcs.cli.stress import stress
@@ -32,22 +32,8 @@ def help_without_command(context: typer.Context) -> None:
         typer.echo(context.get_help())
 
 
-for _command in (
-    fly,
-    design,
-    compare,
-    margin,
-    thesis,
-    bench,
-    capacity,
-    grade,
-    view,
-    recover,
-    key,
-    stress,
-    monitor,
-    replay,
-):
+_COMMANDS = (fly, design, compare, margin, thesis, bench, capacity, grade, view, recover, key, stress, monitor, replay)
+for _command in _COMMANDS:
     app.command()(_command)
 
 

@@ -2,10 +2,11 @@
 
 import json
 import sys
-from enum import Enum
+from collections.abc import Callable
+from dataclasses import asdict
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -18,13 +19,11 @@ if TYPE_CHECKING:
     from scenarios.schema import Scenario
 
 
-class Loop(Enum):
-    """Where the loop is closed, as `control.loop` of a scenario."""
-
-    GROUND = "ground"
-    ONBOARD = "onboard"
+Result = TypeVar("Result")
 
 
+Loop = Literal["ground", "onboard"]
+"""Where the loop is closed, as `control.loop` of a scenario."""
 ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file, as scenarios/triangle5.toml")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="run folder")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
@@ -41,22 +40,31 @@ KeyFile = Annotated[
 
 
 def print_json(result: Any) -> None:
-    """Print a result as `--json` asks for it."""
-    typer.echo(json.dumps(result, indent=2, allow_nan=False))
+    """Print a result as `--json` asks for it; records in it are written with their fields."""
+
+    def fields(record: Any) -> Any:
+        return record.to_dict() if hasattr(record, "to_dict") else asdict(record)
+
+    typer.echo(json.dumps(result, indent=2, allow_nan=False, default=fields))
+
+
+def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> None:
+    """Print a result: as JSON, or in the way that `show` does."""
+    if as_json:
+        print_json(result)
+    else:
+        show(result)
 
 
 def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":
     """The scenario in a file, with its loop closed elsewhere if `loop` is given.
 
-    Raises
-    ------
-    scenarios.errors.ScenarioError
-        If the file cannot be used, or not with this loop.
+    Raises scenarios.errors.ScenarioError if the file cannot be used, or not with this loop.
     """
     from scenarios.files import load, with_loop
 
     scenario = load(file)
-    return scenario if loop is None else with_loop(scenario, loop.value, file)
+    return scenario if loop is None else with_loop(scenario, loop, file)
 
 
 def within(option: str, value: float, least: float, most: float, unit: str = "") -> None:
@@ -89,6 +97,13 @@ def out_folder(out: Path, wanted: str = "a new or empty folder") -> Path:
     if used:
         raise InputError(f"--out: {out} is not empty, wanted {wanted}")
     return out
+
+
+def run_folder(out: Path | None, name: str) -> Path:
+    """The folder that --out names, or a new one in runs/ with a name and the time."""
+    from gcs.drive.fly import new_folder
+
+    return new_folder(name) if out is None else out_folder(out)
 
 
 def out_file(option: str, file: Path) -> None:

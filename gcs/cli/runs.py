@@ -1,44 +1,38 @@
 """`gcs grade`, `view` and `recover`: what is done with the folder of a run."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gcs.cli.exit_codes import FAILED
-from gcs.cli.options import AsJson, RunFolder, out_file, print_json, within
+from gcs.cli import FAILED
+from gcs.cli.options import AsJson, RunFolder, answer, out_file, within
 from gcs.errors import InputError
+
+if TYPE_CHECKING:
+    from gcs.runs.grade import Grade
 
 
 def grade(run: RunFolder, as_json: AsJson = False) -> None:
     """How true a flight's latencies were, and how punctual its emulated links: errors against the truth log."""
     from gcs.runs.grade import grade as graded
 
-    result = graded(run)
-    if as_json:
-        print_json(result)
-    else:
-        print_grade(result)
+    answer(graded(run), print_grade, as_json=as_json)
 
 
-def print_grade(result: dict[str, Any]) -> None:
+def print_grade(result: "Grade") -> None:
     """Print the errors of each quantity in a line of its own."""
-    kinds = {
-        "loop_delay": "loop delay, measured",
-        "rtt": "round trip, measured",
-        "link_delay": "link delay, applied upwards",
-    }
-    print(f"errors against the truth, {result['vehicles']} vehicles, ms")
-    for name, title in kinds.items():
-        own = result[name]
-        p50, p99, largest = (_ms(own[f"error_{part}_s"]) for part in ("p50", "p99", "max"))
-        print(f"{title:<28} p50 {p50}  p99 {p99}  max {largest}  of {own['samples']}")
+    from gcs.views.console import ms_text
 
-
-def _ms(value_s: float | None) -> str:
-    from gcs.views.report import UNKNOWN
-
-    return UNKNOWN if value_s is None else f"{1e3 * value_s:.3f}"
+    print(f"errors against the truth, {result.vehicles} vehicles, ms")
+    for title, own in (
+        ("loop delay, measured", result.loop_delay),
+        ("round trip, measured", result.rtt),
+        ("link delay, applied upwards", result.link_delay),
+    ):
+        errors_s = own.error_p50_s, own.error_p99_s, own.error_max_s
+        p50, p99, largest = (ms_text(error_s, ".3f", unit="") for error_s in errors_s)
+        print(f"{title:<28} p50 {p50}  p99 {p99}  max {largest}  of {own.samples}")
 
 
 def view(
@@ -52,7 +46,7 @@ def view(
 
     Exit code 1 if a view of the picture reports a fault.
     """
-    from gcs.views.viewer import ViewerError, find_recording, picture_time_s, screenshot
+    from gcs.views.viewer import find_recording, picture_time_s, screenshot
     from gcs.views.viewer import view as open_viewer
 
     if at is not None:
@@ -61,15 +55,12 @@ def view(
         out_file("--picture", picture)
         if picture.suffix.lower() != ".png":
             raise InputError(f"--picture: read {picture}, wanted a name that ends in .png, as what is written is PNG")
-    try:
-        recording = find_recording(run)
-        if picture is None:
-            raise typer.Exit(open_viewer(recording))
-        time_s = picture_time_s(recording, at)
-        complaints = screenshot(recording, picture, time_s=time_s)
-        typer.echo(f"picture  {picture}: {recording} at {time_s:g} s")
-    except ViewerError as error:
-        raise InputError(str(error)) from None
+    recording = find_recording(run)
+    if picture is None:
+        raise typer.Exit(open_viewer(recording))
+    time_s = picture_time_s(recording, at)
+    complaints = screenshot(recording, picture, time_s=time_s)
+    typer.echo(f"picture  {picture}: {recording} at {time_s:g} s")
     for complaint in complaints:
         typer.echo(complaint, err=True)
     raise typer.Exit(FAILED if complaints else 0)
@@ -77,11 +68,7 @@ def view(
 
 def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run that was killed")]) -> None:
     """Finish the files of a run whose processes were killed: ticks.parquet, summary.json, flight.rrd."""
-    from gcs.runs.summary import finish
-    from gcs.views.observer import record_run
+    from gcs.views.observer import recover_run
     from gcs.views.report import print_summary
 
-    finish(run)
-    record_run(run)
-    summary = finish(run)  # again: it lists the files
-    print_summary(summary, run)
+    print_summary(recover_run(run), run)

@@ -4,25 +4,26 @@ The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
 """
 
 import contextlib
-import json
+import itertools
 import os
 from collections.abc import Generator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gcs.cli.exit_codes import FAILED
+from gcs.cli import FAILED
 from gcs.cli.options import (
     AsJson,
     Loop,
     LoopOption,
     ScenarioFile,
+    answer,
     load_scenario,
     out_file,
     out_folder,
-    print_json,
     refuse,
 )
 from gcs.errors import InputError
@@ -31,7 +32,9 @@ from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
     from gcs.plan.design import Design
+    from gcs.stress.axes import Axis
     from gcs.stress.campaign import Fly
+    from gcs.stress.report import CampaignResult
     from gcs.stress.study import Onset, Study
     from gcs.stress.trial import Outcome
 
@@ -71,27 +74,31 @@ def stress(
     jitter: Annotated[
         str, typer.Option(metavar="FROM:TO:N", help="jitter each way in s: half width, or scale of the link's own kind")
     ] = "",
-    loss: Annotated[str, typer.Option(metavar="FROM:TO:N", help="part of the datagrams lost, each way")] = "",
+    loss: Annotated[str, typer.Option(metavar="FROM:TO:N", help="fraction of the datagrams lost, each way")] = "",
     rate: Annotated[
         str, typer.Option(metavar="FROM:TO:N", help="control rate in Hz, with the gains designed for the scenario's")
     ] = "",
     loop: LoopOption = None,
     onset: Annotated[bool, typer.Option("--onset", help="find the delay at which it breaks")] = False,
     tolerance: Annotated[
-        float, typer.Option(metavar="PART", help="half width of the last round of flights around the onset")
+        float, typer.Option(metavar="FRACTION", help="half width of the last round of flights around the onset")
     ] = 0.02,
-    seeds: Annotated[int, typer.Option(metavar="N", help="flights at each point, each with a seed of its own")] = 1,
+    seeds: Annotated[
+        int, typer.Option(metavar="N", min=1, help="flights at each point, each with a seed of its own")
+    ] = 1,
     workers: Annotated[
-        int, typer.Option(metavar="N", show_default=False, help="processes; default all processors, 1 in real time")
+        int,
+        typer.Option(metavar="N", min=0, show_default=False, help="processes; default all processors, 1 in real time"),
     ] = 0,
     dask: Annotated[str, typer.Option(metavar="ADDRESS", help="fly on the workers of this Dask scheduler")] = "",
-    resume: Annotated[bool, typer.Option("--resume", help="go on with the campaign in --out")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="resume the campaign in --out")] = False,
     trial: Annotated[
         str, typer.Option(metavar="ID", help="fly one trial of the campaign in --out again, with a recording")
     ] = "",
     real_time: Annotated[bool, typer.Option("--real-time", help="over UDP, in processes, on the real clock")] = False,
     assert_onset: Annotated[
-        float | None, typer.Option(metavar="PART", help="exit 1 if onset and margin differ by more; implies --onset")
+        float | None,
+        typer.Option(metavar="FRACTION", help="exit 1 if onset and margin differ by more; implies --onset"),
     ] = None,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/<scenario>-stress-<time>")] = None,
@@ -123,26 +130,16 @@ def stress(
     outlive_readers()
     if junit is not None:
         out_file("--junit", junit)
-    from gcs.stress.campaign import CampaignError
+    from gcs.cli.stress_output import print_result, write_junit
 
-    try:
-        if trial:
-            assert out is not None
-            raise typer.Exit(_refly(options, out, trial, as_json=as_json))
-        result, folder = _campaign(options, out, shown=not as_json)
-    except CampaignError as error:
-        raise InputError(str(error)) from None
+    if trial:
+        assert out is not None
+        raise typer.Exit(_refly(options, out, trial, as_json=as_json))
+    result, folder = _campaign(options, out, shown=not as_json)
     if junit is not None:
-        from gcs.cli.stress_output import write_junit
-
         write_junit(result, junit)
-    if as_json:
-        print_json(result)
-    else:
-        from gcs.cli.stress_output import print_result
-
-        print_result(result, folder)
-    raise typer.Exit(0 if result["passed"] else FAILED)
+    answer(result, partial(print_result, folder=folder), as_json=as_json)
+    raise typer.Exit(0 if result.passed else FAILED)
 
 
 def _check(options: StressOptions, out: Path | None, trial: str) -> None:
@@ -154,15 +151,13 @@ def _check(options: StressOptions, out: Path | None, trial: str) -> None:
         raise InputError("nothing to fly; wanted --onset, or an axis as --delay 0:0.6:13")
     if len(options.axes) > 2:
         raise InputError(f"read {len(options.axes)} axes, wanted one (a sweep) or two (a map)")
-    if options.seeds < 1 or options.workers < 0:
-        raise InputError("--seeds and --workers: wanted whole numbers from 1")
     for name, value in (("--tolerance", options.tolerance), ("--assert-onset", options.assert_onset)):
         if value is not None and not 0.0 < value < 1.0:
-            raise InputError(f"{name}: read {value:g}, wanted a part between 0 and 1, as 0.02")
+            raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, as 0.02")
 
 
-def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple[dict[str, Any], Path]:
-    """Fly the campaign; returns its result as plain types, and the folder that holds it."""
+def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> "tuple[CampaignResult, Path]":
+    """Fly the campaign; returns its result, and the folder that holds it."""
     from gcs.drive.fly import new_folder
     from gcs.runs.record import write_whole
     from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
@@ -207,8 +202,8 @@ def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> tuple
         write_parquet(outcomes, folder)
     allowed = options.assert_onset
     result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, no_onset=no_onset, allowed=allowed)
-    write_whole(folder / RESULT_FILE, json.dumps(result, indent=2, allow_nan=False).encode())
-    write_report(folder, result, study=study, axes=axes, sweep=sweep, onset=onset)
+    write_whole(folder / RESULT_FILE, result.to_json().encode())
+    write_report(folder, result, study=study, axes=axes)
     return result, folder
 
 
@@ -228,29 +223,25 @@ def _study(options: StressOptions) -> "tuple[Study, Design]":
     return Study(plan, real_time=options.real_time), design
 
 
-def _axes(options: StressOptions, study: "Study") -> "list[Any]":
+def _axes(options: StressOptions, study: "Study") -> "list[Axis]":
     from gcs.stress.axes import AxisError, parse_axis, parse_vehicle_axis
 
-    axes: list[Any] = []
+    ids = study.plan.formation.system_ids
+    axes: list[Axis] = []
     for name, text in options.axes:
         try:
-            of_vehicle = name == "delay_of"
-            axes.append(
-                parse_vehicle_axis(text, study.plan.formation.system_ids) if of_vehicle else parse_axis(name, text)
-            )
+            axes.append(parse_vehicle_axis(text, ids) if name == "delay_of" else parse_axis(name, text))
         except AxisError as error:
             raise InputError(f"--{name.replace('_', '-')}: {error}") from None
     return axes
 
 
-@contextlib.contextmanager
-def _workers(options: StressOptions) -> "Generator[Fly]":
+def _workers(options: StressOptions) -> "contextlib.AbstractContextManager[Fly]":
     from gcs.stress.campaign import dask_workers, local_workers
 
     # flights in real time disturb each other: one at a time unless the user knows better
     count = options.workers or (1 if options.real_time else len(os.sched_getaffinity(0)))
-    with dask_workers(options.dask) if options.dask else local_workers(count) as fly:
-        yield fly
+    return dask_workers(options.dask) if options.dask else local_workers(count)
 
 
 @contextlib.contextmanager
@@ -276,13 +267,11 @@ def _progress(shown: bool) -> Generator[Any]:
 
         def begin(name: str, total: int | None) -> Any:
             task = bar.add_task(name, total=total)
-            count = 0
+            begun = itertools.count(1)
 
             def ended(_: "Outcome", left: int) -> None:
-                nonlocal count
-                count += 1
-                done = count if total is None else total - left
-                bar.update(task, completed=done, total=count + left if total is None else total)
+                done = next(begun) if total is None else total - left
+                bar.update(task, completed=done, total=done + left)
 
             return ended
 

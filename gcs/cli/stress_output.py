@@ -1,7 +1,8 @@
 """What `gcs stress` prints, and the JUnit XML it writes for CI."""
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 from rich import box
@@ -11,63 +12,59 @@ from rich.text import Text
 
 from gcs.stress.axes import place_text
 from gcs.stress.refly import Reflown
-from gcs.stress.report import MOST_ROWS, REPORT_FILE, refly_command
-from gcs.views.console import plain_console
-from gcs.views.page import milliseconds_text as _ms
-from gcs.views.report import UNKNOWN
-from gcs.views.report import number_text as _number
+from gcs.stress.report import MOST_ROWS, REPORT_FILE, CampaignResult, Noise, refly_command
+from gcs.stress.trial import Outcome
+from gcs.views.console import UNKNOWN, ms_text, plain_console
+from gcs.views.console import number_text as _number
 
+_ms = partial(ms_text, form=".2f")
 _FILE_WIDTH = 120
 _ID = 8
 """Characters of an id that are shown; `--trial` accepts the beginning of an id."""
 
 
-def print_result(result: dict[str, Any], folder: Path) -> None:
+def print_result(result: CampaignResult, folder: Path) -> None:
     """Print the onset beside the margin, the points of the sweep, and where the files are."""
     console = plain_console()
     if not console.is_terminal:
         console.width = _FILE_WIDTH
-    onset = result["onset"]
-    margin_s = result["delay_margin_s"]
+    onset, margin_s = result.onset, result.delay_margin_s
     console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
-    console.print(f"trials   {result['trials']}: {_kinds(result['trials_of_kind'])}")
+    console.print(f"trials   {result.trials}: {_kinds(result.trials_of_kind)}")
     if onset is not None:
-        frequency = onset["frequency_rad_s"]
-        breaks = "" if frequency is None else f"; breaks at {frequency:.2f} rad/s"
+        frequency_rad_s = onset.frequency_rad_s
+        breaks = "" if frequency_rad_s is None else f"; breaks at {frequency_rad_s:.2f} rad/s"
         console.print(
-            f"onset    {_ms(onset['loop_delay_s'])} ± {1e3 * onset['error_s']:.2f} ms in flight, "
-            f"{onset['difference']:+.3%} from the sampled margin of this loop, {_ms(onset['predicted_s'])}; "
-            f"the continuous model's less half a period for the hold, {_ms(onset['predicted_continuous_s'])}"
+            f"onset    {_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms in flight, "
+            f"{onset.difference:+.3%} from the sampled margin of this loop, {_ms(onset.predicted_s)}; "
+            f"the continuous model's less half a period for the hold, {_ms(onset.predicted_continuous_s)}"
         )
         console.print(
-            f"         {_ms(onset['link_delay_s'])} of link delay, up + down: vehicle {onset['critical']} waits "
-            f"{_ms(onset['waiting_s'])} for the control tick{breaks}"
+            f"         {_ms(onset.link_delay_s)} of link delay, up + down: vehicle {onset.critical} waits "
+            f"{_ms(onset.waiting_s)} for the control tick{breaks}"
         )
-    if result["onset_missing"]:
-        found = "none, as predicted" if result["onset_missing_as_predicted"] else "not found"
-        console.print(f"onset    {found}: {result['onset_missing']}")
-    if result["curve_error"] is not None:
+    if result.onset_missing:
+        found = "none, as predicted" if result.onset_missing_as_predicted else "not found"
+        console.print(f"onset    {found}: {result.onset_missing}")
+    if result.curve_error is not None:
+        console.print(f"curve    measured and predicted growth differ by at most {result.curve_error:.3%} of the range")
+    if result.past_limits:
         console.print(
-            f"curve    measured and predicted growth differ by at most {result['curve_error']:.3%} of the range"
-        )
-    if result["past_limits"]:
-        console.print(
-            f"limits   the links alone push vehicles past [limits] in {result['past_limits']} probes, which are flown "
+            f"limits   the links alone push vehicles past [limits] in {result.past_limits} probes, which are flown "
             "without; where limits bind, errors last that the loop alone would bring down",
             markup=False,
         )
-    _print_noise(console, result["noise"])
-    points = [point for point in result["points"] if point["kind"] == "probe"] or result["points"]
+    _print_noise(console, result.noise)
+    points = [point for point in result.points if point.kind == "probe"] or result.points
     if points:
         console.print(_table(points))
-    for failed in result["trials_failed"]:
-        last = failed["error"].strip().splitlines()[-1]
-        console.print(f"failed   {failed['id']}, seed {failed['seed']}, {place_text(failed['coordinates'])}: {last}")
+    for failed in result.trials_failed:
+        console.print(f"failed   {failed.id}, seed {failed.seed}, {place_text(failed.coordinates)}: {_fault(failed)}")
     console.print(f"files    {folder}: {REPORT_FILE}, stress.json, trials.jsonl, trials.parquet")
-    if result["worst"]:
-        console.print(f"again    {refly_command(folder, result['worst'][0])}")
-    if result["failure"]:
-        console.print(Text.assemble(("failed", "bold red"), f"   {result['failure']}"))
+    if result.worst:
+        console.print(f"again    {refly_command(folder, result.worst[0])}")
+    if result.failure:
+        console.print(Text.assemble(("failed", "bold red"), f"   {result.failure}"))
 
 
 def _kinds(trials_of_kind: dict[str, int]) -> str:
@@ -76,32 +73,32 @@ def _kinds(trials_of_kind: dict[str, int]) -> str:
     return ", ".join(f"{trials_of_kind[kind]} {text}" for kind, text in words.items() if kind in trials_of_kind)
 
 
-def _print_noise(console: Console, noise: dict[str, Any] | None) -> None:
+def _print_noise(console: Console, noise: Noise | None) -> None:
     """Print how much the machine disturbed flights in real time."""
-    if noise is None or "lateness_s_p50" not in noise:
+    if noise is None or not (noise.lateness_s_p50 and noise.lateness_s_p99 and noise.steal_share and noise.busy_share):
         return
-    late, latest, steal = noise["lateness_s_p50"], noise["lateness_s_p99"], noise["steal_share"]
+    latest = noise.lateness_s_p99
     console.print(
-        f"noise    set-points {_ms(late['median'])} late at the median, {_ms(latest['median'])} at the 99th percentile "
-        f"(at worst {_ms(latest['max'])}); the host took {steal['median']:.1%} of the processors, others and flights "
-        f"used {noise['busy_share']['median']:.0%}"
+        f"noise    set-points {_ms(noise.lateness_s_p50.median)} late at the median, {_ms(latest.median)} at the 99th "
+        f"percentile (at worst {_ms(latest.max)}); the host took {noise.steal_share.median:.1%} of the processors, "
+        f"others and flights used {noise.busy_share.median:.0%}"
     )
 
 
-def _table(points: list[dict[str, Any]]) -> Table:
+def _table(points: Sequence[Outcome]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    names = list(points[0]["coordinates"])
+    names = list(points[0].coordinates)
     for name in ("trial", *names, "loop, ms", "growth, 1/s", "±", "model", "verdict"):
         table.add_column(name, justify="right", no_wrap=True)
     for point in points[:MOST_ROWS]:
         table.add_row(
-            point["id"][:_ID],
-            *(f"{point['coordinates'][name]:g}" for name in names),
-            _ms(point["loop_delay_s"], unit=""),
-            _number(point["growth_1_s"]),
-            _number(point["growth_error_1_s"], "0.1g"),
-            _number(point["predicted_growth_1_s"]),
-            point["verdict"] or UNKNOWN,
+            point.id[:_ID],
+            *(f"{point.coordinates[name]:g}" for name in names),
+            _ms(point.loop_delay_s, unit=""),
+            _number(point.growth_1_s),
+            _number(point.growth_error_1_s, "0.1g"),
+            _number(point.predicted_growth_1_s),
+            point.verdict or UNKNOWN,
         )
     return table
 
@@ -129,27 +126,30 @@ def print_reflown(reflown: Reflown) -> None:
         console.print(outcome.error)
 
 
-def write_junit(result: dict[str, Any], file: Path) -> None:
+def write_junit(result: CampaignResult, file: Path) -> None:
     """Write one test case that onset and margin agree, and one for every trial that could not be flown."""
-    failed = {entry["id"]: entry for entry in result["trials_failed"]}
-    name = f"gcs stress {result['scenario']}"
-    count = 1 + len(failed)
+    failed, name = result.trials_failed, f"gcs stress {result.scenario}"
+    skipped = not result.failure and result.assert_onset is None
     suite = ElementTree.Element(
         "testsuite",
         name=name,
-        tests=str(count),
-        failures=str(int(bool(result["failure"]))),
+        tests=str(1 + len(failed)),
+        failures=str(int(bool(result.failure))),
         errors=str(len(failed)),
-        skipped=str(int(not result["failure"] and result["assert_onset"] is None)),
-        time=str(result["flight_time_s"]),
+        skipped=str(int(skipped)),
+        time=str(result.flight_time_s),
     )
     case = ElementTree.SubElement(suite, "testcase", classname=name, name="the onset is where the margin says")
-    if result["failure"]:
-        ElementTree.SubElement(case, "failure", message=result["failure"])
-    elif result["assert_onset"] is None:
+    if result.failure:
+        ElementTree.SubElement(case, "failure", message=result.failure)
+    elif skipped:
         ElementTree.SubElement(case, "skipped", message="--assert-onset was not given")
-    for trial_id, entry in failed.items():
-        case = ElementTree.SubElement(suite, "testcase", classname=name, name=f"trial {trial_id}")
-        error = ElementTree.SubElement(case, "error", message=entry["error"].strip().splitlines()[-1])
-        error.text = entry["error"]
+    for outcome in failed:
+        case = ElementTree.SubElement(suite, "testcase", classname=name, name=f"trial {outcome.id}")
+        ElementTree.SubElement(case, "error", message=_fault(outcome)).text = outcome.error
     ElementTree.ElementTree(suite).write(file, encoding="utf-8", xml_declaration=True)
+
+
+def _fault(outcome: Outcome) -> str:
+    """The last line of a failed trial's traceback."""
+    return (outcome.error or "").strip().splitlines()[-1]

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from gcs.cli.exit_codes import FAILED
-from gcs.cli.options import AsJson, ScenarioFile, load_scenario, out_folder, print_json
+from gcs.cli import FAILED
+from gcs.cli.options import AsJson, ScenarioFile, answer, load_scenario, print_json, run_folder
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
@@ -21,21 +21,18 @@ def compare(
 
     Exit code 1 if no route could be designed.
     """
-    from dataclasses import asdict
-
     from gcs.cli.study_output import print_comparison
-    from gcs.drive.fly import new_folder
     from gcs.studies import compare as comparing
     from gcs.studies.compare_cost import design_costs
 
     outlive_readers()
     scenario = load_scenario(scenario_file)
-    folder = out_folder(out) if out is not None else new_folder(f"{scenario.name}-compare")
+    folder = run_folder(out, f"{scenario.name}-compare")
     routes, flights = comparing.compare(scenario)
     grown = design_costs() if sizes else []
     comparing.write_comparison(folder, scenario, routes, flights, grown)
     if as_json:
-        print_json({"routes": [asdict(route) for route in routes], "files": str(folder)})
+        print_json({"routes": routes, "files": str(folder)})
     else:
         print_comparison(scenario, routes, grown)
         typer.echo(f"files    {folder}: {comparing.REPORT_FILE}, {comparing.RESULT_FILE}, PNG")
@@ -47,16 +44,13 @@ def thesis(
     as_json: AsJson = False,
 ) -> None:
     """Reproduce the figures and numbers of the source, published and computed side by side."""
-    from dataclasses import asdict
-
-    from gcs.drive.fly import new_folder
     from gcs.studies import thesis as source
 
-    folder = out_folder(out) if out is not None else new_folder("thesis")
+    folder = run_folder(out, "thesis")
     found = source.claims()
     page = source.write_page(folder, found)
     if as_json:
-        print_json([asdict(claim) for claim in found])
+        print_json(found)
         return
     for claim in found:
         typer.echo(f"{claim.place}  {claim.subject}: {claim.verdict}")
@@ -85,15 +79,10 @@ def bench(
     if vehicles:
         scenario = benchmark.with_vehicles(scenario, vehicles)
     if real_time:
-        result = benchmark.benchmark_real_time(scenario, seconds=seconds)
+        answer(benchmark.benchmark_real_time(scenario, seconds=seconds), print_real_time, as_json=as_json)
     else:
         result = benchmark.benchmark(scenario, seconds=seconds, repeat=repeat, signed=signed)
-    if as_json:
-        print_json(result)
-    elif real_time:
-        print_real_time(result)
-    else:
-        print_benchmark(result)
+        answer(result, print_benchmark, as_json=as_json)
 
 
 def capacity(
@@ -104,15 +93,13 @@ def capacity(
     as_json: AsJson = False,
 ) -> None:
     """How many vehicles, at which rate, the scenario's links carry before the delay margin is gone."""
-    from dataclasses import asdict
-
     from gcs.cli.study_output import print_capacity
     from gcs.studies.capacity import capacity as capacity_of
 
     scenario = load_scenario(scenario_file)
     found = capacity_of(scenario, rates_hz=_rates(rates), most=most, seeds=seeds)
     if as_json:
-        print_json({"capacities": [asdict(capacity) for capacity in found]})
+        print_json({"capacities": found})
     else:
         print_capacity(scenario, found)
 

@@ -8,11 +8,11 @@ from rich import box
 from rich.table import Table
 
 from gcs.cli.runs import print_grade
+from gcs.runs.grade import Grade
 from gcs.studies.capacity import FEWEST, Capacity, Load
 from gcs.studies.compare import Route, rows
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
-from gcs.views.console import plain_console
-from gcs.views.report import number_text
+from gcs.views.console import number_text, plain_console
 from scenarios.schema import Scenario
 
 _WHOLE_CORE = 0.95
@@ -111,4 +111,4 @@ def print_real_time(result: dict[str, Any]) -> None:
         f"set-points sent after they were due: p50 {1e3 * late['p50']:.3f} ms, p99 {1e3 * late['p99']:.3f} ms, "
         f"{control['deadline_misses']} deadline misses of {control['ticks']} ticks"
     )
-    print_grade(result)
+    print_grade(Grade.model_validate(result))

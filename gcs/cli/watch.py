@@ -3,14 +3,19 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gcs.cli.exit_codes import FAILED, INTERRUPTED
-from gcs.cli.options import AsJson, KeyFile, listening, opened_guard, print_json
+from gcs.cli import FAILED, INTERRUPTED
+from gcs.cli.options import AsJson, KeyFile, answer, listening, load_scenario, opened_guard, print_json
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+
+if TYPE_CHECKING:
+    from gcs.watch.links import WatchReport
+    from gcs.watch.rebuild_report import RebuildReport
+    from scenarios.schema import Scenario
 
 _TIMESYNC_HZ = 10.0
 ComparedMargin = Annotated[
@@ -53,10 +58,10 @@ def monitor(
         # Imported after the socket is open: datagrams that come meanwhile keep their receive stamps.
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
-        from gcs.watch.live import MonitorOptions, monitor_links
+        from gcs.watch.live import WatchOptions, watch_links
 
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
-        options = MonitorOptions(
+        options = WatchOptions(
             margin_s=margin_s,
             margin_of=margin_of,
             timesync_hz=0.0 if silent else asked_hz,
@@ -65,7 +70,7 @@ def monitor(
         )
         watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
         with stop_signals() as stop_reason:
-            report = monitor_links(link, watch, options, stop_reason, guard)
+            report = watch_links(link, watch, options, stop_reason, guard)
             interrupted = bool(stop_reason())
     if as_json:
         print_json(report)
@@ -100,19 +105,14 @@ def replay(
     _refuse_both(margin, design)
     from gcs.plan.design import Design
     from gcs.runs.files import read_design
-    from gcs.watch import rebuild_report
-    from gcs.watch.tlog import TlogError, read_tlog
+    from gcs.watch.rebuild_report import found, rebuild_report
+    from gcs.watch.tlog import read_tlog
 
-    there = rebuild_report.found(run)
+    there = found(run)
     given = None if design is None else read_design(design)
-    try:
-        log = read_tlog(there.log_file)
-    except TlogError as error:
-        raise InputError(str(error)) from None
+    log = read_tlog(there.log_file)
     if scenario_file is not None:
-        from scenarios.files import load
-
-        there = replace(there, scenario=load(scenario_file), design=None, recorded=None)
+        there = replace(there, scenario=load_scenario(scenario_file), design=None, recorded=None)
     if margin is not None:
         there = replace(there, design=Design(delay_margin_s=margin))
     elif given is not None:
@@ -121,32 +121,26 @@ def replay(
         from gcs.plan.planner import flight_plan
 
         there = replace(there, design=flight_plan(there.scenario)[0])
-    result = rebuild_report.replay(log, there)
-    if as_json:
-        print_json(result)
-    else:
-        _print_replay(result)
+    answer(rebuild_report(log, there), _print_rebuilt, as_json=as_json)
 
 
-def _print_replay(result: dict[str, Any]) -> None:
+def _print_rebuilt(report: "RebuildReport") -> None:
     """Print what was read of the log, its links, and the flight if the formation is known."""
     from gcs.views.console import plain_console
     from gcs.views.report import delay_text, print_flight
     from gcs.watch.table import links_table
 
-    console = plain_console()
-    log = result["log"]
-    left_out = "".join(f"; {count} {reason}" for reason, count in log["left_out"].items())
-    console.print(f"log      {log['file']}: {log['frames']} frames in {log['duration_s']:.1f} s{left_out}")
-    if not result["links"]:
+    console, log = plain_console(), report.log
+    left_out = "".join(f"; {count} {reason}" for reason, count in log.left_out.items())
+    console.print(f"log      {log.file}: {log.frames} frames in {log.duration_s:.1f} s{left_out}")
+    if not report.links:
         console.print("no vehicle in this log")
-    elif "flight" in result:
-        print_flight(result["flight"], console)
+    elif report.flight is not None:
+        print_flight(report.flight, console)
     else:
-        console.print(links_table(result["links"], console.width))
-    if "recorded" in result:
-        recorded = result["recorded"]
-        console.print(f"recorded {recorded['verdict']}: {delay_text(recorded)}")
+        console.print(links_table(report.links, console.width))
+    if report.recorded is not None:
+        console.print(f"recorded {report.recorded.verdict}: {delay_text(report.recorded)}")
 
 
 def _refuse_both(margin: float | None, design: Path | None) -> None:
@@ -154,18 +148,16 @@ def _refuse_both(margin: float | None, design: Path | None) -> None:
         raise InputError("read --margin and --design, wanted one of them")
 
 
-def _exit_code(report: dict[str, Any]) -> int:
-    bad = {"not heard", "past the margin"} & {vehicle["status"] for vehicle in report["vehicles"]}
-    return FAILED if bad or not report["vehicles"] else 0
+def _exit_code(report: "WatchReport") -> int:
+    bad = {"not heard", "past the margin"} & {vehicle.status for vehicle in report.vehicles}
+    return FAILED if bad or not report.vehicles else 0
 
 
-def _compared_with(scenario_file: Path | None, margin: float | None, design: Path | None) -> tuple[Any, Any, str]:
+def _compared_with(
+    scenario_file: Path | None, margin: float | None, design: Path | None
+) -> "tuple[Scenario | None, float | None, str]":
     """The scenario, the delay margin in s (None if none is known), and the source of that margin in words."""
-    scenario = None
-    if scenario_file is not None:
-        from scenarios.files import load
-
-        scenario = load(scenario_file)
+    scenario = None if scenario_file is None else load_scenario(scenario_file)
     if margin is not None:
         return scenario, margin, "given"
     if design is not None:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gains.formation.model import FormationModel
 from gcs.control.history import Report, State, StateHistory
 from gcs.plan.formation import Formation
 
@@ -59,12 +58,12 @@ def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequ
     its velocity error is used. Terms without a stand-in, and the spacing error of the lost vehicle, are omitted. A
     vehicle with nobody left ahead keeps the nominal velocity, as the leader does.
     """
-    model = FormationModel(tuple(formation.predecessor.tolist()))
+    model = formation.model
     stand_in: list[int] = []
-    for row, ahead in enumerate(formation.predecessor.tolist()):
+    for row, ahead in enumerate(model.predecessors):
         stand_in.append(row if not lost[row] else stand_in[ahead] if ahead >= 0 else -1)
     K = np.stack(gains)
-    in_front = [stand_in[ahead] if ahead >= 0 else -1 for ahead in formation.predecessor.tolist()]
+    in_front = [stand_in[ahead] if ahead >= 0 else -1 for ahead in model.predecessors]
     blocks: dict[tuple[int, int], FloatArray] = {}
 
     def block(i: int, k: int) -> FloatArray:

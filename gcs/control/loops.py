@@ -134,7 +134,7 @@ class OnboardLoop:
 
     def parameters(self, system_id: int) -> dict[str, float]:
         formation = self._plan.formation
-        return own_parameters(formation, self._plan.gain, formation.system_ids.index(system_id))
+        return own_parameters(formation, self._plan.gain, formation.row(system_id))
 
 
 def _gains(plan: FlightPlan, lost: Sequence[bool]) -> tuple[Any, ...]:

@@ -1,5 +1,9 @@
-"""The tick record: one row per vehicle and control tick, the contract between control, recording, reports and tests."""
+"""The tick record: one row per vehicle and control tick, the contract between control, recording, reports and tests.
 
+What happens between ticks is an `Event`.
+"""
+
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -12,6 +16,23 @@ GAIN_SET = "gain set "
 """Begins the part of a STATUSTEXT, after the vehicle's name, that announces its new gain set."""
 TickArray = NDArray[Any]
 """A structured array of dtype TICK: one row for each vehicle."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Something that happened in a flight, as a line of events.jsonl has it; `time_s` is scenario time."""
+
+    time_s: float
+    kind: str
+    system_id: int | None = None
+    text: str
+    counts: dict[str, int] | None = None
+    """How often each thing named in the text happened, where it counts them."""
+
+    @property
+    def about(self) -> list[int]:
+        """The vehicle that it is about, in a list; empty if it is about none."""
+        return [] if self.system_id is None else [self.system_id]
 
 
 class Mode(IntEnum):

@@ -2,18 +2,17 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.effective_delay import truth_of
 from gcs.runs.files import write_design
 from gcs.runs.grade import Truth
-from gcs.runs.record import SCENARIO_FILE, RunWriter
+from gcs.runs.record import END, SCENARIO_FILE, RunWriter
 from gcs.station.station import Station
 from scenarios import files as scenario_files
 
@@ -28,7 +27,7 @@ class Flight:
     """
 
     ticks: TickArray
-    events: list[dict[str, Any]]
+    events: list[Event]
     truth: Truth | None = None
     steal_share: float | None = None
     busy_share: float | None = None
@@ -57,11 +56,10 @@ def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: boo
         if writer is not None:
             writer.tick(tick)
             writer.frames(station.frames)
-    events: list[dict[str, Any]] = [event._asdict() for event in station.events]
-    events.append({"time_s": float(rows[-1]["time_s"][0]), "kind": "end", "text": station.end_reason})
+    events = [*station.events, Event(time_s=float(rows[-1]["time_s"][0]), kind=END, text=station.end_reason)]
     if writer is not None:
         for event in events:
-            writer.event(**event)
+            writer.event(event)
         writer.close()
     return Flight(np.concatenate(rows), events, truth_of(records) if with_truth else None)
 

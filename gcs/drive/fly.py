@@ -8,8 +8,8 @@ import time  # noqa: TID251 - names the run's folder; the flight's own clock is 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from gcs.control.tick import Event
 from gcs.drive.guard import Guard
 from gcs.drive.mirror import Mirror
 from gcs.drive.sitl import VehicleProcess
@@ -21,6 +21,7 @@ from gcs.plan.planner import described
 from gcs.runs.files import write_design
 from gcs.runs.record import DESIGN_FILE, END, FLEET, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter
 from gcs.runs.summary import finish
+from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
 from scenarios import files as scenario_files
 
@@ -51,7 +52,7 @@ def fly(
     options: FlyOptions,
     guard: Guard | None = None,
     mirror: Mirror | None = None,
-) -> dict[str, Any]:
+) -> Summary:
     """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder."""
     folder = options.folder
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
@@ -69,7 +70,7 @@ def _flown(
     guard: Guard | None,
     mirror: Mirror | None,
     asked_to_stop: Callable[[], str],
-) -> list[dict[str, Any]]:
+) -> list[Event]:
     """Fly and leave the logs in the folder; returns the events that could not be written."""
     folder = options.folder
     with contextlib.ExitStack() as stack:
@@ -90,7 +91,7 @@ def _flown(
         prepare_real_time()
         station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS)
         if options.fleet:
-            writer.event(time_s=station.scenario_time_s(clock_ns()), kind=FLEET, text=options.fleet)
+            writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=FLEET, text=options.fleet))
 
         def new_plan(found: FlightPlan) -> None:
             try:
@@ -98,14 +99,14 @@ def _flown(
             except OSError as error:
                 writer.ended(DESIGN_FILE, error)
             text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
-            writer.event(time_s=station.scenario_time_s(clock_ns()), kind=NEW_DESIGN, text=text)
+            writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=NEW_DESIGN, text=text))
 
         def stop() -> str:
             return asked_to_stop() or ("" if vehicles is None else vehicles.complaint())
 
         try:
             drive(station, link, writer, stop, new_plan, guard, mirror)
-            writer.event(time_s=station.scenario_time_s(clock_ns()), kind=END, text=station.end_reason)
+            writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=END, text=station.end_reason))
         finally:
             unwritten = writer.close()
         if unwritten:  # including the last event, for which the observer waits

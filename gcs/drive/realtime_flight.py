@@ -4,9 +4,9 @@ import errno
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.drive.fly import FlyOptions, fly
 from gcs.drive.udp import StationSocket
 from gcs.plan.design import Design
@@ -28,7 +28,7 @@ class ProcessorShares(NamedTuple):
 
 def fly_real_time(
     plan: FlightPlan, design: Design, folder: Path | None
-) -> tuple[TickArray, list[dict[str, Any]], Truth, ProcessorShares]:
+) -> tuple[TickArray, list[Event], Truth, ProcessorShares]:
     """Fly a plan in real time.
 
     With a folder, which is created, the run is left there; otherwise it is deleted once read.
@@ -45,7 +45,7 @@ def fly_real_time(
         with StationSocket("127.0.0.1", 0) as link:
             summary = fly(plan, design, link, FlyOptions(folder=folder, show_table=False))
         needed = (TICKS_FILE, EVENTS_FILE, TRUTH_FILE)
-        if lost := [text for text in summary["not_logged"] if text.startswith(needed)]:
+        if lost := [text for text in summary.not_logged if text.startswith(needed)]:
             raise OSError(errno.ENOSPC, "; ".join(lost), str(folder))
         spent = [after - former for after, former in zip(_processor_times(), before, strict=True)]
         total = max(1, sum(spent))

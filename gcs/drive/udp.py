@@ -15,6 +15,7 @@ from types import TracebackType
 from typing import Self
 
 from gcs.control.phases import Phase
+from gcs.control.tick import Event
 from gcs.drive.guard import Guard
 from gcs.drive.mirror import Mirror
 from gcs.link import mavlink
@@ -144,7 +145,7 @@ def drive(
     def log_refusals(now_ns: int, *, last: bool = False) -> None:
         if counts := refusals.news(station.counters, last=last):
             text = in_words(counts) if last else ", ".join(counts)
-            writer.event(time_s=station.scenario_time_s(now_ns), kind=REFUSED, text=text, counts=counts)
+            writer.event(Event(time_s=station.scenario_time_s(now_ns), kind=REFUSED, text=text, counts=counts))
 
     while station.phase is not Phase.ENDED:
         link.wait(station.next_event_ns)
@@ -176,7 +177,7 @@ def drive(
     log_refusals(clock_ns(), last=True)
     if mirror is not None:
         time_s, counts = station.scenario_time_s(clock_ns()), dict(mirror.counters)
-        writer.event(time_s=time_s, kind=MIRROR, text=in_words(counts), counts=counts)
+        writer.event(Event(time_s=time_s, kind=MIRROR, text=in_words(counts), counts=counts))
 
 
 def _log(station: Station, writer: RunWriter, frames: list[tuple[bytes, int]]) -> None:
@@ -185,5 +186,5 @@ def _log(station: Station, writer: RunWriter, frames: list[tuple[bytes, int]]) -
     writer.frames([(frame, time_ns + offset_ns) for frame, time_ns in frames])
     frames.clear()
     for event in station.events:
-        writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
+        writer.event(event)
     station.events.clear()

@@ -1,9 +1,9 @@
-"""α and the growth of spacing errors at a loop delay, that expected of a scenario's links or one measured in flight.
+"""α and the growth of spacing errors at a loop delay: that expected of a scenario's links, or one measured in flight.
 
-What a design says of them without delay says little of a flight. `gains.performance.flown_loop` has the loop of a
-follower as it is flown, which says it all for a leader-follower tree with the same gains for each;
-`gains.performance.flown_formation` has the whole formation, for gains on any other pattern. There errors run both ways,
-so that no growth from vehicle to vehicle is defined and only α is reported.
+Their values without delay say little about a flight. In a leader-follower tree with equal gains the loop of a follower
+as flown (`gains.performance.flown_loop`) gives both. Gains on another pattern need the whole formation
+(`gains.performance.flown_formation`): errors run both ways there, so growth from vehicle to vehicle is undefined and
+only α is reported.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,6 @@ import numpy as np
 
 from gains.core.requirement import plain
 from gains.design.graph import time_scaled
-from gains.formation.model import FormationModel
 from gains.performance.delayed_alpha import ALPHA_KEPT
 from gains.performance.flown_formation import FlownFormation
 from gains.performance.flown_loop import FlownLoop
@@ -27,11 +26,11 @@ from scenarios.schema import Scenario
 
 
 def expected_loop_delay_s(scenario: Scenario) -> float:
-    """The loop delay (s) to be expected of the slowest links, at the slowest of their delay points.
+    """The expected loop delay (s) over the slowest links, at the slowest of their delay points.
 
-    Up and down with the mean of their jitter, and half of the shorter period of telemetry and control: on average the
-    first command computed from a state waits that long, from none to a whole period as the phases of vehicle and
-    station happen to be. On board the state of the slowest link up may be needed on the slowest link down.
+    It is the delay up and down with mean jitter, plus half the shorter period of telemetry and control: the first
+    command computed from a state waits from nothing to a whole period, as the phases of vehicle and station happen to
+    be. With the loop on board, a state from the slowest link up may be needed on the slowest link down.
     """
     links = [scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles]
     if scenario.control.loop == "onboard":
@@ -59,14 +58,14 @@ def _mean_jitter_s(jitter: Jitter) -> float:
 
 
 def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
-    """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole."""
+    """The design with `at_loop_delay`: the figures at the expected loop delay, and the delays up to which they hold."""
     loops = _flown_loops(design, scenario)
     if not loops:
         return design
     requirement = design.requirement
     chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
     peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
-    # of different vehicles the one that leaves least
+    # where vehicles differ, the least counts
     alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
     flown = FiguresAtExpectedDelay(
         **figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump(),
@@ -82,7 +81,7 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
     """α and the string peak of a design's gain set at a loop delay (s)."""
     loops = [] if delay_s is None else _flown_loops(design, scenario, gain_set)
     if delay_s is None or not loops:
-        return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
+        return FiguresAtDelay(loop_delay_s=delay_s, alpha=None, has_string_verdict=False, string_peak=None)
     chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
     return FiguresAtDelay(
         loop_delay_s=delay_s,
@@ -95,7 +94,7 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
 def _flown_loops(
     design: Design, scenario: Scenario, gain_set: int = 0
 ) -> Sequence[FlownLoop] | Sequence[FlownFormation]:
-    """What is flown, as far as it has an α at all: the formation, or the loops of its followers."""
+    """The loops of the followers, or the whole formation; empty where no α is defined."""
     if design.vehicles < 2:
         return []
     entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
@@ -105,7 +104,7 @@ def _flown_loops(
 
 
 def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
-    """The loops of the followers of an inclusion design, one for each way in which vehicles answer."""
+    """The loops of the followers of an inclusion design, one for each response that vehicles have."""
     gains = entry.K1_1_s or design.K1_1_s, entry.K2_1_s or design.K2_1_s, entry.K3_1_s2 or design.K3_1_s2
     own, front, spacing = (0.0 if gain is None else gain[0][0] for gain in gains)
     if not (own < 0.0 < spacing):
@@ -126,8 +125,7 @@ def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
 def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> FlownFormation:
     """The formation with the gains of an entry of a graph design's schedule."""
     formation = plan_formation(scenario)
-    model = FormationModel(tuple(formation.predecessor.tolist()))
-    first = np.array(design.K)
+    model, first = formation.model, np.array(design.K)
     if design.loop == "onboard":
         own = own_part(model, first)
         gain = own + entry.streamed_share * (first - own)
@@ -146,6 +144,6 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
 
 
 def _responses(design: Design) -> dict[int, Response]:
-    """How vehicles answer, by system id; empty if that is not known, or at once."""
+    """The vehicles' responses by system id; empty if they are unknown or immediate."""
     known = design.response.vehicles if design.response is not None else ()
     return {vehicle.system_id: Response(vehicle.lag_s, vehicle.velocity_gain_1_s) for vehicle in known}

@@ -4,12 +4,13 @@
 """
 
 from math import inf, isinf
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
 from gains.core.requirement import Requirement
 from gains.performance.robust import SolverFacts
+from gcs.published import Published
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -22,25 +23,21 @@ Margin = Annotated[Annotated[float, Field(ge=0)] | None, AfterValidator(_none_if
 """A delay margin in s; None where no delay makes the loop unstable, or where it is not known."""
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True)
-
-
-class BlockMargin(_Part):
+class BlockMargin(Published):
     """Continuous delay margin of one diagonal block, and the frequency at which it is lost; None if it never is."""
 
     delay_margin_s: Margin
     crossing_rad_s: float | None
 
 
-class TradeOffPoint(_Part):
+class TradeOffPoint(Published):
     """The largest α that gains with this delay margin can have."""
 
     delay_margin_s: float
     alpha: float
 
 
-class Behaviour(_Part):
+class Behaviour(Published):
     """As in `gains.performance.behaviour.Behaviour`; None for what is not finite."""
 
     decay_rate_1_s: float
@@ -52,7 +49,7 @@ class Behaviour(_Part):
     delay_s: float
 
 
-class Proof(_Part):
+class Proof(Published):
     """P of the Lyapunov function, what it proves, and the eigenvalues that were checked.
 
     Inclusion gains have the proof of `gains.performance.robust.Certificate`, gains on a pattern that of
@@ -67,7 +64,7 @@ class Proof(_Part):
     solver: SolverFacts | None = None
 
 
-class Block(_Part):
+class Block(Published):
     """The gain with which a vehicle uses the errors of another, or its own; both are system ids."""
 
     vehicle: int
@@ -75,8 +72,8 @@ class Block(_Part):
     gain: Matrix
 
 
-class GainSet(_Part):
-    """One entry of the gain schedule: its gains, or the share of what is streamed, and what they are good for."""
+class GainSet(Published):
+    """One entry of the gain schedule: its gains, or the share of the stream it flies with, and its figures."""
 
     streamed_share: float = 1.0
     time_scale: float = 1.0
@@ -90,7 +87,7 @@ class GainSet(_Part):
     delay_margin_continuous_s: Margin = None
 
 
-class VehicleResponse(_Part):
+class VehicleResponse(Published):
     """How one vehicle responds to set-points, as in `gains.performance.response.Response`."""
 
     system_id: int
@@ -98,7 +95,7 @@ class VehicleResponse(_Part):
     velocity_gain_1_s: float
 
 
-class ResponsePart(_Part):
+class ResponsePart(Published):
     """How the vehicles respond to set-points, and what the margin would be if they did so at once."""
 
     source: str
@@ -109,7 +106,7 @@ class ResponsePart(_Part):
     string_peak: float | None = None
 
 
-class OnboardPart(_Part):
+class OnboardPart(Published):
     """Rates of the loop on board, and the margins if the station closed every loop with the same gains."""
 
     rate_hz: float
@@ -118,7 +115,7 @@ class OnboardPart(_Part):
     ground_delay_margin_continuous_s: Margin
 
 
-class FiguresAtDelay(_Part):
+class FiguresAtDelay(Published):
     """α and the growth of spacing errors at a loop delay; None where unknown or without bound."""
 
     loop_delay_s: float | None
@@ -138,11 +135,11 @@ class FiguresAtExpectedDelay(FiguresAtDelay):
     string_peak_kept_to_s: float | None
 
 
-class Design(_Part):
-    """The gains of a scenario, what they are good for, and how that is known; fields as published in design.json.
+class Design(Published):
+    """The gains of a scenario, their margins and other figures, and the proofs; fields as published in design.json.
 
-    Only the margins have to be there: what a method does not give, and what an older file lacks, keeps its default and
-    is not written. Of the margins in a schedule the first is that of the design.
+    Only the sampled margin is required: what a method does not give, and what an older file lacks, keeps its default
+    and is not written. The first margin of the schedule is that of the design.
     """
 
     K1_1_s: Matrix | None = None
@@ -188,12 +185,8 @@ class Design(_Part):
         every = [entry.delay_margin_s for entry in self.schedule] or [self.delay_margin_s]
         return tuple(inf if margin_s is None else margin_s for margin_s in every)
 
-    def with_schedule(self, schedule: tuple[GainSet, ...], **parts: _Part | str) -> Self:
+    def with_schedule(self, schedule: tuple[GainSet, ...], **parts: Published | str) -> Self:
         """The design with another schedule, of which the first entry gives its margins, and with other parts."""
         first = schedule[0]
         margins = {"delay_margin_s": first.delay_margin_s, "delay_margin_continuous_s": first.delay_margin_continuous_s}
         return self.model_copy(update=margins | {"schedule": schedule} | parts)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain types for JSON: what the design has, under the published names."""
-        return self.model_dump(mode="json", exclude_unset=True)

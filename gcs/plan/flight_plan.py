@@ -25,11 +25,11 @@ class FlightPlan:
     separable: bool = True
     """Whether every vehicle's loop has a margin of its own, as in a leader-follower tree."""
     responses: Responses | None = None
-    """How the vehicles answer; None if at once, or not yet known."""
+    """The vehicles' responses; None if they are immediate, or not yet known."""
     around_loss: tuple[FloatArray, ...] = ()
-    """In place of `gains` while a vehicle is lost; empty if they serve. A leader-follower tree stays stable when the
-    nearest vehicle ahead stands in for a lost one; gains on another pattern may not without all of their terms, so
-    they are left for the inclusion gains of the same delay margin. The step in the commands is accepted."""
+    """Flown in place of `gains` while a vehicle is lost; empty if those serve. A leader-follower tree stays stable when
+    the nearest vehicle ahead stands in for a lost one. Gains on another pattern may need all of their terms, so
+    inclusion gains of the same delay margin replace them; the step in the commands is accepted."""
 
     @cached_property
     def gains(self) -> tuple[FloatArray, ...]:
@@ -41,9 +41,10 @@ class FlightPlan:
         """The delay margins of the gain schedule."""
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
 
-    @cached_property
+    @property
     def model(self) -> FormationModel:
-        return FormationModel(tuple(self.formation.predecessor.tolist()))
+        """The formation's error model."""
+        return self.formation.model
 
     @property
     def timing(self) -> Timing:
@@ -51,7 +52,7 @@ class FlightPlan:
         return loop_timing(self.scenario)
 
     def with_margins(self, margins_s: tuple[float, ...], responses: Responses | None) -> "FlightPlan":
-        """The same gains with the margins that they have on vehicles that answer so."""
+        """The same gains, with their margins on vehicles that respond so."""
         slower = tuple((gain, s) for (gain, _), s in zip(self.slower, margins_s[1:], strict=True))
         return replace(self, delay_margin_s=margins_s[0], slower=slower, responses=responses)
 

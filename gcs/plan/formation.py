@@ -1,40 +1,42 @@
-"""The scenario's formation as arrays: who follows whom, and at which distance."""
+"""The scenario's formation: who follows whom, and at which distance."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from gains.core.arrays import FloatArray, IntArray
+from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
 from scenarios.schema import Scenario
 
 
 @dataclass(frozen=True)
 class Formation:
-    """Who follows whom, in an order in which every vehicle comes after the one it follows.
-
-    `predecessor` (n,) holds rows, -1 for the leader; `offset_ne_m` (n, 2) is the wanted position relative to the
-    predecessor, zero for the leader.
-    """
+    """The vehicles of a formation, in an order in which each comes after the one it follows."""
 
     system_ids: tuple[int, ...]
-    predecessor: IntArray
+    model: FormationModel
+    """Who follows whom, and the error model that follows from it."""
     offset_ne_m: FloatArray
+    """Wanted position relative to the vehicle in front, (n, 2); zero for the leader."""
+
+    def row(self, system_id: int) -> int:
+        """The place of a vehicle in the order."""
+        return self.system_ids.index(system_id)
 
     def place_ne_m(self) -> FloatArray:
         """Wanted positions relative to the leader, (n, 2)."""
         place = self.offset_ne_m.copy()
-        for row, ahead in enumerate(self.predecessor.tolist()):
-            if ahead >= 0:
-                place[row] += place[ahead]
+        for i in self.model.followers:
+            place[i] += place[self.model.predecessors[i]]
         return place
 
 
 def plan_formation(scenario: Scenario) -> Formation:
-    """The scenario's formation as arrays, vehicles in `leader_first` order."""
+    """The scenario's formation, its vehicles in `leader_first` order."""
     ordered = scenario.leader_first()
     row = {vehicle.system_id: k for k, vehicle in enumerate(ordered)}
     return Formation(
         system_ids=tuple(row),
-        predecessor=np.array([-1 if v.follows is None else row[v.follows] for v in ordered], dtype=np.int64),
+        model=FormationModel(tuple(-1 if v.follows is None else row[v.follows] for v in ordered)),
         offset_ne_m=np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered]),
     )

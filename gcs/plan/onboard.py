@@ -12,7 +12,6 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.requirement import plain
-from gains.formation.model import FormationModel
 from gains.performance.behaviour import behaviour
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
 from gcs.plan.design import Behaviour, Design, GainSet, OnboardPart
@@ -37,12 +36,11 @@ def timing_of(scenario: Scenario) -> OnboardTiming | None:
 
 
 def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
-    """Design and plan of a ground loop, made those of the onboard loop with the same gains.
+    """Design and plan of the onboard loop, from those of a ground loop with the same gains.
 
-    Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. The
-    slower entries of the schedule leave the vehicles' own gains as they are and take a smaller share of what is
-    streamed: with none of it the formation is stable at every delay. That is what is flown around a lost vehicle, if
-    vehicles act on each other both ways.
+    Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. Slower
+    entries of the schedule keep the vehicles' own gains and reduce the share of the stream. Without any of it the
+    formation is stable at every delay: where vehicles act on each other both ways, that is flown around a lost one.
     """
     timing = timing_of(plan.scenario)
     assert timing is not None
@@ -89,8 +87,8 @@ def own_parameters(formation: Formation, K: FloatArray, row: int) -> dict[str, f
     to it; FORM_KP_xy and FORM_KV_xy are the gains from spacing and velocity error in y to acceleration in x. FORM_LOOP,
     the last, switches the loop on.
     """
-    model = FormationModel(tuple(formation.predecessor.tolist()))
-    ahead = int(formation.predecessor[row])
+    model = formation.model
+    ahead = model.predecessors[row]
     rows, north_east = model.input_slice(row), enumerate(formation.offset_ne_m[row].tolist())
     on_spacing = K[rows, model.spacing_slice(row)] if ahead >= 0 else np.zeros((2, 2))
     on_velocity = K[rows, model.velocity_slice(row)]

@@ -28,21 +28,18 @@ _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
 
 _MORE = 1.1
-"""What the rates take of a margin asked for is asked for so many times more: it is a small part of the margin."""
+"""A design whose margin is too short at these rates is repeated for a margin larger by the shortage times this."""
 
 
 def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     """The design of a scenario, and the plan to fly it.
 
-    Raises
-    ------
-    gains.core.errors.GainsError
-        If the scenario's requirement cannot be met.
+    Raises gains.core.errors.GainsError if the scenario's requirement cannot be met.
     """
     formation = plan_formation(scenario)
-    model = FormationModel(tuple(formation.predecessor.tolist()))
+    model = formation.model
     if scenario.control.method != "inclusion" or scenario.control.blocks:
-        return _flown_loop(*_graph_plan(scenario, formation, model))
+        return _flown_loop(*_graph_plan(scenario, formation))
     responses = given_responses(scenario)
     found = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
     schedule = _schedule(scenario, model, found)
@@ -59,7 +56,7 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
 
 
 def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
-    """Design and plan of a ground loop, made those of the scenario's loop, with the figures at its delay."""
+    """Design and plan of the scenario's loop, from those of its ground loop, with the figures at its delay."""
     if plan.scenario.control.loop == "onboard":
         design, plan = onboard_plan(design, plan)
     return with_figures_at_delay(design, plan.scenario), plan
@@ -81,9 +78,9 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
 
 
 def described(design: Design, plan: FlightPlan) -> Design:
-    """The design with the vehicles' responses in it: its margins become those with them.
+    """The design with the vehicles' responses, and its margins with them.
 
-    `delay_margin_at_once_s` is the margin that the same gains have on vehicles that answer at once.
+    `delay_margin_at_once_s` is the margin of the same gains on vehicles that respond at once.
     """
     assert plan.responses is not None
     every = plan.responses.in_order(plan.formation.system_ids)
@@ -118,7 +115,7 @@ def _with_margins(
 def _schedule(scenario: Scenario, model: FormationModel, found: InclusionDesign) -> list[tuple[float, InclusionDesign]]:
     """The design slowed down by the scenario's factors.
 
-    With K1 / s, K2 / s and K3 / s² the loop does the same things s times slower, so its delay margin is s times larger.
+    With K1 / s, K2 / s and K3 / s² the loop moves s times slower, so its delay margin is s times larger.
     """
     period_s = loop_timing(scenario).held_s
     return [
@@ -153,13 +150,13 @@ def _requirement(scenario: Scenario) -> Requirement:
     )
 
 
-def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel) -> tuple[Design, FlightPlan]:
+def _graph_plan(scenario: Scenario, formation: Formation) -> tuple[Design, FlightPlan]:
     """Design and plan on an information pattern, designed or given block by block."""
-    control, timing = scenario.control, loop_timing(scenario)
+    control, timing, model = scenario.control, loop_timing(scenario), formation.model
     period_s = timing.held_s
-    pattern = _pattern(scenario, formation, model)
+    pattern = _pattern(scenario, formation)
     if control.blocks:
-        found = evaluate_graph_gain(model, pattern, _given_gain(scenario, formation, model), period_s=period_s)
+        found = evaluate_graph_gain(model, pattern, _given_gain(scenario, formation), period_s=period_s)
     else:
         assert control.method != "inclusion"
         wanted = _requirement(scenario)
@@ -182,7 +179,7 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
         around_loss=() if control.loop == "onboard" else _around_loss(model, found.delay_margin_s, scales, period_s),
     )
     schedule = [
-        _entry(scale, entry, blocks=_blocks(entry.K, formation, model, pattern))
+        _entry(scale, entry, blocks=_blocks(entry.K, formation, pattern))
         for scale, entry in zip(scales, [found, *slower], strict=True)
     ]
     ids = formation.system_ids
@@ -191,27 +188,26 @@ def _graph_plan(scenario: Scenario, formation: Formation, model: FormationModel)
     return _with_responses(Design.model_validate(found.to_dict() | parts), plan, given_responses(scenario))
 
 
-def _pattern(scenario: Scenario, formation: Formation, model: FormationModel) -> Pattern:
+def _pattern(scenario: Scenario, formation: Formation) -> Pattern:
     """Who may use whose errors."""
-    row = {system_id: k for k, system_id in enumerate(formation.system_ids)}
-    tree = leader_follower(model)
+    row, tree = formation.row, leader_follower(formation.model)
     if scenario.control.blocks:
         none = without_links(tree, tree.links)
-        return with_links(none, [(row[block.vehicle], row[block.of]) for block in scenario.control.blocks])
-    return with_links(tree, [(row[v.system_id], row[heard]) for v in scenario.vehicles for heard in v.hears])
+        return with_links(none, [(row(block.vehicle), row(block.of)) for block in scenario.control.blocks])
+    return with_links(tree, [(row(v.system_id), row(heard)) for v in scenario.vehicles for heard in v.hears])
 
 
-def _given_gain(scenario: Scenario, formation: Formation, model: FormationModel) -> FloatArray:
-    row = {system_id: k for k, system_id in enumerate(formation.system_ids)}
+def _given_gain(scenario: Scenario, formation: Formation) -> FloatArray:
+    model, row = formation.model, formation.row
     K = np.zeros((model.inputs, model.states))
     for block in scenario.control.blocks:
-        K[model.input_slice(row[block.vehicle]), model.output_slice(row[block.of])] = block.gain
+        K[model.input_slice(row(block.vehicle)), model.output_slice(row(block.of))] = block.gain
     return K
 
 
-def _blocks(K: FloatArray, formation: Formation, model: FormationModel, pattern: Pattern) -> list[Block]:
+def _blocks(K: FloatArray, formation: Formation, pattern: Pattern) -> list[Block]:
     """The gain matrix block by block, as a scenario gives it."""
-    ids = formation.system_ids
+    ids, model = formation.system_ids, formation.model
     return [
         Block(vehicle=ids[i], of=ids[j], gain=K[model.input_slice(i), model.output_slice(j)].tolist())
         for i, j in pattern.links
@@ -221,7 +217,7 @@ def _blocks(K: FloatArray, formation: Formation, model: FormationModel, pattern:
 def _around_loss(
     model: FormationModel, delay_margin_s: float, scales: tuple[float, ...], period_s: float
 ) -> tuple[FloatArray, ...]:
-    """Inclusion gains of the same delay margin, as far as they can have it, slowed down by each factor."""
+    """Inclusion gains of the same delay margin, within limits, slowed down by each factor."""
     margin_s = min(max(delay_margin_s, _MARGINS_AROUND_LOSS_S[0]), _MARGINS_AROUND_LOSS_S[1])
     found = design(model, Requirement(delay_margin_s=margin_s, string_peak_max=1.0), period_s=period_s)
     K = model.overlapping_gain(found.K1, found.K2, found.K3)

@@ -1,4 +1,4 @@
-"""How vehicles with autopilots answer to set-points, and the margins with that."""
+"""How vehicles with autopilots respond to set-points, and the margins with these responses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The constant loop delay that a vehicle's commands stand for, whatever their links did to each of them."""
+"""The constant loop delay that is equivalent to the varying delays of a vehicle's commands."""
 
 from collections.abc import Iterable, Sequence
 
@@ -12,7 +12,7 @@ _TRUTH = np.dtype([("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_n
 
 
 def truth_of(records: Iterable[Sequence[int]]) -> Truth:
-    """Of the records of simulated vehicles those that say when states were sampled and set-points acted."""
+    """Those records of simulated vehicles that say when states were sampled and set-points acted."""
     return np.array([tuple(record[:4]) for record in records if record[0] in (SAMPLED, ACTED)], _TRUTH)
 
 
@@ -39,11 +39,11 @@ def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray
 
 
 def effective_delay_s(commands: NDArray[np.int64], *, held_s: float) -> float:
-    """The constant loop delay that commands like these stand for: mean age of the state behind them, less T / 2.
+    """The constant loop delay equivalent to these commands: the mean age of the state behind them, less T / 2.
 
-    T = `held_s` is the slower of the periods of telemetry and control. The command in action grows older until one from
-    a newer state acts, T / 2 more in the mean when all arrive (`gains.sampled.multirate`). Unlike the
-    median of the loop delays this counts commands that never came. Where delays change fast against the loop's motion
+    T = `held_s` is the slower of the periods of telemetry and control. The command in action ages until one from a
+    newer state acts, T / 2 on average when all arrive (`gains.sampled.multirate`). Unlike the median of the loop
+    delays, this accounts for commands that never arrived. Where delays change fast compared with the loop's motion,
     only the mean age matters, to first order.
     """
     if len(commands) < 2:

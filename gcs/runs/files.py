@@ -1,49 +1,25 @@
-"""The files of a run's folder, each with its one reader: what is damaged, or of another kind, is told in one line.
+"""The one reader of each file in a run's folder.
 
-Raised everywhere here: gcs.errors.InputError.
+A file that is damaged, or of another kind, raises gcs.errors.InputError with one line.
 """
 
-import json
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
-from gcs.control.tick import TICK, Mode, TickArray
+from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.errors import InputError
-from gcs.plan.design import Design, Margin
+from gcs.plan.design import Design
+from gcs.published import Published
 from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE, write_whole
+from gcs.runs.summary_record import Summary
 from scenarios import files as scenario_files
 from scenarios.schema import Scenario
 
-_Record = TypeVar("_Record", bound=BaseModel)
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")
-
-
-class _Delays(_Part):
-    p50: float | None
-    p99: float | None
-    max: float | None
-
-
-class _Summary(_Part):
-    verdict: str
-    loop: Literal["ground", "onboard"]
-    delay_margin_s: Margin
-    loop_delay_s: _Delays
-    headroom_min: float | None
-
-
-class _Event(_Part):
-    time_s: float
-    kind: str
-    system_id: int | None
-    text: str
-    counts: dict[str, int] = {}
+_Record = TypeVar("_Record", bound=Published)
+_EVENT = TypeAdapter(Event)
 
 
 def read_scenario(folder: Path) -> Scenario:
@@ -60,12 +36,12 @@ def read_design(file: Path) -> Design:
 
 def write_design(folder: Path, design: Design) -> None:
     """Write a run's design.json, whole or not at all."""
-    write_whole(folder / DESIGN_FILE, json.dumps(design.to_dict(), indent=2, allow_nan=False).encode())
+    write_whole(folder / DESIGN_FILE, design.to_json().encode())
 
 
-def read_summary(file: Path) -> dict[str, Any]:
+def read_summary(file: Path) -> Summary:
     """A summary.json."""
-    return _checked(file, _Summary, "the summary of a run").model_dump()
+    return _checked(file, Summary, "the summary of a run")
 
 
 def read_ticks(folder: Path) -> TickArray:
@@ -80,7 +56,7 @@ def read_ticks(folder: Path) -> TickArray:
 
 
 _ADDED = {"delay_margin_s": np.nan, "repeated_s": 0.0}
-"""Columns that older runs lack, and what is read for them."""
+"""Columns that older runs lack, and the values read instead."""
 
 
 def _from_parquet(file: Path) -> TickArray:
@@ -133,13 +109,13 @@ class RunTail:
         self._ticks_read += count
         return np.frombuffer(data[:count], dtype=TICK)
 
-    def events(self) -> list[dict[str, Any]]:
-        """New events: time_s, kind, system_id (or None), text."""
+    def events(self) -> list[Event]:
+        """New events, in the order they were written."""
         data, _ = self._new(EVENTS_FILE, self._events_read, 1)
         whole = data[: data.rfind(b"\n") + 1]
         self._events_read += len(whole)
         try:
-            return [_Event.model_validate_json(line).model_dump(exclude_unset=True) for line in whole.splitlines()]
+            return [_EVENT.validate_json(line, strict=True) for line in whole.splitlines()]
         except ValidationError as errors:
             raise InputError(f"{self._folder / EVENTS_FILE}: {_first(errors)}; wanted the events of a run") from None
 

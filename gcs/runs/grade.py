@@ -2,13 +2,12 @@
 
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
 loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
-acts; both are in the truth by the time_boot_ms that the messages bear.
+acts; both are found in the truth by the time_boot_ms of the messages.
 """
 
 import itertools
 from collections import defaultdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gcs.control.tick import TickArray
 from gcs.errors import InputError
+from gcs.published import Published
 from gcs.runs.files import read_ticks
 from gcs.runs.record import TRUTH_FILE
 from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED, read_truth
@@ -26,13 +26,29 @@ Truth = NDArray[np.void]
 _TIMESYNC = 111
 
 
-def grade(folder: Path) -> dict[str, Any]:
+class Graded(Published):
+    """How far measurements are from the truth; with no sample, the errors are None and not 0."""
+
+    status: str
+    samples: int
+    error_p50_s: float | None
+    error_p99_s: float | None
+    error_max_s: float | None
+
+
+class Grade(Published):
+    """The errors of a run's loop delays and round trips, and how punctual its emulated links were."""
+
+    vehicles: int
+    loop_delay: Graded
+    rtt: Graded
+    link_delay: Graded
+
+
+def grade(folder: Path) -> Grade:
     """Grade a run: the loop delays and round trips it measured, and how punctual its emulated links were.
 
-    Raises
-    ------
-    InputError
-        If the folder is not a run, or has no truth log.
+    Raises InputError if the folder is not a run, or has no truth log.
     """
     try:
         truth = read_truth(folder / TRUTH_FILE)
@@ -47,19 +63,19 @@ def grade(folder: Path) -> dict[str, Any]:
     trip_errors_s = np.concatenate([_trip_errors_s(ticks, truth, system_id) for system_id in system_ids])
     left = truth[(truth["kind"] == LINK_UP) & (truth["fate"] & DROPPED == 0)]
     late_s = (left["time_ns"] - left["due_ns"]) * 1e-9
-    return {
-        "vehicles": len(system_ids),
-        "loop_delay": graded(flown["loop_delay_s"] + flown["repeated_s"], true_loop_delays_s(flown, truth)),
-        "rtt": graded(trip_errors_s, np.zeros(len(trip_errors_s))),
-        "link_delay": graded(late_s, np.zeros(len(late_s))),
-    }
+    return Grade(
+        vehicles=len(system_ids),
+        loop_delay=graded(flown["loop_delay_s"] + flown["repeated_s"], true_loop_delays_s(flown, truth)),
+        rtt=graded(trip_errors_s, np.zeros(len(trip_errors_s))),
+        link_delay=graded(late_s, np.zeros(len(late_s))),
+    )
 
 
 def _trip_errors_s(ticks: TickArray, truth: Truth, system_id: int) -> FloatArray:
-    """Each measured round trip against that of the nearest reply which had left before the tick that logs it.
+    """The error of each measured round trip against the nearest true one whose reply had left before its tick.
 
-    Both are in order of time, and each reply is one round trip at most; of several that came between two ticks the
-    later ones are in the ticks after.
+    Both are in order of time and each reply counts once: of several replies between two ticks, later ticks log the
+    later ones.
     """
     rows = ticks[(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
     due_ns, trip_s = true_round_trips(truth, system_id)
@@ -115,7 +131,7 @@ def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
 
 
 def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
-    """For each row that of the same tick whose state its loop delay counts from.
+    """For each row, the row of the same tick whose state its loop delay counts from.
 
     In the ground loop its own; in the onboard loop that of the oldest state that was needed, known by its age.
     """
@@ -130,7 +146,7 @@ def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
 
 
 def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
-    """(System id, time_boot_ms) to the first instant with that key."""
+    """The first instant (ns) of each (system id, time_boot_ms)."""
     own = truth[truth["kind"] == kind]
     found: dict[tuple[int, int], int] = {}
     for system_id, key, time_ns in zip(
@@ -140,17 +156,12 @@ def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
     return found
 
 
-def graded(measured_s: FloatArray, true_s: FloatArray) -> dict[str, Any]:
-    """How far measurements are from the truth; with no sample, the figures are None and not 0."""
+def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
+    """The errors of measurements where both they and the truth are known."""
     both = np.isfinite(measured_s) & np.isfinite(true_s)
     error_s = np.abs(measured_s - true_s)[both]
     if not error_s.size:
-        return {"status": "unknown", "samples": 0, "error_p50_s": None, "error_p99_s": None, "error_max_s": None}
+        return Graded(status="unknown", samples=0, error_p50_s=None, error_p99_s=None, error_max_s=None)
     p50, p99 = np.percentile(error_s, [50, 99]).tolist()
-    return {
-        "status": "measured",
-        "samples": int(error_s.size),
-        "error_p50_s": p50,
-        "error_p99_s": p99,
-        "error_max_s": float(error_s.max()),
-    }
+    largest = float(error_s.max())
+    return Graded(status="measured", samples=error_s.size, error_p50_s=p50, error_p99_s=p99, error_max_s=largest)

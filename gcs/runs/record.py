@@ -9,13 +9,14 @@ import contextlib
 import json
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 
 SCENARIO_FILE = "scenario.toml"
 DESIGN_FILE = "design.json"
@@ -29,6 +30,8 @@ TRUTH_FILE = "truth.bin"
 MIRROR = "mirror"
 """Kind of the event that counts what a mirrored station sent."""
 RECORDING_FILE = "flight.rrd"
+UNFINISHED_FILE = RECORDING_FILE + ".part"
+"""The recording while it is written."""
 SUMMARY_FILE = "summary.json"
 NEW_DESIGN = "design"
 """Kind of the event that DESIGN_FILE has been written anew."""
@@ -37,12 +40,12 @@ END = "end"
 FLEET = "fleet"
 """Kind of the event that says where the vehicles are from, if the flight did not start them."""
 STARTED = "started by the station"
-"""Where those of other flights are from."""
+"""Origin of the vehicles in all other flights."""
 LOG_ENDED = "log"
-"""Kind of the event that a file could not be written from then on: its name and the reason."""
+"""Kind of the event that a file can no longer be written: its name and the reason."""
 _MOST_WAITING = 1000
 READY_FILE = ".observer-ready"
-"""There while an observer follows the run."""
+"""Exists while an observer follows the run."""
 
 
 class RunWriter:
@@ -58,7 +61,7 @@ class RunWriter:
             RecordLog(folder / name) for name in (TICKS_FILE, EVENTS_FILE, TLOG_FILE)
         )
         self._ended: set[str] = set()
-        self._waiting: list[bytes] = []
+        self._waiting: list[Event] = []
         """Events that could not be written yet."""
         self._time_s = -np.inf
         """Of the newest tick."""
@@ -67,22 +70,13 @@ class RunWriter:
         self._time_s = float(rows["time_s"][0])
         self._add(TICKS_FILE, self._ticks, rows.tobytes())
 
-    def event(
-        self,
-        *,
-        time_s: float,
-        kind: str,
-        text: str,
-        system_id: int | None = None,
-        counts: dict[str, int] | None = None,
-    ) -> None:
-        line: dict[str, Any] = {"time_s": round(time_s, 6), "kind": kind, "system_id": system_id, "text": text}
-        if counts is not None:
-            line["counts"] = counts
-        if len(self._waiting) < _MOST_WAITING or kind == END:
-            self._waiting.append((json.dumps(line) + "\n").encode())
+    def event(self, event: Event) -> None:
+        rounded = replace(event, time_s=round(event.time_s, 6))
+        if len(self._waiting) < _MOST_WAITING or event.kind == END:
+            self._waiting.append(rounded)
         with contextlib.suppress(OSError):
-            self._events.add(b"".join(self._waiting))
+            lines = (json.dumps(event_fields(waiting)) + "\n" for waiting in self._waiting)
+            self._events.add("".join(lines).encode())
             self._waiting.clear()
 
     def frames(self, frames: Iterable[tuple[bytes, int]]) -> None:
@@ -92,15 +86,15 @@ class RunWriter:
             self._add(TLOG_FILE, self._tlog, entries)
 
     def ended(self, name: str, error: OSError) -> None:
-        """Note that a file of the run could not be written, and is not from now on."""
+        """Note that a file of the run could not be written; it is left as it is from now on."""
         self._ended.add(name)
-        self.event(time_s=self._time_s, kind=LOG_ENDED, text=f"{name}: {error.strerror}")
+        self.event(Event(time_s=self._time_s, kind=LOG_ENDED, text=f"{name}: {error.strerror}"))
 
-    def close(self) -> list[dict[str, Any]]:
-        """Close the files; gives the events that could not be written."""
+    def close(self) -> list[Event]:
+        """Close the files; returns the events that could not be written."""
         for log in (self._ticks, self._events, self._tlog):
             log.close()
-        return [json.loads(line) for line in self._waiting]
+        return self._waiting
 
     def _add(self, name: str, log: "RecordLog", data: bytes) -> None:
         if name in self._ended:
@@ -111,8 +105,16 @@ class RunWriter:
             self.ended(name, error)
 
 
+def event_fields(event: Event) -> dict[str, Any]:
+    """The fields of a line of events.jsonl; `counts` only where the event has them."""
+    fields = asdict(event)
+    if event.counts is None:
+        del fields["counts"]
+    return fields
+
+
 class RecordLog:
-    """A file that grows by whole records: what a failed write has left of one is cut off."""
+    """A file that grows by whole records: a partly written one is cut off."""
 
     def __init__(self, file: Path) -> None:
         self.descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
@@ -134,10 +136,17 @@ class RecordLog:
 
 
 def write_whole(file: Path, data: bytes) -> None:
-    """Write a file in one step, for those who read it meanwhile; one that is there stays if that fails."""
+    """Replace a file in one step: nobody reads half of it, and the old one stays if writing fails."""
+    with replacing(file) as part:
+        part.write_bytes(data)
+
+
+@contextlib.contextmanager
+def replacing(file: Path) -> Generator[Path]:
+    """A file to be written while entered, which then takes the place of another in one step."""
     part = file.with_name(file.name + ".new")
     try:
-        part.write_bytes(data)
+        yield part
         part.replace(file)
     except OSError:
         part.unlink(missing_ok=True)

@@ -1,23 +1,25 @@
-"""What does not get in at the station, by reason, for the log of a run: each once, so that no attacker can fill it."""
+"""What the station refuses, by reason, for the log of a run: each reason once, so that no attacker can fill the log."""
 
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from pydantic import TypeAdapter
 
+from gcs.control.tick import Event
+
 VEHICLES_FILE = "vehicles.json"
-"""What the simulated vehicles counted."""
+"""The counters of the simulated vehicles."""
 
 REFUSED = "refused"
 """Kind of the events: one when a reason is first met, and one at the end with how often each was."""
 _IGNORED = {"other component", "before a first heartbeat"}
-"""No strangers, though the station has no use for what they say."""
+"""Not refused, only of no use to the station."""
 _COUNTERS = TypeAdapter(dict[str, int])
 
 
 class Refusals:
-    """Remembers what has been told."""
+    """Remembers what was reported."""
 
     def __init__(self) -> None:
         self._told: dict[str, int] = {}
@@ -39,7 +41,7 @@ def in_words(counts: dict[str, int]) -> str:
 
 
 def counted_by_vehicles(folder: Path) -> dict[str, int] | None:
-    """What the vehicles of a run counted; None if they have not said."""
+    """The counters of a run's vehicles; None without their file."""
     try:
         return _COUNTERS.validate_json((folder / VEHICLES_FILE).read_bytes())
     except (OSError, ValueError):
@@ -47,21 +49,15 @@ def counted_by_vehicles(folder: Path) -> dict[str, int] | None:
 
 
 def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
-    """What they refused, by reason."""
-    counters = counted_by_vehicles(folder)
-    prefix = "refused_"
-    return (
-        None
-        if counters is None
-        else {
-            name.removeprefix(prefix).replace("_", " "): count
-            for name, count in counters.items()
-            if name.startswith(prefix)
-        }
-    )
+    """What a run's vehicles refused, by reason; None if that is not known."""
+    counters, prefix = counted_by_vehicles(folder), "refused_"
+    if counters is None:
+        return None
+    refused = {name.removeprefix(prefix): count for name, count in counters.items() if name.startswith(prefix)}
+    return {name.replace("_", " "): count for name, count in refused.items()}
 
 
-def counts_of(events: list[dict[str, Any]], kind: str = REFUSED) -> dict[str, int]:
-    """The newest counts in a run's events of a kind."""
-    told = [event["counts"] for event in events if event["kind"] == kind]
-    return told[-1] if told else {}
+def counts_of(events: Iterable[Event], kind: str) -> dict[str, int]:
+    """The newest counts in the events of a kind."""
+    counts = [event.counts for event in events if event.kind == kind and event.counts is not None]
+    return counts[-1] if counts else {}

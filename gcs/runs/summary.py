@@ -3,16 +3,14 @@
 Works from the files alone, so a run whose station was killed is finished by the same code as one that ended well.
 """
 
-import json
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gcs.control.tick import CLOCK_JUMPED, TICK, Mode, TickArray
+from gains.core.arrays import FloatArray
+from gcs.control.tick import CLOCK_JUMPED, TICK, Event, Mode, TickArray
 from gcs.errors import InputError
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
@@ -31,17 +29,19 @@ from gcs.runs.record import (
     SUMMARY_FILE,
     TICKS_FILE,
     TRUTH_FILE,
+    replacing,
     write_whole,
 )
-from gcs.runs.refusals import counted_by_vehicles, counts_of, refused_by_vehicles
+from gcs.runs.refusals import REFUSED, counted_by_vehicles, counts_of, refused_by_vehicles
+from gcs.runs.summary_record import Clock, Control, Estimate, MarginRange, OneWayDelay, Spread, Summary, VehicleSummary
 from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0
-"""A clock's rate is not told from less than this."""
+"""A clock's rate is not estimated over less than this."""
 SILENT_END = "interrupted: the station ended without a word"
 
 
-def finish(folder: Path, *, unwritten: list[dict[str, Any]] | None = None) -> dict[str, Any]:
+def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary:
     """Write ticks.parquet and summary.json of a run that has ended, and return the summary.
 
     `unwritten` is given at the end of a flight: its events that could not be written. What cannot be written now is
@@ -61,8 +61,8 @@ def finish(folder: Path, *, unwritten: list[dict[str, Any]] | None = None) -> di
         raise InputError(
             f"{folder}: read ticks of vehicles {sorted(strangers)}, wanted those of its {SCENARIO_FILE} only"
         )
-    summary = summarise(scenario, design, ticks, RunTail(folder).events() + (unwritten or []))
-    not_logged: list[str] = summary["not_logged"]
+    summary = summarise(scenario, design, ticks, [*RunTail(folder).events(), *(unwritten or ())])
+    not_logged = list(summary.not_logged)
     if unwritten:
         not_logged.append(f"{EVENTS_FILE}: the last {len(unwritten)}")
     if unwritten is not None and not (folder / RECORDING_FILE).exists():
@@ -78,14 +78,17 @@ def finish(folder: Path, *, unwritten: list[dict[str, Any]] | None = None) -> di
                 raise
             not_logged.append(f"{name}: {error.strerror or error}")
 
+    def whole(files: set[str]) -> Summary:
+        parts = {"not_logged": tuple(not_logged), "files": tuple(sorted(files))}
+        return summary.model_copy(update=parts | {"refused_by_vehicles": refused_by_vehicles(folder)})
+
+    def there() -> set[str]:
+        return {file.name for file in folder.iterdir() if not file.name.startswith(".")}
+
     write(PARQUET_FILE, lambda: _write_parquet(folder, ticks))
-    summary["refused_by_vehicles"] = refused_by_vehicles(folder)
-    there = {file.name for file in folder.iterdir() if not file.name.startswith(".")}
-    summary["files"] = sorted(there | {SUMMARY_FILE})
-    text = json.dumps(summary, indent=2, allow_nan=False).encode()
+    text = whole(there() | {SUMMARY_FILE}).to_json().encode()
     write(SUMMARY_FILE, lambda: write_whole(folder / SUMMARY_FILE, text))
-    summary["files"] = [name for name in summary["files"] if (folder / name).exists()]
-    return summary
+    return whole(there())
 
 
 def _write_parquet(folder: Path, ticks: TickArray) -> None:
@@ -94,76 +97,65 @@ def _write_parquet(folder: Path, ticks: TickArray) -> None:
     import pyarrow.parquet as pq
 
     table = pa.table({name: np.ascontiguousarray(ticks[name]) for name in TICK.names or ()})
-    part = folder / (PARQUET_FILE + ".new")
-    try:
+    with replacing(folder / PARQUET_FILE) as part:
         pq.write_table(table, part, compression="zstd")
-        part.replace(folder / PARQUET_FILE)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
     (folder / TICKS_FILE).unlink(missing_ok=True)
 
 
-def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: list[dict[str, Any]]) -> dict[str, Any]:
-    """The summary of a run, as plain types; an unknown is None."""
+def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> Summary:
+    """The summary of a run, all but its files and what its vehicles refused."""
     commanded = ticks["tick"][ticks["commanded"]]
     flown = ticks[(ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1))]
-    said = {kind: [event["text"] for event in events if event["kind"] == kind] for kind in (END, FLEET)}
-    ends = said[END]
-    not_logged = [f"{e['text']}, from {e['time_s']:.2f} s on" for e in events if e["kind"] == LOG_ENDED]
-    reason = ends[-1] if ends else SILENT_END
+    sent = flown[flown["commanded"]]
+    said = {kind: [event.text for event in events if event.kind == kind] for kind in (END, FLEET)}
+    reason = (said[END] or [SILENT_END])[-1]
+    not_logged = tuple(f"{event.text}, from {event.time_s:.2f} s on" for event in events if event.kind == LOG_ENDED)
     followers = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
     errors = {system_id: _error(flown, system_id) for system_id in followers}
     settled = _settling_time_s(errors, followers, scenario.safety.settled_fraction)
     if not followers:
         settled = _settled_velocity_s(scenario, flown)
-    jumps: dict[int, list[float]] = defaultdict(list)
+    jumps: dict[int | None, list[float]] = defaultdict(list)
     for event in events:
-        if event["text"] == CLOCK_JUMPED:
-            jumps[event["system_id"]].append(event["time_s"])
-    loop_delay = flown["loop_delay_s"][flown["commanded"]]
-    headroom = flown["headroom"][flown["commanded"]]
+        if event.text == CLOCK_JUMPED:
+            jumps[event.system_id].append(event.time_s)
     headroom_end, logged = _headroom_end(flown), not any(text.startswith(TICKS_FILE) for text in not_logged)
-    return {
-        "scenario": scenario.name,
-        "verdict": verdict(reason, settled, headroom_end=headroom_end, logged=logged),
-        "reason": reason,
-        "fleet": said[FLEET][-1] if said[FLEET] else STARTED,
-        "not_logged": not_logged,
-        "loop": scenario.control.loop,
-        "delay_margin_s": _number(design.delay_margin_s),
-        "delay_margin_continuous_s": _number(design.delay_margin_continuous_s),
-        "response": design.response and design.response.model_dump(mode="json", exclude_unset=True),
-        "loop_delay_s": _spread(loop_delay),
-        "at_loop_delay": figures_at(design, scenario, _slowest_median_s(flown)).model_dump(),
-        "headroom_min": _number(np.nanmin(headroom)) if np.isfinite(headroom).any() else None,
-        "headroom_end": headroom_end,
-        "settling_time_s": settled,
-        "distance_min_m": _number(np.nanmin(flown["nearest_m"])) if np.isfinite(flown["nearest_m"]).any() else None,
-        "duration_s": _number(flown["time_s"].max()) if flown.size else 0.0,
-        "vehicles": [
+    slowest_s = max(_medians(sent, "loop_delay_s"), default=None)
+    return Summary(
+        scenario=scenario.name,
+        verdict=verdict(reason, settled, headroom_end=headroom_end, logged=logged),
+        reason=reason,
+        fleet=(said[FLEET] or [STARTED])[-1],
+        not_logged=not_logged,
+        loop=scenario.control.loop,
+        delay_margin_s=design.delay_margin_s,
+        delay_margin_continuous_s=design.delay_margin_continuous_s,
+        response=design.response,
+        loop_delay_s=_spread(sent["loop_delay_s"]),
+        at_loop_delay=figures_at(design, scenario, None if slowest_s is None else round(slowest_s, 9)),
+        headroom_min=np.fmin.reduce(sent["headroom"], initial=np.nan),
+        headroom_end=headroom_end,
+        settling_time_s=settled,
+        distance_min_m=np.fmin.reduce(flown["nearest_m"], initial=np.nan),
+        duration_s=flown["time_s"].max(initial=0.0),
+        vehicles=tuple(
             _vehicle(ticks, flown, v.system_id, errors.get(v.system_id), jumps_s=jumps[v.system_id])
             for v in scenario.vehicles
-        ],
-        "control": _control(scenario, flown),
-        "refused": counts_of(events),
-        "mirror": counts_of(events, MIRROR),
-        "mode_changes": [e for e in events if e["kind"] == "mode" and e["time_s"] >= 0],
-        "files": [],
-    }
+        ),
+        control=_control(scenario, flown),
+        refused=counts_of(events, REFUSED),
+        mirror=counts_of(events, MIRROR),
+        mode_changes=tuple(event for event in events if event.kind == "mode" and event.time_s >= 0),
+    )
 
 
-def _slowest_median_s(flown: TickArray) -> float | None:
-    """The largest of the vehicles' median loop delays."""
-    medians: list[float] = []
-    for system_id in np.unique(flown["system_id"]):
-        own = flown["loop_delay_s"][(flown["system_id"] == system_id) & flown["commanded"]]
-        if (known := own[np.isfinite(own)]).size:
-            medians.append(float(np.median(known)))
-    return _number(max(medians, default=None))
+def _medians(rows: TickArray, name: str) -> list[float]:
+    """The median of a column for each vehicle that has a known value there."""
+    columns = (rows[name][rows["system_id"] == system_id] for system_id in np.unique(rows["system_id"]))
+    return [float(np.median(known)) for own in columns if (known := own[np.isfinite(own)]).size]
 
 
-Errors = tuple[NDArray[np.float64], NDArray[np.float64]]
+Errors = tuple[FloatArray, FloatArray]
 """Times (s) and the norm of the spacing error (m) of one follower."""
 
 
@@ -189,15 +181,8 @@ def verdict(
 
 def _headroom_end(flown: TickArray) -> float | None:
     """The least of the vehicles' median headrooms in the last quarter of the flight; None where unknown."""
-    if not flown.size:
-        return None
-    late = flown[flown["commanded"] & (flown["time_s"] >= 0.75 * flown["time_s"].max())]
-    medians = [float(np.median(own[np.isfinite(own)])) for own in _headrooms(late) if np.isfinite(own).any()]
-    return min(medians, default=None)
-
-
-def _headrooms(rows: TickArray) -> list[NDArray[np.float64]]:
-    return [rows["headroom"][rows["system_id"] == system_id] for system_id in np.unique(rows["system_id"])]
+    late = flown[flown["commanded"] & (flown["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0))]
+    return min(_medians(late, "headroom"), default=None)
 
 
 def _error(flown: TickArray, system_id: int) -> Errors:
@@ -231,34 +216,28 @@ def _settled_velocity_s(scenario: Scenario, flown: TickArray) -> float | None:
 
 def _vehicle(
     ticks: TickArray, flown: TickArray, system_id: int, error: Errors | None, *, jumps_s: list[float]
-) -> dict[str, Any]:
+) -> VehicleSummary:
     rows = ticks[ticks["system_id"] == system_id]
-    rtt = rows["rtt_s"]
     own = flown[flown["system_id"] == system_id]
+    sent = own[own["commanded"]]
     error_m = error[1] if error is not None and error[1].size else None
     counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
-    return {
-        "system_id": system_id,
-        "spacing_error_final_m": None if error_m is None else _number(error_m[-1]),
-        "spacing_error_max_m": None if error_m is None else _number(error_m.max()),
-        "rtt_s": spread_with_status(rtt),
-        "loop_delay_s": spread_with_status(own["loop_delay_s"][own["commanded"]]),
-        "delay_margin_s": _margins(own["delay_margin_s"][own["commanded"]]),
-        "up_delay_s": _one_way(own["up_delay_s"], own["sample_bound_s"], own["commanded"]),
-        "down_delay_s": _one_way(own["down_delay_s"], own["down_bound_s"], own["commanded"]),
-        "telemetry_age_s": spread_with_status(own["telemetry_age_s"][own["commanded"]]),
-        "station_queue_s": spread_with_status(own["queue_s"][own["commanded"]]),
-        "clock": _clock(own, int(np.isfinite(rtt).sum()), jumps_s) | {"jumps": len(jumps_s)},
-        "mode_final": _mode_final(rows),
+    margins_s, rtt = sent["delay_margin_s"], estimate(rows["rtt_s"])
+    return VehicleSummary(
+        system_id=system_id,
+        spacing_error_final_m=None if error_m is None else error_m[-1],
+        spacing_error_max_m=None if error_m is None else error_m.max(),
+        rtt_s=rtt,
+        loop_delay_s=estimate(sent["loop_delay_s"]),
+        delay_margin_s=MarginRange(min=margins_s.min(initial=np.inf), max=margins_s.max(initial=-np.inf)),
+        up_delay_s=_one_way(sent["up_delay_s"], sent["sample_bound_s"]),
+        down_delay_s=_one_way(sent["down_delay_s"], sent["down_bound_s"]),
+        telemetry_age_s=estimate(sent["telemetry_age_s"]),
+        station_queue_s=estimate(sent["queue_s"]),
+        clock=_clock(own, rtt.samples, jumps_s),
+        mode_final=_mode_final(rows),
         **counted,
-    }
-
-
-def _margins(flown_s: NDArray[np.float64]) -> dict[str, float | None]:
-    """The least and the largest delay margin of the gains that a vehicle was flown with."""
-    if not flown_s.size:
-        return {"min": None, "max": None}
-    return {"min": _number(flown_s.min()), "max": _number(flown_s.max())}
+    )
 
 
 def _mode_final(rows: TickArray) -> str | None:
@@ -267,72 +246,59 @@ def _mode_final(rows: TickArray) -> str | None:
     return Mode(int((flown if flown.size else rows)["mode"][-1])).name if rows.size else None
 
 
-def spread_with_status(values: NDArray[np.float64]) -> dict[str, Any]:
+def estimate(values: FloatArray) -> Estimate:
     """The spread of an estimate with its status and the number of its samples."""
     samples = int(np.isfinite(values).sum())
-    return _spread(values) | {"samples": samples, "status": "measured" if samples else "unknown"}
+    return Estimate(**vars(_spread(values)), samples=samples, status="measured" if samples else "unknown")
 
 
-def _one_way(
-    delay_s: NDArray[np.float64], bound_s: NDArray[np.float64], commanded: NDArray[np.bool_]
-) -> dict[str, Any]:
-    """The spread of a one-way delay, and the largest bound of the error that the vehicle's clock brings into it."""
-    known = commanded & np.isfinite(delay_s) & np.isfinite(bound_s)
-    return spread_with_status(delay_s[commanded]) | {"bound_s": _number(bound_s[known].max()) if known.any() else None}
+def _one_way(delay_s: FloatArray, bound_s: FloatArray) -> OneWayDelay:
+    known_s = bound_s[np.isfinite(delay_s) & np.isfinite(bound_s)]
+    return OneWayDelay(**vars(estimate(delay_s)), bound_s=known_s.max(initial=-np.inf))
 
 
-def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> dict[str, Any]:
-    """The vehicle's boot clock against the station's: offset as last estimated, skew since the last jump, and bounds.
+def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> Clock:
+    """The clock's offset as last estimated, its skew since the last jump, and their bounds.
 
     The skew is that of the straight line between the first and the last offset, each wrong by its bound at most.
     """
     known = own[np.isfinite(own["clock_offset_s"])]
     if not known.size:
-        return {"status": "unknown", "samples": 0} | dict.fromkeys(
-            ("offset_s", "bound_s", "skew_ppm", "skew_bound_ppm")
-        )
-    offset_s, bound_s = known["clock_offset_s"], known["clock_offset_bound_s"]
-    steady = np.flatnonzero(known["time_s"] > max(jumps_s, default=-np.inf))
+        nothing = dict.fromkeys(("offset_s", "bound_s", "skew_ppm", "skew_bound_ppm"))
+        return Clock(status="unknown", samples=0, **nothing, jumps=len(jumps_s))
+    offset_s, bound_s, due_ns = known["clock_offset_s"], known["clock_offset_bound_s"], known["due_ns"]
     skew_ppm = skew_bound_ppm = None
-    if steady.size:
-        first = steady[0]
-        span_s = (known["due_ns"][-1] - known["due_ns"][first]) * 1e-9
-        if span_s > _SKEW_SPAN_S:
-            skew_ppm = _number(1e6 * (offset_s[-1] - offset_s[first]) / span_s)
-            skew_bound_ppm = _number(1e6 * (bound_s[-1] + bound_s[first]) / span_s)
-    return {
-        "status": "measured",
-        "samples": exchanges,
-        "offset_s": _number(offset_s[-1]),
-        "bound_s": _number(bound_s[-1]),
-        "skew_ppm": skew_ppm,
-        "skew_bound_ppm": skew_bound_ppm,
-    }
+    steady = np.flatnonzero(known["time_s"] > max(jumps_s, default=-np.inf))
+    if steady.size and (span_s := (due_ns[-1] - due_ns[steady[0]]) * 1e-9) > _SKEW_SPAN_S:
+        skew_ppm = 1e6 * (offset_s[-1] - offset_s[steady[0]]) / span_s
+        skew_bound_ppm = 1e6 * (bound_s[-1] + bound_s[steady[0]]) / span_s
+    return Clock(
+        status="measured",
+        samples=exchanges,
+        offset_s=offset_s[-1],
+        bound_s=bound_s[-1],
+        skew_ppm=skew_ppm,
+        skew_bound_ppm=skew_bound_ppm,
+        jumps=len(jumps_s),
+    )
 
 
-def _control(scenario: Scenario, flown: TickArray) -> dict[str, Any]:
+def _control(scenario: Scenario, flown: TickArray) -> Control:
     """Ticks flown, and deadline misses: set-points sent later than half a period after they were due, or not at all."""
-    period_s = 1.0 / scenario.rates.control_hz
     ticks, first = np.unique(flown["tick"], return_index=True)
     late_s = (flown["sent_ns"][first] - flown["due_ns"][first]) * 1e-9
     skipped = int(ticks[-1] - ticks[0] + 1 - ticks.size) if ticks.size else 0
-    return {
-        "rate_hz": scenario.rates.control_hz,
-        "ticks": int(ticks.size),
-        "deadline_misses": skipped + int((late_s > period_s / 2).sum()),
-        "lateness_s": _spread(late_s),
-    }
+    return Control(
+        rate_hz=scenario.rates.control_hz,
+        ticks=int(ticks.size),
+        deadline_misses=skipped + int((late_s > 0.5 / scenario.rates.control_hz).sum()),
+        lateness_s=_spread(late_s),
+    )
 
 
-def _spread(values: NDArray[np.float64]) -> dict[str, float | None]:
+def _spread(values: FloatArray) -> Spread:
     known = values[np.isfinite(values)]
     if not known.size:
-        return {"p50": None, "p95": None, "p99": None, "max": None}
-    p50, p95, p99 = np.percentile(known, [50, 95, 99])
-    return {"p50": _number(p50), "p95": _number(p95), "p99": _number(p99), "max": _number(known.max())}
-
-
-def _number(value: Any) -> float | None:
-    """A finite float, or None: JSON has no infinity, and an unbounded margin has no number."""
-    number = float(value) if value is not None else np.nan
-    return round(number, 9) if np.isfinite(number) else None
+        return Spread(p50=None, p95=None, p99=None, max=None)
+    p50, p95, p99 = np.percentile(known, [50, 95, 99]).tolist()
+    return Spread(p50=p50, p95=p95, p99=p99, max=known.max())

@@ -39,7 +39,7 @@ class Breakage:
         self._behind: list[list[int]] = [[row] for row in range(n)]
         """Each vehicle with all that follow it, directly or through others."""
         for row in range(n - 1, 0, -1):
-            self._behind[int(plan.formation.predecessor[row])] += self._behind[row]
+            self._behind[plan.model.predecessors[row]] += self._behind[row]
 
     def judge(
         self,

@@ -6,7 +6,6 @@ or in virtual time, with the same bytes.
 
 from collections import Counter, deque
 from math import isfinite, nan
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
 from gcs.control.loops import Order
 from gcs.control.phases import Phase, next_phase, patience_s
-from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Mode, TickArray
+from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Event, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.kinds import Goal
@@ -33,13 +32,6 @@ AUTOPILOT_COMPONENT = 1
 """A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
 ANOTHER_ADDRESS = "known system id from another address"
 _HEARTBEAT_NS = NS_PER_S
-
-
-class Event(NamedTuple):
-    time_s: float
-    kind: str
-    text: str
-    system_id: int | None = None
 
 
 class Station:
@@ -362,4 +354,4 @@ class Station:
         self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
 
     def _report(self, kind: str, text: str, system_id: int | None = None) -> None:
-        self.events.append(Event(self.scenario_time_s(self._now_ns), kind, text, system_id))
+        self.events.append(Event(time_s=self.scenario_time_s(self._now_ns), kind=kind, text=text, system_id=system_id))

@@ -114,7 +114,7 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     plan = study.plan
     if any(system_id in loop.system_ids and len(loop.system_ids) > 1 for loop in plan_loops(plan) for system_id in ids):
         return []
-    model, places = plan.model, [plan.formation.system_ids.index(system_id) for system_id in ids]
+    model, places = plan.model, [plan.formation.row(system_id) for system_id in ids]
     late = late_by_vehicle(model.B, plan.gain, [model.input_slice(k) for k in range(model.vehicles)])
     others = sum((late[k] for k in range(model.vehicles) if k not in places), model.A)
     # the link delay is the model's delay less the hold and the waiting for the control tick

@@ -17,9 +17,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from gcs.errors import InputError
 from gcs.interrupts import FROM_TERMINAL, held_back
 from gcs.output import DISK_FULL
-from gcs.runs.record import SCENARIO_FILE, RecordLog
+from gcs.runs.record import SCENARIO_FILE, RecordLog, replacing
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
 
@@ -33,17 +34,10 @@ Run = Callable[[Sequence[Trial]], list[Outcome]]
 """Returns the outcomes of trials in their order, flying those that are not stored."""
 
 
-class CampaignError(Exception):
-    """The campaign cannot continue: one line."""
-
-
 class Store:
     """The finished trials of a campaign's folder.
 
-    Raises
-    ------
-    CampaignError
-        If another campaign has it open: both would fly the same trials.
+    Raises InputError if another campaign has it open: both would fly the same trials.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -54,7 +48,7 @@ class Store:
             fcntl.flock(self._log.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._log.close()
-            raise CampaignError(f"{folder}: another gcs stress works there; wanted a folder of its own") from None
+            raise InputError(f"{folder}: another gcs stress works there; wanted a folder of its own") from None
         text = self.file.read_bytes()
         for line in text.splitlines():
             with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; its trial is flown again
@@ -66,15 +60,12 @@ class Store:
     def add(self, outcome: Outcome) -> None:
         """Store an outcome; it is in the file when this returns.
 
-        Raises
-        ------
-        CampaignError
-            If it cannot be written.
+        Raises InputError if it cannot be written.
         """
         try:
             self._log.add((outcome.to_json() + "\n").encode())
         except OSError as error:
-            raise CampaignError(f"{self.file}: {error.strerror}; {self.resume}") from None
+            raise InputError(f"{self.file}: {error.strerror}; {self.resume}") from None
         self.outcomes[outcome.id] = outcome
 
     @property
@@ -89,17 +80,14 @@ class Store:
 def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None:
     """Refuse a folder that holds no campaign, or a campaign of another scenario; `scenario` is TOML.
 
-    Raises
-    ------
-    CampaignError
-        With what was read and what was wanted.
+    Raises InputError with what was read and what was wanted.
     """
     for name in (SCENARIO_FILE, TRIALS_FILE):
         if not (folder / name).is_file():
-            raise CampaignError(f"{flag}: read no {name} in {folder}, wanted the folder of a campaign")
+            raise InputError(f"{flag}: read no {name} in {folder}, wanted the folder of a campaign")
     file = folder / SCENARIO_FILE
     if scenario is not None and file.read_text(encoding="utf-8") != scenario:
-        raise CampaignError(f"{flag}: {folder} holds a campaign of another scenario or loop, wanted {file}")
+        raise InputError(f"{flag}: {folder} holds a campaign of another scenario or loop, wanted {file}")
 
 
 def run_campaign(
@@ -109,10 +97,7 @@ def run_campaign(
 
     `ended` is called with each outcome and the number of trials still to come.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        Also if Ctrl-C ended a flight in real time; that flight does not count as flown.
+    Raises KeyboardInterrupt also if Ctrl-C ended a flight in real time; that flight does not count as flown.
     """
     missing = {trial.id: trial for trial in trials if trial.id not in store.outcomes}
     left = len(missing)
@@ -127,7 +112,7 @@ def run_campaign(
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
-        raise CampaignError(f"{error.filename}: {error.strerror}; {store.resume}") from None
+        raise InputError(f"{error.filename}: {error.strerror}; {store.resume}") from None
     # the same trial may have other coordinates in another sweep
     return [replace(store.outcomes[trial.id], coordinates=dict(trial.coordinates)) for trial in trials]
 
@@ -152,7 +137,7 @@ def local_workers(count: int) -> Generator[Fly]:
                 for future in as_completed(futures):
                     yield future.result()
             except BrokenProcessPool:
-                raise CampaignError(
+                raise InputError(
                     "a worker process was killed, perhaps for want of memory; try fewer --workers, with --resume"
                 ) from None
 
@@ -163,20 +148,17 @@ def local_workers(count: int) -> Generator[Fly]:
 def dask_workers(address: str) -> Generator[Fly]:
     """While entered, fly trials on the workers of a Dask cluster, where this package is installed.
 
-    Raises
-    ------
-    CampaignError
-        If `distributed` is not installed or there is no scheduler at the address.
+    Raises InputError if `distributed` is not installed or there is no scheduler at the address.
     """
     try:
         from distributed import Client
         from distributed import as_completed as dask_as_completed
     except ImportError:
-        raise CampaignError("--dask: the package distributed is not installed, wanted the extra [cluster]") from None
+        raise InputError("--dask: the package distributed is not installed, wanted the extra [cluster]") from None
     try:
         client = Client(address, timeout=10)
     except (OSError, ValueError) as error:
-        raise CampaignError(f"--dask: read {address!r} ({error}), wanted the address of a Dask scheduler") from None
+        raise InputError(f"--dask: read {address!r} ({error}), wanted the address of a Dask scheduler") from None
 
     def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
         # the id as key: a scheduler that still has the result for an earlier client returns it without a flight
@@ -196,9 +178,9 @@ def write_parquet(outcomes: Iterable[Outcome], folder: Path) -> Path:
     rows = [_row(outcome) for outcome in outcomes]
     names = dict.fromkeys(name for row in rows for name in row)
     table = pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
-    part = folder / (PARQUET_FILE + ".new")
-    pq.write_table(table, part, compression="zstd")
-    return part.replace(folder / PARQUET_FILE)
+    with replacing(folder / PARQUET_FILE) as part:
+        pq.write_table(table, part, compression="zstd")
+    return folder / PARQUET_FILE
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:

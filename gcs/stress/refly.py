@@ -4,13 +4,13 @@ import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gcs.errors import InputError
 from gcs.runs.record import SCENARIO_FILE
-from gcs.runs.summary import finish
-from gcs.stress.campaign import CampaignError, Store, check_campaign
+from gcs.stress.campaign import Store, check_campaign
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, Trial
-from gcs.views.observer import record_run
+from gcs.views.observer import recover_run
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,7 @@ def refly(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Reflow
     Its runs are left in `flights` beside the campaign's table. With `real_time` it is flown over UDP, even if it was
     first flown in virtual time.
 
-    Raises
-    ------
-    CampaignError
-        If not exactly one id begins so, or the trial was flown with another scenario.
+    Raises InputError if not exactly one id begins so, or the trial was flown with another scenario.
     """
     stored = _stored(folder, wanted)
     trial = _trial_of(study, stored, folder)
@@ -43,9 +40,7 @@ def refly(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Reflow
     outcome = fly_trial(again, run)
     runs = [run] if (run / SCENARIO_FILE).exists() else sorted(run.iterdir()) if run.is_dir() else []
     for flight in runs:
-        finish(flight)
-        record_run(flight)
-        finish(flight)  # again: it lists the files
+        recover_run(flight)
     return Reflown(outcome, runs, [] if again.real_time else _differences(outcome, stored))
 
 
@@ -54,7 +49,7 @@ def _stored(folder: Path, wanted: str) -> Outcome:
     with contextlib.closing(Store(folder)) as store:
         found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
     if len(found) != 1:
-        raise CampaignError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
+        raise InputError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
     return found[0]
 
 
@@ -62,7 +57,7 @@ def _trial_of(study: Study, stored: Outcome, folder: Path) -> Trial:
     study = replace(study, real_time=stored.real_time)
     trial = study.trial(stored.kind, stored.coordinates, seed=stored.seed, probe=stored.probe)
     if trial.id != stored.id:
-        raise CampaignError(
+        raise InputError(
             f"--trial: {stored.id} was flown with another scenario or design; wanted {folder / SCENARIO_FILE}"
         )
     return trial

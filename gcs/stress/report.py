@@ -1,4 +1,4 @@
-"""What a campaign found: as plain types for stress.json, and as one HTML page with its figures."""
+"""What a campaign found: the record in stress.json, and one HTML page with its figures."""
 
 import platform
 import shlex
@@ -7,11 +7,13 @@ from collections import Counter
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import InstanceOf, PlainSerializer
 
 from gcs.plan.design import Design
+from gcs.published import Published
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.figures import worst_of
 from gcs.stress.study import NoOnset, Onset, Study, curve_error
@@ -21,8 +23,83 @@ from gcs.views.page import data_uri, rendered
 REPORT_FILE = "report.html"
 _TEMPLATE = "stress_report.html.j2"
 MOST_ROWS = 200
-_GAINS = ("K1_1_s", "K2_1_s", "K3_1_s2", "blocks")
+_GAINS = {"K1_1_s", "K2_1_s", "K3_1_s2", "blocks"}
+_FLOWN = ("id", "kind", "seed", "coordinates", "verdict")
+_POINT = (*_FLOWN, "loop_delay_s", "growth_1_s", "growth_error_1_s", "predicted_growth_1_s", "spacing_error_max_m")
+_FAILED = ("id", "seed", "coordinates", "error")
 _PACKAGES = ("formation-gcs", "numpy", "scipy", "clarabel", "cvxpy", "pymavlink")
+
+
+def _gains(design: Design) -> dict[str, Any]:
+    return design.model_dump(mode="json", include=_GAINS, exclude_unset=True)
+
+
+def _point(outcome: Outcome) -> dict[str, Any]:
+    return {name: getattr(outcome, name) for name in _POINT}
+
+
+def _failed(outcome: Outcome) -> dict[str, Any]:
+    return {name: getattr(outcome, name) for name in _FAILED}
+
+
+class Typical(Published):
+    """A figure over the flights of a campaign."""
+
+    median: float
+    max: float
+
+
+class Noise(Published):
+    """How much the machine disturbed flights in real time.
+
+    `lateness` is how much later than due set-points were handed over. `loop_delay_spread_s` is the 90th percentile of
+    the loop delay minus its median. Of the processor time, the host took away `steal_share`, and all processes together
+    used `busy_share`.
+    """
+
+    flights: int
+    lateness_s_p50: Typical | None = None
+    lateness_s_p99: Typical | None = None
+    loop_delay_spread_s: Typical | None = None
+    steal_share: Typical | None = None
+    busy_share: Typical | None = None
+
+
+class Provenance(Published):
+    """What a campaign was flown with; the commit is None outside a checkout."""
+
+    seed: int
+    versions: dict[str, str | None]
+    git_commit: str | None
+    machine: str
+
+
+class CampaignResult(Published):
+    """The result of a campaign. `points` are the outcomes of its sweep, `failure` says in one line why it failed."""
+
+    scenario: str
+    delay_margin_s: float | None
+    delay_margin_continuous_s: float | None
+    period_s: float
+    gains: Annotated[InstanceOf[Design], PlainSerializer(_gains)]
+    real_time: bool
+    axes: dict[str, tuple[float, ...]]
+    onset: Annotated[InstanceOf[Onset], PlainSerializer(Onset.to_dict)] | None
+    onset_missing: str
+    onset_missing_as_predicted: bool
+    curve_error: float | None
+    assert_onset: float | None
+    failure: str
+    passed: bool
+    trials: int
+    trials_of_kind: dict[str, int]
+    trials_failed: tuple[Annotated[InstanceOf[Outcome], PlainSerializer(_failed)], ...]
+    worst: tuple[str, ...]
+    flight_time_s: float
+    points: tuple[Annotated[InstanceOf[Outcome], PlainSerializer(_point)], ...]
+    past_limits: int
+    noise: Noise | None
+    provenance: Provenance
 
 
 def result_of(
@@ -35,68 +112,59 @@ def result_of(
     onset: Onset | None,
     no_onset: NoOnset | None,
     allowed: float | None,
-) -> dict[str, Any]:
+) -> CampaignResult:
     """The result of a campaign: `outcomes` are all of its trials, `sweep` those of its points.
 
     With `allowed`, the campaign fails if the onset differs from the margin by more than this fraction, or was predicted
-    and not found. `failure` then says why in one line.
+    and not found.
     """
-    failed = [outcome for outcome in outcomes if outcome.error is not None]
+    failed = tuple(outcome for outcome in outcomes if outcome.error is not None)
     failure = ""
     if allowed is not None and onset is not None:
         failure = _parted(onset, allowed)
     elif allowed is not None and no_onset is not None and not no_onset.as_predicted:
         failure = str(no_onset)
-    worst = worst_of(outcomes)
-    return {
-        "scenario": study.plan.scenario.name,
-        "delay_margin_s": design.delay_margin_s,
-        "delay_margin_continuous_s": design.delay_margin_continuous_s,
-        "period_s": design.period_s,
-        "gains": {name: gain for name, gain in design.to_dict().items() if name in _GAINS},
-        "real_time": study.real_time,
-        "axes": {axis.name: list(axis.values) for axis in axes},
-        "onset": None if onset is None else onset.to_dict(),
-        "onset_missing": str(no_onset or ""),
-        "onset_missing_as_predicted": no_onset is not None and no_onset.as_predicted,
-        "curve_error": curve_error([*(sweep if exact(study, axes) else ()), *(onset.flights if onset else ())]),
-        "assert_onset": allowed,
-        "failure": failure,
-        "passed": not failure and not failed,
-        "trials": len(outcomes),
-        "trials_of_kind": dict(Counter(outcome.kind for outcome in outcomes)),
-        "trials_failed": [{"id": o.id, "seed": o.seed, "coordinates": o.coordinates, "error": o.error} for o in failed],
-        "worst": [o.id for o in worst],
-        "flight_time_s": round(sum(outcome.elapsed_s for outcome in outcomes), 3),
-        "points": [_point(outcome) for outcome in sweep],
-        "past_limits": sum(outcome.past_limits for outcome in outcomes),
-        "noise": noise_of(outcomes) if study.real_time else None,
-        "provenance": provenance(study.plan.scenario.seed),
-    }
+    return CampaignResult(
+        scenario=study.plan.scenario.name,
+        delay_margin_s=design.delay_margin_s,
+        delay_margin_continuous_s=design.delay_margin_continuous_s,
+        period_s=design.period_s,
+        gains=design,
+        real_time=study.real_time,
+        axes={axis.name: tuple(axis.values) for axis in axes},
+        onset=onset,
+        onset_missing=str(no_onset or ""),
+        onset_missing_as_predicted=no_onset is not None and no_onset.as_predicted,
+        curve_error=curve_error([*(sweep if exact(study, axes) else ()), *(onset.flights if onset else ())]),
+        assert_onset=allowed,
+        failure=failure,
+        passed=not failure and not failed,
+        trials=len(outcomes),
+        trials_of_kind=dict(Counter(outcome.kind for outcome in outcomes)),
+        trials_failed=failed,
+        worst=tuple(outcome.id for outcome in worst_of(outcomes)),
+        flight_time_s=round(sum(outcome.elapsed_s for outcome in outcomes), 3),
+        points=tuple(sweep),
+        past_limits=sum(outcome.past_limits for outcome in outcomes),
+        noise=_noise(outcomes) if study.real_time else None,
+        provenance=_provenance(study.plan.scenario.seed),
+    )
 
 
-def noise_of(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """How much the machine disturbed flights in real time: median and largest of each figure over the flights.
-
-    `lateness` is how much later than due set-points were handed over. `loop_delay_spread_s` is the 90th percentile of
-    the loop delay minus its median. Of the processor time, the host took away `steal_share`, and all processes together
-    used `busy_share`.
-    """
+def _noise(outcomes: Sequence[Outcome]) -> Noise:
     names = ("lateness_s_p50", "lateness_s_p99", "loop_delay_spread_s", "steal_share", "busy_share")
     known = {name: [v for o in outcomes if (v := getattr(o, name)) is not None] for name in names}
-    return {"flights": len(outcomes)} | {
-        name: {"median": float(np.median(values)), "max": max(values)} for name, values in known.items() if values
-    }
+    figures = {name: Typical(median=float(np.median(own)), max=max(own)) for name, own in known.items() if own}
+    return Noise(flights=len(outcomes), **figures)
 
 
-def provenance(seed: int) -> dict[str, Any]:
-    """Seed, package versions, git commit (None outside a checkout) and type of machine."""
-    return {
-        "seed": seed,
-        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
-        "git_commit": _commit(),
-        "machine": f"{platform.system()} {platform.machine()}",
-    }
+def _provenance(seed: int) -> Provenance:
+    return Provenance(
+        seed=seed,
+        versions={"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+        git_commit=_commit(),
+        machine=f"{platform.system()} {platform.machine()}",
+    )
 
 
 def _version(name: str) -> str | None:
@@ -132,32 +200,16 @@ def exact(study: Study, axes: Sequence[Axis]) -> bool:
     return has_constant_links(at_coordinates(study.plan.scenario, at))
 
 
-def _point(o: Outcome) -> dict[str, Any]:
-    return {
-        "id": o.id, "kind": o.kind, "seed": o.seed, "coordinates": o.coordinates, "verdict": o.verdict,
-        "loop_delay_s": o.loop_delay_s, "growth_1_s": o.growth_1_s, "growth_error_1_s": o.growth_error_1_s,
-        "predicted_growth_1_s": o.predicted_growth_1_s, "spacing_error_max_m": o.spacing_error_max_m,
-    }  # fmt: skip
-
-
-def write_report(
-    folder: Path,
-    result: dict[str, Any],
-    *,
-    study: Study,
-    axes: Sequence[Axis],
-    sweep: Sequence[Outcome],
-    onset: Onset | None,
-) -> Path:
+def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Sequence[Axis]) -> Path:
     """Write report.html with its figures embedded, and the figures as PNG files beside it."""
     # matplotlib takes half a second to import
     from gcs.stress.boundary import map_figure
     from gcs.stress.figures import axis_figure, growth_figure, worst_figure
 
-    probes = [outcome for outcome in sweep if outcome.kind == "probe"]
-    own = [outcome for outcome in sweep if outcome.kind == "own"]
+    onset = result.onset
+    probes, own = ([outcome for outcome in result.points if outcome.kind == kind] for kind in ("probe", "own"))
     points = probes or own
-    fitted = _along_delay(axes) and bool(probes)
+    fitted = len(axes) == 1 and axes[0].name == "delay" and bool(probes)
     flights = [*(probes if fitted else ()), *(onset.flights if onset is not None else ())]
     flights = list({outcome.id: outcome for outcome in flights}.values())
     large = [*own, *(onset.own if onset is not None else ())]
@@ -186,7 +238,8 @@ def write_report(
         axes=axes,
         random=not exact(study, axes),
         coupled=any(len(loop.system_ids) > 1 for loop in plan_loops(study.plan)),
-        again=refly_command(folder, result["worst"][0]) if result["worst"] else "",
+        gains=_gains(result.gains),
+        again=refly_command(folder, result.worst[0]) if result.worst else "",
     )
     file = folder / REPORT_FILE
     file.write_text(page, encoding="utf-8")
@@ -196,7 +249,3 @@ def write_report(
 def refly_command(folder: Path, trial_id: str) -> str:
     """The command that flies a trial of a campaign again."""
     return shlex.join(["gcs", "stress", str(folder / "scenario.toml"), "--out", str(folder), "--trial", trial_id])
-
-
-def _along_delay(axes: Sequence[Axis]) -> bool:
-    return len(axes) == 1 and axes[0].name == "delay"

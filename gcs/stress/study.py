@@ -111,10 +111,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
     fraction of one if no smooth curve fits the flights. The search follows the measured growth; the prediction only
     says where to start.
 
-    Raises
-    ------
-    NoOnset
-        With the reason.
+    Raises NoOnset with the reason.
     """
     predicted_s = study.plan.delay_margin_s
     if predicted_s == np.inf:

@@ -121,8 +121,7 @@ def sparse_gain(K: FloatArray) -> tuple[tuple[int, int, float], ...]:
 def plan_of(trial: Trial) -> FlightPlan:
     """The plan of a trial, before the changes that a probe makes."""
     formation = plan_formation(trial.scenario)
-    n = len(formation.system_ids)
-    K = np.zeros((2 * n, 4 * n - 2))
+    K = np.zeros((formation.model.inputs, formation.model.states))
     for row, column, value in trial.gain:
         K[row, column] = value
     return FlightPlan(trial.scenario.with_calm_monitor(), formation, K, trial.delay_margin_s)
@@ -137,16 +136,15 @@ def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
 def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
     """The outcome with the verdict of the flight, its spacing errors and the driver's lateness."""
     summary = summarise(plan.scenario, margins_of(plan), flight.ticks, flight.events)
-    largest = [v["spacing_error_max_m"] for v in summary["vehicles"] if v["spacing_error_max_m"] is not None]
-    final = [v["spacing_error_final_m"] for v in summary["vehicles"] if v["spacing_error_final_m"] is not None]
+    assert summary.control is not None
     return replace(
         outcome,
-        verdict=summary["verdict"],
-        reason=summary["reason"],
-        spacing_error_max_m=max(largest, default=None),
-        spacing_error_final_m=max(final, default=None),
-        lateness_s_p50=summary["control"]["lateness_s"]["p50"],
-        lateness_s_p99=summary["control"]["lateness_s"]["p99"],
+        verdict=summary.verdict,
+        reason=summary.reason,
+        spacing_error_max_m=summary.spacing_error_max_m,
+        spacing_error_final_m=summary.spacing_error_final_m,
+        lateness_s_p50=summary.control.lateness_s.p50,
+        lateness_s_p99=summary.control.lateness_s.p99,
         steal_share=flight.steal_share,
         busy_share=flight.busy_share,
         ticks_sha256=None if outcome.real_time else hashlib.sha256(flight.ticks.tobytes()).hexdigest(),

@@ -104,15 +104,16 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]
         folder = Path(name) / "run"
         _, _, _, spent = fly_real_time(plan, designed, folder)
         summary = finish(folder)
-        if summary["reason"].startswith("interrupted"):
+        if summary.reason.startswith("interrupted"):
             raise KeyboardInterrupt
         graded = grade(folder)
+    assert summary.control is not None
     return {
-        "control": summary["control"],
-        "reason": summary["reason"],
+        "control": summary.control.to_dict(),
+        "reason": summary.reason,
         "steal_share": spent.steal,
         "load_average": os.getloadavg()[0],
-        **graded,
+        **graded.to_dict(),
     }
 
 

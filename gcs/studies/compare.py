@@ -24,7 +24,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
-from gcs.views.report import UNKNOWN, number_text
+from gcs.views.console import UNKNOWN, number_text
 from scenarios.files import dump
 from scenarios.schema import Control, Scenario
 
@@ -102,23 +102,22 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
     flight = fly_virtual(plan)
     summary = summarise(plan.scenario, designed, flight.ticks, flight.events)
     flown = flight.ticks[(flight.ticks["time_s"] >= 0.0) & flight.ticks["commanded"]]
-    model, K = FormationModel(tuple(plan.formation.predecessor.tolist())), plan.gain
+    model, K = plan.model, plan.gain
     squared = flown["command_north_m_s2"] ** 2 + flown["command_east_m_s2"] ** 2
-    largest = [v["spacing_error_max_m"] for v in summary["vehicles"] if v["spacing_error_max_m"] is not None]
     links, numbers = _information(model, K)
     return (
         Route(
             method=method,
             design_s=design_s,
-            verdict=summary["verdict"],
-            settling_time_s=summary["settling_time_s"],
+            verdict=summary.verdict,
+            settling_time_s=summary.settling_time_s,
             overshoot=_overshoot(plan, flown),
             effort_m2_s3=float(squared.sum() / scenario.rates.control_hz),
             command_max_m_s2=float(np.sqrt(squared.max(initial=0.0))),
-            spacing_error_max_m=max(largest, default=None),
+            spacing_error_max_m=summary.spacing_error_max_m,
             alpha=disturbance_bound(model.A + model.B @ K, np.eye(model.states)),
-            delay_margin_s=summary["delay_margin_s"],
-            delay_margin_continuous_s=summary["delay_margin_continuous_s"],
+            delay_margin_s=summary.delay_margin_s,
+            delay_margin_continuous_s=summary.delay_margin_continuous_s,
             decay_rate_1_s=-abscissa(model.A + model.B @ K),
             string_peak=string_peak(model, K),
             links=links,

@@ -73,4 +73,4 @@ def flown(name: str, method: str) -> tuple[TickArray, float | None]:
     scenario = scenario.with_link_delay(up_s=0.0, down_s=0.0).with_calm_monitor()
     designed, plan = flight_plan(scenario.model_copy(update={"control": control}))
     flight = fly_virtual(plan)
-    return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events)["settling_time_s"]
+    return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events).settling_time_s

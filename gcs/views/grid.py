@@ -47,7 +47,7 @@ def by_tick(rows: TickArray, system_ids: Sequence[int]) -> TickArray:
 
 
 def unknown(system_ids: Sequence[int]) -> TickArray:
-    """One row for each vehicle that says nothing about it."""
+    """One row for each vehicle, of which nothing is known."""
     rows = np.zeros(len(system_ids), TICK)
     for name in TICK.names or ():
         if TICK[name].kind == "f":

@@ -4,9 +4,9 @@ It draws the live table and writes the Rerun recording, so that the control proc
 
     python -m gcs.views.observer FOLDER --parent PID [--no-table]
 
-The file FOLDER/.observer-ready appears when everything slow to start has been started, and goes when the observer
-ends. It ends after the run's "end" event, on SIGTERM, or when its parent has gone and nothing new is written; in
-each case the recording is whole. SIGINT and SIGHUP are left to the parent, which decides how the flight ends.
+The file FOLDER/.observer-ready exists from when all slow imports are done until the observer ends. It ends after the
+run's "end" event, on SIGTERM, or when its parent has died and nothing new is written; in each case the recording is
+whole. SIGINT and SIGHUP are left to the parent, which decides how the flight ends.
 """
 
 import argparse
@@ -25,8 +25,9 @@ from gcs.plan.design import Design
 from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
 from gcs.runs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE
 from gcs.runs.summary import finish
+from gcs.runs.summary_record import Summary
+from gcs.views.console import live_display
 from gcs.views.grid import WholeTicks
-from gcs.views.recording import Recording
 from gcs.views.table import Display, FlightState
 from scenarios.schema import Scenario
 
@@ -35,12 +36,12 @@ TABLE_S = 0.24
 SEND_S = 1.0
 ROWS_AT_ONCE = 100_000
 ORPHAN_S = 1.0
-"""How long an observer without a parent waits for more."""
+"""Time without anything new after which an observer whose parent has died ends."""
 
 
 @dataclass
 class Parent:
-    """Whether the process that started the observer still lives, and whether the observer was asked to stop."""
+    """The process that started the observer, and whether the observer was asked to stop."""
 
     pid: int
     stop: bool = False
@@ -65,7 +66,8 @@ def main(argv: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, stop)
     outlive_readers()
     os.environ.setdefault("RUST_LOG", "off")  # Rerun would write over the table what is told in one line at the end
-    Recording.prepare()
+    import gcs.views.recording  # noqa: F401  # pyright: ignore[reportUnusedImport]
+
     os.nice(10)  # not before: the station waits until this is ready
     ready = arguments.folder / READY_FILE
     try:
@@ -85,10 +87,13 @@ def main(argv: list[str] | None = None) -> int:
 
 def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent, show_table: bool) -> None:
     """Follow the run in `folder` until it ends or is left alone."""
+    from gcs.views.recording import Recording  # Rerun is slow to import
+
     tail = RunTail(folder)
     whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])
     state = FlightState(scenario, design)
-    with Recording(folder, scenario, design) as recording, Display(state, shown=show_table) as display:
+    with Recording(folder, scenario, design) as recording, live_display(shown=show_table) as live:
+        display = Display(state, live, shown=show_table)
         news = table_due = send_due = time.monotonic()
         ended = False
         while not ended:
@@ -96,10 +101,10 @@ def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent,
             # Events before ticks: whatever was written before the "end" event is then read as well.
             events = tail.events()
             ticks = whole.add(tail.ticks())
-            ended = last_look or any(event["kind"] == "end" for event in events)
+            ended = last_look or any(event.kind == "end" for event in events)
             if ended:
                 ticks = np.concatenate([ticks, whole.rest()])
-            if any(event["kind"] == NEW_DESIGN for event in events):
+            if any(event.kind == NEW_DESIGN for event in events):
                 design = read_design(folder / DESIGN_FILE)
                 state.redesigned(design)
                 recording.redesigned(design)
@@ -119,8 +124,17 @@ def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent,
                 time.sleep(POLL_S)
 
 
+def recover_run(folder: Path) -> Summary:
+    """Finish the files of a run that has ended, flight.rrd among them, and return its summary."""
+    finish(folder)
+    record_run(folder)
+    return finish(folder)  # again: the summary lists the files
+
+
 def record_run(folder: Path) -> Path:
-    """Make flight.rrd anew from the other files of a run that has ended, and return its path."""
+    """Make flight.rrd from the other files of a run that has ended, and return its path."""
+    from gcs.views.recording import Recording
+
     scenario, design = read_scenario(folder), read_design(folder / DESIGN_FILE)
     rows = read_ticks(folder)
     whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])

@@ -1,10 +1,11 @@
 """HTML pages that need nothing else: templates of this package, figures inside."""
 
 import base64
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gcs.views.report import UNKNOWN, number_text
+from gcs.views.console import ms_text, number_text
 
 
 def rendered(template: str, **values: Any) -> str:
@@ -14,18 +15,18 @@ def rendered(template: str, **values: Any) -> str:
     environment = Environment(
         loader=PackageLoader("gcs.views", "."), autoescape=select_autoescape(["j2"]), undefined=StrictUndefined
     )
-    environment.filters |= {"ms": milliseconds_text, "number": number_text, "percent": percent_text}
+    environment.filters |= {
+        "ms": partial(ms_text, form=".2f"),
+        "number": number_text,
+        "percent": percent_text,
+    }
     return environment.get_template(template).render(**values)
+
+
+def percent_text(value: float | None, form: str = "+.3%") -> str:
+    return number_text(value, form)
 
 
 def data_uri(png: Path) -> str:
     """A picture as an address that holds it."""
     return "data:image/png;base64," + base64.b64encode(png.read_bytes()).decode("ascii")
-
-
-def milliseconds_text(seconds: float | None, *, unit: str = " ms") -> str:
-    return UNKNOWN if seconds is None else f"{1e3 * seconds:.2f}{unit}"
-
-
-def percent_text(value: float | None, form: str = "+.3%") -> str:
-    return UNKNOWN if value is None else format(value, form)

@@ -1,8 +1,8 @@
 """The Rerun recording of a run, and the screen made for it. The one file that knows Rerun.
 
-What is in it, on the timeline sim_time, which starts with the flight (what was before it is left out, but its events,
-which stand at 0): entities with one value for each vehicle, in the scenario's order, so that a tick costs much the
-same for two hundred vehicles as for two.
+All is on the timeline sim_time, which starts with the flight; of the time before, only the events are kept, at 0. An
+entity holds one value for each vehicle, in the scenario's order, so that a tick of two hundred vehicles costs about as
+much as a tick of two.
 
     formation/...   vehicles, trails, wanted places and links as seen from the leader, in m north, east, down of it
     ground/...      the same over the ground, local NED
@@ -10,7 +10,7 @@ same for two hundred vehicles as for two.
     delay/...       loop delay and round trip of each vehicle, and the margin of the gains it is flown with, in ms
     headroom/...    in %
     command/...     accelerations sent
-    modes/ID        what the station thinks of a vehicle;  events: what happened
+    modes/ID        the station's judgement of a vehicle;  events: what happened
 """
 
 import errno
@@ -23,11 +23,16 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
+from rerun.chunk import RrdReader
+from rerun.experimental import ViewerClient
 
 from gcs.control.phases import patience_s
-from gcs.control.tick import Mode, TickArray
+from gcs.control.tick import Event, Mode, TickArray
 from gcs.plan.design import Design
-from gcs.runs.record import RECORDING_FILE
+from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 from gcs.views.scene import (
     PICTURE_S,
     TRAIL_STEP_S,
@@ -45,12 +50,18 @@ from gcs.views.table import event_text
 from scenarios.schema import Scenario
 
 TIMELINE = "sim_time"
-UNFINISHED_FILE = RECORDING_FILE + ".part"
 TRAIL_S = 20.0
 LABELS_MAX = 40
 """With more vehicles than this, their names would cover the scene."""
 LEGEND_MAX = 8
 """The same for the legend of a plot."""
+_CURVES = {
+    "delay/loop_ms": ("loop_delay_s", 1e3),
+    "headroom/percent": ("headroom", 100.0),
+    "command/north_m_s2": ("command_north_m_s2", 1.0),
+    "command/east_m_s2": ("command_east_m_s2", 1.0),
+}
+"""Curves with one line for each vehicle: the column of the ticks, and what it is multiplied by."""
 
 MODE_COLORS: dict[Mode, Color] = {
     Mode.WAITING: (110, 110, 120),
@@ -82,8 +93,6 @@ class Recording:
     """
 
     def __init__(self, folder: Path, scenario: Scenario, design: Design) -> None:
-        import rerun as rr
-
         count = len(scenario.vehicles)
         self._folder = folder
         self._scenario = scenario
@@ -92,7 +101,7 @@ class Recording:
         self._levels = _levels(scenario)
         self._before_s = patience_s(scenario)
         self._ticks: list[TickArray] = []
-        self._events: list[dict[str, Any]] = []
+        self._events: list[Event] = []
         self._newest_m = Newest(count, 3)
         self._newest_rtt_ms = Newest(count)
         self._modes = np.full(count, -1)
@@ -105,18 +114,13 @@ class Recording:
         self._log_scene_styles()
         self._log_plot_styles()
 
-    @staticmethod
-    def prepare() -> None:
-        """Load what is slow to load."""
-        import rerun  # noqa: F401  # pyright: ignore[reportUnusedImport]
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.close()
 
-    def add(self, ticks: TickArray, events: list[dict[str, Any]]) -> None:
+    def add(self, ticks: TickArray, events: list[Event]) -> None:
         """Take whole ticks, shape (ticks, vehicles), and events; nothing is written yet."""
         if ticks.size:
             self._ticks.append(ticks)
@@ -152,13 +156,9 @@ class Recording:
         os.replace(self._folder / UNFINISHED_FILE, self._folder / RECORDING_FILE)
 
     def _columns(self, path: str, times_s: Floats, columns: Any) -> None:
-        import rerun as rr
-
         self._stream.send_columns(path, [rr.TimeColumn(TIMELINE, duration=times_s)], columns)
 
     def _scalars(self, path: str, times_s: Floats, values: Floats) -> None:
-        import rerun as rr
-
         self._columns(path, times_s, rr.Scalars.columns(scalars=values))
 
     def _send_series(self, ticks: TickArray) -> None:
@@ -166,22 +166,18 @@ class Recording:
         if self._tree.followers:
             errors_m = np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])
             self._scalars("spacing/error_m", times_s, errors_m[:, self._tree.followers])
-        self._scalars("delay/loop_ms", times_s, 1e3 * ticks["loop_delay_s"])
+        for path, (column, factor) in _CURVES.items():
+            self._scalars(path, times_s, factor * ticks[column])
         margins_ms = 1e3 * ticks["delay_margin_s"]
         if np.isfinite(margins_ms).any():
             self._scalars("delay/margin_ms", times_s, np.where(np.isfinite(margins_ms), margins_ms, np.nan))
         # Round trips end at some ticks only: each is shown until the next.
         self._scalars("delay/rtt_ms", times_s, self._newest_rtt_ms.fill(1e3 * ticks["rtt_s"]))
-        self._scalars("headroom/percent", times_s, 100 * ticks["headroom"])
-        self._scalars("command/north_m_s2", times_s, ticks["command_north_m_s2"])
-        self._scalars("command/east_m_s2", times_s, ticks["command_east_m_s2"])
         for level in self._levels:
             self._scalars(level.path, times_s[[0, -1]], np.full((2, 1), level.value))
 
     def _send_modes(self, ticks: TickArray) -> None:
         """The changes only; a vehicle that is not nominal has its mode on its label."""
-        import rerun as rr
-
         modes = np.vstack([self._modes, ticks["mode"]])
         times_s = ticks["time_s"][:, 0]
         for k, line in zip(*np.nonzero(np.diff(modes, axis=0).T), strict=True):
@@ -212,8 +208,6 @@ class Recording:
             self._send_trail(times_s[[k]], np.stack([place_m[k] for place_m in places_m.values()]), list(places_m))
 
     def _send_places(self, root: str, times_s: Floats, place_m: Floats) -> None:
-        import rerun as rr
-
         count, tree = place_m.shape[1], self._tree
         points = rr.Points3D.columns(positions=place_m.reshape(-1, 3)).partition([count] * times_s.size)
         self._columns(f"{root}/vehicles", times_s, points)
@@ -230,31 +224,25 @@ class Recording:
 
     def _send_trail(self, time_s: Floats, ends_m: Floats, roots: list[str]) -> None:
         """The piece flown since the piece before, each logged once; the view shows those of the last seconds."""
-        import rerun as rr
-
         before_m, self._trail_ends_m = self._trail_ends_m, ends_m
         if before_m is not None:
             for root, start_m, end_m in zip(roots, before_m, ends_m, strict=True):
                 pieces = rr.LineStrips3D.columns(strips=_segments(start_m, end_m)).partition([len(end_m)])
                 self._columns(f"{root}/trails", time_s, pieces)
 
-    def _send_events(self, events: list[dict[str, Any]]) -> None:
+    def _send_events(self, events: list[Event]) -> None:
         """One entry for what one tick says of several vehicles."""
-        import rerun as rr
-
-        entries: list[tuple[dict[str, Any], list[int]]] = []
-        for _, same in itertools.groupby(events, key=lambda event: (event["time_s"], event["kind"], event["text"])):
+        entries: list[tuple[Event, list[int]]] = []
+        for _, same in itertools.groupby(events, key=lambda event: (event.time_s, event.kind, event.text)):
             group = list(same)
-            entries.append((group[0], [event["system_id"] for event in group if event["system_id"] is not None]))
-        times_s = np.array([max(float(event["time_s"]), 0.0) for event, _ in entries])
+            entries.append((group[0], [system_id for event in group for system_id in event.about]))
+        times_s = np.array([max(event.time_s, 0.0) for event, _ in entries])
         texts = [event_text(event, system_ids, self._before_s) for event, system_ids in entries]
         levels = [_event_level(event) for event, _ in entries]
         self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
 
     def _log_scene_styles(self) -> None:
         """Colours, names and sizes of what moves."""
-        import rerun as rr
-
         colors, few = vehicle_colors(len(self._labels)), len(self._labels) <= LABELS_MAX
         own = [colors[k] for k in self._tree.followers]
         spacing_m = min((math.hypot(*offset) for offset in self._tree.offsets_m[:, :2]), default=1.0)
@@ -275,7 +263,6 @@ class Recording:
 
     def _log_plot_styles(self) -> None:
         """Colours, names and widths of the curves."""
-        import rerun as rr
 
         def lines(path: str, names: list[str], colors: list[Color], width: float = 1.5) -> None:
             style = rr.SeriesLines(colors=colors, names=names, widths=[width] * len(names))
@@ -284,11 +271,10 @@ class Recording:
         labels, colors = self._labels, vehicle_colors(len(self._labels))
         followers = self._tree.followers
         lines("spacing/error_m", [labels[k] for k in followers], [colors[k] for k in followers])
-        lines("delay/loop_ms", labels, colors)
+        for path in _CURVES:
+            lines(path, labels, colors)
         lines("delay/rtt_ms", [f"{label} RTT" for label in labels], [dimmed(color) for color in colors], 0.8)
         lines("delay/margin_ms", [f"{label} margin" for label in labels], [LIMIT_COLOR] * len(labels), 3.5)
-        for path in ("headroom/percent", "command/north_m_s2", "command/east_m_s2"):
-            lines(path, labels, colors)
         for level in self._levels:
             lines(level.path, [level.name], [LIMIT_COLOR if level.limit else PALE], 3.5 if level.limit else 1.0)
         names = [mode.name for mode in Mode]
@@ -299,8 +285,6 @@ class Recording:
 
 def length_s(recording: Path) -> float | None:
     """The last scenario time of a recording, None if nothing in it has a time."""
-    from rerun.chunk import RrdReader
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it was cut short: what is left of it may do
         chunks = [chunk for chunk in RrdReader(recording).stream() if TIMELINE in chunk.timeline_names]
@@ -310,8 +294,6 @@ def length_s(recording: Path) -> float | None:
 
 def viewer_client(address: str) -> Any:
     """A client that drives the Rerun viewer listening at an address."""
-    from rerun.experimental import ViewerClient
-
     return ViewerClient.connect(address)
 
 
@@ -331,9 +313,9 @@ def _segments(start_m: Floats, end_m: Floats) -> Any:
     return np.stack([start_m, end_m], axis=-2).reshape(-1, 2, 3)
 
 
-def _event_level(event: dict[str, Any]) -> str:
+def _event_level(event: Event) -> str:
     """How bad an event is: of a change of mode, the mode it ends in counts."""
-    last = event["text"].upper().split("->")[-1]
+    last = event.text.upper().split("->")[-1]
     if any(word in last for word in ("CRITICAL", "LOST", "FAILSAFE")):
         return "ERROR"
     return "WARN" if "CAUTION" in last else "INFO"
@@ -348,8 +330,6 @@ def _margins_text(design: Design) -> str:
 
 def _blueprint(scenario: Scenario, design: Design) -> Any:
     """The screen: the scene on the left, with modes and events; plots on the right; time below."""
-    import rerun.blueprint as rrb
-    from rerun.blueprint.encodings import TextLogColumn, TimelineColumn
 
     def plot(name: str, *contents: str, legend: bool = False) -> Any:
         corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend)
@@ -391,8 +371,6 @@ def _blueprint(scenario: Scenario, design: Design) -> Any:
 
 def _scene_view(root: str, scenario: Scenario) -> Any:
     """A 3D view from behind and above, from so far that it holds the wanted formation."""
-    import rerun.blueprint as rrb
-
     middle_m, reach_m = wanted_extent_m(scenario)
     # What is long from north to south comes near the eye at its southern end: such a formation needs more room.
     radius_m = max(math.hypot(*reach_m), 1.4 * reach_m[0]) or 50.0

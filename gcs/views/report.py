@@ -2,46 +2,43 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, ResponsePart
-from gcs.runs.record import STARTED
+from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
-from gcs.views.console import plain_console
-
-UNKNOWN = "–"
+from gcs.runs.summary_record import Summary
+from gcs.views.console import UNKNOWN, ms_text, number_text, numbers_table, plain_console
 
 
 def print_design(design: Design, console: Console | None = None) -> None:
     """Gains, robustness, both margins, and the trade-off between robustness and margin."""
     console = console or plain_console()
     console.print(f"design   {design.method}, loop {design.loop}, period {design.period_s * 1e3:g} ms")
-    if design.inclusion_gains is None or design.behaviour is None:
-        _print_graph_design(design, console)
-        return
-    own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
-    console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
-    console.print("         u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike")
-    _print_margins(design, console)
-    console.print(_response(design.response), end="")
-    console.print(
-        f"alpha    {design.alpha:.4f} (robustness bound), decay {design.behaviour.decay_rate_1_s:.2f} 1/s without delay"
-    )
+    if design.inclusion_gains is not None and design.behaviour is not None:
+        own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
+        console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
+        law = "u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike"
+        console.print(f"         {law}")
+        _print_margins(design, console)
+        console.print(_response(design.response), end="")
+        bound, decay_1_s = "robustness bound", design.behaviour.decay_rate_1_s
+    else:
+        console.print(_blocks_table(design))
+        _print_margins(design, console)
+        bound, decay_1_s = "robustness bound of the whole formation", design.decay_rate_1_s
+    loss = "" if design.cost_loss is None else f"; costs {design.cost_loss:.1%} more than with all information"
+    console.print(f"alpha    {design.alpha:.4f} ({bound}), decay {decay_1_s:.2f} 1/s without delay{loss}")
     if design.at_loop_delay is not None:
         _print_figures_at_delay(design.at_loop_delay, console)
-    if not design.trade_off:
-        return
-    table = Table(box=box.SIMPLE_HEAD, title="the trade-off it sits on", title_justify="left", title_style="")
-    table.add_column("delay margin, ms", justify="right")
-    table.add_column("largest alpha", justify="right")
-    for point in design.trade_off:
-        table.add_row(_ms(point.delay_margin_s, unit=""), f"{point.alpha:.3f}")
-    console.print(table)
+    if design.trade_off:
+        table = numbers_table("delay margin, ms", "largest alpha", title="the trade-off it sits on")
+        for point in design.trade_off:
+            table.add_row(ms_text(point.delay_margin_s, unit=""), f"{point.alpha:.3f}")
+        console.print(table)
 
 
 def _print_margins(design: Design, console: Console) -> None:
@@ -52,13 +49,14 @@ def _print_margins(design: Design, console: Console) -> None:
         console.print("margin   none: the sampled loop is unstable without any delay")
     else:
         console.print(
-            f"margin   {_ms(sampled_s)} of loop delay in the sampled loop, {_ms(continuous_s)} in the continuous model"
+            f"margin   {ms_text(sampled_s)} of loop delay in the sampled loop, {ms_text(continuous_s)} in the "
+            "continuous model"
         )
     if design.vehicles == 1:
         console.print("         of the one vehicle's own velocity loop, as nobody follows it")
     if design.onboard is not None:
         ground_s = design.onboard.ground_delay_margin_s
-        console.print(f"         {_ms(ground_s)} if the station closed every loop with the same gains")
+        console.print(f"         {ms_text(ground_s)} if the station closed every loop with the same gains")
 
 
 def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> None:
@@ -74,7 +72,7 @@ def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> 
 
 def figures_text(flown: FiguresAtDelay) -> str:
     """α and, where they run down a chain, the growth of spacing errors at a loop delay, in words."""
-    alpha = f"{flown.alpha:.4f} at {_ms(flown.loop_delay_s)} of loop delay"
+    alpha = f"{flown.alpha:.4f} at {ms_text(flown.loop_delay_s)} of loop delay"
     if not flown.has_string_verdict:
         return f"{alpha}, of the whole formation"
     grows = "without bound" if flown.string_peak is None else f"{flown.string_peak:.2f} times at most"
@@ -84,119 +82,99 @@ def figures_text(flown: FiguresAtDelay) -> str:
 def _up_to(delay_s: float | None) -> str:
     if delay_s is None:
         return "at every loop delay"
-    return "at no loop delay" if delay_s == 0.0 else f"up to {_ms(delay_s)} of it"
+    return "at no loop delay" if delay_s == 0.0 else f"up to {ms_text(delay_s)} of it"
 
 
-def _print_graph_design(design: Design, console: Console) -> None:
+def _blocks_table(design: Design) -> Table:
     """The gain matrix by blocks: who uses whose errors, and how."""
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("vehicle", "uses", "spacing error, 1/s²", "velocity error, 1/s"):
-        table.add_column(heading, justify="right")
+    table = numbers_table("vehicle", "uses", "spacing error, 1/s²", "velocity error, 1/s")
     for block in design.blocks:
         *spacing, north, east = zip(*block.gain, strict=True)
         table.add_row(str(block.vehicle), str(block.of), _matrix(spacing), _matrix([north, east]))
-    console.print(table)
-    _print_margins(design, console)
-    loss = "" if design.cost_loss is None else f"; costs {design.cost_loss:.1%} more than with all information"
-    console.print(
-        f"alpha    {design.alpha:.4f} (robustness bound of the whole formation), decay "
-        f"{design.decay_rate_1_s:.2f} 1/s without delay{loss}"
-    )
-    if design.at_loop_delay is not None:
-        _print_figures_at_delay(design.at_loop_delay, console)
-
-
-def number_text(value: float | None, form: str = ".5f") -> str:
-    return UNKNOWN if value is None else format(value, form)
+    return table
 
 
 def _matrix(columns: Sequence[Sequence[float]]) -> str:
-    """A block as one number where it is that on each axis alike, else with all of its numbers."""
+    """A block: one number if it is the same on both axes and does not couple them, else all four."""
     if not columns:
         return UNKNOWN
     (a, c), (b, d) = columns
     return f"{a:+.4f}" if a == d and b == c == 0.0 else f"[{a:+.4f} {b:+.4f}; {c:+.4f} {d:+.4f}]"
 
 
-def print_summary(summary: dict[str, Any], folder: Path, console: Console | None = None) -> None:
+def print_summary(summary: Summary, folder: Path, console: Console | None = None) -> None:
     """The verdict with its figures, and where the files are."""
     console = console or plain_console()
     print_flight(summary, console)
-    console.print(f"files    {folder}: {', '.join(summary['files'])}")
-    if "flight.rrd" in summary["files"]:
+    console.print(f"files    {folder}: {', '.join(summary.files)}")
+    if RECORDING_FILE in summary.files:
         console.print(f"look     gcs view {folder}")
 
 
-def print_flight(summary: dict[str, Any], console: Console) -> None:
-    """The verdict with its figures; `control` may be None, where a log does not show the ticks."""
-    style = {"stable": "bold green", "unstable": "bold red"}.get(summary["verdict"], "bold yellow")
-    fleet = summary.get("fleet", STARTED)
-    flown = "" if fleet == STARTED else f"; vehicles {fleet}"
-    console.print(Text.assemble("verdict  ", (summary["verdict"], style), f": {_reason(summary)}{flown}"))
-    for text in summary.get("not_logged", ()):
+def print_flight(summary: Summary, console: Console) -> None:
+    """The verdict with its figures."""
+    style = {"stable": "bold green", "unstable": "bold red"}.get(summary.verdict, "bold yellow")
+    flown = "" if summary.fleet == STARTED else f"; vehicles {summary.fleet}"
+    console.print(Text.assemble("verdict  ", (summary.verdict, style), f": {_reason(summary)}{flown}"))
+    for text in summary.not_logged:
         console.print(f"log      not written: {text}")
     console.print(f"delay    {delay_text(summary)}")
-    at_delay = FiguresAtDelay.model_validate(summary.get("at_loop_delay") or {"loop_delay_s": None})
-    if at_delay.alpha is not None:
-        console.print(f"alpha    {figures_text(at_delay)}")
-    if (response := summary.get("response")) is not None:
-        console.print(_response(ResponsePart.model_validate(response)), end="")
-    control = summary["control"]
-    if control is not None:
+    if summary.at_loop_delay.alpha is not None:
+        console.print(f"alpha    {figures_text(summary.at_loop_delay)}")
+    console.print(_response(summary.response), end="")
+    if (control := summary.control) is not None:
+        settled_s = summary.settling_time_s
         console.print(
-            f"control  {control['ticks']} ticks at {control['rate_hz']:g} Hz, "
-            f"{control['deadline_misses']} deadline misses; settled {_after(summary['settling_time_s'])}"
+            f"control  {control.ticks} ticks at {control.rate_hz:g} Hz, {control.deadline_misses} deadline misses; "
+            f"settled {'not at all' if settled_s is None else f'after {settled_s:.1f} s'}"
         )
-    for who, counts in (("station", summary.get("refused")), ("vehicles", summary.get("refused_by_vehicles"))):
+    for who, counts in (("station", summary.refused), ("vehicles", summary.refused_by_vehicles)):
         if counts:
             console.print(f"refused  by the {who}: {in_words(counts)}")
-    if mirror := summary.get("mirror"):
-        console.print(f"mirror   {in_words(mirror)}")
-    table = Table(box=box.SIMPLE_HEAD)
-    for name in ("vehicle", "final error, m", "largest, m", "RTT p50, ms", "loop p50, ms", "p99, ms", "lost", "late"):
-        table.add_column(name, justify="right")
-    for vehicle in summary["vehicles"]:
+    if summary.mirror:
+        console.print(f"mirror   {in_words(summary.mirror)}")
+    headings = ("vehicle", "final error, m", "largest, m", "RTT p50, ms", "loop p50, ms", "p99, ms", "lost", "late")
+    table = numbers_table(*headings)
+    for vehicle in summary.vehicles:
         table.add_row(
-            str(vehicle["system_id"]),
-            _metres(vehicle["spacing_error_final_m"]),
-            _metres(vehicle["spacing_error_max_m"]),
-            _ms(vehicle["rtt_s"]["p50"], unit=""),
-            _ms(vehicle["loop_delay_s"]["p50"], unit=""),
-            _ms(vehicle["loop_delay_s"]["p99"], unit=""),
-            _count(vehicle["lost"]),
-            _count(vehicle["late"]),
+            str(vehicle.system_id),
+            number_text(vehicle.spacing_error_final_m, ".2f"),
+            number_text(vehicle.spacing_error_max_m, ".2f"),
+            ms_text(vehicle.rtt_s.p50, unit=""),
+            ms_text(vehicle.loop_delay_s.p50, unit=""),
+            ms_text(vehicle.loop_delay_s.p99, unit=""),
+            number_text(vehicle.lost, "d"),
+            number_text(vehicle.late, "d"),
         )
     console.print(table)
 
 
-def _reason(summary: dict[str, Any]) -> str:
+def _reason(summary: Summary) -> str:
     """How the flight ended; of one that was flown to its end and is not stable, why."""
-    errors = [(v["spacing_error_final_m"], v["spacing_error_max_m"]) for v in summary["vehicles"]]
-    known = [(final_m, most_m) for final_m, most_m in errors if final_m is not None and most_m is not None]
-    if summary["verdict"] != "unstable" or not summary["reason"].startswith("completed") or not known:
-        return summary["reason"]
-    if summary["settling_time_s"] is not None:
-        return f"errors are small after {summary['duration_s']:.1f} s, but the loop delay is past the margin"
-    final_m, most_m = (max(column) for column in zip(*known, strict=True))
-    return f"not settled in {summary['duration_s']:.1f} s; {final_m:.2f} m left of errors of up to {most_m:.2f} m"
+    final_m, most_m = summary.spacing_error_final_m, summary.spacing_error_max_m
+    completed = summary.reason.startswith("completed")
+    if summary.verdict != "unstable" or not completed or final_m is None or most_m is None:
+        return summary.reason
+    if summary.settling_time_s is not None:
+        return f"errors are small after {summary.duration_s:.1f} s, but the loop delay is past the margin"
+    return f"not settled in {summary.duration_s:.1f} s; {final_m:.2f} m left of errors of up to {most_m:.2f} m"
 
 
-def delay_text(summary: dict[str, Any]) -> str:
+def delay_text(summary: Summary) -> str:
     """Loop delay against the margin."""
-    delay, margin_s = summary["loop_delay_s"], summary["delay_margin_s"]
-    margin = "no limit" if summary["loop"] == "onboard" and margin_s is None else f"margin {_ms(margin_s)}"
-    flown_s = [vehicle.get("delay_margin_s", {}).get("max") for vehicle in summary.get("vehicles", [])]
-    slowest_s = max((s for s in flown_s if s is not None), default=0.0)
+    delay, margin_s = summary.loop_delay_s, summary.delay_margin_s
+    margin = "no limit" if summary.loop == "onboard" and margin_s is None else f"margin {ms_text(margin_s)}"
+    slowest_s = max((vehicle.delay_margin_s.max or 0.0 for vehicle in summary.vehicles), default=0.0)
     if margin_s is not None and slowest_s > margin_s:
-        margin += f", up to {_ms(slowest_s)} with slower gains"
+        margin += f", up to {ms_text(slowest_s)} with slower gains"
     return (
-        f"loop {_ms(delay['p50'])} p50, {_ms(delay['p99'])} p99, {_ms(delay['max'])} max; "
-        f"{margin}; least headroom {_percent(summary['headroom_min'])}"
+        f"loop {ms_text(delay.p50)} p50, {ms_text(delay.p99)} p99, {ms_text(delay.max)} max; "
+        f"{margin}; least headroom {number_text(summary.headroom_min, '.0%')}"
     )
 
 
 def _response(response: ResponsePart | None) -> str:
-    """A line on how the vehicles answer, if they do not do so at once."""
+    """A line on how the vehicles respond to set-points; empty if they do at once."""
     if response is None:
         return ""
     if not response.vehicles:
@@ -211,25 +189,5 @@ def _response(response: ResponsePart | None) -> str:
     lag, gain = (" to ".join(dict.fromkeys((each[0], each[-1]))) for each in (lags, gains))
     return (
         f"response {response.source}: lag {lag} s, velocity gain {gain} 1/s; in the margin, which would be "
-        f"{_ms(response.delay_margin_at_once_s)} without it{grows}\n"
+        f"{ms_text(response.delay_margin_at_once_s)} without it{grows}\n"
     )
-
-
-def _ms(seconds: float | None, *, unit: str = " ms") -> str:
-    return UNKNOWN if seconds is None else f"{seconds * 1e3:.1f}{unit}"
-
-
-def _metres(value: float | None) -> str:
-    return UNKNOWN if value is None else f"{value:.2f}"
-
-
-def _percent(value: float | None) -> str:
-    return UNKNOWN if value is None else f"{value:.0%}"
-
-
-def _after(seconds: float | None) -> str:
-    return "not at all" if seconds is None else f"after {seconds:.1f} s"
-
-
-def _count(value: int | None) -> str:
-    return UNKNOWN if value is None else str(value)

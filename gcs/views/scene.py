@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs.control.tick import TickArray
+from gcs.plan.formation import plan_formation
 from scenarios.schema import Scenario
 
 Floats = NDArray[np.float64]
@@ -72,12 +73,9 @@ def tree_of(scenario: Scenario) -> Tree:
 
 
 def wanted_extent_m(scenario: Scenario) -> tuple[Floats, Floats]:
-    """Middle (north, east) of the wanted formation relative to the leader, and how far it reaches either way of it."""
-    places: dict[int | None, Floats] = {None: np.zeros(2)}
-    for vehicle in scenario.leader_first():
-        places[vehicle.system_id] = places[vehicle.follows] + np.array(vehicle.offset_ne_m or (0.0, 0.0))
-    corners_m = np.array(list(places.values()))
-    lowest_m, highest_m = corners_m.min(axis=0), corners_m.max(axis=0)
+    """Centre (north, east) of the wanted formation relative to the leader, and its half extents."""
+    place_m = plan_formation(scenario).place_ne_m()
+    lowest_m, highest_m = place_m.min(axis=0), place_m.max(axis=0)
     return (lowest_m + highest_m) / 2, (highest_m - lowest_m) / 2
 
 

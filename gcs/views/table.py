@@ -5,12 +5,9 @@ terminal, and `Display` chooses between the two.
 """
 
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from rich import box
 from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
@@ -18,15 +15,14 @@ from rich.table import Table
 from rich.text import Text
 
 from gcs.control.phases import patience_s
-from gcs.control.tick import TICK, Mode, TickArray
+from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.runs.refusals import REFUSED
-from gcs.views.console import plain_console
+from gcs.views.console import UNKNOWN, draw, fitted_table, ms_text, not_shown, number_text
 from gcs.views.grid import unknown
+from gcs.views.scene import Floats, Newest
 from scenarios.schema import Scenario
-
-Floats = NDArray[np.float64]
 
 WINDOW_S = 5.0
 """What "the last seconds" are: percentiles and least headroom are taken over them."""
@@ -35,29 +31,20 @@ EVENTS_SHOWN = 3
 TOGETHER_S = 0.5
 """Events that say the same within this time share a line."""
 NAMED_MAX = 12
-UNKNOWN = "–"
 
 HEADROOM_GOOD = 0.3
 """Headroom from which it is shown in green."""
-BADNESS = (
-    Mode.NOMINAL,
-    Mode.WAITING,
-    Mode.RECOVERING,
-    Mode.CAUTION,
-    Mode.CRITICAL,
-    Mode.FAILSAFE,
-    Mode.LOST,
-)
-"""Modes, from good to bad."""
 MODE_STYLES: dict[Mode, str] = {
-    Mode.WAITING: "dim",
     Mode.NOMINAL: "green",
+    Mode.WAITING: "dim",
     Mode.RECOVERING: "cyan",
     Mode.CAUTION: "yellow",
     Mode.CRITICAL: "bold red",
     Mode.FAILSAFE: "bold magenta",
     Mode.LOST: "bold red",
 }
+"""Modes, from good to bad."""
+_BADNESS = list(MODE_STYLES)
 
 
 class FlightState:
@@ -73,7 +60,7 @@ class FlightState:
         """What did not get in, in words."""
         self.time_s = np.nan
         self.before_s = patience_s(scenario)
-        """What scenario time lacks to the time since the station's start, until the flight begins at 0."""
+        """Until the flight begins at 0, scenario time plus this is the time since the station started."""
         self.skipped = 0
         """Ticks that were left out."""
         self.news: list[str] = []
@@ -82,6 +69,7 @@ class FlightState:
         self._named: list[int] = []
         self.system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
         self.newest = unknown(self.system_ids)
+        self._newest_rtt_s = Newest(len(self.system_ids))
         self.rtt_s = self.newest["rtt_s"]
         self._window: TickArray = np.empty((0, len(self.system_ids)), TICK)
 
@@ -105,13 +93,13 @@ class FlightState:
             self._at_delay[key] = text
         return self._at_delay[key]
 
-    def add(self, ticks: TickArray, events: list[dict[str, Any]]) -> None:
+    def add(self, ticks: TickArray, events: list[Event]) -> None:
         """Take whole ticks, shape (ticks, vehicles), and events."""
         for event in events:
-            if event["kind"] == "phase":
-                self.phase = event["text"]
-            if event["kind"] == REFUSED:
-                self.refused = event["text"]
+            if event.kind == "phase":
+                self.phase = event.text
+            if event.kind == REFUSED:
+                self.refused = event.text
             else:
                 self._add_news(event)
         if not ticks.size:
@@ -120,23 +108,22 @@ class FlightState:
         self.skipped += int(np.sum(np.diff(numbers) - 1))
         self.newest = ticks[-1]
         self.time_s = float(ticks["time_s"][-1, 0])
-        for line in ticks["rtt_s"]:
-            self.rtt_s = np.where(np.isnan(line), self.rtt_s, line)
+        self.rtt_s = self._newest_rtt_s.fill(ticks["rtt_s"])[-1]
         window = np.concatenate([self._window, ticks])
         self._window = window[window["time_s"][:, 0] > self.time_s - WINDOW_S]
 
-    def _add_news(self, event: dict[str, Any]) -> None:
-        same = (event["kind"], event["text"], event["time_s"] // TOGETHER_S)
-        if event["system_id"] is not None and self._named and same == self._last_event:
-            self._named.append(event["system_id"])
-            self.news[-1] = event_text(event, self._named, self.before_s)
+    def _add_news(self, event: Event) -> None:
+        same = (event.kind, event.text, event.time_s // TOGETHER_S)
+        if event.system_id is not None and self._named and same == self._last_event:
+            self._named.append(event.system_id)
+            self.news.pop()
         else:
-            self._named = [] if event["system_id"] is None else [event["system_id"]]
+            self._named = event.about
             self._last_event = same
-            self.news = [*self.news, event_text(event, self._named, self.before_s)][-EVENTS_SHOWN:]
+        self.news = [*self.news, event_text(event, self._named, self.before_s)][-EVENTS_SHOWN:]
 
     def figures(self) -> "Figures":
-        """The figures to be shown, one value for each vehicle; NaN where unknown."""
+        """The figures to be shown; NaN where unknown."""
         now = self.newest
         loop_delay_s = _quantiles(self._window["loop_delay_s"], (0.5, 0.99))
         spacings_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in self.scenario.vehicles]
@@ -173,11 +160,11 @@ class Figures:
     def worst_first(self) -> list[int]:
         """Indices of vehicles: first those in the worst mode, within a mode those with the least headroom."""
         headroom = np.nan_to_num(self.headroom, nan=np.inf)
-        return sorted(range(len(self.modes)), key=lambda k: (-BADNESS.index(self.modes[k]), headroom[k], k))
+        return sorted(range(len(self.modes)), key=lambda k: (-_BADNESS.index(self.modes[k]), headroom[k], k))
 
     def not_nominal(self) -> dict[Mode, list[int]]:
         """Indices of the vehicles in each mode but NOMINAL, worst mode first."""
-        found = {mode: [k for k, own in enumerate(self.modes) if own == mode] for mode in reversed(BADNESS)}
+        found = {mode: [k for k, own in enumerate(self.modes) if own == mode] for mode in reversed(_BADNESS)}
         return {mode: indices for mode, indices in found.items() if indices and mode != Mode.NOMINAL}
 
 
@@ -191,16 +178,14 @@ def render(state: FlightState, *, width: int, height: int) -> RenderableType:
     if len(order) > room:
         order = sorted(figures.worst_first()[: room - 1])
     table = _vehicles(state, figures, order, width)
-    hidden = len(state.system_ids) - len(order)
-    more = [Text(f"  … {hidden} vehicles not shown, none of them worse", style="dim", no_wrap=True)] if hidden else []
-    return Group(*head, table, *more, Text(), *foot)
+    return Group(*head, table, *not_shown(len(state.system_ids) - len(order)), Text(), *foot)
 
 
 def _headline(state: FlightState) -> Text:
     time = UNKNOWN if np.isnan(state.time_s) else time_text(state.time_s, state.before_s, ".1f")
     line = Text.assemble((state.scenario.name, "bold"), "  ", (state.phase, "bold cyan"), f"  {time}")
     loop = state.scenario.control.loop
-    margin = _number(1e3 * state.margin_s, ".0f")
+    margin = ms_text(state.margin_s, ".0f", unit="")
     line.append(f"   delay margin {margin} ms (sampled, {loop} loop, fastest gains)", style="dim")
     line.no_wrap = True
     return line
@@ -230,44 +215,38 @@ _COLUMNS = (
     ("late", 5, 76),
     ("mode", 8, 0),
 )
-"""Heading, least width (so that columns stand still while their numbers change), and the terminal it needs."""
+"""As `fitted_table` takes them."""
 
 
 def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
-    """One row for each vehicle in `order`; on a narrow terminal the columns that say least are left out."""
-    gap = 1 if width >= 101 else 0
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, gap, 0, 0))
-    for name, least, from_width in _COLUMNS:
-        if width >= from_width:
-            justify = "left" if name in ("", "mode") else "right"
-            table.add_column(name, justify=justify, no_wrap=True, min_width=least)
-    for k in order:
+    """One row for each vehicle in `order`."""
+
+    def row(k: int) -> list[str | Text]:
         vehicle, error_m, mode = state.scenario.vehicles[k], figures.spacing_error_m[k], figures.modes[k]
         headroom = float(figures.headroom[k])
-        cells = [
+        return [
             str(vehicle.system_id),
-            UNKNOWN if vehicle.follows is None else str(vehicle.follows),
-            _number(error_m, ".2f"),
-            _number(100 * error_m / figures.spacing_m[k], ".1f"),
-            _number(1e3 * figures.rtt_s[k], ".1f"),
-            _number(1e3 * figures.loop_delay_s_p50[k], ".1f"),
-            _number(1e3 * figures.loop_delay_s_p99[k], ".1f"),
-            _number(1e3 * state.newest["delay_margin_s"][k], ".0f"),
-            Text(_number(100 * headroom, ".0f"), headroom_style(headroom)),
+            number_text(vehicle.follows, "d"),
+            number_text(error_m, ".2f"),
+            number_text(100 * error_m / figures.spacing_m[k], ".1f"),
+            ms_text(figures.rtt_s[k], unit=""),
+            ms_text(figures.loop_delay_s_p50[k], unit=""),
+            ms_text(figures.loop_delay_s_p99[k], unit=""),
+            ms_text(state.newest["delay_margin_s"][k], ".0f", unit=""),
+            Text(number_text(headroom, ".0f", factor=100), headroom_style(headroom)),
             Text(_bar(headroom), headroom_style(headroom)),
             str(figures.lost[k]),
             str(figures.late[k]),
             Text(mode.name, MODE_STYLES[mode]),
         ]
-        columns = zip(cells, _COLUMNS, strict=True)
-        table.add_row(*(cell for cell, (_, _, from_width) in columns if width >= from_width))
-    return table
+
+    return fitted_table(_COLUMNS, map(row, order), width=width, gap=1 if width >= 101 else 0)
 
 
 def _footer(state: FlightState, figures: Figures) -> list[Text]:
     """The formation in one line, then the newest events."""
     line = Text(f"least headroom {_worst_headroom(state, figures)}", no_wrap=True)
-    line.append(f"   tick lateness p99 {_number(1e3 * figures.lateness_s_p99, '.2f')} ms")
+    line.append(f"   tick lateness p99 {ms_text(figures.lateness_s_p99, '.2f', unit='')} ms")
     if state.skipped:
         line.append(f"   {state.skipped} ticks skipped", style="yellow")
     refused = [Text(f"refused: {state.refused}", style="yellow", no_wrap=True)] if state.refused else []
@@ -284,68 +263,50 @@ def plain_line(state: FlightState) -> str:
     ]
     time, at_delay = time_text(state.time_s, state.before_s), state.at_delay(figures)
     return (
-        f"{time}  spacing error max {_number(_worst(figures.spacing_error_m), '.2f')} m"
-        f"  loop delay p99 max {_number(1e3 * _worst(figures.loop_delay_s_p99), '.1f')} ms"
+        f"{time}  spacing error max {number_text(_worst(figures.spacing_error_m), '.2f')} m"
+        f"  loop delay p99 max {ms_text(_worst(figures.loop_delay_s_p99), unit='')} ms"
         f"  headroom min {_worst_headroom(state, figures)}  {', '.join(modes) or 'all NOMINAL'}"
         f"{at_delay and f'  {at_delay}'}"
     )
 
 
 def time_text(time_s: float, before_s: float, form: str = "8.2f") -> str:
-    """Time of the flight; before it, time since the station's start, which scenario time is `before_s` short of."""
-    return f"start {time_s + before_s:+.2f} s" if time_s < 0.0 else f"{_number(time_s, form)} s"
+    """Time of the flight; before it, time since the station started: scenario time plus `before_s`."""
+    return f"start {time_s + before_s:+.2f} s" if time_s < 0.0 else f"{number_text(time_s, form)} s"
 
 
-def event_text(event: dict[str, Any], system_ids: list[int], before_s: float) -> str:
-    """An event in one line of text, for the vehicles it says the same of; `before_s` as in `time_text`."""
+def event_text(event: Event, system_ids: list[int], before_s: float) -> str:
+    """One line of text for an event that concerns these vehicles; `before_s` as in `time_text`."""
     named = " ".join(str(system_id) for system_id in system_ids[:NAMED_MAX])
     if len(system_ids) > NAMED_MAX:
         named += f" and {len(system_ids) - NAMED_MAX} more"
     who = f"vehicle{'s' * (len(system_ids) > 1)} {named}: " if system_ids else ""
-    kind = "" if event["kind"] == "vehicle" else f"{event['kind']}  "  # else the word would stand there twice
-    return f"{time_text(event['time_s'], before_s)}  {kind}{who}{event['text']}"
+    kind = "" if event.kind == "vehicle" else f"{event.kind}  "  # or the word would appear twice
+    return f"{time_text(event.time_s, before_s)}  {kind}{who}{event.text}"
 
 
 class Display:
-    """Shows a flight on standard output: as a table that is drawn anew on a terminal, else as lines of text."""
+    """Shows a flight on standard output: as a picture on a terminal, else as lines of text."""
 
-    def __init__(self, state: FlightState, *, shown: bool) -> None:
+    def __init__(self, state: FlightState, live: Live | None, *, shown: bool) -> None:
         self._state = state
-        self._console = plain_console(soft_wrap=False)
-        self._shown = shown
-        self._live = Live(auto_refresh=False, console=self._console) if shown and self._console.is_terminal else None
-        self._plain_due_s = -np.inf
+        self._live = live
+        self._says_lines = shown and live is None
+        self._line_due_s = -np.inf
 
-    def __enter__(self) -> Self:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def events(self, events: list[dict[str, Any]]) -> None:
-        """Say each event once, where there is no terminal to keep a table on."""
-        if self._live is None:
-            for event in events:
-                system_ids = [] if event["system_id"] is None else [event["system_id"]]
-                self._say(event_text(event, system_ids, self._state.before_s))
+    def events(self, events: list[Event]) -> None:
+        """Say each event once, where there is no picture to keep them on."""
+        for event in events if self._says_lines else ():
+            print(event_text(event, event.about, self._state.before_s), flush=True)
 
     def show(self, *, last: bool = False) -> None:
         """Show the flight as it is now."""
         state = self._state
         if self._live is not None:
-            # The last line stays free for the cursor: a display as high as the terminal would scroll it.
-            picture = render(state, width=self._console.width, height=self._console.height - 1)
-            self._live.update(picture, refresh=True)
-        elif state.time_s >= self._plain_due_s or last:
-            self._plain_due_s = (state.time_s // PLAIN_EVERY_S + 1) * PLAIN_EVERY_S
-            self._say(plain_line(state))
-
-    def _say(self, line: str) -> None:
-        if self._shown:
-            print(line, flush=True)
+            draw(self._live, lambda width, height: render(state, width=width, height=height))
+        elif self._says_lines and (state.time_s >= self._line_due_s or last):
+            self._line_due_s = (state.time_s // PLAIN_EVERY_S + 1) * PLAIN_EVERY_S
+            print(plain_line(state), flush=True)
 
 
 def _quantiles(values: Floats, probabilities: tuple[float, ...]) -> Floats:
@@ -363,7 +324,7 @@ def _quantiles(values: Floats, probabilities: tuple[float, ...]) -> Floats:
 
 
 def _worst(values: Floats) -> float:
-    return float(np.nanmax(values)) if not np.all(np.isnan(values)) else np.nan
+    return float(np.fmax.reduce(values, initial=np.nan))
 
 
 def _worst_headroom(state: FlightState, figures: Figures) -> str:
@@ -371,10 +332,6 @@ def _worst_headroom(state: FlightState, figures: Figures) -> str:
         return UNKNOWN
     worst = int(np.nanargmin(figures.headroom))
     return f"{100 * figures.headroom[worst]:.0f} % (vehicle {state.system_ids[worst]})"
-
-
-def _number(value: float, form: str) -> str:
-    return UNKNOWN if np.isnan(value) else format(value, form)
 
 
 def headroom_style(headroom: float) -> str:

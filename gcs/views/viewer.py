@@ -1,7 +1,4 @@
-"""Show a recording: the Rerun viewer on the screen, or a picture made without one.
-
-ViewerError(Exception)    a recording or a viewer that is not there, in one line
-"""
+"""Show a recording: the Rerun viewer on the screen, or a picture made without one."""
 
 import importlib.util
 import os
@@ -16,27 +13,23 @@ from math import floor
 from pathlib import Path
 from typing import IO, Any
 
+from gcs.errors import InputError
 from gcs.interrupts import raised
-from gcs.runs.record import RECORDING_FILE
-from gcs.views.recording import TIMELINE, UNFINISHED_FILE, length_s, viewer_client
+from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 
 START_S = 20.0
 SETTLE_S = 20.0
 DEFAULT_PICTURE_S = 10.0
 _MAGIC = b"RRF"
-"""How every .rrd file begins."""
+"""The first bytes of every .rrd file."""
 _WANTED = "wanted a recording of a run (.rrd)"
-
-
-class ViewerError(Exception):
-    """A recording that cannot be shown."""
 
 
 def view(folder_or_rrd: Path) -> int:
     """Open the Rerun viewer on a recording; returns when it is closed, with its exit code."""
     recording = find_recording(folder_or_rrd)
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ViewerError("no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; a picture can be made without")
+        raise InputError("no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; a picture can be made without")
     print(f"viewer   {recording}: until its window is closed", flush=True)
     return subprocess.run([_program(), str(recording)], check=False).returncode
 
@@ -44,81 +37,76 @@ def view(folder_or_rrd: Path) -> int:
 def picture_time_s(recording: Path, wanted_s: float | None) -> float:
     """The scenario time of a picture: the one wanted, if the recording is that long, else ten seconds or its end.
 
-    Raises
-    ------
-    ViewerError
-        If the recording ends before, or holds no flight.
+    Raises InputError if the recording ends before, or holds no flight.
     """
+    from gcs.views.recording import length_s  # Rerun is slow to import, and the viewer itself does not need it
+
     try:
         end_s = length_s(recording)
     except (OSError, RuntimeError, ValueError):  # cut short, or of another version
         end_s = None
     if end_s is None:
-        raise ViewerError(f"{recording}: read no flight in it, {_WANTED}")
+        raise InputError(f"{recording}: read no flight in it, {_WANTED}")
     if wanted_s is None:
         return min(DEFAULT_PICTURE_S, end_s)
     if not 0.0 <= wanted_s <= end_s:
         length = f"{floor(1e3 * end_s) / 1e3:g} s"
-        raise ViewerError(f"--at: read {wanted_s:g}, wanted seconds from 0: {recording} is {length} long")
+        raise InputError(f"--at: read {wanted_s:g}, wanted seconds from 0: {recording} is {length} long")
     return wanted_s
 
 
 def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 1600, height: int = 900) -> list[str]:
     """Write a picture of the recording's screen at a scenario time; returns what the views report as wrong.
 
-    Raises
-    ------
-    ViewerError
-        If there is no finished recording, or the viewer does not start: it needs a Vulkan driver, but no screen.
+    Raises InputError if there is no finished recording, or the viewer does not start: it needs a Vulkan driver, but no
+    screen.
     """
+    from gcs.views.recording import TIMELINE
+
     recording = find_recording(folder_or_rrd)
     with _headless(width, height) as viewer:
         viewer.open(str(recording.resolve()))
         try:
             viewer.set_time(TIMELINE, duration=time_s, play_state="paused")
         except ConnectionError:  # it has loaded nothing with times
-            raise ViewerError(f"{recording}: the viewer reads no flight in it; {_WANTED}") from None
-        viewer.run_command("ui.toggle_top_panel")  # it has nothing to say on a picture
+            raise InputError(f"{recording}: the viewer reads no flight in it; {_WANTED}") from None
+        viewer.run_command("ui.toggle_top_panel")  # of no use on a picture
         png.write_bytes(_settled_picture(viewer))
         state = viewer.get_state()
     if not state.views:
-        raise ViewerError(f"{recording}: the viewer shows nothing of it; {_WANTED}")
+        raise InputError(f"{recording}: the viewer shows nothing of it; {_WANTED}")
     return [f"{shown.name}: {report}" for shown in state.views for report in shown.reports]
 
 
 def find_recording(folder_or_rrd: Path) -> Path:
     """The finished recording of a run folder, or the file itself."""
-    if folder_or_rrd.is_file():
-        return _begun_as_recording(folder_or_rrd)
-    recording = folder_or_rrd / RECORDING_FILE
+    recording = folder_or_rrd / RECORDING_FILE if folder_or_rrd.is_dir() else folder_or_rrd
     if recording.is_file():
-        return _begun_as_recording(recording)
+        with recording.open("rb") as opened:
+            if opened.read(len(_MAGIC)) != _MAGIC:
+                raise InputError(f"{recording}: read a file of another kind; {_WANTED}")
+        return recording
     if not folder_or_rrd.is_dir():
-        raise ViewerError(f"{folder_or_rrd}: no such run folder or recording")
+        raise InputError(f"{folder_or_rrd}: no such run folder or recording")
     if (folder_or_rrd / UNFINISHED_FILE).exists():
-        raise ViewerError(f"{folder_or_rrd}: the recording is not finished; the run still flies, or it was killed")
-    raise ViewerError(f"{folder_or_rrd}: no {RECORDING_FILE} here; wanted a run folder or an .rrd file")
-
-
-def _begun_as_recording(file: Path) -> Path:
-    with file.open("rb") as opened:
-        if opened.read(len(_MAGIC)) != _MAGIC:
-            raise ViewerError(f"{file}: read a file of another kind; {_WANTED}")
-    return file
+        raise InputError(f"{folder_or_rrd}: the recording is not finished; the run still flies, or it was killed")
+    raise InputError(f"{folder_or_rrd}: no {RECORDING_FILE} here; wanted a run folder or an .rrd file")
 
 
 def vulkan_missing() -> bool:
     """Whether no Vulkan driver is installed, which a picture without a screen needs."""
-    folders = (Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d"), Path("/usr/local/share/vulkan/icd.d"))
-    return not any(file.suffix == ".json" for folder in folders if folder.is_dir() for file in folder.iterdir())
+    folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+    return not any(any(Path(folder).glob("*.json")) for folder in folders)
 
 
 @contextmanager
 def _headless(width: int, height: int) -> Generator[Any]:
     """A viewer without a window, listening on a free port of this machine only."""
     if vulkan_missing():
-        raise ViewerError("no Vulkan driver to draw with; on Debian and Ubuntu: apt install mesa-vulkan-drivers")
+        raise InputError("no Vulkan driver to draw with; on Debian and Ubuntu: apt install mesa-vulkan-drivers")
     command = [_program(), "--headless", "--bind", "127.0.0.1", "--port", "0", "--window-size", f"{width}x{height}"]
+    from gcs.views.recording import viewer_client
+
     with raised(), tempfile.TemporaryFile() as log:
         environment = os.environ | {"RERUN_APP_ONLY": "true"}  # what the package sets when it starts a viewer itself
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
@@ -148,7 +136,7 @@ def _address(process: subprocess.Popen[bytes], log: IO[bytes]) -> str:
             return address.group()
         if process.poll() is not None or time.monotonic() > give_up:
             last = (text.strip().splitlines() or ["it said nothing"])[-1]
-            raise ViewerError(f"the Rerun viewer does not start without a screen: {last}")
+            raise InputError(f"the Rerun viewer does not start without a screen: {last}")
         time.sleep(0.02)
 
 
@@ -157,5 +145,5 @@ def _program() -> str:
     package = importlib.util.find_spec("rerun_cli")
     program = Path(package.origin or "").parent / "rerun" if package else Path("rerun")
     if not program.is_file():
-        raise ViewerError("the Rerun viewer is not installed; it comes with the Python package rerun-sdk")
+        raise InputError("the Rerun viewer is not installed; it comes with the Python package rerun-sdk")
     return str(program)

@@ -1,1 +1,1 @@
-"""What the frames on a link or in a telemetry log say about latency, without commanding anything."""
+"""What the frames on a link or in a telemetry log say about latency. Nothing is commanded here."""

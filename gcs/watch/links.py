@@ -1,49 +1,82 @@
-"""What the frames on a link say of its vehicles' latencies, without a say in what they do.
+"""The latencies of vehicles, from the frames on their links; nothing is commanded.
 
 Pure: frames and times in, figures out. `gcs monitor` feeds it from a socket, `gcs replay` from a log.
 
-A TIMESYNC exchange counts whoever asked: this watch, or a ground station whose requests are on the same stream. Until
-one has been seen the vehicle's clock is unknown, and delays are told against the fastest of the last frames: what is
-measured then is a lower bound.
+A TIMESYNC exchange counts no matter who asked: this watch, or a ground station whose requests are on the same stream.
+Before the first one the vehicle's clock is unknown, and delays are measured against the fastest of the last frames:
+then they are lower bounds.
 """
 
 from array import array
 from collections import Counter
 from collections.abc import Iterable
 from math import nan
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.link import mavlink
 from gcs.link.datagram import Address, Outgoing
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
-from gcs.runs.summary import spread_with_status
+from gcs.published import Published
+from gcs.runs.summary import estimate
+from gcs.runs.summary_record import Clock, Estimate
 from scenarios.schema import NS_PER_S
 
 SYSTEM_ID = 254
-"""Whose name requests of a watch bear: vehicles number a station's frames, and this is none."""
+"""System id of the watch's requests. Not a station's: vehicles track the sequence numbers of theirs."""
 SILENT_NS = 3 * NS_PER_S
 """A vehicle not heard for this long counts as silent."""
 SAMPLE_NS = NS_PER_S // 10
-"""Mean time between two looks at the ages of what was received."""
+"""Mean time between two looks at how old the newest states are."""
+LOWER_BOUND = "lower bound"
+"""Status of a delay measured against the fastest frame, for want of an exchange."""
 _GOLDEN = 0.6180339887498949
 _ASKED = 4096
 """Requests remembered: those of 250 vehicles at 10 Hz over 1.6 s, of five over 80 s."""
 _LEAST_NS = 10 * NS_PER_S
-"""The fastest frame is that of the last one or two of these; a clock that drifts by 20 ppm is off by 0.4 ms then."""
+"""The fastest frame is that of the last one to two such spans, in which a drift of 20 ppm adds up to 0.4 ms."""
 _AUTOPILOT, _NO_AUTOPILOT, _STATION = 1, 8, 6
 """Component id of an autopilot; MAV_AUTOPILOT_INVALID; MAV_TYPE_GCS."""
 _POSITIONS = (mavlink.LOCAL_POSITION_NED, mavlink.GLOBAL_POSITION_INT)
 
-Figures = dict[str, Any]
+
+class LinkFigures(Published):
+    """What is known of one vehicle's links. Without a TIMESYNC exchange, delays are lower bounds."""
+
+    system_id: int
+    status: str
+    telemetry_hz: float | None
+    rtt_s: Estimate
+    telemetry_age_s: Estimate
+    loop_delay_s: Estimate
+    headroom: float | None
+    received: int
+    lost: int
+    late: int
+    duplicate: int
+    clock: Clock
+
+
+class WatchReport(Published):
+    """The links that `gcs monitor` watches, and what it sent itself."""
+
+    listening: str
+    duration_s: float
+    delay_margin_s: float | None
+    margin_of: str
+    """Where the margin is from."""
+    silent: bool
+    sent: dict[str, int]
+    send_errors: int
+    stations: tuple[int, ...]
+    refused: dict[str, int]
+    vehicles: tuple[LinkFigures, ...]
 
 
 class WatchedVehicle:
-    """One vehicle as it is seen from aside: what it sent, and how late that was."""
+    """One vehicle as an onlooker sees it: what it sent, and how late that was."""
 
     def __init__(self, system_id: int) -> None:
         self.remote = RemoteVehicle(system_id, startup=LaunchedStartup(1.0))
@@ -51,22 +84,22 @@ class WatchedVehicle:
         self.rtt_s = array("d")
         self.age_s = array("d")
         self.loop_delay_s = array("d")
-        """At each look; NaN where unknown, or where nothing came for so long that it is silence and no latency."""
+        """At each look; NaN where it is unknown, and during a silence, which is not a latency."""
         self._judged = 0
-        """Looks up to the newest state: whether the later ones saw a latency is known when the next state comes."""
+        """Looks up to the newest state; whether later ones saw a latency or a silence, the next state shows."""
         self.states = 0
         """Position reports received."""
         self.first_state_ns = 0
         self.state_ns = 0
         """When the newest one was received."""
         self.boot_ns = 0
-        """Its instant on the vehicle's clock."""
+        """When it was sampled, on the vehicle's clock."""
         self._kind = mavlink.GLOBAL_POSITION_INT
         self._least_since_ns = 0
         self._least_ns: tuple[int, int] = (1 << 62, 1 << 62)
 
     def state(self, frame: mavlink.Frame, received_ns: int) -> None:
-        """Take in a position report; the local one counts where it is sent, as it is what formations fly by."""
+        """Take in a position report; local positions count where they are sent, as formations fly by them."""
         if frame.msg_id == mavlink.LOCAL_POSITION_NED != self._kind:
             self._kind, self.states = mavlink.LOCAL_POSITION_NED, 0
         boot_ns = self.remote.clock.boot_ns(frame.fields[0], received_ns)
@@ -90,7 +123,7 @@ class WatchedVehicle:
 
     @property
     def least_delay_ns(self) -> int:
-        """The least of reception minus boot time among the last frames: of the offset and the fastest frame's delay."""
+        """Least reception time minus boot time among the last frames: clock offset plus the least delay."""
         return min(self._least_ns)
 
     def look(self, now_ns: int) -> None:
@@ -106,39 +139,37 @@ class WatchedVehicle:
         self.age_s.append(age_s)
         self.loop_delay_s.append(loop_delay_s(sampled_ns, now_ns, down_s))
 
-    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> Figures:
-        """The figures as plain types, of the whole time or of the last so many looks; an unknown is None."""
+    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> LinkFigures:
+        """The figures of the whole time, or of the last so many looks."""
         clock, frames = self.remote.clock, self.remote.frames
-        estimate = clock.estimate
-        measured = estimate.samples > 0
-        rtt_s = _spread(self.rtt_s, last)
+        known = clock.estimate if clock.estimate.samples else None
         age_s, loop_s = (_spread(looks[: self._judged], last) for looks in (self.age_s, self.loop_delay_s))
-        if not measured:
-            age_s["status"] = loop_s["status"] = "lower bound" if self.states else "unknown"
+        if known is None:
+            bounds = {"status": LOWER_BOUND if self.states else "unknown"}
+            age_s, loop_s = (looks.model_copy(update=bounds) for looks in (age_s, loop_s))
         span_s = (self.state_ns - self.first_state_ns) * 1e-9
-        worst_s = loop_s["p99"]
-        left = None if margin_s is None or worst_s is None else headroom(worst_s, margin_s)
-        return {
-            "system_id": self.remote.system_id,
-            "status": self._status(now_ns, worst_s, left),
-            "telemetry_hz": round((self.states - 1) / span_s, 3) if self.states > 1 and span_s > 0 else None,
-            "rtt_s": rtt_s,
-            "telemetry_age_s": age_s,
-            "loop_delay_s": loop_s,
-            "headroom": left if margin_s else None,
-            "received": frames.received,
-            "lost": frames.lost,
-            "late": frames.late,
-            "duplicate": frames.duplicate,
-            "clock": {
-                "status": "measured" if measured else "unknown",
-                "samples": len(self.rtt_s),
-                "offset_s": estimate.offset_at_ns(now_ns) * 1e-9 if measured else None,
-                "bound_s": estimate.bound_at_ns(now_ns) * 1e-9 if measured else None,
-                "skew_ppm": round(estimate.skew * 1e6, 3) if measured else None,
-                "jumps": clock.jumps,
-            },
-        }
+        left = None if margin_s is None or loop_s.p99 is None else headroom(loop_s.p99, margin_s)
+        return LinkFigures(
+            system_id=self.remote.system_id,
+            status=self._status(now_ns, loop_s.p99, left),
+            telemetry_hz=round((self.states - 1) / span_s, 3) if self.states > 1 and span_s > 0 else None,
+            rtt_s=_spread(self.rtt_s, last),
+            telemetry_age_s=age_s,
+            loop_delay_s=loop_s,
+            headroom=left if margin_s else None,
+            received=frames.received,
+            lost=frames.lost,
+            late=frames.late,
+            duplicate=frames.duplicate,
+            clock=Clock(
+                status="unknown" if known is None else "measured",
+                samples=len(self.rtt_s),
+                offset_s=None if known is None else known.offset_at_ns(now_ns) * 1e-9,
+                bound_s=None if known is None else known.bound_at_ns(now_ns) * 1e-9,
+                skew_ppm=None if known is None else round(known.skew * 1e6, 3),
+                jumps=clock.jumps,
+            ),
+        )
 
     def _status(self, now_ns: int, loop_delay_s: float | None, left: float | None) -> str:
         if not self.remote.heard_ns:
@@ -172,7 +203,7 @@ class Watch:
         return now_ns
 
     def take(self, frame: mavlink.Frame, time_ns: int, address: Address | None = None) -> WatchedVehicle | None:
-        """Take in a frame received, or sent by a station, at a time; returns its vehicle if it tells something new."""
+        """Take in a frame of a vehicle or a station; returns its vehicle if it says something new."""
         vehicle = self._vehicle(frame)
         if vehicle is None:
             if frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0:
@@ -196,7 +227,7 @@ class Watch:
     def look(self, now_ns: int) -> int:
         """Look at the ages of all vehicles' states if that is due; returns when it is due next.
 
-        At uneven times, so that a telemetry rate cannot be in step with them.
+        Looks are unevenly spaced, so that no telemetry rate is in step with them.
         """
         if now_ns >= self._look_ns:
             self._looks += 1
@@ -205,7 +236,7 @@ class Watch:
                 vehicle.look(now_ns)
         return self._look_ns
 
-    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> list[Figures]:
+    def figures(self, now_ns: int, margin_s: float | None, last: int = 0) -> list[LinkFigures]:
         """The figures of each vehicle, in order of system id."""
         return [self.vehicles[system_id].figures(now_ns, margin_s, last) for system_id in sorted(self.vehicles)]
 
@@ -237,7 +268,7 @@ class Watch:
 
 
 class Requests:
-    """TIMESYNC requests, spread over the addresses that vehicles send from: all vehicles behind one answer.
+    """TIMESYNC requests, in turn to each address that vehicles send from; all vehicles behind it answer.
 
     With a rate of 0 there are none.
     """
@@ -264,6 +295,5 @@ class Requests:
         return [Outgoing(mavlink.encode(mavlink.TIMESYNC, fields, sequence=sequence, system_id=SYSTEM_ID), address)]
 
 
-def _spread(values: "array[float]", last: int) -> dict[str, Any]:
-    seen: NDArray[np.float64] = np.array(values[-last:] if last else values, dtype=np.float64)
-    return spread_with_status(seen)
+def _spread(values: "array[float]", last: int) -> Estimate:
+    return estimate(np.array(values[-last:] if last else values, dtype=np.float64))

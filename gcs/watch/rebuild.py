@@ -1,11 +1,11 @@
-"""From a telemetry log alone: the ticks of a flight as the log shows them, with their latencies, errors and modes.
+"""From a telemetry log alone: the ticks of a flight, with their latencies, errors and modes.
 
-The frames of the log go, in its order, through the code that the station has for them: clocks, sequence numbers, states
-brought to one instant. A log of this station shows its ticks by the time_boot_ms of its set-points; any other log is
-looked at as often as the scenario's control rate says.
+The frames of the log are fed in their order to the station's own code: clocks, sequence numbers, states brought to one
+instant. A log of this station shows its ticks by the time_boot_ms of its set-points; any other log is sampled at the
+scenario's control rate.
 
-Not in a log: how long telemetry waited in the station's socket, and by how much the monitor had opened the formation,
-so errors are those against the formation as designed. A tick's lateness is told against the most punctual one.
+A log does not say how long telemetry waited in the station's socket, nor by how much the monitor had opened the
+formation, so errors are relative to the formation as designed. Lateness is relative to the most punctual tick.
 """
 
 import re
@@ -16,11 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gains.formation.model import FormationModel
 from gcs.control.history import StateHistory
 from gcs.control.law import Blend, distances_m
 from gcs.control.loop_delay import Repetitions
-from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Mode, TickArray
+from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.vehicle import SILENCE_S, ignored
 from gcs.plan.flight_plan import FlightPlan
@@ -34,37 +33,36 @@ from gcs.watch.links import Watch, WatchedVehicle
 from scenarios.schema import NS_PER_S, Scenario
 
 Frames = list[tuple[int, mavlink.Frame]]
-Events = list[dict[str, object]]
 
 _TOLD = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
 _LONGEST_GAP_NS = 10 * NS_PER_S
-"""In a log that says nothing for longer there are no ticks."""
+"""No ticks are made in longer gaps of a log."""
 _LEAST_TICKS = 3
 _NO_BLEND = Blend()
 
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """What a log shows of a flight: rows and events as of a run, and its links."""
+    """What a log shows of a flight: ticks and events as those of a run, and its links."""
 
     ticks: TickArray
-    events: Events
+    events: list[Event]
     links: Watch
     own: bool
-    """Whether the log is one of this station, so that its ticks and the flight's end are known."""
+    """Whether this station wrote the log, so that its ticks and the flight's end are known."""
 
 
 class _Outline(NamedTuple):
-    """What a first look at a log shows."""
+    """What a first pass over a log shows."""
 
     base_ns: int
     """Log time of key 0, by the most punctual set-point."""
     keys: list[int]
-    """time_boot_ms of the set-points of this station's ticks; none in a log of another."""
+    """time_boot_ms of the set-points of this station's ticks; none in a log of another station."""
     start_key: int
     """The flight's first tick."""
     exchanges: bool
-    """Whether requests of TIMESYNC are in the log, and not only telemetry."""
+    """Whether TIMESYNC requests are in the log."""
 
 
 @dataclass
@@ -78,14 +76,14 @@ class _OpenTick:
 
 def rebuild(frames: Frames, scenario: Scenario, margins_s: tuple[float, ...]) -> Rebuilt:
     """The flight of a scenario in a log; `margins_s` are those of the gain schedule, fastest first."""
-    replayed = _Replay(scenario, margins_s, _outline(frames, scenario))
+    flight = _Rebuilding(scenario, margins_s, _outline(frames, scenario))
     for time_ns, frame in frames:
-        replayed.take(time_ns, frame)
-    return replayed.finished()
+        flight.take(time_ns, frame)
+    return flight.finished()
 
 
 def watched(frames: Iterable[tuple[int, mavlink.Frame]]) -> Watch:
-    """The links in a log, whosever it is."""
+    """The links in a log of any tool."""
     watch = Watch()
     for time_ns, frame in frames:
         watch.take(frame, time_ns)
@@ -118,22 +116,21 @@ def _outline(frames: Frames, scenario: Scenario) -> _Outline:
 
 
 def _told(frame: mavlink.Frame) -> tuple[int, str] | None:
-    """What a STATUSTEXT of the station tells of a vehicle: its mode, or the number of its gain set."""
+    """What a STATUSTEXT of the station says about a vehicle: its mode, or the number of its gain set."""
     found = _TOLD.match(frame.fields[1].split(b"\0")[0].decode(errors="replace"))
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 
 def _plan(scenario: Scenario) -> FlightPlan:
-    """The plan by which the errors are formed, with gains only where it takes them to know how old the errors are."""
+    """The plan that defines the errors; it has gains only where the age of the errors depends on them."""
     if timing_of(scenario) is not None:  # the states that a streamed command needs depend on the gains
         return flight_plan(scenario)[1]
     formation = plan_formation(scenario)
-    model = FormationModel(tuple(formation.predecessor.tolist()))
-    return FlightPlan(scenario, formation, np.zeros((model.inputs, model.states)), nan)
+    return FlightPlan(scenario, formation, np.zeros((formation.model.inputs, formation.model.states)), nan)
 
 
-class _Replay:
-    """The station's picture of the vehicles, built up again."""
+class _Rebuilding:
+    """What the station knew of the vehicles, frame by frame."""
 
     def __init__(self, scenario: Scenario, margins_s: tuple[float, ...], outline: _Outline) -> None:
         self._scenario, self._margins_s, self._outline = scenario, margins_s, outline
@@ -153,7 +150,7 @@ class _Replay:
         self._states = [VehicleState()] * len(ids)
         self._jumps = [0] * len(ids)
         self._exchanges = [0] * len(ids)
-        """Of each vehicle, those that earlier ticks have shown."""
+        """Of each vehicle, the number that earlier ticks have shown."""
         self._period_ns = round(NS_PER_S / scenario.rates.control_hz)
         self._start_ns = outline.base_ns + outline.start_key * 1_000_000
         first_key, last_key = (outline.keys[0], outline.keys[-1]) if outline.keys else (0, -1)
@@ -162,7 +159,7 @@ class _Replay:
         self._grid_ns = self._newest_ns = 0
         self._open: _OpenTick | None = None
         self._rows: list[TickArray] = []
-        self._events: Events = []
+        self._events: list[Event] = []
 
     def take(self, time_ns: int, frame: mavlink.Frame) -> None:
         """Take in the next frame of the log."""
@@ -205,7 +202,7 @@ class _Replay:
             self._open = None
 
     def _look(self, time_ns: int) -> None:
-        """Ticks without set-points: before and after those of this station, or where there is none of it."""
+        """Add the ticks without set-points: before and after those of this station, or all in a log of another."""
         if time_ns - self._grid_ns > _LONGEST_GAP_NS:
             behind = (time_ns - self._outline.base_ns) // self._period_ns
             self._grid_ns = self._outline.base_ns + behind * self._period_ns
@@ -217,7 +214,7 @@ class _Replay:
             self._grid_ns += self._period_ns
 
     def _all_known(self) -> dict[int, tuple[float, float]]:
-        """In a log without this station's set-points: its vehicles count as flown while all have reported."""
+        """The commands where the log has no set-points: vehicles count as flown once all have reported."""
         return dict.fromkeys(self._row, (nan, nan)) if self._history.complete else {}
 
     def _take_told(self, time_ns: int, frame: mavlink.Frame) -> None:
@@ -310,4 +307,4 @@ class _Replay:
 
     def _event(self, time_ns: int, kind: str, text: str, system_id: int | None = None) -> None:
         time_s = round((time_ns - self._start_ns) / NS_PER_S, 6)
-        self._events.append({"time_s": time_s, "kind": kind, "system_id": system_id, "text": text})
+        self._events.append(Event(time_s=time_s, kind=kind, system_id=system_id, text=text))

@@ -1,17 +1,22 @@
-"""`gcs replay`: what is asked of a log, and the summary made of it."""
+"""The summary of a telemetry log, as `gcs replay` shows it."""
 
 from dataclasses import dataclass
-from math import hypot, inf
+from math import hypot
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import PlainSerializer
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.plan.design import Design
+from gcs.published import Published
 from gcs.runs.files import read_design, read_summary
-from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
+from gcs.runs.record import DESIGN_FILE, END, SCENARIO_FILE, SUMMARY_FILE, TLOG_FILE
 from gcs.runs.summary import summarise
+from gcs.runs.summary_record import Summary
+from gcs.station.absence import COMPLETED
+from gcs.watch.links import LinkFigures
 from gcs.watch.rebuild import Rebuilt, rebuild, watched
 from gcs.watch.tlog import TelemetryLog
 from scenarios import files
@@ -21,18 +26,18 @@ _COMPARED = ("verdict", "loop", "delay_margin_s", "loop_delay_s", "headroom_min"
 
 
 @dataclass(frozen=True)
-class Replayed:
-    """Where a log is, and what it is compared with as far as that is known."""
+class LogSource:
+    """A log, and what is known of its flight: None where there is nothing beside it."""
 
     log_file: Path
     scenario: Scenario | None
     design: Design | None
-    recorded: dict[str, Any] | None
+    recorded: Summary | None
     """The summary of the run that the log is of."""
 
 
-def found(run_or_file: Path) -> Replayed:
-    """The log, and what stands beside it in the folder of a run."""
+def found(run_or_file: Path) -> LogSource:
+    """The log, and the files beside it if it is that of a run's folder."""
     folder = run_or_file if run_or_file.is_dir() else run_or_file.parent
     log_file = folder / TLOG_FILE if run_or_file.is_dir() else run_or_file
     own = log_file.name == TLOG_FILE
@@ -40,43 +45,64 @@ def found(run_or_file: Path) -> Replayed:
     scenario = files.load(scenario_file) if own and scenario_file.exists() else None
     design = read_design(design_file) if own and design_file.exists() else None
     recorded = read_summary(summary_file) if own and summary_file.exists() else None
-    return Replayed(log_file, scenario, design, recorded)
+    return LogSource(log_file, scenario, design, recorded)
 
 
-def replay(log: TelemetryLog, replayed: Replayed) -> dict[str, Any]:
+def _compared(recorded: Summary) -> dict[str, Any]:
+    return recorded.model_dump(mode="json", include=set(_COMPARED))
+
+
+class LogContents(Published):
+    """What could be read of a log."""
+
+    file: str
+    frames: int
+    duration_s: float
+    left_out: dict[str, int]
+
+
+class RebuildReport(Published):
     """The summary of a log: of its links, and of the flight if the scenario is known."""
+
+    log: LogContents
+    delay_margin_s: float | None
+    stations: tuple[int, ...]
+    links: tuple[LinkFigures, ...]
+    flight: Summary | None = None
+    recorded: Annotated[Summary, PlainSerializer(_compared)] | None = None
+    """The summary that the station made of the same flight."""
+
+
+def rebuild_report(log: TelemetryLog, source: LogSource) -> RebuildReport:
+    """The summary of a log, with the figures that were recorded if it is in the folder of a run."""
     first_ns, last_ns = log.frames[0][0], log.frames[-1][0]
-    scenario, design = replayed.scenario, replayed.design
-    margin_s = None if design is None else design.delay_margin_s
-    margins_s = (inf,) if design is None else design.margins_s
-    rebuilt = None if scenario is None else rebuild(log.frames, scenario, margins_s)
+    scenario, design = source.scenario, source.design or Design(delay_margin_s=None)
+    rebuilt = None if scenario is None else rebuild(log.frames, scenario, design.margins_s)
     watch = watched(log.frames) if rebuilt is None else rebuilt.links
-    result: dict[str, Any] = {
-        "log": {
-            "file": str(replayed.log_file),
-            "frames": len(log.frames),
-            "duration_s": (last_ns - first_ns) * 1e-9,
-            "left_out": dict(log.counters + watch.counters),
-        },
-        "delay_margin_s": margin_s,
-        "stations": sorted(watch.stations),
-        "links": watch.figures(last_ns, margin_s),
+    parts = {
+        "flight": None if rebuilt is None or scenario is None else _flight(scenario, design, rebuilt),
+        "recorded": source.recorded,
     }
-    if rebuilt is not None and scenario is not None:
-        result["flight"] = _flight(scenario, design, rebuilt)
-    if replayed.recorded is not None:
-        result["recorded"] = {name: replayed.recorded.get(name) for name in _COMPARED}
-    return result
+    return RebuildReport(
+        log=LogContents(
+            file=str(source.log_file),
+            frames=len(log.frames),
+            duration_s=(last_ns - first_ns) * 1e-9,
+            left_out=dict(log.counters + watch.counters),
+        ),
+        delay_margin_s=design.delay_margin_s,
+        stations=tuple(sorted(watch.stations)),
+        links=tuple(watch.figures(last_ns, design.delay_margin_s)),
+        **{name: part for name, part in parts.items() if part is not None},
+    )
 
 
-def _flight(scenario: Scenario, design: Design | None, rebuilt: Rebuilt) -> dict[str, Any]:
-    reason = _reason(scenario, rebuilt)
-    ends = [{"time_s": 0.0, "kind": "end", "system_id": None, "text": reason}]
-    summary = summarise(scenario, design or Design(delay_margin_s=None), rebuilt.ticks, [*rebuilt.events, *ends])
-    if not rebuilt.own:
-        summary |= {"verdict": "not judged", "settling_time_s": None, "control": None}
-    del summary["files"]
-    return summary
+def _flight(scenario: Scenario, design: Design, rebuilt: Rebuilt) -> Summary:
+    end = Event(time_s=0.0, kind=END, text=_reason(scenario, rebuilt))
+    summary = summarise(scenario, design, rebuilt.ticks, [*rebuilt.events, end])
+    if rebuilt.own:
+        return summary
+    return summary.model_copy(update={"verdict": "not judged", "settling_time_s": None, "control": None})
 
 
 def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
@@ -87,7 +113,7 @@ def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
     if not flown.size:
         return "nothing was flown"
     last = flown[flown["tick"] == flown["tick"][-1]]
-    if (broken := _broken(scenario, last)) is not None:
+    if broken := _broken(scenario, last):
         return broken
     left = sorted({vehicle.system_id for vehicle in scenario.vehicles} - set(last["system_id"].tolist()))
     if left:
@@ -95,17 +121,16 @@ def _reason(scenario: Scenario, rebuilt: Rebuilt) -> str:
     end_s = float(last["time_s"][0])
     if end_s < scenario.duration_s - 1.5 / scenario.rates.control_hz:
         return f"interrupted: set-points end after {end_s:.1f} s of {scenario.duration_s:g} s"
-    return "completed: duration reached"
+    return COMPLETED
 
 
-def _broken(scenario: Scenario, last: TickArray) -> str | None:
-    """Which limit the last tick breaks, in the order in which the station looks."""
-    closest_m = float(np.fmin.reduce(last["nearest_m"]))
+def _broken(scenario: Scenario, last: TickArray) -> str:
+    """The first safety limit that the last tick violates."""
+    closest_m, limit_m = float(np.fmin.reduce(last["nearest_m"])), scenario.safety.spacing_error_limit_m
     if closest_m < scenario.safety.collision_distance_m:
         return f"broken: vehicles have collided, {closest_m:.1f} m apart"
     for row in last:
         error_m = hypot(row["spacing_error_north_m"], row["spacing_error_east_m"])
-        if error_m > scenario.safety.spacing_error_limit_m:
-            limit_m = scenario.safety.spacing_error_limit_m
+        if error_m > limit_m:
             return f"broken: spacing error of vehicle {row['system_id']} is {error_m:.0f} m, limit {limit_m:g} m"
-    return None
+    return ""

@@ -1,8 +1,6 @@
 """Telemetry logs (.tlog) of any tool: big-endian µs since 1970, then a MAVLink 1 or 2 frame, and so on.
 
-What is damaged is left out and counted: reading goes on at the next place where a frame with a good checksum begins.
-
-TlogError(Exception)    a file that has no frame in it, in one line
+What is damaged is left out and counted: reading goes on at the next frame with a good checksum.
 """
 
 import re
@@ -13,17 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from gcs.errors import InputError
 from gcs.link import mavlink
 from gcs.link.clocks import LATEST_NS
 
 _STAMP = struct.Struct(">Q")
 _MAGIC = re.compile(b"[\xfd\xfe]")
 _WRONG_STAMP_US = 1_000_000
-"""A stamp this far from those of both neighbours is wrong: no checksum covers it."""
-
-
-class TlogError(Exception):
-    """A file that is no telemetry log."""
+"""A stamp this far from its neighbours is wrong: no checksum covers stamps."""
 
 
 @dataclass(frozen=True)
@@ -37,18 +32,15 @@ class TelemetryLog:
 def read_tlog(file: Path) -> TelemetryLog:
     """Read what can be read of a log.
 
-    Raises
-    ------
-    TlogError
-        If the file cannot be read or there is no frame in it.
+    Raises InputError if the file cannot be read or there is no frame in it.
     """
     try:
         data = file.read_bytes()
     except OSError as error:
-        raise TlogError(f"{file}: {error.strerror}, wanted a telemetry log") from None
+        raise InputError(f"{file}: {error.strerror}, wanted a telemetry log") from None
     log = parse_tlog(data)
     if not log.frames:
-        raise TlogError(f"{file}: read no MAVLink frame in {len(data)} bytes, wanted a telemetry log (.tlog)")
+        raise InputError(f"{file}: read no MAVLink frame in {len(data)} bytes, wanted a telemetry log (.tlog)")
     return log
 
 
@@ -87,7 +79,7 @@ def parse_tlog(data: bytes) -> TelemetryLog:
 
 
 def _good_within(data: bytes, start: int, stop: int) -> bool:
-    """Whether a good frame begins in a stretch: then what seemed to be a frame all over it was a damaged length."""
+    """Whether a good frame begins within a stretch; if so, the frame that seemed to span it has a damaged length."""
     for magic in _MAGIC.finditer(data, start, stop):
         end = mavlink.frame_end(data, magic.start())
         if end and mavlink.decode_either(data[magic.start() : end], Counter()):
@@ -96,7 +88,7 @@ def _good_within(data: bytes, start: int, stop: int) -> bool:
 
 
 def _plausible(stamps_us: list[int]) -> list[bool]:
-    """Which stamps are times at all, and not far from the middle one of themselves and their two neighbours."""
+    """Which stamps are possible times, and near the median of themselves and their two neighbours."""
     possible = [us < LATEST_NS // 1000 for us in stamps_us]
     if len(stamps_us) < 3:
         return possible

@@ -19,7 +19,7 @@ from docs.generate.fields import described, found_fields
 from docs.generate.keys import schema
 from docs.generate.runner import CommandError, Runner
 from docs.generate.sessions import Step, steps_of
-from gcs.cli.margin import margin_of_file, margin_of_scenario
+from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import write_design
@@ -93,9 +93,9 @@ def fly(folder: Path, name: str, **changes: Any) -> dict[str, Any]:
     for rows in fly_lockstep(plan, station=station):
         writer.tick(rows)
     for event in station.events:
-        writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
+        writer.event(event)
     writer.close()
-    return finish(folder)
+    return finish(folder).to_dict()
 
 
 def test_every_field_of_a_summary_is_described_and_no_other(tmp_path: Path) -> None:
@@ -117,9 +117,9 @@ def test_every_field_of_a_margin_is_described_and_no_other(tmp_path: Path) -> No
     known = described()["margin"]
     numbers = tmp_path / "numbers.json"
     numbers.write_text('{"terms": [{"A": [[0]], "delay": 0}, {"A": [[-1]], "delay": 0.1}]}', encoding="utf-8")
-    results = [margin_of_file(file) for file in (numbers, *sorted((ROOT / "docs" / "models").glob("*.json")))]
-    results.append(margin_of_scenario(ROOT / "scenarios" / "thesis_delay.toml"))
-    assert set[str]().union(*(found_fields(result, known) for result in results)) == known.keys()
+    models = [margin_of_file(file) for file in (numbers, *sorted((ROOT / "docs" / "models").glob("*.json")))]
+    results = [*models, margin_of_scenario(ROOT / "scenarios" / "thesis_delay.toml")]
+    assert set[str]().union(*(found_fields(margin_fields(result), known) for result in results)) == known.keys()
 
 
 def test_every_field_of_a_trial_is_described_and_no_other() -> None:

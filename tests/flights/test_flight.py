@@ -11,18 +11,20 @@ from rich.console import Console
 
 from gains.sampled.constant import growth_rate
 from gcs.control.phases import Phase
-from gcs.control.tick import Mode, TickArray
+from gcs.control.tick import Event, Mode, TickArray
 from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
 from gcs.link import mavlink
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
+from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
 from gcs.views.report import print_flight
 from scenarios.files import load
 from scenarios.schema import FixedGains, Limits, Monitor, Scenario
 from sim_vehicles.drive.fleet import Fleet
+from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
 S = 1_000_000_000
@@ -34,13 +36,10 @@ def planned(name: str, **changes: Any) -> tuple[FlightPlan, Design]:
     return plan, design
 
 
-def flown(
-    plan: FlightPlan, design: Design, station: Station | None = None, **kwargs: Any
-) -> tuple[TickArray, dict[str, Any]]:
+def flown(plan: FlightPlan, design: Design, station: Station | None = None, **kwargs: Any) -> tuple[TickArray, Summary]:
     station = station or Station(plan, start_ns=START_NS)
     ticks = np.concatenate(list(fly_lockstep(plan, station=station, **kwargs)))
-    events = [event._asdict() for event in station.events]
-    events.append({"time_s": 0.0, "kind": "end", "text": station.end_reason, "system_id": None})
+    events = [*station.events, Event(time_s=0.0, kind="end", text=station.end_reason)]
     return ticks, summarise(plan.scenario, design, ticks, events)
 
 
@@ -67,31 +66,32 @@ class Without:
 def test_formation_settles_below_one_percent_of_the_spacing(name: str) -> None:
     plan, design = planned(name)
     _, summary = flown(plan, design)
-    assert (summary["verdict"], summary["reason"]) == ("stable", "completed: duration reached")
+    assert (summary.verdict, summary.reason) == ("stable", "completed: duration reached")
     spacing = {v.system_id: np.hypot(*v.offset_ne_m) for v in plan.scenario.vehicles if v.offset_ne_m}
-    for vehicle in summary["vehicles"][1:]:
-        assert vehicle["spacing_error_final_m"] < 0.01 * spacing[vehicle["system_id"]]
-    assert summary["settling_time_s"] < plan.scenario.duration_s / 2
-    assert summary["control"]["deadline_misses"] == 0
-    assert {vehicle["mode_final"] for vehicle in summary["vehicles"]} == {"NOMINAL"}
+    for vehicle in summary.vehicles[1:]:
+        assert known(vehicle.spacing_error_final_m) < 0.01 * spacing[vehicle.system_id]
+    assert known(summary.settling_time_s) < plan.scenario.duration_s / 2
+    assert summary.control is not None
+    assert summary.control.deadline_misses == 0
+    assert {vehicle.mode_final for vehicle in summary.vehicles} == {"NOMINAL"}
 
 
 def test_a_flight_too_short_to_settle_says_what_is_left_of_its_errors() -> None:
     plan, design = planned("triangle5", duration_s=0.4)
     _, summary = flown(plan, design)
-    assert (summary["verdict"], summary["reason"]) == ("unstable", "completed: duration reached")
+    assert (summary.verdict, summary.reason) == ("unstable", "completed: duration reached")
     output = io.StringIO()
     print_flight(summary, Console(file=output, width=200))
     [verdict] = [line for line in output.getvalue().splitlines() if line.startswith("verdict")]
-    most_m = max(vehicle["spacing_error_max_m"] for vehicle in summary["vehicles"][1:])
-    left_m = max(vehicle["spacing_error_final_m"] for vehicle in summary["vehicles"][1:])
+    most_m = max(known(vehicle.spacing_error_max_m) for vehicle in summary.vehicles[1:])
+    left_m = max(known(vehicle.spacing_error_final_m) for vehicle in summary.vehicles[1:])
     assert verdict == f"verdict  unstable: not settled in 0.4 s; {left_m:.2f} m left of errors of up to {most_m:.2f} m"
 
 
 def test_formation_follows_the_turns() -> None:
     plan, design = planned("triangle5_turns")
     ticks, summary = flown(plan, design)
-    assert summary["verdict"] == "stable"
+    assert summary.verdict == "stable"
     for at_s, heading_deg in ((24.0, -60.0), (49.0, 0.0), (74.0, 60.0)):
         rows = ticks[np.abs(ticks["time_s"] - at_s) < 0.009]
         assert rows.size == 5
@@ -104,9 +104,9 @@ def test_above_the_margin_the_formation_breaks_and_vehicles_are_left_in_failsafe
     scenario = plan.scenario.with_link_delay(up_s=0.4, down_s=0.4)
     plan = replace(plan, scenario=scenario)
     ticks, summary = flown(plan, design)
-    assert summary["verdict"] == "unstable"
-    assert summary["reason"].startswith("broken: spacing error of vehicle")
-    assert summary["headroom_min"] < 0
+    assert summary.verdict == "unstable"
+    assert summary.reason.startswith("broken: spacing error of vehicle")
+    assert known(summary.headroom_min) < 0
     assert set(ticks[-5:]["mode"]) == {Mode.FAILSAFE}
     assert not ticks[-5:]["commanded"].any()
 
@@ -172,7 +172,7 @@ def test_a_lost_vehicle_is_named_and_flown_around() -> None:
     vehicles = Without(plan.scenario, {2}, from_ns=START_NS + 6 * S)
     station = Station(plan, start_ns=START_NS)
     ticks, summary = flown(plan, design, station, vehicles=vehicles)
-    assert (summary["verdict"], summary["reason"]) == ("aborted", "lost: vehicles 2")
+    assert (summary.verdict, summary.reason) == ("aborted", "lost: vehicles 2")
     assert [e.system_id for e in station.events if e.text == "is lost"] == [2]
     last = {int(row["system_id"]): row for row in ticks[ticks["time_s"] <= 20.0][-5:]}
     assert last[2]["mode"] == Mode.LOST
@@ -199,7 +199,7 @@ def test_a_vehicle_that_is_heard_again_is_taken_back() -> None:
     plan, design = planned("triangle5", duration_s=25.0)
     vehicles = Without(plan.scenario, {3}, from_ns=START_NS + 6 * S, until_ns=START_NS + 11 * S)
     ticks, summary = flown(plan, design, vehicles=vehicles)
-    assert summary["verdict"] == "stable"
+    assert summary.verdict == "stable"
     modes = ticks[ticks["system_id"] == 3]["mode"]
     assert {Mode.LOST, Mode.FAILSAFE, Mode.NOMINAL} <= set(modes.tolist())
     assert modes[ticks[ticks["system_id"] == 3]["time_s"] < 25.0][-1] == Mode.NOMINAL
@@ -208,13 +208,13 @@ def test_a_vehicle_that_is_heard_again_is_taken_back() -> None:
 def test_all_vehicles_lost_aborts() -> None:
     plan, design = planned("chain3")
     _, summary = flown(plan, design, vehicles=Without(plan.scenario, {1, 2, 3}, from_ns=START_NS + 6 * S))
-    assert (summary["verdict"], summary["reason"]) == ("aborted", "lost: all vehicles")
+    assert (summary.verdict, summary.reason) == ("aborted", "lost: all vehicles")
 
 
 def test_a_vehicle_that_never_answers_is_named_and_nothing_flies() -> None:
     plan, design = planned("chain3")
     ticks, summary = flown(plan, design, vehicles=Without(plan.scenario, {2}, from_ns=0))
-    assert (summary["verdict"], summary["reason"]) == ("aborted", "not ready: vehicle 2 not heard")
+    assert (summary.verdict, summary.reason) == ("aborted", "not ready: vehicle 2 not heard")
     assert not ticks["commanded"].any()
 
 
@@ -234,7 +234,7 @@ def test_a_new_station_takes_flying_vehicles_back() -> None:
     assert said == {1, 2, 3, 4, 5}
     second = Station(plan, start_ns=now_ns + 5 * S)
     _, summary = flown(plan, design, second, vehicles=fleet)
-    assert summary["verdict"] == "stable"
+    assert summary.verdict == "stable"
 
 
 def test_interrupted_flight_leaves_the_vehicles_holding() -> None:
@@ -256,12 +256,12 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
     plan, design = planned("chain3", control=control, monitor=Monitor(act=False), limits=Limits())
     assert design.margins_s[0] < 0.05  # 40 ms of link and the waiting of one vehicle at least pass it
     _, summary = flown(plan, design)
-    assert max(v["loop_delay_s"]["p50"] for v in summary["vehicles"]) > design.margins_s[0]
-    assert (summary["verdict"], summary["settling_time_s"]) == ("unstable", None)
+    assert max(known(v.loop_delay_s.p50) for v in summary.vehicles) > design.margins_s[0]
+    assert (summary.verdict, summary.settling_time_s) == ("unstable", None)
     # limits hold the errors in a cycle so small that they count as settled
     _, limited = flown(*planned("chain3", control=control, monitor=Monitor(act=False)))
-    assert limited["settling_time_s"] is not None
-    assert (limited["verdict"], limited["reason"]) == ("unstable", "completed: duration reached")
+    assert limited.settling_time_s is not None
+    assert (limited.verdict, limited.reason) == ("unstable", "completed: duration reached")
     output = io.StringIO()
     print_flight(limited, Console(file=output, width=200))
     assert "errors are small after" in output.getvalue()
@@ -271,8 +271,8 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
 def test_errors_that_still_grow_slowly_past_the_margin_are_not_stable() -> None:
     links = load(SCENARIOS / "thesis_delay.toml").with_link_delay(up_s=0.55, down_s=0.55).links
     _, summary = flown(*planned("thesis_delay", links=links))
-    assert summary["headroom_end"] < 0.0
-    assert summary["verdict"] == "unstable"
+    assert known(summary.headroom_end) < 0.0
+    assert summary.verdict == "unstable"
 
 
 FIXED_WING = (
@@ -321,8 +321,8 @@ def test_a_wide_start_is_flown_at_three_g_and_comes_together() -> None:
     assert size.max() == pytest.approx(29.4, abs=1e-3)
     speed = np.hypot(own["velocity_north_m_s"], own["velocity_east_m_s"])
     assert 60.0 - 1e-3 < speed.min() < speed.max() < 130.0 + 1e-3
-    assert summary["verdict"] == "stable"
-    assert 7.0 < summary["settling_time_s"] < 9.0
+    assert summary.verdict == "stable"
+    assert 7.0 < known(summary.settling_time_s) < 9.0
 
 
 @pytest.mark.parametrize(
@@ -341,10 +341,10 @@ def test_what_breaks_triangle5_far_above_its_margin_is_its_tolerance_or_a_statio
     late = plan.scenario.with_link_delay(up_s=0.4, down_s=0.4)
     safety = late.safety.model_copy(update={"spacing_error_limit_m": limit_m})
     ticks, summary = flown(replace(plan, scenario=late.model_copy(update={"safety": safety})), design)
-    assert summary["reason"] == reason
+    assert summary.reason == reason
     saved = limit_m == 300.0 and acts
-    assert summary["verdict"] == ("stable" if saved else "unstable")
+    assert summary.verdict == ("stable" if saved else "unstable")
     if saved:
         error = np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])
         assert np.nanmax(error) == pytest.approx(29.0, abs=1.0)
-        assert 11.0 < summary["settling_time_s"] < 15.0
+        assert 11.0 < known(summary.settling_time_s) < 15.0

@@ -10,14 +10,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.control.phases import START_PATIENCE_S
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.link.datagram import Datagram
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import described, flight_plan
 from gcs.runs.summary import verdict
 from gcs.station.absence import TAKEN_OVER
-from gcs.station.station import Event, Station
+from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.link_schema import Link, Links, Outage, VehicleLinks
 from scenarios.schema import ClockJump, Response, Scenario

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.control.tick import Mode, TickArray
+from gcs.control.tick import Event, Mode, TickArray
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
@@ -23,6 +23,7 @@ from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.link_schema import DelayPoint, Jitter, Link, Links
 from scenarios.schema import Monitor, Safety
+from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
 TRIANGLE = load(SCENARIOS / "triangle5.toml")
@@ -149,7 +150,7 @@ def test_a_collision_ends_the_flight_as_broken_and_the_least_distance_is_in_the_
     ticks, station = flown(duration_s=5.0, safety=Safety(collision_distance_m=180.0))
     assert station.end_reason.startswith("broken: vehicles")
     assert "have collided" in station.end_reason
-    events = [{"time_s": 0.0, "kind": "end", "text": station.end_reason, "system_id": None}]
+    events = [Event(time_s=0.0, kind="end", text=station.end_reason)]
     summary = summarise(planned().scenario, Design(delay_margin_s=0.3), ticks, events)
-    assert summary["verdict"] == "unstable"
-    assert 0.0 < summary["distance_min_m"] < 180.0
+    assert summary.verdict == "unstable"
+    assert 0.0 < known(summary.distance_min_m) < 180.0

@@ -8,7 +8,6 @@ that a sequence number can tell apart, are not meant: those cannot be told from 
 raise anything, which is a test of its own.
 """
 
-import json
 import math
 import os
 from collections import Counter, deque
@@ -19,16 +18,16 @@ import numpy as np
 import pytest
 
 from gcs.control.phases import Phase
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.drive.guard import Guard
 from gcs.drive.lockstep import EPOCH_NS, START_NS
 from gcs.link import mavlink
 from gcs.link.datagram import Datagram
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
-from gcs.station.station import Event, Station
+from gcs.station.station import Station
 from gcs.watch.links import Requests, Watch
-from gcs.watch.rebuild_report import Replayed, replay
+from gcs.watch.rebuild_report import LogSource, rebuild_report
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load, with_loop
 from scenarios.schema import FixedGains, Scenario
@@ -252,7 +251,8 @@ def test_a_watched_link_under_fire_is_still_watched(timesync_hz: float, version:
             for frame in mavlink.decode_either(data, watch.counters):
                 watch.take(frame, now_ns, ("127.0.0.1", 9 + step % 3))
         watch.look(now_ns)
-    json.dumps(watch.figures(now_ns, 0.3))
+    for figures in watch.figures(now_ns, 0.3):
+        figures.to_json()
     assert watch.counters["bad checksum"] > 0
     assert watch.counters["truncated"] > 0
 
@@ -279,4 +279,4 @@ def test_a_log_of_hostile_frames_and_stamps_is_read_to_its_end(hurt: str) -> Non
         log = parse_tlog(bytes(data))
         assert bool(log.frames) == (hurt != "stamps of no time")
         for known in (None, scenario) if log.frames else ():
-            json.dumps(replay(log, Replayed(Path("a.tlog"), known, design if known else None, None)))
+            rebuild_report(log, LogSource(Path("a.tlog"), known, design if known else None, None)).to_json()

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.design import Design
 from gcs.plan.planner import flight_plan
@@ -18,6 +18,7 @@ from scenarios.schema import Clocks, FixedGains, Monitor, Safety
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import DTYPE, LINK_UP, SAMPLED, Row
 from sim_vehicles.services.clock import BootClock
+from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
 CHAIN = load(SCENARIOS / "chain3.toml")
@@ -96,18 +97,20 @@ def test_every_round_trip_is_in_the_ticks(name: str) -> None:
 def test_loop_delay_is_exact_to_the_microsecond_where_links_are_constant(name: str) -> None:
     ticks, truth = flown(name)
     grade = graded(ticks["loop_delay_s"], true_loop_delays_s(ticks, truth))
-    assert grade["samples"] > 700
-    assert grade["error_p50_s"] < 1e-6
+    assert grade.samples > 700
+    assert known(grade.error_p50_s) < 1e-6
     # Two clocks' rates are told apart only after a second; until then drift counts: 300 ppm of some 0.2 s.
-    assert grade["error_max_s"] < 1e-4
+    assert known(grade.error_max_s) < 1e-4
 
 
 def test_with_jitter_loop_delay_is_off_by_no_more_than_set_points_and_exchanges_differ() -> None:
     """The down delay is that of the newest exchange; the set-point's own is known to nobody when it is sent."""
     ticks, truth = flown("reordering")
     grade = graded(ticks["loop_delay_s"], true_loop_delays_s(ticks, truth))
-    assert grade["samples"] > 700
-    assert 1e-3 < grade["error_p50_s"] < grade["error_max_s"] < 0.02 + 0.01  # jitter, and the clock's own error by it
+    assert grade.samples > 700
+    assert (
+        1e-3 < known(grade.error_p50_s) < known(grade.error_max_s) < 0.02 + 0.01
+    )  # jitter, and the clock's own error by it
 
 
 @pytest.mark.parametrize("name", GRID)
@@ -142,15 +145,14 @@ def test_clock_offsets_are_never_outside_their_bounds(name: str) -> None:
 @pytest.mark.parametrize("name", ["drift 300 ppm", "asymmetric"])
 def test_the_skew_of_a_clock_is_that_of_its_time_stamps(name: str) -> None:
     ticks, truth = flown(name)
-    events = [{"time_s": 8.0, "kind": "end", "text": "completed: duration reached"}]
+    events = [Event(time_s=8.0, kind="end", text="completed: duration reached")]
     summary = summarise(CHAIN, Design(delay_margin_s=1.0), ticks, events)
-    for vehicle in summary["vehicles"]:
-        own = truth[(truth["kind"] == SAMPLED) & (truth["system_id"] == vehicle["system_id"])]
+    for vehicle in summary.vehicles:
+        own = truth[(truth["kind"] == SAMPLED) & (truth["system_id"] == vehicle.system_id)]
         slope, _ = np.polyfit((own["time_ns"] - own["time_ns"][0]) * 1e-9, own["key"] * 1e-3, 1)
-        clock = vehicle["clock"]
         # stamps are whole milliseconds, over 8 s and more
-        assert clock["skew_ppm"] == pytest.approx(1e6 * (slope - 1.0), abs=30.0)
-        assert abs(clock["skew_ppm"] - 1e6 * (slope - 1.0)) < clock["skew_bound_ppm"]
+        assert known(vehicle.clock.skew_ppm) == pytest.approx(1e6 * (slope - 1.0), abs=30.0)
+        assert abs(known(vehicle.clock.skew_ppm) - 1e6 * (slope - 1.0)) < known(vehicle.clock.skew_bound_ppm)
 
 
 def test_loss_and_duplicates_are_those_of_the_links_though_they_reorder() -> None:
@@ -167,5 +169,5 @@ def test_loss_and_duplicates_are_those_of_the_links_though_they_reorder() -> Non
 
 def test_an_unknown_is_none_and_not_zero() -> None:
     nothing = graded(np.full(3, np.nan), np.zeros(3))
-    assert nothing["status"] == "unknown"
-    assert [nothing[key] for key in ("error_p50_s", "error_p99_s", "error_max_s")] == [None] * 3
+    assert nothing.status == "unknown"
+    assert (nothing.error_p50_s, nothing.error_p99_s, nothing.error_max_s) == (None, None, None)

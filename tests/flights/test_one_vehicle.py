@@ -9,7 +9,9 @@ from gcs.drive.flown import fly_virtual
 from gcs.plan.design import Design
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
+from gcs.runs.summary_record import Summary
 from scenarios.schema import Control, NominalVelocity, Scenario, Vehicle
+from tests.support.known import known
 
 LONE = Scenario(
     name="lone",
@@ -20,7 +22,7 @@ LONE = Scenario(
 )
 
 
-def flown(scenario: Scenario) -> tuple[Design, dict[str, Any]]:
+def flown(scenario: Scenario) -> tuple[Design, Summary]:
     """Design and summary."""
     calm = scenario.model_copy(update={"monitor": scenario.monitor.model_copy(update={"act": False})})
     design, plan = flight_plan(calm)
@@ -39,14 +41,14 @@ def test_one_vehicle_alone_flies_with_the_margin_of_its_own_velocity_loop(loop: 
         assert 0.3 < design.margins_s[0] < pi / (2.0 * own)
     else:
         assert design.delay_margin_s is None
-    assert summary["verdict"] == "stable"
-    assert 0.5 < summary["settling_time_s"] < 5.0
+    assert summary.verdict == "stable"
+    assert 0.5 < known(summary.settling_time_s) < 5.0
 
 
 def test_one_vehicle_beyond_its_margin_is_called_unstable() -> None:
     design, summary = flown(LONE.with_link_delay(up_s=0.3, down_s=0.3))
-    assert summary["loop_delay_s"]["p50"] > design.margins_s[0]
-    assert summary["verdict"] == "unstable"
+    assert known(summary.loop_delay_s.p50) > design.margins_s[0]
+    assert summary.verdict == "unstable"
 
 
 @pytest.mark.parametrize("method", ["graph-lqr", "graph-dk"])

@@ -9,6 +9,7 @@ import pytest
 
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.planner import flight_plan
+from gcs.runs.record import event_fields
 from gcs.station.station import Station
 from scenarios.files import dump, load
 from scenarios.link_schema import DelayPoint, Jitter, Link, Links
@@ -63,7 +64,7 @@ def test_over_udp_the_monitor_comes_to_the_verdicts_and_modes_of_virtual_time(tm
         ended[name] = str(json.loads(out)["reason"]).split(":")[0]
         assert ended[name] == station.end_reason.split(":")[0], name
         lines = (tmp_path / name / "events.jsonl").read_text(encoding="utf-8").splitlines()
-        real, virtual = [json.loads(line) for line in lines], [event._asdict() for event in station.events]
+        real, virtual = [json.loads(line) for line in lines], [event_fields(event) for event in station.events]
         for vehicle in scenario.vehicles:
             flown = modes(real, vehicle.system_id)
             assert flown >= modes(virtual, vehicle.system_id), (name, vehicle.system_id)

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gcs.control.tick import Event
 from gcs.drive.takeover import TAKEN_OVER
 from gcs.runs.files import RunTail, read_ticks
 from gcs.watch.tlog import parse_tlog
@@ -67,9 +68,9 @@ class Run:
             os.set_blocking(self.terminal, False)
             with contextlib.suppress(OSError):
                 os.read(self.terminal, 1 << 16)
-        return self.process.poll() is not None or any(event["text"] == "flying" for event in self.events())
+        return self.process.poll() is not None or any(event.text == "flying" for event in self.events())
 
-    def events(self) -> list[dict[str, object]]:
+    def events(self) -> list[Event]:
         return RunTail(self.folder).events()
 
     def processes(self) -> dict[int, str]:

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import pytest
 
-from gcs.runs.record import READY_FILE, RECORDING_FILE, TICKS_FILE
-from gcs.views.recording import UNFINISHED_FILE
+from gcs.control.tick import Event
+from gcs.runs.record import READY_FILE, RECORDING_FILE, TICKS_FILE, UNFINISHED_FILE
 from tests.gcs.views.test_recording import read_back
 from tests.support.flown_run import line, prepare, ticks_of
 
@@ -72,7 +72,7 @@ def test_a_growing_run_is_followed_to_its_end_and_ctrl_c_is_left_to_the_parent(t
         wait_for(ready.exists, "the observer to be ready")
         process.send_signal(signal.SIGINT)
         wait_for(growing.exists, "the recording to be begun")
-        writer.event(time_s=-1.0, kind="phase", text="connecting")
+        writer.event(Event(time_s=-1.0, kind="phase", text="connecting"))
         for rows in ticks[:300]:
             writer.tick(rows)
         rest = ticks[300:].tobytes()
@@ -81,8 +81,8 @@ def test_a_growing_run_is_followed_to_its_end_and_ctrl_c_is_left_to_the_parent(t
             file.flush()
             wait_for(lambda: ticks_so_far(growing) == 250, "the first ticks to be recorded before the others come")
             file.write(rest[1000:])
-        writer.event(time_s=2.0, kind="mode", system_id=3, text="NOMINAL -> CAUTION")
-        writer.event(time_s=13.0, kind="end", text="duration reached")
+        writer.event(Event(time_s=2.0, kind="mode", system_id=3, text="NOMINAL -> CAUTION"))
+        writer.event(Event(time_s=13.0, kind="end", text="duration reached"))
         writer.close()
         output = process.communicate(timeout=20)[0].decode()
         assert process.returncode == 0
@@ -152,7 +152,7 @@ def test_a_reader_that_goes_away_does_not_stop_the_recording(tmp_path: Path) -> 
         process.stdout.close()
         for rows in ticks_of(FIVE, start_s=0.0, count=100):
             writer.tick(rows)
-        writer.event(time_s=2.0, kind="end", text="duration reached")
+        writer.event(Event(time_s=2.0, kind="end", text="duration reached"))
         writer.close()
         assert process.wait(20) == 0
         assert process.stderr is not None

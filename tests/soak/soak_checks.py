@@ -4,7 +4,6 @@ Each check gives what it found broken, in words. Where a check has a tolerance, 
 how; where theory promises nothing (a clock that was set, a link that is random), nothing is checked.
 """
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -219,7 +218,7 @@ def _ends_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
     log = stretch.flight()
     design = margins_of(stretch.station.plan)
     summary = summarise(scenario, design, log.ticks, log.events)
-    json.dumps(summary, allow_nan=False)
+    summary.to_json()
     if stretch.replaced or not stretch.states_at_end:
         return
     for system_id, state in stretch.states_at_end.items():
@@ -249,11 +248,11 @@ def _ends_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
         bands_m = {v.system_id: fraction * math.hypot(*v.offset_ne_m) for v in scenario.vehicles if v.offset_ne_m}
         beyond = [i for i, (true_m, off_m) in errors.items() if true_m - off_m > bands_m[i]]
         within = all(true_m + off_m < bands_m[i] for i, (true_m, off_m) in errors.items())
-        if (summary["verdict"] == "stable" and beyond) or (summary["verdict"] == "unstable" and within):
+        if (summary.verdict == "stable" and beyond) or (summary.verdict == "unstable" and within):
             text = {
                 i: f"{true_m:.3f} ± {off_m:.3f} m, band {bands_m[i]:.3f} m" for i, (true_m, off_m) in errors.items()
             }
-            yield Broken("verdict", f"{summary['verdict']}; errors in truth at the end: {text}")
+            yield Broken("verdict", f"{summary.verdict}; errors in truth at the end: {text}")
 
 
 def _true_errors_m(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gcs.control.phases import Phase
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.drive.flown import Flight
 from gcs.drive.guard import Guard
 from gcs.drive.lockstep import EPOCH_NS, START_NS, Sent, fly_lockstep
@@ -64,9 +64,8 @@ class Stretch:
 
     def flight(self) -> Flight:
         """As `summarise` wants it."""
-        events: list[dict[str, Any]] = [event._asdict() for event in self.station.events]
-        events.append({"time_s": float(self.ticks["time_s"][-1, 0]), "kind": "end", "text": self.station.end_reason})
-        return Flight(self.ticks.ravel(), events)
+        end = Event(time_s=float(self.ticks["time_s"][-1, 0]), kind="end", text=self.station.end_reason)
+        return Flight(self.ticks.ravel(), [*self.station.events, end])
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs.control.tick import TICK, Mode, TickArray
+from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.design import Design
 from gcs.runs.files import write_design
 from gcs.runs.record import SCENARIO_FILE, RunWriter
@@ -71,8 +71,8 @@ def prepare(folder: Path, scenario: Scenario) -> RunWriter:
 def write_run(folder: Path, scenario: Scenario, ticks: TickArray) -> None:
     """A finished run of these ticks, with a word at the beginning and the end."""
     writer = prepare(folder, scenario)
-    writer.event(time_s=float(ticks["time_s"][0, 0]), kind="phase", text="connecting")
+    writer.event(Event(time_s=float(ticks["time_s"][0, 0]), kind="phase", text="connecting"))
     for rows in ticks:
         writer.tick(rows)
-    writer.event(time_s=float(ticks["time_s"][-1, 0]), kind="end", text="duration reached")
+    writer.event(Event(time_s=float(ticks["time_s"][-1, 0]), kind="end", text="duration reached"))
     writer.close()

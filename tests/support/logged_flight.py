@@ -2,15 +2,15 @@
 
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, Sent, Vehicles, fly_lockstep, vehicles_of
 from gcs.plan.design import Design
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
+from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
 from scenarios.schema import Scenario
 
@@ -37,13 +37,12 @@ def log_bytes(entries: list[tuple[int, bytes]]) -> bytes:
     return b"".join(struct.pack(">Q", time_ns // 1000) + data for time_ns, data in entries)
 
 
-def flown(scenario: Scenario) -> tuple[Design, dict[str, Any], TickArray, list[tuple[int, bytes]]]:
+def flown(scenario: Scenario) -> tuple[Design, Summary, TickArray, list[tuple[int, bytes]]]:
     """The design, the summary and the ticks of a flight, and the entries of its log."""
     design, plan = flight_plan(scenario)
     station, vehicles = Station(plan, start_ns=START_NS), Logged(vehicles_of(plan))
     ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=vehicles)))
-    events = [event._asdict() for event in station.events]
-    events.append({"time_s": 0.0, "kind": "end", "system_id": None, "text": station.end_reason})
+    events = [*station.events, Event(time_s=0.0, kind="end", text=station.end_reason)]
     return design, summarise(scenario, design, ticks, events), ticks, vehicles.entries
 
 

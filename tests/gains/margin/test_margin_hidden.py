@@ -15,11 +15,12 @@ from gains.delay._commensurate import circle_sweep_margin
 from gains.delay.constant import analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.delay.sweep import frequency_sweep_margin
+from gains.margin.loop_margin import loop_margin
 from gains.margin.model_file import parse_model
 from gains.margin.opinions import checked_delay_margin
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
-from gcs.cli.margin import margin_of_model
+from gcs.cli.margin import margin_fields
 
 Matrix = NDArray[np.float64]
 Pair = tuple[Matrix, Matrix]
@@ -32,7 +33,7 @@ GROUPS = max(20, SYSTEMS // 5)
 def result_of(A0: ArrayLike, A1: ArrayLike) -> dict[str, object]:
     """What the command says of a pair, by way of its text."""
     text = f'{{"A0": {np.asarray(A0).tolist()}, "A1": {np.asarray(A1).tolist()}}}'
-    return margin_of_model(parse_model(text))
+    return margin_fields(loop_margin(parse_model(text)))
 
 
 def second_order(damping: float, stiffness: float, delayed: float) -> Pair:

@@ -57,7 +57,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         (f"stress {CHAIN} --onset --out README.md", "--out: README.md: File exists, wanted a folder that can"),
         (f"stress {CHAIN} --onset --out {{run}}", "run is not empty, wanted a new or empty folder, or --resume"),
         (f"stress {CHAIN} --onset --junit {{run}}", "run: Is a directory, wanted a file that can be written"),
-        (f"stress {CHAIN} --onset --tolerance nan", "--tolerance: read nan, wanted a part between 0 and 1"),
+        (f"stress {CHAIN} --onset --tolerance nan", "--tolerance: read nan, wanted a fraction between 0 and 1"),
         (f"stress {CHAIN} --delay 0:x:3", "--delay: "),
         (f"stress {CHAIN} --delay 0:1:1000000000", "--delay: read '0:1:1000000000', wanted FROM:TO:COUNT or values"),
         (f"bench {CHAIN} --seconds 1e9", "86400"),
@@ -164,8 +164,8 @@ def test_brackets_and_colons_in_text_reach_the_terminal(capsys: pytest.CaptureFi
     """A verdict's reason can name a key of a scenario, and a log's name or a vehicle's word be anything."""
     scenario = line(2)
     summary = summarise(scenario, DESIGN, ticks_of(scenario, start_s=0.0, count=100), [])
-    summary["reason"] = "refused: give [response] in [/the scenario] :warning:"
-    print_summary(summary, Path("[bold]"))
+    reason = "refused: give [response] in [/the scenario] :warning:"
+    print_summary(summary.model_copy(update={"reason": reason}), Path("[bold]"))
     told = capsys.readouterr().out
     assert "verdict  aborted: refused: give [response] in [/the scenario] :warning:\n" in told
     assert "files    [bold]: " in told

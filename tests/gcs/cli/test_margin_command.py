@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from gains.core.errors import BadModelError, DisagreementError
+from gains.margin.loop_margin import loop_margin
 from gains.margin.model_file import parse_model
-from gcs.cli.margin import ModelFileError, margin_of_file, margin_of_model, margin_of_scenario, print_margin
+from gcs.cli.margin import ModelFileError, margin_fields, margin_of_file, margin_of_scenario, print_margin
 from tests.support.paths import SCENARIOS
 
 CLASSIC = {"A0": [[-2.0, 0.0], [0.0, -0.9]], "A1": [[-1.0, 0.0], [-1.0, -1.0]]}
@@ -21,7 +22,7 @@ CLASSIC_MARGIN_S = acos(-0.9) / sqrt(1.0 - 0.81)
 
 
 def result_of(model: object) -> dict[str, Any]:
-    return margin_of_model(parse_model(json.dumps(model)))
+    return margin_fields(loop_margin(parse_model(json.dumps(model))))
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -89,7 +90,7 @@ def test_unreadable_file_is_named(tmp_path: Path, content: bytes | None) -> None
 def test_byte_order_mark_is_no_mistake(tmp_path: Path) -> None:
     file = tmp_path / "model.json"
     file.write_text(json.dumps(CLASSIC), encoding="utf-8-sig")
-    assert margin_of_file(file)["unknown"] == "tau"
+    assert margin_fields(margin_of_file(file))["unknown"] == "tau"
 
 
 def test_terms_with_one_delay_are_the_pair() -> None:
@@ -230,7 +231,7 @@ def test_disagreement_is_an_error_of_its_own() -> None:
     ],
 )
 def test_table_says_the_verdict(model: object, lines: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    print_margin(result_of(model))
+    print_margin(loop_margin(parse_model(json.dumps(model))))
     shown = capsys.readouterr().out
     for line in lines:
         assert line in shown
@@ -243,12 +244,13 @@ def test_table_says_the_verdict(model: object, lines: list[str], capsys: pytest.
 def test_a_scenario_has_the_margins_of_the_loop_it_flies(
     name: str, loop: str, continuous_s: float, sampled_s: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    result = margin_of_scenario(SCENARIOS / f"{name}.toml")
+    found = margin_of_scenario(SCENARIOS / f"{name}.toml")
+    result = margin_fields(found)
     assert result["loop"] == loop
     assert result["delay_margin_s"] == pytest.approx(continuous_s, rel=1e-5)
     assert result["delay_margin_sampled_s"] == pytest.approx(sampled_s, rel=1e-5)
     assert result["checked_by"]
-    print_margin(result)
+    print_margin(found)
     assert f"as flown, sampled and held every 20 ms: margin {sampled_s}" in capsys.readouterr().out
 
 

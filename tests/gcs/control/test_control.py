@@ -18,8 +18,8 @@ K1, K2, K3 = (RNG.normal(size=(2, 2)) for _ in range(3))
 NOBODY = (False,) * 5
 FASTEST = Blend()
 # 0 leads; 1 and 2 follow it; 3 follows 1; 4 follows 3
-TREE = Formation((9, 3, 4, 7, 5), np.array([-1, 0, 0, 1, 3]), np.vstack([np.zeros(2), RNG.normal(size=(4, 2)) * 100]))
 MODEL = FormationModel((-1, 0, 0, 1, 3))
+TREE = Formation((9, 3, 4, 7, 5), MODEL, np.vstack([np.zeros(2), RNG.normal(size=(4, 2)) * 100]))
 OVERLAPPING = MODEL.overlapping_gain(K1, K2, K3)
 
 
@@ -60,7 +60,7 @@ def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:
     """The error vector e of the thesis (2.10), from the definition."""
     parts = [states[0, 2:] - v_d]
     for i in range(1, 5):
-        ahead = TREE.predecessor[i]
+        ahead = MODEL.predecessors[i]
         d = -TREE.offset_ne_m[i]
         parts += [states[ahead, :2] - states[i, :2] - d, states[i, 2:] - v_d]
     return np.concatenate(parts)

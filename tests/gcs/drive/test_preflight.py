@@ -98,10 +98,10 @@ def test_an_unstable_loop_flown_all_the_same_shows_no_headroom(tmp_path: Path) -
     designed, plan = flight_plan(load(with_gains(tmp_path, 3.0, 0.6, 5.6)))
     flight = fly_virtual(without_actions(plan))
     summary = summarise(plan.scenario, designed, flight.ticks, flight.events)
-    assert summary["verdict"] == "unstable"
-    assert summary["headroom_min"] is None
+    assert summary.verdict == "unstable"
+    assert summary.headroom_min is None
     assert not (flight.ticks["headroom"] == -float("inf")).any()
-    assert not [event for event in flight.events if event["kind"] == "gains"]
+    assert not [event for event in flight.events if event.kind == "gains"]
 
 
 @pytest.mark.parametrize("gains", list(itertools.product((-1e5, 1e5), repeat=3)))

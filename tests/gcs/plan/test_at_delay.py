@@ -18,6 +18,7 @@ from gcs.views.table import FlightState, plain_line
 from scenarios.files import load, with_loop
 from scenarios.link_schema import DelayPoint, Jitter, Link, Links, VehicleLinks
 from scenarios.schema import Rates
+from tests.support.known import known
 from tests.support.paths import ROOT
 
 TRIANGLE = load(ROOT / "scenarios/triangle5.toml")
@@ -69,17 +70,17 @@ def test_table_and_summary_tell_both_at_the_loop_delay_that_was_measured() -> No
     calm = late.model_copy(update={"monitor": late.monitor.model_copy(update={"act": False})})
     design, plan = flight_plan(calm)
     flight = fly_virtual(plan)
-    told = summarise(calm, design, flight.ticks, flight.events)["at_loop_delay"]
+    told = summarise(calm, design, flight.ticks, flight.events).at_loop_delay
     own = flight.ticks["loop_delay_s"][flight.ticks["commanded"]].reshape(-1, 5)
-    assert told["loop_delay_s"] == pytest.approx(np.nanmedian(own, axis=0).max(), abs=1e-9)
-    assert told == figures_at(design, calm, told["loop_delay_s"]).model_dump()
-    assert 0.5 < told["alpha"] < 0.81
-    assert 1.0 < told["string_peak"] < 1.4
+    assert told.loop_delay_s == pytest.approx(np.nanmedian(own, axis=0).max(), abs=1e-9)
+    assert told == figures_at(design, calm, told.loop_delay_s)
+    assert 0.5 < known(told.alpha) < 0.81
+    assert 1.0 < known(told.string_peak) < 1.4
     state = FlightState(calm, design)
     rows = flight.ticks.reshape(-1, 5)
     state.add(rows[(rows["time_s"][:, 0] > 3.0) & (rows["time_s"][:, 0] < 5.9)], [])
-    assert f"alpha {told['alpha']:.2f}" in plain_line(state)
-    assert f"errors grow {told['string_peak']:.1f}" in plain_line(state)
+    assert f"alpha {told.alpha:.2f}" in plain_line(state)
+    assert f"errors grow {told.string_peak:.1f}" in plain_line(state)
 
 
 def test_gains_on_a_general_pattern_have_the_alpha_of_the_whole_formation_and_no_string_verdict() -> None:
@@ -121,11 +122,11 @@ def test_table_and_summary_of_a_flight_on_a_general_pattern_tell_its_alpha_at_th
     short = TWO_WAY.model_copy(update={"duration_s": 4.0})
     design, plan = flight_plan(short)
     flight = fly_virtual(plan)
-    told = summarise(short, design, flight.ticks, flight.events)["at_loop_delay"]
-    assert told == figures_at(design, short, told["loop_delay_s"]).model_dump()
-    assert 0.6 < told["alpha"] < (design.alpha or 0.0)
+    told = summarise(short, design, flight.ticks, flight.events).at_loop_delay
+    assert told == figures_at(design, short, told.loop_delay_s)
+    assert 0.6 < known(told.alpha) < (design.alpha or 0.0)
     state = FlightState(short, design)
     rows = flight.ticks.reshape(-1, 3)
     state.add(rows[rows["time_s"][:, 0] > 2.0], [])
-    assert f"alpha {told['alpha']:.2f}" in plain_line(state)
+    assert f"alpha {told.alpha:.2f}" in plain_line(state)
     assert "errors grow" not in plain_line(state)

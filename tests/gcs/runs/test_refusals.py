@@ -3,6 +3,7 @@
 from collections import Counter
 from pathlib import Path
 
+from gcs.control.tick import Event
 from gcs.runs.files import RunTail
 from gcs.runs.record import RunWriter
 from gcs.runs.refusals import REFUSED, VEHICLES_FILE, Refusals, counts_of, in_words, refused_by_vehicles
@@ -32,13 +33,13 @@ def test_a_run_tells_its_newest_counts_the_most_frequent_first(tmp_path: Path) -
     writer = RunWriter(tmp_path)
     for unsigned in (1, 5):
         counts = {"replayed": 2, "unsigned": unsigned}
-        writer.event(time_s=1.0, kind=REFUSED, text=in_words(counts), counts=counts)
-    writer.event(time_s=2.0, kind="end", text="completed")
+        writer.event(Event(time_s=1.0, kind=REFUSED, text=in_words(counts), counts=counts))
+    writer.event(Event(time_s=2.0, kind="end", text="completed"))
     writer.close()
     events = RunTail(tmp_path).events()
-    assert [event["text"] for event in events] == ["2 replayed, 1 unsigned", "5 unsigned, 2 replayed", "completed"]
-    assert counts_of(events) == {"replayed": 2, "unsigned": 5}
-    assert counts_of([]) == {}
+    assert [event.text for event in events] == ["2 replayed, 1 unsigned", "5 unsigned, 2 replayed", "completed"]
+    assert counts_of(events, REFUSED) == {"replayed": 2, "unsigned": 5}
+    assert counts_of([], REFUSED) == {}
 
 
 def test_what_vehicles_counted_is_read_if_it_is_there(tmp_path: Path) -> None:

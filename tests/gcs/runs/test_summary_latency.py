@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gcs.control.tick import CLOCK_JUMPED
+from gcs.control.tick import CLOCK_JUMPED, Event
 from gcs.runs.summary import summarise
 from tests.support.flown_run import DESIGN, line, ticks_of
 
@@ -18,18 +18,18 @@ def test_each_estimate_has_status_and_samples_unknown_is_none() -> None:
     for name in ("rtt_s", "down_delay_s", "telemetry_age_s", "loop_delay_s", "clock_offset_s"):
         ticks[name][blind] = np.nan
     ticks["rtt_s"][~blind] = np.arange(1, 201) * 1e-3
-    events = [{"time_s": 1.0, "kind": "vehicle", "text": CLOCK_JUMPED, "system_id": 2}]
-    of = {vehicle["system_id"]: vehicle for vehicle in summarise(scenario, DESIGN, ticks, events)["vehicles"]}
-    rtt = of[2]["rtt_s"]
+    events = [Event(time_s=1.0, kind="vehicle", text=CLOCK_JUMPED, system_id=2)]
+    of = {vehicle.system_id: vehicle for vehicle in summarise(scenario, DESIGN, ticks, events).vehicles}
+    rtt = of[2].rtt_s
     # numpy's percentile of 1..200 ms: 1 + 199 * 0.95
-    assert (rtt["status"], rtt["samples"], rtt["max"], rtt["p95"]) == ("measured", 200, 0.2, 0.19005)
-    clock = of[2]["clock"]
-    assert (clock["status"], clock["samples"], clock["jumps"]) == ("measured", 200, 1)
-    assert (clock["offset_s"], clock["bound_s"]) == (3.0, 0.02)
-    assert of[2]["station_queue_s"]["p50"] == 0.0002
+    assert (rtt.status, rtt.samples, rtt.max, rtt.p95) == ("measured", 200, 0.2, 0.19005)
+    clock = of[2].clock
+    assert (clock.status, clock.samples, clock.jumps) == ("measured", 200, 1)
+    assert (clock.offset_s, clock.bound_s) == (3.0, 0.02)
+    assert of[2].station_queue_s.p50 == 0.0002
     nothing = {"p50": None, "p95": None, "p99": None, "max": None, "samples": 0, "status": "unknown"}
-    for name in ("rtt_s", "telemetry_age_s", "loop_delay_s"):
-        assert of[1][name] == nothing
-    assert of[1]["down_delay_s"] == nothing | {"bound_s": None}
-    assert of[2]["down_delay_s"]["bound_s"] == 0.004
-    assert of[1]["clock"]["offset_s"] is None
+    for unknown in (of[1].rtt_s, of[1].telemetry_age_s, of[1].loop_delay_s):
+        assert unknown.to_dict() == nothing
+    assert of[1].down_delay_s.to_dict() == nothing | {"bound_s": None}
+    assert of[2].down_delay_s.bound_s == 0.004
+    assert of[1].clock.offset_s is None

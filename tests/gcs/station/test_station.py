@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gains.formation.model import FormationModel
 from gcs.link.datagram import Datagram, Outgoing
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
@@ -17,7 +16,7 @@ from tests.support.paths import SCENARIOS
 S, MS = 1_000_000_000, 1_000_000
 SCENARIO = load(SCENARIOS / "chain3.toml")
 FORMATION = plan_formation(SCENARIO)
-GAIN = FormationModel(tuple(FORMATION.predecessor.tolist())).overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
+GAIN = FORMATION.model.overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
 PLAN = FlightPlan(SCENARIO, FORMATION, GAIN, 0.3)
 HOME = ("127.0.0.1", 5001)
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from gcs.errors import InputError
 from gcs.stress.campaign import (
     TRIALS_FILE,
-    CampaignError,
     Store,
     dask_workers,
     local_workers,
@@ -83,7 +83,7 @@ def test_a_trial_at_two_coordinates_is_flown_once(tmp_path: Path) -> None:
 
 def test_two_campaigns_do_not_fly_in_one_folder(tmp_path: Path) -> None:
     first = Store(tmp_path)
-    with pytest.raises(CampaignError, match="another gcs stress"):
+    with pytest.raises(InputError, match="another gcs stress"):
         Store(tmp_path)
     first.close()
     Store(tmp_path).close()
@@ -233,5 +233,5 @@ class cluster:  # noqa: N801 - used as a function
 
 
 def test_no_scheduler_is_one_line_with_what_was_wanted() -> None:
-    with pytest.raises(CampaignError, match="wanted the address of a Dask scheduler"), dask_workers("no address"):
+    with pytest.raises(InputError, match="wanted the address of a Dask scheduler"), dask_workers("no address"):
         pass

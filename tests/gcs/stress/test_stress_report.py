@@ -18,7 +18,9 @@ from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.summary import SUMMARY_FILE
 from gcs.stress.campaign import TRIALS_FILE, Store, local_workers, run_campaign
+from gcs.stress.report import CampaignResult
 from gcs.stress.study import Onset, Study, find_onset
+from gcs.stress.trial import Outcome
 from scenarios.files import dump
 from tests.support.paths import DATA
 from tests.support.stress_pair import SCENARIO, pair_plan
@@ -209,7 +211,7 @@ def test_a_real_time_trial_records_the_machines_noise(tmp_path: Path) -> None:
         (["--delay", "x"], "wanted FROM:TO:COUNT"),
         (["--delay-of", "9=0:1:2"], "system id of a vehicle"),
         (["--delay", "0", "--rate", "50", "--loss", "0"], "wanted one (a sweep) or two (a map)"),
-        (["--onset", "--tolerance", "2"], "wanted a part between 0 and 1"),
+        (["--onset", "--tolerance", "2"], "wanted a fraction between 0 and 1"),
         (["--onset", "--resume"], "wanted the folder of a campaign"),
         (["--onset", "--dask", "no address"], "wanted the address of a Dask scheduler"),
     ],
@@ -223,10 +225,12 @@ def test_input_that_cannot_be_used_is_told_and_leaves_nothing(tmp_path: Path, op
 
 
 def test_failed_trials_are_errors_in_junit(tmp_path: Path) -> None:
-    failed = {"id": "abc", "seed": 3, "coordinates": {"delay": 0.1}, "error": "Traceback\nValueError: no"}
-    result = {
-        "scenario": "pair", "flight_time_s": 1.0, "failure": "", "assert_onset": None, "trials_failed": [failed]
-    }  # fmt: skip
+    failed = Outcome(
+        id="abc", kind="own", seed=3, coordinates={"delay": 0.1}, real_time=False, error="Traceback\nValueError: no"
+    )
+    result = CampaignResult.model_construct(
+        scenario="pair", flight_time_s=1.0, failure="", assert_onset=None, trials_failed=(failed,)
+    )
     write_junit(result, tmp_path / "junit.xml")
     suite = ElementTree.parse(tmp_path / "junit.xml").getroot()
     assert junit_counts(tmp_path / "junit.xml") == {"tests": 2, "failures": 0, "errors": 1, "skipped": 1}

@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import read_design, read_ticks, write_design
 from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, RunWriter
@@ -17,7 +18,7 @@ from gcs.runs.summary import finish
 from gcs.station.station import Station
 from gcs.views.observer import record_run
 from gcs.views.report import delay_text
-from gcs.views.viewer import ViewerError, screenshot, vulkan_missing
+from gcs.views.viewer import screenshot, vulkan_missing
 from scenarios.files import dump, load
 from scenarios.link_schema import DelayPoint, Link, VehicleLinks
 from scenarios.schema import Scenario
@@ -46,7 +47,7 @@ def recorded(scenario: Scenario, folder: Path) -> Path:
     for rows in fly_lockstep(plan, station=station):
         writer.tick(rows)
     for event in station.events:
-        writer.event(time_s=event.time_s, kind=event.kind, text=event.text, system_id=event.system_id)
+        writer.event(event)
     writer.close()
     record_run(folder)
     return folder
@@ -102,9 +103,10 @@ def test_a_margin_is_drawn_for_the_gains_each_vehicle_is_flown_with(tmp_path: Pa
     known = np.isfinite(headroom)
     np.testing.assert_allclose((100.0 * (1.0 - loops_ms / margins_ms))[known], headroom[known], rtol=1e-9, atol=1e-9)
     summary = finish(folder)
-    margins = {vehicle["system_id"]: vehicle["delay_margin_s"] for vehicle in summary["vehicles"]}
-    assert margins[2] == {"min": pytest.approx(0.3, abs=1e-4), "max": pytest.approx(slower_s, abs=1e-6)}
-    assert margins[3]["max"] == pytest.approx(0.3, abs=1e-4)
+    margins = {vehicle.system_id: vehicle.delay_margin_s for vehicle in summary.vehicles}
+    assert margins[2].min == pytest.approx(0.3, abs=1e-4)
+    assert margins[2].max == pytest.approx(slower_s, abs=1e-6)
+    assert margins[3].max == pytest.approx(0.3, abs=1e-4)
     assert "margin 300.0 ms, up to 610.0 ms with slower gains" in delay_text(summary)
 
 
@@ -125,5 +127,5 @@ def test_the_headless_viewer_opens_a_flight_and_no_view_reports_an_error(run: Pa
 def test_a_recording_cut_off_before_its_first_tick_is_told_in_one_line(run: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.rrd"
     cut.write_bytes((run / "flight.rrd").read_bytes()[:2000])
-    with pytest.raises(ViewerError, match=r"cut\.rrd: the viewer reads no flight in it; wanted a recording of a run"):
+    with pytest.raises(InputError, match=r"cut\.rrd: the viewer reads no flight in it; wanted a recording of a run"):
         screenshot(cut, tmp_path / "cut.png", time_s=0.0, width=800, height=500)

@@ -9,14 +9,15 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from gcs.control.tick import TICK, Mode, TickArray
+from gcs.control.tick import TICK, Event, Mode, TickArray
+from gcs.errors import InputError
 from gcs.plan.design import Design
-from gcs.runs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE
+from gcs.runs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE, UNFINISHED_FILE
 from gcs.views.grid import WholeTicks
 from gcs.views.observer import record_run
-from gcs.views.recording import UNFINISHED_FILE, Recording
+from gcs.views.recording import Recording
 from gcs.views.scene import vehicle_colors
-from gcs.views.viewer import ViewerError, find_recording, view
+from gcs.views.viewer import find_recording, view
 from tests.support.flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
 
 FIVE = line(5)
@@ -118,7 +119,7 @@ def test_the_recording_starts_with_the_flight_and_earlier_events_stand_at_its_st
 def test_what_a_tick_says_of_several_vehicles_is_one_entry(tmp_path: Path) -> None:
     said = [("NOMINAL -> CAUTION", 4), ("NOMINAL -> CAUTION", 3), ("NOMINAL -> LOST", 2), ("NOMINAL -> CAUTION", 1)]
     with Recording(tmp_path, FIVE, DESIGN) as recording:
-        events = [{"time_s": 2.5, "kind": "mode", "system_id": system_id, "text": text} for text, system_id in said]
+        events = [Event(time_s=2.5, kind="mode", system_id=system_id, text=text) for text, system_id in said]
         recording.add(ticks_of(FIVE, start_s=0.0, count=5), events)
     [chunk] = RrdReader(tmp_path / RECORDING_FILE).stream().filter(content="/events")
     batch = chunk.to_record_batch()
@@ -135,7 +136,7 @@ def test_without_a_screen_the_viewer_is_not_started(tmp_path: Path, monkeypatch:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
-    with pytest.raises(ViewerError, match="no screen here"):
+    with pytest.raises(InputError, match="no screen here"):
         view(tmp_path)
 
 
@@ -192,17 +193,17 @@ def test_every_vehicle_has_a_colour_of_its_own(count: int) -> None:
 
 
 def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ViewerError, match=r"nowhere: no such run folder or recording"):
+    with pytest.raises(InputError, match=r"nowhere: no such run folder or recording"):
         find_recording(tmp_path / "nowhere")
-    with pytest.raises(ViewerError, match=r"no flight\.rrd here"):
+    with pytest.raises(InputError, match=r"no flight\.rrd here"):
         find_recording(tmp_path)
     (tmp_path / UNFINISHED_FILE).touch()
-    with pytest.raises(ViewerError, match=r"the recording is not finished"):
+    with pytest.raises(InputError, match=r"the recording is not finished"):
         find_recording(tmp_path)
     (tmp_path / RECORDING_FILE).write_bytes(b"RRF2")
     assert find_recording(tmp_path) == find_recording(tmp_path / RECORDING_FILE) == tmp_path / RECORDING_FILE
     (tmp_path / RECORDING_FILE).write_bytes(b"")
-    with pytest.raises(ViewerError, match=r"flight\.rrd: read a file of another kind; wanted a recording of a run"):
+    with pytest.raises(InputError, match=r"flight\.rrd: read a file of another kind; wanted a recording of a run"):
         find_recording(tmp_path)
 
 

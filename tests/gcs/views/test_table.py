@@ -1,12 +1,13 @@
 """The live table says what is known, fits its place, and is as useful without a terminal."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from gcs.control.tick import Mode, TickArray
+from gcs.control.tick import Event, Mode, TickArray
 from gcs.views.table import FlightState, plain_line, render
 from scenarios.schema import Scenario
 from tests.support.flown_run import DESIGN, line, ticks_of
@@ -72,7 +73,7 @@ def test_the_table_fits_every_terminal(count: int, width: int, height: int) -> N
     words = "a long word about something that happened somewhere " * 5
     state.add(
         ticks_of(line(count), start_s=5.0, count=1),
-        [{"time_s": 1.0 * k, "kind": "statustext", "system_id": 1, "text": words} for k in range(9)],
+        [Event(time_s=1.0 * k, kind="statustext", system_id=1, text=words) for k in range(9)],
     )
     lines = drawn(state, width=width, height=height)
     assert len(lines) <= height
@@ -106,7 +107,7 @@ def test_header_and_footer_say_phase_time_progress_lateness_and_skipped_ticks() 
     ticks["sent_ns"] = ticks["due_ns"] + 2_500_000
     ticks["headroom"][-1, 1] = 0.123
     state = FlightState(scenario, DESIGN)
-    state.add(np.delete(ticks, [30, 31], axis=0), [{"time_s": 0, "kind": "phase", "system_id": None, "text": "flying"}])
+    state.add(np.delete(ticks, [30, 31], axis=0), [Event(time_s=0, kind="phase", system_id=None, text="flying")])
     text = "\n".join(drawn(state))
     for wanted in (
         "line3  flying  5.0 s",
@@ -122,8 +123,8 @@ def test_header_and_footer_say_phase_time_progress_lateness_and_skipped_ticks() 
 
 def test_events_that_say_the_same_of_several_vehicles_share_a_line() -> None:
     state = FlightState(line(20), DESIGN)
-    late = [{"time_s": 3.1, "kind": "mode", "system_id": k, "text": "NOMINAL -> CAUTION"} for k in range(1, 21)]
-    back = [{"time_s": 9.0, "kind": "mode", "system_id": 7, "text": "CAUTION -> NOMINAL"}]
+    late = [Event(time_s=3.1, kind="mode", system_id=k, text="NOMINAL -> CAUTION") for k in range(1, 21)]
+    back = [Event(time_s=9.0, kind="mode", system_id=7, text="CAUTION -> NOMINAL")]
     state.add(ticks_of(line(20), start_s=0.0, count=1), [*late[:5], *back])
     assert [text.split("  mode  ")[1] for text in state.news] == [
         "vehicles 1 2 3 4 5: NOMINAL -> CAUTION",
@@ -151,7 +152,7 @@ def test_a_plain_line_has_the_worst_of_the_formation() -> None:
 
 def test_before_the_flight_times_count_from_the_stations_start() -> None:
     state = FlightState(line(2), DESIGN)
-    found = {"time_s": -19.5, "kind": "vehicle", "system_id": 2, "text": "found"}
+    found = Event(time_s=-19.5, kind="vehicle", system_id=2, text="found")
     state.add(ticks_of(line(2), start_s=-20.0, count=51), [found])
     assert plain_line(state).startswith("start +1.00 s  spacing")
     assert state.news == ["start +0.50 s  vehicle 2: found"]
@@ -182,8 +183,8 @@ def test_headroom_is_coloured_on_a_terminal_only(mode: Mode, headroom: float, se
 
 def test_what_was_refused_has_a_line_of_its_own_and_is_no_news() -> None:
     state = flown(line(2))
-    event = {"time_s": 1.0, "kind": "refused", "system_id": None, "text": "3 unsigned", "counts": {"unsigned": 3}}
+    event = Event(time_s=1.0, kind="refused", text="3 unsigned", counts={"unsigned": 3})
     assert not any("refused" in text for text in drawn(state))
-    state.add(ticks_of(line(2), start_s=1.0, count=1), [event, {**event, "text": "5 unsigned, 1 replayed"}])
+    state.add(ticks_of(line(2), start_s=1.0, count=1), [event, replace(event, text="5 unsigned, 1 replayed")])
     assert [text for text in drawn(state) if "refused" in text] == ["refused: 5 unsigned, 1 replayed"]
     assert state.news == []

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v10 import ardupilotmega as dialect_1
 from pymavlink.dialects.v20 import ardupilotmega as dialect_2
 
+from gcs.errors import InputError
 from gcs.link import mavlink
 from gcs.runs.record import TLOG_FILE, RunWriter
-from gcs.watch.tlog import TlogError, parse_tlog, read_tlog
+from gcs.watch.tlog import parse_tlog, read_tlog
 
 START_US = 1_750_000_000_000_000
 ENTRIES = [
@@ -105,7 +106,7 @@ def test_messages_of_another_dialect_are_stepped_over() -> None:
 def test_a_file_without_a_frame_is_one_line(tmp_path: Path) -> None:
     file = tmp_path / "empty.tlog"
     file.touch()
-    with pytest.raises(TlogError, match="read no MAVLink frame in 0 bytes"):
+    with pytest.raises(InputError, match="read no MAVLink frame in 0 bytes"):
         read_tlog(file)
-    with pytest.raises(TlogError, match="No such file"):
+    with pytest.raises(InputError, match="No such file"):
         read_tlog(tmp_path / "nowhere.tlog")

@@ -1,7 +1,0 @@
-"""What the exit code of a command says; 0 is success."""
-
-FAILED = 1
-"""The command did its work, and the answer is bad: unstable, past the margin, not the same."""
-BAD_INPUT = 2
-INTERRUPTED = 130
-"""Ended by Ctrl-C, SIGTERM or SIGHUP."""

@@ -1,0 +1,140 @@
+"""The summary of a run: a frozen record with the fields of summary.json.
+
+`gcs.runs.summary` makes it from the logs of a run, `gcs.runs.files` reads it back.
+"""
+
+from math import isfinite
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, PlainSerializer
+
+from gcs.control.tick import Event
+from gcs.plan.design import FiguresAtDelay, ResponsePart
+from gcs.published import Published
+from gcs.runs.record import STARTED, event_fields
+
+
+def _rounded(value: Any) -> Any:
+    """A float to nine decimals; None for one that is not finite: JSON has no infinity."""
+    if not isinstance(value, float):
+        return value
+    return round(float(value), 9) if isfinite(value) else None
+
+
+Number = Annotated[float | None, BeforeValidator(_rounded)]
+"""None where it is unknown or without bound."""
+
+
+class Spread(Published):
+    """Percentiles and maximum of a quantity, None without a sample."""
+
+    p50: Number
+    p95: Number = None
+    p99: Number
+    max: Number
+
+
+class Estimate(Spread):
+    """The spread of an estimate, with the number of its samples."""
+
+    samples: int
+    status: str
+
+
+class OneWayDelay(Estimate):
+    """The spread of a one-way delay, and the largest error that the vehicle's clock brings into it."""
+
+    bound_s: Number
+
+
+class MarginRange(Published):
+    """The delay margins of the gains that a vehicle was flown with."""
+
+    min: Number
+    max: Number
+
+
+class Clock(Published):
+    """A vehicle's boot clock against the station's."""
+
+    status: str
+    samples: int
+    offset_s: Number
+    bound_s: Number
+    skew_ppm: Number
+    skew_bound_ppm: Number = None
+    jumps: int
+
+
+class VehicleSummary(Published):
+    """The figures of one vehicle."""
+
+    system_id: int
+    spacing_error_final_m: Number
+    spacing_error_max_m: Number
+    rtt_s: Estimate
+    loop_delay_s: Estimate
+    delay_margin_s: MarginRange = MarginRange(min=None, max=None)
+    up_delay_s: OneWayDelay
+    down_delay_s: OneWayDelay
+    telemetry_age_s: Estimate
+    station_queue_s: Estimate
+    clock: Clock
+    mode_final: str | None
+    received: int | None
+    lost: int | None
+    late: int | None
+    duplicate: int | None
+
+
+class Control(Published):
+    """Ticks flown and their punctuality."""
+
+    rate_hz: float
+    ticks: int
+    deadline_misses: int
+    lateness_s: Spread
+
+
+class Summary(Published):
+    """The verdict on a run and its figures. What older files lack keeps its default.
+
+    docs/reference describes each field.
+    """
+
+    scenario: str = ""
+    verdict: str
+    reason: str = ""
+    fleet: str = STARTED
+    not_logged: tuple[str, ...] = ()
+    loop: Literal["ground", "onboard"]
+    delay_margin_s: Number
+    delay_margin_continuous_s: Number = None
+    response: ResponsePart | None = None
+    loop_delay_s: Spread
+    at_loop_delay: FiguresAtDelay = FiguresAtDelay(loop_delay_s=None)
+    headroom_min: Number
+    headroom_end: float | None = None
+    settling_time_s: float | None = None
+    distance_min_m: Number = None
+    duration_s: Number = None
+    vehicles: tuple[VehicleSummary, ...] = ()
+    control: Control | None = None
+    """None of a flight whose log does not show the ticks."""
+    refused: dict[str, int] = Field(default_factory=dict[str, int])
+    mirror: dict[str, int] = Field(default_factory=dict[str, int])
+    mode_changes: tuple[Annotated[Event, PlainSerializer(event_fields)], ...] = ()
+    files: tuple[str, ...] = ()
+    refused_by_vehicles: dict[str, int] | None = None
+
+    @property
+    def spacing_error_final_m(self) -> float | None:
+        """The largest spacing error at the last tick."""
+        return max(
+            (v.spacing_error_final_m for v in self.vehicles if v.spacing_error_final_m is not None), default=None
+        )
+
+    @property
+    def spacing_error_max_m(self) -> float | None:
+        """The largest spacing error of all vehicles."""
+        return max((v.spacing_error_max_m for v in self.vehicles if v.spacing_error_max_m is not None), default=None)
