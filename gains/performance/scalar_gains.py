@@ -4,6 +4,7 @@ The gains act on every axis alike, u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p, and 
 depends on (k1, k3) alone and the gains of a given margin form a curve with an explicit equation (`gains_of_margin`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -115,9 +116,8 @@ def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string
     >>> front_gain_limit(np.array([2.0]), np.array([1.0]), np.array([0.0]), 1.0).round(6).tolist()
     [1.414214]
     """
-    # Above ω = 2 k1 + √(2 k3) the bound grows with ω for every delay: ω² outgrows 2 (k3 + k1 ω).
-    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
     at_rest = k1**2 - 2 * k3 if string_peak_max == 1 else np.full_like(k1, np.inf)
+    omega = _frequencies_below_growth(k1, k3)
     k1, k3, delay_s = k1[..., None], k3[..., None], delay_s[..., None]
 
     def bound(omega: FloatArray) -> FloatArray:
@@ -125,12 +125,7 @@ def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string
         flat = omega**2 - 2 * (k3 * np.cos(lag) + k1 * omega * np.sin(lag)) + k1**2
         return string_peak_max**2 * flat + (string_peak_max**2 - 1) * (k3 / omega) ** 2
 
-    omega = np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape[:-1], 96))
-    square, at = _with_least_inside(bound(omega))
-    for _ in range(_CLOSER_LOOKS):
-        omega = _between_neighbours(omega, at)
-        square, at = _with_least_inside(bound(omega))
-    least = np.minimum(square.min(axis=-1), at_rest)
+    least = np.minimum(_around_least(bound, omega)[0].min(axis=-1), at_rest)
     return np.sqrt(np.where(least >= 0, least, np.nan))
 
 
@@ -158,20 +153,14 @@ def onboard_front_gain_limit(k1: FloatArray, k3: FloatArray, string_peak_max: fl
     """
     if string_peak_max == 1.0:
         return np.where(k1**2 >= 2 * k3, 0.0, np.nan)
+    omega = _frequencies_below_growth(k1, k3)
     k1, k3 = k1[..., None], k3[..., None]
 
     def bound(omega: FloatArray) -> FloatArray:
         size = np.sqrt((k3 - omega**2) ** 2 + (k1 * omega) ** 2)
         return (string_peak_max * size - k3) / omega
 
-    # 0 at rest is +∞ of the bound, and above 2 k1 + √(2 k3) it grows
-    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
-    omega = np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape[:-1], 96))
-    limit, at = _with_least_inside(bound(omega))
-    for _ in range(_CLOSER_LOOKS):
-        omega = _between_neighbours(omega, at)
-        limit, at = _with_least_inside(bound(omega))
-    least = limit.min(axis=-1)
+    least = _around_least(bound, omega)[0].min(axis=-1)
     return np.where(least >= 0, least, np.nan)
 
 
@@ -260,10 +249,7 @@ def alpha_of(k1: FloatArray, k2: FloatArray, k3: FloatArray) -> FloatArray:
     omega = np.broadcast_to(
         np.concatenate([[0.0], np.geomspace(slow / 10, 3 * fast, _FREQUENCIES)]), (*k1.shape[:-1], _FREQUENCIES + 1)
     )
-    sigma, at = _with_least_inside(least_singular_value(k1, k2, k3, omega))
-    for _ in range(_CLOSER_LOOKS):
-        omega = _between_neighbours(omega, at)
-        sigma, at = _with_least_inside(least_singular_value(k1, k2, k3, omega))
+    sigma, at = _around_least(lambda at: least_singular_value(k1, k2, k3, at), omega)
     before, middle, after = (np.take_along_axis(sigma, at + step, -1)[..., 0] for step in (-1, 0, 1))
     bend, slope = before - 2 * middle + after, (after - before) / 2
     vertex = middle - np.where(bend > 0, slope**2 / (2 * np.where(bend > 0, bend, 1.0)), 0.0)
@@ -287,12 +273,25 @@ def decay_rate_of(k1: FloatArray, k3: FloatArray) -> FloatArray:
     return k1 / 2 - np.sqrt(np.maximum(k1**2 / 4 - k3, 0.0))
 
 
-def _with_least_inside(values: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
-    """The values and, along their last axis, the index of the least one, moved off the ends."""
-    return values, np.clip(np.argmin(values, axis=-1, keepdims=True), 1, values.shape[-1] - 2)
+def _frequencies_below_growth(k1: FloatArray, k3: FloatArray) -> FloatArray:
+    """Frequencies up to 2 k1 + √(2 k3), above which bounds of k2 grow at every delay: ω² outgrows 2 (k3 + k1 ω)."""
+    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
+    return np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape, 96))
 
 
-def _between_neighbours(omega: FloatArray, at: NDArray[np.intp]) -> FloatArray:
-    """Finer frequencies between the neighbours of those at the index, along the last axis."""
-    low, high = np.take_along_axis(omega, at - 1, -1), np.take_along_axis(omega, at + 1, -1)
-    return low + (high - low) * np.linspace(0, 1, _FREQUENCIES_CLOSER)
+def _around_least(
+    function: Callable[[FloatArray], FloatArray], omega: FloatArray
+) -> tuple[FloatArray, NDArray[np.intp]]:
+    """The values around the least one of each row, ever closer, and its index along the last axis, off the ends."""
+    values = function(omega)
+    at = _index_of_least(values)
+    for _ in range(_CLOSER_LOOKS):
+        low, high = np.take_along_axis(omega, at - 1, -1), np.take_along_axis(omega, at + 1, -1)
+        omega = low + (high - low) * np.linspace(0, 1, _FREQUENCIES_CLOSER)
+        values = function(omega)
+        at = _index_of_least(values)
+    return values, at
+
+
+def _index_of_least(values: FloatArray) -> NDArray[np.intp]:
+    return np.clip(np.argmin(values, axis=-1, keepdims=True), 1, values.shape[-1] - 2)

@@ -1,9 +1,8 @@
 """α and the growth of spacing errors at a loop delay, that expected of a scenario's links or one measured in flight.
 
-What a design says of them without delay says little of a flight. `gains.performance.flown_loop` has the loop of a
-follower as it is flown, which says it all for a leader-follower tree with the same gains for each;
-`gains.performance.flown_formation` has the whole formation, for gains on any other pattern. There errors run both ways,
-so that no growth from vehicle to vehicle is defined and only α is reported.
+A design's figures without delay say little about a flight; `gains.performance.flown` has those at a loop delay. Gains
+on a pattern other than a leader-follower tree have an α only: errors run both ways, so that no growth from vehicle to
+vehicle is defined.
 """
 
 from collections.abc import Sequence
@@ -12,11 +11,9 @@ from math import inf
 import numpy as np
 
 from gains.core.requirement import plain
-from gains.design.graph import time_scaled
+from gains.design.time_scale import time_scaled
 from gains.formation.model import FormationModel
-from gains.performance.delayed_alpha import ALPHA_KEPT
-from gains.performance.flown_formation import FlownFormation
-from gains.performance.flown_loop import FlownLoop
+from gains.performance.flown import ALPHA_KEPT, FlownFormation, FlownLoop, FlownTiming
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.onboard import own_part
@@ -112,11 +109,8 @@ def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
     return [
         FlownLoop(
             ScalarGains(-own, front * entry.streamed_share, spacing, 0.0),
-            delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
-            period_s=design.period_s,
-            loop=design.loop,
-            step_s=1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0,
-            response=answer,
+            _timing(design, entry),
+            answer,
         )
         for answer in set(_responses(design).values()) or [None]
     ]
@@ -136,12 +130,15 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
     return FlownFormation(
         model,
         gain,
-        delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
-        period_s=design.period_s,
-        loop=design.loop,
-        step_s=1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0,
-        responses=tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
+        _timing(design, entry),
+        tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
     )
+
+
+def _timing(design: Design, entry: GainSet) -> FlownTiming:
+    margin_s = inf if entry.delay_margin_s is None else entry.delay_margin_s
+    step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
+    return FlownTiming(margin_s, design.period_s, design.loop, step_s)
 
 
 def _responses(design: Design) -> dict[int, Response]:
