@@ -1,12 +1,11 @@
 """Overlapping gains for a formation, with the delay they take and the disturbance they withstand.
 
 `design` finds gains of largest robustness α with a wanted delay margin, or of largest delay margin with a wanted α;
-`evaluate_gains` says the same of gains that are given. Both check their result with the functions of
-`gains.delay.constant`, `gains.sampled.constant`, `gains.performance.robust` and `gains.formation.inclusion` on the
-whole formation.
+`evaluate_gains` reports the same figures of given gains. Both check their result on the whole formation, with methods
+that share no formula with the search.
 
-The margin that is asked for is that of the loop really flown: `sampled`, with period and zero-order hold, and `ground`,
-with all feedback late. It is about half a period less than the continuous one. Both are reported.
+The margin asked for is that of the loop as flown: `sampled`, with period and zero-order hold, and `ground`, with all
+feedback late. It is about half a period less than the continuous one. Both are reported.
 
 Source: Sahoo 2012 (see `gains.formation.model`), sections 3 and 5.
 """
@@ -21,21 +20,20 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError, SolverError
 from gains.core.requirement import ALPHA_MIN, Requirement, plain
 from gains.delay.constant import delay_margin
-from gains.design.graph import GraphDesign, GraphMethod, graph_design
+from gains.design.graph import GraphDesign, GraphMethod, assess, graph_design
 from gains.design.required import required_gains
 from gains.design.search import largest_alpha
 from gains.formation.model import FormationModel, checked_gain
-from gains.formation.pattern import Pattern, leader_follower
+from gains.formation.pattern import Pattern, checked_pattern_gain, leader_follower
 from gains.performance.behaviour import (
     Behaviour,
     BlockMargin,
-    Gains,
     behaviour,
     block_margin,
-    follower_block,
-    leader_block,
+    diagonal_blocks,
 )
 from gains.performance.robust import Certificate, certify, robustness
+from gains.performance.string_stability import Gains
 from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming
 
@@ -195,17 +193,38 @@ def design(
     return result
 
 
+@overload
 def evaluate_gains(
-    formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, *, period_s: float
-) -> Design:
-    """Return margins, α and behaviour of given gains, each of shape (axes, axes).
+    formation: FormationModel, gains: tuple[ArrayLike, ArrayLike, ArrayLike], *, period_s: float
+) -> Design: ...
 
-    Gains of an unstable loop are reported too: α and the continuous margin are 0 and there is no certificate.
+
+@overload
+def evaluate_gains(
+    formation: FormationModel, gains: ArrayLike, *, period_s: float, pattern: Pattern
+) -> GraphDesign: ...
+
+
+def evaluate_gains(
+    formation: FormationModel, gains: Any, *, period_s: float, pattern: Pattern | None = None
+) -> Design | GraphDesign:
+    """Return margins, robustness and decay of given gains.
+
+    Gains of an unstable loop are reported too: α and the margins are 0 and there is no certificate.
+
+    Parameters
+    ----------
+    gains
+        K1, K2 and K3, each of shape (axes, axes); with a pattern, K of u = K e, shape (inputs, states).
+    period_s
+        Period of the control loop: sample, hold.
+    pattern
+        Who may use whose output.
 
     Raises
     ------
     BadModelError
-        If a gain is not finite or not of that shape, or the period is not positive.
+        If a gain is not finite, not of its shape or not in the pattern, or the period is not positive.
 
     Examples
     --------
@@ -213,13 +232,14 @@ def evaluate_gains(
 
     >>> from gains.design.design import evaluate_gains
     >>> from gains.formation.model import FormationModel
-    >>> found = evaluate_gains(FormationModel((-1, 0), axes=1), [[-1]], [[0]], [[1]], period_s=0.02)
+    >>> found = evaluate_gains(FormationModel((-1, 0), axes=1), ([[-1]], [[0]], [[1]]), period_s=0.02)
     >>> round(found.delay_margin_continuous_s, 6), round(found.delay_margin_s, 3)
     (0.711119, 0.701)
     """
-    _check_period(period_s)
+    if pattern is not None:
+        return assess(formation, pattern, checked_pattern_gain(pattern, gains), period_s=period_s)
     own, front, spacing = (
-        checked_gain(name, gain, formation.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
+        checked_gain(name, gain, formation.axes) for name, gain in zip(("K1", "K2", "K3"), gains, strict=True)
     )
     return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None, method="given")
 
@@ -243,7 +263,7 @@ def _assess(
     alpha = robustness(*gains)
     margin_s = float(sampled_delay_margin(A, B, K, period_s=period_s))
     continuous_s = delay_margin(A, B @ K)
-    leader, follower = block_margin(*leader_block(gains)), block_margin(*follower_block(gains))
+    leader, follower = (block_margin(*block) for block in diagonal_blocks(gains))
     blocks_s = [leader.delay_margin_s, follower.delay_margin_s][: formation.vehicles]
     if not np.isclose(continuous_s, min(blocks_s), rtol=1e-9, atol=0):
         raise DisagreementError(
