@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -152,23 +153,21 @@ def cell_edges(values: FloatArray) -> FloatArray:
     return np.r_[2.0 * values[0] - between[0], between, 2.0 * values[-1] - between[-1]]
 
 
+def _of_cells(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[list[Outcome]]:
+    """The outcomes of each cell, the second axis varying fastest."""
+    points = [dict(zip([axis.name for axis in axes], at, strict=True)) for at in product(*(a.values for a in axes))]
+    return [[outcome for outcome in outcomes if outcome.coordinates == point] for point in points]
+
+
 def _cells(axes: Sequence[Axis], outcomes: Sequence[Outcome], field: str) -> FloatArray:
     """A field as an array over two axes, mean of the seeds; NaN where no seed has it."""
-    values = np.full([len(axis.values) for axis in axes], np.nan)
-    for place in np.ndindex(*values.shape):
-        at = {axis.name: axis.values[k] for axis, k in zip(axes, place, strict=True)}
-        known = [getattr(o, field) for o in outcomes if o.coordinates == at]
-        known = [value for value in known if value is not None]
-        if known:
-            values[place] = float(np.mean(known))
-    return values
+    known = [[v for o in cell if (v := getattr(o, field)) is not None] for cell in _of_cells(axes, outcomes)]
+    means = [float(np.mean(values)) if values else np.nan for values in known]
+    return np.array(means).reshape([len(axis.values) for axis in axes])
 
 
 def _verdicts(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> NDArray[np.str_]:
     """The worst verdict of all seeds at each point, empty where nothing was flown."""
-    worst = np.full([len(axis.values) for axis in axes], "", dtype="U16")
-    for place in np.ndindex(*worst.shape):
-        at = {axis.name: axis.values[k] for axis, k in zip(axes, place, strict=True)}
-        found = {outcome.verdict for outcome in outcomes if outcome.coordinates == at}
-        worst[place] = next((verdict for verdict in ("unstable", "aborted", "stable") if verdict in found), "")
-    return worst
+    found = [{outcome.verdict for outcome in cell} for cell in _of_cells(axes, outcomes)]
+    worst = [next((v for v in ("unstable", "aborted", "stable") if v in verdicts), "") for verdicts in found]
+    return np.array(worst).reshape([len(axis.values) for axis in axes])

@@ -88,17 +88,10 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     flown = flight.ticks[flight.ticks["time_s"] >= 0.0]
     delays_s = median_delays_s(flown, plan.formation.system_ids)
     loop = critical_block(plan_loops(plan), delays_s)
-    slowest = max(loop.system_ids, key=lambda system_id: delays_s[system_id])
-    up, down = plan.scenario.link_of(slowest)
-    outcome = replace(
-        outcome,
-        critical=loop.system_ids[0],
-        link_delay_s=up.delay_s + down.delay_s,
-        loop_delay_s=round(delays_s[slowest], 9),
-        predicted_growth_1_s=finite(loop.growth_at_1_s(delays_s)),
-        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(delays_s)),
-    )
-    start_s = _BEGUN_LOOP_DELAYS * delays_s[slowest]
+    loop_s, link_s, _ = _slowest(plan, loop, delays_s)
+    outcome = replace(outcome, critical=loop.system_ids[0], link_delay_s=link_s, loop_delay_s=round(loop_s, 9))
+    outcome = _with_prediction(outcome, loop, delays_s)
+    start_s = _BEGUN_LOOP_DELAYS * loop_s
     growth = envelope_growth(np.array(outcome.trace_m), period_s=TRACE_PERIOD_S, start_s=start_s)
     return outcome if growth is None else _with_fit(outcome, growth)
 
@@ -137,14 +130,13 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
         probed = critical_block(loops, delays_s)
     else:
         probed = next(loop for loop in loops if trial.probe in loop.system_ids)
-    slowest = max(probed.system_ids, key=lambda system_id: delays_s[system_id])
-    up, down = base.scenario.link_of(slowest)
+    _, link_s, waiting_s = _slowest(base, probed, delays_s)
     outcome = replace(
         outcome,
         probed=probed.system_ids[0],
         critical=probed.system_ids[0],
-        link_delay_s=up.delay_s + down.delay_s,
-        waiting_s=round(delays_s[slowest] - up.delay_s - down.delay_s, 9),
+        link_delay_s=link_s,
+        waiting_s=round(waiting_s, 9),
         past_limits=past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]]),
     )
 
@@ -179,15 +171,30 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
     The loop that breaks first may be far down the tree, where vehicles ahead would drive it. So the equal loop nearest
     to the leader is probed in its place, with its links and its waiting.
     """
-    loops, links = plan_loops(plan), plan.scenario.links
+    loops = plan_loops(plan)
     if probe == CRITICAL:
         critical = critical_block(loops, loop_delay_s)
         probed = next(loop for loop in loops if loop.same_as(critical))
     else:
         probed = critical = next(loop for loop in loops if probe in loop.system_ids)
-    slowest = max(critical.system_ids, key=lambda system_id: loop_delay_s[system_id])
-    up, down = links.of(slowest)
-    return probed, critical, (loop_delay_s[slowest] - up.delay_s - down.delay_s) % critical.timing.step_s
+    _, _, waiting_s = _slowest(plan, critical, loop_delay_s)
+    return probed, critical, waiting_s % critical.timing.step_s
+
+
+def _slowest(plan: FlightPlan, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> tuple[float, float, float]:
+    """Loop delay, link delay (up plus down) and the rest (s) of the vehicle of a loop whose loop delay is longest."""
+    slowest = max(loop.system_ids, key=lambda system_id: loop_delay_s[system_id])
+    up, down = plan.scenario.link_of(slowest)
+    longest_s = loop_delay_s[slowest]
+    return longest_s, up.delay_s + down.delay_s, longest_s - up.delay_s - down.delay_s
+
+
+def _with_prediction(outcome: Outcome, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> Outcome:
+    return replace(
+        outcome,
+        predicted_growth_1_s=finite(loop.growth_at_1_s(loop_delay_s)),
+        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(loop_delay_s)),
+    )
 
 
 def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -> Outcome:
@@ -212,13 +219,9 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
     window = own[(since_s >= growth.start_s) & (since_s <= growth.end_s)]
     delays_s = response.loop_delays_s(window, loop.system_ids)
     spread_s = float(np.nanpercentile(window["loop_delay_s"], 90) - np.nanmedian(window["loop_delay_s"]))
-    return replace(
-        _with_fit(outcome, growth),
-        loop_delay_s=round(max(delays_s.values()), 9),
-        loop_delay_spread_s=round(spread_s, 9),
-        predicted_growth_1_s=finite(loop.growth_at_1_s(delays_s)),
-        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(delays_s)),
-    )
+    loop_s = round(max(delays_s.values()), 9)
+    outcome = replace(_with_fit(outcome, growth), loop_delay_s=loop_s, loop_delay_spread_s=round(spread_s, 9))
+    return _with_prediction(outcome, loop, delays_s)
 
 
 def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:

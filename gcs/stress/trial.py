@@ -137,14 +137,16 @@ def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
 def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:
     """The outcome with the verdict of the flight, its spacing errors and the driver's lateness."""
     summary = summarise(plan.scenario, margins_of(plan), flight.ticks, flight.events)
-    largest = [v["spacing_error_max_m"] for v in summary["vehicles"] if v["spacing_error_max_m"] is not None]
-    final = [v["spacing_error_final_m"] for v in summary["vehicles"] if v["spacing_error_final_m"] is not None]
+
+    def largest(name: str) -> float | None:
+        return max((vehicle[name] for vehicle in summary["vehicles"] if vehicle[name] is not None), default=None)
+
     return replace(
         outcome,
         verdict=summary["verdict"],
         reason=summary["reason"],
-        spacing_error_max_m=max(largest, default=None),
-        spacing_error_final_m=max(final, default=None),
+        spacing_error_max_m=largest("spacing_error_max_m"),
+        spacing_error_final_m=largest("spacing_error_final_m"),
         lateness_s_p50=summary["control"]["lateness_s"]["p50"],
         lateness_s_p99=summary["control"]["lateness_s"]["p99"],
         steal_share=flight.steal_share,

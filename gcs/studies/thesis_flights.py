@@ -22,7 +22,8 @@ PERIOD_S = 0.02
 ALPHA = 0.93
 SPEED_M_S = 91.44  # 300 ft/s
 DELAYS_S = (0.17, 0.9, 1.1)
-CHAIN = FormationModel((-1, 0, 1))
+CHAIN, SINGLE = FormationModel((-1, 0, 1)), FormationModel((-1, 0, 1), axes=1)
+"""The source's three vehicles, with both axes and with one."""
 
 
 @cache
@@ -38,9 +39,7 @@ def _scenario(name: str) -> Scenario:
 @cache
 def late_flight(delay_s: float) -> tuple[FloatArray, FloatArray]:
     """Times and errors of the nonlinear flight with the printed gains: 20 s, with initial errors of our choice."""
-    start = np.zeros(CHAIN.states)
-    start[CHAIN.velocity_slice(0)] = (2.0, -1.0)
-    start[CHAIN.spacing_slice(1)], start[CHAIN.spacing_slice(2)] = (10.0, 5.0), (-6.0, 8.0)
+    start = np.array([2.0, -1.0, 10.0, 5.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0])
     return fly_with_late_neighbours(
         CHAIN, printed_gains(), start, delay_s=delay_s, speed_m_s=SPEED_M_S, duration_s=20.0
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
+from gains.sampled.onboard import own_part
 
 STEP_S = 1e-3
 
@@ -21,11 +22,7 @@ def fly_with_late_neighbours(
     Before the start the errors are constant.
     """
     steps, lag = round(duration_s / STEP_S), round(delay_s / STEP_S)
-    own = np.zeros_like(K)
-    for i in range(formation.vehicles):
-        own[formation.input_slice(i), formation.output_slice(i)] = K[
-            formation.input_slice(i), formation.output_slice(i)
-        ]
+    own = own_part(formation, K)
     others = K - own
     nominal = np.array([speed_m_s, 0.0])
     state = _states(formation, start, nominal)
