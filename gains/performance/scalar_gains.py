@@ -6,14 +6,11 @@ depends on (k1, k3) alone and the gains of a given margin form a curve with an e
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-
-Factor = NDArray[np.complexfloating[Any, Any]] | float
 
 # Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three of
 # those, and a parabola through the last, bring σ_min to about 1e-10 of itself.
@@ -187,42 +184,7 @@ def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: 
     loop = (k3 - x) ** 2 + a2 * x
     c2 = 3 * x + 2 * a2 + 2 + k2**2 + k3**2
     c1 = loop + (k2 - k1) ** 2 + x + k3**2 + k2**2 * x + own * (own + k3**2 + 1 + x)
-    return _least_root(c2, c1, own * loop)
-
-
-def delayed_singular_value(gains: ScalarGains, omega: FloatArray, own: Factor, front: Factor) -> FloatArray:
-    """Return σ_min of the characteristic matrix of the subsystem with late feedback, at each frequency.
-
-    With the complex factors d on a vehicle's own errors and f on the velocity error of the vehicle in front, e^{−jωτ}
-    for a delay τ, times what the vehicle makes of a command, the matrix is::
-
-        [[jω + k1 d, 0, 0], [−1, jω, 1], [−k2 f, −k3 d, jω + k1 d]]
-
-    σ_min² is found as in `least_singular_value`, which is the case d = f = 1, in half the time.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from gains.performance.scalar_gains import ScalarGains, delayed_singular_value, least_singular_value
-    >>> at_once = delayed_singular_value(ScalarGains(3.0, 2.0, 2.0, 0.0), np.array(1.0), 1.0, 1.0)
-    >>> bool(abs(at_once - least_singular_value(3.0, 2.0, 2.0, np.array(1.0))) < 1e-12)
-    True
-    """
-    jw = 1j * omega
-    leader, spacing, ahead = jw + gains.k1 * own, gains.k3 * own, gains.k2 * front
-    x, a2, g2, h2 = omega**2, _squared(leader), _squared(ahead), _squared(spacing)
-    loop = _squared(jw * leader + spacing)
-    c2 = 2 * a2 + x + 2 + g2 + h2
-    c1 = loop + _squared(ahead - leader) + _squared(spacing + jw * ahead) + a2 * (x + 1 + h2 + a2)
-    return _least_root(c2, c1, a2 * loop)
-
-
-def _squared(value: Factor) -> FloatArray:
-    return np.abs(value) ** 2
-
-
-def _least_root(c2: FloatArray, c1: FloatArray, c0: FloatArray) -> FloatArray:
-    """Root of the least root of λ³ − c2 λ² + c1 λ − c0, whose roots are real and positive."""
+    c0 = own * loop
     root = c0 / c1
     for _ in range(5):
         root = root + (c0 - root * (c1 - root * (c2 - root))) / (c1 - root * (2 * c2 - 3 * root))

@@ -5,7 +5,6 @@ on a pattern other than a leader-follower tree have an α only: errors run both 
 vehicle is defined.
 """
 
-from collections.abc import Sequence
 from math import inf
 
 import numpy as np
@@ -56,48 +55,45 @@ def _mean_jitter_s(jitter: Jitter) -> float:
 
 def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
     """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole."""
-    loops = _flown_loops(design, scenario)
-    if not loops:
+    flown, chains = _flown(design, scenario)
+    if not flown:
         return design
     requirement = design.requirement
-    chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
     peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
     # of different vehicles the one that leaves least
-    alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
-    flown = FiguresAtExpectedDelay(
+    alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(formation.alpha(0.0) for formation in flown)
+    figures = FiguresAtExpectedDelay(
         **figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump(),
         alpha_kept=alpha,
-        alpha_kept_to_s=plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
+        alpha_kept_to_s=plain(min(formation.alpha_limit_s(alpha) for formation in flown)),
         string_peak_kept=peak,
         string_peak_kept_to_s=plain(min(loop.string_limit_s(peak) for loop in chains)) if peak else None,
     )
-    return design.model_copy(update={"at_loop_delay": flown})
+    return design.model_copy(update={"at_loop_delay": figures})
 
 
 def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
     """α and the string peak of a design's gain set at a loop delay (s)."""
-    loops = [] if delay_s is None else _flown_loops(design, scenario, gain_set)
-    if delay_s is None or not loops:
+    flown, chains = _flown(design, scenario, gain_set) if delay_s is not None else ([], [])
+    if delay_s is None or not flown:
         return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
-    chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
     return FiguresAtDelay(
         loop_delay_s=delay_s,
-        alpha=min(loop.alpha(delay_s) for loop in loops),
+        alpha=min(formation.alpha(delay_s) for formation in flown),
         has_string_verdict=bool(chains),
         string_peak=plain(max(loop.string_peak(delay_s) for loop in chains)) if chains else None,
     )
 
 
-def _flown_loops(
-    design: Design, scenario: Scenario, gain_set: int = 0
-) -> Sequence[FlownLoop] | Sequence[FlownFormation]:
-    """What is flown, as far as it has an α at all: the formation, or the loops of its followers."""
+def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
+    """What is flown, as far as it has an α at all, and the loops of its followers where errors run down chains."""
     if design.vehicles < 2:
-        return []
+        return [], []
     entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
     if design.inclusion_gains is not None:
-        return _follower_loops(design, entry)
-    return [_flown_formation(design, entry, scenario)] if design.K is not None else []
+        chains = _follower_loops(design, entry)
+        return [chain.pair for chain in chains], chains
+    return [_flown_formation(design, entry, scenario)] if design.K is not None else [], []
 
 
 def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:

@@ -87,7 +87,7 @@ def test_alpha_falls_long_before_the_margin_and_is_kept_up_to_the_limit_that_is_
     assert flight.alpha_limit_s(1.01 * at_rest) == 0.0
 
 
-def test_a_leader_with_one_follower_is_the_loop_that_is_known_in_closed_form() -> None:
+def test_a_leader_with_one_follower_is_the_loop_of_a_follower() -> None:
     pair, gains = FormationModel((-1, 0)), ScalarGains(3.4, 0.6, 5.6, 0.0)
     K = pair.overlapping_gain(-gains.k1 * np.eye(2), gains.k2 * np.eye(2), gains.k3 * np.eye(2))
     answer = Response(0.05, 1.5)
@@ -96,9 +96,9 @@ def test_a_leader_with_one_follower_is_the_loop_that_is_known_in_closed_form() -
         for response, responses in ((None, None), (answer, (answer, answer))):
             timing = FlownTiming(margin_s, PERIOD_S, loop, step_s)
             matrix = FlownFormation(pair, K, timing, responses)
-            formula = FlownLoop(gains, timing, response)
+            pair_of_one_axis = FlownLoop(gains, timing, response).pair
             for delay_s in (0.0, 0.1, 0.2):
-                assert matrix.alpha(delay_s) == pytest.approx(formula.alpha(delay_s), rel=1e-9)
+                assert matrix.alpha(delay_s) == pytest.approx(pair_of_one_axis.alpha(delay_s), rel=1e-9)
 
 
 def test_gains_that_couple_north_and_east_are_taken_whole_and_others_by_one_axis() -> None:
