@@ -38,9 +38,9 @@ from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming
 
 PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
-# The certificate proves this share of α: at α itself the proof is on the edge of existence.
+# The certificate proves this share of α: at α itself a proof only just exists.
 _CERTIFIED_SHARE = 1 - 1e-4
-# A decay rate that is asked for is met to this share of itself: a double root is known to the root of the rounding.
+# A wanted decay rate is met to this share of itself: a double root is known to the square root of rounding.
 _DECAY_ROUNDING = 1e-6
 _TRADE_OFF_MARGINS_S = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 
@@ -130,7 +130,7 @@ def design(
     pattern: Pattern | None = None,
     onboard: OnboardTiming | None = None,
 ) -> Design | GraphDesign:
-    """Return the gains that meet the requirement and are the best in what it leaves open.
+    """Return the gains that meet the requirement and are best in what it leaves open.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ def _assess(
     requirement: Requirement | None,
     method: Literal["inclusion", "given"],
 ) -> Design:
-    """Everything that is reported of the gains, by the exact methods and on the whole formation."""
+    """Everything that is reported of the gains, by the exact methods, on the whole formation."""
     # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
     from gains.formation.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
 
@@ -294,7 +294,7 @@ def _assess(
 
 
 def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | None:
-    """The proof of α. Given gains, however badly scaled, are assessed without one where the solver finds none."""
+    """The proof of α. Given gains, which may be badly scaled, do without one where the solver finds none."""
     if alpha < ALPHA_MIN:
         return None
     try:
@@ -308,7 +308,7 @@ def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | No
 def trade_off(
     *, period_s: float, string_peak_max: float | None = None, loop: Literal["ground", "onboard"] = "ground"
 ) -> tuple[TradeOffPoint, ...]:
-    """Return the largest α at sampled delay margins from 0.05 to 1 s; margins no gains have are left out.
+    """Return the largest α at sampled delay margins from 0.05 to 1 s, without those that no gains have.
 
     Parameters
     ----------

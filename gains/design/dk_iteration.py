@@ -49,7 +49,7 @@ class DkIterate:
 
 @dataclass(frozen=True, eq=False)
 class DecayProof:
-    """P of (1) with the eigenvalues that were checked: V = x'Px proves that motions decay like e^{αt/2}.
+    """P of (1) and the eigenvalues that were checked: V = x'Px proves that motions decay like e^{αt/2}.
 
     Attributes
     ----------
@@ -225,7 +225,7 @@ def _proved_alpha(closed_loop: FloatArray, P: FloatArray) -> float:
 
 
 def abscissa(closed_loop: FloatArray) -> float:
-    """Largest real part of an eigenvalue (1/s) of A (n, n), by strongly connected blocks: see `gains.core.structure`.
+    """Return the largest real part (1/s) of an eigenvalue, by strongly connected blocks (`gains.core.structure`).
 
     Examples
     --------
@@ -239,7 +239,7 @@ def abscissa(closed_loop: FloatArray) -> float:
 
 
 def decay_proof(closed_loop: FloatArray, P: FloatArray) -> DecayProof:
-    """The least α that P proves for a closed loop A_K, both (n, n), checked by numpy's eigenvalues alone.
+    """Return the least α that P proves for a closed loop A_K, both (n, n), checked by numpy's eigenvalues alone.
 
     Raises
     ------

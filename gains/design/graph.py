@@ -52,8 +52,8 @@ class GraphDesign:
     links
         The pattern: (i, j) where vehicle i uses the output of vehicle j, spacing and velocity error.
     alpha
-        Exact sector bound of the whole formation for W = I: 1 / ‖(sI − A − BK)^{-1}‖∞. It is not that of one vehicle
-        behind another, which `gains.design.design` reports, and falls with the length of a chain.
+        Exact sector bound of the whole formation for W = I: 1 / ‖(sI − A − BK)^{-1}‖∞. It falls with the length of a
+        chain, unlike that of one vehicle behind another, which `gains.design.design` reports.
     decay_rate_1_s
         Of the slowest motion without delay; negative if unstable.
     delay_margin_s, delay_margin_continuous_s
@@ -99,7 +99,7 @@ def graph_design(
     period_s: float,
     onboard: OnboardTiming | None = None,
 ) -> GraphDesign:
-    """Return a gain with the pattern that meets the requirement, the best in what it leaves open.
+    """Return the gain with the pattern that meets the requirement and is best in what it leaves open.
 
     Parameters
     ----------
@@ -113,8 +113,8 @@ def graph_design(
     period_s
         Period of the control loop: sample, hold.
     onboard
-        Timing of the onboard loop, if that is flown: its margin is then asked for, and that of the vehicles' own gains
-        late by themselves. The margins reported are those of the ground loop in any case.
+        Timing of the onboard loop, if that is flown: the requirement then bounds its margin, and that of the vehicles'
+        own gains (`gains.design.time_scale`). The margins reported are those of the ground loop in any case.
 
     Raises
     ------

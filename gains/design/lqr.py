@@ -65,10 +65,10 @@ class CostPoint:
 
 
 class LyapunovEquations:
-    """Both Lyapunov equations of one closed loop from one Schur form that follows the loop's block triangular form.
+    """Both Lyapunov equations of one closed loop, from one Schur form that follows the loop's block triangular form.
 
-    The eigenvalues of the strongly connected blocks are computed block by block: a chain of identical followers is one
-    defective eigenvalue as a whole, which rounding would spread into the right half plane.
+    Eigenvalues are computed by strongly connected blocks: as a whole, a chain of identical followers is one defective
+    eigenvalue, which rounding would spread into the right half plane.
     """
 
     def __init__(self, A: FloatArray, blocks: list[NDArray[np.intp]]) -> None:
@@ -140,7 +140,7 @@ class Cost:
         L = equations.reached()
         gradient = 2.0 * (weights.R @ F + plant.B.T @ P) @ L @ plant.C.T
         cost = float(np.trace(P))
-        # a loop so near its limit of stability that rounding decides: covariances are not negative
+        # near the limit of stability rounding decides: a covariance cannot be negative
         if not (np.isfinite(cost) and np.trace(L) > 0.0 and np.diag(L).min() > -1e-9 * np.trace(L)):
             return None
         return CostPoint(K, cost, np.where(self.mask, gradient, 0.0), plant.C @ L @ plant.C.T)
@@ -148,7 +148,7 @@ class Cost:
     def scaled(self, point: CostPoint, gradient: FloatArray) -> FloatArray:
         """M⁻¹g with M the curvature of the cost at fixed P and L: 2 R_aa (C L C') on the free entries of every row a.
 
-        A step of −M⁻¹g is the one of Anderson and Moore; M makes the descent indifferent to units and to how fast the
+        A step of −M⁻¹g is that of Anderson and Moore; M makes the descent independent of units and of how fast the
         vehicles are.
         """
         direction = np.zeros_like(gradient)
@@ -163,7 +163,7 @@ class Cost:
 
 
 def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
-    """The optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P), of the algebraic Riccati equation.
+    """Return the optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P), of the algebraic Riccati equation.
 
     Raises
     ------

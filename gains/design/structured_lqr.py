@@ -2,9 +2,9 @@
 
 The cost J(K) of `gains.design.lqr` is minimised over the gains with the pattern.
 
-The gradient is exact and is projected on the pattern. J has no minimum outside the stabilising gains: it grows without
-bound towards their border, so a descent never leaves them. It need not be convex; what is found is a local minimum, and
-the centralised optimum, with all states for every input, says how much better any other could be.
+The gradient is exact and is projected on the pattern. J grows without bound towards the border of the stabilising
+gains, so a descent never leaves them. J need not be convex: what is found is a local minimum, and the centralised
+optimum, with all states for every input, bounds how much better any other could be.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5), which solves it by other means.
 """
@@ -22,7 +22,7 @@ from gains.formation.pattern import Pattern, Plant, check_fits
 
 # The decrement g'M⁻¹g / J estimates the share of the cost that is still to be gained. Costs are known to about 1e-13.
 _DECREMENT = 1e-13
-# a line search that fails above this has failed; below, rounding is what stopped it
+# above this a failed line search is an error; below, rounding has stopped it
 _DECREMENT_ACCEPTED = 1e-9
 _ITERATIONS = 2000
 _MEMORY = 20
@@ -30,10 +30,10 @@ _LINE_STEPS = 50
 _HOMOTOPY_ROUNDS = 200
 # share of the way to the border of stability that the homotopy keeps as distance
 _HOMOTOPY_DISTANCE = 0.1
-# random starts of the descent of the abscissa: of the patterns of three vehicles that a static gain stabilises, and the
+# random starts of the descent of the abscissa: of the patterns of three vehicles that a static gain stabilises but the
 # homotopy does not, the hardest takes 22
 _ABSCISSA_STARTS = 60
-# share of the norm of A: an abscissa above is rounding of a defective eigenvalue
+# share of the norm of A: a negative abscissa nearer to zero may be the rounding of a defective eigenvalue
 _CLEARLY_STABLE = 1e-4
 
 
@@ -97,11 +97,11 @@ def structured_lqr(plant: Plant, pattern: Pattern, weights: Weights) -> Structur
 
 
 def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatArray:
-    """A gain with the pattern that stabilises, found from K = 0 by a homotopy, or from random gains.
+    """Return a gain with the pattern that stabilises, found from K = 0 by a homotopy, or from random gains.
 
-    A − σI is stable for large σ. Its cost is lowered for a while; the gain then stabilises more than was asked for, and
-    σ is lowered nearly as far, until it is 0. Where that ends at a σ > 0, as in patterns in which vehicles steer each
-    other only, the real part of the rightmost eigenvalue is lowered itself, from seeded random gains.
+    A − σI is stable for large σ. A few descent steps on its cost give a gain that stabilises a smaller σ too; σ is then
+    lowered nearly as far, until it is 0. Where that ends at a σ > 0, as in patterns in which vehicles steer only each
+    other, the real part of the rightmost eigenvalue itself is lowered, from seeded random gains.
 
     Raises
     ------
@@ -149,10 +149,10 @@ def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatA
 
 
 def _gain_of_least_abscissa(plant: Plant, pattern: Pattern) -> tuple[FloatArray, float]:
-    """The first gain found that stabilises by more than rounding, or the best, and the real part (1/s) it leaves.
+    """The first gain that stabilises by more than rounding, or else the best, with the largest real part (1/s) left.
 
     Quasi-Newton descent of the abscissa, whose derivative for an eigenvalue with left and right vectors w, v is
-    Re w B dK C v / w v. It is not smooth where eigenvalues meet, and has many local minima: hence many starts.
+    Re w B dK C v / w v. It is not smooth where eigenvalues meet, and has many local minima, hence many starts.
     """
     from scipy import optimize
 

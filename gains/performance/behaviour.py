@@ -29,7 +29,7 @@ class BlockMargin:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How the loop behaves inside its margin: what α and the margin do not say.
+    """How the loop behaves inside its margin.
 
     Attributes
     ----------
@@ -128,5 +128,5 @@ def behaviour(gains: Gains, delay_s: float, *, own_delay_s: float | None = None)
 
 
 def _damping(root: complex) -> float:
-    """Damping ratio −Re s / |s|; 0 for a root at zero, which nothing brings back."""
+    """Damping ratio −Re s / |s|; 0 for a root at zero."""
     return -root.real / abs(root) if root else 0.0

@@ -18,8 +18,8 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError, SolverError
 from gains.formation.model import FormationModel
 
-# The level-set search stops when no frequency exceeds the largest gain found by this relative step; it is far above
-# the rounding of a 6×6 eigenvalue problem and far below what any figure shown to a user resolves.
+# The level-set search stops when no frequency exceeds the largest gain found by this share: far above the rounding of a
+# 6×6 eigenvalue problem, and far below what any figure shown to a user resolves.
 _LEVEL_STEP = 1e-10
 _LEVEL_ROUNDS = 60
 # With Clarabel's own 1e-8 and longest step the larger problems (axes = 2, bounds of 300) end "optimal_inaccurate" now
@@ -29,7 +29,7 @@ _CLARABEL = {"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-7, "max_st
 
 @dataclass(frozen=True)
 class SolverFacts:
-    """What the optimiser did: enough to repeat the run and to see that it ended as it should.
+    """What the solver did: enough to repeat the run and to see that it ended well.
 
     `variables` and `constraints` count the scalars of the problem as modelled.
     """
@@ -90,7 +90,7 @@ def robustness(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, W: ArrayLike | None 
 
     A quadratic Lyapunov function, with a full matrix, that proves the sector bound α exists if and only if
     α ‖W (sI − A_cl)^{-1}‖∞ < 1 (Kalman-Yakubovich-Popov). For W = I this is the complex stability radius of A_cl, the
-    least of σ_min(jωI − A_cl) over ω, which the SLICOT routine AB13FD computes also.
+    least of σ_min(jωI − A_cl) over ω, which the SLICOT routine AB13FD also computes.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def _checked_weight(W: ArrayLike | None, m: int) -> FloatArray:
 
 
 def negative(matrix: Any, slack: Any) -> Any:
-    """Constraint matrix ⪯ −slack; the mean with the transpose tells cvxpy what it cannot see: that it is symmetric."""
+    """Constraint matrix ⪯ −slack, averaged with the transpose, as cvxpy cannot see that it is symmetric."""
     return (matrix + matrix.T) / 2 + slack << 0
 
 

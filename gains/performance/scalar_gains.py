@@ -1,4 +1,4 @@
-"""One follower with gains that are numbers: its delay margin, growth of errors, robustness and decay, by formula.
+"""One follower with scalar gains: its delay margin, growth of errors, robustness and decay, by formula.
 
 The gains act on every axis alike, u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p, and all feedback is late. The delay margin
 depends on (k1, k3) alone and the gains of a given margin form a curve with an explicit equation (`gains_of_margin`).
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 
-# Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three of
-# those, and a parabola through the last, bring σ_min to about 1e-10 of itself.
+# Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three
+# closer looks, and a parabola through the last, give σ_min to about 1e-10 of itself.
 _FREQUENCIES, _FREQUENCIES_CLOSER, _CLOSER_LOOKS = 40, 9, 3
 
 
@@ -42,7 +42,7 @@ def gains_of_margin(share: FloatArray, delay_margin_s: FloatArray, period_s: flo
     feedback late, τ = atan(k1 ω / k3) / ω, ω² = (k1² + √(k1⁴ + 4 k3²)) / 2.
 
     Sampled loop with period T and zero-order hold: with τ = (l + f) T, 0 ≤ f < 1, the command computed from the sample
-    at t_k acts from t_k + τ. Over one period the velocity and spacing answer u with
+    at t_k acts from t_k + τ. Over one period velocity and spacing respond to u with
 
         G_v(z) = T z^{−l−1} (f + (1 − f) z) / (z − 1)
         G_p(z) = −(T G_v + T² z^{−l−1} (f − f²/2 + (1 − f)² z / 2)) / (z − 1)
@@ -221,7 +221,7 @@ def alpha_of(k1: FloatArray, k2: FloatArray, k3: FloatArray) -> FloatArray:
 
 
 def decay_rate_of(k1: FloatArray, k3: FloatArray) -> FloatArray:
-    """Return the decay rate (1/s) without delay of s² + k1 s + k3; that of the leader, s + k1, is no less.
+    """Return the decay rate (1/s) of s² + k1 s + k3, without delay; the leader, s + k1, decays no slower.
 
     Examples
     --------
