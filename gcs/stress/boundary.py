@@ -1,4 +1,4 @@
-"""The map of a campaign with two axes: where the formation breaks in flight, where predicted, and where it cannot."""
+"""The map of a campaign with two axes: where the formation breaks in flight, where by prediction, where it cannot."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ from gains.delay.several import boundary_of_two_delays, late_by_vehicle
 from gains.sampled.coupled_block import unlike_blocks
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
-from gcs.stress.axes import Axis, at_coordinates
+from gcs.stress.axes import Axis, at_coordinates, every_link
 from gcs.stress.figures import MEASURED, figure_of, saved
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, plan_loops
@@ -73,8 +73,8 @@ def map_figure(
 def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     """(k, 2) link delays and the jitter below which the formation is proved stable however the delay varies.
 
-    With jitter of at most j each way and periods T of telemetry and control, the age of the state behind the command
-    in action lies between d - 2 j and d + 2 j + 2 T. Two bounds cover it: one for deviations from the middle
+    With jitter of at most j each way and periods T of telemetry and control, the state behind the command in action is
+    between d - 2 j and d + 2 j + 2 T old. Two bounds cover that: one for deviations from the middle
     (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies), one for any variation between 0 and a
     maximum (`gains.varying.bounds.varying_delay_bound`). None for other axes, for unbounded jitter, and for the onboard
     loop, where not all feedback is late.
@@ -86,9 +86,8 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
         or scenario.control.loop != "ground"
     ):
         return None
-    links = at_coordinates(scenario, {"jitter": 1.0}).links
-    every = [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link)]
-    if any(link.jitter is None or link.jitter.distribution != "uniform" for link in every):
+    jittery = every_link(at_coordinates(scenario, {"jitter": 1.0}))
+    if any(link.jitter is None or link.jitter.distribution != "uniform" for link in jittery):
         return None
     period_s = study.plan.timing.held_s
     loops = [(loop.A, loop.B @ loop.K) for loop in unlike_blocks(plan_loops(study.plan))]

@@ -13,6 +13,7 @@ from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, plan_loops
 
 SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
+_RATES = "growth_1_s", "predicted_growth_1_s", "growth_error_1_s"
 _DPI = 130
 _WORST = 6
 
@@ -27,10 +28,8 @@ def growth_figure(
     probes = [o for o in outcomes if o.growth_1_s is not None and o.loop_delay_s is not None]
     if not probes:
         return None
-    delay_s = np.array([o.loop_delay_s for o in probes], dtype=float)
-    measured = np.array([o.growth_1_s for o in probes], dtype=float)
-    predicted = np.array([o.predicted_growth_1_s for o in probes], dtype=float)
-    error = np.array([o.growth_error_1_s for o in probes], dtype=float)
+    delay_s = _column(probes, "loop_delay_s")
+    measured, predicted, error = (_column(probes, name) for name in _RATES)
     figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
     room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 240)
@@ -71,17 +70,18 @@ def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path 
     figure, (plot,) = figure_of(1, (9.0, 4.2))
     at = [o.coordinates[axis.name] for o in probes]
     plot.axhline(0.0, color=LIMIT, linewidth=0.8)
-    plot.plot(at, [o.predicted_growth_1_s for o in probes], "_", color=SAMPLED, markersize=14, label="sampled model")
-    plot.errorbar(
-        at,
-        [o.growth_1_s for o in probes],
-        yerr=[o.growth_error_1_s for o in probes],
-        fmt="o", color=MEASURED, markersize=4.0, capsize=2.0, label="flights",
-    )  # fmt: skip
+    measured, predicted, error = (_column(probes, name) for name in _RATES)
+    plot.plot(at, predicted, "_", color=SAMPLED, markersize=14, label="sampled model")
+    plot.errorbar(at, measured, yerr=error, fmt="o", color=MEASURED, markersize=4.0, capsize=2.0, label="flights")
     plot.set_xlabel(axis.label)
     plot.set_ylabel("growth rate of errors [1/s]")
     plot.legend(frameon=False)
     return saved(figure, file)
+
+
+def _column(outcomes: Sequence[Outcome], name: str) -> FloatArray:
+    """A field of outcomes; NaN for None."""
+    return np.array([getattr(outcome, name) for outcome in outcomes], dtype=float)
 
 
 def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:

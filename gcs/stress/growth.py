@@ -1,13 +1,13 @@
 """How fast the errors of a flight grow or decay, with the uncertainty of that rate.
 
-"Did it diverge within 60 s" is a poor test of a delay margin: near the margin, errors change so slowly that the answer
-is left to chance. Here the modes z_k of the flown loop are fitted to the tick record, y[n] = sum_k a_k z_k^n in every
-channel, and the growth rate is ln|z| / T of the slowest one; its zero is the margin.
+"Did it diverge within 60 s" is a poor test of a delay margin: near the margin errors change so slowly that chance
+decides. Here the modes z_k of the flown loop are fitted to the tick record, y[n] = sum_k a_k z_k^n in every channel.
+The growth rate is ln|z| / T of the slowest mode, and the delay margin is where it is zero.
 
 Method: ESPRIT (Roy and Kailath, "ESPRIT - estimation of signal parameters via rotational invariance techniques",
-IEEE Trans. ASSP 37(7), 1989) on Hankel matrices of all channels side by side, which share their modes. It runs twice:
-the second time on y[n] e^{-g n T} with g from the first, so that the start and the end of a motion that changes by
-orders of magnitude have equal weight.
+IEEE Trans. ASSP 37(7), 1989) on Hankel matrices of all channels side by side, which share their modes. It runs twice,
+the second time on y[n] e^{-g n T} with g from the first, so that start and end have equal weight in a motion that
+changes by orders of magnitude.
 """
 
 from collections.abc import Sequence
@@ -20,10 +20,10 @@ from gcs.control.tick import TickArray
 
 DECAY_KEPT = 0.02
 """A motion is followed until it has shrunk to this share of its largest value. Rounding of the telemetry, which the
-loop feeds back and amplifies, lies well below that, in real time too."""
+loop feeds back and amplifies, is well below that, in real time too."""
 FEWEST_SAMPLES = 12
 _MOST_SAMPLES = 300
-"""More samples are thinned out: accuracy comes from the length of the window, cost from the number of samples."""
+"""Longer motions are thinned out: accuracy comes from the length of the window, cost from the number of samples."""
 _ENVELOPE_S = 1.0
 _FEWEST_ENVELOPE = 4
 _FEWEST_SIGNS = 3
@@ -132,8 +132,8 @@ def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: 
 def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Growth | None:
     """The growth rate of a motion under varying delays: the slope of the logarithm of its norm over all channels.
 
-    Such a motion has a mean rate but no modes; a fit would find spurious ones. The window is that of `fit_growth`, and
-    the standard error half the difference between its halves. The frequency follows from the changes of sign.
+    Such a motion has a mean rate but no modes; a fit would find spurious ones. The window is that of `fit_growth`, the
+    standard error half the difference between its halves, and the frequency that of the changes of sign.
     """
     time_s, values = _window(motion, start_s, end_s)
     scale = np.sqrt((values**2).mean(axis=0)) if len(values) else np.zeros(0)
@@ -148,7 +148,7 @@ def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Gro
 def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Growth | None:
     """The growth rate of a whole formation's errors, from their size at every `period_s`: slope of ln(envelope).
 
-    For flights without a free response to fit: random links push the vehicles all the time, and many vehicles have
+    For flights without a free response to fit, where random links push the vehicles all the time or many vehicles have
     large errors at once. The envelope is the largest size within a second; it is followed until it has shrunk to
     `DECAY_KEPT`, where noise may sustain it.
     """
@@ -166,7 +166,9 @@ def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Gro
 
 def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
     """The slope of a logarithm over time, with half the difference between its halves as the error."""
-    slopes = [float(np.polyfit(t, y, 1)[0]) for t, y in _whole_and_halves(time_s, level)]
+    half = time_s.size // 2
+    parts = slice(None), slice(half), slice(half, None)
+    slopes = [float(np.polyfit(time_s[part], level[part], 1)[0]) for part in parts]
     return Growth(
         growth_1_s=slopes[0],
         error_1_s=abs(slopes[1] - slopes[2]) / 2.0,
@@ -187,11 +189,6 @@ def _frequency(time_s: FloatArray, values: FloatArray) -> float | None:
         if crossed_s.size >= _FEWEST_SIGNS:
             found.append(np.pi * (crossed_s.size - 1) / float(np.ptp(crossed_s)))
     return float(np.median(found)) if found else None
-
-
-def _whole_and_halves(time_s: FloatArray, level: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    half = time_s.size // 2
-    return [(time_s, level), (time_s[:half], level[:half]), (time_s[half:], level[half:])]
 
 
 def _window(motion: Motion, start_s: float, end_s: float) -> tuple[FloatArray, FloatArray]:
