@@ -33,12 +33,12 @@ from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growt
 from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_loops, plan_of, with_summary
 
 AMPLITUDES = (1.0, 0.03, 0.001)
-"""Initial errors of a probe in m (m/s for the leader); the next is used if growth leaves the linear range too soon."""
+"""Initial errors of a probe in m (m/s for the leader); the next is flown if errors leave the linear range too soon."""
 _PILOT_S, _PILOT_PERIODS = 1.0, 6.0
 _SETTLED_LOOP_DELAYS = 4.0
 """After this many loop delays, modes other than the slowest are gone, or small enough to be fitted with it."""
 _FLYING_LOOP_DELAYS = 1.0
-"""Until then the station uses states of vehicles on the launcher; enough where no feedback is late."""
+"""Until then the station uses states of vehicles on the launcher; enough to wait where no feedback is late."""
 _BEGUN_LOOP_DELAYS = 2.0
 """After this many loop delays, no command depends on what a vehicle did at the start any more."""
 _CALM_SHARE = 0.8
@@ -46,7 +46,7 @@ _CALM_SHARE = 0.8
 _WANTED_LOOP_DELAYS = 8.0
 _WANTED_SAMPLES = 60
 _WANTED_ERROR = 0.01
-"""Wanted standard error as a share of the growth rate: in loops of several vehicles, other modes decay slowly."""
+"""Wanted standard error as a share of the growth rate: in loops of several vehicles the other modes decay slowly."""
 
 
 def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
@@ -75,7 +75,7 @@ def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
 
 
 def _needs_pair(trial: Trial) -> bool:
-    """Whether the free response of one loop takes two flights. Not in real time, where no two have the same delays."""
+    """Whether the free response of a loop takes two flights; never in real time, where no two have the same delays."""
     links = {trial.scenario.link_of(vehicle.system_id) for vehicle in trial.scenario.vehicles}
     coupled = any(len(loop.system_ids) > 1 for loop in plan_loops(plan_of(trial)))
     return not trial.real_time and (not has_constant_links(trial.scenario) or (coupled and len(links) > 1))
@@ -169,7 +169,7 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
     """The loop to be probed, the loop it stands for, and how long the latter's telemetry waits for the control tick.
 
     The loop that breaks first may be far down the tree, where vehicles ahead would drive it. So the equal loop nearest
-    to the leader is probed in its place, with its links and its waiting.
+    to the leader is probed instead, with the links and the waiting of the former.
     """
     loops = plan_loops(plan)
     if probe == CRITICAL:

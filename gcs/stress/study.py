@@ -19,7 +19,7 @@ _FLIGHTS_A_ROUND = 5
 _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 """Link delays flown where no delay is predicted to break the formation."""
 _FIRST_WIDTH, _FINEST_WIDTH = 3.0, 0.1
-"""Half widths of the first and of the finest round of an onset search, in tolerances."""
+"""Half widths of the first and the finest round of an onset search, in tolerances."""
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 
@@ -107,7 +107,7 @@ class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a f
 def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
     """Fly probes around the predicted onset, ever closer, until the zero of their growth rates is located.
 
-    A round is a few flights at once, spread evenly over three tolerances to either side, then over one, and over a
+    A round is a few flights at once, spread evenly over three tolerances to either side, then over one, then over a
     fraction of one if no smooth curve fits the flights. The search follows the measured growth; the prediction only
     says where to start.
 

@@ -47,8 +47,8 @@ class Route:
     alpha
         1 / ‖(sI − A − BK)^{-1}‖∞ of the whole formation.
     string_peak
-        Largest growth of a spacing error from one follower to the one behind it, over all frequencies, for a
-        disturbance of the leader, without delay.
+        Largest growth of a spacing error from one follower to the one behind it, over all frequencies, when the leader
+        is disturbed, without delay.
     links, numbers_used
         Pairs of vehicles in which one uses the other's errors, and the number of errors used in all.
     """
@@ -137,7 +137,7 @@ def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
         error = np.stack([own["spacing_error_north_m"], own["spacing_error_east_m"]], axis=1)
         error = error[np.isfinite(error).all(axis=1)]
         first = float(np.linalg.norm(error[0])) if len(error) else 0.0
-        if first > 0.1:  # smaller ones are noise of the start
+        if first > 0.1:  # smaller ones are noise at the start
             shares.append(max(0.0, float(-(error @ error[0]).min()) / first**2))
     return max(shares, default=None)
 

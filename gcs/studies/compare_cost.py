@@ -1,4 +1,4 @@
-"""The cost of a design as the formation grows: time and free gains, for all routes and for centralised designs."""
+"""The cost of a design as the formation grows: its time and free gains, for all routes and for centralised designs."""
 
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from collections.abc import Callable
@@ -20,7 +20,7 @@ RATIO = "times inclusion of 5"
 _REFERENCE = ("inclusion", 5)
 _SIZES = (3, 5, 10, 20, 40, 80, 200)
 _LONGEST_S = 10.0
-"""A method is not tried on more vehicles if, growing with the cube of their number, it would take longer."""
+"""A method is not tried on a size for which it would take longer, if time grows with the cube of the vehicles."""
 _DK_STATES = LARGEST_STATES // 2
 _REPEATED_BELOW_S = 1.0
 _REPEATS = 5

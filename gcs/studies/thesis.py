@@ -45,7 +45,7 @@ PAGE_FILE = "thesis.md"
 
 @dataclass(frozen=True)
 class Claim:
-    """One number or statement: its place, what is printed, what is computed, and a second, independent way."""
+    """One number or statement: its place, what is printed, what is computed, and a second, independent way to it."""
 
     place: str
     subject: str
@@ -71,7 +71,7 @@ def claims() -> list[Claim]:
 
 
 def late_neighbours(K: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatArray]:
-    """(A0, A1) of (5.2): own errors are fed back at once, those of others late."""
+    """(A0, A1) of (5.2): a vehicle feeds back its own errors at once, those of others late."""
     own, others = split_own(pattern, K)
     return CHAIN.A + CHAIN.B @ own, CHAIN.B @ others
 
