@@ -101,17 +101,14 @@ def graph_design(
 ) -> GraphDesign:
     """Return the gain with the pattern that meets the requirement and is best in what it leaves open.
 
+    Arguments are those of `gains.design.design.design`, with these differences:
+
     Parameters
     ----------
-    formation, pattern
-        The pattern is one of the formation with one axis or with all of them; D-K takes at most 40 states an axis.
+    pattern
+        One of the formation with one axis or with all of them; D-K takes at most 40 states an axis.
     requirement
-        As in `gains.design.design.design`; its `string_peak_max` is not used, as errors run both ways in a general
-        pattern.
-    method
-        Where the base gain comes from.
-    period_s
-        Period of the control loop: sample, hold.
+        Its `string_peak_max` is not used, as errors run both ways in a general pattern.
     onboard
         Timing of the onboard loop, if that is flown: the requirement then bounds its margin, and that of the vehicles'
         own gains (`gains.design.time_scale`). The margins reported are those of the ground loop in any case.

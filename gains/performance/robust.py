@@ -201,7 +201,7 @@ def certify(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, alpha: float, W: ArrayL
     solver = solved(problem, advice=f"alpha = {alpha} may be too near its limit; try one smaller by 1e-4 of itself")
     if float(np.asarray(t.value)) <= 0:
         raise InfeasibleError(f"no quadratic Lyapunov function proves alpha = {alpha:.6g} for these gains; lower alpha")
-    return checked_certificate(A, W_, alpha, alpha * np.asarray(P.value, dtype=float), solver)
+    return _checked_certificate(A, W_, alpha, alpha * np.asarray(P.value, dtype=float), solver)
 
 
 def _checked_weight(W: ArrayLike | None, m: int) -> FloatArray:
@@ -248,7 +248,7 @@ def solved(problem: Any, *, advice: str) -> SolverFacts:
     )
 
 
-def checked_certificate(A: FloatArray, W: FloatArray, alpha: float, P: FloatArray, solver: SolverFacts) -> Certificate:
+def _checked_certificate(A: FloatArray, W: FloatArray, alpha: float, P: FloatArray, solver: SolverFacts) -> Certificate:
     """Check P ≻ 0 and the S-procedure matrix ≺ 0 by numpy's eigenvalues alone, with room for their rounding."""
     P_ = (P + P.T) / 2
     s_procedure = np.block([[A.T @ P_ + P_ @ A + alpha**2 * W.T @ W, P_], [P_, -np.eye(A.shape[0])]])

@@ -126,10 +126,7 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     calm = fly_calm(base, _folder_of(folder, 0.0))
     delays_s = effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
     loops = plan_loops(base)
-    if trial.probe == CRITICAL:
-        probed = critical_block(loops, delays_s)
-    else:
-        probed = next(loop for loop in loops if trial.probe in loop.system_ids)
+    probed = _loop_of(loops, delays_s, trial.probe)
     _, link_s, waiting_s = _slowest(base, probed, delays_s)
     outcome = replace(
         outcome,
@@ -172,13 +169,17 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
     to the leader is probed instead, with the links and the waiting of the former.
     """
     loops = plan_loops(plan)
-    if probe == CRITICAL:
-        critical = critical_block(loops, loop_delay_s)
-        probed = next(loop for loop in loops if loop.same_as(critical))
-    else:
-        probed = critical = next(loop for loop in loops if probe in loop.system_ids)
+    critical = _loop_of(loops, loop_delay_s, probe)
+    probed = next(loop for loop in loops if loop.same_as(critical)) if probe == CRITICAL else critical
     _, _, waiting_s = _slowest(plan, critical, loop_delay_s)
     return probed, critical, waiting_s % critical.timing.step_s
+
+
+def _loop_of(loops: list[CoupledBlock], loop_delay_s: dict[int, float], probe: int) -> CoupledBlock:
+    """The loop of a vehicle, or the one that is predicted to break first."""
+    if probe == CRITICAL:
+        return critical_block(loops, loop_delay_s)
+    return next(loop for loop in loops if probe in loop.system_ids)
 
 
 def _slowest(plan: FlightPlan, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> tuple[float, float, float]:

@@ -31,7 +31,6 @@ INTERNAL_FUNCTIONS = {
     "gains.formation.pattern.checked_pattern_gain",
     "gains.margin.opinions.margin_error_s",
     "gains.margin.opinions.second_opinions",
-    "gains.performance.robust.checked_certificate",
     "gains.performance.robust.negative",
     "gains.performance.robust.solved",
     "gains.sampled.constant.checked_loop",

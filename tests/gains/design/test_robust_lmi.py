@@ -23,23 +23,22 @@ def test_lmi_reaches_its_supremum_as_the_bounds_get_loose(shear: float, supremum
     assert alphas[-1] == pytest.approx(abs(shear) / np.hypot(1, shear), abs=5e-6)
 
 
-def test_lmi_certificate_holds_in_the_original_coordinates() -> None:
-    """Recomputed here from the gains and P alone: V' < 0 for every w with w'w ≤ α² E'E, tried on its worst w."""
-    gains = robust_lmi(shear=-2.0, gain_bound=10.0, lyapunov_bound=10.0)
-    A, P = subsystem_loop(gains.k1, gains.k2, gains.k3), gains.certificate.P
-    assert np.linalg.eigvalsh(P).min() > 0
-    rng = np.random.default_rng(1)
-    for E in rng.normal(size=(200, 3)):
-        gradient = 2 * P @ E
-        worst = gains.alpha * np.linalg.norm(E) * gradient / np.linalg.norm(gradient)
-        assert gradient @ (A @ E + worst) < 0
+def test_lmi_gains_have_the_pattern_of_the_source_with_the_same_k1_twice() -> None:
+    found = robust_lmi(shear=-2.0, gain_bound=10.0, lyapunov_bound=10.0)
+    (own, none, nothing), (front, spacing, own_again) = found.K.tolist()
+    assert (none, nothing) == pytest.approx((0.0, 0.0), abs=1e-12)
+    assert own == pytest.approx(own_again, rel=1e-12)
+    # of both vehicles as one formation, and of the subsystem that the source writes
+    pair = FormationModel((-1, 0), axes=1)
+    assert pytest.approx(subsystem_loop(own, front, spacing), abs=1e-9) == pair.A + pair.B @ found.K
 
 
 def test_lmi_alpha_is_a_lower_bound_of_the_exact_one() -> None:
     """The full Lyapunov matrix of `robustness` can prove at least what a block-diagonal one in some coordinates can."""
     for shear in (-0.3, -1.0, -2.0):
         gains = robust_lmi(shear=shear, gain_bound=10.0, lyapunov_bound=10.0)
-        assert robustness(gains.k1, gains.k2, gains.k3) > gains.alpha
+        (_, _, _), (front, spacing, own) = gains.K.tolist()
+        assert robustness(own, front, spacing) > gains.alpha
 
 
 def test_bounds_too_tight_end_in_a_solver_error_that_names_them() -> None:
