@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError, SolverError
-from gains.core.requirement import ALPHA_MIN, Requirement, plain
+from gains.core.requirement import ALPHA_MIN, PeakLimit, Requirement, plain
 from gains.delay.constant import delay_margin
 from gains.design.graph import GraphDesign, GraphMethod, assess, graph_design
 from gains.design.required import required_gains
@@ -135,8 +135,8 @@ def design(
     Parameters
     ----------
     formation
-        A leader and any number of followers. The gains of a leader alone are those for followers too, but its margin is
-        that of its own velocity loop.
+        A leader and any number of followers. A leader alone gets the same gains, with the margin of its own velocity
+        loop.
     requirement
         A sampled delay margin of 0.3 s if not given.
     period_s
@@ -174,18 +174,14 @@ def design(
     _check_period(period_s)
     gains = required_gains(wanted, period_s)
     identity = np.eye(formation.axes)
-    result = _assess(
-        formation,
-        (0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity),
-        period_s=period_s,
-        requirement=wanted,
-        method="inclusion",
-    )
-    short_of_margin = wanted.delay_margin_s is not None and result.delay_margin_s < wanted.delay_margin_s
-    short_of_alpha = wanted.alpha is not None and result.alpha < wanted.alpha
+    matrices = 0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity
+    result = _assess(formation, matrices, period_s=period_s, requirement=wanted)
     decay = result.behaviour.decay_rate_1_s
-    short_of_decay = decay < (1.0 - _DECAY_ROUNDING) * (wanted.decay_rate_1_s or 0.0)
-    if short_of_margin or short_of_alpha or short_of_decay:
+    if (
+        result.delay_margin_s < (wanted.delay_margin_s or 0.0)
+        or result.alpha < (wanted.alpha or 0.0)
+        or decay < (1.0 - _DECAY_ROUNDING) * (wanted.decay_rate_1_s or 0.0)
+    ):
         raise DisagreementError(
             f"the search found gains for {wanted}, but the exact analysis gives them delay_margin_s = "
             f"{result.delay_margin_s!r}, alpha = {result.alpha!r} and decay_rate_1_s = {decay!r}"
@@ -241,18 +237,11 @@ def evaluate_gains(
     own, front, spacing = (
         checked_gain(name, gain, formation.axes) for name, gain in zip(("K1", "K2", "K3"), gains, strict=True)
     )
-    return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None, method="given")
+    return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None)
 
 
-def _assess(
-    formation: FormationModel,
-    gains: Gains,
-    *,
-    period_s: float,
-    requirement: Requirement | None,
-    method: Literal["inclusion", "given"],
-) -> Design:
-    """Everything that is reported of the gains, by the exact methods, on the whole formation."""
+def _assess(formation: FormationModel, gains: Gains, *, period_s: float, requirement: Requirement | None) -> Design:
+    """Everything that is reported of gains, given or designed to a requirement, for the whole formation."""
     # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
     from gains.formation.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
 
@@ -282,14 +271,10 @@ def _assess(
         leader=leader,
         follower=follower,
         behaviour=behaviour(gains, (margin_s + period_s) / 2),
-        certificate=_certificate(gains, alpha, given=method == "given"),
+        certificate=_certificate(gains, alpha, given=requirement is None),
         requirement=requirement,
-        trade_off=trade_off(
-            period_s=period_s,
-            string_peak_max=requirement.string_peak_max if requirement else None,
-            loop=requirement.loop if requirement else "ground",
-        ),
-        method=method,
+        trade_off=_trade_off(period_s, requirement.peak_limit if requirement else None),
+        method="inclusion" if requirement else "given",
     )
 
 
@@ -330,7 +315,10 @@ def trade_off(
     (0.05, 1.0, True)
     """
     _check_period(period_s)
-    limit = Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit
+    return _trade_off(period_s, Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit)
+
+
+def _trade_off(period_s: float, limit: PeakLimit) -> tuple[TradeOffPoint, ...]:
     points = ((margin_s, largest_alpha(margin_s, period_s, limit)) for margin_s in _TRADE_OFF_MARGINS_S)
     return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)
 
