@@ -34,10 +34,10 @@ from gcs.studies.thesis_flights import (
     SINGLE,
     SPEED_M_S,
     flown,
+    fly_with_late_neighbours,
     nonlinear_response,
     printed_gains,
 )
-from gcs.studies.thesis_nonlinear import fly_with_late_neighbours
 from gcs.views.page import rendered
 
 PAGE_FILE = "thesis.md"
