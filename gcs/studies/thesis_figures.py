@@ -43,14 +43,11 @@ def _snapshots(plot: Any, ticks: TickArray, until_s: float) -> None:
 
 def _distances(plot: Any, ticks: TickArray, until_s: float) -> None:
     within = ticks[(ticks["time_s"] >= 0.0) & (ticks["time_s"] <= until_s)]
-    place = {
-        k: np.stack([own["north_m"], own["east_m"]], axis=1)
-        for k in (1, 2, 3)
-        for own in [within[within["system_id"] == k]]
-    }
-    time_s = within["time_s"][within["system_id"] == 1]
+    own = {k: within[within["system_id"] == k] for k in (1, 2, 3)}
+    time_s = own[1]["time_s"]
     for one, other, colour in ((1, 2, _COLOURS[0]), (2, 3, _COLOURS[1])):
-        distance = np.linalg.norm(place[one] - place[other], axis=1) / _FT
+        apart = (own[one][name] - own[other][name] for name in ("north_m", "east_m"))
+        distance = np.hypot(*apart) / _FT
         plot.plot(time_s, distance, color=colour, linewidth=1.3, label=f"V{one}-V{other}")
     plot.set_xlabel("time [s]")
 
