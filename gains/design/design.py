@@ -1,12 +1,11 @@
 """Overlapping gains for a formation, with the delay they take and the disturbance they withstand.
 
 `design` finds gains of largest robustness α with a wanted delay margin, or of largest delay margin with a wanted α;
-`evaluate_gains` says the same of gains that are given. Both check their result with the functions of
-`gains.delay.constant`, `gains.sampled.constant`, `gains.performance.robust` and `gains.formation.inclusion` on the
-whole formation.
+`evaluate_gains` reports the same figures of given gains. Both check their result on the whole formation, with methods
+that share no formula with the search.
 
-The margin that is asked for is that of the loop really flown: `sampled`, with period and zero-order hold, and `ground`,
-with all feedback late. It is about half a period less than the continuous one. Both are reported.
+The margin asked for is that of the loop as flown: `sampled`, with period and zero-order hold, and `ground`, with all
+feedback late. It is about half a period less than the continuous one. Both are reported.
 
 Source: Sahoo 2012 (see `gains.formation.model`), sections 3 and 5.
 """
@@ -19,30 +18,29 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError, SolverError
-from gains.core.requirement import ALPHA_MIN, Requirement, plain
+from gains.core.requirement import ALPHA_MIN, PeakLimit, Requirement, plain
 from gains.delay.constant import delay_margin
-from gains.design.graph import GraphDesign, GraphMethod, graph_design
+from gains.design.graph import GraphDesign, GraphMethod, assess, graph_design
 from gains.design.required import required_gains
 from gains.design.search import largest_alpha
 from gains.formation.model import FormationModel, checked_gain
-from gains.formation.pattern import Pattern, leader_follower
+from gains.formation.pattern import Pattern, checked_pattern_gain, leader_follower
 from gains.performance.behaviour import (
     Behaviour,
     BlockMargin,
-    Gains,
     behaviour,
     block_margin,
-    follower_block,
-    leader_block,
+    diagonal_blocks,
 )
 from gains.performance.robust import Certificate, certify, robustness
+from gains.performance.string_stability import Gains
 from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming
 
 PATTERN = "u_leader = K1 e_leader^v;  u_i = K1 e_i^v + K2 e_predecessor^v + K3 e_i^p"
-# The certificate proves this share of α: at α itself the proof is on the edge of existence.
+# The certificate proves this share of α: at α itself a proof only just exists.
 _CERTIFIED_SHARE = 1 - 1e-4
-# A decay rate that is asked for is met to this share of itself: a double root is known to the root of the rounding.
+# A wanted decay rate is met to this share of itself: a double root is known to the square root of rounding.
 _DECAY_ROUNDING = 1e-6
 _TRADE_OFF_MARGINS_S = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 
@@ -132,13 +130,13 @@ def design(
     pattern: Pattern | None = None,
     onboard: OnboardTiming | None = None,
 ) -> Design | GraphDesign:
-    """Return the gains that meet the requirement and are the best in what it leaves open.
+    """Return the gains that meet the requirement and are best in what it leaves open.
 
     Parameters
     ----------
     formation
-        A leader and any number of followers. The gains of a leader alone are those for followers too, but its margin is
-        that of its own velocity loop.
+        A leader and any number of followers. A leader alone gets the same gains, with the margin of its own velocity
+        loop.
     requirement
         A sampled delay margin of 0.3 s if not given.
     period_s
@@ -176,18 +174,14 @@ def design(
     _check_period(period_s)
     gains = required_gains(wanted, period_s)
     identity = np.eye(formation.axes)
-    result = _assess(
-        formation,
-        (0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity),
-        period_s=period_s,
-        requirement=wanted,
-        method="inclusion",
-    )
-    short_of_margin = wanted.delay_margin_s is not None and result.delay_margin_s < wanted.delay_margin_s
-    short_of_alpha = wanted.alpha is not None and result.alpha < wanted.alpha
+    matrices = 0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity
+    result = _assess(formation, matrices, period_s=period_s, requirement=wanted)
     decay = result.behaviour.decay_rate_1_s
-    short_of_decay = decay < (1.0 - _DECAY_ROUNDING) * (wanted.decay_rate_1_s or 0.0)
-    if short_of_margin or short_of_alpha or short_of_decay:
+    if (
+        result.delay_margin_s < (wanted.delay_margin_s or 0.0)
+        or result.alpha < (wanted.alpha or 0.0)
+        or decay < (1.0 - _DECAY_ROUNDING) * (wanted.decay_rate_1_s or 0.0)
+    ):
         raise DisagreementError(
             f"the search found gains for {wanted}, but the exact analysis gives them delay_margin_s = "
             f"{result.delay_margin_s!r}, alpha = {result.alpha!r} and decay_rate_1_s = {decay!r}"
@@ -195,17 +189,38 @@ def design(
     return result
 
 
+@overload
 def evaluate_gains(
-    formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, *, period_s: float
-) -> Design:
-    """Return margins, α and behaviour of given gains, each of shape (axes, axes).
+    formation: FormationModel, gains: tuple[ArrayLike, ArrayLike, ArrayLike], *, period_s: float
+) -> Design: ...
 
-    Gains of an unstable loop are reported too: α and the continuous margin are 0 and there is no certificate.
+
+@overload
+def evaluate_gains(
+    formation: FormationModel, gains: ArrayLike, *, period_s: float, pattern: Pattern
+) -> GraphDesign: ...
+
+
+def evaluate_gains(
+    formation: FormationModel, gains: Any, *, period_s: float, pattern: Pattern | None = None
+) -> Design | GraphDesign:
+    """Return margins, robustness and decay of given gains.
+
+    Gains of an unstable loop are reported too: α and the margins are 0 and there is no certificate.
+
+    Parameters
+    ----------
+    gains
+        K1, K2 and K3, each of shape (axes, axes); with a pattern, K of u = K e, shape (inputs, states).
+    period_s
+        Period of the control loop: sample, hold.
+    pattern
+        Who may use whose output.
 
     Raises
     ------
     BadModelError
-        If a gain is not finite or not of that shape, or the period is not positive.
+        If a gain is not finite, not of its shape or not in the pattern, or the period is not positive.
 
     Examples
     --------
@@ -213,26 +228,20 @@ def evaluate_gains(
 
     >>> from gains.design.design import evaluate_gains
     >>> from gains.formation.model import FormationModel
-    >>> found = evaluate_gains(FormationModel((-1, 0), axes=1), [[-1]], [[0]], [[1]], period_s=0.02)
+    >>> found = evaluate_gains(FormationModel((-1, 0), axes=1), ([[-1]], [[0]], [[1]]), period_s=0.02)
     >>> round(found.delay_margin_continuous_s, 6), round(found.delay_margin_s, 3)
     (0.711119, 0.701)
     """
-    _check_period(period_s)
+    if pattern is not None:
+        return assess(formation, pattern, checked_pattern_gain(pattern, gains), period_s=period_s)
     own, front, spacing = (
-        checked_gain(name, gain, formation.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
+        checked_gain(name, gain, formation.axes) for name, gain in zip(("K1", "K2", "K3"), gains, strict=True)
     )
-    return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None, method="given")
+    return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None)
 
 
-def _assess(
-    formation: FormationModel,
-    gains: Gains,
-    *,
-    period_s: float,
-    requirement: Requirement | None,
-    method: Literal["inclusion", "given"],
-) -> Design:
-    """Everything that is reported of the gains, by the exact methods and on the whole formation."""
+def _assess(formation: FormationModel, gains: Gains, *, period_s: float, requirement: Requirement | None) -> Design:
+    """Everything that is reported of gains, given or designed to a requirement, for the whole formation."""
     # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
     from gains.formation.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
 
@@ -243,7 +252,7 @@ def _assess(
     alpha = robustness(*gains)
     margin_s = float(sampled_delay_margin(A, B, K, period_s=period_s))
     continuous_s = delay_margin(A, B @ K)
-    leader, follower = block_margin(*leader_block(gains)), block_margin(*follower_block(gains))
+    leader, follower = (block_margin(*block) for block in diagonal_blocks(gains))
     blocks_s = [leader.delay_margin_s, follower.delay_margin_s][: formation.vehicles]
     if not np.isclose(continuous_s, min(blocks_s), rtol=1e-9, atol=0):
         raise DisagreementError(
@@ -262,19 +271,15 @@ def _assess(
         leader=leader,
         follower=follower,
         behaviour=behaviour(gains, (margin_s + period_s) / 2),
-        certificate=_certificate(gains, alpha, given=method == "given"),
+        certificate=_certificate(gains, alpha, given=requirement is None),
         requirement=requirement,
-        trade_off=trade_off(
-            period_s=period_s,
-            string_peak_max=requirement.string_peak_max if requirement else None,
-            loop=requirement.loop if requirement else "ground",
-        ),
-        method=method,
+        trade_off=_trade_off(period_s, requirement.peak_limit if requirement else None),
+        method="inclusion" if requirement else "given",
     )
 
 
 def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | None:
-    """The proof of α. Given gains, however badly scaled, are assessed without one where the solver finds none."""
+    """The proof of α. Given gains, which may be badly scaled, do without one where the solver finds none."""
     if alpha < ALPHA_MIN:
         return None
     try:
@@ -288,7 +293,7 @@ def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | No
 def trade_off(
     *, period_s: float, string_peak_max: float | None = None, loop: Literal["ground", "onboard"] = "ground"
 ) -> tuple[TradeOffPoint, ...]:
-    """Return the largest α at sampled delay margins from 0.05 to 1 s; margins no gains have are left out.
+    """Return the largest α at sampled delay margins from 0.05 to 1 s, without those that no gains have.
 
     Parameters
     ----------
@@ -310,7 +315,10 @@ def trade_off(
     (0.05, 1.0, True)
     """
     _check_period(period_s)
-    limit = Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit
+    return _trade_off(period_s, Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit)
+
+
+def _trade_off(period_s: float, limit: PeakLimit) -> tuple[TradeOffPoint, ...]:
     points = ((margin_s, largest_alpha(margin_s, period_s, limit)) for margin_s in _TRADE_OFF_MARGINS_S)
     return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)
 

@@ -6,16 +6,16 @@ For x' = A x + B u, y = C x, u = K y find K with the pattern and a small α with
 
 so that every motion of the loop decays at least like e^{αt/2}. With K fixed (1) is linear in P, with P fixed in K and
 α; each step can only lower α. The start is K = 0 and the α of P = I. P is not block diagonal: the pattern is imposed on
-K alone, and P is perturbed by ε 11' before every gain step, because where P decouples states from inputs no gain helps.
+K alone. P is perturbed by ε 11' before every gain step, because no gain helps where P decouples states from inputs.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4.4. It prints "… + αI ⪯ 0, minimise α", which is unbounded
-below; with αP and P normalised, "stop when α < 0" is the test of stability that is meant. Its bound of ‖K‖, 0.1 < k̄ <
-100 in [[k̄, K], [K', I]] ≻ 0, allows ‖K‖ < 10 only, less than the gains it prints; here k̄ bounds ‖K‖ itself. Its fixed
-ε = 0.1 can raise α; here ε is halved until it does not.
+below; with αP and P normalised, its stop at α < 0 is the test of stability that is meant. Its bound
+[[k̄, K], [K', I]] ≻ 0 with 0.1 < k̄ < 100 allows ‖K‖ < 10 only, less than the gains it prints; here k̄ bounds ‖K‖ itself.
+Its fixed ε = 0.1 can raise α; here ε is halved until it does not.
 """
 
-import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,33 +26,30 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError, InfeasibleError, SolverError
 from gains.core.structure import strongly_connected_blocks
 from gains.formation.pattern import Pattern, Plant, check_fits
-from gains.performance.robust import SolverFacts
+from gains.performance.robust import SolverFacts, solved
 
 # At 40 states an iteration takes the solver seconds, at 60 a minute. A formation needs its states along one axis only.
 LARGEST_STATES = 40
-DEFAULT_GAIN_BOUND = 20.0
-DEFAULT_LYAPUNOV_BOUND = 100.0
-DEFAULT_PERTURBATION = 0.1
+# k̄, κ and the first ε
+_GAIN_BOUND, _LYAPUNOV_BOUND, _PERTURBATION = 20.0, 100.0, 0.1
+_ADVICE = "scale states and inputs to like size, or add links"
 _ITERATIONS = 200
 _HALVINGS = 12
 # the iteration has settled when α falls by less than this share of its scale in each of some iterations in a row
 _SETTLED, _SETTLED_IN_A_ROW = 1e-3, 3
-_CLARABEL = {"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-7, "max_step_fraction": 0.9}
 
 
 @dataclass(frozen=True)
 class DkIterate:
-    """One iteration: the α proved, the rightmost eigenvalue (1/s), the ε that was added to P, and ‖K‖."""
+    """One iteration: the α proved and the rightmost eigenvalue, both in 1/s."""
 
     alpha: float
     abscissa: float
-    perturbation: float
-    gain_norm: float
 
 
 @dataclass(frozen=True, eq=False)
 class DecayProof:
-    """P of (1) with the eigenvalues that were checked: V = x'Px proves that motions decay like e^{αt/2}.
+    """P of (1) and the eigenvalues that were checked: V = x'Px proves that motions decay like e^{αt/2}.
 
     Attributes
     ----------
@@ -80,136 +77,27 @@ class DkDesign:
     ----------
     K
         Shape (inputs, outputs), with the pattern's zeros.
-    alpha
-        The last α, 1/s; the decay rate is −α/2 or more.
     proof
-        Checked by eigenvalues, independent of the solver.
+        Of the last α; the decay rate is −α/2 or more.
     iterates
         All of them, the first with K = 0; α falls.
     solver
-        Of all steps together: seconds and iterations are sums.
+        Of all steps together: seconds and iterations are sums. None if K = 0 is stable.
     """
 
     K: FloatArray
-    alpha: float
     proof: DecayProof
     iterates: tuple[DkIterate, ...]
-    solver: SolverFacts
+    solver: SolverFacts | None
 
 
-class _Effort:
-    """Solves problems and adds up what that took."""
-
-    def __init__(self) -> None:
-        self.seconds, self.iterations, self.variables, self.constraints = 0.0, 0, 0, 0
-
-    def solve(self, problem: Any, *, step: str) -> None:
-        """Solve with Clarabel; every status but "optimal" is an error."""
-        import cvxpy as cp
-
-        advice = f"in the {step} step; lower gain_bound or lyapunov_bound, or scale states and inputs to like size"
-        try:
-            # cvxpy warns of an inaccurate solution; here that is an error, raised below.
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)
-                problem.solve(solver=cp.CLARABEL, **_CLARABEL)
-        except cp.SolverError as error:
-            raise SolverError(f"Clarabel stopped: {error}; {advice}") from error
-        if problem.status != cp.OPTIMAL:
-            raise SolverError(f"Clarabel ended with status {problem.status!r}; wanted 'optimal' {advice}")
-        self.seconds += float(problem.solver_stats.solve_time)
-        self.iterations += int(problem.solver_stats.num_iters)
-        self.variables = max(self.variables, int(problem.size_metrics.num_scalar_variables))
-        self.constraints = max(self.constraints, sum(int(constraint.size) for constraint in problem.constraints))
-
-    def facts(self) -> SolverFacts:
-        from importlib.metadata import version
-
-        return SolverFacts(
-            name="Clarabel",
-            version=version("clarabel"),
-            modelling_version=f"cvxpy {version('cvxpy')}",
-            status="optimal",
-            seconds=self.seconds,
-            iterations=self.iterations,
-            variables=self.variables,
-            constraints=self.constraints,
-        )
-
-
-class _LyapunovStep:
-    """K and α fixed: the P, I ⪯ P ⪯ κI, for which (1) holds with most to spare. Compiled once."""
-
-    def __init__(self, states: int, lyapunov_bound: float) -> None:
-        import cvxpy as cp
-
-        identity = np.eye(states)
-        self._shifted = cp.Parameter((states, states))
-        self._P, spare = cp.Variable((states, states), symmetric=True), cp.Variable()
-        left: Any = self._P @ self._shifted
-        inequality = left + left.T + spare * identity << 0
-        bounds = [self._P - identity >> 0, lyapunov_bound * identity - self._P >> 0]
-        self._problem = cp.Problem(cp.Maximize(spare), [inequality, *bounds])
-
-    def solve(self, closed_loop: FloatArray, alpha: float, effort: _Effort) -> FloatArray:
-        self._shifted.value = closed_loop - alpha / 2 * np.eye(len(closed_loop))
-        effort.solve(self._problem, step="Lyapunov")
-        P = np.asarray(self._P.value, dtype=float)
-        return (P + P.T) / 2
-
-
-class _GainStep:
-    """P fixed: the K with the pattern and ‖K‖ ≤ k̄ for which (1) holds with the least α. Compiled once."""
-
-    def __init__(self, plant: Plant, mask: NDArray[np.bool_], gain_bound: float) -> None:
-        import cvxpy as cp
-
-        rows, columns = mask.shape
-        free = np.flatnonzero(mask)
-        scatter = np.eye(mask.size)[:, free]
-        self._mask = mask
-        self._P, alpha = cp.Parameter((plant.states, plant.states), symmetric=True), cp.Variable()
-        entries = cp.Variable(free.size)
-        self._K = cp.reshape(scatter @ entries, mask.shape, order="C")
-        half: Any = self._P @ plant.A + self._P @ plant.B @ self._K @ plant.C
-        inequality = half + half.T - alpha * self._P << 0
-        limit = cp.bmat([[gain_bound * np.eye(rows), self._K], [self._K.T, gain_bound * np.eye(columns)]])
-        self._problem = cp.Problem(cp.Minimize(alpha), [inequality, limit >> 0])
-
-    def solve(self, P: FloatArray, effort: _Effort) -> FloatArray:
-        self._P.value = P
-        effort.solve(self._problem, step="gain")
-        return np.where(self._mask, np.asarray(self._K.value, dtype=float), 0.0)
-
-
-def dk_iteration(
-    plant: Plant,
-    pattern: Pattern,
-    *,
-    decay_rate_1_s: float = 0.0,
-    gain_bound: float = DEFAULT_GAIN_BOUND,
-    lyapunov_bound: float = DEFAULT_LYAPUNOV_BOUND,
-    perturbation: float = DEFAULT_PERTURBATION,
-) -> DkDesign:
-    """Return the first gain of the iteration that is proved to decay faster than at the wanted rate.
-
-    Parameters
-    ----------
-    plant, pattern
-        At most `LARGEST_STATES` states.
-    decay_rate_1_s
-        The iteration stops when α < −2 `decay_rate_1_s`; with 0, when stability is proved.
-    gain_bound
-        k̄, limit of ‖K‖.
-    lyapunov_bound
-        κ > 1.
-    perturbation
-        ε, at least 0.
+def dk_iteration(plant: Plant, pattern: Pattern) -> DkDesign:
+    """Return the first gain of the iteration that is proved to stabilise.
 
     Raises
     ------
     BadModelError
-        If sizes do not fit or a number is out of range.
+        If sizes do not fit, or the plant has more than `LARGEST_STATES` states.
     InfeasibleError
         If the iteration settles before; the message says at which rate.
     SolverError
@@ -221,53 +109,102 @@ def dk_iteration(
 
     >>> from gains.design.dk_iteration import dk_iteration
     >>> from gains.formation.pattern import Pattern, Plant
-    >>> found = dk_iteration(Plant([[0, 1], [0, 0]], [[0], [1]]), Pattern([[1]], (1,), (2,)), decay_rate_1_s=0.5)
-    >>> found.alpha < -1, found.iterates[-1].abscissa < -0.5
+    >>> found = dk_iteration(Plant([[0, 1], [0, 0]], [[0], [1]]), Pattern([[1]], (1,), (2,)))
+    >>> found.proof.alpha < 0, found.iterates[-1].abscissa < 0
     (True, True)
     """
     check_fits(plant, pattern)
-    _check_numbers(plant, decay_rate_1_s, gain_bound, lyapunov_bound, perturbation)
-    effort = _Effort()
-    lyapunov_step = _LyapunovStep(plant.states, lyapunov_bound)
-    gain_step = _GainStep(plant, pattern.mask, gain_bound)
+    if plant.states > LARGEST_STATES:
+        raise BadModelError(
+            f"the plant has {plant.states} states; at most {LARGEST_STATES} are wanted for the D-K iteration: use "
+            "gains.design.structured_lqr"
+        )
+    effort: list[SolverFacts] = []
+    lyapunov_step, gain_step = _lyapunov_step(plant.states, effort), _gain_step(plant, pattern.mask, effort)
     gain, lyapunov = np.zeros(pattern.mask.shape), np.eye(plant.states)
-    iterates = [_iterate(plant, gain, lyapunov, 0.0)]
+    iterates = [_iterate(plant, gain, lyapunov)]
     slow = 0
-    for _ in range(_ITERATIONS):
-        if iterates[-1].alpha < -2 * decay_rate_1_s:
-            proof = decay_proof(plant.closed_loop(gain), lyapunov)
-            return DkDesign(K=gain, alpha=proof.alpha, proof=proof, iterates=tuple(iterates), solver=effort.facts())
-        centre = lyapunov_step.solve(plant.closed_loop(gain), iterates[-1].alpha, effort)
-        held = (gain, centre, iterates[-1].alpha)
-        gain, lyapunov, following = _best_gain(plant, gain_step, held, perturbation, effort)
+    while iterates[-1].alpha >= 0.0:
+        if slow == _SETTLED_IN_A_ROW or len(iterates) > _ITERATIONS:
+            raise InfeasibleError(
+                f"the iteration settles at alpha = {iterates[-1].alpha:.4g} 1/s after {len(iterates) - 1} iterations, "
+                f"which does not prove stability (wanted < 0) with gains of norm {_GAIN_BOUND} at most: {_ADVICE}"
+            )
+        centre = lyapunov_step(plant.closed_loop(gain), iterates[-1].alpha)
+        gain, lyapunov, following = _best_gain(plant, gain_step, (gain, centre, iterates[-1].alpha))
         slow = slow + 1 if iterates[-1].alpha - following.alpha < _SETTLED * (1 + abs(following.alpha)) else 0
         iterates.append(following)
-        if slow == _SETTLED_IN_A_ROW:
-            break
-    raise InfeasibleError(
-        f"the iteration settles at alpha = {iterates[-1].alpha:.4g} 1/s after {len(iterates) - 1} iterations, which "
-        f"proves a decay rate of {max(-iterates[-1].alpha / 2, 0.0):.4g} 1/s; wanted more than {decay_rate_1_s} 1/s: "
-        f"raise gain_bound = {gain_bound} or lyapunov_bound = {lyapunov_bound}, or add links"
+    proof = decay_proof(plant.closed_loop(gain), lyapunov)
+    return DkDesign(K=gain, proof=proof, iterates=tuple(iterates), solver=_together(effort))
+
+
+def _together(effort: list[SolverFacts]) -> SolverFacts | None:
+    if not effort:
+        return None
+    return replace(
+        effort[0],
+        seconds=sum(facts.seconds for facts in effort),
+        iterations=sum(facts.iterations for facts in effort),
+        variables=max(facts.variables for facts in effort),
+        constraints=max(facts.constraints for facts in effort),
     )
 
 
+def _lyapunov_step(states: int, effort: list[SolverFacts]) -> Callable[[FloatArray, float], FloatArray]:
+    """From a closed loop and α to the P, I ⪯ P ⪯ κI, for which (1) holds with most to spare; compiled once."""
+    import cvxpy as cp
+
+    identity = np.eye(states)
+    shifted = cp.Parameter((states, states))
+    P, spare = cp.Variable((states, states), symmetric=True), cp.Variable()
+    left: Any = P @ shifted
+    inequality = left + left.T + spare * identity << 0
+    problem = cp.Problem(cp.Maximize(spare), [inequality, P - identity >> 0, _LYAPUNOV_BOUND * identity - P >> 0])
+
+    def step(closed_loop: FloatArray, alpha: float) -> FloatArray:
+        shifted.value = closed_loop - alpha / 2 * identity
+        effort.append(solved(problem, advice=f"Lyapunov step; {_ADVICE}"))
+        value = np.asarray(P.value, dtype=float)
+        return (value + value.T) / 2
+
+    return step
+
+
+def _gain_step(plant: Plant, mask: NDArray[np.bool_], effort: list[SolverFacts]) -> Callable[[FloatArray], FloatArray]:
+    """From P to the K with the pattern and ‖K‖ ≤ k̄ for which (1) holds with the least α; compiled once."""
+    import cvxpy as cp
+
+    rows, columns = mask.shape
+    free = np.flatnonzero(mask)
+    P, alpha = cp.Parameter((plant.states, plant.states), symmetric=True), cp.Variable()
+    K = cp.reshape(np.eye(mask.size)[:, free] @ cp.Variable(free.size), mask.shape, order="C")
+    half: Any = P @ plant.A + P @ plant.B @ K @ plant.C
+    limit = cp.bmat([[_GAIN_BOUND * np.eye(rows), K], [K.T, _GAIN_BOUND * np.eye(columns)]])
+    problem = cp.Problem(cp.Minimize(alpha), [half + half.T - alpha * P << 0, limit >> 0])
+
+    def step(lyapunov: FloatArray) -> FloatArray:
+        P.value = lyapunov
+        effort.append(solved(problem, advice=f"gain step; {_ADVICE}"))
+        return np.where(mask, np.asarray(K.value, dtype=float), 0.0)
+
+    return step
+
+
 def _best_gain(
-    plant: Plant, gain_step: _GainStep, held: tuple[FloatArray, FloatArray, float], perturbation: float, effort: _Effort
+    plant: Plant, gain_step: Callable[[FloatArray], FloatArray], held: tuple[FloatArray, FloatArray, float]
 ) -> tuple[FloatArray, FloatArray, DkIterate]:
     """Gain step at P + ε 11', with the largest ε, ε/2, ε/4, ... that does not raise α; else the gain held."""
     K_held, P, alpha_held = held
-    ones = np.ones_like(P)
     for halving in range(_HALVINGS):
-        epsilon = perturbation / 2**halving if halving < _HALVINGS - 1 else 0.0
-        perturbed = P + epsilon * ones
-        K = gain_step.solve(perturbed, effort)
-        found = _iterate(plant, K, perturbed, epsilon)
+        perturbed = P + (_PERTURBATION / 2**halving if halving < _HALVINGS - 1 else 0.0)
+        K = gain_step(perturbed)
+        found = _iterate(plant, K, perturbed)
         if found.alpha < alpha_held:
             return K, perturbed, found
-    return K_held, P, _iterate(plant, K_held, P, 0.0)
+    return K_held, P, _iterate(plant, K_held, P)
 
 
-def _iterate(plant: Plant, K: FloatArray, P: FloatArray, epsilon: float) -> DkIterate:
+def _iterate(plant: Plant, K: FloatArray, P: FloatArray) -> DkIterate:
     """The α that P proves for K, and its check against the eigenvalues of the loop."""
     closed_loop = plant.closed_loop(K)
     alpha = _proved_alpha(closed_loop, P)
@@ -278,7 +215,7 @@ def _iterate(plant: Plant, K: FloatArray, P: FloatArray, epsilon: float) -> DkIt
             f"the Lyapunov matrix proves alpha = {alpha:.6g} 1/s, but the rightmost eigenvalue is {rightmost:.6g} 1/s; "
             "alpha cannot be less than twice that"
         )
-    return DkIterate(alpha, rightmost, epsilon, float(np.linalg.norm(K, 2)))
+    return DkIterate(alpha, rightmost)
 
 
 def _proved_alpha(closed_loop: FloatArray, P: FloatArray) -> float:
@@ -288,7 +225,7 @@ def _proved_alpha(closed_loop: FloatArray, P: FloatArray) -> float:
 
 
 def abscissa(closed_loop: FloatArray) -> float:
-    """Largest real part of an eigenvalue (1/s) of A (n, n), by strongly connected blocks: see `gains.core.structure`.
+    """Return the largest real part (1/s) of an eigenvalue, by strongly connected blocks (`gains.core.structure`).
 
     Examples
     --------
@@ -302,7 +239,7 @@ def abscissa(closed_loop: FloatArray) -> float:
 
 
 def decay_proof(closed_loop: FloatArray, P: FloatArray) -> DecayProof:
-    """The least α that P proves for a closed loop A_K, both (n, n), checked by numpy's eigenvalues alone.
+    """Return the least α that P proves for a closed loop A_K, both (n, n), checked by numpy's eigenvalues alone.
 
     Raises
     ------
@@ -332,21 +269,3 @@ def decay_proof(closed_loop: FloatArray, P: FloatArray) -> DecayProof:
             f"inequality is {inequality_max:.3g} (wanted <= 0); ask for a little faster decay"
         )
     return DecayProof(P=P, alpha=alpha, P_eigenvalue_min=P_min, inequality_eigenvalue_max=inequality_max)
-
-
-def _check_numbers(
-    plant: Plant, decay_rate_1_s: float, gain_bound: float, lyapunov_bound: float, perturbation: float
-) -> None:
-    if plant.states > LARGEST_STATES:
-        raise BadModelError(
-            f"the plant has {plant.states} states; at most {LARGEST_STATES} are wanted for the D-K iteration: use "
-            "gains.design.structured_lqr"
-        )
-    for name, value, least in (
-        ("decay_rate_1_s", decay_rate_1_s, 0.0),
-        ("gain_bound", gain_bound, 1e-6),
-        ("lyapunov_bound", lyapunov_bound, 1.0 + 1e-6),
-        ("perturbation", perturbation, 0.0),
-    ):
-        if not (np.isfinite(value) and value >= least):
-            raise BadModelError(f"{name} = {value}; a number of at least {least} is wanted")

@@ -1,10 +1,10 @@
 """The linear quadratic cost of a gain with a given pattern, its gradient, and the centralised optimum.
 
 For x' = A x + B u, y = C x, u = K y the cost (4.5) is the mean of ∫ x'Qx + u'Ru dt over initial states with covariance
-X0, or over white noise of intensity X0 (the squared H2 norm)::
+I, or over white noise of intensity I (the squared H2 norm)::
 
-    J(K) = trace(P X0),   A_K'P + P A_K + Q + C'K'RKC = 0,   A_K = A + B K C
-    ∇J(K) = 2 (R K C + B'P) L C',   A_K L + L A_K' + X0 = 0
+    J(K) = trace(P),   A_K'P + P A_K + Q + C'K'RKC = 0,   A_K = A + B K C
+    ∇J(K) = 2 (R K C + B'P) L C',   A_K L + L A_K' + I = 0
 
 Sources: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5); W. S. Levine and M. Athans, "On the
 determination of the optimal constant output feedback gains for linear multivariable systems", IEEE Trans. Automatic
@@ -20,43 +20,36 @@ from scipy import linalg
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.structure import real_matrix, strongly_connected_blocks
-from gains.formation.pattern import Pattern, Plant, check_fits, checked_pattern_gain
+from gains.formation.pattern import Plant
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """Weights of the cost: Q (n, n) on states, R (inputs, inputs), and the covariance X0 (n, n) of initial states.
-
-    X0 = I if not given.
+    """Weights of the cost: Q (n, n) on states and R (inputs, inputs).
 
     Raises
     ------
     BadModelError
-        If a weight is not symmetric, Q or X0 not positive semidefinite, or R not positive definite.
+        If a weight is not symmetric, Q not positive semidefinite, or R not positive definite.
 
     Examples
     --------
     >>> from gains.design.lqr import Weights
-    >>> Weights([[1, 0], [0, 2]], [[1]]).X0.tolist()
-    [[1.0, 0.0], [0.0, 1.0]]
+    >>> Weights([[1, 0], [0, 2]], [[1]]).Q.tolist()
+    [[1.0, 0.0], [0.0, 2.0]]
     """
 
     Q: FloatArray
     R: FloatArray
-    X0: FloatArray
 
-    def __init__(self, Q: ArrayLike, R: ArrayLike, X0: ArrayLike | None = None) -> None:
-        state = _checked_weight("Q", Q, definite=False)
-        object.__setattr__(self, "Q", state)
+    def __init__(self, Q: ArrayLike, R: ArrayLike) -> None:
+        object.__setattr__(self, "Q", _checked_weight("Q", Q, definite=False))
         object.__setattr__(self, "R", _checked_weight("R", R, definite=True))
-        spread = np.eye(len(state)) if X0 is None else _checked_weight("X0", X0, definite=False)
-        object.__setattr__(self, "X0", spread)
 
     def check_fits(self, plant: Plant) -> None:
         """Raise BadModelError unless the sizes are those of the plant."""
-        for name, matrix, wanted in (("Q", self.Q, plant.states), ("X0", self.X0, plant.states)):
-            if len(matrix) != wanted:
-                raise BadModelError(f"{name} has shape {matrix.shape}; ({wanted}, {wanted}) is wanted, as A")
+        if len(self.Q) != plant.states:
+            raise BadModelError(f"Q has shape {self.Q.shape}; {plant.A.shape} is wanted, as A")
         if len(self.R) != plant.B.shape[1]:
             raise BadModelError(f"R has shape {self.R.shape}; one row for each of {plant.B.shape[1]} inputs is wanted")
 
@@ -72,10 +65,10 @@ class CostPoint:
 
 
 class LyapunovEquations:
-    """Both Lyapunov equations of one closed loop from one Schur form that follows the loop's block triangular form.
+    """Both Lyapunov equations of one closed loop, from one Schur form that follows the loop's block triangular form.
 
-    The eigenvalues of the strongly connected blocks are computed block by block: a chain of identical followers is one
-    defective eigenvalue as a whole, which rounding would spread into the right half plane.
+    Eigenvalues are computed by strongly connected blocks: as a whole, a chain of identical followers is one defective
+    eigenvalue, which rounding would spread into the right half plane.
     """
 
     def __init__(self, A: FloatArray, blocks: list[NDArray[np.intp]]) -> None:
@@ -107,9 +100,9 @@ class LyapunovEquations:
         """P with A'P + P A + Q = 0."""
         return self._solve(Q, "T", "N")
 
-    def reached(self, X0: FloatArray) -> FloatArray:
-        """L with A L + L A' + X0 = 0."""
-        return self._solve(X0, "N", "T")
+    def reached(self) -> FloatArray:
+        """L with A L + L A' + I = 0."""
+        return self._solve(np.eye(len(self._basis)), "N", "T")
 
     def _solve(self, constant: FloatArray, left: str, right: str) -> FloatArray:
         Z = self._basis
@@ -144,10 +137,10 @@ class Cost:
             return None
         F = K @ plant.C
         P = equations.observed(weights.Q + F.T @ weights.R @ F)
-        L = equations.reached(weights.X0)
+        L = equations.reached()
         gradient = 2.0 * (weights.R @ F + plant.B.T @ P) @ L @ plant.C.T
-        cost = float(np.sum(P * weights.X0))
-        # a loop so near its limit of stability that rounding decides: covariances are not negative
+        cost = float(np.trace(P))
+        # near the limit of stability rounding decides: a covariance cannot be negative
         if not (np.isfinite(cost) and np.trace(L) > 0.0 and np.diag(L).min() > -1e-9 * np.trace(L)):
             return None
         return CostPoint(K, cost, np.where(self.mask, gradient, 0.0), plant.C @ L @ plant.C.T)
@@ -155,7 +148,7 @@ class Cost:
     def scaled(self, point: CostPoint, gradient: FloatArray) -> FloatArray:
         """M⁻¹g with M the curvature of the cost at fixed P and L: 2 R_aa (C L C') on the free entries of every row a.
 
-        A step of −M⁻¹g is the one of Anderson and Moore; M makes the descent indifferent to units and to how fast the
+        A step of −M⁻¹g is that of Anderson and Moore; M makes the descent independent of units and of how fast the
         vehicles are.
         """
         direction = np.zeros_like(gradient)
@@ -169,34 +162,8 @@ class Cost:
         return direction
 
 
-def lqr_cost(plant: Plant, pattern: Pattern, weights: Weights, K: ArrayLike) -> tuple[float, FloatArray]:
-    """J(K) and its gradient, zero outside the pattern; infinity and zeros for a gain that does not stabilise.
-
-    Both K and the gradient are of shape (inputs, outputs).
-
-    Raises
-    ------
-    BadModelError
-        If sizes do not fit or K does not have the pattern.
-
-    Examples
-    --------
-    x' = u, u = −2 x: ∫ (1 + 4) e^{−4t} dt.
-
-    >>> from gains.formation.pattern import Pattern, Plant
-    >>> from gains.design.lqr import Weights, lqr_cost
-    >>> cost, gradient = lqr_cost(Plant([[0]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]), [[-2]])
-    >>> round(cost, 6), gradient.round(6).tolist()
-    (1.25, [[-0.375]])
-    """
-    check_fits(plant, pattern)
-    weights.check_fits(plant)
-    point = Cost(plant, pattern.mask, weights).at(checked_pattern_gain(pattern, K))
-    return (np.inf, np.zeros(pattern.mask.shape)) if point is None else (point.cost, point.gradient)
-
-
 def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
-    """The optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P X0), of the algebraic Riccati equation.
+    """Return the optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P), of the algebraic Riccati equation.
 
     Raises
     ------
@@ -209,7 +176,7 @@ def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
     >>> from gains.formation.pattern import Plant
     >>> from gains.design.lqr import Weights, centralised_lqr
     >>> integrator = Plant(A=np.zeros((1, 1)), B=np.eye(1), C=np.eye(1))
-    >>> K, cost = centralised_lqr(integrator, Weights(Q=4 * np.eye(1), R=np.eye(1), X0=np.eye(1)))
+    >>> K, cost = centralised_lqr(integrator, Weights(Q=4 * np.eye(1), R=np.eye(1)))
     >>> K.round(12).tolist(), round(cost, 12)
     ([[-2.0]], 2.0)
     """
@@ -221,7 +188,7 @@ def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
             f"the Riccati equation has no stabilising solution ({error}): (A, B) must be stabilisable and Q must weigh "
             "every mode on the imaginary axis"
         ) from error
-    return -np.linalg.solve(weights.R, plant.B.T @ P), float(np.sum(P * weights.X0))
+    return -np.linalg.solve(weights.R, plant.B.T @ P), float(np.trace(P))
 
 
 def _checked_weight(name: str, value: ArrayLike, *, definite: bool) -> FloatArray:

@@ -1,7 +1,7 @@
 """Gains of the inclusion principle that meet a requirement, or which part of it to relax and how far.
 
-Every combination is one search of `gains.design.search`: what is given limits it, what is open is made as large as
-possible.
+Every combination is one search of `gains.design.search`: what the requirement gives limits it, what it leaves open is
+made as large as possible.
 """
 
 from dataclasses import replace
@@ -16,24 +16,17 @@ from gains.performance.response import Response, sampled_margin
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.multirate import Timing
 
-# The search aims this much above a margin asked for, so that rounding cannot leave it below.
+# The search aims this much above the wanted margin, so that rounding cannot leave it below.
 _MARGIN_AIM_S = 2e-10
-# A margin is found to this share of itself, a decay rate for a message to a coarser one.
+# A margin is found to this share of itself; a decay rate for a message by this many bisections.
 _MARGIN_RESOLUTION, _DECAY_STEPS = 1e-9, 14
 
 
 def required_gains(wanted: Requirement, period_s: float) -> ScalarGains:
     """Return the gains that meet the requirement and are the best in what it leaves open.
 
-    With a delay margin they have the largest α of all that meet the rest, without one the largest margin, and of those
-    the largest α.
-
-    Parameters
-    ----------
-    wanted
-        What to reach.
-    period_s
-        Period of the control loop: sample, hold.
+    With a delay margin they have the largest α of all that meet the rest; without one the largest margin, and of those
+    the largest α. `period_s` is that of the control loop: sample, hold.
 
     Raises
     ------
@@ -72,7 +65,7 @@ def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains | None:
 
 
 def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: PeakLimit) -> float:
-    """The largest margin (s) of which gains decay as fast as this, 0 if none do: the fastest decay falls with it."""
+    """The largest margin (s) with which gains decay as fast as this, 0 if none do; longer margins decay slower."""
     low, high = 0.0, DELAY_MARGIN_MAX_S
     if fastest_decay(high, period_s, limit) >= decay_rate_1_s:
         return high
@@ -128,20 +121,16 @@ def _rounded_down(value: float) -> float:
     return floor(value / unit) * unit
 
 
-_MARGIN_MAX_S = 30.0
-
-
 def requirement_with(requirement: Requirement, response: Response | None, *, timing: Timing) -> Requirement:
-    """The requirement on vehicles that answer at once, with one period for telemetry and control, the slower one, whose
-    design has the wanted margin with this response and these periods.
+    """Return the requirement whose design has the wanted margin with this response and these periods.
 
-    The margin with them grows with the one without: found by false position. A requirement without a margin stays as
-    it is.
+    It is one on vehicles that respond at once, with the slower period for telemetry and control. Its margin, found by
+    false position, grows with the wanted one. A requirement without a margin stays as it is.
 
     Raises
     ------
     InfeasibleError
-        If no gains have this margin so.
+        If no gains have this margin with the response and the periods.
 
     Examples
     --------
@@ -172,10 +161,10 @@ def requirement_with(requirement: Requirement, response: Response | None, *, tim
     # the response takes about its lag of the margin
     low, high = wanted_s, wanted_s + lag_s
     f_low, f_high = excess(low), excess(high)
-    while f_high < 0.0 and high < _MARGIN_MAX_S:
-        low, f_low, high = high, f_high, min(high + wanted_s + lag_s, _MARGIN_MAX_S)
+    while f_high < 0.0 and high < DELAY_MARGIN_MAX_S:
+        low, f_low, high = high, f_high, min(high + wanted_s + lag_s, DELAY_MARGIN_MAX_S)
         f_high = excess(high)
-    if f_high < 0.0 or high > _MARGIN_MAX_S:
+    if f_high < 0.0 or high > DELAY_MARGIN_MAX_S:
         answer = (
             f" with lag_s = {response.lag_s} and velocity_gain_1_s = {response.velocity_gain_1_s}" if response else ""
         )

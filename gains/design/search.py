@@ -1,8 +1,8 @@
 """The exact trade-off between robustness, delay margin and decay rate of one follower, as a two-dimensional search.
 
-The search runs along the curve of all (k1, k3) of a margin (`gains.performance.scalar_gains`) and over k2. Nothing here
-is random, and no frequency grid decides a margin. The designs found are checked by the functions of
-`gains.delay.constant`, `gains.sampled.constant` and `gains.performance.robust`, which share no formula with it.
+The search runs along the curve of all (k1, k3) of a margin (`gains.performance.scalar_gains`) and over k2. Nothing in
+it is random, and no frequency grid decides a margin. `gains.design.design` checks what it finds with methods that share
+no formula with it.
 """
 
 import numpy as np
@@ -19,9 +19,9 @@ from gains.performance.scalar_gains import (
     onboard_front_gain_limit,
 )
 
-# Points of the first, coarse scan along the curve and over k2, of the later ones, and of both over the spare margin.
-# A round keeps ±2 cells about the best point, so the window halves; 18 rounds leave 1e-5 of it (k2 begins five
-# rounds later: 1e-4), and α, flat at its maximum, is then exact to about 1e-9.
+# Points along the curve and over k2 in the first, coarse scan and in the later ones, and points over the spare margin.
+# A round keeps ±2 cells around the best point, so the window halves; 18 rounds leave 1e-5 of it (k2 starts five rounds
+# later: 1e-4), and α, flat at its maximum, is then exact to about 1e-9.
 _ROUNDS_ALL_FRONT = 5
 _SCAN_FIRST, _SCAN_NEXT, _SCAN_SPARE, _ROUNDS = (25, 17), (9, 9), 9, 18
 # The angle of the crossing, as a share of the one at which k3 = 0 in the continuous loop. The sampled loop's share goes
@@ -34,12 +34,13 @@ _FRONT_MAX = 2.0
 _OWN_STEP_MAX = 1.8
 # α is exact to about this, so an α asked for is aimed at from above by it, and no finer root is sought.
 _ALPHA_RESOLUTION = 1e-9
-# Gains of exactly a margin that is short against the period are so high that few are good or usable, and a larger
-# margin comes with a larger α. Up to this margin in periods, one larger by up to so many periods is looked at too.
+# Where the margin is short against the period, the gains of exactly this margin are so high that few are usable, and a
+# larger margin comes with a larger α. So up to the first number of periods, margins longer by up to the second are
+# searched too.
 _SHORT_MARGIN, _SPARE_MAX = 2.0, 2.0
-# Where the search for a margin begins, and where it ends: α is then below 1e-4 and the loop of no use to anyone.
+# Where the search for a margin begins, and where it ends: α is then below 1e-4, which is of no use.
 _MARGIN_FIRST_S, _MARGIN_MAX_S = 0.3, 75.0
-# Points along the curve of a margin in the search of the fastest decay, and rounds that keep ±1 cell: 1e-13 of it.
+# Points along the curve in the search for the fastest decay, and rounds that keep ±1 cell: 1e-13 of the curve is left.
 _SCAN_FASTEST, _ROUNDS_FASTEST = 33, 12
 
 
@@ -103,11 +104,11 @@ def largest_margin(
 ) -> tuple[float, ScalarGains] | None:
     """Return the largest delay margin (s) at which α can be reached, and the gains; None if no margin is left.
 
-    The largest α falls as the margin grows, so this is its inverse, by false position.
+    The largest α falls as the margin grows; this is the inverse, by false position.
 
     Examples
     --------
-    The way back: the α that is reached at a margin is reached at no longer one.
+    The largest α at a margin is not reached at a longer one:
 
     >>> from gains.design.search import largest_alpha, largest_margin
     >>> margin_s, _ = largest_margin(largest_alpha(0.3, 0.02).alpha, 0.02)
@@ -139,7 +140,7 @@ def largest_margin(
 
 
 def fastest_decay(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit = None) -> float:
-    """Return the largest decay rate (1/s) without delay of gains of a margin, 0 if no gains have it.
+    """Return the largest decay rate (1/s), without delay, of gains with a margin; 0 if no gains have the margin.
 
     Arguments as of `largest_alpha`.
 
@@ -202,7 +203,7 @@ def _decay_rates(share: FloatArray, delay_margin_s: float, period_s: float, stri
 
 
 def _spare_max(delay_margin_s: float, period_s: float) -> float:
-    """How much more of a margin than is asked for is looked at, in periods."""
+    """How far beyond the wanted margin is searched, in periods."""
     return _SPARE_MAX if delay_margin_s <= _SHORT_MARGIN * period_s else 0.0
 
 

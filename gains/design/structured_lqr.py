@@ -2,9 +2,9 @@
 
 The cost J(K) of `gains.design.lqr` is minimised over the gains with the pattern.
 
-The gradient is exact and is projected on the pattern. J has no minimum outside the stabilising gains: it grows without
-bound towards their border, so a descent never leaves them. It need not be convex; what is found is a local minimum, and
-the centralised optimum, with all states for every input, says how much better any other could be.
+The gradient is exact and is projected on the pattern. J grows without bound towards the border of the stabilising
+gains, so a descent never leaves them. J need not be convex: what is found is a local minimum, and the centralised
+optimum, with all states for every input, bounds how much better any other could be.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5), which solves it by other means.
 """
@@ -14,16 +14,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
-from gains.core.errors import BadModelError, InfeasibleError, SolverError
+from gains.core.errors import InfeasibleError, SolverError
 from gains.design.lqr import Cost, CostPoint, Weights, centralised_lqr
-from gains.formation.pattern import Pattern, Plant, check_fits, checked_pattern_gain
+from gains.formation.pattern import Pattern, Plant, check_fits
 
 # The decrement g'M⁻¹g / J estimates the share of the cost that is still to be gained. Costs are known to about 1e-13.
 _DECREMENT = 1e-13
-# a line search that fails above this has failed; below, rounding is what stopped it
+# above this a failed line search is an error; below, rounding has stopped it
 _DECREMENT_ACCEPTED = 1e-9
 _ITERATIONS = 2000
 _MEMORY = 20
@@ -31,10 +30,10 @@ _LINE_STEPS = 50
 _HOMOTOPY_ROUNDS = 200
 # share of the way to the border of stability that the homotopy keeps as distance
 _HOMOTOPY_DISTANCE = 0.1
-# random starts of the descent of the abscissa: of the patterns of three vehicles that a static gain stabilises, and the
+# random starts of the descent of the abscissa: of the patterns of three vehicles that a static gain stabilises but the
 # homotopy does not, the hardest takes 22
 _ABSCISSA_STARTS = 60
-# share of the norm of A: an abscissa above is rounding of a defective eigenvalue
+# share of the norm of A: a negative abscissa nearer to zero may be the rounding of a defective eigenvalue
 _CLEARLY_STABLE = 1e-4
 
 
@@ -42,29 +41,12 @@ _CLEARLY_STABLE = 1e-4
 class StructuredLqr:
     """A gain with the pattern at which the cost is stationary, and lower than at the start.
 
-    Attributes
-    ----------
-    K
-        Shape (inputs, outputs).
-    cost
-        J(K).
-    cost_centralised
-        Least cost of all gains on the full state, a lower bound of J.
-    decrement
-        g'M⁻¹g / J at the end, with the gradient g and the curvature M of the cost at fixed P and L: an estimate of the
-        share of the cost that is still to be gained.
-    gradient_norm
-        Frobenius norm of the projected gradient.
-    costs
-        J after every iteration, falling; the first is that of the start.
+    `cost` is J(K) and `cost_centralised` the least of all gains on the full state, a lower bound of J.
     """
 
     K: FloatArray
     cost: float
     cost_centralised: float
-    decrement: float
-    gradient_norm: float
-    costs: tuple[float, ...]
 
     @property
     def loss(self) -> float:
@@ -72,22 +54,15 @@ class StructuredLqr:
         return self.cost / self.cost_centralised - 1.0
 
 
-def structured_lqr(
-    plant: Plant, pattern: Pattern, weights: Weights, *, start: ArrayLike | None = None
-) -> StructuredLqr:
+def structured_lqr(plant: Plant, pattern: Pattern, weights: Weights) -> StructuredLqr:
     """Return a gain with the pattern at which the quadratic cost has a local minimum.
 
-    Parameters
-    ----------
-    plant, pattern, weights
-        For 50 vehicles of one axis (99 states) it takes a few seconds.
-    start
-        A stabilising gain with the pattern; found by `stabilising_gain` if not given.
+    The descent starts from `stabilising_gain`. 50 vehicles of one axis (99 states) take a few seconds.
 
     Raises
     ------
     BadModelError
-        If sizes do not fit or the start does not stabilise.
+        If sizes do not fit.
     InfeasibleError
         If no stabilising gain is found.
     SolverError
@@ -104,44 +79,35 @@ def structured_lqr(
     >>> found.K.round(4).tolist(), round(found.cost, 6)
     ([[-1.0]], 1.0)
     """
-    check_fits(plant, pattern)
-    weights.check_fits(plant)
+    start = stabilising_gain(plant, pattern, weights)
     cost = Cost(plant, pattern.mask, weights)
-    K = stabilising_gain(plant, pattern, weights) if start is None else checked_pattern_gain(pattern, start)
-    first = cost.at(K)
+    first = cost.at(start)
     if first is None:
-        raise BadModelError(
-            f"the start does not stabilise: the rightmost eigenvalue of A + B K C has real part "
-            f"{cost.lyapunov(K).abscissa:.3g} 1/s; a negative one is wanted"
+        raise SolverError(
+            f"the start is too near its limit of stability: its rightmost eigenvalue has real part "
+            f"{cost.lyapunov(start).abscissa:.3g} 1/s; scale states and inputs to like size"
         )
-    point, decrement, costs = _descend(cost, first, _ITERATIONS, _DECREMENT)
+    point, decrement, iterations = _descend(cost, first, _ITERATIONS, _DECREMENT)
     if decrement > _DECREMENT_ACCEPTED:
         raise SolverError(
-            f"the descent ended after {len(costs) - 1} iterations with decrement {decrement:.3g} (wanted "
-            f"{_DECREMENT_ACCEPTED}): scale states and inputs to like size, or give another start"
+            f"the descent ended after {iterations} iterations with decrement {decrement:.3g} (wanted "
+            f"{_DECREMENT_ACCEPTED}): scale states and inputs to like size"
         )
-    return StructuredLqr(
-        K=point.K,
-        cost=point.cost,
-        cost_centralised=centralised_lqr(plant, weights)[1],
-        decrement=decrement,
-        gradient_norm=float(np.linalg.norm(point.gradient)),
-        costs=tuple(costs),
-    )
+    return StructuredLqr(point.K, point.cost, centralised_lqr(plant, weights)[1])
 
 
 def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatArray:
-    """A gain with the pattern that stabilises, found from K = 0 by a homotopy, or from random gains.
+    """Return a gain with the pattern that stabilises, found from K = 0 by a homotopy, or from random gains.
 
-    A − σI is stable for large σ. Its cost is lowered for a while; the gain then stabilises more than was asked for, and
-    σ is lowered nearly as far, until it is 0. Where that ends at a σ > 0, as in patterns in which vehicles steer each
-    other only, the real part of the rightmost eigenvalue is lowered itself, from seeded random gains.
+    A − σI is stable for large σ. A few descent steps on its cost give a gain that stabilises a smaller σ too; σ is then
+    lowered nearly as far, until it is 0. Where that ends at a σ > 0, as in patterns in which vehicles steer only each
+    other, the real part of the rightmost eigenvalue itself is lowered, from seeded random gains.
 
     Raises
     ------
     InfeasibleError
-        If no gain is found. To decide whether any static gain stabilises is NP-hard in general: there
-        may be one all the same, but none exists if `gains.formation.fixed_modes` finds an unstable mode.
+        If no gain is found. To decide whether any static gain stabilises is NP-hard in general: there may be one all
+        the same, but none exists if `gains.formation.fixed_modes` finds an unstable mode.
 
     Examples
     --------
@@ -156,9 +122,9 @@ def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatA
     """
     check_fits(plant, pattern)
     weights.check_fits(plant)
-    full_spread = Weights(weights.Q + 1e-6 * np.eye(plant.states), weights.R, np.eye(plant.states))
+    observable = Weights(weights.Q + 1e-6 * np.eye(plant.states), weights.R)
     gain = np.zeros(pattern.mask.shape)
-    cost = Cost(plant, pattern.mask, full_spread)
+    cost = Cost(plant, pattern.mask, observable)
     abscissa = cost.lyapunov(gain).abscissa
     shift = max(abscissa, 0.0) + max(1.0, float(np.linalg.norm(plant.A, 1)))
     for _ in range(_HOMOTOPY_ROUNDS):
@@ -166,7 +132,7 @@ def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatA
             return gain
         shift = abscissa + _HOMOTOPY_DISTANCE * (shift - abscissa)
         shifted = Plant(plant.A - shift * np.eye(plant.states), plant.B, plant.C)
-        cost = Cost(shifted, pattern.mask, full_spread)
+        cost = Cost(shifted, pattern.mask, observable)
         point = cost.at(gain)
         if point is None:
             break
@@ -178,15 +144,15 @@ def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatA
         return gain
     raise InfeasibleError(
         f"no static gain with this pattern was found that stabilises: the best leaves a mode at "
-        f"{min(abscissa, found):.3g} 1/s; add links, or outputs, or give a stabilising start"
+        f"{min(abscissa, found):.3g} 1/s; add links or outputs"
     )
 
 
 def _gain_of_least_abscissa(plant: Plant, pattern: Pattern) -> tuple[FloatArray, float]:
-    """The first gain found that stabilises by more than rounding, or the best, and the real part (1/s) it leaves.
+    """The first gain that stabilises by more than rounding, or else the best, with the largest real part (1/s) left.
 
     Quasi-Newton descent of the abscissa, whose derivative for an eigenvalue with left and right vectors w, v is
-    Re w B dK C v / w v. It is not smooth where eigenvalues meet, and has many local minima: hence many starts.
+    Re w B dK C v / w v. It is not smooth where eigenvalues meet, and has many local minima, hence many starts.
     """
     from scipy import optimize
 
@@ -219,29 +185,29 @@ def _gain_of_least_abscissa(plant: Plant, pattern: Pattern) -> tuple[FloatArray,
     return best, max(least, 0.0)
 
 
-def _descend(cost: Cost, point: CostPoint, iterations: int, tolerance: float) -> tuple[CostPoint, float, list[float]]:
-    """Quasi-Newton descent (L-BFGS) in the metric M; the last point, its decrement and all costs."""
+def _descend(cost: Cost, point: CostPoint, most: int, tolerance: float) -> tuple[CostPoint, float, int]:
+    """Quasi-Newton descent (L-BFGS) in the metric M; the last point, its decrement and the number of iterations."""
     steps: list[tuple[FloatArray, FloatArray]] = []
-    costs = [point.cost]
+    iterations = 0
     while True:
         newton_like = cost.scaled(point, point.gradient)
         decrement = float(np.sum(point.gradient * newton_like)) / max(point.cost, 1e-300)
-        if decrement <= tolerance or len(costs) > iterations:
-            return point, decrement, costs
+        if decrement <= tolerance or iterations >= most:
+            return point, decrement, iterations
         direction = -_quasi_newton(point, steps, cost.scaled)
         if float(np.sum(direction * point.gradient)) >= 0.0:
             steps, direction = [], -newton_like
         following = _line_search(cost, point, direction)
         if following is None:
             if not steps:
-                return point, decrement, costs
+                return point, decrement, iterations
             steps = []
             continue
         step, change = following.K - point.K, following.gradient - point.gradient
         if float(np.sum(step * change)) > 0.0:
             steps = [*steps[1 - _MEMORY :], (step, change)]
         point = following
-        costs.append(point.cost)
+        iterations += 1
 
 
 def _quasi_newton(

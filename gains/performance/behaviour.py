@@ -7,18 +7,16 @@ Source: Sahoo 2012 (see `gains.formation.model`), eq. (2.11) with the gains (3.2
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.delay.constant import analyse_delay
 from gains.delay.rightmost import rightmost_root
+from gains.formation.model import FormationModel
 from gains.performance.robust import subsystem_loop
-from gains.performance.string_stability import Response, response_peak
-
-Gains = tuple[FloatArray, FloatArray, FloatArray]
+from gains.performance.string_stability import Gains, string_peak
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,7 @@ class BlockMargin:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How the loop behaves inside its margin: what α and the margin do not say.
+    """How the loop behaves inside its margin.
 
     Attributes
     ----------
@@ -56,45 +54,30 @@ class Behaviour:
     delay_s: float
 
 
-def leader_block(gains: Gains) -> tuple[FloatArray, FloatArray]:
-    """(A0, A1) of e_0^v: e_0^v' = K1 e_0^v, late. `gains` are K1, K2, K3, each of shape (axes, axes).
+def diagonal_blocks(gains: Gains) -> list[tuple[FloatArray, FloatArray]]:
+    """(A0, A1) of e' = A0 e + A1 e(t − τ) of the leader, e_0^v, and of a follower, (e_i^p, e_i^v).
+
+    K2 couples the two and is in neither.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from gains.performance.behaviour import leader_block
-    >>> A0, A1 = leader_block((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
-    >>> A0.tolist(), A1.tolist()
-    ([[0.0]], [[-1.0]])
-    """
-    return np.zeros_like(gains[0]), gains[0]
-
-
-def follower_block(gains: Gains) -> tuple[FloatArray, FloatArray]:
-    """(A0, A1) of (e_i^p, e_i^v): e_i^p' = −e_i^v, e_i^v' = K3 e_i^p + K1 e_i^v, the latter late.
-
-    `gains` are K1, K2, K3, each of shape (axes, axes); K2 couples blocks and is in none.
-
-    Examples
-    --------
-    e^p' = -e^v at once, e^v' = e^p - e^v late:
+    e_0^v' = −e_0^v late; e^p' = −e^v at once, e^v' = e^p − e^v late:
 
     >>> import numpy as np
-    >>> from gains.performance.behaviour import follower_block
-    >>> A0, A1 = follower_block((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
-    >>> (A0 + A1).tolist()
-    [[0.0, -1.0], [1.0, -1.0]]
+    >>> from gains.performance.behaviour import diagonal_blocks
+    >>> blocks = diagonal_blocks((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
+    >>> [(A0 + A1).tolist() for A0, A1 in blocks]
+    [[[-1.0]], [[0.0, -1.0], [1.0, -1.0]]]
     """
-    own, _, spacing = gains
-    zero, identity = np.zeros_like(own), np.eye(own.shape[0])
-    return np.block([[zero, -identity], [zero, zero]]), np.block([[zero, zero], [spacing, own]])
+    axes = len(gains[0])
+    A0, A1 = FormationModel((-1, 0), axes).ground_loop(*gains)
+    return [(A0[place, place], A1[place, place]) for place in (slice(axes), slice(axes, None))]
 
 
 def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
-    """Margin of x'(t) = A0 x(t) + A1 x(t − τ) and the crossing at its end. Arguments as of
-    `gains.delay.constant.analyse_delay`.
+    """Return the margin of x'(t) = A0 x(t) + A1 x(t − τ) and the frequency of the crossing at its end.
 
-    The frequency is NaN if there is no crossing.
+    The frequency is NaN if there is no crossing. Arguments as of `gains.delay.constant.analyse_delay`.
 
     Examples
     --------
@@ -111,7 +94,7 @@ def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
 
 
 def behaviour(gains: Gains, delay_s: float, *, own_delay_s: float | None = None) -> Behaviour:
-    """Behaviour of a formation whose leader and followers have the gains K1, K2, K3, each of shape (axes, axes).
+    """Return the behaviour of a formation whose leader and followers have the gains K1, K2 and K3.
 
     Parameters
     ----------
@@ -132,7 +115,7 @@ def behaviour(gains: Gains, delay_s: float, *, own_delay_s: float | None = None)
     """
     roots = np.linalg.eigvals(subsystem_loop(*gains))
     own_s = delay_s if own_delay_s is None else own_delay_s
-    late = [rightmost_root([(A0, 0.0), (A1, own_s)]) for A0, A1 in (leader_block(gains), follower_block(gains))]
+    late = [rightmost_root([(A0, 0.0), (A1, own_s)]) for A0, A1 in diagonal_blocks(gains)]
     return Behaviour(
         decay_rate_1_s=float(-roots.real.max()),
         damping=min(_damping(root) for root in roots.tolist()),
@@ -145,51 +128,5 @@ def behaviour(gains: Gains, delay_s: float, *, own_delay_s: float | None = None)
 
 
 def _damping(root: complex) -> float:
-    """Damping ratio −Re s / |s|; 0 for a root at zero, which nothing brings back."""
+    """Damping ratio −Re s / |s|; 0 for a root at zero."""
     return -root.real / abs(root) if root else 0.0
-
-
-def string_peak(
-    gains: Gains, delay_s: float, *, front_delay_s: float | None = None, answer: Response = np.ones_like
-) -> float:
-    """Return the largest singular value of Γ(jω) over ω, at least |Γ(0)| = 1, as `gains.performance.string_stability`
-    finds it.
-
-    Γ takes the velocity error of the vehicle in front to the own one, and for gains that act on every axis alike also
-    the spacing error in front to the own one. With own feedback delayed by a and that of the vehicle in front by b::
-
-        Γ(s) = (s² I − (s K1 − K3) h e^{−sa})^{-1} (s K2 e^{−sb} + K3 e^{−sa}) h
-
-    Parameters
-    ----------
-    delay_s, front_delay_s
-        a and b; b = a if not given, as when a ground station closes every loop.
-    answer
-        h(jω), from wanted to real acceleration: frequencies (k,) to values (k,). One if not given.
-
-    Examples
-    --------
-    |1 / (s² + s + 1)| peaks at 2 / √3:
-
-    >>> import numpy as np
-    >>> from gains.performance.behaviour import string_peak
-    >>> round(string_peak((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), 0.0), 4)
-    1.1547
-    """
-    identity = np.eye(gains[0].shape[0])
-    own, front, spacing = gains
-    if all(np.array_equal(gain, gain[0, 0] * identity) for gain in gains):  # one axis says it for all
-        own, front, spacing, identity = own[:1, :1], front[:1, :1], spacing[:1, :1], identity[:1, :1]
-    behind_s = delay_s if front_delay_s is None else front_delay_s
-
-    def growth(omega: FloatArray) -> NDArray[Any]:
-        s, h = 1j * omega, answer(omega)
-        at_once, late = ((h * np.exp(-s * delay))[:, None, None] for delay in (delay_s, behind_s))
-        s = s[:, None, None]
-        loop, entry = s**2 * identity - (s * own - spacing) * at_once, s * front * late + spacing * at_once
-        if len(identity) == 1:
-            return (entry / loop)[:, 0, 0]
-        return np.linalg.norm(np.linalg.solve(loop, entry), ord=2, axis=(1, 2))
-
-    near = float(np.linalg.norm(own, 2) + np.sqrt(np.linalg.norm(spacing, 2)))
-    return response_peak(growth, near_rad_s=near or 1.0)[0]

@@ -1,12 +1,12 @@
-"""The formation loop with vehicles that follow a command late and softly, as an autopilot does, and its delay margin.
+"""The formation loop of vehicles that respond to a command with a lag, as an autopilot does, and its delay margin.
 
-A vehicle takes an acceleration u and the velocity v_s that goes with it, v_s' = u. Its acceleration a follows
+A vehicle is commanded an acceleration u and the velocity that goes with it, v_s' = u. Its acceleration a follows
 
     lag a' = u + g (v_s - v) - a,   v' = a,
 
-so a / u = (s + g) / (lag s² + s + g), which is 1 / (lag s + 1) for g = 0. In place of v_s the state holds the velocity
-still owed, d = v_s - v, d' = u - a. With A, B of this and u = K e the margin is that of `gains.delay.constant` and
-`gains.sampled.multirate`: one delay, exact.
+so a / u = (s + g) / (lag s² + s + g), which is 1 / (lag s + 1) for g = 0. Instead of v_s the state holds the velocity
+still owed, d = v_s - v, d' = u - a. With these A, B and u = K e, `gains.delay.constant` and
+`gains.sampled.multirate` have the margin: one delay, exact.
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,10 @@ from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.sampled.multirate import Timing, multirate_delay_margin
 
-_MARGIN_RESOLUTION = 1e-9
-
 
 @dataclass(frozen=True)
 class Response:
-    """How one vehicle answers: `lag_s` > 0 from wanted to real acceleration, velocity gain g >= 0 in 1/s.
+    """The response of one vehicle: `lag_s` > 0 from wanted to real acceleration, velocity gain g >= 0 in 1/s.
 
     Raises
     ------
@@ -62,7 +60,7 @@ class Response:
 def formation_loop(
     model: FormationModel, K: FloatArray, responses: Sequence[Response]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(A, B, K) of the formation u = K e whose vehicles answer so, one response for each in the model's order.
+    """Return (A, B, K) of the formation u = K e whose vehicles have these responses, one for each in the model's order.
 
     The state is e of `gains.formation.model`, followed by a and d of each vehicle; a vehicle with g = 0 has no d.
 
@@ -115,9 +113,9 @@ def formation_loop(
 def sampled_margin(
     model: FormationModel, K: FloatArray, responses: Sequence[Response] | None, *, timing: Timing
 ) -> float:
-    """The least loop delay (s) at which the sampled and held loop of these vehicles loses stability.
+    """Return the least loop delay (s) at which the sampled and held loop of these vehicles loses stability.
 
-    Without responses they answer at once. Arguments and exceptions as of `formation_loop` and
+    Without responses they respond at once. Arguments and exceptions as of `formation_loop` and
     `gains.sampled.multirate.multirate_delay_margin`.
 
     Examples
@@ -137,7 +135,7 @@ def sampled_margin(
 
 
 def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response]) -> float:
-    """The least delay (s) at which the continuous loop of these vehicles loses stability.
+    """Return the least delay (s) at which the continuous loop of these vehicles loses stability.
 
     Arguments and exceptions as of `formation_loop` and `gains.delay.constant.delay_margin`.
 

@@ -1,12 +1,10 @@
-"""Robust gains of one follower subsystem, and how robust given gains are: by LMI and, exactly, by frequency response.
+"""How robust given gains are: exactly, by frequency response, and proved, by a linear matrix inequality.
 
-The subsystem E = (e_j^v, e_i^p, e_i^v) of a follower i behind j is disturbed by w (wind, model error) that is bounded
-by a sector, w'w ≤ α² E'W'W E (3.25-3.29). Every follower has the same subsystem, so nothing here grows with the number
-of vehicles. α in 1/s for W = I with the state in m and m/s.
+The subsystem E = (e_j^v, e_i^p, e_i^v) of a follower i behind j is disturbed by w (wind, model error) within a sector,
+w'w ≤ α² E'W'W E (3.25-3.29). Every follower has the same subsystem, so nothing here grows with the number of vehicles.
+α is in 1/s for W = I with the state in m and m/s. `gains.design.robust_lmi` finds gains by such an inequality.
 
-Source: Sahoo 2012 (see `gains.formation.model`), eqs. (3.20)-(3.29). Its LMI as printed has no solution: with a
-block-diagonal Y the (2, 2) block of A Y + Y A' + B L + L'B' is identically zero. `robust_lmi` solves it in sheared
-coordinates instead, which keep the structure of the gain.
+Source: Sahoo 2012 (see `gains.formation.model`), eqs. (3.20)-(3.29).
 """
 
 import warnings
@@ -18,14 +16,12 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError, SolverError
-from gains.formation.model import checked_gain
+from gains.formation.model import FormationModel
 
-# The level-set search stops when no frequency exceeds the largest gain found by this relative step; it is far above
-# the rounding of a 6×6 eigenvalue problem and far below what any figure shown to a user resolves.
+# The level-set search stops when no frequency exceeds the largest gain found by this share: far above the rounding of a
+# 6×6 eigenvalue problem, and far below what any figure shown to a user resolves.
 _LEVEL_STEP = 1e-10
 _LEVEL_ROUNDS = 60
-# Slack asked of the synthesis LMI, above the solver's tolerance: rounding then cannot turn its certificate indefinite.
-_LMI_SLACK = 1e-6
 # With Clarabel's own 1e-8 and longest step the larger problems (axes = 2, bounds of 300) end "optimal_inaccurate" now
 # and then. What the solver reaches is checked afterwards by eigenvalues in any case.
 _CLARABEL = {"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-7, "max_step_fraction": 0.9}
@@ -33,7 +29,7 @@ _CLARABEL = {"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-7, "max_st
 
 @dataclass(frozen=True)
 class SolverFacts:
-    """What the optimiser did: enough to repeat the run and to see that it ended as it should.
+    """What the solver did: enough to repeat the run and to see that it ended well.
 
     `variables` and `constraints` count the scalars of the problem as modelled.
     """
@@ -73,37 +69,10 @@ class Certificate:
     solver: SolverFacts
 
 
-@dataclass(frozen=True, eq=False)
-class RobustGains:
-    """Gains from the robust LMI.
-
-    Attributes
-    ----------
-    K1, K2, K3
-        Gains on the own velocity error (1/s), that of the vehicle in front (1/s) and the spacing error (1/s²), (n, n).
-    alpha
-        Bound of the LMI. The exact bound of these gains, `robustness(K1, K2, K3)`, is as large or larger.
-    Y
-        diag(Y1, Y2, Y1), inverse Lyapunov matrix in the sheared coordinates, shape (3 n, 3 n).
-    shear
-        The c of the coordinates z_3 = e_i^v + c e_i^p.
-    certificate
-        The same proof in the coordinates of E: P = T'Y^{-1}T.
-    """
-
-    K1: FloatArray
-    K2: FloatArray
-    K3: FloatArray
-    alpha: float
-    Y: FloatArray
-    shear: float
-    certificate: Certificate
-
-
 def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
-    """Closed loop A_cl = [[K1, 0, 0], [I, 0, −I], [K2, K3, K1]] of the subsystem (3.25, 3.26), shape (3 n, 3 n).
+    """Return the closed loop A_cl = [[K1, 0, 0], [I, 0, −I], [K2, K3, K1]] of (3.25, 3.26), shape (3 n, 3 n).
 
-    Arguments and exceptions as of `robustness`.
+    It is that of a leader and one follower. Arguments and exceptions as of `robustness`.
 
     Examples
     --------
@@ -111,13 +80,9 @@ def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
     >>> subsystem_loop(-3, 2, 1).tolist()
     [[-3.0, 0.0, 0.0], [1.0, 0.0, -1.0], [2.0, 1.0, -3.0]]
     """
-    n = np.atleast_2d(np.asarray(K1, dtype=float)).shape[0]
-    own, front, spacing = (
-        checked_gain(name, np.atleast_2d(np.asarray(gain, dtype=float)), n)
-        for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
-    )
-    identity, zero = np.eye(n), np.zeros((n, n))
-    return np.block([[own, zero, zero], [identity, zero, -identity], [front, spacing, own]])
+    gains = [np.atleast_2d(np.asarray(gain, dtype=float)) for gain in (K1, K2, K3)]
+    A0, A1 = FormationModel((-1, 0), axes=len(gains[0])).ground_loop(*gains)
+    return A0 + A1
 
 
 def robustness(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, W: ArrayLike | None = None) -> float:
@@ -125,7 +90,7 @@ def robustness(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, W: ArrayLike | None 
 
     A quadratic Lyapunov function, with a full matrix, that proves the sector bound α exists if and only if
     α ‖W (sI − A_cl)^{-1}‖∞ < 1 (Kalman-Yakubovich-Popov). For W = I this is the complex stability radius of A_cl, the
-    least of σ_min(jωI − A_cl) over ω, which the SLICOT routine AB13FD computes also.
+    least of σ_min(jωI − A_cl) over ω, which the SLICOT routine AB13FD also computes.
 
     Parameters
     ----------
@@ -239,105 +204,6 @@ def certify(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, alpha: float, W: ArrayL
     return _checked_certificate(A, W_, alpha, alpha * np.asarray(P.value, dtype=float), solver)
 
 
-def robust_lmi(
-    *, shear: float, gain_bound: float, lyapunov_bound: float, W: ArrayLike | None = None, axes: int = 1
-) -> RobustGains:
-    """Gains of the largest α that a block-diagonal Lyapunov matrix in sheared coordinates can prove.
-
-    In z = T E, T = [[I, 0, 0], [0, I, 0], [0, cI, I]], c = `shear`, minimise γ = 1/α² subject to::
-
-        [[A_z Y + Y A_z' + B_z L + L'B_z' + T T', Y T^{-T} W'], [W T^{-1} Y, −γ I]] ≺ 0
-        [[κ_L I, L'], [L, κ_L I]] ⪰ 0,   [[Y, I], [I, κ_Y I]] ⪰ 0
-        Y = diag(Y1, Y2, Y1),   L = [[L1, 0, 0], [L2, L3, L1]],   A_z = T A T^{-1},   B_z = T B
-
-    One Schur complement less than the source: with its constant block −I kept, Clarabel often ends inaccurate.
-    K = L Y^{-1} T = [[K1, 0, 0], [K2, K3z + c K1, K1]] has the wanted pattern, with the same K1 twice. For W = I
-    the supremum over unbounded gains is α = |c| / √(1 + c²), approached only as the gains diverge; ‖K T^{-1}‖ is at
-    most κ_L κ_Y.
-
-    Parameters
-    ----------
-    shear
-        c < 0, 1/s.
-    gain_bound, lyapunov_bound
-        κ_L and κ_Y.
-    W
-        Weight of the sector, shape (q, 3 axes); the identity if not given.
-    axes
-        Block size n; 1 gives numbers that act on every axis alike.
-
-    Raises
-    ------
-    BadModelError
-        If c is not negative or a bound not positive.
-    SolverError
-        If the solver does not end with status "optimal", or the certificate fails its check.
-
-    Examples
-    --------
-    Near to the supremum 1 / √2 = 0.7071 of c = −1:
-
-    >>> from gains.performance.robust import robust_lmi
-    >>> found = robust_lmi(shear=-1.0, gain_bound=10.0, lyapunov_bound=10.0)
-    >>> round(found.alpha, 3)
-    0.707
-    """
-    import cvxpy as cp
-
-    _check_bounds(shear, gain_bound, lyapunov_bound, axes)
-    m = 3 * axes
-    W_ = _checked_weight(W, m)
-    T, A_z, B_z = _sheared_subsystem(shear, axes)
-    W_z = W_ @ np.linalg.inv(T)
-    Y1, Y2 = cp.Variable((axes, axes), symmetric=True), cp.Variable((axes, axes), symmetric=True)
-    L1, L2, L3 = (cp.Variable((axes, axes)) for _ in range(3))
-    gamma, zero = cp.Variable(), np.zeros((axes, axes))
-    Y: Any = cp.bmat([[Y1, zero, zero], [zero, Y2, zero], [zero, zero, Y1]])
-    L: Any = cp.bmat([[L1, zero, zero], [L2, L3, L1]])
-    drift = A_z @ Y + Y @ A_z.T + B_z @ L + L.T @ B_z.T
-    sector = cp.bmat([[drift + T @ T.T, Y @ W_z.T], [W_z @ Y, -gamma * np.eye(len(W_z))]])
-    gain_limit = cp.bmat([[gain_bound * np.eye(m), L.T], [L, gain_bound * np.eye(2 * axes)]])
-    lyapunov_limit = cp.bmat([[Y, np.eye(m)], [np.eye(m), lyapunov_bound * np.eye(m)]])
-    constraints: list[Any] = [
-        negative(sector, _LMI_SLACK * np.eye(m + len(W_z))),
-        gain_limit >> 0,
-        lyapunov_limit >> 0,
-    ]
-    solver = solved(
-        cp.Problem(cp.Minimize(gamma), constraints),
-        advice=f"raise gain_bound = {gain_bound} or lyapunov_bound = {lyapunov_bound}, or move shear = {shear} to zero",
-    )
-
-    Y_value = np.asarray(Y.value, dtype=float)
-    K_z = np.asarray(L.value, dtype=float) @ np.linalg.inv(Y_value)
-    first, second, third = (slice(k * axes, (k + 1) * axes) for k in range(3))
-    K1, K2 = K_z[second, third], K_z[second, first]
-    K3 = K_z[second, second] + shear * K1
-    alpha = float(np.asarray(gamma.value)) ** -0.5
-    P = T.T @ np.linalg.inv(Y_value) @ T
-    certificate = _checked_certificate(subsystem_loop(K1, K2, K3), W_, alpha, P, solver)
-    return RobustGains(K1=K1, K2=K2, K3=K3, alpha=alpha, Y=Y_value, shear=shear, certificate=certificate)
-
-
-def _sheared_subsystem(shear: float, n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """T, T A T^{-1} and T B of the subsystem (3.25) without feedback."""
-    identity, zero = np.eye(n), np.zeros((n, n))
-    T = np.block([[identity, zero, zero], [zero, identity, zero], [zero, shear * identity, identity]])
-    A = np.block([[zero, zero, zero], [identity, zero, -identity], [zero, zero, zero]])
-    B = np.block([[identity, zero], [zero, zero], [zero, identity]])
-    return T, T @ A @ np.linalg.inv(T), T @ B
-
-
-def _check_bounds(shear: float, gain_bound: float, lyapunov_bound: float, axes: int) -> None:
-    if not (np.isfinite(shear) and shear < 0):
-        raise BadModelError(f"shear = {shear}; wanted a negative number, for example -2.5")
-    for name, bound in (("gain_bound", gain_bound), ("lyapunov_bound", lyapunov_bound)):
-        if not (np.isfinite(bound) and bound > 0):
-            raise BadModelError(f"{name} = {bound}; wanted a positive number, for example 100")
-    if axes < 1:
-        raise BadModelError(f"axes = {axes}; wanted 1 or more")
-
-
 def _checked_weight(W: ArrayLike | None, m: int) -> FloatArray:
     if W is None:
         return np.eye(m)
@@ -350,7 +216,7 @@ def _checked_weight(W: ArrayLike | None, m: int) -> FloatArray:
 
 
 def negative(matrix: Any, slack: Any) -> Any:
-    """Constraint matrix ⪯ −slack; the mean with the transpose tells cvxpy what it cannot see: that it is symmetric."""
+    """Constraint matrix ⪯ −slack, averaged with the transpose, as cvxpy cannot see that it is symmetric."""
     return (matrix + matrix.T) / 2 + slack << 0
 
 

@@ -1,21 +1,19 @@
-"""One follower with gains that are numbers: its delay margin, growth of errors, robustness and decay, by formula.
+"""One follower with scalar gains: its delay margin, growth of errors, robustness and decay, by formula.
 
 The gains act on every axis alike, u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p, and all feedback is late. The delay margin
 depends on (k1, k3) alone and the gains of a given margin form a curve with an explicit equation (`gains_of_margin`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 
-Factor = NDArray[np.complexfloating[Any, Any]] | float
-
-# Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three of
-# those, and a parabola through the last, bring σ_min to about 1e-10 of itself.
+# Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three
+# closer looks, and a parabola through the last, give σ_min to about 1e-10 of itself.
 _FREQUENCIES, _FREQUENCIES_CLOSER, _CLOSER_LOOKS = 40, 9, 3
 
 
@@ -44,7 +42,7 @@ def gains_of_margin(share: FloatArray, delay_margin_s: FloatArray, period_s: flo
     feedback late, τ = atan(k1 ω / k3) / ω, ω² = (k1² + √(k1⁴ + 4 k3²)) / 2.
 
     Sampled loop with period T and zero-order hold: with τ = (l + f) T, 0 ≤ f < 1, the command computed from the sample
-    at t_k acts from t_k + τ. Over one period the velocity and spacing answer u with
+    at t_k acts from t_k + τ. Over one period velocity and spacing respond to u with
 
         G_v(z) = T z^{−l−1} (f + (1 − f) z) / (z − 1)
         G_p(z) = −(T G_v + T² z^{−l−1} (f − f²/2 + (1 − f)² z / 2)) / (z − 1)
@@ -115,9 +113,8 @@ def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string
     >>> front_gain_limit(np.array([2.0]), np.array([1.0]), np.array([0.0]), 1.0).round(6).tolist()
     [1.414214]
     """
-    # Above ω = 2 k1 + √(2 k3) the bound grows with ω for every delay: ω² outgrows 2 (k3 + k1 ω).
-    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
     at_rest = k1**2 - 2 * k3 if string_peak_max == 1 else np.full_like(k1, np.inf)
+    omega = _frequencies_below_growth(k1, k3)
     k1, k3, delay_s = k1[..., None], k3[..., None], delay_s[..., None]
 
     def bound(omega: FloatArray) -> FloatArray:
@@ -125,12 +122,7 @@ def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string
         flat = omega**2 - 2 * (k3 * np.cos(lag) + k1 * omega * np.sin(lag)) + k1**2
         return string_peak_max**2 * flat + (string_peak_max**2 - 1) * (k3 / omega) ** 2
 
-    omega = np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape[:-1], 96))
-    square, at = _with_least_inside(bound(omega))
-    for _ in range(_CLOSER_LOOKS):
-        omega = _between_neighbours(omega, at)
-        square, at = _with_least_inside(bound(omega))
-    least = np.minimum(square.min(axis=-1), at_rest)
+    least = np.minimum(_around_least(bound, omega)[0].min(axis=-1), at_rest)
     return np.sqrt(np.where(least >= 0, least, np.nan))
 
 
@@ -158,20 +150,14 @@ def onboard_front_gain_limit(k1: FloatArray, k3: FloatArray, string_peak_max: fl
     """
     if string_peak_max == 1.0:
         return np.where(k1**2 >= 2 * k3, 0.0, np.nan)
+    omega = _frequencies_below_growth(k1, k3)
     k1, k3 = k1[..., None], k3[..., None]
 
     def bound(omega: FloatArray) -> FloatArray:
         size = np.sqrt((k3 - omega**2) ** 2 + (k1 * omega) ** 2)
         return (string_peak_max * size - k3) / omega
 
-    # 0 at rest is +∞ of the bound, and above 2 k1 + √(2 k3) it grows
-    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
-    omega = np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape[:-1], 96))
-    limit, at = _with_least_inside(bound(omega))
-    for _ in range(_CLOSER_LOOKS):
-        omega = _between_neighbours(omega, at)
-        limit, at = _with_least_inside(bound(omega))
-    least = limit.min(axis=-1)
+    least = _around_least(bound, omega)[0].min(axis=-1)
     return np.where(least >= 0, least, np.nan)
 
 
@@ -198,42 +184,7 @@ def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: 
     loop = (k3 - x) ** 2 + a2 * x
     c2 = 3 * x + 2 * a2 + 2 + k2**2 + k3**2
     c1 = loop + (k2 - k1) ** 2 + x + k3**2 + k2**2 * x + own * (own + k3**2 + 1 + x)
-    return _least_root(c2, c1, own * loop)
-
-
-def delayed_singular_value(gains: ScalarGains, omega: FloatArray, own: Factor, front: Factor) -> FloatArray:
-    """Return σ_min of the characteristic matrix of the subsystem with late feedback, at each frequency.
-
-    With the complex factors d on a vehicle's own errors and f on the velocity error of the vehicle in front, e^{−jωτ}
-    for a delay τ, times what the vehicle makes of a command, the matrix is::
-
-        [[jω + k1 d, 0, 0], [−1, jω, 1], [−k2 f, −k3 d, jω + k1 d]]
-
-    σ_min² is found as in `least_singular_value`, which is the case d = f = 1, in half the time.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from gains.performance.scalar_gains import ScalarGains, delayed_singular_value, least_singular_value
-    >>> at_once = delayed_singular_value(ScalarGains(3.0, 2.0, 2.0, 0.0), np.array(1.0), 1.0, 1.0)
-    >>> bool(abs(at_once - least_singular_value(3.0, 2.0, 2.0, np.array(1.0))) < 1e-12)
-    True
-    """
-    jw = 1j * omega
-    leader, spacing, ahead = jw + gains.k1 * own, gains.k3 * own, gains.k2 * front
-    x, a2, g2, h2 = omega**2, _squared(leader), _squared(ahead), _squared(spacing)
-    loop = _squared(jw * leader + spacing)
-    c2 = 2 * a2 + x + 2 + g2 + h2
-    c1 = loop + _squared(ahead - leader) + _squared(spacing + jw * ahead) + a2 * (x + 1 + h2 + a2)
-    return _least_root(c2, c1, a2 * loop)
-
-
-def _squared(value: Factor) -> FloatArray:
-    return np.abs(value) ** 2
-
-
-def _least_root(c2: FloatArray, c1: FloatArray, c0: FloatArray) -> FloatArray:
-    """Root of the least root of λ³ − c2 λ² + c1 λ − c0, whose roots are real and positive."""
+    c0 = own * loop
     root = c0 / c1
     for _ in range(5):
         root = root + (c0 - root * (c1 - root * (c2 - root))) / (c1 - root * (2 * c2 - 3 * root))
@@ -260,10 +211,7 @@ def alpha_of(k1: FloatArray, k2: FloatArray, k3: FloatArray) -> FloatArray:
     omega = np.broadcast_to(
         np.concatenate([[0.0], np.geomspace(slow / 10, 3 * fast, _FREQUENCIES)]), (*k1.shape[:-1], _FREQUENCIES + 1)
     )
-    sigma, at = _with_least_inside(least_singular_value(k1, k2, k3, omega))
-    for _ in range(_CLOSER_LOOKS):
-        omega = _between_neighbours(omega, at)
-        sigma, at = _with_least_inside(least_singular_value(k1, k2, k3, omega))
+    sigma, at = _around_least(lambda at: least_singular_value(k1, k2, k3, at), omega)
     before, middle, after = (np.take_along_axis(sigma, at + step, -1)[..., 0] for step in (-1, 0, 1))
     bend, slope = before - 2 * middle + after, (after - before) / 2
     vertex = middle - np.where(bend > 0, slope**2 / (2 * np.where(bend > 0, bend, 1.0)), 0.0)
@@ -273,7 +221,7 @@ def alpha_of(k1: FloatArray, k2: FloatArray, k3: FloatArray) -> FloatArray:
 
 
 def decay_rate_of(k1: FloatArray, k3: FloatArray) -> FloatArray:
-    """Return the decay rate (1/s) without delay of s² + k1 s + k3; that of the leader, s + k1, is no less.
+    """Return the decay rate (1/s) of s² + k1 s + k3, without delay; the leader, s + k1, decays no slower.
 
     Examples
     --------
@@ -287,12 +235,25 @@ def decay_rate_of(k1: FloatArray, k3: FloatArray) -> FloatArray:
     return k1 / 2 - np.sqrt(np.maximum(k1**2 / 4 - k3, 0.0))
 
 
-def _with_least_inside(values: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
-    """The values and, along their last axis, the index of the least one, moved off the ends."""
-    return values, np.clip(np.argmin(values, axis=-1, keepdims=True), 1, values.shape[-1] - 2)
+def _frequencies_below_growth(k1: FloatArray, k3: FloatArray) -> FloatArray:
+    """Frequencies up to 2 k1 + √(2 k3), above which bounds of k2 grow at every delay: ω² outgrows 2 (k3 + k1 ω)."""
+    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
+    return np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape, 96))
 
 
-def _between_neighbours(omega: FloatArray, at: NDArray[np.intp]) -> FloatArray:
-    """Finer frequencies between the neighbours of those at the index, along the last axis."""
-    low, high = np.take_along_axis(omega, at - 1, -1), np.take_along_axis(omega, at + 1, -1)
-    return low + (high - low) * np.linspace(0, 1, _FREQUENCIES_CLOSER)
+def _around_least(
+    function: Callable[[FloatArray], FloatArray], omega: FloatArray
+) -> tuple[FloatArray, NDArray[np.intp]]:
+    """The values around the least one of each row, ever closer, and its index along the last axis, off the ends."""
+    values = function(omega)
+    at = _index_of_least(values)
+    for _ in range(_CLOSER_LOOKS):
+        low, high = np.take_along_axis(omega, at - 1, -1), np.take_along_axis(omega, at + 1, -1)
+        omega = low + (high - low) * np.linspace(0, 1, _FREQUENCIES_CLOSER)
+        values = function(omega)
+        at = _index_of_least(values)
+    return values, at
+
+
+def _index_of_least(values: FloatArray) -> NDArray[np.intp]:
+    return np.clip(np.argmin(values, axis=-1, keepdims=True), 1, values.shape[-1] - 2)

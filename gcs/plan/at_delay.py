@@ -1,21 +1,18 @@
 """α and the growth of spacing errors at a loop delay: that expected of a scenario's links, or one measured in flight.
 
-Their values without delay say little about a flight. In a leader-follower tree with equal gains the loop of a follower
-as flown (`gains.performance.flown_loop`) gives both. Gains on another pattern need the whole formation
-(`gains.performance.flown_formation`): errors run both ways there, so growth from vehicle to vehicle is undefined and
-only α is reported.
+A design's figures without delay say little about a flight; `gains.performance.flown` has those at a loop delay. Gains
+on a pattern other than a leader-follower tree have an α only: errors run both ways, so that no growth from vehicle to
+vehicle is defined.
 """
 
-from collections.abc import Sequence
 from math import inf
 
 import numpy as np
 
 from gains.core.requirement import plain
-from gains.design.graph import time_scaled
-from gains.performance.delayed_alpha import ALPHA_KEPT
-from gains.performance.flown_formation import FlownFormation
-from gains.performance.flown_loop import FlownLoop
+from gains.design.time_scale import time_scaled
+from gains.formation.model import FormationModel
+from gains.performance.flown import ALPHA_KEPT, FlownFormation, FlownLoop, FlownTiming
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.onboard import own_part
@@ -58,49 +55,46 @@ def _mean_jitter_s(jitter: Jitter) -> float:
 
 
 def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
-    """The design with `at_loop_delay`: the figures at the expected loop delay, and the delays up to which they hold."""
-    loops = _flown_loops(design, scenario)
-    if not loops:
+    """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole."""
+    flown, chains = _flown(design, scenario)
+    if not flown:
         return design
     requirement = design.requirement
-    chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
     peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
-    # where vehicles differ, the least counts
-    alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(loop.alpha(0.0) for loop in loops)
-    flown = FiguresAtExpectedDelay(
+    # of different vehicles the one that leaves least
+    alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(formation.alpha(0.0) for formation in flown)
+    figures = FiguresAtExpectedDelay(
         **figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump(),
         alpha_kept=alpha,
-        alpha_kept_to_s=plain(min(loop.alpha_limit_s(alpha) for loop in loops)),
+        alpha_kept_to_s=plain(min(formation.alpha_limit_s(alpha) for formation in flown)),
         string_peak_kept=peak,
         string_peak_kept_to_s=plain(min(loop.string_limit_s(peak) for loop in chains)) if peak else None,
     )
-    return design.model_copy(update={"at_loop_delay": flown})
+    return design.model_copy(update={"at_loop_delay": figures})
 
 
 def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
     """α and the string peak of a design's gain set at a loop delay (s)."""
-    loops = [] if delay_s is None else _flown_loops(design, scenario, gain_set)
-    if delay_s is None or not loops:
-        return FiguresAtDelay(loop_delay_s=delay_s, alpha=None, has_string_verdict=False, string_peak=None)
-    chains = [loop for loop in loops if isinstance(loop, FlownLoop)]
+    flown, chains = _flown(design, scenario, gain_set) if delay_s is not None else ([], [])
+    if delay_s is None or not flown:
+        return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
     return FiguresAtDelay(
         loop_delay_s=delay_s,
-        alpha=min(loop.alpha(delay_s) for loop in loops),
+        alpha=min(formation.alpha(delay_s) for formation in flown),
         has_string_verdict=bool(chains),
         string_peak=plain(max(loop.string_peak(delay_s) for loop in chains)) if chains else None,
     )
 
 
-def _flown_loops(
-    design: Design, scenario: Scenario, gain_set: int = 0
-) -> Sequence[FlownLoop] | Sequence[FlownFormation]:
-    """The loops of the followers, or the whole formation; empty where no α is defined."""
+def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
+    """What is flown, as far as it has an α at all, and the loops of its followers where errors run down chains."""
     if design.vehicles < 2:
-        return []
+        return [], []
     entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
     if design.inclusion_gains is not None:
-        return _follower_loops(design, entry)
-    return [_flown_formation(design, entry, scenario)] if design.K is not None else []
+        chains = _follower_loops(design, entry)
+        return [chain.pair for chain in chains], chains
+    return [_flown_formation(design, entry, scenario)] if design.K is not None else [], []
 
 
 def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
@@ -112,11 +106,8 @@ def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
     return [
         FlownLoop(
             ScalarGains(-own, front * entry.streamed_share, spacing, 0.0),
-            delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
-            period_s=design.period_s,
-            loop=design.loop,
-            step_s=1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0,
-            response=answer,
+            _timing(design, entry),
+            answer,
         )
         for answer in set(_responses(design).values()) or [None]
     ]
@@ -135,12 +126,15 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
     return FlownFormation(
         model,
         gain,
-        delay_margin_s=inf if entry.delay_margin_s is None else entry.delay_margin_s,
-        period_s=design.period_s,
-        loop=design.loop,
-        step_s=1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0,
-        responses=tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
+        _timing(design, entry),
+        tuple(answers[system_id] for system_id in formation.system_ids) if answers else None,
     )
+
+
+def _timing(design: Design, entry: GainSet) -> FlownTiming:
+    margin_s = inf if entry.delay_margin_s is None else entry.delay_margin_s
+    step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
+    return FlownTiming(margin_s, design.period_s, design.loop, step_s)
 
 
 def _responses(design: Design) -> dict[int, Response]:

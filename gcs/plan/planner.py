@@ -9,12 +9,13 @@ from gains.core.arrays import FloatArray
 from gains.core.requirement import Requirement, plain
 from gains.design.design import Design as InclusionDesign
 from gains.design.design import design, evaluate_gains
-from gains.design.graph import GraphDesign, evaluate_graph_gain, time_scaled
+from gains.design.graph import GraphDesign
 from gains.design.required import requirement_with
+from gains.design.time_scale import time_scaled
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, leader_follower, with_links, without_links
-from gains.performance.behaviour import string_peak
 from gains.performance.response import Response, continuous_margin, sampled_margin
+from gains.performance.string_stability import string_peak
 from gcs.plan.at_delay import with_figures_at_delay
 from gcs.plan.design import Block, Design, GainSet, ResponsePart, VehicleResponse
 from gcs.plan.flight_plan import FlightPlan, loop_timing
@@ -119,7 +120,7 @@ def _schedule(scenario: Scenario, model: FormationModel, found: InclusionDesign)
     """
     period_s = loop_timing(scenario).held_s
     return [
-        (s, evaluate_gains(model, found.K1 / s, found.K2 / s, found.K3 / s**2, period_s=period_s))
+        (s, evaluate_gains(model, (found.K1 / s, found.K2 / s, found.K3 / s**2), period_s=period_s))
         for s in scenario.monitor.time_scales[1:]
     ]
 
@@ -134,7 +135,7 @@ def _design(scenario: Scenario, model: FormationModel, response: Response | None
     control, timing = scenario.control, loop_timing(scenario)
     if control.gains is not None:
         own, front, spacing = (gain * np.eye(2) for gain in (control.gains.K1, control.gains.K2, control.gains.K3))
-        return evaluate_gains(model, own, front, spacing, period_s=timing.held_s)
+        return evaluate_gains(model, (own, front, spacing), period_s=timing.held_s)
     requirement = requirement_with(_requirement(scenario), response, timing=timing)
     return design(model, requirement, period_s=timing.held_s)
 
@@ -156,7 +157,7 @@ def _graph_plan(scenario: Scenario, formation: Formation) -> tuple[Design, Fligh
     period_s = timing.held_s
     pattern = _pattern(scenario, formation)
     if control.blocks:
-        found = evaluate_graph_gain(model, pattern, _given_gain(scenario, formation), period_s=period_s)
+        found = evaluate_gains(model, _given_gain(scenario, formation), pattern=pattern, period_s=period_s)
     else:
         assert control.method != "inclusion"
         wanted = _requirement(scenario)
@@ -168,7 +169,7 @@ def _graph_plan(scenario: Scenario, formation: Formation) -> tuple[Design, Fligh
             found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
     scales = scenario.monitor.time_scales
     gains = [time_scaled(model, found.K, scale) for scale in scales]
-    slower = [evaluate_graph_gain(model, pattern, gain, period_s=period_s) for gain in gains[1:]]
+    slower = [evaluate_gains(model, gain, pattern=pattern, period_s=period_s) for gain in gains[1:]]
     plan = FlightPlan(
         scenario=scenario,
         formation=formation,

@@ -1,14 +1,16 @@
 """The axes of a campaign: the quantities of a scenario that vary, and their values.
 
-*Link delay* here is the total of a vehicle's two links, up plus down, so that it compares directly with the delay
-margin: the loop delay is this plus the time that telemetry waits for the next control tick, less than one period. The
+*Link delay* here is the total of a vehicle's two links, up plus down, which compares directly with the delay margin:
+the loop delay is the link delay plus the time that telemetry waits for the next control tick, less than one period. The
 up link takes a whole number of control periods, as near to half as possible, and the down link the rest. With any other
 split the waiting would jump by a period whenever the up link crossed a whole period, and the loop delay would grow in
 steps; with this one it grows with the link delay.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -93,15 +95,7 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
     distribution of a link that has one; elsewhere it is uniform within ± the value.
     """
     if "rate" in coordinates:
-        rates, hz = scenario.rates, coordinates["rate"]
-        together = rates.telemetry_hz == rates.control_hz
-        telemetry_hz = hz if together else rates.telemetry_hz
-        update = {"rates": rates.model_copy(update={"control_hz": hz, "telemetry_hz": telemetry_hz})}
-        scenario = scenario.model_copy(update=update)
-        if scenario.control.loop == "onboard":
-            own, factor = scenario.onboard, hz / rates.control_hz
-            on_board = {"rate_hz": own.rate_hz * factor, "sensor_hz": own.sensor_hz * factor}
-            scenario = scenario.model_copy(update={"onboard": own.model_copy(update=on_board)})
+        scenario = _with_rate(scenario, coordinates["rate"])
     if "delay" in coordinates:
         up_s, down_s = split_delay(coordinates["delay"], 1.0 / scenario.rates.control_hz)
         scenario = scenario.with_link_delay(up_s=up_s, down_s=down_s)
@@ -109,18 +103,23 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
         if name.startswith("delay_"):
             scenario = _with_vehicle_delay(scenario, int(name.removeprefix("delay_")), delay_s)
     if "jitter" in coordinates:
-        scenario = _with_every_link(scenario, lambda link: _with_jitter(link, coordinates["jitter"]))
+        change = partial(_with_jitter, scale_s=coordinates["jitter"])
+        scenario = scenario.with_links(change, change)
     if "loss" in coordinates:
-        loss = {"loss_probability": coordinates["loss"]}
-        scenario = _with_every_link(scenario, lambda link: link.model_copy(update=loss))
+        lossy = partial(Link.model_copy, update={"loss_probability": coordinates["loss"]})
+        scenario = scenario.with_links(lossy, lossy)
     return scenario
 
 
 def has_constant_links(scenario: Scenario) -> bool:
     """Whether every link has only a constant delay, so that the models describe it exactly."""
+    return all(link == Link(delay_s=link.delay_s) for link in every_link(scenario))
+
+
+def every_link(scenario: Scenario) -> list[Link]:
+    """The links of all vehicles, and those that vehicles have of their own."""
     links = scenario.links
-    every = [links.up, links.down, *(link for v in links.vehicles for link in (v.up, v.down) if link is not None)]
-    return all(link == Link(delay_s=link.delay_s) for link in every)
+    return [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link is not None)]
 
 
 def place_text(coordinates: Mapping[str, float]) -> str:
@@ -129,9 +128,20 @@ def place_text(coordinates: Mapping[str, float]) -> str:
 
 
 def split_delay(total_s: float, period_s: float) -> tuple[float, float]:
-    """Split a total link delay into up, a whole number of periods, and down, the rest: about half each."""
+    """A total link delay as up, a whole number of periods, and down, the rest: about half each."""
     up_s = round(round(total_s / 2.0 / period_s) * period_s, 12)
     return up_s, max(0.0, round(total_s - up_s, 12))
+
+
+def _with_rate(scenario: Scenario, hz: float) -> Scenario:
+    rates, own = scenario.rates, scenario.onboard
+    telemetry_hz = hz if rates.telemetry_hz == rates.control_hz else rates.telemetry_hz
+    update: dict[str, Any] = {"rates": rates.model_copy(update={"control_hz": hz, "telemetry_hz": telemetry_hz})}
+    if scenario.control.loop == "onboard":
+        factor = hz / rates.control_hz
+        on_board = {"rate_hz": own.rate_hz * factor, "sensor_hz": own.sensor_hz * factor}
+        update["onboard"] = own.model_copy(update=on_board)
+    return scenario.model_copy(update=update)
 
 
 def _with_jitter(link: Link, scale_s: float) -> Link:
@@ -152,7 +162,3 @@ def _with_vehicle_delay(scenario: Scenario, system_id: int, delay_s: float) -> S
     )
     others = tuple(links for links in scenario.links.vehicles if links.system_id != system_id)
     return scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (*others, own)})})
-
-
-def _with_every_link(scenario: Scenario, change: Callable[[Link], Link]) -> Scenario:
-    return scenario.with_links(change, change)

@@ -1,7 +1,8 @@
-"""The map of a campaign with two axes: where the formation breaks in flight, where predicted, and where it cannot."""
+"""The map of a campaign with two axes: where the formation breaks in flight, where by prediction, where it cannot."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from gains.delay.several import boundary_of_two_delays, late_by_vehicle
 from gains.sampled.coupled_block import unlike_blocks
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
-from gcs.stress.axes import Axis, at_coordinates
+from gcs.stress.axes import Axis, at_coordinates, every_link
 from gcs.stress.figures import MEASURED, figure_of, saved
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, plan_loops
@@ -72,8 +73,8 @@ def map_figure(
 def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     """(k, 2) link delays and the jitter below which the formation is proved stable however the delay varies.
 
-    With jitter of at most j each way and periods T of telemetry and control, the age of the state behind the command
-    in action lies between d - 2 j and d + 2 j + 2 T. Two bounds cover it: one for deviations from the middle
+    With jitter of at most j each way and periods T of telemetry and control, the state behind the command in action is
+    between d - 2 j and d + 2 j + 2 T old. Two bounds cover that: one for deviations from the middle
     (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies), one for any variation between 0 and a
     maximum (`gains.varying.bounds.varying_delay_bound`). None for other axes, for unbounded jitter, and for the onboard
     loop, where not all feedback is late.
@@ -85,9 +86,8 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
         or scenario.control.loop != "ground"
     ):
         return None
-    links = at_coordinates(scenario, {"jitter": 1.0}).links
-    every = [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link)]
-    if any(link.jitter is None or link.jitter.distribution != "uniform" for link in every):
+    jittery = every_link(at_coordinates(scenario, {"jitter": 1.0}))
+    if any(link.jitter is None or link.jitter.distribution != "uniform" for link in jittery):
         return None
     period_s = study.plan.timing.held_s
     loops = [(loop.A, loop.B @ loop.K) for loop in unlike_blocks(plan_loops(study.plan))]
@@ -152,23 +152,21 @@ def cell_edges(values: FloatArray) -> FloatArray:
     return np.r_[2.0 * values[0] - between[0], between, 2.0 * values[-1] - between[-1]]
 
 
+def _of_cells(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[list[Outcome]]:
+    """The outcomes of each cell, the second axis varying fastest."""
+    points = [dict(zip([axis.name for axis in axes], at, strict=True)) for at in product(*(a.values for a in axes))]
+    return [[outcome for outcome in outcomes if outcome.coordinates == point] for point in points]
+
+
 def _cells(axes: Sequence[Axis], outcomes: Sequence[Outcome], field: str) -> FloatArray:
     """A field as an array over two axes, mean of the seeds; NaN where no seed has it."""
-    values = np.full([len(axis.values) for axis in axes], np.nan)
-    for place in np.ndindex(*values.shape):
-        at = {axis.name: axis.values[k] for axis, k in zip(axes, place, strict=True)}
-        known = [getattr(o, field) for o in outcomes if o.coordinates == at]
-        known = [value for value in known if value is not None]
-        if known:
-            values[place] = float(np.mean(known))
-    return values
+    known = [[v for o in cell if (v := getattr(o, field)) is not None] for cell in _of_cells(axes, outcomes)]
+    means = [float(np.mean(values)) if values else np.nan for values in known]
+    return np.array(means).reshape([len(axis.values) for axis in axes])
 
 
 def _verdicts(axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> NDArray[np.str_]:
     """The worst verdict of all seeds at each point, empty where nothing was flown."""
-    worst = np.full([len(axis.values) for axis in axes], "", dtype="U16")
-    for place in np.ndindex(*worst.shape):
-        at = {axis.name: axis.values[k] for axis, k in zip(axes, place, strict=True)}
-        found = {outcome.verdict for outcome in outcomes if outcome.coordinates == at}
-        worst[place] = next((verdict for verdict in ("unstable", "aborted", "stable") if verdict in found), "")
-    return worst
+    found = [{outcome.verdict for outcome in cell} for cell in _of_cells(axes, outcomes)]
+    worst = [next((v for v in ("unstable", "aborted", "stable") if v in verdicts), "") for verdicts in found]
+    return np.array(worst).reshape([len(axis.values) for axis in axes])

@@ -1,6 +1,7 @@
 """The figures of a campaign, as PNG files."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, plan_loops
 
 SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
+_RATES = "growth_1_s", "predicted_growth_1_s", "growth_error_1_s"
 _DPI = 130
 _WORST = 6
 
@@ -27,10 +29,8 @@ def growth_figure(
     probes = [o for o in outcomes if o.growth_1_s is not None and o.loop_delay_s is not None]
     if not probes:
         return None
-    delay_s = np.array([o.loop_delay_s for o in probes], dtype=float)
-    measured = np.array([o.growth_1_s for o in probes], dtype=float)
-    predicted = np.array([o.predicted_growth_1_s for o in probes], dtype=float)
-    error = np.array([o.growth_error_1_s for o in probes], dtype=float)
+    delay_s = _column(probes, "loop_delay_s")
+    measured, predicted, error = (_column(probes, name) for name in _RATES)
     figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
     room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 240)
@@ -56,8 +56,7 @@ def growth_figure(
     figure.legend(loc="outside upper left", ncols=3, frameon=False, fontsize=9)
     below.axhline(0.0, color=LIMIT, linewidth=0.8)
     below.errorbar(delay_s, measured - predicted, yerr=error, **style)
-    below.set_ylabel("flight − sampled\n[1/s]")
-    below.set_xlabel("loop delay of the flight [s]")
+    below.set(xlabel="loop delay of the flight [s]", ylabel="flight − sampled\n[1/s]")
     below.ticklabel_format(axis="y", scilimits=(-2, 2))
     above.sharex(below)
     return saved(figure, file)
@@ -71,17 +70,17 @@ def axis_figure(file: Path, *, axis: Axis, outcomes: Sequence[Outcome]) -> Path 
     figure, (plot,) = figure_of(1, (9.0, 4.2))
     at = [o.coordinates[axis.name] for o in probes]
     plot.axhline(0.0, color=LIMIT, linewidth=0.8)
-    plot.plot(at, [o.predicted_growth_1_s for o in probes], "_", color=SAMPLED, markersize=14, label="sampled model")
-    plot.errorbar(
-        at,
-        [o.growth_1_s for o in probes],
-        yerr=[o.growth_error_1_s for o in probes],
-        fmt="o", color=MEASURED, markersize=4.0, capsize=2.0, label="flights",
-    )  # fmt: skip
-    plot.set_xlabel(axis.label)
-    plot.set_ylabel("growth rate of errors [1/s]")
+    measured, predicted, error = (_column(probes, name) for name in _RATES)
+    plot.plot(at, predicted, "_", color=SAMPLED, markersize=14, label="sampled model")
+    plot.errorbar(at, measured, yerr=error, fmt="o", color=MEASURED, markersize=4.0, capsize=2.0, label="flights")
+    plot.set(xlabel=axis.label, ylabel="growth rate of errors [1/s]")
     plot.legend(frameon=False)
     return saved(figure, file)
+
+
+def _column(outcomes: Sequence[Outcome], name: str) -> FloatArray:
+    """A field of outcomes; NaN for None."""
+    return np.array([getattr(outcome, name) for outcome in outcomes], dtype=float)
 
 
 def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
@@ -93,11 +92,9 @@ def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
     for outcome in worst:
         error_m = np.maximum(np.array(outcome.trace_m), 1e-6)
         time_s = outcome.trace_period_s * (np.arange(error_m.size) + 0.5)
-        plot.semilogy(
-            time_s, error_m, linewidth=1.3, label=f"{outcome.id}  {outcome.kind}, {place_text(outcome.coordinates)}"
-        )
-    plot.set_xlabel("scenario time [s]")
-    plot.set_ylabel("largest spacing error of all vehicles [m]")
+        label = f"{outcome.id}  {outcome.kind}, {place_text(outcome.coordinates)}"
+        plot.semilogy(time_s, error_m, linewidth=1.3, label=label)
+    plot.set(xlabel="scenario time [s]", ylabel="largest spacing error of all vehicles [m]")
     plot.legend(frameon=False, fontsize=8)
     return saved(figure, file)
 
@@ -121,9 +118,9 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
 
 def _curves(kinds: Sequence[CoupledBlock], delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Growth rates of the formation by the sampled and the continuous model: the largest over its loops."""
-    sampled = np.array([[kind.growth_1_s(float(at)) for at in delay_s] for kind in kinds])
-    continuous = np.array([[kind.growth_continuous_1_s(float(at)) for at in delay_s] for kind in kinds])
-    return sampled.max(axis=0), continuous.max(axis=0)
+    sampled = [[kind.growth_1_s(at) for at in delay_s.tolist()] for kind in kinds]
+    continuous = [[kind.growth_continuous_1_s(at) for at in delay_s.tolist()] for kind in kinds]
+    return np.max(sampled, axis=0), np.max(continuous, axis=0)
 
 
 def figure_of(
@@ -155,15 +152,9 @@ def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
 
 def _link_delay_axis(plot: Any, onset: Onset) -> None:
     """Add the link delays as a second axis at the top."""
-
-    def to_link_s(loop_delay_s: FloatArray) -> FloatArray:
-        return loop_delay_s - onset.waiting_s
-
-    def to_loop_s(link_delay_s: FloatArray) -> FloatArray:
-        return link_delay_s + onset.waiting_s
-
-    top = plot.secondary_xaxis("top", functions=(to_link_s, to_loop_s))
-    top.set_xlabel(f"link delay of vehicle {onset.critical}, up + down [s]: {1e3 * onset.waiting_s:.1f} ms less")
+    waiting_s = onset.waiting_s
+    top = plot.secondary_xaxis("top", functions=(partial(np.add, -waiting_s), partial(np.add, waiting_s)))
+    top.set_xlabel(f"link delay of vehicle {onset.critical}, up + down [s]: {1e3 * waiting_s:.1f} ms less")
 
 
 def saved(figure: Any, file: Path) -> Path:

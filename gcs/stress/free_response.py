@@ -1,26 +1,26 @@
-"""The free response of one loop, as flown: what its errors do after it alone was disturbed.
+"""The free response of one loop in flight: how its errors move after it alone was disturbed.
 
 A *probe* is a flight in which the formation starts exactly in place at its nominal velocity, except for a small error
 of the vehicles of one loop. Nothing acts on the vehicles ahead, so the flight shows the free response of that loop
-alone. In a formation with errors of its own, identical loops along the chain drive each other at resonance
-(t^k e^{st}), and growth can be read only after a long time.
+alone. Where every vehicle has errors, identical loops along the chain drive each other at resonance (t^k e^{st}), and
+growth can be read only after a long time.
 
 A probe removes everything that would hide the loop:
 
 * Clock drift moves the sampling instants, and with them the loop delay while it is being measured.
 * Vehicles on the launcher report a velocity but do not move. The station extrapolates their states to one instant, so
-  it would see errors of up to v T where there are none, and push every vehicle at the start. Vehicles that sample at
-  the same instant do not have this error, so all clocks are equal. The time that telemetry of the probed loop waits for
-  the control tick then no longer follows from its clock; it is kept by moving less than one period of delay between its
-  up and down links.
+  it would see errors of up to v T where there are none, and push every vehicle at the start. This error is absent if
+  all vehicles sample at the same instant, so all clocks are equal. How long telemetry of the probed loop waits for the
+  control tick then no longer follows from its clock; moving less than one period of delay between its up and down links
+  keeps it.
 * Links that differ start the vehicles at different instants. They also leave each clock wrong by half the asymmetry of
   its links, which the station sees as errors. So all vehicles have the links of the probed one. Its loop is unchanged:
   the station extrapolates the others' states to the instant of its own.
 * Changes of the nominal velocity, and the noise of the vehicles' sensors.
 * The vehicles' failsafe, which lossy links would trigger now and then: it opens the loop.
 * The scenario's limit on the spacing error: a growing error must be seen for long enough to be measured.
-* The vehicles' limits. A small error stays within them, so within them the loop is the same. But links that lose or
-  delay at random push vehicles by more than an error of a millimetre, and a response that limits clip is not linear.
+* The vehicles' limits. A small error stays within them, where the loop is the same. But links that lose or delay at
+  random push vehicles by more than an error of a millimetre, and a response clipped by limits is not linear.
   `past_limits` says when that happens.
 
 On constant links one flight is enough. Links that lose or delay at random push the vehicles all the time, because the
@@ -50,13 +50,13 @@ from scenarios.schema import Limits, Safety, Scenario, Vehicle
 PROBE_S = 20.0
 """How long a probe is flown, if that is enough."""
 _RANDOM_LOOP_DELAYS, _LONGEST_S = 66.0, 120.0
-"""On links that lose or delay at random, a probe shows a mean growth rate. Its error falls with the number of loop
+"""On links that lose or delay at random a probe shows a mean growth rate, whose error falls with the number of loop
 delays that the probe lasts: this many, for at most this long."""
 _SPEED_MIN_M_S = 1e-3
 """The kinematics are singular at speed 0."""
 _DIRECTION_NE = np.array([1.0, -0.8])
-"""Direction of a probe's error. It is not a diagonal, where the modes of gains that couple north and east lie; it is
-near one, because two nearly equal modes are hard to separate where both are large."""
+"""Direction of a probe's error: not a diagonal, where the modes of gains that couple north and east lie, but near one,
+because two nearly equal modes are hard to separate where both are large."""
 _LINEAR_SHARE = 0.8
 """Share of the nominal speed that an error may reach: the vehicles' linearisation is exact except at speed zero."""
 
@@ -65,7 +65,7 @@ _LINEAR_SHARE = 0.8
 class FreeResponse:
     """The errors of one loop's vehicles as rows of ticks, in order of time, and their flight.
 
-    Until `until_s` after the first row, no limit and no singularity was near. `calm_until_s` is the same for the calm
+    No limit and no singularity was near until `until_s` after the first row; `calm_until_s` is the same for the calm
     flight of a pair, which bounds it for every disturbance. `varying` says that the delays vary.
     """
 

@@ -1,13 +1,13 @@
 """How fast the errors of a flight grow or decay, with the uncertainty of that rate.
 
-"Did it diverge within 60 s" is a poor test of a delay margin: near the margin, errors change so slowly that the answer
-is left to chance. Here the modes z_k of the flown loop are fitted to the tick record, y[n] = sum_k a_k z_k^n in every
-channel, and the growth rate is ln|z| / T of the slowest one; its zero is the margin.
+"Did it diverge within 60 s" is a poor test of a delay margin: near the margin errors change so slowly that chance
+decides. Here the modes z_k of the flown loop are fitted to the tick record, y[n] = sum_k a_k z_k^n in every channel.
+The growth rate is ln|z| / T of the slowest mode, and the delay margin is where it is zero.
 
 Method: ESPRIT (Roy and Kailath, "ESPRIT - estimation of signal parameters via rotational invariance techniques",
-IEEE Trans. ASSP 37(7), 1989) on Hankel matrices of all channels side by side, which share their modes. It runs twice:
-the second time on y[n] e^{-g n T} with g from the first, so that the start and the end of a motion that changes by
-orders of magnitude have equal weight.
+IEEE Trans. ASSP 37(7), 1989) on Hankel matrices of all channels side by side, which share their modes. It runs twice,
+the second time on y[n] e^{-g n T} with g from the first, so that start and end have equal weight in a motion that
+changes by orders of magnitude.
 """
 
 from collections.abc import Sequence
@@ -20,10 +20,10 @@ from gcs.control.tick import TickArray
 
 DECAY_KEPT = 0.02
 """A motion is followed until it has shrunk to this share of its largest value. Rounding of the telemetry, which the
-loop feeds back and amplifies, lies well below that, in real time too."""
+loop feeds back and amplifies, is well below that, in real time too."""
 FEWEST_SAMPLES = 12
 _MOST_SAMPLES = 300
-"""More samples are thinned out: accuracy comes from the length of the window, cost from the number of samples."""
+"""Longer motions are thinned out: accuracy comes from the length of the window, cost from the number of samples."""
 _ENVELOPE_S = 1.0
 _FEWEST_ENVELOPE = 4
 _PARTS = 8
@@ -150,7 +150,7 @@ def norm_growth(motion: Motion, *, start_s: float, end_s: float = np.inf) -> Gro
 def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Growth | None:
     """The growth rate of a whole formation's errors, from their size at every `period_s`: slope of ln(envelope).
 
-    For flights without a free response to fit: random links push the vehicles all the time, and many vehicles have
+    For flights without a free response to fit, where random links push the vehicles all the time or many vehicles have
     large errors at once. The envelope is the largest size within a second; it is followed until it has shrunk to
     `DECAY_KEPT`, where noise may sustain it.
     """

@@ -33,12 +33,12 @@ from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growt
 from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_loops, plan_of, with_summary
 
 AMPLITUDES = (1.0, 0.03, 0.001)
-"""Initial errors of a probe in m (m/s for the leader); the next is used if growth leaves the linear range too soon."""
+"""Initial errors of a probe in m (m/s for the leader); the next is flown if errors leave the linear range too soon."""
 _PILOT_S, _PILOT_PERIODS = 1.0, 6.0
 _SETTLED_LOOP_DELAYS = 4.0
 """After this many loop delays, modes other than the slowest are gone, or small enough to be fitted with it."""
 _FLYING_LOOP_DELAYS = 1.0
-"""Until then the station uses states of vehicles on the launcher; enough where no feedback is late."""
+"""Until then the station uses states of vehicles on the launcher; enough to wait where no feedback is late."""
 _BEGUN_LOOP_DELAYS = 2.0
 """After this many loop delays, no command depends on what a vehicle did at the start any more."""
 _CALM_SHARE = 0.8
@@ -46,7 +46,7 @@ _CALM_SHARE = 0.8
 _WANTED_LOOP_DELAYS = 8.0
 _WANTED_SAMPLES = 60
 _WANTED_ERROR = 0.01
-"""Wanted standard error as a share of the growth rate: in loops of several vehicles, other modes decay slowly."""
+"""Wanted standard error as a share of the growth rate: in loops of several vehicles the other modes decay slowly."""
 
 
 def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
@@ -75,7 +75,7 @@ def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
 
 
 def _needs_pair(trial: Trial) -> bool:
-    """Whether the free response of one loop takes two flights. Not in real time, where no two have the same delays."""
+    """Whether the free response of a loop takes two flights; never in real time, where no two have the same delays."""
     links = {trial.scenario.link_of(vehicle.system_id) for vehicle in trial.scenario.vehicles}
     coupled = any(len(loop.system_ids) > 1 for loop in plan_loops(plan_of(trial)))
     return not trial.real_time and (not has_constant_links(trial.scenario) or (coupled and len(links) > 1))
@@ -88,17 +88,10 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     flown = flight.ticks[flight.ticks["time_s"] >= 0.0]
     delays_s = median_delays_s(flown, plan.formation.system_ids)
     loop = critical_block(plan_loops(plan), delays_s)
-    slowest = max(loop.system_ids, key=lambda system_id: delays_s[system_id])
-    up, down = plan.scenario.link_of(slowest)
-    outcome = replace(
-        outcome,
-        critical=loop.system_ids[0],
-        link_delay_s=up.delay_s + down.delay_s,
-        loop_delay_s=round(delays_s[slowest], 9),
-        predicted_growth_1_s=finite(loop.growth_at_1_s(delays_s)),
-        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(delays_s)),
-    )
-    start_s = _BEGUN_LOOP_DELAYS * delays_s[slowest]
+    loop_s, link_s, _ = _slowest(plan, loop, delays_s)
+    outcome = replace(outcome, critical=loop.system_ids[0], link_delay_s=link_s, loop_delay_s=round(loop_s, 9))
+    outcome = _with_prediction(outcome, loop, delays_s)
+    start_s = _BEGUN_LOOP_DELAYS * loop_s
     growth = envelope_growth(np.array(outcome.trace_m), period_s=TRACE_PERIOD_S, start_s=start_s)
     return outcome if growth is None else _with_fit(outcome, growth)
 
@@ -133,18 +126,14 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     calm = fly_calm(base, _folder_of(folder, 0.0))
     delays_s = effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
     loops = plan_loops(base)
-    if trial.probe == CRITICAL:
-        probed = critical_block(loops, delays_s)
-    else:
-        probed = next(loop for loop in loops if trial.probe in loop.system_ids)
-    slowest = max(probed.system_ids, key=lambda system_id: delays_s[system_id])
-    up, down = base.scenario.link_of(slowest)
+    probed = _loop_of(loops, delays_s, trial.probe)
+    _, link_s, waiting_s = _slowest(base, probed, delays_s)
     outcome = replace(
         outcome,
         probed=probed.system_ids[0],
         critical=probed.system_ids[0],
-        link_delay_s=up.delay_s + down.delay_s,
-        waiting_s=round(delays_s[slowest] - up.delay_s - down.delay_s, 9),
+        link_delay_s=link_s,
+        waiting_s=round(waiting_s, 9),
         past_limits=past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]]),
     )
 
@@ -177,17 +166,36 @@ def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tup
     """The loop to be probed, the loop it stands for, and how long the latter's telemetry waits for the control tick.
 
     The loop that breaks first may be far down the tree, where vehicles ahead would drive it. So the equal loop nearest
-    to the leader is probed in its place, with its links and its waiting.
+    to the leader is probed instead, with the links and the waiting of the former.
     """
-    loops, links = plan_loops(plan), plan.scenario.links
+    loops = plan_loops(plan)
+    critical = _loop_of(loops, loop_delay_s, probe)
+    probed = next(loop for loop in loops if loop.same_as(critical)) if probe == CRITICAL else critical
+    _, _, waiting_s = _slowest(plan, critical, loop_delay_s)
+    return probed, critical, waiting_s % critical.timing.step_s
+
+
+def _loop_of(loops: list[CoupledBlock], loop_delay_s: dict[int, float], probe: int) -> CoupledBlock:
+    """The loop of a vehicle, or the one that is predicted to break first."""
     if probe == CRITICAL:
-        critical = critical_block(loops, loop_delay_s)
-        probed = next(loop for loop in loops if loop.same_as(critical))
-    else:
-        probed = critical = next(loop for loop in loops if probe in loop.system_ids)
-    slowest = max(critical.system_ids, key=lambda system_id: loop_delay_s[system_id])
-    up, down = links.of(slowest)
-    return probed, critical, (loop_delay_s[slowest] - up.delay_s - down.delay_s) % critical.timing.step_s
+        return critical_block(loops, loop_delay_s)
+    return next(loop for loop in loops if probe in loop.system_ids)
+
+
+def _slowest(plan: FlightPlan, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> tuple[float, float, float]:
+    """Loop delay, link delay (up plus down) and the rest (s) of the vehicle of a loop whose loop delay is longest."""
+    slowest = max(loop.system_ids, key=lambda system_id: loop_delay_s[system_id])
+    up, down = plan.scenario.link_of(slowest)
+    longest_s = loop_delay_s[slowest]
+    return longest_s, up.delay_s + down.delay_s, longest_s - up.delay_s - down.delay_s
+
+
+def _with_prediction(outcome: Outcome, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> Outcome:
+    return replace(
+        outcome,
+        predicted_growth_1_s=finite(loop.growth_at_1_s(loop_delay_s)),
+        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(loop_delay_s)),
+    )
 
 
 def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -> Outcome:
@@ -212,13 +220,9 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
     window = own[(since_s >= growth.start_s) & (since_s <= growth.end_s)]
     delays_s = response.loop_delays_s(window, loop.system_ids)
     spread_s = float(np.nanpercentile(window["loop_delay_s"], 90) - np.nanmedian(window["loop_delay_s"]))
-    return replace(
-        _with_fit(outcome, growth),
-        loop_delay_s=round(max(delays_s.values()), 9),
-        loop_delay_spread_s=round(spread_s, 9),
-        predicted_growth_1_s=finite(loop.growth_at_1_s(delays_s)),
-        predicted_growth_continuous_1_s=finite(loop.growth_continuous_at_1_s(delays_s)),
-    )
+    loop_s = round(max(delays_s.values()), 9)
+    outcome = replace(_with_fit(outcome, growth), loop_delay_s=loop_s, loop_delay_spread_s=round(spread_s, 9))
+    return _with_prediction(outcome, loop, delays_s)
 
 
 def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:

@@ -24,9 +24,9 @@ class GrowthPoint:
 class Zero:
     """Where growth passes from below to above zero; `error_s` is the standard error, `slope_1_s2` dg/dtau there.
 
-    `inside` says that there are flights on both sides: otherwise it is extrapolated. `misfit` is how far the flights
-    lie off the curve, in their errors: well above one where no parabola fits, as over a kink. The sampled loop's growth
-    has one where the delay is a whole number of periods.
+    `inside` says that there are flights on both sides; otherwise the zero is extrapolated. `misfit` is the distance of
+    the flights from the curve in standard errors: well above one where no parabola fits, as across a kink. The growth
+    of a sampled loop has one where the delay is a whole number of periods.
     """
 
     loop_delay_s: float
@@ -45,7 +45,7 @@ def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
     if len({round(point.loop_delay_s, 6) for point in points}) < 2:
         return None
     delay_s, growth, error = np.array([(p.loop_delay_s, p.growth_1_s, p.error_1_s) for p in points], dtype=float).T
-    # no flight is trusted more than a thousandth of what the rates differ by: the curve is not exactly a parabola
+    # no error counts as less than a thousandth of the spread of the rates: the curve is not exactly a parabola
     error = np.maximum(error, 1e-3 * float(np.ptp(growth)) + 1e-9)
     middle, half = float(delay_s.mean()), float(np.ptp(delay_s)) / 2.0
     x = (delay_s - middle) / half
@@ -70,7 +70,7 @@ def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
 
 
 def _rising_root(coefficients: FloatArray, *, nearest_to: float) -> float | None:
-    """The root at which a polynomial rises; of two the one nearest to a place."""
+    """The root at which a polynomial rises; of several the one nearest to a place."""
     roots = np.roots(coefficients)
     real = roots[np.abs(roots.imag) < 1e-9].real
     rising = real[np.polyval(np.polyder(coefficients), real) > 0.0]

@@ -19,7 +19,7 @@ _FLIGHTS_A_ROUND = 5
 _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
 """Link delays flown where no delay is predicted to break the formation."""
 _FIRST_WIDTH, _FINEST_WIDTH = 3.0, 0.1
-"""Half widths of the first and of the finest round of an onset search, in tolerances."""
+"""Half widths of the first and the finest round of an onset search, in tolerances."""
 _SMOOTH_MISFIT = 3.0
 """Root mean square misfit, in standard errors, above which flights do not lie on a parabola."""
 
@@ -107,7 +107,7 @@ class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a f
 def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
     """Fly probes around the predicted onset, ever closer, until the zero of their growth rates is located.
 
-    A round is a few flights at once, spread evenly over three tolerances to either side, then over one, and over a
+    A round is a few flights at once, spread evenly over three tolerances to either side, then over one, then over a
     fraction of one if no smooth curve fits the flights. The search follows the measured growth; the prediction only
     says where to start.
 
@@ -136,7 +136,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         flown = run(trials)
         flights |= {outcome.id: outcome for outcome in flown}
         near = [o for o in flights.values() if abs((o.link_delay_s or 0.0) - centre_s) <= 1.001 * width_s]
-        zero = locate_zero(points_of(near))
+        zero = locate_zero(_points(near))
         if zero is None:
             centre_s, width_s = centre_s + _downhill(near) * width_s, 2.0 * width_s
             continue
@@ -153,17 +153,17 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         if abs(ahead_s) < width_s:
             width_s = wanted_s if width_s > 1.001 * wanted_s else _FINEST_WIDTH * wanted_s
     failed = sum(outcome.growth_1_s is None for outcome in flights.values())
+    flown_s = [outcome.link_delay_s or 0.0 for outcome in flights.values()]
     raise NoOnset(
-        f"growth did not pass zero in {len(flights)} flights with {min(links_of(flights.values())):.3f} to "
-        f"{max(links_of(flights.values())):.3f} s of link delay ({failed} without a growth rate)"
+        f"growth did not pass zero in {len(flights)} flights with {min(flown_s):.3f} to {max(flown_s):.3f} s of link "
+        f"delay ({failed} without a growth rate)"
     )
 
 
 def _no_limit(study: Study, run: Run, *, tolerance: float) -> NoOnset:
     """Fly a loop that no delay is predicted to break, and say what the flights show."""
     flown = run([study.trial("probe", {"delay": d}, seed=study.plan.scenario.seed) for d in _LIMITLESS_LINKS_S])
-    pairs = [(o.growth_1_s, o.predicted_growth_1_s) for o in flown]
-    known = [(measured, predicted) for measured, predicted in pairs if measured is not None and predicted is not None]
+    known = _growth_pairs(flown)
     off = max((abs(measured - predicted) / abs(predicted) for measured, predicted in known), default=np.inf)
     steady = len(known) == len(flown) and off <= tolerance and all(measured < 0.0 for measured, _ in known)
     first_s, *_, last_s = _LIMITLESS_LINKS_S
@@ -177,7 +177,7 @@ def _no_limit(study: Study, run: Run, *, tolerance: float) -> NoOnset:
     )
 
 
-def points_of(outcomes: Sequence[Outcome]) -> list[GrowthPoint]:
+def _points(outcomes: Sequence[Outcome]) -> list[GrowthPoint]:
     """The measured growth rates of the outcomes that have one."""
     return [
         GrowthPoint(o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
@@ -186,18 +186,15 @@ def points_of(outcomes: Sequence[Outcome]) -> list[GrowthPoint]:
     ]
 
 
-def links_of(outcomes: Any) -> list[float]:
-    """The total link delays of outcomes."""
-    return [outcome.link_delay_s or 0.0 for outcome in outcomes]
+def _growth_pairs(outcomes: Sequence[Outcome]) -> list[tuple[float, float]]:
+    """Measured and predicted growth rates, where both are known."""
+    pairs = ((outcome.growth_1_s, outcome.predicted_growth_1_s) for outcome in outcomes)
+    return [(measured, predicted) for measured, predicted in pairs if measured is not None and predicted is not None]
 
 
 def curve_error(outcomes: Sequence[Outcome]) -> float | None:
     """Largest difference between measured and predicted growth rates, as a share of the range of the predicted ones."""
-    pairs = [
-        (o.growth_1_s, o.predicted_growth_1_s)
-        for o in outcomes
-        if o.kind == "probe" and o.growth_1_s is not None and o.predicted_growth_1_s is not None
-    ]
+    pairs = _growth_pairs([outcome for outcome in outcomes if outcome.kind == "probe"])
     if len(pairs) < 2:
         return None
     measured, predicted = np.array(pairs, dtype=float).T
@@ -235,12 +232,8 @@ def _found(
     waiting_s = _waiting_s(near)
     link_s = max(0.0, zero.loop_delay_s - waiting_s)
     seed = study.plan.scenario.seed
-    checks = run(
-        [
-            study.trial("probe", {"delay": round(link_s, 6)}, seed=seed, probe=system_id)
-            for system_id in _to_check(loops, loop)
-        ]
-    )
+    at_onset, others = {"delay": round(link_s, 6)}, _to_check(loops, loop)
+    checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
     own = run([study.trial("own", {"delay": round(part * link_s, 6)}, seed=seed) for part in (0.9, 1.1)])
     return Onset(
         loop_delay_s=zero.loop_delay_s,

@@ -1,4 +1,4 @@
-"""One trial and its outcome: a formation flown once, and what the flight says about its stability.
+"""One trial, a formation flown once, and its outcome: what the flight says about stability.
 
 Both can be pickled. `gcs.stress.measure` flies trials.
 """
@@ -23,7 +23,7 @@ from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]
 CRITICAL = 0
-"""In place of a system id: probe the loop that is predicted to break first."""
+"""Instead of a system id: probe the loop that is predicted to break first."""
 
 TRACE_PERIOD_S = 0.25
 

@@ -23,7 +23,7 @@ _SPACING_M = 100.0
 
 @dataclass
 class _Timed:
-    """Vehicles, with their own run time summed."""
+    """Vehicles, with the sum of their own run time."""
 
     vehicles: Vehicles
     taken_s: float = 0.0
@@ -36,7 +36,7 @@ class _Timed:
 
 
 def with_vehicles(scenario: Scenario, count: int) -> Scenario:
-    """The scenario with this many vehicles, in place, in columns behind one leader."""
+    """The scenario with this many vehicles in columns behind one leader, all in place."""
     velocity = scenario.nominal_velocity[0].velocity_ne_m_s
     vehicles = [Vehicle(system_id=1, position_ne_m=(0.0, 0.0), velocity_ne_m_s=velocity)]
     for k in range(count - 1):

@@ -20,9 +20,9 @@ from gcs.studies.benchmark import with_vehicles
 from scenarios.schema import Scenario
 
 _START_ERROR_M = 2.0
-"""Initial displacement of every second vehicle."""
+"""Initial displacement of every second vehicle to the east."""
 _DECAYED = 0.1
-"""A controlled formation has reduced its errors to this share in the last third of a flight."""
+"""A formation under control has reduced its errors to this share by the last third of a flight."""
 FEWEST = 2
 
 
@@ -39,8 +39,8 @@ class Load:
     lost_up, lost_down
         True shares of the datagrams from and to the vehicles that the links lost.
     error_end_m
-        Largest spacing error of all vehicles, as the median over the last third of the flight: a single lost set-point
-        affects it for seconds.
+        Largest spacing error of all vehicles, as the median over the last third of the flight, because a single lost
+        set-point affects it for seconds.
     reason
         How the flight ended.
     holds
@@ -90,8 +90,8 @@ def capacity(
 ) -> list[Capacity]:
     """The capacity of each rate, up to `most` vehicles: doubled until one fails, then halved in between.
 
-    Each formation flies with the scenario's seed and those that follow it. Near the margin errors decay slowly, so the
-    flights of `seconds` are long.
+    Each formation flies with the scenario's seed and those that follow it. Flights last `seconds`, long because errors
+    decay slowly near the margin.
 
     Raises
     ------

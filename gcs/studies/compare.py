@@ -7,8 +7,9 @@ from the same initial states. Robustness and string peak are computed for all ro
 import json
 import time  # noqa: TID251 - design time is one of the figures; nothing flown depends on it
 from dataclasses import asdict, dataclass
+from itertools import permutations
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -46,8 +47,8 @@ class Route:
     alpha
         1 / ‖(sI − A − BK)^{-1}‖∞ of the whole formation.
     string_peak
-        Largest growth of a spacing error from one follower to the one behind it, over all frequencies, for a
-        disturbance of the leader, without delay.
+        Largest growth of a spacing error from one follower to the one behind it, over all frequencies, when the leader
+        is disturbed, without delay.
     links, numbers_used
         Pairs of vehicles in which one uses the other's errors, and the number of errors used in all.
     """
@@ -135,21 +136,17 @@ def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
         error = np.stack([own["spacing_error_north_m"], own["spacing_error_east_m"]], axis=1)
         error = error[np.isfinite(error).all(axis=1)]
         first = float(np.linalg.norm(error[0])) if len(error) else 0.0
-        if first > 0.1:  # smaller ones are noise of the start
+        if first > 0.1:  # smaller ones are noise at the start
             shares.append(max(0.0, float(-(error @ error[0]).min()) / first**2))
     return max(shares, default=None)
 
 
 def _information(model: FormationModel, K: FloatArray) -> tuple[int, int]:
     """The number of pairs (i, j) in which i uses errors of j, and the number of these errors per axis."""
-    links = numbers = 0
-    for i in range(model.vehicles):
-        for j in range(model.vehicles):
-            block = K[model.input_slice(i), model.output_slice(j)]
-            if i != j and block.any():
-                links += 1
-                numbers += int(np.count_nonzero(block.any(axis=0)))
-    return links, numbers
+    blocks = [
+        K[model.input_slice(i), model.output_slice(j)].any(axis=0) for i, j in permutations(range(model.vehicles), 2)
+    ]
+    return sum(bool(used.any()) for used in blocks), sum(int(used.sum()) for used in blocks)
 
 
 def string_peak(model: FormationModel, K: FloatArray) -> float | None:
@@ -170,7 +167,7 @@ def string_peak(model: FormationModel, K: FloatArray) -> float | None:
         error = np.abs(np.linalg.solve(shifted, single.B[:, :1])[..., 0])
         return (error[:, behind] / error[:, ahead]).max(axis=1)
 
-    return largest_magnitude(growth, near_rad_s=float(np.abs(np.linalg.eigvals(closed_loop)).max()))[0]
+    return largest_magnitude(growth, near_rad_s=float(np.abs(np.linalg.eigvals(closed_loop)).max()))
 
 
 def write_comparison(
@@ -206,31 +203,27 @@ def write_comparison(
 
 def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
     """The rows of the table: what is compared, and the figure of each route."""
-    kinds: list[tuple[str, str, str, float]] = [
-        ("verdict of the flight", "verdict", "", 1.0),
-        ("settling time, s", "settling_time_s", ".2f", 1.0),
-        ("overshoot, %", "overshoot", ".1f", 100.0),
-        ("control effort, m²/s³", "effort_m2_s3", ".0f", 1.0),
-        ("largest command, m/s²", "command_max_m_s2", ".1f", 1.0),
-        ("largest spacing error, m", "spacing_error_max_m", ".1f", 1.0),
-        ("delay margin, sampled, ms", "delay_margin_s", ".1f", 1e3),
-        ("delay margin, continuous, ms", "delay_margin_continuous_s", ".1f", 1e3),
-        ("alpha of the whole formation", "alpha", ".4f", 1.0),
-        ("decay without delay, 1/s", "decay_rate_1_s", ".3f", 1.0),
-        ("string peak", "string_peak", ".3f", 1.0),
-        ("links between vehicles", "links", "d", 1),
-        ("numbers used over them", "numbers_used", "d", 1),
-        ("design time, s", "design_s", ".2f", 1.0),
+    kinds: list[tuple[str, tuple[str, str, float]]] = [
+        ("settling time, s", ("settling_time_s", ".2f", 1.0)),
+        ("overshoot, %", ("overshoot", ".1f", 100.0)),
+        ("control effort, m²/s³", ("effort_m2_s3", ".0f", 1.0)),
+        ("largest command, m/s²", ("command_max_m_s2", ".1f", 1.0)),
+        ("largest spacing error, m", ("spacing_error_max_m", ".1f", 1.0)),
+        ("delay margin, sampled, ms", ("delay_margin_s", ".1f", 1e3)),
+        ("delay margin, continuous, ms", ("delay_margin_continuous_s", ".1f", 1e3)),
+        ("alpha of the whole formation", ("alpha", ".4f", 1.0)),
+        ("decay without delay, 1/s", ("decay_rate_1_s", ".3f", 1.0)),
+        ("string peak", ("string_peak", ".3f", 1.0)),
+        ("links between vehicles", ("links", "d", 1)),
+        ("numbers used over them", ("numbers_used", "d", 1)),
+        ("design time, s", ("design_s", ".2f", 1.0)),
     ]
-    table: list[tuple[str, list[str]]] = []
-    for title, name, form, factor in kinds:
-        values: list[Any] = [getattr(route, name) for route in routes]
-        texts = [
-            str(v or UNKNOWN) if not form else number_text(None if v is None else factor * v, form) for v in values
-        ]
-        if name.startswith("delay_margin"):  # None means no limit for a route that was flown
-            texts = [
-                "no limit" if v is None and not r.failed else t for v, r, t in zip(values, routes, texts, strict=True)
-            ]
-        table.append((title, texts))
-    return table
+
+    def text(route: Route, name: str, form: str, factor: float) -> str:
+        value: float | None = getattr(route, name)
+        if value is None and name.startswith("delay_margin") and not route.failed:
+            return "no limit"
+        return number_text(None if value is None else factor * value, form)
+
+    verdicts = ("verdict of the flight", [route.verdict or UNKNOWN for route in routes])
+    return [verdicts, *((title, [text(route, *kind) for route in routes]) for title, kind in kinds)]

@@ -1,4 +1,4 @@
-"""The cost of a design as the formation grows: time and free gains, for all routes and for centralised designs."""
+"""The cost of a design as the formation grows: its time and free gains, for all routes and for centralised designs."""
 
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from collections.abc import Callable
@@ -8,10 +8,11 @@ from statistics import median
 import numpy as np
 
 from gains.core.requirement import Requirement
-from gains.design.centralised import centralised_lmi
 from gains.design.design import design
 from gains.design.dk_iteration import LARGEST_STATES
+from gains.design.graph import GraphMethod
 from gains.design.lqr import Weights, centralised_lqr
+from gains.design.robust_lmi import centralised_lmi
 from gains.formation.model import FormationModel
 from gains.formation.pattern import bidirectional, formation_plant, leader_follower
 
@@ -19,7 +20,7 @@ RATIO = "times inclusion of 5"
 _REFERENCE = ("inclusion", 5)
 _SIZES = (3, 5, 10, 20, 40, 80, 200)
 _LONGEST_S = 10.0
-"""A method is not tried on more vehicles if, growing with the cube of their number, it would take longer."""
+"""A method is not tried on a size for which it would take longer, if time grows with the cube of the vehicles."""
 _DK_STATES = LARGEST_STATES // 2
 _REPEATED_BELOW_S = 1.0
 _REPEATS = 5
@@ -74,18 +75,13 @@ def ratios(costs: list[DesignCost]) -> list[float]:
 
 def left_out(costs: list[DesignCost]) -> list[str]:
     """One line for each method that was not tried on all sizes, with the first size left out and the reason."""
-    largest = {cost.method: cost.vehicles for cost in costs}
-    tried = {method: _SIZES.index(vehicles) + 1 for method, vehicles in largest.items()}
-    return [
-        f"{method}: not tried on {_SIZES[count]} vehicles and more; "
-        + (
-            f"more than {_DK_STATES} states an axis"
-            if _too_large(method, _SIZES[count])
-            else f"it may take over {_LONGEST_S:g} s"
-        )
-        for method, count in tried.items()
-        if count < len(_SIZES)
-    ]
+    lines: list[str] = []
+    for method, largest in {cost.method: cost.vehicles for cost in costs}.items():
+        if (count := _SIZES.index(largest) + 1) < len(_SIZES):
+            states = f"more than {_DK_STATES} states an axis"
+            why = states if _too_large(method, _SIZES[count]) else f"it may take over {_LONGEST_S:g} s"
+            lines.append(f"{method}: not tried on {_SIZES[count]} vehicles and more; {why}")
+    return lines
 
 
 def _too_large(method: str, vehicles: int) -> bool:
@@ -111,13 +107,10 @@ def _inclusion(vehicles: int) -> int:
     return 3
 
 
-def _graph(vehicles: int, method: str, *, two_way: bool) -> int:
+def _graph(vehicles: int, method: GraphMethod, *, two_way: bool) -> int:
     chain = _chain(vehicles)
     pattern = bidirectional(chain) if two_way else leader_follower(chain)
-    if method == "graph-dk":
-        design(chain, _WANTED, method="graph-dk", pattern=pattern, period_s=_PERIOD_S)
-    else:
-        design(chain, _WANTED, method="graph-lqr", pattern=pattern, period_s=_PERIOD_S)
+    design(chain, _WANTED, method=method, pattern=pattern, period_s=_PERIOD_S)
     return int(pattern.mask.sum()) // chain.axes**2
 
 

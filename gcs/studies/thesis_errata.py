@@ -1,6 +1,7 @@
 """Computations that contradict statements of the source; `gcs.studies.thesis` has those about its numbers."""
 
-from itertools import product
+from collections.abc import Iterator, Sequence
+from itertools import compress, islice, product
 
 import numpy as np
 
@@ -9,9 +10,8 @@ from gains.delay.constant import delay_margin
 from gains.delay.sweep import frequency_sweep_margin
 from gains.formation.inclusion import Restriction, expand
 from gains.formation.model import FormationModel
-from gcs.studies.thesis_flights import printed_gains
+from gcs.studies.thesis_flights import SINGLE, printed_gains
 
-SINGLE = FormationModel((-1, 0, 1), axes=1)
 PUBLISHED_S = (0.185, 0.195)
 """The values that round to the published 0.19 s."""
 
@@ -23,9 +23,7 @@ def controllable_dimensions(restriction: Restriction) -> tuple[int, int]:
     """
     expansion = expand(SINGLE, restriction)
     A, B = expansion.A.toarray(), expansion.B.toarray()
-    powers = [B]
-    for _ in range(len(A) - 1):
-        powers.append(A @ powers[-1])
+    powers = [np.linalg.matrix_power(A, k) @ B for k in range(len(A))]
     return int(np.linalg.matrix_rank(np.hstack(powers))), int(np.linalg.matrix_rank(np.hstack([A, B])))
 
 
@@ -48,34 +46,38 @@ def first_crossing(own: float, late: float, sign: float) -> float:
     return float(np.mod(sign * np.angle((1j * omega - own) / late), 2.0 * np.pi)) / omega
 
 
-def subset_margins() -> FloatArray:
-    """The delay margin for each of the 4,095 choices of which of the twelve printed scalar gains are late.
+def late_choices(
+    model: FormationModel, K: FloatArray, parts: Sequence[FloatArray]
+) -> Iterator[tuple[tuple[bool, ...], tuple[FloatArray, FloatArray]]]:
+    """Each choice of which parts of K are late, at least one, with (A0, A1) of the loop that has them late."""
+    for chosen in islice(product((False, True), repeat=len(parts)), 1, None):
+        late = np.sum(list(compress(parts, chosen)), axis=0)
+        yield chosen, (model.A + model.B @ (K - late), model.B @ late)
+
+
+def _late_entries() -> list[tuple[FloatArray, FloatArray]]:
+    """(A0, A1) for each of the 4,095 choices of which of the twelve printed scalar gains are late.
 
     One axis: the blocks are multiples of the identity, except for entries of at most 0.0053.
     """
     K = printed_gains()[::2, ::2]
-    places = np.argwhere(np.abs(K) > 0.1)
+    places = np.flatnonzero(np.abs(K) > 0.1)
     assert len(places) == 12
+    entries = [K * place.reshape(K.shape) for place in np.eye(K.size)[places]]
+    return [loop for _, loop in late_choices(SINGLE, K, entries)]
+
+
+def subset_margins() -> FloatArray:
+    """The delay margin for each choice of which of the twelve printed scalar gains are late."""
     margins: list[float] = []
-    for chosen in product((False, True), repeat=len(places)):
-        if any(chosen):
-            late = np.zeros_like(K)
-            for (i, j), take in zip(places.tolist(), chosen, strict=True):
-                late[i, j] = K[i, j] if take else 0.0
-            now, delayed = SINGLE.A + SINGLE.B @ (K - late), SINGLE.B @ late
-            try:
-                margins.append(delay_margin(now, delayed))
-            except np.linalg.LinAlgError:  # the resolvent is singular on the axis
-                margins.append(frequency_sweep_margin(now, delayed))
+    for now, late in _late_entries():
+        try:
+            margins.append(delay_margin(now, late))
+        except np.linalg.LinAlgError:  # the resolvent is singular on the axis
+            margins.append(frequency_sweep_margin(now, late))
     return np.array(margins)
 
 
 def subset_margin_by_sweep(number: int) -> float:
     """The margin of one of the subsets of `subset_margins` by the frequency sweep."""
-    K = printed_gains()[::2, ::2]
-    places = np.argwhere(np.abs(K) > 0.1)
-    chosen = [number + 1 >> k & 1 for k in reversed(range(len(places)))]
-    late = np.zeros_like(K)
-    for (i, j), take in zip(places.tolist(), chosen, strict=True):
-        late[i, j] = K[i, j] * take
-    return frequency_sweep_margin(SINGLE.A + SINGLE.B @ (K - late), SINGLE.B @ late)
+    return frequency_sweep_margin(*_late_entries()[number])

@@ -1,6 +1,7 @@
 """The source's figures, drawn from our flights, as PNG files."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,28 +31,25 @@ def formation_figure(file: Path, method: str) -> Path:
     return saved(figure, file)
 
 
-def _snapshots(plot: object, ticks: TickArray, until_s: float) -> None:
+def _snapshots(plot: Any, ticks: TickArray, until_s: float) -> None:
     for time_s, strength in zip(np.linspace(0.0, until_s, _SHOTS), np.linspace(0.35, 1.0, _SHOTS), strict=True):
         tick = ticks["tick"][np.abs(ticks["time_s"] - time_s).argmin()]
         now = ticks[ticks["tick"] == tick]
         for row, colour in zip(now, _COLOURS, strict=False):
-            plot.plot(row["east_m"] / _FT, row["north_m"] / _FT, "^", color=colour, alpha=strength, markersize=5)  # pyright: ignore
-    plot.set_xlabel("east [ft]")  # pyright: ignore
-    plot.set_aspect("equal", adjustable="datalim")  # pyright: ignore
+            plot.plot(row["east_m"] / _FT, row["north_m"] / _FT, "^", color=colour, alpha=strength, markersize=5)
+    plot.set_xlabel("east [ft]")
+    plot.set_aspect("equal", adjustable="datalim")
 
 
-def _distances(plot: object, ticks: TickArray, until_s: float) -> None:
+def _distances(plot: Any, ticks: TickArray, until_s: float) -> None:
     within = ticks[(ticks["time_s"] >= 0.0) & (ticks["time_s"] <= until_s)]
-    place = {
-        k: np.stack([own["north_m"], own["east_m"]], axis=1)
-        for k in (1, 2, 3)
-        for own in [within[within["system_id"] == k]]
-    }
-    time_s = within["time_s"][within["system_id"] == 1]
+    own = {k: within[within["system_id"] == k] for k in (1, 2, 3)}
+    time_s = own[1]["time_s"]
     for one, other, colour in ((1, 2, _COLOURS[0]), (2, 3, _COLOURS[1])):
-        distance = np.linalg.norm(place[one] - place[other], axis=1) / _FT
-        plot.plot(time_s, distance, color=colour, linewidth=1.3, label=f"V{one}-V{other}")  # pyright: ignore
-    plot.set_xlabel("time [s]")  # pyright: ignore
+        apart = (own[one][name] - own[other][name] for name in ("north_m", "east_m"))
+        distance = np.hypot(*apart) / _FT
+        plot.plot(time_s, distance, color=colour, linewidth=1.3, label=f"V{one}-V{other}")
+    plot.set_xlabel("time [s]")
 
 
 def responses_figure(file: Path) -> Path:

@@ -197,7 +197,7 @@ def test_number_of_vehicles_changes_neither_gains_nor_margins(default_design: De
 
 def test_given_gains_are_evaluated() -> None:
     """k1 = k3 = 1, all feedback late: continuous margin 0.711119 s and string peak 1.47 without delay at K2 = k1."""
-    found = evaluate_gains(TRIANGLE, -EYE, EYE, EYE, period_s=0.02)
+    found = evaluate_gains(TRIANGLE, (-EYE, EYE, EYE), period_s=0.02)
     assert found.delay_margin_continuous_s == pytest.approx(0.711119, abs=1e-6)
     assert found.delay_margin_s == pytest.approx(0.711119 - 0.01, abs=1e-3)
     assert found.behaviour.string_peak == pytest.approx(1.47, abs=5e-3)
@@ -207,7 +207,7 @@ def test_given_gains_are_evaluated() -> None:
 
 def test_coupled_axes_are_evaluated() -> None:
     K1 = np.array([[-3.0, 0.4], [-0.4, -3.0]])
-    found = evaluate_gains(TRIANGLE, K1, 2 * EYE, 4 * EYE, period_s=0.02)
+    found = evaluate_gains(TRIANGLE, (K1, 2 * EYE, 4 * EYE), period_s=0.02)
     # K1 has eigenvalues −3 ± 0.4j: z' = (−3 + 0.4j) z(t − τ) turns unstable at (π/2 − atan(0.4 / 3)) / |−3 + 0.4j|.
     closed_form = (np.pi / 2 - np.arctan2(0.4, 3)) / np.hypot(3, 0.4)
     assert found.leader.delay_margin_s == pytest.approx(closed_form, rel=1e-9)
@@ -216,7 +216,7 @@ def test_coupled_axes_are_evaluated() -> None:
 
 
 def test_an_unstable_loop_is_reported_with_no_margin_and_no_proof() -> None:
-    found = evaluate_gains(TRIANGLE, EYE, EYE, EYE, period_s=0.02)
+    found = evaluate_gains(TRIANGLE, (EYE, EYE, EYE), period_s=0.02)
     assert (found.alpha, found.delay_margin_s, found.delay_margin_continuous_s, found.certificate) == (0, 0, 0, None)
 
 
@@ -247,7 +247,7 @@ def test_period_and_gains_are_checked() -> None:
     with pytest.raises(BadModelError, match="period_s = 0"):
         design(TRIANGLE, period_s=0.0)
     with pytest.raises(BadModelError, match="K1 has shape"):
-        evaluate_gains(TRIANGLE, [[1.0]], EYE, EYE, period_s=PERIOD_S)
+        evaluate_gains(TRIANGLE, ([[1.0]], EYE, EYE), period_s=PERIOD_S)
     with pytest.raises(BadModelError, match="period_s = -1"):
         trade_off(period_s=-1.0)
     with pytest.raises(BadModelError, match=r"string_peak_max = 0\.5"):

@@ -9,8 +9,9 @@ import pytest
 from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.requirement import Requirement
 from gains.delay.constant import delay_margin
-from gains.design.design import design
-from gains.design.graph import GraphDesign, GraphMethod, evaluate_graph_gain, time_scaled
+from gains.design.design import design, evaluate_gains
+from gains.design.graph import GraphDesign, GraphMethod
+from gains.design.time_scale import time_scaled
 from gains.formation.bipartite import expanded_gain, partition_by_input, smallest_partition, verify_expansion
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, bidirectional, formation_plant, leader_follower, with_links, without_links
@@ -112,7 +113,7 @@ def test_missing_link_is_named_before_anything_is_designed() -> None:
 def test_given_gain_outside_its_pattern_is_refused() -> None:
     K = np.ones((CHAIN.inputs, CHAIN.states))
     with pytest.raises(BadModelError, match="pattern"):
-        evaluate_graph_gain(CHAIN, leader_follower(CHAIN), K, period_s=PERIOD_S)
+        evaluate_gains(CHAIN, K, pattern=leader_follower(CHAIN), period_s=PERIOD_S)
 
 
 BIDIRECTIONAL = (SCENARIOS / "chain3_bidirectional.toml").read_text(encoding="utf-8")

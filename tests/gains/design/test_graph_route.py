@@ -5,9 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from gains.core.arrays import FloatArray
 from gains.core.errors import InfeasibleError
 from gains.design.dk_iteration import dk_iteration
-from gains.design.lqr import Weights, lqr_cost
+from gains.design.lqr import Cost, CostPoint, Weights
 from gains.design.structured_lqr import stabilising_gain, structured_lqr
 from gains.formation.fixed_modes import check_stabilisable, fixed_modes
 from gains.formation.model import FormationModel
@@ -24,6 +25,12 @@ from gains.formation.pattern import (
 CHAIN = FormationModel((-1, 0, 1))
 PLANT = formation_plant(CHAIN)
 WEIGHTS = Weights(np.eye(10), np.eye(6))
+
+
+def cost_at(plant: Plant, pattern: Pattern, weights: Weights, K: FloatArray) -> CostPoint:
+    point = Cost(plant, pattern.mask, weights).at(K)
+    assert point is not None
+    return point
 
 
 def abscissa(matrix: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> float:
@@ -55,7 +62,7 @@ def test_structured_optimum_is_stationary_stable_in_the_pattern_and_costs_more(p
     assert result.loss > 0
     step = np.random.default_rng(1).normal(size=result.K.shape) * mask
     step *= 1e-4 / np.linalg.norm(step)
-    up, down = (lqr_cost(PLANT, pattern, WEIGHTS, result.K + s * step)[0] for s in (1, -1))
+    up, down = (cost_at(PLANT, pattern, WEIGHTS, result.K + s * step).cost for s in (1, -1))
     assert up > result.cost
     assert down > result.cost
     assert abs(up - down) < 1e-3 * (up + down - 2 * result.cost) + 1e-9 * result.cost  # flat to first order
@@ -71,12 +78,12 @@ def test_gradient_of_the_cost_is_its_slope_away_from_the_optimum_with_outputs_th
     pattern = Pattern(np.array([[1, 0], [1, 1]], dtype=bool), (1, 2), (2, 2))
     weights = Weights(np.eye(5) + np.diag(rng.uniform(size=5)), np.diag(rng.uniform(1.0, 2.0, size=3)))
     K = 0.1 * rng.normal(size=(3, 4)) * pattern.mask
-    _, gradient = lqr_cost(plant, pattern, weights, K)
+    gradient = cost_at(plant, pattern, weights, K).gradient
     assert not gradient[~pattern.mask].any()
     for row, column in np.argwhere(pattern.mask):
         step = np.zeros_like(K)
         step[row, column] = 1e-5
-        up, down = (lqr_cost(plant, pattern, weights, K + s * step)[0] for s in (1, -1))
+        up, down = (cost_at(plant, pattern, weights, K + s * step).cost for s in (1, -1))
         assert gradient[row, column] == pytest.approx((up - down) / 2e-5, rel=1e-5, abs=1e-7)
 
 

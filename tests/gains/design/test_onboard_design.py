@@ -9,7 +9,7 @@ from gains.design.graph import GraphMethod
 from gains.design.required import required_gains
 from gains.formation.model import FormationModel
 from gains.formation.pattern import bidirectional
-from gains.performance.flown_loop import FlownLoop
+from gains.performance.flown import FlownLoop, FlownTiming
 from gains.performance.scalar_gains import ScalarGains, onboard_front_gain_limit
 from gains.sampled.constant import growth_rate, sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
@@ -68,8 +68,8 @@ def test_the_certificate_of_an_onboard_design_proves_its_alpha_at_every_delay() 
     found = design(FormationModel((-1, 0, 1)), Requirement(0.3, None, 1.0, loop="onboard"), period_s=0.02)
     assert found.certificate is not None
     gains = ScalarGains(-found.K1[0, 0], found.K2[0, 0], found.K3[0, 0], 0.0)
-    flown = FlownLoop(gains, np.inf, 0.02, "onboard")
-    assert min(flown.alpha(delay_s) for delay_s in (0.0, 0.3, 2.0)) >= found.certificate.alpha
+    flown = FlownLoop(gains, FlownTiming(np.inf, 0.02, "onboard"))
+    assert min(flown.pair.alpha(delay_s) for delay_s in (0.0, 0.3, 2.0)) >= found.certificate.alpha
 
 
 @pytest.mark.parametrize("method", ["graph-lqr", "graph-dk"])

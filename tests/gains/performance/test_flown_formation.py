@@ -13,8 +13,7 @@ from gains.core.arrays import FloatArray
 from gains.design.graph import graph_design
 from gains.formation.model import FormationModel
 from gains.formation.pattern import bidirectional
-from gains.performance.flown_formation import FlownFormation
-from gains.performance.flown_loop import FlownLoop
+from gains.performance.flown import FlownFormation, FlownLoop, FlownTiming
 from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.constant import spectral_radius
@@ -34,12 +33,12 @@ def flown(loop: Loop) -> FlownFormation:
     margin_s = found.delay_margin_s
     if loop == "onboard":
         margin_s = onboard_loop(CHAIN, found.K, ONBOARD).sampled_margin_s()
-    return FlownFormation(CHAIN, found.K, margin_s, PERIOD_S, loop, STEP_S if loop == "onboard" else 0.0)
+    return FlownFormation(CHAIN, found.K, FlownTiming(margin_s, PERIOD_S, loop, STEP_S if loop == "onboard" else 0.0))
 
 
 def sampled_growth(flight: FlownFormation, disturbance: FloatArray, delay_s: float) -> float:
     """Spectral radius, or growth rate plus one, of the loop as sampled and held: above one if it is unstable."""
-    if flight.loop == "ground":
+    if flight.timing.loop == "ground":
         disturbed = CHAIN.A + disturbance
         return spectral_radius(disturbed, CHAIN.B, flight.K, period_s=PERIOD_S, delay_s=delay_s)
     loop = onboard_loop(CHAIN, flight.K, ONBOARD)
@@ -78,27 +77,28 @@ def test_a_real_disturbance_just_beyond_alpha_destabilises_the_sampled_formation
 def test_alpha_falls_long_before_the_margin_and_is_kept_up_to_the_limit_that_is_named(loop: Loop) -> None:
     flight = flown(loop)
     at_rest = flight.alpha(0.0)
-    assert flight.alpha(0.97 * flight.delay_margin_s) < 0.2 * at_rest
+    assert flight.alpha(0.97 * flight.timing.delay_margin_s) < 0.2 * at_rest
     for share in (0.99, 0.5):
         limit_s = flight.alpha_limit_s(share * at_rest)
-        assert 0.0 < limit_s < flight.delay_margin_s
+        assert 0.0 < limit_s < flight.timing.delay_margin_s
         assert flight.alpha(limit_s) == pytest.approx(share * at_rest, rel=1e-6)
         assert min(flight.alpha(part * limit_s) for part in (0.2, 0.5, 0.8, 0.99)) >= share * at_rest
-    assert flight.alpha(flight.delay_margin_s) == 0.0
+    assert flight.alpha(flight.timing.delay_margin_s) == 0.0
     assert flight.alpha_limit_s(1.01 * at_rest) == 0.0
 
 
-def test_a_leader_with_one_follower_is_the_loop_that_is_known_in_closed_form() -> None:
+def test_a_leader_with_one_follower_is_the_loop_of_a_follower() -> None:
     pair, gains = FormationModel((-1, 0)), ScalarGains(3.4, 0.6, 5.6, 0.0)
     K = pair.overlapping_gain(-gains.k1 * np.eye(2), gains.k2 * np.eye(2), gains.k3 * np.eye(2))
     answer = Response(0.05, 1.5)
     flown_where: list[tuple[Loop, float, float]] = [("ground", 0.0, 0.3), ("onboard", STEP_S, inf)]
     for loop, step_s, margin_s in flown_where:
         for response, responses in ((None, None), (answer, (answer, answer))):
-            matrix = FlownFormation(pair, K, margin_s, PERIOD_S, loop, step_s, responses)
-            formula = FlownLoop(gains, margin_s, PERIOD_S, loop, step_s, response)
+            timing = FlownTiming(margin_s, PERIOD_S, loop, step_s)
+            matrix = FlownFormation(pair, K, timing, responses)
+            pair_of_one_axis = FlownLoop(gains, timing, response).pair
             for delay_s in (0.0, 0.1, 0.2):
-                assert matrix.alpha(delay_s) == pytest.approx(formula.alpha(delay_s), rel=1e-9)
+                assert matrix.alpha(delay_s) == pytest.approx(pair_of_one_axis.alpha(delay_s), rel=1e-9)
 
 
 def test_gains_that_couple_north_and_east_are_taken_whole_and_others_by_one_axis() -> None:

@@ -13,8 +13,8 @@ from gains.delay.rightmost import rightmost_root
 from gains.design.design import design
 from gains.design.required import requirement_with
 from gains.formation.model import FormationModel
-from gains.performance.behaviour import string_peak
 from gains.performance.response import Response, continuous_margin, formation_loop, sampled_margin
+from gains.performance.string_stability import string_peak
 from gains.sampled.multirate import Timing
 
 GAINS = (-2.1 * np.eye(2), 0.6 * np.eye(2), 2.0 * np.eye(2))

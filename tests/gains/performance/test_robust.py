@@ -1,84 +1,14 @@
-"""Robustness: the LMI against its closed-form supremum, exact bounds against each other and against known systems."""
+"""Robustness: exact bounds against each other, against certificates and against known systems."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gains.core.errors import BadModelError, InfeasibleError, SolverError
-from gains.performance.robust import certify, disturbance_bound, robust_lmi, robustness, subsystem_loop
+from gains.core.errors import BadModelError, InfeasibleError
+from gains.performance.robust import certify, disturbance_bound, robustness, subsystem_loop
 
 EYE = np.eye(2)
-
-
-@pytest.mark.parametrize(("shear", "supremum"), [(-1.0, 0.7071), (-2.0, 0.8944), (-3.0, 0.9487), (-2.53, 0.9300)])
-def test_lmi_reaches_its_supremum_as_the_bounds_get_loose(shear: float, supremum: float) -> None:
-    """α(c) = |c| / √(1 + c²) for W = I; the source's published 0.93 is c = −2.53."""
-    alphas = [robust_lmi(shear=shear, gain_bound=k, lyapunov_bound=k).alpha for k in (10.0, 30.0, 100.0)]
-    assert alphas == sorted(alphas)
-    assert alphas[-1] < abs(shear) / np.hypot(1, shear)
-    # Figures are printed to four digits; with bounds of 100 the optimum is within 2e-6 of the supremum.
-    assert alphas[-1] == pytest.approx(supremum, abs=6e-5)
-    assert alphas[-1] == pytest.approx(abs(shear) / np.hypot(1, shear), abs=5e-6)
-
-
-def test_lmi_gains_have_the_same_k1_and_block_size_changes_nothing() -> None:
-    """Two axes at once: no coupling of the axes can do better, and the gains are the scalar ones times I."""
-    scalar = robust_lmi(shear=-1.7, gain_bound=10.0, lyapunov_bound=10.0)
-    double = robust_lmi(shear=-1.7, gain_bound=10.0, lyapunov_bound=10.0, axes=2)
-    # Both optima are reached to the solver's 1e-7 in γ; gains near the optimum are flatter, hence the wider band.
-    assert double.alpha == pytest.approx(scalar.alpha, abs=1e-6)
-    np.testing.assert_allclose(double.K1, scalar.K1 * EYE, atol=1e-2 * abs(scalar.K1[0, 0]))
-    np.testing.assert_allclose(double.K3, scalar.K3 * EYE, atol=1e-2 * abs(scalar.K3[0, 0]))
-
-
-def test_lmi_certificate_holds_in_the_original_coordinates() -> None:
-    """Recomputed here from the gains and P alone: V' < 0 for every w with w'w ≤ α² E'E, tried on its worst w."""
-    gains = robust_lmi(shear=-2.0, gain_bound=10.0, lyapunov_bound=10.0)
-    A, P = subsystem_loop(gains.K1, gains.K2, gains.K3), gains.certificate.P
-    assert np.linalg.eigvalsh(P).min() > 0
-    rng = np.random.default_rng(1)
-    for E in rng.normal(size=(200, 3)):
-        gradient = 2 * P @ E
-        worst = gains.alpha * np.linalg.norm(E) * gradient / np.linalg.norm(gradient)
-        assert gradient @ (A @ E + worst) < 0
-
-
-def test_lmi_alpha_is_a_lower_bound_of_the_exact_one() -> None:
-    """The full Lyapunov matrix of `robustness` can prove at least what a block-diagonal one in some coordinates can."""
-    for shear in (-0.3, -1.0, -2.0):
-        gains = robust_lmi(shear=shear, gain_bound=10.0, lyapunov_bound=10.0)
-        assert robustness(gains.K1, gains.K2, gains.K3) > gains.alpha
-
-
-def test_lmi_weight_scales_alpha_inversely() -> None:
-    """w'w ≤ α² E'W'W E with W = 2 I is the problem of W = I with 2 α in place of α."""
-    plain = robust_lmi(shear=-1.0, gain_bound=10.0, lyapunov_bound=10.0)
-    weighted = robust_lmi(shear=-1.0, gain_bound=10.0, lyapunov_bound=10.0, W=2 * np.eye(3))
-    # γ is four times larger, and so is the solver's error.
-    assert weighted.alpha == pytest.approx(plain.alpha / 2, rel=1e-5)
-
-
-def test_bounds_too_tight_end_in_a_solver_error_that_names_them() -> None:
-    with pytest.raises(SolverError, match=r"'infeasible'.*gain_bound = 2.*lyapunov_bound = 2"):
-        robust_lmi(shear=-5.0, gain_bound=2.0, lyapunov_bound=2.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "arguments"),
-    [
-        ("shear", {"shear": 1.0, "gain_bound": 10.0, "lyapunov_bound": 10.0}),
-        ("gain_bound", {"shear": -1.0, "gain_bound": -1.0, "lyapunov_bound": 10.0}),
-        ("lyapunov_bound", {"shear": -1.0, "gain_bound": 10.0, "lyapunov_bound": np.nan}),
-    ],
-)
-def test_arguments_out_of_range_are_refused_by_name(name: str, arguments: dict[str, float]) -> None:
-    with pytest.raises(BadModelError, match=name):
-        robust_lmi(
-            shear=arguments["shear"],
-            gain_bound=arguments["gain_bound"],
-            lyapunov_bound=arguments["lyapunov_bound"],
-        )
 
 
 def test_bound_of_a_normal_matrix_is_the_distance_of_its_spectrum_from_the_axis() -> None:

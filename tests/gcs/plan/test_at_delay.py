@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gains.performance.flown_formation import FlownFormation
+from gains.performance.flown import FlownFormation, FlownTiming
 from gcs.drive.flown import fly_virtual
 from gcs.plan.at_delay import expected_loop_delay_s, figures_at
 from gcs.plan.design import Design, FiguresAtDelay
@@ -113,7 +113,7 @@ def test_each_gain_set_on_a_general_pattern_has_the_alpha_of_the_gains_that_are_
     design, plan = flight_plan(scenario)
     for gain_set, (K, margin_s) in enumerate(zip(plan.gains, plan.margins_s, strict=True)):
         step_s = 1.0 / scenario.onboard.rate_hz if loop == "onboard" else 0.0
-        own = FlownFormation(plan.model, K, margin_s, 0.02, loop, step_s)
+        own = FlownFormation(plan.model, K, FlownTiming(margin_s, 0.02, loop, step_s))
         found = figures_at(design, scenario, 0.15, gain_set).alpha
         assert found == pytest.approx(own.alpha(0.15), rel=1e-6)  # own gains are flown as float32
 

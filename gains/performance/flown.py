@@ -1,0 +1,281 @@
+"""What delay leaves of a formation's robustness and string stability when it is flown.
+
+`gains.performance.robust` and the requirement's `string_peak_max` describe a loop without delay. In flight a command
+is late by the loop delay τ and held for a control period T, which adds T/2 on average::
+
+    x'(t) = A x(t) + B K_own x(t − τ_own) + B K_others x(t − τ − T/2) + w
+
+    ground    τ_own = τ + T/2: the station closes every loop
+    onboard   τ_own is half a step of the vehicle's own loop: only the errors of other vehicles are late
+
+The loop stays stable under any disturbance |w| ≤ α |x| up to α(τ), the least singular value over all frequencies of
+its characteristic matrix (the complex stability radius). A complex disturbance of one axis is a real one of two, so no
+larger real bound exists for north and east together. The sampled loop differs in the second order of T.
+
+`FlownFormation` has the robustness of any formation. `FlownLoop` adds the growth of spacing errors from vehicle to
+vehicle: it is one follower behind another, which stands for all followers of a leader-follower tree with equal gains.
+On any other pattern vehicles act on each other both ways, and no such growth is defined.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core._bracketing import met_end
+from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
+from gains.performance.response import Response
+from gains.performance.scalar_gains import ScalarGains
+from gains.performance.string_stability import largest_magnitude, largest_value, string_peak
+from gains.sampled.onboard import own_part
+
+# Where no α is asked for, it counts as kept down to this share of its value without delay.
+ALPHA_KEPT = 0.99
+# Frequencies of the first look at σ_min, and delays of the first look at how far α is kept: where there is no margin,
+# up to this many times the slowest time constant.
+_FREQUENCIES, _DELAYS, _LONGEST = 400, 32, 50.0
+# α at its limit is within this share of what it is to be.
+_ALPHA_RESOLUTION = 1e-7
+# A growth this little above the limit is rounding, and a gain this small beside k1 is none.
+_ROUNDING, _NOTHING = 1e-9, 1e-12
+
+
+@dataclass(frozen=True)
+class FlownTiming:
+    """When feedback acts in flight.
+
+    Attributes
+    ----------
+    delay_margin_s
+        Least loop delay (s) at which the loop as flown is unstable; `inf` if there is none.
+    period_s
+        Control period T: commands are held for it.
+    loop
+        Where the vehicles' own loops are closed.
+    step_s
+        Period of the loop on board.
+
+    Examples
+    --------
+    A hold of 20 ms delays by 10 ms; on board a vehicle feeds back its own errors at once:
+
+    >>> from gains.performance.flown import FlownTiming
+    >>> FlownTiming(0.3, 0.02).delays_s(0.1), FlownTiming(0.3, 0.02, "onboard").delays_s(0.1)
+    ((0.11, 0.11), (0.0, 0.11))
+    """
+
+    delay_margin_s: float
+    period_s: float
+    loop: Literal["ground", "onboard"] = "ground"
+    step_s: float = 0.0
+
+    def delays_s(self, delay_s: float) -> tuple[float, float]:
+        """Delays of a vehicle's own errors and of those of others at a loop delay (s), holds included."""
+        late_s = delay_s + self.period_s / 2.0
+        return (self.step_s / 2.0 if self.loop == "onboard" else late_s), late_s
+
+
+@dataclass(frozen=True, eq=False)
+class FlownFormation:
+    """A formation flown by a station with the gain K (inputs, states) of u = K e.
+
+    Its `responses` are in the order of the model; without them vehicles answer at once.
+
+    Examples
+    --------
+    A vehicle alone: σ_min is |jω + e^{−jωτ}|, least where the phase of the loop is nearest to −π:
+
+    >>> import numpy as np
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.performance.flown import FlownFormation, FlownTiming
+    >>> lone = FlownFormation(FormationModel((-1,), axes=1), np.array([[-1.0]]), FlownTiming(np.pi / 2, period_s=0.0))
+    >>> [round(lone.alpha(delay_s), 3) for delay_s in (0.0, 1.0, 1.5)]
+    [1.0, 0.43, 0.039]
+    """
+
+    model: FormationModel
+    K: FloatArray
+    timing: FlownTiming
+    responses: tuple[Response, ...] | None = None
+
+    def alpha(self, delay_s: float) -> float:
+        """α at a loop delay (s); 0 from the margin on."""
+        if not delay_s < self.timing.delay_margin_s:
+            return 0.0
+        return -largest_value(lambda omega: -self.singular_value(omega, delay_s), self.frequencies())
+
+    def alpha_limit_s(self, alpha: float) -> float:
+        """The largest loop delay up to which α is kept: `inf` if at every one, 0 if not even without delay."""
+        margin_s, omega = self.timing.delay_margin_s, self.frequencies()
+        longest_s = min(margin_s, _LONGEST / self._slowest)
+        delays = np.linspace(0.0, longest_s, _DELAYS, endpoint=False).tolist()
+        lost = (k for k, delay_s in enumerate(delays) if not self.singular_value(omega, delay_s).min() >= alpha)
+        first = next(lost, _DELAYS)
+        at_rest = self.alpha(0.0) - alpha
+        if at_rest < 0.0 or first == 0:
+            return 0.0
+        if first == _DELAYS and margin_s == inf:
+            return inf
+        ends = [(delay_s, self.alpha(delay_s) - alpha) for delay_s in (delays[first - 1], [*delays, longest_s][first])]
+        if ends[0][1] < 0.0:  # a valley between the frequencies looked at first
+            ends = [(0.0, at_rest), ends[0]]
+        return met_end(lambda delay_s: self.alpha(delay_s) - alpha, *ends, resolution=_ALPHA_RESOLUTION * alpha)
+
+    def frequencies(self) -> FloatArray:
+        """Frequencies (rad/s) that show every valley of σ_min. Beyond the last one σ_min is larger than at rest."""
+        A, own, others = self._matrices
+        highest = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(own, 2) + np.linalg.norm(others, 2))
+        return np.concatenate([[0.0], np.geomspace(self._slowest * 1e-2, highest, _FREQUENCIES)])
+
+    def singular_value(self, omega: FloatArray, delay_s: float) -> FloatArray:
+        """σ_min of the characteristic matrix at each frequency, with a loop delay (s)."""
+        sigma = np.linalg.svd(self.characteristic(omega, delay_s), compute_uv=False)
+        return sigma[:, -1].astype(np.float64)
+
+    def characteristic(self, omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
+        """jωI − A − B h (K_own e^{−jωτ_own} + K_others e^{−jω(τ + T/2)}), shape (k, n, n); h are the responses.
+
+        Of one axis if the gains act on every axis alike, which is as large as that of all of them.
+        """
+        A, own, others = self._matrices
+        own_s, late_s = self.timing.delays_s(delay_s)
+        s = 1j * omega[:, None, None]
+        feedback = own * np.exp(-s * own_s) + others * np.exp(-s * late_s)
+        return s * np.eye(len(A)) - A - self._answers(omega) * feedback
+
+    @cached_property
+    def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A, B K_own and B K_others."""
+        model = self._model
+        step = self.model.axes // model.axes
+        K = self.K[::step, ::step]
+        own = own_part(model, K)
+        return model.A, model.B @ own, model.B @ (K - own)
+
+    @cached_property
+    def _model(self) -> FormationModel:
+        """The formation of one axis, if the gains act on every axis alike."""
+        axes = self.model.axes
+        alike = np.array_equal(self.K, np.kron(self.K[::axes, ::axes], np.eye(axes)))
+        return FormationModel(self.model.predecessors, axes=1) if alike and axes > 1 else self.model
+
+    @cached_property
+    def _slowest(self) -> float:
+        """Magnitude of the slowest motion without delay, 1/s."""
+        magnitudes = np.abs(np.linalg.eigvals(sum(self._matrices)))
+        return float(max(magnitudes.min(), 1e-6 * magnitudes.max()))
+
+    def _answers(self, omega: FloatArray) -> NDArray[np.complex128]:
+        """From wanted to real accelerations, (k, n, 1): the factor of each row of B K."""
+        model = self._model
+        factors = np.ones((len(omega), model.states, 1), dtype=np.complex128)
+        for vehicle, response in enumerate(self.responses or ()):
+            factors[:, model.velocity_slice(vehicle)] = response.transfer(omega)[:, None, None]
+        return factors
+
+
+@dataclass(frozen=True)
+class FlownLoop:
+    """One follower behind another, flown by a station.
+
+    `gains` are k1, k2 and k3, which act on every axis alike; their α is not used. The vehicle answers at once if it has
+    no `response`.
+
+    Examples
+    --------
+    A loop with a margin of 0.71 s, whose errors grow more the nearer it comes:
+
+    >>> from gains.performance.flown import FlownLoop, FlownTiming
+    >>> from gains.performance.scalar_gains import ScalarGains
+    >>> loop = FlownLoop(ScalarGains(1.0, 0.0, 1.0, 0.0), FlownTiming(delay_margin_s=0.711119, period_s=0.0))
+    >>> [round(loop.string_peak(delay_s), 2) for delay_s in (0.0, 0.4, 0.6)]
+    [1.15, 1.69, 4.39]
+    >>> [round(loop.pair.alpha(delay_s), 3) for delay_s in (0.0, 0.4, 0.711)]
+    [0.364, 0.235, 0.0]
+    """
+
+    gains: ScalarGains
+    timing: FlownTiming
+    response: Response | None = None
+
+    @cached_property
+    def pair(self) -> FlownFormation:
+        """The follower and the vehicle in front as a formation of one axis, which has the α of all axes."""
+        model = FormationModel((-1, 0), axes=1)
+        own, front, spacing = self._matrices
+        responses = None if self.response is None else (self.response, self.response)
+        return FlownFormation(model, model.overlapping_gain(own, front, spacing), self.timing, responses)
+
+    def string_peak(self, delay_s: float) -> float:
+        """Largest growth of a spacing error from one vehicle to the next at a loop delay (s); `inf` past the margin."""
+        if not delay_s < self.timing.delay_margin_s:
+            return inf
+        own_s, front_s = self.timing.delays_s(delay_s)
+        return string_peak(self._matrices, own_s, front_delay_s=front_s, answer=self._answer)
+
+    def string_limit_s(self, peak: float) -> float:
+        """The largest loop delay up to which no spacing error grows by more than `peak` >= 1 from vehicle to vehicle.
+
+        `inf` if that holds at every delay, 0 if not even without. In closed form at each frequency: one part of
+        Γ = N / D turns by e^{−jθ}, θ = ωτ, as the delay grows, so that |N|² ≤ peak² |D|² is cos(θ + ψ) ≥ c, which holds
+        from |ψ| ≤ acos c up to θ = acos c − ψ. The least θ / ω is the limit.
+        """
+        k1, k2, k3 = self._k
+        own_s, hold_s = self.timing.delays_s(0.0)
+        # |N|² − |D|² is k2² + 2 k2 k3 (front − own delay) + 2 k3 − k1² times ω² at low frequencies, too flat to see
+        spare = k1**2 - k2**2 - 2 * k3
+        if abs(spare) <= _ROUNDING * k1**2:
+            spare = 0.0
+        if peak == 1.0 and spare < 0.0:
+            return 0.0
+        at_rest_s = (
+            own_s - hold_s + spare / (2 * k2 * k3)
+            if peak == 1.0 and self.timing.loop == "onboard" and k2 > _NOTHING * k1
+            else inf
+        )
+        slowest = min(k1, k3**0.5, k3 / k1)
+        steepest = largest_magnitude(lambda omega: self._turn(omega, peak, spare), near_rad_s=10.0 * slowest)
+        limit_s = min(1.0 / steepest if steepest > 0.0 else inf, max(at_rest_s, 0.0))
+        return min(limit_s, self.timing.delay_margin_s) if limit_s > _ROUNDING else 0.0
+
+    def _turn(self, omega: FloatArray, peak: float, spare: float) -> FloatArray:
+        """ω / θ, 1 over the loop delay up to which the growth at a frequency is within `peak`."""
+        k1, k2, k3 = self._k
+        x, h = omega**2, self._answer(omega)
+        power = np.real(h * np.conj(h))
+        level = peak**2
+        own_s, hold_s = self.timing.delays_s(0.0)
+        # what |N|² and peak² |D|² differ by beside the part that turns, exact for small ω
+        flat = (level - 1.0) * k3**2 + x * ((level - 1.0) * k1**2 + spare + 2 * k3)
+        own = (1j * k1 * omega + k3) * h
+        if self.timing.loop == "ground":
+            still, turning, sign = -x + 0j, own, 1.0
+            excess = -(flat * power / level + x**2)
+        else:
+            own = own * np.exp(-1j * omega * own_s)
+            still, turning, sign = k3 * np.exp(-1j * omega * own_s), 1j * k2 * omega + 0j, -1.0
+            excess = -(flat + level * (x**2 - 2 * x * own.real) / power)
+        size = 2 * np.abs(still * turning)
+        psi = np.angle(sign * still * np.conj(turning) * np.exp(1j * omega * hold_s))
+        turns = np.abs(turning) > _NOTHING * k1 * omega
+        c = excess / np.where(turns, size, 1.0)
+        end = np.arccos(np.clip(c, -1.0, 1.0))
+        angle = np.where(np.abs(psi) <= end, end - psi, 0.0)
+        never = np.where(turns, c <= -1.0, excess <= _ROUNDING * k1**2 * x)
+        return np.where(never, 0.0, omega / np.maximum(angle, _ROUNDING * omega))
+
+    @property
+    def _k(self) -> tuple[float, float, float]:
+        return self.gains.k1, self.gains.k2, self.gains.k3
+
+    @property
+    def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        k1, k2, k3 = self._k
+        return np.array([[-k1]]), np.array([[k2]]), np.array([[k3]])
+
+    def _answer(self, omega: FloatArray) -> NDArray[np.complex128]:
+        return np.ones_like(omega, dtype=np.complex128) if self.response is None else self.response.transfer(omega)
