@@ -11,7 +11,6 @@ import numpy as np
 
 from gains.core.requirement import plain
 from gains.design.time_scale import time_scaled
-from gains.formation.model import FormationModel
 from gains.performance.flown import ALPHA_KEPT, FlownFormation, FlownLoop, FlownTiming
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains

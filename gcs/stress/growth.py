@@ -68,8 +68,8 @@ class Growth:
     """Rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
 
     `error_1_s` is the standard error. Of a fitted mode it is the larger of that from the misfit and half the difference
-    between the first and the second half of the window. The window is `start_s` to `end_s` of the motion's time. The frequency is None if the
-    motion does not oscillate.
+    between the first and the second half of the window. The window is `start_s` to `end_s` of the motion's time. The
+    frequency is None if the motion does not oscillate.
     """
 
     growth_1_s: float
