@@ -126,7 +126,7 @@ class RemoteVehicle:
             return "not heard" if self.address is None else "is silent"
         if self.taken_over:
             left = "left" if self._has_been_guided else "is armed and not in"
-            return f"{left} {self.kind.guided_name}: flown by its pilot or by itself"
+            return f"{left} {self.kind.guided_name}: flown by its pilot or its autopilot"
         return self._next_step().missing
 
     def encode(self, msg_id: int, fields: tuple[Any, ...]) -> bytes:

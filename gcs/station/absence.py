@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from gcs.link.vehicle import RemoteVehicle
 
-LOST, TAKEN_OVER = "is lost", "is taken over, by its pilot or by itself"
+LOST, TAKEN_OVER = "is lost", "is taken over by its pilot or its autopilot"
 COMPLETED = "completed: duration reached"
 
 

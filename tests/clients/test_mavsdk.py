@@ -149,7 +149,7 @@ def test_its_velocities_are_flown_in_both_frames_then_it_holds_and_returns(clien
 
 
 def take_over_and_say_so(port: int) -> None:
-    """What the process does that is killed: take a plain vehicle in flight under control."""
+    """What the process does that is killed: take a double integrator in flight under control."""
     client = Client(port)
     action = Action(client.systems[2])
     action.arm()

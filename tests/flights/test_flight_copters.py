@@ -250,7 +250,7 @@ def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str,
 @pytest.mark.parametrize(("flavour", "mode", "left"), [("ardupilot", 5, "GUIDED"), ("px4", 3 << 16, "OFFBOARD")])
 def test_a_pilot_who_takes_over_in_the_manoeuvre_ends_it(flavour: str, mode: int, left: str) -> None:
     flight = fly_with_a_pilot(flavour, {13.0 - START_PATIENCE_S: mode})
-    assert flight.station.end_reason == f"not identified: vehicle 3 left {left}: flown by its pilot or by itself"
+    assert flight.station.end_reason == f"not identified: vehicle 3 left {left}: flown by its pilot or its autopilot"
     modes = [flight.copter(k).mode for k in (1, 2, 3)]
     assert modes == [RULES[flavour].hold_mode] * 2 + [mode]
 

@@ -202,7 +202,7 @@ def test_a_pilot_who_takes_over_while_the_flight_ends_is_not_told_to_hold(flavou
 def test_a_px4_pilot_who_intervenes_before_the_first_offboard_is_left_alone(mode: int, at_s: float) -> None:
     """While it climbs; what the pilot chooses may also be the hold that a take-off ends in."""
     station, pilots = fly(flown("px4"), "px4", {at_s: mode}, until_s=30.0)
-    assert station.vehicles[2].missing == "is armed and not in OFFBOARD: flown by its pilot or by itself"
+    assert station.vehicles[2].missing == "is armed and not in OFFBOARD: flown by its pilot or its autopilot"
     assert_left_alone(pilots, pilots.copter.mode)
     assert pilots.copter.mode != RULES["px4"].guided_mode  # a pilot's return ends in a landing
 

@@ -130,7 +130,7 @@ def test_home_is_where_it_stood_in_both_frames(kind: str, request_frame: bytes) 
     (home,) = named(sent, "HOME_POSITION")
     place, local = named(sent, "GLOBAL_POSITION_INT")[-1], named(sent, "LOCAL_POSITION_NED")[-1]
     north_m = math.radians((place.lat - home.latitude) * 1e-7) * 6_378_137.0
-    # 1e-7 degrees are 11 mm; the plain vehicle's home is the origin of its frame, under the launcher
+    # 1e-7 degrees are 11 mm; a double integrator's home is the origin of its frame, under the launcher
     assert (local.x - home.x, home.z - local.z) == pytest.approx((north_m, place.relative_alt * 1e-3), abs=0.03)
     assert home.altitude == place.alt - place.relative_alt
 
@@ -289,7 +289,7 @@ def velocity_setpoint(
 
 
 @pytest.mark.parametrize(("frame", "mask"), [(1, 0x9C7), (8, 0x5C7), (8, 0xFC7)], ids=["MAVSDK", "body", "MAVProxy"])
-def test_a_plain_vehicle_takes_the_velocity_that_clients_send(frame: int, mask: int) -> None:
+def test_a_double_integrator_takes_the_velocity_that_clients_send(frame: int, mask: int) -> None:
     vehicle = a_vehicle()
     take_off(vehicle)
     course = math.atan2(9.0, 40.0)

@@ -33,7 +33,7 @@ from tests.soak.soak_experiments import Experiment, Fault
 from tests.soak.soak_scenarios import AUTOPILOT_START_S
 
 CONNECT_S = 25.0
-"""Longest start of vehicles without an autopilot. A flight that has not ended in its time is told to."""
+"""Longest start of double integrators. A flight that has not ended in its time is told to."""
 GARBAGE_A_STEP = 10
 KEY = Key(bytes(range(32)))
 _HEARTBEAT, _SET_POINT = 0, 84
