@@ -28,6 +28,8 @@ _SPARE = 1e-6
 _SCALING_STEPS, _BISECTIONS = 20, 40
 # Time scales looked at when only robustness or decay are asked for.
 _SCALES = np.geomspace(1e-3, 1e3, 121).tolist()
+# The figures of a requirement that a time scale trades for the margin.
+_FIGURES = "alpha", "decay_rate_1_s"
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,16 +168,10 @@ def _meets(figures: tuple[float, float], wanted: Requirement) -> bool:
 
 def _short_of(wanted: Requirement, reached: Sequence[tuple[float, float]]) -> tuple[str, str]:
     """What was asked for, and the most that was reached of each."""
-    most_alpha, most_decay = (max(column) for column in zip(*reached, strict=True))
     asked = [
-        (name, value, most)
-        for name, value, most in (
-            ("alpha", wanted.alpha, most_alpha),
-            ("decay_rate_1_s", wanted.decay_rate_1_s, most_decay),
-        )
-        if value is not None
+        (name, most) for name, most in zip(_FIGURES, np.max(reached, axis=0), strict=True) if getattr(wanted, name)
     ]
     return (
-        " and ".join(f"{name} = {value}" for name, value, _ in asked),
-        " or ".join(f"{name} = {most:.4f}" for name, _, most in asked),
+        " and ".join(f"{name} = {getattr(wanted, name)}" for name, _ in asked),
+        " or ".join(f"{name} = {most:.4f}" for name, most in asked),
     )
