@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core._bracketing import bracketed_roots
+from gains.core._bracketing import bracketed_roots, may_reach_zero, peaks
 from gains.core.arrays import ComplexArray, FloatArray
 
 Loci = Callable[[FloatArray], ComplexArray]
@@ -22,6 +22,8 @@ Loci = Callable[[FloatArray], ComplexArray]
 _EPS = float(np.finfo(np.float64).eps)
 # the least normal number: a matrix of zeros has no scale of its own
 _LEAST = float(np.finfo(np.float64).tiny)
+# a modulus peak is searched when its sampled height is this close to one (log): sampled peaks are flat by far less
+_NEAR_UNIT = 1.0
 # two crossings closer than this (relative) are one place: below the error of a double eigenvalue, sqrt(eps)
 _SAME_PLACE = 1e-10
 # log of the modulus of a locus at such a place
@@ -137,6 +139,24 @@ def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: f
 def _is_flat(loci: Loci, omega: float, locus: complex) -> bool:
     rows = loci(np.array([omega / 2.0, 2.0 * omega]))
     return bool(np.all(np.min(np.abs(rows - locus), axis=1) < _FLAT))
+
+
+def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
+    """Frequencies of local extrema of the sorted log moduli that may reach zero between grid points.
+
+    Extrema whose sampled log modulus is `near` or more away from zero are taken not to reach it.
+    """
+    logs = log_moduli(loci(omega))
+    peak, valley = may_reach_zero(omega, logs), may_reach_zero(omega, -logs)
+    row, rank = np.nonzero((peak | valley) & (np.abs(logs[1:-1]) < near))
+    if row.size == 0:
+        return np.empty(0)
+    sign = np.where(peak[row, rank], 1.0, -1.0)
+
+    def height(at: FloatArray) -> FloatArray:
+        return sign * log_moduli(loci(at))[np.arange(at.size), rank]
+
+    return peaks(height, omega[row], omega[row + 2])
 
 
 def slope_sign(loci: Loci, omega: float, locus: complex) -> int:

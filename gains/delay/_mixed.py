@@ -18,12 +18,16 @@ from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 from gains.delay._commensurate import column_space, companion_loci
-from gains.delay._crossing_error import DelayedTerm
-from gains.delay._crossings import AxisCrossing
-from gains.delay._loci import Loci, highest_frequency, unit_crossings, without_limits_at_zero
-from gains.delay._windows import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
-from gains.delay._zero_root import zero_passage
-from gains.delay.sweep import near_unit_extrema
+from gains.delay._crossings import AxisCrossing, DelayedTerm
+from gains.delay._loci import Loci, highest_frequency, near_unit_extrema, unit_crossings, without_limits_at_zero
+from gains.delay._windows import (
+    BlockAnalysis,
+    DelayAnalysis,
+    block_analysis,
+    check_horizon,
+    combined_analysis,
+    zero_passage,
+)
 
 # rad by which e^{-j omega d} turns between neighbouring frequencies
 _TURN = 0.1
@@ -64,7 +68,7 @@ def analyse_mixed(
     x'(t) = -x(t - 0.5 - tau) leaves pi / 2 - 0.5 for tau:
 
     >>> import numpy as np
-    >>> from gains.delay._crossing_error import DelayedTerm
+    >>> from gains.delay._crossings import DelayedTerm
     >>> from gains.delay._mixed import analyse_mixed
     >>> round(analyse_mixed([DelayedTerm(np.array([[-1.0]]), known_s=0.5, multiple=1)]).delay_margin_s, 6)
     1.070796

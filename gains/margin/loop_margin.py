@@ -2,7 +2,7 @@
 
 Which analysis answers depends on the model: `gains.delay.constant` for one late part, `gains.delay._commensurate` for
 multiples of the unknown delay, `gains.delay._mixed` if there are known delays beside it, `gains.sampled.constant` for a
-held loop of known period, and `gains.sampled._period_windows` if the period is the unknown. `gains.margin.opinions`
+held loop of known period, and `gains.sampled._period` if the period is the unknown. `gains.margin.opinions`
 confirms what it can. The model is read by `gains.margin.model_file`; `gcs margin` prints the result.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
-from gains.delay._crossing_error import DelayedTerm, by_multiple, crossing_error
+from gains.delay._crossings import DelayedTerm, by_multiple, crossing_error
 from gains.delay.constant import Crossing, DelayAnalysis
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
@@ -31,7 +31,9 @@ _ERRORS_OF = 100
 _BESIDE = 1e-4
 # and only of one-period maps up to this size, which take 0.2 s
 _LARGEST_MAP = 300
-# backward error of an eigenvalue of such a map, in units of n eps and its norm
+# an eigenvalue of such a map is known to this
+_ROUNDING = 1e-11
+# its backward error, in units of n eps and the norm of the map
 _BACKWARD = 10.0
 
 
@@ -194,7 +196,7 @@ def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
 
 
 def _with_unknown_period(model: HeldModel) -> LoopMargin:
-    from gains.sampled._period_windows import analyse_period
+    from gains.sampled._period import analyse_period
     from gains.sampled.constant import period_map
 
     def error_s(period_s: float) -> float:
@@ -228,13 +230,14 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
     crossings: tuple[MarginCrossing, ...] = ()
     checks: tuple[str, ...] = ()
     if 0.0 < margin_s < inf and len(model.A) + model.B.shape[1] * (margin_s / period_s + 2.0) <= _LARGEST_MAP:
-        for delay_s in ((1.0 - _BESIDE) * margin_s, (1.0 + _BESIDE) * margin_s):
-            radius = spectral_radius(*loop, period_s=period_s, delay_s=delay_s)
-            if (radius < 1.0) != (delay_s < margin_s):
-                raise DisagreementError(
-                    f"the sampled delay margin is {margin_s} s at a period of {period_s} s, but the spectral radius of "
-                    f"the one-period map at {delay_s} s is {radius}"
-                )
+        delays_s = [(1.0 - _BESIDE) * margin_s, margin_s, (1.0 + _BESIDE) * margin_s]
+        before, at, after = (spectral_radius(*loop, period_s=period_s, delay_s=delay_s) for delay_s in delays_s)
+        # it may touch one at a whole period and be smaller on both sides
+        if before >= 1.0 or max(at, after) < 1.0 - _ROUNDING:
+            raise DisagreementError(
+                f"the sampled delay margin is {margin_s} s at a period of {period_s} s, but the spectral radius of the "
+                f"one-period map is {before} before it, {at} at it and {after} after it"
+            )
         checks = ("spectral radius",)
 
         def map_at(delay_s: float) -> FloatArray:

@@ -1,6 +1,6 @@
 """Second opinions on an analysis of one unknown delay, and how many of its digits are known.
 
-The exact analysis is compared with a sweep along the unit circle (`gains.delay._commensurate.circle_sweep_margin`) and
+The exact analysis is compared with a sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`) and
 the rightmost root beside the ends of the windows, or, where a root at zero is left out, with a count of the roots by
 the argument principle. None of them shares algebra with it. A difference larger than rounding explains is an error.
 
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._crossing_error import DelayedTerm, by_multiple, crossing_error
+from gains.delay._crossings import DelayedTerm, by_multiple, crossing_error
 from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
 
 # a sweep of blocks of n states costs some n^3: these are 0.2 s, and 0.08 s one of 12 states
@@ -117,7 +117,7 @@ def margin_error_s(analysis: DelayAnalysis, terms: Sequence[DelayedTerm]) -> flo
 
 def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thorough: bool) -> float | None:
     """The margin that the sweep finds, None where it has nothing to say or would take long."""
-    from gains.delay._commensurate import circle_sweep_margin
+    from gains.delay.sweep import circle_sweep_margin
 
     # a loop with roots on the axis at zero delay has no margin to a sweep, which judges zero delay by itself
     on_axis = analysis.roots_fixed_at_zero > 0 or any(crossing.delay_s == 0.0 for crossing in analysis.crossings)

@@ -19,8 +19,8 @@ from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._crossings import separating_points
-from gains.delay._loci import Loci, delay_loci, solved_beside_poles, unit_crossings
-from gains.delay.sweep import near_unit_extrema, sweep_frequencies
+from gains.delay._loci import Loci, delay_loci, near_unit_extrema, solved_beside_poles, unit_crossings
+from gains.delay.sweep import sweep_frequencies
 from gains.sampled._loop import SampledPlant, block_radius, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
@@ -30,8 +30,12 @@ _REFINEMENTS = (1, 4, 16)
 _LARGEST_CHECK = 120
 # where the check is made, as fractions of the margin: the radius moves by a part in 10^6 or so, its error is 10^-12
 _BELOW, _ABOVE = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0 - 1e-6), 1.0 + 1e-6
+# a radius this near to one is no evidence: at a whole period it may pass one with no slope
+_AT_ONE = 1e-11
 # |H(-1)| below this at all fractions of a period cannot reach one in between
 _FAR_FROM_ONE = 0.5
+# a residual this small beside its terms is rounding, and a delay this close to another (in periods) the same
+_ROUNDING, _SAME_PLACE = 1e-13, 1e-6
 
 
 def block_delay_margin(plant: SampledPlant) -> float:
@@ -63,9 +67,12 @@ def _least_delay_off_the_real_axis(plant: SampledPlant, refinement: int) -> floa
     for delay_s, angle in sorted(_starts(plant, refinement)):
         if delay_s > best_s + 2.0 * plant.period_s:
             break
-        refined_s = _newton(plant, delay_s, angle)
-        if 0.0 <= refined_s < best_s:
-            best_s = refined_s
+        found_s = [_refined(plant, delay_s, angle)]
+        periods, beside_s = delay_s / plant.period_s, _SAME_PLACE * plant.period_s
+        if np.isnan(found_s[0]) and abs(periods - round(periods)) < _SAME_PLACE:
+            # the slope that leads from a whole period to a solution very near to it may be on either side
+            found_s = [_refined(plant, start_s, angle) for start_s in (delay_s - beside_s, delay_s + beside_s)]
+        best_s = min([best_s, *(refined_s for refined_s in found_s if refined_s >= 0.0)])
     return best_s
 
 
@@ -187,40 +194,51 @@ def _sweep_points(plant: SampledPlant, loci: Loci) -> FloatArray:
     return np.union1d(omega, near_unit_extrema(loci, omega))
 
 
-def _newton(plant: SampledPlant, delay_s: float, angle: float) -> float:
+def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
     """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by.
 
-    Newton's method for u*M(phi, tau)v = 0 with the singular vectors of the least singular value of
-    M = z^{q+1} (z I - Phi) - (G0 z + G1) K, whose derivative by tau is (z - 1) e^{A (T - e)} B K.
+    At a whole period the least singular value of `_residual` has a kink, and perhaps a slope on one side only: a start
+    that is a solution already stays one, wherever a step from it leads.
     """
-    n, period_s = plant.A.shape[0], plant.period_s
-    identity = np.eye(n)
-    start_s, previous = delay_s, inf
-    for _ in range(30):
-        whole, rest_s = split_delay(max(delay_s, 0.0), period_s) if delay_s >= 0.0 else (-1, delay_s + period_s)
-        states, hold = plant.transition(np.array([period_s, period_s - rest_s]))
-        Phi, newer, older = states[0], hold[1] @ plant.K, (hold[0] - hold[1]) @ plant.K
-        z = np.exp(1j * angle)
-        turned = z ** (whole + 1)
-        U, singular, Vh = np.linalg.svd(turned * (z * identity - Phi) - newer * z - older)
-        u, v = U[:, -1].conj(), Vh[-1].conj()
-        by_z = (whole + 1) * turned / z * (z * identity - Phi) + turned * identity - newer
-        by_angle = 1j * z * complex(u @ by_z @ v)
-        by_delay = (z - 1.0) * complex(u @ states[1] @ plant.B @ (plant.K @ v))
+    start_s, is_root, previous = delay_s, False, inf
+    for attempt in range(30):
+        residual, size, (by_angle, by_delay) = _residual(plant, delay_s, angle)
+        is_root = residual <= _ROUNDING * size if attempt == 0 else is_root
         determinant = by_angle.real * by_delay.imag - by_angle.imag * by_delay.real
         if determinant == 0.0:
-            return np.nan
-        step_angle = -float(singular[-1]) * by_delay.imag / determinant
-        step_s = float(singular[-1]) * by_angle.imag / determinant
+            break
+        step_angle = -residual * by_delay.imag / determinant
+        step_s = residual * by_angle.imag / determinant
         angle, delay_s = angle + step_angle, delay_s + step_s
-        if not (0.0 < angle < pi and abs(delay_s - start_s) < 2.0 * period_s and delay_s > -period_s):
-            return np.nan
-        size = abs(step_angle) / angle + abs(step_s) / period_s
+        if not (0.0 < angle < pi and abs(delay_s - start_s) < 2.0 * plant.period_s and delay_s > -plant.period_s):
+            break
+        step = abs(step_angle) / angle + abs(step_s) / plant.period_s
         # rounding stops the steps from shrinking near 1e-13; larger steps that do not shrink lead nowhere
-        if size < 1e-14 or (size < 1e-9 and size >= 0.5 * previous):
-            return delay_s
-        previous = size
-    return np.nan
+        if step < 1e-14 or (step < 1e-9 and step >= 0.5 * previous):
+            moved = abs(delay_s - start_s) > _SAME_PLACE * plant.period_s
+            return start_s if is_root and moved else delay_s
+        previous = step
+    return start_s if is_root else np.nan
+
+
+def _residual(plant: SampledPlant, delay_s: float, angle: float) -> tuple[float, float, tuple[complex, complex]]:
+    """The least singular value of M = z^{q+1} (z I - Phi) - (G0 z + G1) K, the size of its terms, and its derivatives.
+
+    With its singular vectors u, v those of u*M v by phi and tau; dM / dtau = (z - 1) e^{A (T - e)} B K.
+    """
+    period_s = plant.period_s
+    whole, rest_s = split_delay(delay_s, period_s) if delay_s >= 0.0 else (-1, delay_s + period_s)
+    states, hold = plant.transition(np.array([period_s, period_s - rest_s]))
+    newer, older = hold[1] @ plant.K, (hold[0] - hold[1]) @ plant.K
+    z = np.exp(1j * angle)
+    turned = z ** (whole + 1)
+    free = z * np.eye(plant.A.shape[0]) - states[0]
+    U, singular, Vh = np.linalg.svd(turned * free - newer * z - older)
+    u, v = U[:, -1].conj(), Vh[-1].conj()
+    by_z = (whole + 1) * turned / z * free + turned * np.eye(len(free)) - newer
+    by_delay = (z - 1.0) * complex(u @ states[1] @ plant.B @ (plant.K @ v))
+    size = sum(float(np.linalg.norm(term)) for term in (free, newer, older))
+    return float(singular[-1]), size, (1j * z * complex(u @ by_z @ v), by_delay)
 
 
 def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
@@ -240,6 +258,8 @@ def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
             return np.linalg.det(identity - sign * _loops_at_minus_one(plant, m))
 
         values = determinant(fractions)
+        # rounding must not hide a root at a whole period from the intervals on both sides of it
+        values[np.abs(values) < _ROUNDING] = 0.0
         at = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
         if at.size > 0:
             m = bracketed_roots(determinant, fractions[at], fractions[at + 1], values[at], values[at + 1])
@@ -258,14 +278,16 @@ def _contradiction(plant: SampledPlant, margin_s: float) -> str:
     known_s = margin_s if margin_s < inf else 5.0 * plant.period_s
     if plant.A.shape[0] + plant.B.shape[1] * (known_s / plant.period_s + 2.0) > _LARGEST_CHECK:
         return ""
-    checks = [(fraction * known_s, True) for fraction in _BELOW]
-    if margin_s < inf:
-        checks.append((_ABOVE * known_s, False))
-    for delay_s, stable in checks:
-        radius = block_radius(plant, delay_s)
-        if (radius < 1.0) != stable:
-            return (
-                f"the sampled delay margin is {margin_s} s at a period of {plant.period_s} s, but the spectral radius "
-                f"of the one-period map at {delay_s} s is {radius}"
-            )
-    return ""
+    radii = {fraction: block_radius(plant, fraction * known_s) for fraction in _BELOW}
+    wrong = next((fraction for fraction, radius in radii.items() if radius >= 1.0 + _AT_ONE), None)
+    if wrong is None and margin_s < inf:
+        radii[_ABOVE] = block_radius(plant, _ABOVE * known_s)
+        # it may touch one at a whole period and be smaller on both sides
+        if max(radii[_ABOVE], block_radius(plant, known_s)) < 1.0 - _AT_ONE:
+            wrong = _ABOVE
+    if wrong is None:
+        return ""
+    return (
+        f"the sampled delay margin is {margin_s} s at a period of {plant.period_s} s, but the spectral radius "
+        f"of the one-period map at {wrong * known_s} s is {radii[wrong]}"
+    )

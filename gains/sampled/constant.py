@@ -20,10 +20,9 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import balanced, distinct_blocks, real_matrix, square_matrices
+from gains.core.structure import real_matrix, square_matrices
 from gains.sampled._crossings import block_delay_margin
 from gains.sampled._loop import HeldPlant, block_radius, held_blocks, lifted_map
-from gains.sampled._period import block_period_limit
 
 
 def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> FloatArray:
@@ -120,33 +119,6 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
     """
     plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
     return float(min(block_delay_margin(plant) for plant in plants))
-
-
-def sampling_period_limit(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> float:
-    """The least period T (s) at which the sampled and held loop without further delay loses stability.
-
-    0 if A + B K is not Hurwitz (no period is short enough), `inf` if every period is. Found by a march through T that
-    resolves every motion of the plant and of the loop, with peaks of the spectral radius below one refined.
-    Arguments as of `period_map`.
-
-    Raises
-    ------
-    BadModelError
-        Naming the argument, what was read and what was wanted.
-    GainsError
-        The march, some ten thousand periods long, ends without a limit.
-
-    Examples
-    --------
-    x' = u, u = -x: x_{k+1} = (1 - T) x_k is stable up to T = 2.
-
-    >>> from gains.sampled.constant import sampling_period_limit
-    >>> round(sampling_period_limit([[0]], [[1]], [[-1]]), 6)
-    2.0
-    """
-    plant, entry, feedback = checked_loop(A, B, K)
-    blocks = distinct_blocks(plant, entry @ feedback)
-    return min(block_period_limit(*balanced(*block.matrices)) for block in blocks)
 
 
 def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:

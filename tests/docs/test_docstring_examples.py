@@ -22,7 +22,6 @@ INTERNAL_FUNCTIONS = {
     "gains.core.structure.balanced",
     "gains.core.structure.real_matrix",
     "gains.core.structure.square_matrices",
-    "gains.delay.sweep.near_unit_extrema",
     "gains.delay.sweep.sweep_frequencies",
     "gains.formation.model.checked_gain",
     "gains.formation.pattern.check_fits",
@@ -36,6 +35,10 @@ INTERNAL_FUNCTIONS = {
     "gains.sampled.constant.checked_loop",
     "gains.sampled.coupled_block.critical_block",
     "gains.sampled.coupled_block.unlike_blocks",
+    "gains.sampled.multirate.hardly_sampled",
+    "gains.sampled.multirate.lifted_growth",
+    "gains.sampled.multirate.lifted_margin",
+    "gains.sampled.multirate.multirate_map",
 }
 
 
