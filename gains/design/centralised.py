@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from gains.core._semidefinite import SolverFacts, negative, solved
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, SolverError
 from gains.formation.pattern import Plant
-from gains.performance.robust import SolverFacts, disturbance_bound, negative, solved
+from gains.performance.robust import disturbance_bound
 
 # Room for the solver's rounding, as a share, when the bound it claims is compared with the exact one.
 _ROUNDING = 1e-6

@@ -14,7 +14,6 @@ below; with αP and P normalised, "stop when α < 0" is the test of stability th
 ε = 0.1 can raise α; here ε is halved until it does not.
 """
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from gains.core._semidefinite import SolverFacts, solved, summed
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError, InfeasibleError, SolverError
 from gains.core.structure import strongly_connected_blocks
 from gains.formation.pattern import Pattern, Plant, check_fits
-from gains.performance.robust import SolverFacts
 
 # At 40 states an iteration takes the solver seconds, at 60 a minute. A formation needs its states along one axis only.
 LARGEST_STATES = 40
@@ -37,7 +36,6 @@ _ITERATIONS = 200
 _HALVINGS = 12
 # the iteration has settled when α falls by less than this share of its scale in each of some iterations in a row
 _SETTLED, _SETTLED_IN_A_ROW = 1e-3, 3
-_CLARABEL = {"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-7, "max_step_fraction": 0.9}
 
 
 @dataclass(frozen=True)
@@ -97,44 +95,9 @@ class DkDesign:
     solver: SolverFacts
 
 
-class _Effort:
-    """Solves problems and adds up what that took."""
-
-    def __init__(self) -> None:
-        self.seconds, self.iterations, self.variables, self.constraints = 0.0, 0, 0, 0
-
-    def solve(self, problem: Any, *, step: str) -> None:
-        """Solve with Clarabel; every status but "optimal" is an error."""
-        import cvxpy as cp
-
-        advice = f"in the {step} step; lower gain_bound or lyapunov_bound, or scale states and inputs to like size"
-        try:
-            # cvxpy warns of an inaccurate solution; here that is an error, raised below.
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)
-                problem.solve(solver=cp.CLARABEL, **_CLARABEL)
-        except cp.SolverError as error:
-            raise SolverError(f"Clarabel stopped: {error}; {advice}") from error
-        if problem.status != cp.OPTIMAL:
-            raise SolverError(f"Clarabel ended with status {problem.status!r}; wanted 'optimal' {advice}")
-        self.seconds += float(problem.solver_stats.solve_time)
-        self.iterations += int(problem.solver_stats.num_iters)
-        self.variables = max(self.variables, int(problem.size_metrics.num_scalar_variables))
-        self.constraints = max(self.constraints, sum(int(constraint.size) for constraint in problem.constraints))
-
-    def facts(self) -> SolverFacts:
-        from importlib.metadata import version
-
-        return SolverFacts(
-            name="Clarabel",
-            version=version("clarabel"),
-            modelling_version=f"cvxpy {version('cvxpy')}",
-            status="optimal",
-            seconds=self.seconds,
-            iterations=self.iterations,
-            variables=self.variables,
-            constraints=self.constraints,
-        )
+def _solve(problem: Any, effort: list[SolverFacts], *, step: str) -> None:
+    advice = f"in the {step} step; lower gain_bound or lyapunov_bound, or scale states and inputs to like size"
+    effort.append(solved(problem, advice=advice))
 
 
 class _LyapunovStep:
@@ -151,9 +114,9 @@ class _LyapunovStep:
         bounds = [self._P - identity >> 0, lyapunov_bound * identity - self._P >> 0]
         self._problem = cp.Problem(cp.Maximize(spare), [inequality, *bounds])
 
-    def solve(self, closed_loop: FloatArray, alpha: float, effort: _Effort) -> FloatArray:
+    def solve(self, closed_loop: FloatArray, alpha: float, effort: list[SolverFacts]) -> FloatArray:
         self._shifted.value = closed_loop - alpha / 2 * np.eye(len(closed_loop))
-        effort.solve(self._problem, step="Lyapunov")
+        _solve(self._problem, effort, step="Lyapunov")
         P = np.asarray(self._P.value, dtype=float)
         return (P + P.T) / 2
 
@@ -176,9 +139,9 @@ class _GainStep:
         limit = cp.bmat([[gain_bound * np.eye(rows), self._K], [self._K.T, gain_bound * np.eye(columns)]])
         self._problem = cp.Problem(cp.Minimize(alpha), [inequality, limit >> 0])
 
-    def solve(self, P: FloatArray, effort: _Effort) -> FloatArray:
+    def solve(self, P: FloatArray, effort: list[SolverFacts]) -> FloatArray:
         self._P.value = P
-        effort.solve(self._problem, step="gain")
+        _solve(self._problem, effort, step="gain")
         return np.where(self._mask, np.asarray(self._K.value, dtype=float), 0.0)
 
 
@@ -227,7 +190,7 @@ def dk_iteration(
     """
     check_fits(plant, pattern)
     _check_numbers(plant, decay_rate_1_s, gain_bound, lyapunov_bound, perturbation)
-    effort = _Effort()
+    effort: list[SolverFacts] = []
     lyapunov_step = _LyapunovStep(plant.states, lyapunov_bound)
     gain_step = _GainStep(plant, pattern.mask, gain_bound)
     gain, lyapunov = np.zeros(pattern.mask.shape), np.eye(plant.states)
@@ -236,7 +199,7 @@ def dk_iteration(
     for _ in range(_ITERATIONS):
         if iterates[-1].alpha < -2 * decay_rate_1_s:
             proof = decay_proof(plant.closed_loop(gain), lyapunov)
-            return DkDesign(K=gain, alpha=proof.alpha, proof=proof, iterates=tuple(iterates), solver=effort.facts())
+            return DkDesign(K=gain, alpha=proof.alpha, proof=proof, iterates=tuple(iterates), solver=summed(effort))
         centre = lyapunov_step.solve(plant.closed_loop(gain), iterates[-1].alpha, effort)
         held = (gain, centre, iterates[-1].alpha)
         gain, lyapunov, following = _best_gain(plant, gain_step, held, perturbation, effort)
@@ -252,7 +215,11 @@ def dk_iteration(
 
 
 def _best_gain(
-    plant: Plant, gain_step: _GainStep, held: tuple[FloatArray, FloatArray, float], perturbation: float, effort: _Effort
+    plant: Plant,
+    gain_step: _GainStep,
+    held: tuple[FloatArray, FloatArray, float],
+    perturbation: float,
+    effort: list[SolverFacts],
 ) -> tuple[FloatArray, FloatArray, DkIterate]:
     """Gain step at P + ε 11', with the largest ε, ε/2, ε/4, ... that does not raise α; else the gain held."""
     K_held, P, alpha_held = held

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
+from gains.core._semidefinite import SolverFacts
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError, SolverError
 from gains.core.requirement import Requirement, plain
@@ -36,7 +37,7 @@ from gains.formation.bipartite import partition_by_input, smallest_partition
 from gains.formation.fixed_modes import check_stabilisable
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Link, Pattern, Plant, checked_pattern_gain, formation_plant
-from gains.performance.robust import SolverFacts, disturbance_bound
+from gains.performance.robust import disturbance_bound
 from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
 

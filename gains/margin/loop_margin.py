@@ -1,9 +1,9 @@
-"""The delay margin of any linear loop that `gains.margin.model_file` describes: one record, with what confirms it.
+"""The delay margin of any linear loop that `gains.margin.model_file` reads, with what confirms it.
 
-Which analysis answers depends on the model: `gains.delay.constant` for one late part, `gains.delay._commensurate` for
-multiples of the unknown delay, `gains.delay._mixed` if there are known delays beside it, `gains.sampled.constant` for a
-held loop of known period, and `gains.sampled._period` if the period is the unknown. `gains.margin.opinions`
-confirms what it can. The model is read by `gains.margin.model_file`; `gcs margin` prints the result.
+The analysis depends on the model: `gains.delay._commensurate` for multiples of the unknown delay, `gains.delay._mixed`
+if there are known delays beside it, `gains.sampled.constant` for a held loop of known period, and
+`gains.sampled._period` if the period is the unknown. `gains.margin.opinions` confirms what it can. `gcs margin` prints
+the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,15 +21,15 @@ from gains.delay.constant import Crossing, DelayAnalysis
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
 
-# multiples of the unknown up to this many times their common divisor
+# largest multiple of the unknown, in units of the common divisor of all
 _MOST_STEPS = 200
-# digits that are printed at most
+# most digits printed
 _DIGITS = 6
 # errors are estimated for the first crossings only: there may be thousands
 _ERRORS_OF = 100
-# the spectral radius is looked at this far beside the margin of a held loop, relative to it
+# the spectral radius is computed this far beside the margin of a held loop, relative to it,
 _BESIDE = 1e-4
-# and only of one-period maps up to this size, which take 0.2 s
+# for one-period maps up to this size, which take 0.2 s
 _LARGEST_MAP = 300
 # an eigenvalue of such a map is known to this
 _ROUNDING = 1e-11
@@ -41,9 +41,9 @@ _BACKWARD = 10.0
 class MarginCrossing:
     """Roots on the imaginary axis, or on the unit circle of a sampled loop, at one value of the unknown.
 
-    `delay_s` is that value, known to `delay_error_s` (nan where it was not estimated), and `direction` as of
-    `gains.delay.constant.Crossing`. `roots` and `repeats_every_s` are None where they are not told: of sampled loops,
-    and of a real root, which passes zero once.
+    `delay_s` is that value, known to `delay_error_s` (nan if not estimated); `direction` is as of
+    `gains.delay.constant.Crossing`. `roots` and `repeats_every_s` are None for sampled loops, and `repeats_every_s` for
+    a real root, which passes zero once.
     """
 
     omega_rad_s: float
@@ -65,11 +65,13 @@ class LoopMargin:
     stable_intervals_s
         The windows of stability, complete up to `complete_to_s`; the last may end at inf.
     delay_margin_s, delay_margin_error_s
-        The end of the window that begins at 0, or 0, and its estimated error.
-    unstable_roots_at_zero_delay, roots_fixed_at_zero
-        The number of roots right of the axis with the unknown at zero; of roots at 0 that nothing else here counts.
+        The end of the window that begins at 0, or 0 without one, and its estimated error.
+    unstable_roots_at_zero_delay
+        The number of roots right of the axis with the unknown at zero.
+    roots_fixed_at_zero
+        The number of roots that stay at 0 and are left out of all else.
     checked_by
-        The names of the methods that confirmed the windows.
+        The methods that confirmed the windows.
     """
 
     unknown: str
@@ -86,7 +88,7 @@ class LoopMargin:
 
 @dataclass(frozen=True)
 class LoopAtGivenDelays:
-    """A loop whose delays are all numbers: its rightmost root (1/s), and its unstable roots without any delay."""
+    """A loop whose delays are all known: its rightmost root (1/s), and its unstable roots without any delay."""
 
     rightmost_root: complex
     unstable_roots_at_zero_delay: int
@@ -121,7 +123,7 @@ def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays
 
 
 def as_known(value: float, error: float) -> str:
-    """A number with as many digits as its error leaves, six at most; the last digit is off by one at most.
+    """A number with the digits that its error leaves, six at most; the last one is off by at most one.
 
     Examples
     --------
@@ -222,7 +224,7 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
 
 
 def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
-    """The margin of the held loop as it is flown; windows beyond the first are not looked for."""
+    """The first window of the held loop as it is flown."""
     from gains.sampled.constant import period_map, sampled_delay_margin, spectral_radius
 
     loop = (model.A, model.B, model.K)

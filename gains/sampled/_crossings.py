@@ -35,7 +35,7 @@ _AT_ONE = 1e-11
 # |H(-1)| below this at all fractions of a period cannot reach one in between
 _FAR_FROM_ONE = 0.5
 # a residual this small beside its terms is rounding, and a delay this close to another (in periods) the same
-_ROUNDING, _SAME_PLACE = 1e-13, 1e-6
+_ROUNDING, _SAME_PLACE = 1e-11, 1e-6
 
 
 def block_delay_margin(plant: SampledPlant) -> float:

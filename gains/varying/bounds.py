@@ -9,7 +9,7 @@ below it, and it never exceeds the margin for constant delays.
 * Any variation at all: small gain on v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain from
   x' is at most h.
 
-Every Lyapunov functional found is checked by the eigenvalues of its matrices, see `gains.varying._lmi`. A delay that
+The eigenvalues of its matrices check every Lyapunov functional found, see `gains.core._semidefinite`. A delay that
 stays near its mean may be bounded higher by `gains.varying.jitter`.
 """
 
@@ -19,12 +19,12 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
 from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
-from gains.varying._lmi import Unknown, positive_definite_solution
 
 # bisection stops at this relative accuracy
 _ACCURACY = 1e-4

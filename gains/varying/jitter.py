@@ -13,12 +13,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
 from gains.delay._loci import factor_rank, highest_frequency
 from gains.delay.constant import analyse_delay
-from gains.varying._lmi import Unknown, positive_definite_solution
 from gains.varying.bounds import varying_delay_bound
 
 Cover = Literal["constant", "rate", "spread", "any", "none"]

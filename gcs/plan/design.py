@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from gains.core._semidefinite import SolverFacts
 from gains.core.requirement import Requirement
-from gains.performance.robust import SolverFacts
 
 Matrix = tuple[tuple[float, ...], ...]
 

@@ -22,9 +22,10 @@ from gains.formation.bipartite import expanded_gain, partition_by_input, verify_
 from gains.formation.inclusion import contracted_gain, expand, modified_gain, verify_inclusion
 from gains.formation.inclusion import expanded_gain as inclusion_gain
 from gains.formation.model import FormationModel
-from gains.formation.pattern import Pattern, bidirectional, formation_plant, leader_follower, split_own
+from gains.formation.pattern import Pattern, bidirectional, checked_pattern_gain, formation_plant, leader_follower
 from gains.margin.opinions import checked_delay_margin
 from gains.performance.robust import robust_lmi
+from gains.sampled.onboard import own_part
 from gcs.studies import thesis_errata as errata
 from gcs.studies.thesis_flights import (
     ALPHA,
@@ -71,8 +72,8 @@ def claims() -> list[Claim]:
 
 def late_neighbours(K: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatArray]:
     """(A0, A1) of (5.2): own errors are fed back at once, those of others late."""
-    own, others = split_own(pattern, K)
-    return CHAIN.A + CHAIN.B @ own, CHAIN.B @ others
+    own = own_part(CHAIN, checked_pattern_gain(pattern, K))
+    return CHAIN.A + CHAIN.B @ own, CHAIN.B @ (K - own)
 
 
 def _modelling() -> Iterator[Claim]:
