@@ -12,8 +12,10 @@ the angles are eigenvalues of a Hamiltonian matrix and none is missed; otherwise
 """
 
 from math import ceil, floor, inf, pi
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import ComplexArray, FloatArray
@@ -67,12 +69,9 @@ def _least_delay_off_the_real_axis(plant: SampledPlant, refinement: int) -> floa
     for delay_s, angle in sorted(_starts(plant, refinement)):
         if delay_s > best_s + 2.0 * plant.period_s:
             break
-        found_s = [_refined(plant, delay_s, angle)]
-        periods, beside_s = delay_s / plant.period_s, _SAME_PLACE * plant.period_s
-        if np.isnan(found_s[0]) and abs(periods - round(periods)) < _SAME_PLACE:
-            # the slope that leads from a whole period to a solution very near to it may be on either side
-            found_s = [_refined(plant, start_s, angle) for start_s in (delay_s - beside_s, delay_s + beside_s)]
-        best_s = min([best_s, *(refined_s for refined_s in found_s if refined_s >= 0.0)])
+        refined_s = _refined(plant, delay_s, angle)
+        if 0.0 <= refined_s < best_s:
+            best_s = refined_s
     return best_s
 
 
@@ -195,34 +194,47 @@ def _sweep_points(plant: SampledPlant, loci: Loci) -> FloatArray:
 
 
 def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
-    """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by.
+    """`_newton` and what it misses at whole periods, where the residual has a kink, and perhaps one slope only.
 
-    At a whole period the least singular value of `_residual` has a kink, and perhaps a slope on one side only: a start
-    that is a solution already stays one, wherever a step from it leads.
+    A start there that is a solution stays one, wherever a step from it leads. From one that nearly is a solution,
+    steps begin on both sides.
     """
-    start_s, is_root, previous = delay_s, False, inf
-    for attempt in range(30):
-        residual, size, (by_angle, by_delay) = _residual(plant, delay_s, angle)
-        is_root = residual <= _ROUNDING * size if attempt == 0 else is_root
+    found_s, beside_s = _newton(plant, delay_s, angle), _SAME_PLACE * plant.period_s
+    from_whole_s = abs(delay_s - round(delay_s / plant.period_s) * plant.period_s)
+    if abs(found_s - delay_s) < beside_s or from_whole_s > beside_s:
+        return found_s
+    residual, terms, _ = _residual(plant, delay_s, angle)
+    relative = residual / sum(float(np.linalg.norm(term)) for term in terms)
+    if _ROUNDING < relative < _SAME_PLACE and np.isnan(found_s):
+        return float(np.fmin(*(_newton(plant, start_s, angle) for start_s in (delay_s - beside_s, delay_s + beside_s))))
+    return delay_s if relative <= _ROUNDING else found_s
+
+
+def _newton(plant: SampledPlant, delay_s: float, angle: float) -> float:
+    """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by."""
+    start_s, previous = delay_s, inf
+    for _ in range(30):
+        residual, _, (by_angle, by_delay) = _residual(plant, delay_s, angle)
         determinant = by_angle.real * by_delay.imag - by_angle.imag * by_delay.real
         if determinant == 0.0:
-            break
+            return np.nan
         step_angle = -residual * by_delay.imag / determinant
         step_s = residual * by_angle.imag / determinant
         angle, delay_s = angle + step_angle, delay_s + step_s
         if not (0.0 < angle < pi and abs(delay_s - start_s) < 2.0 * plant.period_s and delay_s > -plant.period_s):
-            break
+            return np.nan
         step = abs(step_angle) / angle + abs(step_s) / plant.period_s
         # rounding stops the steps from shrinking near 1e-13; larger steps that do not shrink lead nowhere
         if step < 1e-14 or (step < 1e-9 and step >= 0.5 * previous):
-            moved = abs(delay_s - start_s) > _SAME_PLACE * plant.period_s
-            return start_s if is_root and moved else delay_s
+            return delay_s
         previous = step
-    return start_s if is_root else np.nan
+    return np.nan
 
 
-def _residual(plant: SampledPlant, delay_s: float, angle: float) -> tuple[float, float, tuple[complex, complex]]:
-    """The least singular value of M = z^{q+1} (z I - Phi) - (G0 z + G1) K, the size of its terms, and its derivatives.
+def _residual(
+    plant: SampledPlant, delay_s: float, angle: float
+) -> tuple[float, tuple[NDArray[Any], ...], tuple[complex, complex]]:
+    """The least singular value of M = z^{q+1} (z I - Phi) - (G0 z + G1) K, the terms of M, and its derivatives.
 
     With its singular vectors u, v those of u*M v by phi and tau; dM / dtau = (z - 1) e^{A (T - e)} B K.
     """
@@ -237,8 +249,7 @@ def _residual(plant: SampledPlant, delay_s: float, angle: float) -> tuple[float,
     u, v = U[:, -1].conj(), Vh[-1].conj()
     by_z = (whole + 1) * turned / z * free + turned * np.eye(len(free)) - newer
     by_delay = (z - 1.0) * complex(u @ states[1] @ plant.B @ (plant.K @ v))
-    size = sum(float(np.linalg.norm(term)) for term in (free, newer, older))
-    return float(singular[-1]), size, (1j * z * complex(u @ by_z @ v), by_delay)
+    return float(singular[-1]), (free, newer, older), (1j * z * complex(u @ by_z @ v), by_delay)
 
 
 def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
@@ -281,9 +292,9 @@ def _contradiction(plant: SampledPlant, margin_s: float) -> str:
     radii = {fraction: block_radius(plant, fraction * known_s) for fraction in _BELOW}
     wrong = next((fraction for fraction, radius in radii.items() if radius >= 1.0 + _AT_ONE), None)
     if wrong is None and margin_s < inf:
-        radii[_ABOVE] = block_radius(plant, _ABOVE * known_s)
+        radii[_ABOVE], least = block_radius(plant, _ABOVE * known_s), 1.0 - _AT_ONE
         # it may touch one at a whole period and be smaller on both sides
-        if max(radii[_ABOVE], block_radius(plant, known_s)) < 1.0 - _AT_ONE:
+        if radii[_ABOVE] < least and block_radius(plant, known_s) < least:
             wrong = _ABOVE
     if wrong is None:
         return ""
