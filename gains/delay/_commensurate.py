@@ -1,13 +1,10 @@
 """Several delays that are multiples of one unknown: x'(t) = A_0 x(t) + A_1 x(t - tau) + ... + A_m x(t - m tau).
 
-With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda, so at each frequency there are finitely
-many lambda with det(j omega I - sum_k A_k lambda^{-k}) = 0: the eigenvalues of a block companion matrix. They are loci
-like those of one delay (`_loci`): a root is on the imaginary axis where a modulus is one, and it moves to the right
-where that modulus falls with the frequency, whatever the delay. With one delay alone (m = 1) the crossings come from
-`_crossings`; everything else is the same.
-
-The frequencies come from a pencil and from Newton's method along the unit circle, see `_circle_angles`. A sweep of the
-circle is the second opinion (`gains.margin.opinions`).
+With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda. At each frequency the equation
+det(j omega I - sum_k A_k lambda^{-k}) = 0 therefore has finitely many solutions, the eigenvalues of a block companion
+matrix. They are loci like those of one delay (`_loci`): a root is on the imaginary axis where a modulus is one, and it
+moves to the right where that modulus falls with the frequency, whatever the delay. The frequencies come from a pencil
+and from Newton's method along the unit circle (`_circle_angles`) or, for a single delay (m = 1), from `_crossings`.
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, for the same problem as a
 polynomial eigenvalue problem.
@@ -52,11 +49,11 @@ from gains.delay._windows import (
     zero_passage,
 )
 
-# a locus is an eigenvalue of a companion matrix, of which many are wanted; beyond this size angles are followed instead
+# loci are eigenvalues of many companion matrices; beyond this size of them angles are followed instead
 _LARGEST_LOCI = 30
 # states times the largest multiple: a sweep takes some seconds there
 _LARGEST_PRODUCT = 3000
-# a candidate is kept when it is this close to the imaginary axis, relative to the norm; a false one costs little
+# candidates are kept this close to the imaginary axis, relative to the norm; a false one costs little
 _CANDIDATE_TOLERANCE = 1e-3
 
 
@@ -137,19 +134,19 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
-    """The same from the eigenvalues s of A(theta), of which there are n however many the delays.
+    """The same from the n eigenvalues s of A(theta), however many delays there are.
 
-    With theta = omega tau a root j omega goes right with growing tau where omega d(Re s) / d theta > 0, whatever tau.
+    With theta = omega tau, a root j omega moves right with growing tau where omega d(Re s) / d theta > 0.
     """
     loci, candidates = circle_loci(terms), candidate_angles(terms)
     counted = unit_crossings(loci, np.union1d(circle_points(terms), separating_points(candidates, PAST_HALF)))
     crossings: list[AxisCrossing] = []
-    # opposite ones at one angle are usual: all roots are on the axis at a quarter turn if all multiples are odd
+    # opposite crossings at one angle are common: if all multiples are odd, all roots cross at a quarter turn
     for crossing in (*counted, *hidden_crossings(loci, candidates, counted)):
         theta, omega = crossing.omega, float(np.angle(crossing.locus)) * norm_of(terms)
         if passes_zero(terms, theta, abs(omega)):
             continue
-        # the angles beyond pi and the frequencies below zero are these, mirrored; outward is falling, to the left
+        # angles beyond pi mirror these, with negative frequencies; outward means falling, to the left
         turn, way = (theta, -1) if omega > 0.0 else (2.0 * pi - theta, 1)
         if theta <= pi:
             locus = UnitCrossing(abs(omega), complex(np.exp(1j * turn)), way * crossing.outward)
@@ -168,8 +165,8 @@ def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
             # a defective root at zero is known to sqrt(eps) only: the singular value decides, not the eigenvalue
             if is_singular_for_any_delay(terms):
                 return True
-        # a determinant that vanishes at more points of the circle than its degree vanishes identically; 3 unlike
-        # angles stand for them, the tolerance being far above rounding
+        # a determinant that vanishes at more angles than its degree vanishes at all; three unrelated angles stand for
+        # them, with a tolerance far above rounding
         elif all(_least_singular(terms, omega, theta) < 1e-12 * scale for theta in (0.0, 1.0, 2.5)):
             return True
     return False
@@ -199,12 +196,7 @@ def companion_loci(terms_at: Callable[[FloatArray], ComplexArray], B: FloatArray
     The late matrices share their column space, A_i = B B'A_i with B (n, r) orthonormal, so that with
     G_i = B'A_i (j omega I - A_0)^{-1} B the condition is det(lambda^m I - sum_i lambda^{m-i} G_i) = 0.
 
-    Parameters
-    ----------
-    terms_at
-        Frequencies (k,) to A_0, ..., A_m, shape (k, m + 1, n, n).
-    B
-        As above.
+    `terms_at` takes frequencies (k,) to A_0, ..., A_m, shape (k, m + 1, n, n).
     """
     n, rank = B.shape
     identity = np.eye(n)
