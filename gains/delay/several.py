@@ -128,27 +128,6 @@ def crossing_curves(
 
     At every point the least singular value of the characteristic matrix is zero to rounding. The curves are followed
     from crossings on a grid of angles: a search, not a proof.
-
-    Parameters
-    ----------
-    A0, A1, A2
-        Real matrices (n, n), 1/s: what acts at once, tau_1 late and tau_2 late.
-    longest_s
-        The largest tau_1 and tau_2 of interest.
-
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size, or a longest delay is not positive and finite.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) has roots +-j omega with 0.5 <= omega <= 1.5 only:
-
-    >>> from gains.delay.several import crossing_curves
-    >>> curves = crossing_curves([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
-    >>> all(0.49 < line.omega_rad_s.min() <= line.omega_rad_s.max() < 1.51 for line in curves)
-    True
     """
     if not all(isfinite(longest) and longest > 0.0 for longest in longest_s):
         raise BadModelError(f"longest_s is {longest_s}; two positive numbers of seconds are wanted")
@@ -166,7 +145,19 @@ def boundary_of_two_delays(
     """The edge of the stable region in the plane of two delays, up to `longest_s`: pieces of `crossing_curves`.
 
     A piece is part of the edge if no root lies right of the axis on it. The edge may surround several regions; where it
-    has no piece, the axes and `longest_s` bound them. Arguments and exceptions as of `crossing_curves`.
+    has no piece, the axes and `longest_s` bound them. A search, not a proof.
+
+    Parameters
+    ----------
+    A0, A1, A2
+        Real matrices (n, n), 1/s: what acts at once, tau_1 late and tau_2 late.
+    longest_s
+        The largest tau_1 and tau_2 of interest.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size, or a longest delay is not positive and finite.
 
     Examples
     --------

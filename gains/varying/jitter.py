@@ -79,11 +79,6 @@ class CoveringBound:
     spread_bound_s: float
     any_bound_s: float
 
-    @property
-    def is_covered(self) -> bool:
-        """Whether some bound proves the loop stable under the jitter."""
-        return self.cover != "none"
-
 
 def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBound:
     """The least demanding bound that proves x'(t) = A0 x(t) + A1 x(t - tau(t)) stable under `jitter`.

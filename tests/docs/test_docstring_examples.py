@@ -22,6 +22,7 @@ INTERNAL_FUNCTIONS = {
     "gains.core.structure.balanced",
     "gains.core.structure.real_matrix",
     "gains.core.structure.square_matrices",
+    "gains.delay.several.crossing_curves",
     "gains.delay.sweep.sweep_frequencies",
     "gains.formation.model.checked_gain",
     "gains.formation.pattern.check_fits",
