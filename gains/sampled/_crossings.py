@@ -6,9 +6,9 @@ tau = (q + m) T, q whole and 0 <= m < 1, exactly when z^{q+1} is an eigenvalue o
     H_m(z) = K (z I - Phi)^{-1} (G0(m) z + G1(m)).
 
 The moduli of the eigenvalues of H_m do not depend on q: for each m there are finitely many angles phi at which one of
-them is one, whatever the delay. These angles, and with them the delays at which a crossing is possible, change little
-over one period, so the angles at a few m lead to every crossing; no march through the delays is needed. For one input
-the angles are eigenvalues of a Hamiltonian matrix and none is missed; otherwise they come from a refined sweep.
+them is one. These angles, and the delays that belong to them, change little within a period, so the angles at a few m
+lead to every crossing without a march through the delays. For one input the angles come from the eigenvalues of a
+Hamiltonian matrix and none is missed; for several, from a refined sweep.
 """
 
 from math import ceil, floor, inf, pi
@@ -28,9 +28,9 @@ from gains.sampled._loop import SampledPlant, block_radius, split_delay
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
 _FRACTIONS = 8
 _REFINEMENTS = (1, 4, 16)
-# the check by the eigenvalues of the one-period map is left out for maps larger than this: 20 ms and more each
+# one-period maps larger than this are not checked by eigenvalues: each takes 20 ms and more
 _LARGEST_CHECK = 120
-# where the check is made, as fractions of the margin: the radius moves by a part in 10^6 or so, its error is 10^-12
+# where the check is made, as fractions of the margin: the radius moves by a part in 10^6 or so, its error is 1e-12
 _BELOW, _ABOVE = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0 - 1e-6), 1.0 + 1e-6
 # a radius this near to one is no evidence: at a whole period it may pass one with no slope
 _AT_ONE = 1e-11
@@ -53,7 +53,7 @@ def block_delay_margin(plant: SampledPlant) -> float:
     if plant.B.shape[1] == 0:
         return inf
     contradiction = ""
-    # at periods near the limit of the loop, angles may appear and vanish between two fractions: look closer then
+    # at periods near the limit of the loop, angles may appear and vanish between two fractions: refine then
     for refinement in _REFINEMENTS:
         off_axis_s = _least_delay_off_the_real_axis(plant, refinement)
         margin_s = min(off_axis_s, _least_delay_at_minus_one(plant, refinement))
