@@ -1,1 +1,1 @@
-"""What all other rooms use: array types, errors, blocks of a matrix, bracketing of roots, requirements."""
+"""What all other rooms use: array types, errors, blocks of a matrix, roots in brackets, semidefinite programs."""

@@ -1,7 +1,7 @@
-"""Roots and peaks of scalar functions, within brackets.
+"""Roots and peaks of scalar functions within brackets.
 
-Most functions here evaluate all abscissae (k,) at once, as one batch of eigenvalue problems a step: nearly all the time
-is spent there.
+Most functions here evaluate all abscissae (k,) at once, one batch of eigenvalue problems for each step, as nearly all
+the time is spent there.
 """
 
 from collections.abc import Callable
@@ -15,11 +15,11 @@ Functions = Callable[[FloatArray], FloatArray]
 
 _EPS = float(np.finfo(np.float64).eps)
 _GOLDEN = (3.0 - 5.0**0.5) / 2.0
-# 60 steps shrink a bracket to 1e-13: a smooth peak is known to 1e-8 only, a kink to rounding
+# 60 steps shrink a bracket to 1e-13: enough for a kink; a smooth peak is known to 1e-8 only
 _GOLDEN_STEPS = 60
-# a peak between samples is higher than the highest of them by less than this many times what they differ
+# a peak exceeds its highest sample by less than this many times the difference of neighbouring samples
 _REACH = 4.0
-# Steps of false position at most, where the function is too rough for its resolution
+# most steps of false position, reached where the function is too rough for the resolution
 _FALSE_POSITIONS = 30
 
 
@@ -38,10 +38,10 @@ def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def may_reach_zero(points: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
-    """Where a local maximum below zero of samples (k, r) of r functions may hide values of zero, shape (k - 2, r).
+    """Where a local maximum below zero of samples (k, r) of r functions may hide a zero, shape (k - 2, r).
 
-    A smooth peak exceeds its highest sample by an eighth of what the neighbours are lower by; a kink by as much as the
-    line through its neighbour rises over the other step.
+    A smooth peak exceeds its highest sample by an eighth of its height above the neighbours; a kink by as much as the
+    line through one neighbour rises over the other step.
     """
     inner, left, right = values[1:-1], values[:-2], values[2:]
     before, after = np.diff(points)[:-1, np.newaxis], np.diff(points)[1:, np.newaxis]
@@ -96,10 +96,10 @@ def _next_fraction(
 def met_end(
     excess: Callable[[float], float], met: tuple[float, float], missed: tuple[float, float], *, resolution: float
 ) -> float:
-    """An abscissa where an expensive, slightly rough function is between 0 and `resolution`: false position.
+    """An abscissa at which an expensive, slightly rough function is between 0 and `resolution`, by false position.
 
-    `met` and `missed` are abscissae with their excess, >= 0 and < 0. When one end moves twice in a row the value at the
-    other is halved, so that both close in (the Illinois rule); about six steps.
+    `met` and `missed` are abscissae with their excess, >= 0 and < 0. When one end moves twice in a row, the value at
+    the other is halved, so that both close in (the Illinois rule); this takes about six steps.
     """
     (x, value), (outside, f_outside) = met, missed
     f_inside, moved = value, 0

@@ -11,7 +11,7 @@ import numpy as np
 from gains.core.errors import BadModelError
 
 DEFAULT_DELAY_MARGIN_S = 0.3
-# Below this α, which belongs to margins beyond 30 s, the numbers in a proof spread too far for the solver.
+# Below this α, and above this margin, the numbers in a proof spread too far for the solver.
 ALPHA_MIN, DELAY_MARGIN_MAX_S = 5e-4, 30.0
 
 
@@ -36,9 +36,9 @@ PeakLimit = float | OnboardPeak | None
 class Requirement:
     """What the design must reach.
 
-    With `delay_margin_s` given, α is made as large as possible, and `alpha` and `decay_rate_1_s`, if given, must be
-    reached; without it, the delay margin is made as large as these allow. With nothing given, a margin of 0.3 s is
-    wanted.
+    With `delay_margin_s` the design makes α as large as possible, and must reach `alpha` and `decay_rate_1_s` if they
+    are given. Without it, the delay margin is made as large as these two allow. With none of the three, a margin of
+    0.3 s is required.
 
     Attributes
     ----------
@@ -50,17 +50,17 @@ class Requirement:
         Least decay rate of the continuous loop without delay, 1/s.
     string_peak_max
         Limit, at least 1, on the growth of spacing errors from vehicle to vehicle: in the ground loop without delay
-        and at half the margin, on board, where the delay has no end, at every delay. 1 lets no error grow down the
-        chain and costs little α. Not limited if None.
+        and at half the margin, in the onboard loop at every delay. 1 lets no error grow down the chain and costs
+        little α. Not limited if None.
     loop
-        The loop that is flown. On board a pattern without cycles takes any delay, so that `delay_margin_s` limits a
-        vehicle's own gains: they are those that would take it if a ground station closed their loops. On a pattern
-        with cycles the onboard loop must take it as well.
+        The loop that is flown. On board a pattern without cycles takes any delay; `delay_margin_s` then limits each
+        vehicle's own gains, as if a ground station closed their loops. On a pattern with cycles the onboard loop must
+        have this margin too.
 
     Raises
     ------
     BadModelError
-        If a number is out of its range.
+        A number is out of its range.
 
     Examples
     --------
@@ -99,7 +99,7 @@ class Requirement:
 
 
 def plain(value: Any) -> Any:
-    """Return lists, numbers and strings in place of arrays, tuples and numpy numbers; None for what is not finite."""
+    """`value` with lists and plain numbers in place of arrays, tuples and numpy numbers; None if not finite."""
     if isinstance(value, dict):
         return {str(name): plain(entry) for name, entry in value.items()}
     if isinstance(value, np.ndarray):

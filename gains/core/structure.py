@@ -1,15 +1,16 @@
-"""Splits a linear model into the blocks that really interact.
+"""Splitting of a linear model into the blocks that really interact.
 
-A leader-follower tree is block triangular. Its identical followers form one defective eigenvalue chain as long as
-the tree is deep, and rounding spreads a defective eigenvalue of multiplicity N over a circle of radius eps^(1/N):
-from about eight vehicles on, every method that looks at the whole matrix returns wrong verdicts. The strongly
-connected components of the pattern are the diagonal blocks of the triangular form. The spectrum, with or without
-delays, is the union of theirs, so each block is analysed on its own, and equal blocks once.
+A leader-follower tree is block triangular. Its identical followers share one defective eigenvalue, whose multiplicity
+N is the depth of the tree, and rounding spreads such an eigenvalue over a circle of radius eps^(1/N): from about eight
+vehicles on, every method that takes the whole matrix at once returns wrong verdicts. The strongly connected components
+of the pattern are the diagonal blocks of the triangular form. The spectrum, with or without delays, is the union of
+their spectra, so each block is analysed on its own, and equal blocks once.
 """
 
 import heapq
 from collections.abc import Iterable
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from math import log2
 
 import numpy as np
@@ -24,10 +25,9 @@ _LARGEST_CLOSURE = 64
 
 @dataclass(frozen=True)
 class Block:
-    """A diagonal block of the triangular form, which stands for all its equal copies.
+    """A diagonal block of the triangular form, which stands for all its equal `copies`.
 
-    `indices` are the states of the first copy, `copies` the number of equal blocks, `matrices` the diagonal blocks of
-    the given matrices, in their order.
+    `indices` are the states of the first copy; `matrices` are its blocks of the given matrices, in their order.
     """
 
     indices: IntArray
@@ -36,13 +36,7 @@ class Block:
 
 
 def square_matrices(**matrices: ArrayLike) -> list[FloatArray]:
-    """The arguments as finite real square matrices of one size.
-
-    Raises
-    ------
-    BadModelError
-        Naming the matrix, what was read and what was wanted.
-    """
+    """The arguments as finite real square matrices of one size; BadModelError names the one that is not."""
     checked: list[FloatArray] = []
     size = None
     for name, value in matrices.items():
@@ -57,13 +51,7 @@ def square_matrices(**matrices: ArrayLike) -> list[FloatArray]:
 
 
 def real_matrix(name: str, value: ArrayLike) -> FloatArray:
-    """`value` as a two-dimensional array of finite real numbers with at least one entry.
-
-    Raises
-    ------
-    BadModelError
-        Naming the matrix, what was read and what was wanted.
-    """
+    """`value` as a matrix of finite real numbers with at least one entry, or BadModelError with the name."""
     try:
         matrix = np.array(value)
     except ValueError as error:
@@ -80,9 +68,9 @@ def real_matrix(name: str, value: ArrayLike) -> FloatArray:
 def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     """Index sets of the strongly connected components of the union of the patterns of square matrices.
 
-    State j drives state i where the entry (i, j) of any matrix is not exactly zero. The sets come drivers first, so
-    that taking the states in this order makes every matrix block lower triangular; ties are broken by the lowest
-    index. Indices within a set ascend.
+    State j drives state i where the entry (i, j) of any matrix is not exactly zero. The sets come drivers first, the
+    lowest index first in a tie: in this order of states every matrix is block lower triangular. Indices within a set
+    ascend.
 
     Examples
     --------
@@ -108,8 +96,8 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
 def distinct_blocks(*matrices: RealArray) -> list[Block]:
     """The diagonal blocks of `strongly_connected_blocks`, equal ones listed once with the number of copies.
 
-    Equal means equal to the last bit with the states in ascending order, as identical vehicles described one after
-    the other are. 400 identical followers give one block.
+    Blocks are equal if they are to the last bit, with the states in ascending order. 400 identical followers, described
+    one after the other, give one block.
 
     Examples
     --------
@@ -139,45 +127,15 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
     ]
 
 
-def project_out_equilibria(*matrices: ArrayLike) -> tuple[FloatArray, ...]:
-    """The matrices without the directions along which nothing ever acts: a consensus without its common value.
-
-    Directions v with A_k v = 0 for every k (or, for conserved quantities, w'A_k = 0) carry a root of
-    det(sI - A_0 - A_1 e^{-s tau} - ...) at s = 0 for every delay. An orthonormal basis whose first columns span them
-    makes all matrices block triangular; the remaining diagonal block is returned, repeatedly until no such direction
-    is left (a formation at constant velocity has two, one after the other). All other roots are kept.
-
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size, or nothing but equilibria is left.
-
-    Examples
-    --------
-    x_1' = x_2 - x_1, x_2' = x_1 - x_2: the difference decays like e^{-2t}.
-
-    >>> from gains.core.structure import project_out_equilibria
-    >>> [difference] = project_out_equilibria([[-1, 1], [1, -1]])
-    >>> difference.round(6).tolist()
-    [[-2.0]]
-    """
-    left = list(balanced(*square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})))
-    while True:
-        basis = _complement_of_common_kernel(left)
-        if basis.shape[1] == left[0].shape[0]:
-            basis = _complement_of_common_kernel([matrix.T for matrix in left])
-        if basis.shape[1] == left[0].shape[0]:
-            return tuple(left)
-        if basis.shape[1] == 0:
-            raise BadModelError("the matrices have nothing but equilibria; at least one moving state is wanted")
-        left = [_projected(matrix, basis) for matrix in left]
-
-
 def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], int]:
-    """The matrices after `project_out_equilibria` in each strongly connected block, and the number of states removed.
+    """The matrices without the directions along which nothing ever acts, and the number of states removed.
 
-    The blocks are put side by side, which keeps the spectrum. A block in which nothing moves at all (an integrator
-    that nobody feeds back) stays as it is.
+    A consensus loses its common value, a formation at constant velocity its position and then its velocity. A direction
+    v with A_k v = 0 for every k (or w with w'A_k = 0, a conserved quantity) carries a root of
+    det(sI - A_0 - A_1 e^{-s tau} - ...) at s = 0 for every delay. An orthonormal basis whose first columns span these
+    directions makes all matrices block triangular, and the other diagonal block is kept; this is repeated in each
+    strongly connected block until no such direction is left. The blocks are put side by side, which keeps all other
+    roots. A block in which nothing moves at all (an integrator that nobody feeds back) stays as it is.
 
     Raises
     ------
@@ -186,7 +144,7 @@ def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], in
 
     Examples
     --------
-    A consensus of two vehicles beside a loop of its own:
+    A consensus of two vehicles, whose difference decays like e^{-2t}, beside a loop of its own:
 
     >>> from gains.core.structure import without_equilibria
     >>> [moving], taken_out = without_equilibria([[-1, 1, 0], [1, -1, 0], [0, 0, -3]])
@@ -198,9 +156,7 @@ def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], in
     kept = [np.zeros((size, size)) for _ in checked]
     filled = 0
     for indices in strongly_connected_blocks(*checked):
-        block = [matrix[np.ix_(indices, indices)] for matrix in checked]
-        if any(matrix.any() for matrix in block):
-            block = _moving_part(block)
+        block = _moving_part([matrix[np.ix_(indices, indices)] for matrix in checked])
         place = slice(filled, filled + block[0].shape[0])
         for target, matrix in zip(kept, block, strict=True):
             target[place, place] = matrix
@@ -212,10 +168,10 @@ def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], in
 
 
 def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
-    """The matrices after one diagonal similarity by powers of two that evens out rows and columns of sum |A_k|.
+    """The matrices after one diagonal similarity that evens out the rows and columns of sum |A_k|.
 
-    Units as unlike as rad and W make norms, and every tolerance relative to them, say little about the dynamics.
-    Powers of two make the similarity exact.
+    With units as different as rad and W, norms and tolerances relative to them say little about the dynamics. The
+    similarity is exact: its entries are powers of two.
     """
     weight = np.sum([np.abs(matrix) for matrix in matrices], axis=0)
     np.fill_diagonal(weight, 0.0)
@@ -242,7 +198,7 @@ def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
 
 
 def is_singular_for_any_delay(matrices: Iterable[FloatArray] | FloatArray) -> bool:
-    """Whether the sum of the matrices is singular to rounding: s = 0 is then a root however late each one acts.
+    """Whether the sum of the matrices is singular to rounding: s = 0 is then a root at every delay.
 
     Each row is judged in its own unit, so a motion that is merely slow beside others does not count as a standstill.
 
@@ -281,11 +237,17 @@ def _projected(matrix: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def _moving_part(block: list[FloatArray]) -> list[FloatArray]:
-    """`project_out_equilibria`, or the block itself if it has none or nothing else."""
-    try:
-        return list(project_out_equilibria(*block))
-    except BadModelError:
-        return block
+    """The block, balanced, without its equilibria; the block itself if it has nothing else."""
+    left = list(balanced(*block))
+    while left[0].size > 0:
+        size = left[0].shape[0]
+        basis = _complement_of_common_kernel(left)
+        if basis.shape[1] == size:
+            basis = _complement_of_common_kernel([matrix.T for matrix in left])
+        if basis.shape[1] == size:
+            return left
+        left = [_projected(matrix, basis) for matrix in left]
+    return block
 
 
 def _labels_by_closure(pattern: NDArray[np.bool_]) -> IntArray:
@@ -308,21 +270,16 @@ def _labels_by_graph(pattern: NDArray[np.bool_]) -> IntArray:
 
 
 def _drivers_first(lowest_index: list[int], edges: Iterable[tuple[int, int]]) -> list[int]:
-    """Topological order of components (Kahn's algorithm), the component of the lowest state index first in a tie."""
-    followers: dict[int, list[int]] = {}
-    waiting = [0] * len(lowest_index)
+    """Topological order of components, the component of the lowest state index first in a tie."""
+    sorter = TopologicalSorter[int](dict.fromkeys(range(len(lowest_index)), ()))
     for driver, driven in edges:
-        followers.setdefault(driver, []).append(driven)
-        waiting[driven] += 1
-    ready = [(lowest_index[k], k) for k, drivers in enumerate(waiting) if drivers == 0]
-    heapq.heapify(ready)
+        sorter.add(driven, driver)
+    sorter.prepare()
+    ready: list[tuple[int, int]] = []
     order: list[int] = []
-    while ready:
-        _, component = heapq.heappop(ready)
-        order.append(component)
-        for driven in followers.get(component, []):
-            waiting[driven] -= 1
-            if waiting[driven] == 0:
-                heapq.heappush(ready, (lowest_index[driven], driven))
-    assert len(order) == len(lowest_index), "components of a graph cannot form a cycle"
+    while sorter.is_active():
+        for k in sorter.get_ready():
+            heapq.heappush(ready, (lowest_index[k], k))
+        order.append(heapq.heappop(ready)[1])
+        sorter.done(order[-1])
     return order

@@ -1,8 +1,9 @@
-"""Angles theta = omega tau at which roots of loops with several commensurate delays may be on the imaginary axis.
+"""Angles theta = omega tau at which a loop with delays tau, 2 tau, ... may have roots on the imaginary axis.
 
-The eigenvalues s of A(theta) = sum_k A_k e^{-j k theta} are n however many the delays; where one is j omega, tau =
-theta / omega is critical. A pencil gives a finite list of angles that contains every crossing; a grid of the unit
-circle, with extrema and Newton's method, what the pencil is too large or too ill-conditioned for.
+A(theta) = sum_k A_k e^{-j k theta} has n eigenvalues s, however many delays there are. Where one of them is j omega,
+tau = theta / omega is critical. A matrix pencil gives a finite list of angles that contains every crossing. Where the
+pencil is too large or too ill-conditioned, a grid on the unit circle with refined extrema and Newton's method finds
+them.
 """
 
 from collections.abc import Sequence
@@ -12,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.delay._loci import Loci
-from gains.delay.sweep import near_unit_extrema
+from gains.delay._loci import Loci, highest_frequency, near_unit_extrema
 
-# the pencil's companion matrix takes 0.1 s at this size; larger ones leave the frequencies to the sweep
+# the pencil's companion matrix takes 0.1 s at this size; larger problems are left to the grid
 _LARGEST_PENCIL = 450
-# where the polynomial in cos(theta) is expanded: off [-1, 1], and no special angle
+# the polynomial in cos(theta) is expanded here: outside [-1, 1], and at no special value
 _EXPANSION = 1.3717
-# angles of the sweep along the upper half of the unit circle, at least, and for each turn of the longest delay; it goes
-# a little beyond, so that a crossing at pi itself is inside
+# grid angles on the upper half of the unit circle: at least this many, and this many per turn of the longest delay. The
+# grid ends a little beyond pi, so that it brackets a crossing at pi itself.
 _ANGLES, _ANGLES_A_TURN, PAST_HALF = 400, 40, 1.01 * pi
-# steps of the grid that an eigenvalue may be away from where its slope takes it to the axis; a Newton step doubles the
-# digits
+# Newton's method starts at grid angles whose first step is at most this many grid steps; each step doubles the digits
 _REACH, _NEWTON_STEPS = 1.5, 3
+# below this share of the highest frequency a root may be one that passes zero, which a look this far (rad) beside tells
+_SLOW, _BESIDE = 1e-6, 0.05
 # a local extremum of a real part is refined when its sample is this close to the axis, relative to the norm
 _NEAR_AXIS = 0.1
 
@@ -43,7 +44,7 @@ def norm_of(terms: Sequence[FloatArray]) -> float:
 def circle_loci(terms: Sequence[FloatArray]) -> Loci:
     """theta (k,) -> e^{s / scale} for the eigenvalues s of A(theta), scale the sum of the norms.
 
-    Of modulus one on the axis, and |s| / scale <= 1 leaves the frequency in the angle.
+    The modulus is one on the axis. As |s| / scale <= 1, the frequency can be read from the angle.
     """
     scale = norm_of(terms)
 
@@ -54,9 +55,21 @@ def circle_loci(terms: Sequence[FloatArray]) -> Loci:
 
 
 def circle_points(terms: Sequence[FloatArray]) -> FloatArray:
-    """Angles of the sweep, those where a real part comes near the axis and turns back among them."""
+    """Grid angles, and the extrema at which a real part comes near the axis and turns back."""
     theta = _grid_angles(terms)
     return np.union1d(theta, near_unit_extrema(circle_loci(terms), theta, near=_NEAR_AXIS))
+
+
+def passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool:
+    """Whether a root at the frequency omega >= 0 is one that passes s = 0, which no finite delay brings about.
+
+    An eigenvalue of A(theta) that passes zero is slow at this angle only; the slow motions of a loop are slow at the
+    angles beside it too.
+    """
+    if omega > _SLOW * highest_frequency(terms):
+        return False
+    beside = np.abs(np.linalg.eigvals(at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
+    return bool(beside.min() > 1e3 * omega)
 
 
 def _grid_angles(terms: Sequence[FloatArray]) -> FloatArray:
@@ -66,8 +79,8 @@ def _grid_angles(terms: Sequence[FloatArray]) -> FloatArray:
 def candidate_angles(terms: Sequence[FloatArray]) -> FloatArray:
     """Angles that come near every crossing, ascending.
 
-    The pencil misses none where it is well-conditioned, with few multiples; Newton's method from a grid, on each
-    eigenvalue that its slope takes to the axis, tells crossings apart that a count between neighbours cannot.
+    A well-conditioned pencil (few multiples) misses none. Newton's method starts from each grid eigenvalue whose slope
+    leads to the axis; it separates crossings that a count between neighbouring angles cannot.
     """
     grid = _grid_angles(terms)
     step = grid[1] - grid[0]
@@ -99,16 +112,15 @@ def _roots_and_slopes(terms: Sequence[FloatArray], theta: FloatArray) -> tuple[C
 
 
 def _pencil_angles(terms: Sequence[FloatArray]) -> FloatArray:
-    """Angles theta in [0, pi] at which the spectrum of A(theta) = sum_k A_k e^{-j k theta} may touch the axis.
+    """Angles theta in [0, pi] at which an eigenvalue of A(theta) may be imaginary; none if the pencil is too large.
 
-    A(theta) v = j omega v makes X = v v* a solution of A X + X A* = 0. With A = C - j sin(theta) D, C = sum A_k
-    cos(k theta) and D = sum A_k sin(k theta) / sin(theta) polynomials in c = cos(theta), and X = R + j S, the real
-    part and sin(theta) times the imaginary part are, with S' = S sin(theta),
+    If A(theta) v = j omega v, X = v v* solves A X + X A* = 0. Write A = C - j sin(theta) D, where C = sum A_k
+    cos(k theta) and D = sum A_k sin(k theta) / sin(theta) are polynomials in c = cos(theta), and X = R + j S. With
+    S' = S sin(theta), the real part and sin(theta) times the imaginary part are
 
-        C R + R C' + D S' - S' D' = 0,    C S' + S' C' - (1 - c^2) (D R - R D') = 0:
+        C R + R C' + D S' - S' D' = 0,    C S' + S' C' - (1 - c^2) (D R - R D') = 0,
 
-    a polynomial eigenvalue problem in c with n^2 unknowns (R symmetric, S' skew) and real matrices, of degree m + 1.
-    None are returned where it is too large.
+    a real polynomial eigenvalue problem in c of degree m + 1 with n^2 unknowns (R symmetric, S' skew).
     """
     n, degree = terms[0].shape[0], len(terms)
     if degree * n * n > _LARGEST_PENCIL:
@@ -136,7 +148,7 @@ def _pencil_angles(terms: Sequence[FloatArray]) -> FloatArray:
 
 
 def _pencil_at(terms: Sequence[FloatArray], c: float) -> FloatArray:
-    """The linear map (R, S') -> both equations of `_pencil_angles` at one c, in coordinates of R and S' (n^2, n^2)."""
+    """The equations of `_pencil_angles` at one c as a matrix (n^2, n^2) that acts on the entries of R and S'."""
     n = terms[0].shape[0]
     theta = float(np.arccos(c))
     k = np.arange(len(terms))
@@ -151,7 +163,7 @@ def _pencil_at(terms: Sequence[FloatArray], c: float) -> FloatArray:
 
 
 def _unit_matrices(n: int, at: tuple[NDArray[np.intp], NDArray[np.intp]], sign: float) -> FloatArray:
-    """A basis of symmetric (sign 1) or skew (-1) matrices, one for each place above the diagonal."""
+    """A basis of the symmetric (sign 1) or skew (-1) matrices, one for each index pair in `at`."""
     count = np.arange(at[0].size)
     basis = np.zeros((at[0].size, n, n))
     basis[count, at[1], at[0]] = sign

@@ -1,20 +1,17 @@
 """Several delays that are multiples of one unknown: x'(t) = A_0 x(t) + A_1 x(t - tau) + ... + A_m x(t - m tau).
 
-With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda, so at each frequency there are finitely
-many lambda with det(j omega I - sum_k A_k lambda^{-k}) = 0: the eigenvalues of a block companion matrix. They are loci
-like those of one delay (`_loci`): a root is on the imaginary axis where a modulus is one, and it moves to the right
-where that modulus falls with the frequency, whatever the delay. With one delay alone (m = 1) the crossings come from
-`_crossings`; everything else is the same.
-
-The frequencies come from a pencil and from Newton's method along the unit circle, see `_circle_angles`. A sweep of the
-circle is the second opinion (`gains.margin.opinions`).
+With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda. At each frequency the equation
+det(j omega I - sum_k A_k lambda^{-k}) = 0 therefore has finitely many solutions, the eigenvalues of a block companion
+matrix. They are loci like those of one delay (`_loci`): a root is on the imaginary axis where a modulus is one, and it
+moves to the right where that modulus falls with the frequency, whatever the delay. The frequencies come from a pencil
+and from Newton's method along the unit circle (`_circle_angles`) or, for a single delay (m = 1), from `_crossings`.
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, for the same problem as a
 polynomial eigenvalue problem.
 """
 
 from collections.abc import Callable, Sequence
-from math import inf, pi
+from math import pi
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,10 +19,18 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
-from gains.delay._circle_angles import PAST_HALF, at_angle, candidate_angles, circle_loci, circle_points, norm_of
-from gains.delay._crossing_error import DelayedTerm
+from gains.delay._circle_angles import (
+    PAST_HALF,
+    at_angle,
+    candidate_angles,
+    circle_loci,
+    circle_points,
+    norm_of,
+    passes_zero,
+)
 from gains.delay._crossings import (
     AxisCrossing,
+    DelayedTerm,
     axis_crossings,
     crossings_of_loci,
     hidden_crossings,
@@ -41,19 +46,15 @@ from gains.delay._windows import (
     check_horizon,
     combined_analysis,
     unstable_roots,
+    zero_passage,
 )
-from gains.delay._zero_root import zero_passage
 
-# a locus is an eigenvalue of a companion matrix, of which many are wanted; beyond this size angles are followed instead
+# loci are eigenvalues of many companion matrices; beyond this size of them angles are followed instead
 _LARGEST_LOCI = 30
 # states times the largest multiple: a sweep takes some seconds there
 _LARGEST_PRODUCT = 3000
-# a candidate is kept when it is this close to the imaginary axis, relative to the norm; a false one costs little
+# candidates are kept this close to the imaginary axis, relative to the norm; a false one costs little
 _CANDIDATE_TOLERANCE = 1e-3
-# and is on the axis when it is this close to it
-_ON_AXIS = 1e-9
-# below this share of the highest frequency a crossing may be that of a root that passes zero, seen so far beside it
-_SLOW, _BESIDE = 1e-6, 0.05
 
 
 def analyse_commensurate(
@@ -105,26 +106,6 @@ def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
     return block_analysis(block.copies, delayed, found, unstable, passage, highest_frequency(terms))
 
 
-def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
-    """The delay margin of `analyse_commensurate`, found by a sweep along the unit circle: a second opinion.
-
-    The eigenvalues s of A(theta) = sum_k A_k e^{-j k theta} on a grid of angles; where one crosses the imaginary axis
-    at j omega, tau = theta / omega is critical. Sorted real parts are continuous in the angle, so crossings are
-    bracketed, and local extrema near zero are refined. It is a search, not a proof. 0 if the loop is unstable without
-    delay, `inf` if no crossing is found. Arguments and exceptions as of `analyse_commensurate`.
-
-    Examples
-    --------
-    The margin pi / (3 sqrt(3)) of x'(t) = -x(t - tau) - x(t - 2 tau):
-
-    >>> from gains.delay._commensurate import circle_sweep_margin
-    >>> round(circle_sweep_margin([[[0]], [[-1]], [[-1]]]), 6)
-    0.6046
-    """
-    blocks = distinct_blocks(*_checked(matrices))
-    return min(_circle_margin(balanced(*block.matrices)) for block in blocks)
-
-
 def _block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
     """Crossings of the imaginary axis of one block, omega > 0, ascending; theta = omega tau modulo 2 pi."""
     present = [k for k, matrix in enumerate(terms) if k > 0 and matrix.any()]
@@ -153,20 +134,19 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
-    """The same from the eigenvalues s of A(theta), of which there are n however many the delays.
+    """The same from the n eigenvalues s of A(theta), however many delays there are.
 
-    With theta = omega tau a root j omega goes right with growing tau where omega d(Re s) / d theta > 0, whatever tau.
+    With theta = omega tau, a root j omega moves right with growing tau where omega d(Re s) / d theta > 0.
     """
-    scale = highest_frequency(terms)
     loci, candidates = circle_loci(terms), candidate_angles(terms)
     counted = unit_crossings(loci, np.union1d(circle_points(terms), separating_points(candidates, PAST_HALF)))
     crossings: list[AxisCrossing] = []
-    # opposite ones at one angle are usual: all roots are on the axis at a quarter turn if all multiples are odd
+    # opposite crossings at one angle are common: if all multiples are odd, all roots cross at a quarter turn
     for crossing in (*counted, *hidden_crossings(loci, candidates, counted)):
         theta, omega = crossing.omega, float(np.angle(crossing.locus)) * norm_of(terms)
-        if abs(omega) < _SLOW * scale and _passes_zero(terms, theta, abs(omega)):
+        if passes_zero(terms, theta, abs(omega)):
             continue
-        # the angles beyond pi and the frequencies below zero are these, mirrored; outward is falling, to the left
+        # angles beyond pi mirror these, with negative frequencies; outward means falling, to the left
         turn, way = (theta, -1) if omega > 0.0 else (2.0 * pi - theta, 1)
         if theta <= pi:
             locus = UnitCrossing(abs(omega), complex(np.exp(1j * turn)), way * crossing.outward)
@@ -185,8 +165,8 @@ def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
             # a defective root at zero is known to sqrt(eps) only: the singular value decides, not the eigenvalue
             if is_singular_for_any_delay(terms):
                 return True
-        # a determinant that vanishes at more points of the circle than its degree vanishes identically; 3 unlike
-        # angles stand for them, the tolerance being far above rounding
+        # a determinant that vanishes at more angles than its degree vanishes at all; three unrelated angles stand for
+        # them, with a tolerance far above rounding
         elif all(_least_singular(terms, omega, theta) < 1e-12 * scale for theta in (0.0, 1.0, 2.5)):
             return True
     return False
@@ -216,12 +196,7 @@ def companion_loci(terms_at: Callable[[FloatArray], ComplexArray], B: FloatArray
     The late matrices share their column space, A_i = B B'A_i with B (n, r) orthonormal, so that with
     G_i = B'A_i (j omega I - A_0)^{-1} B the condition is det(lambda^m I - sum_i lambda^{m-i} G_i) = 0.
 
-    Parameters
-    ----------
-    terms_at
-        Frequencies (k,) to A_0, ..., A_m, shape (k, m + 1, n, n).
-    B
-        As above.
+    `terms_at` takes frequencies (k,) to A_0, ..., A_m, shape (k, m + 1, n, n).
     """
     n, rank = B.shape
     identity = np.eye(n)
@@ -255,39 +230,3 @@ def _candidates(terms: Sequence[FloatArray], highest: float) -> FloatArray:
     near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
     omega = np.unique(np.abs(roots.imag[near_axis]))
     return omega[(omega > 0.0) & (omega < 1.1 * highest)]
-
-
-def _circle_crossings(terms: Sequence[FloatArray]) -> list[tuple[float, float]]:
-    """Angles theta in [0, pi] and frequencies omega (either sign) with j omega an eigenvalue of A(theta)."""
-    scale, loci = norm_of(terms), circle_loci(terms)
-    angles = np.array([crossing.omega for crossing in unit_crossings(loci, circle_points(terms))])
-    # several roots may cross at nearly one angle (all of them, if nothing acts at once): take all that are on the axis
-    roots = np.log(loci(angles)) * scale if angles.size > 0 else np.empty((0, 0))
-    return [
-        (angle, float(root.imag))
-        for angle, row in zip(angles.tolist(), roots, strict=True)
-        for root in row[np.abs(row.real) <= max(_ON_AXIS * scale, float(np.abs(row.real).min()))]
-    ]
-
-
-def _passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool:
-    """Whether an eigenvalue of A(theta) is slow at this angle only: it passes s = 0, which no finite delay does.
-
-    The motions of a slow part of the loop are slow at the angles beside it too.
-    """
-    beside = np.abs(np.linalg.eigvals(at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
-    return bool(beside.min() > 1e3 * omega)
-
-
-def _circle_margin(terms: Sequence[FloatArray]) -> float:
-    if float(np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).real.max()) >= 0.0:
-        return 0.0
-    if not any(matrix.any() for matrix in terms[1:]):
-        return inf
-    scale = highest_frequency(terms)
-    margin_s = inf
-    for theta, omega in _circle_crossings(terms):
-        # -j omega belongs to the angle -theta
-        if abs(omega) > _SLOW * scale or not _passes_zero(terms, theta, abs(omega)):
-            margin_s = min(margin_s, (theta if omega > 0.0 else 2.0 * pi - theta) / abs(omega))
-    return margin_s

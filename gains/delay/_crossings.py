@@ -1,16 +1,21 @@
 """Where roots of x'(t) = A0 x(t) + A1 x(t - tau) cross the imaginary axis, found without a grid.
 
-The algebraic test gives a finite list of frequencies near every crossing. Counting the loci of the loop (`_loci`)
-between these frequencies then tells how many crossings there are and in which direction, and brackets them; it does not
-rely on the accuracy of the list. Newton's method on the characteristic matrix gives the last digits.
+An algebraic test gives a finite list of frequencies near every crossing. Counts of the loci of the loop (`_loci`)
+between these frequencies then tell the number and direction of the crossings and bracket them, however accurate the
+list is. Newton's method on the characteristic matrix gives the last digits.
+
+Every method in double precision blurs a multiple root, and all of them blur it alike, however well they agree. The
+error of a crossing is therefore estimated from its own sensitivity to rounding.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.structure import balanced, distinct_blocks
 from gains.delay._loci import (
     Loci,
     UnitCrossing,
@@ -21,16 +26,44 @@ from gains.delay._loci import (
     unit_crossings,
     without_limits_at_zero,
 )
+from gains.delay.sweep import sweep_frequencies
 
 # n^2 eigenvalues of an n^2 x n^2 matrix: 0.3 s at 20, and growing with the sixth power
 LARGEST_ALGEBRAIC_BLOCK = 24
-# a candidate is kept when it is this close to the imaginary axis, relative to the norm; an m-fold eigenvalue is known
-# to eps^(1/m), and a false candidate costs one evaluation of the loci only
+# candidates are kept this close to the imaginary axis, relative to the norm: an m-fold eigenvalue is known to
+# eps^(1/m), and a false candidate costs only one evaluation of the loci
 _CANDIDATE_TOLERANCE = 1e-3
-# a locus this close to one (log of the modulus) at an algebraic frequency without a crossing there only touches
+# a locus this close to one (log of the modulus) at a candidate without a crossing touches one there
 _TOUCH = 1e-11
 # least singular value at a crossing, relative to the norm of what it is the sum of: rounding is far below
 _RESIDUAL = 1e-5
+# rad; the angle of a computed unit eigenvalue is known to a few hundred eps
+_ZERO_ANGLE = 1e-11
+# backward error of a crossing, in units of n eps and the norm: rounding of the matrices, a similarity, an eigenvalue
+_BACKWARD = 2.0
+# singular values below this, relative to the norm, belong to roots that cross at one place
+_TOGETHER = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class DelayedTerm:
+    """A x(t - known_s - multiple * tau): `matrix` A (n, n) in 1/s, `multiple` whole."""
+
+    matrix: FloatArray
+    known_s: float
+    multiple: int
+
+    def delay_s(self, tau_s: float) -> float:
+        """The delay (s) at one value of the unknown."""
+        return self.known_s + self.multiple * tau_s
+
+
+def by_multiple(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
+    """A_0, A_1, ..., A_m of sum_k A_k x(t - k tau), from terms without known delays."""
+    matrices = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
+    for term in terms:
+        matrices[term.multiple] = matrices[term.multiple] + term.matrix
+    return matrices
 
 
 @dataclass(frozen=True)
@@ -63,10 +96,10 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
 
 
 def is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
-    """Whether j omega I - sum_k A_k e^{-j k theta} is anything like singular at a crossing.
+    """Whether j omega I - sum_k A_k e^{-j k theta} is singular, at least roughly, at a crossing.
 
-    Near a multiple pole of the resolvent loci are huge, and small ones beside them are rounding: what crosses the unit
-    circle there is none.
+    Near a multiple pole of the resolvent loci are huge, and small ones beside them are rounding, which may cross the
+    unit circle without a root.
     """
     turns = crossing.locus / abs(crossing.locus)
     delayed = sum((matrix * turns**-k for k, matrix in enumerate(matrices)), np.zeros_like(matrices[0]))
@@ -81,15 +114,13 @@ def crossings_of_loci(loci: Loci, candidates: FloatArray, highest: float) -> lis
 
 
 def _candidates(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, highest: float) -> FloatArray:
-    """Frequencies that contain every crossing up to rounding, ascending."""
+    """Ascending frequencies, one of which is at every crossing up to rounding."""
     if B.shape[1] == 1:
         # |C (jw - A0)^-1 B| = 1 exactly if jw is an eigenvalue of this Hamiltonian matrix (2n x 2n)
         roots = np.linalg.eigvals(np.block([[A0, B @ B.T], [-C.T @ C, -A0.T]])).astype(np.complex128)
     elif A0.shape[0] <= LARGEST_ALGEBRAIC_BLOCK:
         roots = _kronecker_roots(A0, A1)
     else:
-        from gains.delay.sweep import sweep_frequencies
-
         return sweep_frequencies(A0, A1)
     near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
     omega = np.sort(roots.imag[near_axis & (roots.imag > 0.0)])
@@ -121,7 +152,7 @@ def separating_points(candidates: FloatArray, highest: float) -> FloatArray:
 
 
 def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossing]) -> list[UnitCrossing]:
-    """Crossings that leave the count unchanged: two in opposite directions at one frequency, or a mere touch."""
+    """Crossings that leave the count unchanged: two in opposite directions at one frequency, or a touch."""
     if candidates.size == 0:
         return []
     values = loci(candidates)
@@ -137,8 +168,8 @@ def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossin
 def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> AxisCrossing:
     """Newton steps on u*(j w I - sum_k A_k e^{-j k theta}) v = 0, u, v the singular vectors of the least value.
 
-    A step is taken only while it lowers the least singular value, and not where two are small at once (several roots
-    cross at one place) or the two unknowns act alike (near-tangent): there the bracketed value is the better one.
+    Steps go on while they lower the least singular value. None is taken where two singular values are small (several
+    roots cross at one place) or both unknowns act alike (near-tangent): the bracketed value is better there.
     """
     omega, theta = crossing.omega, float(np.angle(crossing.locus))
     identity = np.eye(matrices[0].shape[0])
@@ -169,5 +200,50 @@ def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> AxisCrossi
     return AxisCrossing(omega=omega, theta=theta, direction=crossing.outward)
 
 
-# rad; the angle of a computed unit eigenvalue is known to a few hundred eps
-_ZERO_ANGLE = 1e-11
+def crossing_error(terms: Sequence[DelayedTerm], omega: float, tau_s: float) -> tuple[float, float]:
+    """Estimated errors of the frequency omega (rad/s) and of the delay tau (s) of a crossing, by its sensitivity.
+
+    Let u, v be the singular vectors of the least singular value of M(j omega, tau). A change E of M, of norm epsilon,
+    moves the crossing by the solution of a d omega + b d tau = -u*E v with a = u*(dM/d omega) v, b = u*(dM/d tau) v:
+    two real equations. Near a multiple root a and b become small; the estimate is capped by epsilon^(1/n), which no
+    multiplicity exceeds.
+
+    Examples
+    --------
+    x'(t) = -x(t - tau), known to rounding:
+
+    >>> import numpy as np
+    >>> from gains.delay._crossings import DelayedTerm, crossing_error
+    >>> omega_error, delay_error_s = crossing_error([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], 1.0, np.pi / 2.0)
+    >>> delay_error_s < 1e-14
+    True
+    """
+    delays_s, multiples = np.array([term.delay_s(tau_s) for term in terms]), np.array([t.multiple for t in terms])
+    worst, least = (0.0, 0.0), inf
+    for block in distinct_blocks(*(term.matrix for term in terms)):
+        matrices = np.array(balanced(*block.matrices))
+        n = matrices.shape[1]
+        turned = np.exp(-1j * omega * delays_s)[:, np.newaxis, np.newaxis] * matrices
+        M = 1j * omega * np.eye(n) - turned.sum(axis=0)
+        U, singular, Vh = np.linalg.svd(M)
+        scale = omega + float(np.linalg.norm(matrices, axis=(1, 2)).sum())
+        if scale == 0.0 or singular[-1] / scale > least:
+            continue
+        least = float(singular[-1] / scale)
+        near = slice(min(n - 1, int(np.count_nonzero(singular > _TOGETHER * scale))), n)
+        by_s = np.eye(n) + np.tensordot(delays_s, turned, axes=1)
+        # of the roots that cross together, the one that moves most
+        left, _, right = np.linalg.svd(U[:, near].conj().T @ by_s @ Vh[near].conj().T)
+        u, v = (U[:, near] @ left[:, -1]).conj(), Vh[near].conj().T @ right[-1].conj()
+        by_omega = 1j * complex(u @ by_s @ v)
+        by_tau = 1j * omega * complex(u @ np.tensordot(multiples, turned, axes=1) @ v)
+        epsilon = _BACKWARD * n * float(np.finfo(np.float64).eps) * scale
+        determinant = abs((by_omega.conjugate() * by_tau).imag)
+        if omega == 0.0:
+            # a real root passes the one at zero: the delay is a ratio of two numbers
+            worst = (0.0, tau_s * epsilon / scale / max(abs(complex(u @ v)), 1e-300))
+            continue
+        cap = (epsilon / scale) ** (1.0 / max(n, 2))
+        found = [epsilon * abs(by) / determinant if determinant > 0.0 else inf for by in (by_tau, by_omega)]
+        worst = min(found[0], cap * omega), min(found[1], cap * max(tau_s, 1.0 / omega))
+    return worst

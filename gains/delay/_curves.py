@@ -1,8 +1,8 @@
 """Curves of solutions (omega, alpha, beta) of det(j omega I - A0 - A1 e^{-j alpha} - A2 e^{-j beta}) = 0, omega > 0.
 
-Two real equations in three unknowns: curves on the torus of the two angles. Starting points come from a grid of alpha
-and one of beta; each curve is followed by a predictor along its tangent and a Newton corrector until it closes or omega
-reaches zero.
+These are two real equations in three unknowns: their solutions are curves above the torus of the two angles. Starting
+points come from a grid of alpha and a grid of beta. A predictor along the tangent and a Newton corrector then follow
+each curve until it closes or omega reaches zero.
 """
 
 from dataclasses import dataclass
@@ -11,28 +11,25 @@ from math import pi
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.delay._loci import UnitCrossing, unit_crossings
-from gains.delay.sweep import near_unit_extrema
+from gains.delay._loci import near_unit_extrema, unit_crossings
 
-# angles from which curves are looked for, and angles of the other delay in each search
+# angles of the grid of starting points, and angles of the other delay in the search from each
 _SEED_ANGLES, _SEARCH_ANGLES = 48, 160
-# a local extremum of a real part closer to the axis than this, relative to the norm, is refined
+# a local extremum of a real part is refined when it is closer to the axis than this, relative to the norm
 _NEAR_AXIS = 0.1
-# step along a curve, in radians and in units of the norm for the frequency; the least step before giving up
+# longest and shortest step along a curve, in radians and, for the frequency, in units of the norm
 _STEP, _LEAST_STEP = 0.05, 1e-5
-# steps of one curve before giving up: some hundred turns of the torus
+# most steps along one curve: some hundred turns of the torus
 _MOST_STEPS = 20_000
-# a curve ends where the frequency is this small relative to the norm: the delays grow without bound
+# a curve ends where the frequency is this small relative to the norm: there the delays grow without bound
 _LOWEST = 1e-4
-# a starting point lies on a curve that has a point this close to it (in steps)
-_ON_CURVE = 1.5
-# and this close to the segment between two of its points
-_SAME_CURVE = 0.05
+# a starting point is on a known curve if it is this close (in steps) to one of its points, and this close to a segment
+_ON_CURVE, _SAME_CURVE = 1.5, 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Points along one curve: `omega` (k,) in rad/s, `alpha` and `beta` (k,) in rad, unwrapped."""
+    """Points along one curve: `omega` (k,) in rad/s; `alpha` and `beta` (k,) in rad, unwrapped."""
 
     omega: FloatArray
     alpha: FloatArray
@@ -40,15 +37,15 @@ class Curve:
 
 
 def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[Curve]:
-    """All curves of solutions of one block that the grid of starting points finds."""
+    """The curves of one block that pass through the starting points of the grids."""
     scale = sum(float(np.linalg.norm(matrix)) for matrix in (A0, A1, A2))
     if scale == 0.0:
         return []
     terms = np.array([A0, A1, A2]) / scale
     curves: list[FloatArray] = []
-    # an angle off the round ones, where curves of symmetric loops meet
+    # shifted away from round angles, where the curves of symmetric loops meet
     for angle in ((np.arange(_SEED_ANGLES) + 0.37) * (2.0 * pi / _SEED_ANGLES)).tolist():
-        # from a grid of beta as well: where A2 has no part, a curve has one alpha, which no grid meets
+        # a grid of beta as well: a curve on which A2 plays no part has a single alpha, which no grid hits
         swapped = [start[[0, 2, 1]] for start in _solutions_at(terms[[0, 2, 1]], angle)]
         for start in [*_solutions_at(terms, angle), *swapped]:
             if not any(_passes(curve, start) for curve in curves):
@@ -59,9 +56,9 @@ def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[C
 def at_delay(
     matrices: tuple[FloatArray, ...], point: FloatArray, *, which: int, delay_s: float, turns: int
 ) -> FloatArray | None:
-    """The solution near a point (omega, alpha, beta) at which one delay is `delay_s`; None if there is none near by.
+    """The solution near a point (omega, alpha, beta) at which one delay is `delay_s`; None if none is near.
 
-    That delay is (angle + 2 pi turns) / omega, of the angle alpha for `which` 0 and beta for 1.
+    That delay is (angle + 2 pi turns) / omega; the angle is alpha if `which` is 0, beta if it is 1.
     """
     scale = sum(float(np.linalg.norm(matrix)) for matrix in matrices)
     terms = np.array(matrices) / scale
@@ -83,29 +80,22 @@ def at_delay(
 
 
 def _solutions_at(terms: FloatArray, alpha: float) -> list[FloatArray]:
-    """Points (omega, alpha, beta) with omega > 0 at one alpha: eigenvalues of A(beta) that cross the imaginary axis."""
+    """Solutions with omega > 0 at one alpha: where an eigenvalue of A(beta) crosses the imaginary axis."""
     now = terms[0] + terms[1] * np.exp(-1j * alpha)
 
     def loci(beta: FloatArray) -> ComplexArray:
-        # e^s: of modulus one on the axis, and |s| <= 1 leaves the frequency in the angle
+        # e^s has modulus one on the axis, and as |s| <= 1 its angle is the frequency
         matrices = now + terms[2] * np.exp(-1j * beta)[:, np.newaxis, np.newaxis]
         return np.exp(np.linalg.eigvals(matrices)).astype(np.complex128)
 
     beta = np.linspace(1e-9, 2.0 * pi, _SEARCH_ANGLES)
     beta = np.union1d(beta, near_unit_extrema(loci, beta, near=_NEAR_AXIS))
-    return [
-        _corrected(terms, np.array([_frequency(crossing), alpha, crossing.omega]))
-        for crossing in unit_crossings(loci, beta)
-        if _frequency(crossing) > _LOWEST
-    ]
-
-
-def _frequency(crossing: UnitCrossing) -> float:
-    return float(np.angle(crossing.locus))
+    points = [np.array([np.angle(crossing.locus), alpha, crossing.omega]) for crossing in unit_crossings(loci, beta)]
+    return [_corrected(terms, point) for point in points if point[0] > _LOWEST]
 
 
 def _followed(terms: FloatArray, start: FloatArray) -> FloatArray:
-    """The whole curve through a point, shape (k, 3): once around if it closes, else in both directions to its ends."""
+    """The whole curve through a point, shape (k, 3): once around if it is closed, else from end to end."""
     forward, closed = _walked(terms, start, 1.0)
     if closed:
         return forward
@@ -114,7 +104,7 @@ def _followed(terms: FloatArray, start: FloatArray) -> FloatArray:
 
 
 def _walked(terms: FloatArray, start: FloatArray, sign: float) -> tuple[FloatArray, bool]:
-    """Points from a start in one direction, and whether they came back to it."""
+    """Points from a start in one direction, and whether they return to it."""
     points, step = [start], _STEP
     direction = sign * _tangent(terms, start)
     for _ in range(_MOST_STEPS):
@@ -122,9 +112,9 @@ def _walked(terms: FloatArray, start: FloatArray, sign: float) -> tuple[FloatArr
         tangent = _tangent(terms, point)
         tangent *= 1.0 if tangent @ direction >= 0.0 else -1.0
         moved = float(np.linalg.norm(point - points[-1]))
-        # a corrector that jumped, or a bend sharper than the step can follow
+        # the corrector jumped, or the bend is sharper than the step can follow
         bad = moved > 1.5 * step or moved < 0.3 * step or float(tangent @ direction) < 0.9
-        # or the end of the curve at zero frequency, which is approached
+        # near the end of the curve at zero frequency, too, the steps get shorter
         if (bad or point[0] < _LOWEST) and step > _LEAST_STEP:
             step /= 2.0
             continue
@@ -139,10 +129,10 @@ def _walked(terms: FloatArray, start: FloatArray, sign: float) -> tuple[FloatArr
 
 
 def _equation(terms: FloatArray, point: FloatArray) -> tuple[complex, FloatArray]:
-    """The least singular value of the characteristic matrix, and the derivatives (2, 3) of u*M v, real and imaginary.
+    """The least singular value of the characteristic matrix M, and its real and imaginary derivatives (2, 3).
 
-    u and v are its singular vectors; u*M v is that value, and changes with omega, alpha and beta by j u*v,
-    j e^{-j alpha} u*A1 v and j e^{-j beta} u*A2 v.
+    With its singular vectors it is u*M v, whose derivatives by omega, alpha and beta are j u*v, j e^{-j alpha} u*A1 v
+    and j e^{-j beta} u*A2 v.
     """
     omega, alpha, beta = point
     first, second = terms[1] * np.exp(-1j * alpha), terms[2] * np.exp(-1j * beta)
@@ -175,17 +165,17 @@ def _nearest_turn(reference: FloatArray, point: FloatArray) -> FloatArray:
 
 
 def _distance(reference: FloatArray, before: FloatArray, after: FloatArray) -> float:
-    """How far a point is from the segment between two points, whole turns aside."""
+    """Distance of a point from the segment between two points, modulo whole turns."""
     point = _nearest_turn(reference, after)
     along = after - before
     share = float(np.clip((point - before) @ along / max(float(along @ along), 1e-300), 0.0, 1.0))
-    # the chord leaves a curve of radius about one by an eighth of the squared step
+    # an arc of radius about one departs from its chord by an eighth of the squared step
     sagitta = float(along @ along) / 8.0
     return max(float(np.linalg.norm(point - before - share * along)) - sagitta, 0.0)
 
 
 def _passes(curve: FloatArray, point: FloatArray) -> bool:
-    """Whether a curve goes through a point, whole turns aside."""
+    """Whether a curve passes through a point, modulo whole turns."""
     difference = curve - point
     difference[:, 1:] -= 2.0 * pi * np.round(difference[:, 1:] / (2.0 * pi))
     near = np.flatnonzero(np.linalg.norm(difference, axis=1) < _ON_CURVE * _STEP)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core._bracketing import bracketed_roots
+from gains.core._bracketing import bracketed_roots, may_reach_zero, peaks
 from gains.core.arrays import ComplexArray, FloatArray
 
 Loci = Callable[[FloatArray], ComplexArray]
@@ -22,20 +22,22 @@ Loci = Callable[[FloatArray], ComplexArray]
 _EPS = float(np.finfo(np.float64).eps)
 # the least normal number: a matrix of zeros has no scale of its own
 _LEAST = float(np.finfo(np.float64).tiny)
-# two crossings closer than this (relative) are one place: below the error of a double eigenvalue, sqrt(eps)
+# a modulus peak is searched when its sampled height is this close to one (log): sampled peaks are flat by far less
+_NEAR_UNIT = 1.0
+# two crossings closer than this (relative) are at one place: below the error of a double eigenvalue, sqrt(eps)
 _SAME_PLACE = 1e-10
 # log of the modulus of a locus at such a place
 _ON_CIRCLE = 1e-8
-# below this share of the highest frequency a locus that moves less than this when the frequency doubles is at its limit
+# below this share of the highest frequency a locus that moves by less than this per octave is at its limit
 _SLOW, _FLAT = 1e-5, 1e-2
 
 
 @dataclass(frozen=True)
 class UnitCrossing:
-    """An eigenvalue `locus` of the loop (modulus one to rounding) at the frequency `omega`.
+    """An eigenvalue `locus` of the loop, of modulus one to rounding, at the frequency `omega`.
 
-    `outward` is the number by which the count of moduli above one drops as the frequency rises through `omega`: +1
-    modulus falling, -1 rising, 0 touching one and returning.
+    `outward` is +1 if its modulus falls through one as the frequency rises, -1 if it rises through one, and 0 if it
+    touches one and returns.
     """
 
     omega: float
@@ -71,8 +73,8 @@ def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray) -> Loci:
 def solved_beside_poles(matrices: NDArray[Any], right: FloatArray) -> NDArray[Any]:
     """X with M X = `right` (n, r) for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
 
-    A resolvent is singular to rounding on a pole, and near a multiple one: of a double integrator from 1e-8 of its norm
-    down. A locus is infinite there, or large; a least singular value of eps in place of zero makes it large.
+    A resolvent is singular to rounding on a pole and near a multiple one (for a double integrator, at frequencies below
+    1e-8 of its norm). Loci are infinite or large there; eps in place of a zero singular value makes them large.
     """
     try:
         return np.linalg.solve(matrices, right.astype(np.complex128))
@@ -91,13 +93,8 @@ def log_moduli(values: ComplexArray) -> FloatArray:
 def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
     """All crossings of the unit circle that change the number of moduli above one between neighbouring `points`.
 
-    Parameters
-    ----------
-    loci
-        Frequencies (k,) to eigenvalues (k, r).
-    points
-        Ascending frequencies that separate the crossings of opposite direction from each other; crossings of the
-        same direction need not be separated.
+    The points are ascending frequencies that separate crossings of opposite direction; crossings of the same direction
+    need not be separated.
     """
     logs = log_moduli(loci(points))
     above = np.count_nonzero(logs > 0.0, axis=1)
@@ -121,11 +118,11 @@ def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
 
 
 def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: float) -> list[UnitCrossing]:
-    """The crossings without those that rounding makes of a locus of modulus one at zero frequency.
+    """The crossings without those that rounding makes of a locus with modulus one at zero frequency.
 
-    Where A0 + z A1 is singular for some |z| = 1 (x' = -x - x(t - tau): z = -1), a locus tends to 1/z as the frequency
-    tends to zero, and its modulus differs from one by less than rounding. No finite delay belongs to it. A slow motion
-    that does cross, of a loop with fast ones beside it, has a locus that changes with the frequency at its own pace.
+    Where A0 + z A1 is singular for some |z| = 1 (z = -1 for x' = -x - x(t - tau)), a locus tends to 1/z with the
+    frequency to zero, and its modulus differs from one by less than rounding; no finite delay belongs to it. The locus
+    of a slow motion that does cross, beside fast ones, still changes with the frequency.
     """
     return [
         crossing
@@ -139,8 +136,26 @@ def _is_flat(loci: Loci, omega: float, locus: complex) -> bool:
     return bool(np.all(np.min(np.abs(rows - locus), axis=1) < _FLAT))
 
 
+def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
+    """Frequencies of local extrema of the sorted log moduli that may reach zero between grid points.
+
+    Extrema whose sampled log modulus is `near` or more away from zero are taken not to reach it.
+    """
+    logs = log_moduli(loci(omega))
+    peak, valley = may_reach_zero(omega, logs), may_reach_zero(omega, -logs)
+    row, rank = np.nonzero((peak | valley) & (np.abs(logs[1:-1]) < near))
+    if row.size == 0:
+        return np.empty(0)
+    sign = np.where(peak[row, rank], 1.0, -1.0)
+
+    def height(at: FloatArray) -> FloatArray:
+        return sign * log_moduli(loci(at))[np.arange(at.size), rank]
+
+    return peaks(height, omega[row], omega[row + 2])
+
+
 def slope_sign(loci: Loci, omega: float, locus: complex) -> int:
-    """+1 when the modulus of this locus falls through one at omega, -1 when it rises, 0 when it does neither."""
+    """+1 if the modulus of this locus falls through one at omega, -1 if it rises, 0 if it does neither."""
     # far above the accuracy of a locus, far below the distance of frequencies at which anything else happens
     step = 1e-5 * omega
     before, after = (_log(row[np.argmin(np.abs(row - locus))]) for row in loci(np.array([omega - step, omega + step])))
@@ -148,11 +163,11 @@ def slope_sign(loci: Loci, omega: float, locus: complex) -> int:
 
 
 def _read_loci(loci: Loci, omega: FloatArray, outward: NDArray[np.int_]) -> list[UnitCrossing]:
-    """Crossings at the frequencies found, loci that cross at one frequency told apart.
+    """Crossings at the frequencies found, with the loci that cross at one frequency told apart.
 
     Loci of equal modulus at all frequencies (symmetric formations) change places in the sorted order from one
     evaluation to the next, so all that cross at one place are read from one evaluation. Where the count goes up and
-    down at one place, by rounding or because loci cross in opposite directions, each locus is followed by itself.
+    down at one place, by rounding or because loci cross in opposite directions, each locus is followed on its own.
     """
     order = np.argsort(omega, kind="stable")
     omega, outward = omega[order], outward[order]

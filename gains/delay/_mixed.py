@@ -1,10 +1,10 @@
 """Known delays beside one unknown: x'(t) = sum_i A_i x(t - d_i - k_i tau) with d_i in seconds and k_i whole.
 
-As in `_commensurate`, the loci lambda(j omega) = e^{j omega tau} are eigenvalues of a block companion matrix; the known
-delays merely make its blocks depend on the frequency, by e^{-j omega d_i}. A root is on the imaginary axis where a
-modulus is one, and it moves to the right where the modulus falls, for every delay. The frequencies no longer follow
-from algebra: they come from a sweep that is fine enough for the turning of e^{-j omega d_i} and that refines extrema
-near one. The argument principle counts the roots that are unstable without the unknown delay.
+As in `_commensurate`, the loci lambda(j omega) = e^{j omega tau} are eigenvalues of a block companion matrix, but the
+known delays make its blocks depend on the frequency, by e^{-j omega d_i}. A root is on the imaginary axis where a
+modulus is one, and it moves to the right where the modulus falls, for every delay. The frequencies do not follow from
+algebra. They come from a sweep that resolves the turning of e^{-j omega d_i} and refines extrema near one. The argument
+principle counts the roots that are unstable at tau = 0.
 """
 
 from collections.abc import Sequence
@@ -18,21 +18,25 @@ from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 from gains.delay._commensurate import column_space, companion_loci
-from gains.delay._crossing_error import DelayedTerm
-from gains.delay._crossings import AxisCrossing
-from gains.delay._loci import Loci, highest_frequency, unit_crossings, without_limits_at_zero
-from gains.delay._windows import BlockAnalysis, DelayAnalysis, block_analysis, check_horizon, combined_analysis
-from gains.delay._zero_root import zero_passage
-from gains.delay.sweep import near_unit_extrema
+from gains.delay._crossings import AxisCrossing, DelayedTerm
+from gains.delay._loci import Loci, highest_frequency, near_unit_extrema, unit_crossings, without_limits_at_zero
+from gains.delay._windows import (
+    BlockAnalysis,
+    DelayAnalysis,
+    block_analysis,
+    check_horizon,
+    combined_analysis,
+    zero_passage,
+)
 
 # rad by which e^{-j omega d} turns between neighbouring frequencies
 _TURN = 0.1
 _POINTS_PER_DECADE, _DECADES = 60, 9
 # more frequencies than this take more than a few seconds
 _MOST_POINTS = 60_000
-# rad by which the determinant may turn between neighbouring frequencies, and how often the grid is halved for it
+# largest turn (rad) of the determinant between neighbouring frequencies, and how often the grid may be halved for it
 _DETERMINANT_TURN, _HALVINGS = 0.5, 40
-# where that begins if there is a root at zero itself, as a share of the highest frequency
+# least frequency of that grid if there is a root at zero, as a share of the highest
 _LEAST_FREQUENCY = 1e-7
 
 
@@ -41,15 +45,8 @@ def analyse_mixed(
 ) -> DelayAnalysis:
     """Stability windows, critical delays and margin in tau of x'(t) = sum A x(t - known_s - multiple tau).
 
-    `unstable_roots_at_zero_delay` counts the roots at tau = 0, with the known delays. Crossing frequencies come from
-    a sweep: a search, not a proof.
-
-    Parameters
-    ----------
-    terms
-        At least one.
-    horizon_s, leave_out_zero
-        As of `gains.delay.constant.analyse_delay`.
+    `unstable_roots_at_zero_delay` counts the roots at tau = 0, with the known delays. The crossing frequencies come
+    from a sweep: a search, not a proof. Options as of `gains.delay.constant.analyse_delay`.
 
     Raises
     ------
@@ -64,7 +61,7 @@ def analyse_mixed(
     x'(t) = -x(t - 0.5 - tau) leaves pi / 2 - 0.5 for tau:
 
     >>> import numpy as np
-    >>> from gains.delay._crossing_error import DelayedTerm
+    >>> from gains.delay._crossings import DelayedTerm
     >>> from gains.delay._mixed import analyse_mixed
     >>> round(analyse_mixed([DelayedTerm(np.array([[-1.0]]), known_s=0.5, multiple=1)]).delay_margin_s, 6)
     1.070796
@@ -88,21 +85,10 @@ def _analyse_block(block: Block, known_s: FloatArray, multiples: IntArray, leave
 
 
 def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_zero: bool = False) -> int:
-    """Roots of x'(t) = sum A x(t - d) with positive real part, by the argument principle; no spectrum is computed.
+    """The number of roots of x'(t) = sum A x(t - d) with positive real part, by the argument principle.
 
-    Parameters
-    ----------
-    terms
-        Pairs (A, d): a real matrix (n, n) in 1/s and its delay in s.
-    leave_out_zero
-        A block whose matrices have a singular sum has a simple root at s = 0, which is not to be counted.
-
-    Raises
-    ------
-    BadModelError
-        As of `analyse_mixed`.
-    DisagreementError
-        A root too close to the imaginary axis to count it on either side.
+    `terms` are pairs (A, d): a real matrix (n, n) in 1/s and its delay in s. With `leave_out_zero` the simple root at
+    s = 0 of a block whose matrices have a singular sum is not counted. Exceptions as of `analyse_mixed`.
 
     Examples
     --------
@@ -177,8 +163,8 @@ def _loci(parts: _Parts) -> Loci:
 def _unstable_roots(parts: _Parts, at_zero: bool) -> int:
     """Roots with positive real part at tau = 0: turns of det(j omega I - A(j omega)) / (j omega + c)^n.
 
-    The quotient is analytic in the right half plane and tends to one, so it winds around zero once for each root
-    there as omega goes from infinity to minus infinity. A simple root at zero itself is divided out if `at_zero`.
+    The quotient is analytic in the right half plane and tends to one. As omega goes from infinity to minus infinity, it
+    winds around zero once for each root there. If `at_zero`, a simple root at zero is divided out.
     """
     identity, scale = np.eye(parts.size), parts.highest() + float(np.linalg.norm(parts.matrices[0]))
 

@@ -1,7 +1,17 @@
 """From the crossings of the imaginary axis to windows of stability.
 
-Every crossing belongs to an arithmetic sequence of delays, (theta + 2 pi k) / omega. Starting from the unstable roots
-without delay and counting crossings in and out, in the order of their delays, gives every window.
+Every crossing belongs to an arithmetic sequence of delays, (theta + 2 pi k) / omega. The count of unstable roots starts
+at that without delay and changes at each crossing, in the order of the delays; where it is zero, the loop is stable.
+
+A simple root may stay at s = 0 at every delay, as the common value of a consensus does. With M(s) = sI - sum_k A_k
+e^{-s d_k}, M(0) = -sum_k A_k does not depend on the delays: where it is singular, s = 0 is a root at all of them, even
+where no state stands still by itself, as in x' = -x + x(t - tau). With w'M(0) = 0 and M(0) v = 0, the other roots near
+zero solve
+
+    f(s) / s = w'M'v + s w'(M''/2 - M' G M') v + ...,   M' = I + sum_k d_k A_k,  M'' = -sum_k d_k^2 A_k,
+
+with M' and M'' taken at s = 0, and G any matrix with M(0) G M(0) = M(0). The delays are d_k = known_k + multiple_k tau,
+so w'M'v is linear in tau: at most one real root passes zero, at one delay.
 """
 
 from collections.abc import Sequence
@@ -11,18 +21,21 @@ from math import inf, pi
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
-from gains.delay._crossing_error import DelayedTerm, crossing_error
-from gains.delay._crossings import AxisCrossing
-from gains.delay._zero_root import ZeroPassage
+from gains.core.structure import is_singular_for_any_delay
+from gains.delay._crossings import AxisCrossing, DelayedTerm, crossing_error
 
 # more critical delays than this are not listed: a near-tangent pair of crossings can have millions
 _MOST_EVENTS = 200_000
 # two critical delays closer than this (relative) are one
 _SAME_DELAY = 1e-12
-# windows or gaps narrower than this (relative) are looked at again, with the errors of the critical delays
+# windows or gaps narrower than this (relative) are computed again, with the errors of the critical delays
 _NARROW = 1e-2
+# the least cosine of the angle between the null vectors of a simple eigenvalue; rounding is far below
+_SIMPLE = 1e-6
+# a crossing below this share of the highest frequency, and this close to the limit (rad), is the root at zero
+_BLUR, _TURN = 1e-3, 1e-3
 
 
 @dataclass(frozen=True)
@@ -74,8 +87,28 @@ class DelayAnalysis:
 
 
 @dataclass(frozen=True)
+class ZeroPassage:
+    """A real root passes the root that stays at s = 0 at `delay_s`: to the right, unstable (+1), or to the left (-1).
+
+    `direction` is 0 if none passes at a positive delay; `delay_s` is then negative or infinite.
+    """
+
+    delay_s: float
+    direction: int
+
+    def is_seen_at(self, omega: float, theta: float, highest: float) -> bool:
+        """Whether a crossing at the angle theta = omega tau is the root at zero, blurred by rounding.
+
+        The locus e^{s tau} of that root is 1 + s delay_s + ...: at low frequencies its modulus is one to rounding, and
+        its noise may cross one any number of times.
+        """
+        limit = omega * self.delay_s if np.isfinite(self.delay_s) else 0.0
+        return omega < _BLUR * highest and abs(float(np.angle(np.exp(1j * (theta - limit))))) < _TURN
+
+
+@dataclass(frozen=True)
 class BlockAnalysis:
-    """What the analysis of one block found; `roots` of its crossings counts those of one of its equal `copies`.
+    """The analysis of one block that stands for `copies` equal ones; `roots` of its crossings counts one copy.
 
     `fixed_at_zero`: a simple root at s = 0 was left out. `fixed_on_axis`: a root stays on the imaginary axis at every
     delay and was not left out.
@@ -113,9 +146,9 @@ def combined_analysis(blocks: Sequence[BlockAnalysis], horizon_s: float | None) 
 def _windows(
     blocks: Sequence[BlockAnalysis], crossings: Sequence[Crossing], unstable: int, horizon_s: float | None
 ) -> tuple[tuple[tuple[float, float], ...], float]:
-    """`stability_windows`; where critical delays are too close to be told apart, with their errors taken into account.
+    """`stability_windows`, with the errors of the critical delays where these are too close to be told apart.
 
-    A multiple root is computed as several that cross near each other, some of them perhaps in the wrong order.
+    A multiple root is computed as several that cross near each other, perhaps in the wrong order.
     """
     try:
         found = stability_windows(crossings, unstable, horizon_s)
@@ -135,7 +168,7 @@ def _windows(
 
 
 def check_horizon(horizon_s: float | None) -> None:
-    """Raise BadModelError unless the horizon is a positive number of seconds, or None for all windows."""
+    """Raise BadModelError unless the horizon is None or a positive number of seconds."""
     if horizon_s is not None and not horizon_s > 0.0:
         raise BadModelError(f"horizon_s is {horizon_s}; a positive number of seconds is wanted")
 
@@ -163,7 +196,7 @@ def block_analysis(
 
 
 def unstable_roots(roots: ComplexArray, found: Sequence[AxisCrossing], passage: ZeroPassage | None) -> int:
-    """How many of the roots without delay have a positive real part; those known to be on the axis have none."""
+    """The number of roots without delay right of the axis, without those that are known to be on it."""
     # a pair that crosses at zero delay is on the axis there: rounding must not put it in either half plane
     for crossing in found:
         if crossing.theta == 0.0:
@@ -183,8 +216,8 @@ def stability_windows(
 ) -> tuple[tuple[tuple[float, float], ...], float]:
     """The windows without unstable roots, and the delay up to which they are complete.
 
-    `errors` are those of each crossing's frequency (rad/s) and delay (s). Where they are given, the gap between two
-    critical delays that may be one is no window.
+    `errors` are those of each crossing's frequency (rad/s) and delay (s). If given, a gap between two critical delays
+    that their errors can explain is not a window.
     """
     if not crossings:
         return (((0.0, inf),) if unstable == 0 else ()), inf
@@ -230,10 +263,10 @@ def stability_windows(
 def _last_delay(
     omega: FloatArray, first: FloatArray, change: FloatArray, unstable: int, horizon_s: float | None
 ) -> tuple[float, float]:
-    """The last delay (s) at which a window to be listed may begin, and the one up to which all are listed then.
+    """The last delay (s) at which a listed window may begin, and the delay up to which the list is complete.
 
-    A sequence has at least (tau - first) omega / 2 pi and at most one more member up to tau, so the count of unstable
-    roots has a lower bound that grows linearly with tau, and no window lies where that exceeds zero.
+    A sequence has at least (tau - first) omega / 2 pi members up to tau, and at most one more. The count of unstable
+    roots therefore has a lower bound that grows linearly with tau; no window lies where that bound exceeds zero.
     """
     growth = float((change * omega).sum()) / (2.0 * pi)
     offset = unstable - float((change * omega * first).sum()) / (2.0 * pi) + float(change[change < 0].sum())
@@ -245,3 +278,49 @@ def _last_delay(
     if wanted_s > affordable_s:
         wanted_s = complete_to_s = affordable_s
     return wanted_s, complete_to_s
+
+
+def zero_passage(
+    matrices: Sequence[FloatArray] | FloatArray, known_s: FloatArray, multiples: IntArray
+) -> ZeroPassage | None:
+    """The root that passes the simple root of a block at s = 0; None unless s = 0 is a simple root at every delay.
+
+    A_k of `matrices`, (n, n) in 1/s, acts known_s[k] + multiples[k] tau late.
+
+    Examples
+    --------
+    x' = x - x(t - tau), s = 1 - e^{-s tau}: a root passes zero to the right at tau = 1.
+
+    >>> import numpy as np
+    >>> from gains.delay._windows import zero_passage
+    >>> zero_passage([np.array([[1.0]]), np.array([[-1.0]])], np.zeros(2), np.arange(2))
+    ZeroPassage(delay_s=1.0, direction=1)
+    """
+    terms: FloatArray = np.array(matrices, dtype=np.float64)
+    if not terms.any() or not is_singular_for_any_delay(terms):
+        return None
+    total = terms.sum(axis=0)
+    U, singular, Vh = np.linalg.svd(total)
+    w, v = U[:, -1], Vh[-1]
+    if singular.size > 1 and singular[-2] <= 1e-12 * singular[0]:
+        return None
+
+    def weight(factors: FloatArray | IntArray) -> FloatArray:
+        return np.tensordot(factors, terms, axes=1)
+
+    slope_known = w @ v + w @ weight(known_s) @ v
+    by_delay = float(w @ weight(multiples) @ v)
+    # simple without delay at all, and with the known ones: two roots that stay are beyond this
+    if min(abs(float(w @ v)), abs(float(slope_known))) < _SIMPLE:
+        return None
+    delay_s = -float(slope_known) / by_delay if by_delay != 0.0 else np.inf
+    if not 0.0 < delay_s < 1e12 / float(np.linalg.norm(terms, axis=(1, 2)).sum()):
+        return ZeroPassage(delay_s, 0)
+    delays_s = known_s + multiples * delay_s
+    first, second = np.eye(len(total)) + weight(delays_s), -weight(delays_s**2)
+    kept = singular > 1e-12 * singular[0]
+    inverse = -(Vh[kept].T / singular[kept]) @ U[:, kept].T
+    curvature = float(w @ (second / 2.0 - first @ inverse @ first) @ v)
+    if curvature == 0.0:
+        return None
+    return ZeroPassage(delay_s, int(np.sign(-by_delay / curvature)))

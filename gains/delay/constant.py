@@ -28,7 +28,7 @@ def analyse_delay(
     A loop with a root that stays on the imaginary axis at every delay is asymptotically stable at none: no window,
     margin 0. A loop with singular A0 + A1 is one (s = 0). If that root is merely the common value of a consensus, ask
     for `leave_out_zero`. States on which neither A0 nor A1 acts can also be taken out of the matrices, with
-    `gains.core.structure.project_out_equilibria`.
+    `gains.core.structure.without_equilibria`.
 
     Parameters
     ----------

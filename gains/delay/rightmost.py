@@ -18,9 +18,9 @@ from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, distinct_blocks, square_matrices
 
-# a starting value for Newton's method is wanted, not the root: 12 points, and one more for every two radians of |s| tau
+# enough for a starting value of Newton's method: 12 points, and one more for every two radians of |s| tau
 _POINTS = 12
-# a larger discretisation than this takes tens of seconds
+# larger discretisations take tens of seconds
 _LARGEST_MATRIX = 1500
 
 
@@ -66,7 +66,7 @@ def _rightmost_of_block(block: Block, delays: FloatArray) -> complex:
     matrices = np.concatenate([matrices[~late].sum(axis=0)[np.newaxis], matrices[late]])
     delays = np.concatenate([[0.0], delays[late]])
     approximations = _pseudospectral_roots(matrices, delays)
-    # the rightmost approximation need not be the rightmost root: all within its own error band are refined
+    # the rightmost approximation need not belong to the rightmost root: all within its error band are refined
     order = np.argsort(-approximations.real)
     best = approximations[order[0]]
     band = 0.05 * (abs(best) + 1.0 / delays.max())
@@ -122,7 +122,7 @@ def _lagrange_row(nodes: FloatArray, at: float) -> FloatArray:
 def _newton(matrices: FloatArray, delays: FloatArray, root: complex) -> complex:
     """Newton steps on u*M(s)v = 0 with the singular vectors of the least singular value of M(s); the best iterate.
 
-    An iteration that runs away from its start (a multiple root, or an approximation that is none) returns the start.
+    An iteration that runs away from its start (a multiple root, or a spurious approximation) ends there.
     """
     identity = np.eye(matrices.shape[1])
     best, best_value, s = root, np.inf, root

@@ -1,13 +1,13 @@
-"""Several independent delays, one for each link: the combinations under which the loop is stable.
+"""Several independent delays, one for each link: the combinations at which the loop is stable.
 
 x'(t) = A0 x(t) + A1 x(t - tau_1) + A2 x(t - tau_2) has a root j omega where det(j omega I - A0 - A1 e^{-j alpha} -
-A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. Fixing alpha leaves one delay and a complex A0, whose
-crossings are found along the unit circle of beta; from them the curves of solutions (omega, alpha, beta) are followed.
-Each solution belongs to the delays ((alpha + 2 pi p) / omega, (beta + 2 pi q) / omega), p and q whole: the crossing
-curves of the delay plane, across which the number of unstable roots changes. The edge of the stable region is made of
-the pieces with no root to the right of them.
+A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. At a fixed alpha one delay is left, whose crossings
+are found along the unit circle of beta; from there the curves of solutions (omega, alpha, beta) are followed. Each
+solution belongs to the delays ((alpha + 2 pi p) / omega, (beta + 2 pi q) / omega), p and q whole: curves in the plane
+of delays across which the number of unstable roots changes. The edge of the stable region is made of their pieces on
+which no root lies right of the axis.
 
-A leader-follower formation is block triangular, and when each block knows one delay only, the region is a rectangle
+A leader-follower formation is block triangular. If each block has one delay only, the region is a rectangle
 (`delay_box`).
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, which parameterises the
@@ -28,9 +28,9 @@ from gains.delay._curves import Curve, at_delay, crossing_solutions
 from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
 
-# a rightmost root counts as on the axis when it is this close to it, relative to its own size
+# a rightmost root is on the axis if it is this close to it, relative to its own size
 _ON_AXIS = 1e-6
-# pieces of a crossing curve shorter than this many points are corners that touch the box
+# pieces of a crossing curve with fewer points only touch a corner of the box
 _LEAST_POINTS = 2
 
 
@@ -46,10 +46,10 @@ class Polyline:
 class DelayBox:
     """The delays tau_1, ..., tau_m that the loop takes independently of each other.
 
-    `limits_s` is the limit of each delay as far as blocks with that delay alone set it; `inf` without limit, and all
-    zero if a block is unstable without delay. `coupled` lists the sets of delays (indices into the delays) that meet
-    in one block, where the limits of one depend on the others. With `coupled` empty the box is exact: the loop is
-    stable at every delay inside, and loses stability on its faces.
+    `limits_s` is the limit that blocks with one delay alone set to it: `inf` without limit, and all zero if a block is
+    unstable without delay. `coupled` lists the sets of delays (by index) that meet in one block, where the limit of one
+    depends on the others. If it is empty, the box is exact: the loop is stable at every delay inside, and loses
+    stability on its faces.
     """
 
     limits_s: tuple[float, ...]
@@ -64,7 +64,7 @@ class DelayBox:
 def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
     """The rectangle of delays that x'(t) = A0 x(t) + sum_k late[k] x(t - tau_k) takes, block by block.
 
-    Couplings between strongly connected blocks do not count: in a leader-follower tree with one delay for each vehicle
+    Couplings between strongly connected blocks do not matter: in a leader-follower tree with one delay for each vehicle
     every block has one delay, and the box is exact.
 
     Parameters
@@ -79,7 +79,7 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
 
     Examples
     --------
-    x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2): up to pi / 2 and pi / 4, whatever the other delay.
+    x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2): up to pi / 2 and pi / 4, whatever the other delay is.
 
     >>> from gains.delay.several import delay_box
     >>> box = delay_box([[0, 0], [1, 0]], [[[-1, 0], [0, 0]], [[0, 0], [0, -2]]])
@@ -102,19 +102,10 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
 
 
 def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list[FloatArray]:
-    """The part of B K that comes from each vehicle's command, one matrix (n, n) a vehicle: a delayed term of its own.
+    """The part of B K that comes from each vehicle's command, one matrix (n, n) for each: a delayed term of its own.
 
-    Parameters
-    ----------
-    B, K
-        (n, p) and (p, n), u = K x.
-    inputs
-        For each vehicle the place of its command in u, as `gains.formation.model.FormationModel.input_slice`.
-
-    Raises
-    ------
-    BadModelError
-        B or K is not a matrix of finite numbers, or their shapes do not fit.
+    B is (n, p), K is (p, n), u = K x, and `inputs` has the place of each vehicle's command in u, as
+    `gains.formation.model.FormationModel.input_slice`. Raises BadModelError if B and K do not fit.
 
     Examples
     --------
@@ -135,29 +126,8 @@ def crossing_curves(
 ) -> tuple[Polyline, ...]:
     """All curves in the plane of two delays along which roots lie on the imaginary axis, up to `longest_s`.
 
-    On every point the least singular value of the characteristic matrix is zero to rounding. Curves are followed from
-    crossings on a grid of angles: a search, not a proof.
-
-    Parameters
-    ----------
-    A0, A1, A2
-        Real matrices (n, n), 1/s: what acts at once, tau_1 late and tau_2 late.
-    longest_s
-        The largest tau_1 and tau_2 of interest.
-
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size, or a longest delay is not positive and finite.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) has roots +-j omega with 0.5 <= omega <= 1.5 only:
-
-    >>> from gains.delay.several import crossing_curves
-    >>> curves = crossing_curves([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
-    >>> all(0.49 < line.omega_rad_s.min() <= line.omega_rad_s.max() < 1.51 for line in curves)
-    True
+    At every point the least singular value of the characteristic matrix is zero to rounding. The curves are followed
+    from crossings on a grid of angles: a search, not a proof.
     """
     if not all(isfinite(longest) and longest > 0.0 for longest in longest_s):
         raise BadModelError(f"longest_s is {longest_s}; two positive numbers of seconds are wanted")
@@ -174,9 +144,20 @@ def boundary_of_two_delays(
 ) -> tuple[Polyline, ...]:
     """The edge of the stable region in the plane of two delays, up to `longest_s`: pieces of `crossing_curves`.
 
-    A piece is part of the edge when no root lies to the right of the axis on it. The edge may surround several
-    regions, and the axes and `longest_s` bound it where no piece does. Arguments and exceptions as of
-    `crossing_curves`.
+    A piece is part of the edge if no root lies right of the axis on it. The edge may surround several regions; where it
+    has no piece, the axes and `longest_s` bound them. A search, not a proof.
+
+    Parameters
+    ----------
+    A0, A1, A2
+        Real matrices (n, n), 1/s: what acts at once, tau_1 late and tau_2 late.
+    longest_s
+        The largest tau_1 and tau_2 of interest.
+
+    Raises
+    ------
+    BadModelError
+        The matrices are not square, finite and of one size, or a longest delay is not positive and finite.
 
     Examples
     --------
@@ -223,7 +204,7 @@ def _inside(
     turns: tuple[int, int],
     longest_s: tuple[float, float],
 ) -> Iterator[Polyline]:
-    """The stretches of a polyline within the box, each up to the point at which the curve enters or leaves it."""
+    """The stretches of a polyline in the box, each up to the points where the curve enters and leaves it."""
     delays_s = line.delays_s
     inside = np.all((delays_s >= 0.0) & (delays_s <= np.array(longest_s)), axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
@@ -247,10 +228,10 @@ def _edge_point(
     turns: tuple[int, int],
     longest_s: tuple[float, float],
 ) -> tuple[FloatArray, float] | None:
-    """Delays and frequency where the curve passes the edge of the box between a vertex inside and the next outside."""
+    """Delays and frequency where the curve meets the edge of the box between a vertex inside and the next, outside."""
     last, beyond = between
     here, there = delays_s[last], delays_s[beyond]
-    # the edge that is met first on the chord
+    # the edge that the chord meets first
     met = [
         ((bound_s - float(here[which])) / float(there[which] - here[which]), which, bound_s)
         for which in (0, 1)
@@ -267,7 +248,7 @@ def _edge_point(
         return None
     pair_s = (found[1:] + 2.0 * pi * np.array(turns)) / found[0]
     pair_s[which] = bound_s
-    # the curve may leave by another edge before that
+    # the curve may have left by another edge before
     if not bool(np.all((pair_s >= 0.0) & (pair_s <= np.array(longest_s)))):
         return None
     return pair_s, float(found[0])

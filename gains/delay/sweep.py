@@ -1,34 +1,42 @@
-"""The thesis's frequency sweep: a second opinion on the delay margin that shares no algebra with the first.
+"""Delay margins by a sweep: second opinions that share no algebra with `gains.delay.constant`. Searches, not proofs.
 
 P. R. Sahoo, "Decentralized Control Design Approaches for Formation Control of Unmanned Aerial Vehicles", M.Tech
 thesis, NIT Rourkela, 2012, Theorem 2: with A0 + A1 Hurwitz, the margin is the least theta / omega over all omega > 0
-with a generalised eigenvalue lambda(j omega I - A0, A1) = e^{-j theta}. Here the generalised eigenvalues are computed
-as the reciprocals of the eigenvalues of (j omega I - A0)^{-1} A1.
+with a generalised eigenvalue lambda(j omega I - A0, A1) = e^{-j theta}. `frequency_sweep_margin` computes these as the
+reciprocals of the eigenvalues of (j omega I - A0)^{-1} A1. `circle_sweep_margin` sweeps theta in place of omega, which
+allows multiples of the delay too.
 """
 
+from collections.abc import Sequence
 from math import inf, pi
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core._bracketing import may_reach_zero, peaks
 from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._loci import Loci, delay_loci, highest_frequency, log_moduli, unit_crossings, without_limits_at_zero
+from gains.delay._circle_angles import circle_loci, circle_points, norm_of, passes_zero
+from gains.delay._loci import (
+    delay_loci,
+    highest_frequency,
+    near_unit_extrema,
+    unit_crossings,
+    without_limits_at_zero,
+)
 
 # points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
 _POINTS_PER_DECADE = 60
 _DECADES = 9
-# a modulus peak is searched when its sampled height is this close to one (log): sampled peaks are flat by far less
-_NEAR_UNIT = 1.0
+# a root of A(theta) this close to the imaginary axis, relative to the norm, is on it
+_ON_AXIS = 1e-9
 
 
 def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """Delay margin (s) of x'(t) = A0 x(t) + A1 x(t - tau) by a frequency sweep, refined where a modulus is near one.
 
     0 when A0 + A1 is not Hurwitz, `inf` when no modulus reaches one. The sweep is dense near the natural frequencies
-    of A0 and of A0 + A1, and every local extremum of every sorted modulus near one is located, so that two crossings
-    between neighbouring grid points are seen. It is a search, not a proof.
+    of A0 and of A0 + A1. Every local extremum near one of every sorted modulus is located, which separates two
+    crossings between neighbouring grid points.
 
     Parameters
     ----------
@@ -49,7 +57,27 @@ def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     1.570796
     """
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
-    return min(_block_margin(*balanced(*block.matrices)) for block in blocks)
+    return min(_frequency_margin(*balanced(*block.matrices)) for block in blocks)
+
+
+def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
+    """Delay margin (s) of x'(t) = sum_k A_k x(t - k tau) by a sweep along the unit circle.
+
+    The eigenvalues s of A(theta) = sum_k A_k e^{-j k theta} are computed on a grid of angles; where one crosses the
+    imaginary axis at j omega, tau = theta / omega is critical. Sorted real parts are continuous in the angle, so
+    crossings can be bracketed, and local extrema near zero are refined. 0 if the loop is unstable without delay, `inf`
+    if no crossing is found. Arguments and exceptions as of `gains.delay._commensurate.analyse_commensurate`.
+
+    Examples
+    --------
+    The margin pi / (3 sqrt(3)) of x'(t) = -x(t - tau) - x(t - 2 tau):
+
+    >>> from gains.delay.sweep import circle_sweep_margin
+    >>> round(circle_sweep_margin([[[0]], [[-1]], [[-1]]]), 6)
+    0.6046
+    """
+    checked = square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)})
+    return min(_circle_margin(balanced(*block.matrices)) for block in distinct_blocks(*checked))
 
 
 def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
@@ -66,7 +94,7 @@ def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
     return omega[(omega > 0.0) & (omega <= highest)]
 
 
-def _block_margin(A0: FloatArray, A1: FloatArray) -> float:
+def _frequency_margin(A0: FloatArray, A1: FloatArray) -> float:
     if float(np.max(np.linalg.eigvals(A0 + A1).real)) >= 0.0:
         return 0.0
     if not A1.any():
@@ -80,19 +108,18 @@ def _block_margin(A0: FloatArray, A1: FloatArray) -> float:
     return min((float(np.angle(c.locus)) % (2.0 * pi) / c.omega for c in crossings), default=inf)
 
 
-def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
-    """Frequencies of local extrema of the sorted log moduli that may reach zero between grid points.
-
-    Extrema whose sampled log modulus is `near` or more away from zero are taken not to reach it.
-    """
-    logs = log_moduli(loci(omega))
-    peak, valley = may_reach_zero(omega, logs), may_reach_zero(omega, -logs)
-    row, rank = np.nonzero((peak | valley) & (np.abs(logs[1:-1]) < near))
-    if row.size == 0:
-        return np.empty(0)
-    sign = np.where(peak[row, rank], 1.0, -1.0)
-
-    def height(at: FloatArray) -> FloatArray:
-        return sign * log_moduli(loci(at))[np.arange(at.size), rank]
-
-    return peaks(height, omega[row], omega[row + 2])
+def _circle_margin(terms: Sequence[FloatArray]) -> float:
+    if float(np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).real.max()) >= 0.0:
+        return 0.0
+    if not any(matrix.any() for matrix in terms[1:]):
+        return inf
+    scale, loci = norm_of(terms), circle_loci(terms)
+    angles = np.array([crossing.omega for crossing in unit_crossings(loci, circle_points(terms))])
+    margin_s = inf
+    # several roots may cross at nearly one angle (all of them, if nothing acts at once): take all that are on the axis
+    for theta, row in zip(angles.tolist(), np.log(loci(angles)) * scale if angles.size > 0 else (), strict=True):
+        for root in row[np.abs(row.real) <= max(_ON_AXIS * scale, float(np.abs(row.real).min()))].tolist():
+            # -j omega belongs to the angle -theta
+            if not passes_zero(terms, theta, abs(root.imag)):
+                margin_s = min(margin_s, (theta if root.imag > 0.0 else 2.0 * pi - theta) / abs(root.imag))
+    return margin_s

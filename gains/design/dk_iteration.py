@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from gains.core._semidefinite import SolverFacts, solved
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError, InfeasibleError, SolverError
 from gains.core.structure import strongly_connected_blocks
 from gains.formation.pattern import Pattern, Plant, check_fits
-from gains.performance.robust import SolverFacts, solved
 
 # At 40 states an iteration takes the solver seconds, at 60 a minute. A formation needs its states along one axis only.
 LARGEST_STATES = 40

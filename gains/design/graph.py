@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy import linalg
 
+from gains.core._semidefinite import SolverFacts
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError, SolverError
 from gains.core.requirement import Requirement, plain
@@ -29,7 +30,7 @@ from gains.formation.bipartite import partition_by_input, smallest_partition
 from gains.formation.fixed_modes import check_stabilisable
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Link, Pattern, Plant, formation_plant
-from gains.performance.robust import SolverFacts, disturbance_bound
+from gains.performance.robust import disturbance_bound
 from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming
 

@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from gains.core._semidefinite import negative, solved
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, SolverError
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Plant
-from gains.performance.robust import disturbance_bound, negative, solved
+from gains.performance.robust import disturbance_bound
 
 # Room for the solver's rounding: as slack asked of the inequality, and as a share when the bound it claims is compared
 # with the exact one.

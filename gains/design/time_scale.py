@@ -14,12 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gains.core._semidefinite import SolverFacts
 from gains.core.arrays import FloatArray
 from gains.core.errors import InfeasibleError
 from gains.core.requirement import Requirement
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
-from gains.performance.robust import SolverFacts, disturbance_bound
+from gains.performance.robust import disturbance_bound
 from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
 

@@ -1,7 +1,7 @@
-"""The least value of an integer function of subsets, as the rank of a choice of columns.
+"""The least value of an integer function of subsets, such as the rank of the chosen columns of a matrix.
 
-The rank of the columns in a set is submodular: a column adds no more to a larger set than to a smaller one in it. That
-is what makes the minimum of ranks in `gains.formation.fixed_modes` computable without trying all 2^m sets.
+A rank is submodular: a column raises the rank of a set by no more than that of any of its subsets. This is why
+`gains.formation.fixed_modes` can find the least rank without trying all 2^m sets.
 """
 
 from collections.abc import Callable
@@ -17,28 +17,28 @@ _ROUNDS = 1000
 
 
 def least_exhaustive(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
-    """The least value of a function of subsets of range(size), and a set that has it, by trying all 2^size."""
+    """The least value of a function of subsets of range(size), and a set with that value, by trying all 2^size."""
     subsets = [frozenset(k for k in range(size) if code >> k & 1) for code in range(2**size)]
     return min(((value_of(subset), subset) for subset in subsets), key=lambda item: item[0])
 
 
 def least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
-    """The least value of an integer submodular function of subsets of range(size), and a set that has it.
+    """The least value of an integer submodular function of subsets of range(size), and a set with that value.
 
-    Wolfe's algorithm approaches the point x of least norm in the base polytope of f − f(∅). Every such x proves the
-    lower bound f(∅) + Σ min(x_k, 0), and every set met on the way is an upper bound; for integers a gap below one is
-    none. (S. Fujishige, Submodular Functions and Optimization, 2nd ed. 2005, section 7.1.)
+    Wolfe's algorithm approaches the point x of least norm in the base polytope of f − f(∅). Every x on the way proves
+    the lower bound f(∅) + Σ min(x_k, 0), and every set on the way gives an upper bound. Values are integers, so a gap
+    below one closes. (S. Fujishige, Submodular Functions and Optimization, 2nd ed. 2005, section 7.1.)
 
     Raises
     ------
     DisagreementError
-        If the gap does not close: the function is not submodular, as a rank decided by rounding need not be.
+        If the gap does not close: a rank that rounding decides need not be submodular.
     """
     empty = value_of(frozenset())
     best = (empty, frozenset[int]())
 
     def vertex(x: FloatArray) -> FloatArray:
-        """Vertex of the base polytope that is least in the direction x (Edmonds' greedy algorithm)."""
+        """The vertex of the base polytope least in the direction x (Edmonds' greedy algorithm)."""
         nonlocal best
         point, subset, value = np.zeros(size), frozenset[int](), empty
         for k in np.argsort(x, kind="stable").tolist():
@@ -62,10 +62,10 @@ def least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[i
 
 
 def _nearest_to_origin(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Wolfe's minor cycle: the point of least norm in the hull of some of the points, which are kept."""
+    """Wolfe's minor cycle: the points whose hull holds the point of least norm, and the weights of that point."""
     while True:
         count = len(points)
-        # least norm in the affine hull: Lagrange's conditions, by least squares because points may be dependent
+        # least norm in the affine hull, by Lagrange's conditions; least squares because points may be dependent
         system = np.block([[points @ points.T, np.ones((count, 1))], [np.ones((1, count)), np.zeros((1, 1))]])
         affine = np.linalg.lstsq(system, np.append(np.zeros(count), 1.0), rcond=None)[0][:count]
         if affine.min() > -1e-10:

@@ -1,18 +1,17 @@
-"""From an information pattern to a block-diagonal gain: complete bipartite subgraphs of inputs and outputs.
+"""A gain with an information pattern as a block-diagonal gain, one block for each complete bipartite subgraph.
 
-The links of a pattern are the edges of a bipartite graph, inputs on one side and outputs on the other. A partition of
-the edges into complete bipartite subgraphs (bicliques), vertices repeated as needed, expands the gain: K = φ1 K̄ φ2 with
-K̄ block diagonal, one block for each subgraph, and constant 0/1 matrices φ1, φ2. The expanded plant has B̄ = B φ1 and
-C̄ = φ2 C; as B̄ K̄ C̄ = B K C its closed loop is the same.
+The links of a pattern are the edges of a bipartite graph with the inputs on one side and the outputs on the other. A
+partition of the edges into complete bipartite subgraphs (bicliques) expands the gain: K = φ1 K̄ φ2, where K̄ has one
+diagonal block for each subgraph and φ1, φ2 are constant 0/1 matrices that repeat inputs and outputs as needed. The
+expanded plant has B̄ = B φ1 and C̄ = φ2 C. As B̄ K̄ C̄ = B K C, its closed loop is the same.
 
-The partition is not unique. Grouped by input, φ1 = I. The smallest partition is NP-hard to find in general.
+The partition is not unique. The one by inputs has φ1 = I; finding the smallest one is NP-hard in general.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eqs. (4.3), (4.4), (4.6), (4.7).
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,17 +20,15 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.formation.pattern import Link, Pattern, Plant, check_fits, checked_pattern_gain
 
-Origin = Literal["by input", "by output", "greedy", "search"]
-
-# The search is made up to this many links (equal rows and columns of the pattern counted once)
+# All partitions are tried for patterns with at most this many links, equal rows and columns counted once,
 LARGEST_SEARCH_LINKS = 40
-# and up to this many steps: some seconds. Beyond, the partition is reported as not known to be the smallest.
+# and for at most this many steps, some seconds. After that the best partition is not known to be the smallest.
 _SEARCH_STEPS = 200_000
 
 
 @dataclass(frozen=True)
 class Subgraph:
-    """A complete bipartite subgraph: every input of it uses every output of it."""
+    """A complete bipartite subgraph: each of its inputs uses each of its outputs."""
 
     inputs: tuple[int, ...]
     outputs: tuple[int, ...]
@@ -44,31 +41,23 @@ class Subgraph:
 
 @dataclass(frozen=True)
 class Partition:
-    """Subgraphs that hold every link of a pattern exactly once.
+    """Subgraphs, sorted by their first link, that hold every link of a pattern exactly once.
 
-    Attributes
-    ----------
-    subgraphs
-        Sorted by their first link.
-    origin
-        How it was found.
-    lower_bound
-        No partition has fewer subgraphs than this.
+    No partition has fewer than `lower_bound` subgraphs.
 
     Examples
     --------
     >>> from gains.formation.bipartite import Partition, Subgraph
-    >>> Partition((Subgraph((0, 1), (0,)),), "by output", lower_bound=1).smallest
+    >>> Partition((Subgraph((0, 1), (0,)),), lower_bound=1).smallest
     True
     """
 
     subgraphs: tuple[Subgraph, ...]
-    origin: Origin
     lower_bound: int
 
     @property
     def smallest(self) -> bool:
-        """Whether it is known that no partition has fewer subgraphs."""
+        """Whether this is known to be the smallest partition."""
         return len(self.subgraphs) == self.lower_bound
 
 
@@ -81,11 +70,11 @@ class ExpandedGain:
     phi1, phi2
         0/1 matrices, shapes (inputs, expanded inputs) and (expanded outputs, outputs).
     mask
-        Entries of K̄ that may differ from zero: block diagonal, shape (expanded inputs, expanded outputs).
+        Entries of K̄ that may be nonzero: block diagonal, shape (expanded inputs, expanded outputs).
 
     Examples
     --------
-    Back and forth gives the gain again:
+    Expanded, and back again:
 
     >>> from gains.formation.bipartite import expanded_gain, partition_by_input
     >>> from gains.formation.pattern import Pattern
@@ -104,15 +93,9 @@ class ExpandedGain:
     mask: NDArray[np.bool_]
 
     def expand(self, K: ArrayLike) -> FloatArray:
-        """K̄ with φ1 K̄ φ2 = K (4.3): every block of K goes to the one subgraph that holds its link.
-
-        Raises
-        ------
-        BadModelError
-            If K does not have the pattern.
-        """
+        """K̄ with φ1 K̄ φ2 = K (4.3); BadModelError if K does not have the pattern."""
         gain = checked_pattern_gain(self.pattern, K)
-        # every link is in exactly one subgraph: within the mask no entry is met twice
+        # every link is in exactly one subgraph, so each entry of K has one place in the mask
         return np.where(self.mask, self.phi1.T @ gain @ self.phi2.T, 0.0)
 
     def expand_plant(self, plant: Plant) -> Plant:
@@ -122,9 +105,9 @@ class ExpandedGain:
 
 
 def partition_by_input(pattern: Pattern) -> Partition:
-    """One subgraph for each input with the outputs it uses: φ1 = I if no input is without outputs.
+    """One subgraph for each input and the outputs it uses: φ1 = I if every input uses some.
 
-    For the pattern (4.6) {K11}, {K21, K22}, {K32, K33}.
+    The pattern (4.6) gives {K11}, {K21, K22}, {K32, K33}.
 
     Examples
     --------
@@ -134,21 +117,20 @@ def partition_by_input(pattern: Pattern) -> Partition:
     >>> [graph.links for graph in partition_by_input(leader_follower(FormationModel((-1, 0, 1)))).subgraphs]
     [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
     """
-    rows = [Subgraph((i,), tuple(np.flatnonzero(row).tolist())) for i, row in enumerate(pattern.blocks) if row.any()]
-    return Partition(tuple(rows), "by input", _rank_bound(pattern.blocks))
+    return Partition(tuple(_rows(pattern.blocks)), _rank_bound(pattern.blocks))
 
 
 def smallest_partition(pattern: Pattern) -> Partition:
-    """The partition with the fewest subgraphs, or the best that is found: see `Partition.smallest`.
+    """The partition with the fewest subgraphs, or the best that was found: see `Partition.smallest`.
 
     Equal rows, and equal columns, share their subgraphs. The best of three heuristics (by input, by output, largest
-    first) is the smallest if it meets the rank of the pattern, below which no partition goes (Graham and Pollak's
-    bound). If not, and there are at most `LARGEST_SEARCH_LINKS` different links, all smaller ones are tried, within a
-    fixed number of steps.
+    first) is the smallest partition if it meets the rank of the pattern, which bounds all partitions from below (Graham
+    and Pollak). If it does not, all smaller partitions are tried, up to `LARGEST_SEARCH_LINKS` different links and
+    within a fixed number of steps.
 
     Examples
     --------
-    All to all is one subgraph, whatever the number of vehicles:
+    All to all is one subgraph for any number of vehicles:
 
     >>> from gains.formation.bipartite import smallest_partition
     >>> from gains.formation.model import FormationModel
@@ -159,32 +141,22 @@ def smallest_partition(pattern: Pattern) -> Partition:
     """
     core, row_class, column_class = _without_repeats(pattern.blocks)
     bound = _rank_bound(core)
-    guesses: list[tuple[Origin, list[Subgraph]]] = [
-        ("by input", _rows(core)),
-        ("by output", [Subgraph(graph.outputs, graph.inputs) for graph in _rows(core.T)]),
-        ("greedy", _largest_first(core)),
-    ]
-    origin, best = min(guesses, key=lambda guess: len(guess[1]))
+    by_output = [Subgraph(graph.outputs, graph.inputs) for graph in _rows(core.T)]
+    best = min(_rows(core), by_output, _largest_first(core), key=len)
     if len(best) > bound and int(core.sum()) <= LARGEST_SEARCH_LINKS:
         steps = iter(range(_SEARCH_STEPS))
         while bound < len(best):
             found, exhausted = _search(core, bound, steps)
-            if found is not None:
-                origin, best = "search", found
+            best = best if found is None else found
             if not exhausted:
                 break
-            bound = bound if found is not None else bound + 1
+            bound = bound + 1 if found is None else bound
     copied = [_with_repeats(graph, row_class, column_class) for graph in best]
-    return Partition(tuple(sorted(copied, key=lambda graph: graph.links)), origin, bound)
+    return Partition(tuple(sorted(copied, key=lambda graph: graph.links)), bound)
 
 
 def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
-    """φ1, φ2 and the block-diagonal mask of a partition.
-
-    Raises
-    ------
-    BadModelError
-        If the partition does not hold every link of the pattern exactly once.
+    """φ1, φ2 and the mask of a partition; BadModelError if it does not hold every link of the pattern exactly once.
 
     Examples
     --------
@@ -203,29 +175,20 @@ def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
     graphs = partition.subgraphs
     phi1 = _stacked([i for graph in graphs for i in graph.inputs], pattern.input_sizes).T
     phi2 = _stacked([j for graph in graphs for j in graph.outputs], pattern.output_sizes)
-    rows = np.repeat(np.arange(len(graphs)), [sum(pattern.input_sizes[i] for i in graph.inputs) for graph in graphs])
-    columns = np.repeat(
-        np.arange(len(graphs)), [sum(pattern.output_sizes[j] for j in graph.outputs) for graph in graphs]
-    )
-    return ExpandedGain(pattern, partition, phi1, phi2, rows[:, np.newaxis] == columns)
+    rows = [k for k, graph in enumerate(graphs) for i in graph.inputs for _ in range(pattern.input_sizes[i])]
+    columns = [k for k, graph in enumerate(graphs) for j in graph.outputs for _ in range(pattern.output_sizes[j])]
+    return ExpandedGain(pattern, partition, phi1, phi2, np.equal.outer(rows, columns))
 
 
 def verify_expansion(plant: Plant, expanded: ExpandedGain, K: ArrayLike) -> float:
-    """Largest difference of the closed loops A + B K C and A + B̄ K̄ C̄, relative to the latter's largest entry.
-
-    Their modes are then the same to the conditioning of the eigenvalues.
-
-    Parameters
-    ----------
-    K
-        Gain with the pattern, shape (inputs, outputs).
+    """Largest difference of the closed loops A + B K C and A + B̄ K̄ C̄, relative to the largest entry of the latter.
 
     Raises
     ------
     BadModelError
-        If K does not have the pattern, or the plant does not fit it.
+        K, of shape (inputs, outputs), does not have the pattern, or the plant does not fit it.
     DisagreementError
-        If it is more than rounding.
+        The difference is more than rounding.
 
     Examples
     --------
@@ -260,7 +223,7 @@ def _check_partition(pattern: Pattern, partition: Partition) -> None:
 
 
 def _stacked(vehicles: list[int], sizes: tuple[int, ...]) -> FloatArray:
-    """0/1 matrix that stacks the named parts of a vector, in the order given."""
+    """0/1 matrix that stacks these vehicles' parts of a vector, in the order given."""
     starts = np.concatenate([[0], np.cumsum(sizes)])
     index = np.concatenate([np.arange(starts[k], starts[k + 1]) for k in vehicles] or [np.zeros(0, dtype=np.intp)])
     return np.eye(int(starts[-1]))[index.astype(np.intp)]
@@ -273,7 +236,7 @@ def _rank_bound(blocks: NDArray[np.bool_]) -> int:
 def _without_repeats(
     blocks: NDArray[np.bool_],
 ) -> tuple[NDArray[np.bool_], list[list[int]], list[list[int]]]:
-    """The different rows and columns that are not empty, and for each the original indices."""
+    """The distinct nonempty rows and columns, and the original indices of each."""
     row_class = _classes(blocks)
     column_class = _classes(blocks.T)
     core = blocks[np.ix_([rows[0] for rows in row_class], [columns[0] for columns in column_class])]
@@ -295,18 +258,18 @@ def _with_repeats(graph: Subgraph, row_class: list[list[int]], column_class: lis
     )
 
 
-def _rows(core: NDArray[np.bool_]) -> list[Subgraph]:
-    return [Subgraph((i,), tuple(np.flatnonzero(row).tolist())) for i, row in enumerate(core)]
+def _rows(blocks: NDArray[np.bool_]) -> list[Subgraph]:
+    return [Subgraph((i,), tuple(np.flatnonzero(row).tolist())) for i, row in enumerate(blocks) if row.any()]
 
 
 def _largest_first(core: NDArray[np.bool_]) -> list[Subgraph]:
-    """Take away the largest subgraph spanned by the common outputs of one or two inputs until no link is left."""
+    """Greedy partition: again and again the largest subgraph on the common outputs of one or two inputs."""
     left = core.copy()
     graphs: list[Subgraph] = []
     while left.any():
         rows = np.unique(left[left.any(axis=1)], axis=0)
         common = np.unique((rows[:, np.newaxis, :] & rows[np.newaxis]).reshape(-1, rows.shape[1]), axis=0)
-        # an input joins a subgraph if it has all its outputs; the product of the two counts is the number of links
+        # an input that uses all these outputs joins; the product of the two counts is the number of links
         lacking = common.astype(int) @ ~left.T
         best = int(np.argmax((lacking == 0).sum(axis=1) * common.sum(axis=1)))
         inputs, outputs = np.flatnonzero(lacking[best] == 0), np.flatnonzero(common[best])
@@ -316,10 +279,10 @@ def _largest_first(core: NDArray[np.bool_]) -> list[Subgraph]:
 
 
 def _search(core: NDArray[np.bool_], count: int, steps: Iterator[int]) -> tuple[list[Subgraph] | None, bool]:
-    """A partition into at most `count` subgraphs if there is one, and whether the steps sufficed to know.
+    """A partition into at most `count` subgraphs if there is one, and whether the steps were enough to know.
 
-    The first link not yet covered joins one of the subgraphs begun, with every further link that makes it complete
-    again, or begins one. Subgraphs are begun in the order of their first links, so that no partition is met twice.
+    The first uncovered link joins one of the open subgraphs, with the further links that complete it, or opens a new
+    one. Subgraphs are opened in the order of their first links, so that no partition is tried twice.
     """
     links = [(int(i), int(j)) for i, j in np.argwhere(core)]
     allowed: list[list[bool]] = core.tolist()

@@ -1,16 +1,15 @@
 """Modes that no gain with a given information pattern can move, and the links that would free them.
 
 λ is a fixed mode of x' = A x + B u, y = C x under a pattern if it is an eigenvalue of A + B K C for every K with the
-pattern. If it lies in the closed right half plane, no such gain stabilises the plant, and no design should be tried. It
-is found in two ways, which must agree:
+pattern. If it lies in the closed right half plane, no such gain stabilises the plant. Two methods must agree on it:
 
-* by rank: λ is fixed if and only if the inputs can be split into two sets D and E such that
+* Rank: λ is fixed if and only if the inputs can be split into two sets D and E such that
 
       rank [[A − λI, B_D], [C_E, 0]] < n                                                          (1)
 
-  with C_E the outputs that the inputs in E use. The rank is a submodular function of D, so the least one is found
-  without trying all 2^m sets;
-* by random gains: λ is an eigenvalue of A + B K C for several random K with the pattern.
+  where C_E are the outputs that the inputs in E use. The rank is a submodular function of D, so the least rank is
+  found without trying all 2^m sets.
+* Random gains: λ is an eigenvalue of A + B K C for several random K with the pattern.
 
 Both treat one strongly connected component of plant and pattern at a time: the closed loop is block triangular, and λ
 is fixed if and only if it is fixed in one of the diagonal blocks.
@@ -31,9 +30,9 @@ from gains.core.structure import distinct_blocks, strongly_connected_blocks
 from gains.formation._submodular import least_exhaustive, least_submodular
 from gains.formation.pattern import Link, Pattern, Plant, check_fits
 
-# up to this many inputs in one component all subsets are tried (256 ranks); above, the submodular minimum is computed
+# with up to this many inputs in one component all subsets are tried (256 ranks), with more Wolfe's algorithm
 LARGEST_EXHAUSTIVE = 8
-# singular values below this share of the largest are zero: rounding is 1e-15, a mode that moves does so by far more
+# singular values below this share of the largest are zero: rounding is 1e-15, and what a gain moves is far larger
 _RANK_TOLERANCE = 1e-10
 # eigenvalues of A closer than this share of its norm are one defective eigenvalue; their mean is exact to rounding
 _SAME_EIGENVALUE = 1e-5
@@ -53,8 +52,8 @@ class FixedMode:
     cut
         The inputs (vehicles) D of (1) in those components; all others there are E.
     remedies
-        Sets of links each of which, added to the pattern, frees the mode; empty if no links do, because λ is not
-        controllable or not observable with all inputs and outputs together.
+        Sets of links each of which, added to the pattern, frees the mode; empty if λ is not controllable or not
+        observable even with all inputs and outputs.
     """
 
     mode: complex
@@ -83,19 +82,15 @@ class _Component:
 def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
     """Every mode that no gain with the pattern moves, in ascending order of real part.
 
-    Parameters
-    ----------
-    plant, pattern
-        The position of a formation's leader is not a state of its error model and so is no fixed mode here.
-    seed
-        Of the random gains.
+    The position of a formation's leader is not a state of its error model and therefore no fixed mode. `seed` is that
+    of the random gains.
 
     Raises
     ------
     BadModelError
-        If plant and pattern do not fit.
+        Plant and pattern do not fit.
     DisagreementError
-        If the rank test and the random gains contradict each other: λ is fixed to rounding, or nearly so.
+        The rank test and the random gains contradict each other: λ is nearly fixed.
 
     Examples
     --------
@@ -128,15 +123,15 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
 
 
 def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
-    """The fixed modes, all stable.
+    """The fixed modes, if all of them are stable.
 
-    Without unstable fixed modes dynamic controllers with the pattern stabilise the plant; that a static gain does is
-    not implied. Arguments and further exceptions as of `fixed_modes`.
+    A dynamic controller with the pattern then stabilises the plant; a static gain need not exist. Arguments and further
+    exceptions as of `fixed_modes`.
 
     Raises
     ------
     InfeasibleError
-        If a fixed mode is unstable; the message names the links of which one or all have to be added.
+        A fixed mode is unstable; the message names the links to add.
 
     Examples
     --------
@@ -184,14 +179,14 @@ def _components(plant: Plant, pattern: Pattern) -> list[_Component]:
 
 
 def _fingerprint(component: _Component) -> bytes:
-    """Equal for components that differ in the names of their states, inputs and outputs only."""
+    """Bytes that are equal for components that differ only in the indices of states, inputs and outputs."""
     used = np.any(component.rows, axis=0) if component.rows else np.zeros(component.C.shape[0], dtype=bool)
     parts = [component.A, *component.B, component.C[used], *(rows[used].astype(float) for rows in component.rows)]
     return b"".join(repr(part.shape).encode() + (part + 0.0).tobytes() for part in parts)
 
 
 def _fixed_in(component: _Component, feedbacks: list[FloatArray]) -> list[tuple[complex, frozenset[int]]]:
-    """The fixed modes of one component, and the positions of the inputs of D among its own."""
+    """The fixed modes of one component, each with D as positions among the component's inputs."""
     at = np.ix_(component.states, component.states)
     fixed: list[tuple[complex, frozenset[int]]] = []
     for mode in _candidates(component.A):
@@ -236,7 +231,7 @@ def _least_rank(component: _Component, mode: complex) -> tuple[int, frozenset[in
 
 
 def _candidates(A: FloatArray) -> list[complex]:
-    """The eigenvalues of A, defective ones once, of complex pairs one."""
+    """The distinct eigenvalues of A, one of each complex pair."""
     candidates: list[complex] = []
     tolerance = _SAME_EIGENVALUE * max(float(np.linalg.norm(A, 2)), 1e-300)
     for block in distinct_blocks(A):
@@ -252,25 +247,25 @@ def _candidates(A: FloatArray) -> list[complex]:
 
 
 def _is_eigenvalue(matrix: FloatArray, mode: complex) -> bool:
-    """By the least singular value: a defective eigenvalue itself is known to a root of the rounding only."""
+    """Decided by the least singular value, as rounding changes a defective eigenvalue by far more."""
     singular = np.linalg.svd(matrix - mode * np.eye(matrix.shape[0]), compute_uv=False)
     return float(singular[-1]) <= _RANK_TOLERANCE * float(np.linalg.norm(matrix, 2))
 
 
 def _random_gains(plant: Plant, pattern: Pattern, seed: int) -> list[FloatArray]:
-    """Gains with the pattern that move what can be moved about as far as the plant's own modes are apart."""
+    """Gains with the pattern, of a size that moves modes about as far as the plant's own are apart."""
     rng = np.random.default_rng(seed)
     scale = _size(plant.A) / (_size(plant.B) * _size(plant.C))
     mask = pattern.mask
-    # magnitudes between 0.5 and 1.5: an entry close to 0 would be a link that is hardly there
+    # magnitudes between 0.5 and 1.5: an entry close to 0 would hardly be a link
     draws = [rng.uniform(0.5, 1.5, mask.shape) * rng.choice([-1.0, 1.0], mask.shape) for _ in range(_RANDOM_GAINS)]
     return [scale * draw * mask for draw in draws]
 
 
 def _remedies(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -> tuple[tuple[Link, ...], ...]:
-    """Links that free the mode: every single one that does, else one set found link by link.
+    """Links that free the mode: every single one that does or, without any, one set found link by link.
 
-    With M and N the left and right null spaces of A + B K C − λI for a random K, a full block K_ij raises the rank by
+    If M and N are the left and right null spaces of A + B K C − λI for a random K, a full block K_ij raises the rank by
     min(rank M'B_i, rank C_j N).
     """
     singles = _links_that_help(plant, pattern, mode, gain)
@@ -294,7 +289,7 @@ def _remedies(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -
 
 
 def _links_that_help(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -> list[tuple[Link, int, int]]:
-    """(link, nullity, rank gained) for every link not in the pattern that gains any."""
+    """(link, nullity, rank gained) of every link outside the pattern that raises the rank."""
     shifted = plant.closed_loop(gain) - mode * np.eye(plant.states)
     left, singular, right = np.linalg.svd(shifted)
     nullity = int(np.count_nonzero(singular <= _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
@@ -314,7 +309,7 @@ def _nullity(matrix: FloatArray, mode: complex) -> int:
 
 
 def _rank(matrix: FloatArray | ComplexArray, scale: float = 1.0) -> int:
-    """Rank of a product with orthonormal null vectors, whose entries are rounding or of the order of the scale."""
+    """Rank of a matrix whose entries are either rounding or of the order of the scale."""
     if matrix.size == 0:
         return 0
     singular = np.linalg.svd(matrix, compute_uv=False)
@@ -322,7 +317,7 @@ def _rank(matrix: FloatArray | ComplexArray, scale: float = 1.0) -> int:
 
 
 def _size(matrix: FloatArray | ComplexArray) -> float:
-    """Largest entry, or 1 of a matrix that has none: a scale that can be divided by."""
+    """Largest absolute entry, or 1 if there is none: a scale to divide by."""
     largest = float(np.abs(matrix).max()) if matrix.size else 0.0
     return largest if largest > 0.0 else 1.0
 

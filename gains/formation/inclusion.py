@@ -1,14 +1,14 @@
 """Inclusion principle: from overlapping to disjoint subsystems and back, for any leader-follower chain or tree.
 
-The overlapping subsystems {e_0^v} and {e_j^v, e_i^p, e_i^v} of every follower i behind j share velocity errors. In an
-expanded space each subsystem gets its own copy, the subsystems are disjoint, and gains are designed for one of them at
-a time; contraction brings them back. All matrices are built from the tree and are sparse, so that verification of some
-hundred vehicles takes milliseconds.
+The subsystems {e_0^v} and, for every follower i behind j, {e_j^v, e_i^p, e_i^v} overlap: they share velocity errors. In
+an expanded space each subsystem has its own copy of what it shares. The subsystems are then disjoint, gains can be
+designed for one at a time, and contraction takes them back to the formation. All matrices are sparse, so hundreds of
+vehicles are verified in milliseconds.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 3, Theorems 2 and 3, eqs. (3.5)-(3.19), (3.25), (3.26).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -19,7 +19,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.formation.model import FormationModel, checked_gain
 
-# scipy has no types: any of its two-dimensional sparse arrays
+# a two-dimensional sparse array of scipy, which has no types
 Sparse = Any
 Restriction = Literal["a", "b"]
 
@@ -28,7 +28,7 @@ Restriction = Literal["a", "b"]
 class Expansion:
     """The expanded system x~' = A~ x~ + B~ u~ and the maps to and from it.
 
-    x~ = V x, u~ = R u expand; x = U x~, u = Q u~ contract; UV = I, QR = I (3.5, 3.6). U = (V'V)^{-1} V' and
+    x~ = V x and u~ = R u expand; x = U x~ and u = Q u~ contract, UV = I, QR = I (3.5, 3.6). U = (V'V)^{-1} V' and
     Q = (R'R)^{-1} R' take the mean of the copies.
 
     Attributes
@@ -40,8 +40,8 @@ class Expansion:
     A, B
         A~ and B~ of the expanded system.
     M, N
-        Complementary matrices: A~ = V A U + M, B~ = V B Q + N. Restriction needs MV = 0 and, of type (a), NR = 0, of
-        type (b), N = 0.
+        Complementary matrices: A~ = V A U + M, B~ = V B Q + N. A restriction needs MV = 0 and NR = 0 for type (a),
+        N = 0 for type (b).
     restriction
         "a": A~V = VA and B~R = VB. "b": A~V = VA and B~ = VBQ (Theorem 2).
 
@@ -68,47 +68,22 @@ class Expansion:
     restriction: Restriction
 
 
-@dataclass(frozen=True)
-class InclusionResiduals:
-    """Largest absolute entry by which each condition of the inclusion is missed; 0 where it holds exactly.
-
-    Attributes
-    ----------
-    state_inverse, input_inverse
-        UV = I and QR = I (3.5, 3.6).
-    state_map
-        A~V = VA.
-    input_map
-        B~R = VB for restriction (a), B~ = VBQ for (b).
-    gain_map
-        K~V = RK for restriction (a); for (b) it follows from the contraction and is the same number.
-    contraction
-        K = QK~V.
-    """
-
-    state_inverse: float
-    input_inverse: float
-    state_map: float
-    input_map: float
-    gain_map: float
-    contraction: float
-
-
 def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansion:
-    """Return the expanded system in which the subsystems of the formation are disjoint.
+    """The expanded system, in which the subsystems of the formation are disjoint.
 
-    The expanded state is (e_0^v) and then (e_j^v, e_i^p, e_i^v) for every follower i behind j, the expanded input (u_0)
-    and then (u_j, u_i) (3.11-3.13). Of type (a), A~ and B~ are block diagonal with the blocks (3.25). Of type (b), A~
-    is the same and B~ = VBQ, which is not block diagonal: a vehicle's copies move by the mean of its inputs' copies.
+    The expanded state is e_0^v, followed by (e_j^v, e_i^p, e_i^v) for every follower i behind j; the expanded input is
+    u_0, followed by (u_j, u_i) (3.11-3.13). For type (a), A~ and B~ are block diagonal with the blocks (3.25). For type
+    (b), A~ is the same and B~ = VBQ, which is not block diagonal: it moves all copies of a vehicle by the mean of its
+    copied inputs.
 
     Raises
     ------
     BadModelError
-        If the restriction is neither "a" nor "b".
+        The restriction is neither "a" nor "b".
 
     Examples
     --------
-    A chain of three: e_0^v, e_1^v, u_0 and u_1 are there twice.
+    In a chain of three, e_0^v, e_1^v, u_0 and u_1 have two copies each.
 
     >>> from gains.formation.model import FormationModel
     >>> from gains.formation.inclusion import expand
@@ -134,14 +109,14 @@ def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansi
 
 
 def expanded_gain(formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> Sparse:
-    """Return the block-diagonal gain K~ of the disjoint subsystems, sparse, shape (expanded inputs, expanded states).
+    """The block-diagonal gain K~ of the disjoint subsystems, sparse, shape (expanded inputs, expanded states).
 
-    The block of {e_0^v} is K1, that of every follower [K1 0 0; K2 K3 K1] (3.26): in its subsystem the vehicle in front
-    is governed by K1 alone. Arguments and exceptions as of `gains.formation.model.FormationModel.overlapping_gain`.
+    The block of {e_0^v} is K1, that of every follower [K1 0 0; K2 K3 K1] (3.26): within this subsystem only K1 acts on
+    the vehicle in front. Arguments and exceptions as of `gains.formation.model.FormationModel.overlapping_gain`.
 
     Examples
     --------
-    A leader and one follower of one axis: [K1] and [K1 0 0; K2 K3 K1].
+    A leader and one follower of one axis, [K1] and [K1 0 0; K2 K3 K1]:
 
     >>> from gains.formation.model import FormationModel
     >>> from gains.formation.inclusion import expanded_gain
@@ -159,15 +134,14 @@ def expanded_gain(formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: A
 
 
 def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
-    """Return K~_M: the expanded gain in which every copy of an input gets the command of the vehicle's own subsystem.
+    """K~_M: the expanded gain in which every copy of an input gets the command of the vehicle's own subsystem.
 
-    Without this the copies of u_j disagree (K1 e_j^v in the subsystem of the vehicle behind j, the full law in j's
-    own), K~V = RK has no solution K, and the contracted gain would be a mean of the two (3.17-3.19). `gain` is that of
-    `expanded_gain`.
+    In the gain of `expanded_gain` the copies of u_j disagree: K1 e_j^v in the subsystem of the vehicle behind j, the
+    full law in j's own. K~V = RK then has no solution K, and contraction would mix the two laws (3.17-3.19).
 
     Examples
     --------
-    In a chain of three the copy of u_1 in the subsystem behind gets the law of vehicle 1:
+    In a chain of three, the copy of u_1 in the subsystem behind gets the law of vehicle 1:
 
     >>> from gains.formation.model import FormationModel
     >>> from gains.formation.inclusion import expanded_gain, modified_gain
@@ -185,7 +159,7 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
 
 
 def contracted_gain(expansion: Expansion, gain: Sparse) -> FloatArray:
-    """Return K = Q K~ V as an array of shape (inputs, states), K~ of shape (expanded inputs, expanded states).
+    """K = Q K~ V, shape (inputs, states), of a gain K~ of shape (expanded inputs, expanded states).
 
     Examples
     --------
@@ -208,24 +182,25 @@ def verify_inclusion(
     K: ArrayLike,
     K_expanded: Sparse,
     tolerance: float = 1e-9,
-) -> InclusionResiduals:
-    """Check every condition under which the closed loop is included in the expanded closed loop.
+) -> float:
+    """The largest absolute entry by which the closed loop misses a condition for its inclusion in the expanded one.
+
+    The conditions are UV = I, QR = I (3.5, 3.6), A~V = VA, K = QK~V and, for restriction (a), B~R = VB and K~V = RK;
+    for (b), B~ = VBQ.
 
     Parameters
     ----------
-    expansion
-        Maps and expanded system.
-    A, B
-        The original system, shapes (states, states) and (states, inputs).
-    K, K_expanded
-        The gain of the original system and of the expanded one.
+    A, B, K
+        The original system, shapes (states, states) and (states, inputs), and its gain.
+    K_expanded
+        The gain of the expanded system.
     tolerance
         Largest residual accepted, relative to the largest entry of the matrices compared (at least 1).
 
     Raises
     ------
     BadModelError
-        If a condition is missed; the message names it, its residual and the tolerance.
+        A condition is missed; the message names it, its residual and the tolerance.
 
     Examples
     --------
@@ -233,42 +208,35 @@ def verify_inclusion(
     >>> from gains.formation.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
     >>> chain, gains = FormationModel((-1, 0, 1), axes=1), ([[-3]], [[2]], [[1]])
     >>> K, K_expanded = chain.overlapping_gain(*gains), modified_gain(chain, expanded_gain(chain, *gains))
-    >>> verify_inclusion(expand(chain), chain.A, chain.B, K=K, K_expanded=K_expanded).gain_map
+    >>> verify_inclusion(expand(chain), chain.A, chain.B, K=K, K_expanded=K_expanded)
     0.0
     """
     V, U, R, Q = expansion.V, expansion.U, expansion.R, expansion.Q
     A_, B_, K_, K_e = csr_array(A), csr_array(B), csr_array(K), csr_array(K_expanded)
-    type_a = expansion.restriction == "a"
-    contraction = _largest(Q @ K_e @ V - K_)
-    residuals = InclusionResiduals(
-        state_inverse=_largest(U @ V - csr_array(np.eye(V.shape[1]))),
-        input_inverse=_largest(Q @ R - csr_array(np.eye(R.shape[1]))),
-        state_map=_largest(expansion.A @ V - V @ A_),
-        input_map=_largest(expansion.B @ R - V @ B_ if type_a else expansion.B - V @ B_ @ Q),
-        gain_map=_largest(K_e @ V - R @ K_) if type_a else contraction,
-        contraction=contraction,
-    )
     conditions = {
-        "state_inverse": "UV = I",
-        "input_inverse": "QR = I",
-        "state_map": "A~V = VA",
-        "input_map": "B~R = VB" if type_a else "B~ = VBQ",
-        "gain_map": "K~V = RK (do all copies of an input get the same command?)",
-        "contraction": "K = QK~V",
+        "UV = I": U @ V - csr_array(np.eye(V.shape[1])),
+        "QR = I": Q @ R - csr_array(np.eye(R.shape[1])),
+        "A~V = VA": expansion.A @ V - V @ A_,
+        "K = QK~V": Q @ K_e @ V - K_,
     }
+    if expansion.restriction == "a":
+        conditions["B~R = VB"] = expansion.B @ R - V @ B_
+        conditions["K~V = RK (do all copies of an input get the same command?)"] = K_e @ V - R @ K_
+    else:
+        conditions["B~ = VBQ"] = expansion.B - V @ B_ @ Q
     allowed = tolerance * max(1.0, _largest(A_), _largest(B_), _largest(K_e))
-    for field in fields(residuals):
-        residual = getattr(residuals, field.name)
+    residuals = {condition: _largest(missed) for condition, missed in conditions.items()}
+    for condition, residual in residuals.items():
         if not residual <= allowed:
             raise BadModelError(
-                f"the inclusion misses {conditions[field.name]} by {residual:.3g}; wanted at most {allowed:.3g} "
+                f"the inclusion misses {condition} by {residual:.3g}; wanted at most {allowed:.3g} "
                 f"(restriction type {expansion.restriction})"
             )
-    return residuals
+    return max(residuals.values())
 
 
 def _copied_blocks(formation: FormationModel) -> tuple[list[int], list[int]]:
-    """Block index of the original state and input that each block of the expanded state and input is a copy of."""
+    """The index of the original block that each block of the expanded state, and of the expanded input, copies."""
     states, inputs = [0], [0]
     for i in formation.followers:
         front = formation.predecessors[i]
@@ -285,7 +253,7 @@ def _selection(source_blocks: list[int], columns: int, n: int) -> Sparse:
 
 
 def _mean_of_copies(copies: Sparse) -> Sparse:
-    """(V'V)^{-1} V' of a selection matrix; V'V is diagonal and counts the copies."""
+    """(V'V)^{-1} V' of a selection matrix V; V'V is diagonal and counts the copies."""
     counts = np.asarray(copies.sum(axis=0)).ravel()
     return csr_array(copies.T.multiply(1.0 / counts[:, None]))
 

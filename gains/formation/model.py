@@ -32,16 +32,16 @@ class FormationModel:
     Parameters
     ----------
     predecessors
-        For each vehicle the index of the one it follows, −1 for the leader. Any sequence or integer array. A vehicle
-        comes after the one it follows, so the leader comes first.
+        For each vehicle the index of the one it follows, −1 for the leader. Every vehicle comes after the one it
+        follows, so the leader comes first.
     axes
         Number of controlled axes, 2 for north and east.
 
     Raises
     ------
     BadModelError
-        If the sequence is empty, is not of whole numbers, has no leader or more than one, or names a vehicle that does
-        not come earlier.
+        The sequence is empty, not of whole numbers, has no leader or more than one, or names a vehicle that does not
+        come earlier.
 
     Examples
     --------
@@ -88,7 +88,7 @@ class FormationModel:
 
     @property
     def depth(self) -> int:
-        """Number of followers on the longest way from the leader to a last vehicle."""
+        """Number of followers on the longest path from the leader."""
         depths = [0]
         for i in self.followers:
             depths.append(depths[self.predecessors[i]] + 1)
@@ -147,13 +147,8 @@ class FormationModel:
         Parameters
         ----------
         K1, K2, K3
-            Gains on the own velocity error (1/s), the velocity error of the vehicle in front (1/s) and the spacing
-            error (1/s²), each of shape (axes, axes).
-
-        Raises
-        ------
-        BadModelError
-            If a gain is not finite or not of that shape.
+            Gains on the vehicle's own velocity error (1/s), the velocity error of the vehicle in front (1/s) and the
+            spacing error (1/s²), each a finite matrix of shape (axes, axes); else BadModelError.
         """
         own, front, spacing = (
             checked_gain(name, gain, self.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
@@ -167,7 +162,7 @@ class FormationModel:
         return K
 
     def ground_loop(self, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return (A0, A1) of e'(t) = A0 e(t) + A1 e(t − τ) when a ground station closes every loop.
+        """(A0, A1) of e'(t) = A0 e(t) + A1 e(t − τ) if a ground station closes every loop.
 
         All feedback is late: A0 = A, A1 = B K, both (states, states). Arguments as of `overlapping_gain`.
         """
@@ -187,7 +182,7 @@ class FormationModel:
 
 
 def checked_gain(name: str, gain: ArrayLike, axes: int) -> FloatArray:
-    """Return the gain as a finite float array of shape (axes, axes), or raise BadModelError naming it."""
+    """The gain as a finite array of shape (axes, axes), or BadModelError with its name."""
     try:
         array = np.array(gain, dtype=float)
     except (TypeError, ValueError) as error:

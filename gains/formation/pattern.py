@@ -1,10 +1,10 @@
 """Who may use whose output: information patterns of a decentralised static feedback u = K y, y = C x.
 
-A pattern is a binary block matrix; its block (i, j) is 1 where the output of vehicle j may be used in the input of
-vehicle i. The gain may have any entries in these blocks and has zeros elsewhere. A leader-follower tree, bidirectional
-coupling and vehicles with several predecessors are all patterns.
+A pattern is a binary block matrix: block (i, j) is 1 where the input of vehicle i may use the output of vehicle j. The
+gain may have any entries in these blocks and is zero elsewhere. A leader-follower tree, bidirectional coupling and
+vehicles with several predecessors are all patterns.
 
-Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.6), and section 5, eqs. (5.1), (5.2).
+Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.6), and section 5.
 """
 
 from collections.abc import Iterable
@@ -23,23 +23,16 @@ Link = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """Linear plant x' = A x + B u, y = C x.
-
-    Attributes
-    ----------
-    A, B
-        Shapes (n, n) and (n, inputs).
-    C
-        Shape (outputs, n); the identity if not given.
+    """Linear plant x' = A x + B u, y = C x with A (n, n), B (n, inputs) and C (outputs, n), the identity if not given.
 
     Raises
     ------
     BadModelError
-        If a matrix is not finite and real or the shapes do not fit.
+        A matrix is not finite and real, or the shapes do not fit.
 
     Examples
     --------
-    Two integrators in a row of which the position is measured:
+    Two integrators in a row, of which the position is measured:
 
     >>> from gains.formation.pattern import Plant
     >>> plant = Plant([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
@@ -79,14 +72,14 @@ class Pattern:
     Attributes
     ----------
     blocks
-        Shape (vehicles with an input, vehicles with an output); True at (i, j) if y_j may be used in u_i.
+        Shape (vehicles with an input, vehicles with an output); True at (i, j) if u_i may use y_j.
     input_sizes, output_sizes
         Length of every u_i and y_j; they may differ from vehicle to vehicle.
 
     Raises
     ------
     BadModelError
-        If an entry is not 0 or 1, a size is not a positive whole number, or shape and sizes do not fit.
+        An entry is not 0 or 1, a size is not a positive whole number, or shape and sizes do not fit.
 
     Examples
     --------
@@ -145,7 +138,7 @@ class Pattern:
 def leader_follower(formation: FormationModel) -> Pattern:
     """The pattern (4.6): every vehicle uses its own output and that of the vehicle in front.
 
-    The output of the leader is its velocity error, of a follower its spacing and velocity errors: C = I.
+    C = I: the leader's output is its velocity error, a follower's its spacing and velocity errors.
 
     Examples
     --------
@@ -161,9 +154,7 @@ def leader_follower(formation: FormationModel) -> Pattern:
 
 
 def bidirectional(formation: FormationModel) -> Pattern:
-    """Every vehicle uses its own output, that of the vehicle in front and those of the vehicles behind it.
-
-    For a chain of three this is the pattern of section 5: vehicle 2 uses 1, 2, 3, vehicles 1 and 3 use 2.
+    """Every vehicle uses its own output and those of the vehicles in front and behind, as in section 5.
 
     Examples
     --------
@@ -190,12 +181,7 @@ def all_to_all(formation: FormationModel) -> Pattern:
 
 
 def with_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
-    """The pattern in which, for every (i, j) given, u_i may use y_j as well.
-
-    Raises
-    ------
-    BadModelError
-        If a link names a vehicle that is not in the pattern.
+    """The pattern with these links (i, j) added; BadModelError if one names a vehicle that is not in the pattern.
 
     Examples
     --------
@@ -210,7 +196,7 @@ def with_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
 
 
 def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
-    """The pattern in which, for every (i, j) given, u_i may not use y_j. Exceptions as of `with_links`.
+    """The pattern without these links (i, j). Exceptions as of `with_links`.
 
     Examples
     --------
@@ -236,32 +222,8 @@ def formation_plant(formation: FormationModel, C: ArrayLike | None = None) -> Pl
     return Plant(formation.A, formation.B, C)
 
 
-def split_own(pattern: Pattern, K: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """K as K_own + K_others: the blocks (i, i) and the rest, (5.1).
-
-    With own information at once and that of others late by τ the loop is, (5.2)::
-
-        x'(t) = (A + B K_own C) x(t) + B K_others C x(t − τ)
-
-    Raises
-    ------
-    BadModelError
-        If K does not have the pattern.
-
-    Examples
-    --------
-    >>> from gains.formation.pattern import Pattern, split_own
-    >>> own, others = split_own(Pattern([[1, 1], [1, 1]], (1, 1), (1, 1)), [[-2, 1], [1, -2]])
-    >>> own.tolist(), others.tolist()
-    ([[-2.0, 0.0], [0.0, -2.0]], [[0.0, 1.0], [1.0, 0.0]])
-    """
-    gain = checked_pattern_gain(pattern, K)
-    own = replace(pattern, blocks=np.eye(*pattern.blocks.shape, dtype=bool)).mask
-    return np.where(own, gain, 0.0), np.where(own, 0.0, gain)
-
-
 def checked_pattern_gain(pattern: Pattern, K: ArrayLike) -> FloatArray:
-    """K as a finite array of the pattern's shape and with zeros where the pattern has none, or BadModelError."""
+    """K as a finite array of the pattern's shape that is zero outside it, or BadModelError."""
     gain = real_matrix("K", K)
     mask = pattern.mask
     if gain.shape != mask.shape:
@@ -278,7 +240,7 @@ def checked_pattern_gain(pattern: Pattern, K: ArrayLike) -> FloatArray:
 
 
 def check_fits(plant: Plant, pattern: Pattern) -> None:
-    """Raise BadModelError unless the inputs and outputs of plant and pattern are equally many."""
+    """Raise BadModelError unless plant and pattern have as many inputs and outputs."""
     if (plant.B.shape[1], plant.C.shape[0]) != (pattern.inputs, pattern.outputs):
         raise BadModelError(
             f"the pattern has {pattern.inputs} inputs and {pattern.outputs} outputs; {plant.B.shape[1]} and "

@@ -1,9 +1,9 @@
-"""The delay margin of any linear loop that `gains.margin.model_file` describes: one record, with what confirms it.
+"""The delay margin of any linear loop that `gains.margin.model_file` reads, with what confirms it.
 
-Which analysis answers depends on the model: `gains.delay.constant` for one late part, `gains.delay._commensurate` for
-multiples of the unknown delay, `gains.delay._mixed` if there are known delays beside it, `gains.sampled.constant` for a
-held loop of known period, and `gains.sampled._period_windows` if the period is the unknown. `gains.margin.opinions`
-confirms what it can. The model is read by `gains.margin.model_file`; `gcs margin` prints the result.
+The analysis depends on the model: `gains.delay._commensurate` for multiples of the unknown delay, `gains.delay._mixed`
+if there are known delays beside it, `gains.sampled.constant` for a held loop of known period, and
+`gains.sampled._period` if the period is the unknown. `gains.margin.opinions` confirms what it can. `gcs margin` prints
+the result.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,22 +16,24 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
-from gains.delay._crossing_error import DelayedTerm, by_multiple, crossing_error
+from gains.delay._crossings import DelayedTerm, by_multiple, crossing_error
 from gains.delay.constant import Crossing, DelayAnalysis
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
 
-# multiples of the unknown up to this many times their common divisor
+# largest multiple of the unknown, in units of the common divisor of all
 _MOST_STEPS = 200
-# digits that are printed at most
+# most digits printed
 _DIGITS = 6
 # errors are estimated for the first crossings only: there may be thousands
 _ERRORS_OF = 100
-# the spectral radius is looked at this far beside the margin of a held loop, relative to it
+# the spectral radius is computed this far beside the margin of a held loop, relative to it,
 _BESIDE = 1e-4
-# and only of one-period maps up to this size, which take 0.2 s
+# for one-period maps up to this size, which take 0.2 s
 _LARGEST_MAP = 300
-# backward error of an eigenvalue of such a map, in units of n eps and its norm
+# an eigenvalue of such a map is known to this
+_ROUNDING = 1e-11
+# its backward error, in units of n eps and the norm of the map
 _BACKWARD = 10.0
 
 
@@ -39,9 +41,9 @@ _BACKWARD = 10.0
 class MarginCrossing:
     """Roots on the imaginary axis, or on the unit circle of a sampled loop, at one value of the unknown.
 
-    `delay_s` is that value, known to `delay_error_s` (nan where it was not estimated), and `direction` as of
-    `gains.delay.constant.Crossing`. `roots` and `repeats_every_s` are None where they are not told: of sampled loops,
-    and of a real root, which passes zero once.
+    `delay_s` is that value, known to `delay_error_s` (nan if not estimated); `direction` is as of
+    `gains.delay.constant.Crossing`. `roots` and `repeats_every_s` are None for sampled loops, and `repeats_every_s` for
+    a real root, which passes zero once.
     """
 
     omega_rad_s: float
@@ -63,11 +65,13 @@ class LoopMargin:
     stable_intervals_s
         The windows of stability, complete up to `complete_to_s`; the last may end at inf.
     delay_margin_s, delay_margin_error_s
-        The end of the window that begins at 0, or 0, and its estimated error.
-    unstable_roots_at_zero_delay, roots_fixed_at_zero
-        The number of roots right of the axis with the unknown at zero; of roots at 0 that nothing else here counts.
+        The end of the window that begins at 0, or 0 without one, and its estimated error.
+    unstable_roots_at_zero_delay
+        The number of roots right of the axis with the unknown at zero.
+    roots_fixed_at_zero
+        The number of roots that stay at 0 and are left out of all else.
     checked_by
-        The names of the methods that confirmed the windows.
+        The methods that confirmed the windows.
     """
 
     unknown: str
@@ -84,7 +88,7 @@ class LoopMargin:
 
 @dataclass(frozen=True)
 class LoopAtGivenDelays:
-    """A loop whose delays are all numbers: its rightmost root (1/s), and its unstable roots without any delay."""
+    """A loop whose delays are all known: its rightmost root (1/s), and its unstable roots without any delay."""
 
     rightmost_root: complex
     unstable_roots_at_zero_delay: int
@@ -119,7 +123,7 @@ def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays
 
 
 def as_known(value: float, error: float) -> str:
-    """A number with as many digits as its error leaves, six at most; the last digit is off by one at most.
+    """A number with the digits that its error leaves, six at most; the last one is off by at most one.
 
     Examples
     --------
@@ -194,7 +198,7 @@ def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
 
 
 def _with_unknown_period(model: HeldModel) -> LoopMargin:
-    from gains.sampled._period_windows import analyse_period
+    from gains.sampled._period import analyse_period
     from gains.sampled.constant import period_map
 
     def error_s(period_s: float) -> float:
@@ -220,7 +224,7 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
 
 
 def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
-    """The margin of the held loop as it is flown; windows beyond the first are not looked for."""
+    """The first window of the held loop as it is flown."""
     from gains.sampled.constant import period_map, sampled_delay_margin, spectral_radius
 
     loop = (model.A, model.B, model.K)
@@ -228,13 +232,14 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
     crossings: tuple[MarginCrossing, ...] = ()
     checks: tuple[str, ...] = ()
     if 0.0 < margin_s < inf and len(model.A) + model.B.shape[1] * (margin_s / period_s + 2.0) <= _LARGEST_MAP:
-        for delay_s in ((1.0 - _BESIDE) * margin_s, (1.0 + _BESIDE) * margin_s):
-            radius = spectral_radius(*loop, period_s=period_s, delay_s=delay_s)
-            if (radius < 1.0) != (delay_s < margin_s):
-                raise DisagreementError(
-                    f"the sampled delay margin is {margin_s} s at a period of {period_s} s, but the spectral radius of "
-                    f"the one-period map at {delay_s} s is {radius}"
-                )
+        delays_s = [(1.0 - _BESIDE) * margin_s, margin_s, (1.0 + _BESIDE) * margin_s]
+        before, at, after = (spectral_radius(*loop, period_s=period_s, delay_s=delay_s) for delay_s in delays_s)
+        # it may touch one at a whole period and be smaller on both sides
+        if before >= 1.0 or max(at, after) < 1.0 - _ROUNDING:
+            raise DisagreementError(
+                f"the sampled delay margin is {margin_s} s at a period of {period_s} s, but the spectral radius of the "
+                f"one-period map is {before} before it, {at} at it and {after} after it"
+            )
         checks = ("spectral radius",)
 
         def map_at(delay_s: float) -> FloatArray:

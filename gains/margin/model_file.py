@@ -1,14 +1,14 @@
-"""A linear loop with delays, as text: the JSON model that `gcs margin` reads.
+"""The JSON model of a linear loop with delays that `gcs margin` reads.
 
-Four forms::
+It has one of four forms::
 
     {"A0": [[..]], "A1": [[..]]}                                   x'(t) = A0 x(t) + A1 x(t - tau)
     {"terms": [{"A": [[..]], "delay": 0.1}, {"A": [[..]], "delay": "2*tau"}, ...]}   x'(t) = sum A x(t - delay)
     {"A": [[..]], "B": [[..]], "K": [[..]], "hold": true}          x' = A x + B u, u = K x sampled and held: any period
     {"A": [[..]], "B": [[..]], "K": [[..]], "hold": true, "period": 0.02}      the same every 0.02 s, tau late
 
-A delay is a number of seconds, a multiple of one unknown ("tau", "2*tau", "tau/3", "1.5*tau"), or their sum
-("0.1 + tau"). Multiples are taken as the decimal fractions they are written as, so "0.1*tau" is a tenth exactly.
+A delay is a number of seconds, a multiple of one unknown ("tau", "2*tau", "tau/3", "1.5*tau"), or a sum of both
+("0.1 + tau"). Multiples are exact decimal fractions: "0.1*tau" is exactly a tenth.
 """
 
 import json
@@ -29,15 +29,13 @@ _MULTIPLE = re.compile(
     rf"(?:\s*\*\s*(?P<after>{_NUMBER}))?(?:\s*/\s*(?P<divisor>{_NUMBER}))?"
 )
 _PLAIN = re.compile(_NUMBER)
-# not that of an exponent
+# a plus sign that is not part of an exponent
 _PLUS = re.compile(r"(?<![0-9.][eE])\+")
 _FORMS = (("A0", "A1"), ("terms",), ("A", "B", "K", "hold"), ("A", "B", "K", "hold", "period"))
 _DELAY_WANTED = 'a number of seconds >= 0 or a multiple of the unknown, as "tau" or "2*tau"'
-# products and squares of the matrices stay far from the largest number that there is
-_LARGEST = 1e30
-# and far from the least: a product of two, squared, is a normal number still
-_LEAST = 1e-60
-# a text longer than this in a message is cut
+# products and squares of entries up to this do not overflow, and the square of a product of two least ones is normal
+_LARGEST, _LEAST = 1e30, 1e-60
+# longer texts are cut in messages
 _SHOWN = 60
 
 
@@ -52,7 +50,7 @@ class Term:
 
 @dataclass(frozen=True)
 class DelayModel:
-    """x'(t) = sum of the terms; `unknown` is the name of the unknown delay, empty when all delays are numbers.
+    """x'(t) = sum of the terms; `unknown` is the name of the unknown delay, empty if all delays are numbers.
 
     Examples
     --------
@@ -71,9 +69,9 @@ class DelayModel:
 
 @dataclass(frozen=True)
 class HeldModel:
-    """x' = A x + B u with u = K x sampled and held. A (n, n), B (n, p), K (p, n).
+    """x' = A x + B u with u = K x sampled and held; A (n, n), B (n, p), K (p, n).
 
-    The unknown is the delay with which u acts if the period is known, else the period.
+    The unknown is the delay of u if the period is given, else the period.
 
     Examples
     --------
@@ -137,13 +135,13 @@ def _parsed(text: str) -> Any:
         raise BadModelError("read lists within lists too deep to follow, wanted a model") from None
     except BadModelError:
         raise
-    # numbers of thousands of digits, which Python refuses to convert
+    # Python refuses to convert numbers of thousands of digits
     except ValueError as error:
         raise BadModelError(f"{error}; wanted finite numbers") from None
 
 
 def _form(data: dict[str, Any]) -> tuple[str, ...]:
-    """The keys of the form that the data has; all of them are there, and no others."""
+    """The keys of the form that matches the data exactly."""
     known = {key for form in _FORMS for key in form}
     for key in data:
         if key not in known:
@@ -205,7 +203,6 @@ def _square(key: str, value: Any, size: int | None = None) -> FloatArray:
 
 
 def _matrix(key: str, value: Any) -> FloatArray:
-    """`value` as a matrix of finite numbers with at least one entry."""
     if not isinstance(value, list) or not value or not all(isinstance(row, list) for row in value):
         _bad(key, value, "a matrix as a list of rows, [[1, 2], [3, 4]]")
     lengths = {len(row) for row in value}
@@ -220,7 +217,7 @@ def _matrix(key: str, value: Any) -> FloatArray:
 
 
 def _finite(key: str, value: Any, wanted: str) -> float:
-    # True is an int to Python, not to a matrix
+    # True is an int in Python, but not a number in a model
     if isinstance(value, bool) or not isinstance(value, int | float):
         _bad(key, value, wanted)
     try:
@@ -228,7 +225,7 @@ def _finite(key: str, value: Any, wanted: str) -> float:
     except OverflowError:
         raise BadModelError(f"{key}: read a number of {len(str(value))} digits, wanted {wanted}") from None
     if not isfinite(number):
-        # Python reads NaN and Infinity, which are no JSON, and takes 1e999 for the latter
+        # Python reads NaN and Infinity, which are not JSON, and 1e999 as Infinity
         read = "NaN" if isnan(number) else "a number beyond 1e308"
         raise BadModelError(f"{key}: read {read}, wanted {wanted}")
     if abs(number) > _LARGEST:
@@ -239,7 +236,7 @@ def _finite(key: str, value: Any, wanted: str) -> float:
 
 
 def _delay(key: str, value: Any) -> tuple[float, Fraction, str]:
-    """Seconds, multiple and name of the unknown (empty without one)."""
+    """Seconds, multiple, and the name of the unknown (empty without one)."""
     if not isinstance(value, str):
         number = _finite(key, value, _DELAY_WANTED)
         if number < 0.0:

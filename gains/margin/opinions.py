@@ -1,11 +1,8 @@
 """Second opinions on an analysis of one unknown delay, and how many of its digits are known.
 
-The exact analysis is compared with a sweep along the unit circle (`gains.delay._commensurate.circle_sweep_margin`) and
-the rightmost root beside the ends of the windows, or, where a root at zero is left out, with a count of the roots by
-the argument principle. None of them shares algebra with it. A difference larger than rounding explains is an error.
-
-All methods in double precision blur a multiple root alike, however well they agree: an m-fold eigenvalue is known to
-eps^(1/m). The error of a crossing is therefore estimated from its own sensitivity, see `crossing_error`.
+The exact analysis is compared with a sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`) and with the
+rightmost root beside the ends of the windows or, where a root at zero is left out, with a root count by the argument
+principle. None of them shares algebra with it. A difference that rounding does not explain is an error.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,23 +15,23 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._crossing_error import DelayedTerm, by_multiple, crossing_error
+from gains.delay._crossings import DelayedTerm, by_multiple, crossing_error
 from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
 
-# a sweep of blocks of n states costs some n^3: these are 0.2 s, and 0.08 s one of 12 states
+# sum of n^3 over blocks of n states: a sweep takes 0.2 s here, and 0.08 s for one block of 12 states
 _SWEEP_BUDGET = 14_000
 # states times points of a discretised spectrum: 30 ms
 _SPECTRUM_BUDGET = 200
 # turns of the longest delay up to the highest frequency, for a count of roots: 0.1 s
 _COUNT_BUDGET = 1000.0
-# the spectrum is looked at this far inside and outside a window, relative to its end
+# the spectrum is computed this far inside and outside a window, relative to its end
 _BESIDE = 1e-4
-# where the loop is looked at below a margin that is asked for thoroughly, as fractions of it
+# a thorough check also looks at these fractions of a window
 _FRACTIONS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
-# two methods differ by less than this, relative, or than a few times the error of the crossing; a missed crossing is
-# off by far more
+# two methods agree if they differ by less than this (relative), or than so many errors of the crossing; a missed
+# crossing is off by far more
 _AGREEMENT, _ERRORS = 1e-6, 4.0
-# a rightmost root this close to the axis, relative to the norm, is not evidence for either side
+# a rightmost root this close to the axis, relative to the norm, decides nothing
 _UNDECIDED = 1e-9
 # least singular value of a characteristic matrix with rows of unit length, at a root
 _TOUCH = 1e-7
@@ -42,23 +39,17 @@ _TOUCH = 1e-7
 
 @dataclass(frozen=True)
 class Opinions:
-    """The names of the methods that confirmed an analysis, and the estimated error (s) of its margin: 0 if it is 0 or
-    without limit."""
+    """The methods that confirmed an analysis, and the estimated error (s) of its margin (0 if that is 0 or `inf`)."""
 
     checked_by: tuple[str, ...]
     margin_error_s: float
 
 
 def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
-    """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root at delays below and above
-    it.
+    """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root below and above it.
 
-    It is a hundred times slower: meant for a design that is to be flown, not for the inside of an optimisation.
-
-    Parameters
-    ----------
-    A0, A1
-        Real matrices (n, n), 1/s.
+    A hundred times slower: for a design that is to be flown, not for the inside of an optimisation. Arguments as of
+    `gains.delay.constant.delay_margin`.
 
     Raises
     ------
@@ -84,17 +75,10 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 def second_opinions(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], *, thorough: bool = False) -> Opinions:
     """Confirm an analysis of x'(t) = sum of the terms by the methods that take no more than a fraction of a second.
 
-    Parameters
-    ----------
-    thorough
-        Look at more delays, and however long it takes.
-
-    Raises
-    ------
-    DisagreementError
-        A method contradicts the analysis; the message says what each one found.
+    If `thorough`, more delays are checked, and by every method, however long it takes. Raises DisagreementError if a
+    method contradicts the analysis.
     """
-    error_s = margin_error_s(analysis, terms)
+    error_s = _margin_error_s(analysis, terms)
     checks: list[str] = []
     swept_s = _swept_margin(analysis, terms, thorough)
     if swept_s is not None and _agrees(analysis, swept_s, error_s, terms):
@@ -106,8 +90,8 @@ def second_opinions(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], *, th
     return Opinions(tuple(checks), error_s)
 
 
-def margin_error_s(analysis: DelayAnalysis, terms: Sequence[DelayedTerm]) -> float:
-    """The estimated error (s) of the margin: that of the crossing at which it ends."""
+def _margin_error_s(analysis: DelayAnalysis, terms: Sequence[DelayedTerm]) -> float:
+    """The estimated error (s) of the margin, which is that of the crossing at its end."""
     margin_s = analysis.delay_margin_s
     if margin_s == 0.0 or not isfinite(margin_s):
         return 0.0
@@ -116,10 +100,10 @@ def margin_error_s(analysis: DelayAnalysis, terms: Sequence[DelayedTerm]) -> flo
 
 
 def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thorough: bool) -> float | None:
-    """The margin that the sweep finds, None where it has nothing to say or would take long."""
-    from gains.delay._commensurate import circle_sweep_margin
+    """The margin that the sweep finds; None where it does not apply or would take long."""
+    from gains.delay.sweep import circle_sweep_margin
 
-    # a loop with roots on the axis at zero delay has no margin to a sweep, which judges zero delay by itself
+    # the sweep finds no margin for a loop with roots on the axis at zero delay, which it judges by eigenvalues
     on_axis = analysis.roots_fixed_at_zero > 0 or any(crossing.delay_s == 0.0 for crossing in analysis.crossings)
     if on_axis or any(term.known_s for term in terms):
         return None
@@ -131,11 +115,11 @@ def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thoroug
 
 
 def _agrees(analysis: DelayAnalysis, swept_s: float, error_s: float, terms: Sequence[DelayedTerm]) -> bool:
-    """True if the sweep found the same margin, False if it missed a root that is on the axis there; else an error."""
+    """Whether the sweep found the same margin; False if it missed a root that is on the axis there, else an error."""
     margin_s = analysis.delay_margin_s
     if margin_s == swept_s or abs(margin_s - swept_s) <= max(_AGREEMENT * margin_s, _ERRORS * error_s):
         return True
-    # a mere touch, or a motion that is slow beside others, is easily missed by a search
+    # a search easily misses a mere touch, or a motion that is slow beside others
     if margin_s < swept_s and any(_is_root(terms, c) for c in analysis.crossings if c.delay_s == margin_s):
         return False
     raise DisagreementError(f"the exact delay margin is {margin_s} s, the sweep says {swept_s} s")
@@ -153,7 +137,7 @@ def _is_root(terms: Sequence[DelayedTerm], crossing: Crossing) -> bool:
 def _confirmed_beside_windows(
     analysis: DelayAnalysis, terms: Sequence[DelayedTerm], error_s: float, thorough: bool
 ) -> bool:
-    """Compare the windows with the spectrum inside and beside them; False if no delay could be looked at."""
+    """Compare the windows with the spectrum inside and beside them; False if no delay could be checked."""
     rate = sum(float(np.linalg.norm(term.matrix)) for term in terms)
     looked_at = 0
     for tau_s, stable in _delays_to_look_at(analysis, rate, error_s, thorough):
@@ -169,9 +153,9 @@ def _confirmed_beside_windows(
 
 
 def _growth(pairs: Sequence[tuple[FloatArray, float]], rate: float, thorough: bool, *, leave_out_zero: bool) -> float:
-    """Real part (1/s) of the rightmost root, or, with a root at zero left out, a number of its sign.
+    """Real part (1/s) of the rightmost root or, with a root at zero left out, a number of its sign.
 
-    nan where it would take long, and where it is too close to tell.
+    nan where it would take long or is too close to tell.
     """
     longest_s = max(delay_s for _, delay_s in pairs)
     if leave_out_zero:
@@ -191,17 +175,17 @@ def _growth(pairs: Sequence[tuple[FloatArray, float]], rate: float, thorough: bo
     try:
         return rightmost_root(pairs).real
     except BadModelError:
-        # a delay so long that its discretisation would not fit
+        # the delay is too long for its discretisation
         return nan
 
 
 def _delays_to_look_at(
     analysis: DelayAnalysis, rate: float, error_s: float, thorough: bool
 ) -> Iterator[tuple[float, bool]]:
-    """A few delays with the verdict that the windows imply: beside the ends of the first windows, and inside."""
+    """Delays beside the ends of the first windows and inside them, each with the verdict that the windows imply."""
     windows = analysis.stable_intervals_s
     if not windows:
-        # a root on the axis may be taken for one on either side of it: the count must be of roots off the axis
+        # rounding may take a root on the axis to either side: only roots off the axis count
         if analysis.unstable_roots_at_zero_delay > 0 and rate > 0.0:
             yield 0.0, False
         return

@@ -7,13 +7,13 @@ w'w ≤ α² E'W'W E (3.25-3.29). Every follower has the same subsystem, so noth
 Source: Sahoo 2012 (see `gains.formation.model`), eqs. (3.20)-(3.29).
 """
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._semidefinite import SolverFacts, negative, solved
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError, SolverError
 from gains.formation.model import FormationModel
@@ -22,26 +22,6 @@ from gains.formation.model import FormationModel
 # 6×6 eigenvalue problem, and far below what any figure shown to a user resolves.
 _LEVEL_STEP = 1e-10
 _LEVEL_ROUNDS = 60
-# With Clarabel's own 1e-8 and longest step the larger problems (axes = 2, bounds of 300) end "optimal_inaccurate" now
-# and then. What the solver reaches is checked afterwards by eigenvalues in any case.
-_CLARABEL = {"tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-7, "max_step_fraction": 0.9}
-
-
-@dataclass(frozen=True)
-class SolverFacts:
-    """What the solver did: enough to repeat the run and to see that it ended well.
-
-    `variables` and `constraints` count the scalars of the problem as modelled.
-    """
-
-    name: str
-    version: str
-    modelling_version: str
-    status: str
-    seconds: float
-    iterations: int
-    variables: int
-    constraints: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,39 +193,6 @@ def _checked_weight(W: ArrayLike | None, m: int) -> FloatArray:
     if not np.isfinite(weight).all():
         raise BadModelError("W is not finite; wanted finite weights")
     return weight
-
-
-def negative(matrix: Any, slack: Any) -> Any:
-    """Constraint matrix ⪯ −slack, averaged with the transpose, as cvxpy cannot see that it is symmetric."""
-    return (matrix + matrix.T) / 2 + slack << 0
-
-
-def solved(problem: Any, *, advice: str) -> SolverFacts:
-    """Solve with Clarabel and return the facts; every status but "optimal" is an error."""
-    from importlib.metadata import version
-
-    import cvxpy as cp
-
-    try:
-        # cvxpy warns of an inaccurate solution; here that is an error, raised below.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            problem.solve(solver=cp.CLARABEL, **_CLARABEL)
-    except cp.SolverError as error:
-        raise SolverError(f"Clarabel stopped: {error}; {advice}") from error
-    if problem.status != cp.OPTIMAL:
-        raise SolverError(f"Clarabel ended with status {problem.status!r}; wanted 'optimal': {advice}")
-    stats = problem.solver_stats
-    return SolverFacts(
-        name="Clarabel",
-        version=version("clarabel"),
-        modelling_version=f"cvxpy {version('cvxpy')}",
-        status=str(problem.status),
-        seconds=float(stats.solve_time),
-        iterations=int(stats.num_iters),
-        variables=int(problem.size_metrics.num_scalar_variables),
-        constraints=sum(int(constraint.size) for constraint in problem.constraints),
-    )
 
 
 def _checked_certificate(A: FloatArray, W: FloatArray, alpha: float, P: FloatArray, solver: SolverFacts) -> Certificate:

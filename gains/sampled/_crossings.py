@@ -6,32 +6,38 @@ tau = (q + m) T, q whole and 0 <= m < 1, exactly when z^{q+1} is an eigenvalue o
     H_m(z) = K (z I - Phi)^{-1} (G0(m) z + G1(m)).
 
 The moduli of the eigenvalues of H_m do not depend on q: for each m there are finitely many angles phi at which one of
-them is one, whatever the delay. These angles, and with them the delays at which a crossing is possible, change little
-over one period, so the angles at a few m lead to every crossing; no march through the delays is needed. For one input
-the angles are eigenvalues of a Hamiltonian matrix and none is missed; otherwise they come from a refined sweep.
+them is one. These angles, and the delays that belong to them, change little within a period, so the angles at a few m
+lead to every crossing without a march through the delays. For one input the angles come from the eigenvalues of a
+Hamiltonian matrix and none is missed; for several, from a refined sweep.
 """
 
 from math import ceil, floor, inf, pi
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._crossings import separating_points
-from gains.delay._loci import Loci, delay_loci, solved_beside_poles, unit_crossings
-from gains.delay.sweep import near_unit_extrema, sweep_frequencies
+from gains.delay._loci import Loci, delay_loci, near_unit_extrema, solved_beside_poles, unit_crossings
+from gains.delay.sweep import sweep_frequencies
 from gains.sampled._loop import SampledPlant, block_radius, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
 _FRACTIONS = 8
 _REFINEMENTS = (1, 4, 16)
-# the check by the eigenvalues of the one-period map is left out for maps larger than this: 20 ms and more each
+# one-period maps larger than this are not checked by eigenvalues: each takes 20 ms and more
 _LARGEST_CHECK = 120
-# where the check is made, as fractions of the margin: the radius moves by a part in 10^6 or so, its error is 10^-12
+# where the check is made, as fractions of the margin: the radius moves by a part in 10^6 or so, its error is 1e-12
 _BELOW, _ABOVE = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0 - 1e-6), 1.0 + 1e-6
+# a radius this near to one is no evidence: at a whole period it may pass one with no slope
+_AT_ONE = 1e-11
 # |H(-1)| below this at all fractions of a period cannot reach one in between
 _FAR_FROM_ONE = 0.5
+# a residual this small beside its terms is rounding, and a delay this close to another (in periods) the same
+_ROUNDING, _SAME_PLACE = 1e-11, 1e-6
 
 
 def block_delay_margin(plant: SampledPlant) -> float:
@@ -47,7 +53,7 @@ def block_delay_margin(plant: SampledPlant) -> float:
     if plant.B.shape[1] == 0:
         return inf
     contradiction = ""
-    # at periods near the limit of the loop, angles may appear and vanish between two fractions: look closer then
+    # at periods near the limit of the loop, angles may appear and vanish between two fractions: refine then
     for refinement in _REFINEMENTS:
         off_axis_s = _least_delay_off_the_real_axis(plant, refinement)
         margin_s = min(off_axis_s, _least_delay_at_minus_one(plant, refinement))
@@ -63,7 +69,7 @@ def _least_delay_off_the_real_axis(plant: SampledPlant, refinement: int) -> floa
     for delay_s, angle in sorted(_starts(plant, refinement)):
         if delay_s > best_s + 2.0 * plant.period_s:
             break
-        refined_s = _newton(plant, delay_s, angle)
+        refined_s = _refined(plant, delay_s, angle)
         if 0.0 <= refined_s < best_s:
             best_s = refined_s
     return best_s
@@ -187,40 +193,63 @@ def _sweep_points(plant: SampledPlant, loci: Loci) -> FloatArray:
     return np.union1d(omega, near_unit_extrema(loci, omega))
 
 
-def _newton(plant: SampledPlant, delay_s: float, angle: float) -> float:
-    """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by.
+def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
+    """`_newton` and what it misses at whole periods, where the residual has a kink, and perhaps one slope only.
 
-    Newton's method for u*M(phi, tau)v = 0 with the singular vectors of the least singular value of
-    M = z^{q+1} (z I - Phi) - (G0 z + G1) K, whose derivative by tau is (z - 1) e^{A (T - e)} B K.
+    A start there that is a solution stays one, wherever a step from it leads. From one that nearly is a solution,
+    steps begin on both sides.
     """
-    n, period_s = plant.A.shape[0], plant.period_s
-    identity = np.eye(n)
+    found_s, beside_s = _newton(plant, delay_s, angle), _SAME_PLACE * plant.period_s
+    from_whole_s = abs(delay_s - round(delay_s / plant.period_s) * plant.period_s)
+    if abs(found_s - delay_s) < beside_s or from_whole_s > beside_s:
+        return found_s
+    residual, terms, _ = _residual(plant, delay_s, angle)
+    relative = residual / sum(float(np.linalg.norm(term)) for term in terms)
+    if _ROUNDING < relative < _SAME_PLACE and np.isnan(found_s):
+        return float(np.fmin(*(_newton(plant, start_s, angle) for start_s in (delay_s - beside_s, delay_s + beside_s))))
+    return delay_s if relative <= _ROUNDING else found_s
+
+
+def _newton(plant: SampledPlant, delay_s: float, angle: float) -> float:
+    """The delay near `delay_s` at which e^{j phi}, phi near `angle`, is an eigenvalue; nan if there is none near by."""
     start_s, previous = delay_s, inf
     for _ in range(30):
-        whole, rest_s = split_delay(max(delay_s, 0.0), period_s) if delay_s >= 0.0 else (-1, delay_s + period_s)
-        states, hold = plant.transition(np.array([period_s, period_s - rest_s]))
-        Phi, newer, older = states[0], hold[1] @ plant.K, (hold[0] - hold[1]) @ plant.K
-        z = np.exp(1j * angle)
-        turned = z ** (whole + 1)
-        U, singular, Vh = np.linalg.svd(turned * (z * identity - Phi) - newer * z - older)
-        u, v = U[:, -1].conj(), Vh[-1].conj()
-        by_z = (whole + 1) * turned / z * (z * identity - Phi) + turned * identity - newer
-        by_angle = 1j * z * complex(u @ by_z @ v)
-        by_delay = (z - 1.0) * complex(u @ states[1] @ plant.B @ (plant.K @ v))
+        residual, _, (by_angle, by_delay) = _residual(plant, delay_s, angle)
         determinant = by_angle.real * by_delay.imag - by_angle.imag * by_delay.real
         if determinant == 0.0:
             return np.nan
-        step_angle = -float(singular[-1]) * by_delay.imag / determinant
-        step_s = float(singular[-1]) * by_angle.imag / determinant
+        step_angle = -residual * by_delay.imag / determinant
+        step_s = residual * by_angle.imag / determinant
         angle, delay_s = angle + step_angle, delay_s + step_s
-        if not (0.0 < angle < pi and abs(delay_s - start_s) < 2.0 * period_s and delay_s > -period_s):
+        if not (0.0 < angle < pi and abs(delay_s - start_s) < 2.0 * plant.period_s and delay_s > -plant.period_s):
             return np.nan
-        size = abs(step_angle) / angle + abs(step_s) / period_s
+        step = abs(step_angle) / angle + abs(step_s) / plant.period_s
         # rounding stops the steps from shrinking near 1e-13; larger steps that do not shrink lead nowhere
-        if size < 1e-14 or (size < 1e-9 and size >= 0.5 * previous):
+        if step < 1e-14 or (step < 1e-9 and step >= 0.5 * previous):
             return delay_s
-        previous = size
+        previous = step
     return np.nan
+
+
+def _residual(
+    plant: SampledPlant, delay_s: float, angle: float
+) -> tuple[float, tuple[NDArray[Any], ...], tuple[complex, complex]]:
+    """The least singular value of M = z^{q+1} (z I - Phi) - (G0 z + G1) K, the terms of M, and its derivatives.
+
+    With its singular vectors u, v those of u*M v by phi and tau; dM / dtau = (z - 1) e^{A (T - e)} B K.
+    """
+    period_s = plant.period_s
+    whole, rest_s = split_delay(delay_s, period_s) if delay_s >= 0.0 else (-1, delay_s + period_s)
+    states, hold = plant.transition(np.array([period_s, period_s - rest_s]))
+    newer, older = hold[1] @ plant.K, (hold[0] - hold[1]) @ plant.K
+    z = np.exp(1j * angle)
+    turned = z ** (whole + 1)
+    free = z * np.eye(plant.A.shape[0]) - states[0]
+    U, singular, Vh = np.linalg.svd(turned * free - newer * z - older)
+    u, v = U[:, -1].conj(), Vh[-1].conj()
+    by_z = (whole + 1) * turned / z * free + turned * np.eye(len(free)) - newer
+    by_delay = (z - 1.0) * complex(u @ states[1] @ plant.B @ (plant.K @ v))
+    return float(singular[-1]), (free, newer, older), (1j * z * complex(u @ by_z @ v), by_delay)
 
 
 def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
@@ -240,6 +269,8 @@ def _least_delay_at_minus_one(plant: SampledPlant, refinement: int) -> float:
             return np.linalg.det(identity - sign * _loops_at_minus_one(plant, m))
 
         values = determinant(fractions)
+        # rounding must not hide a root at a whole period from the intervals on both sides of it
+        values[np.abs(values) < _ROUNDING] = 0.0
         at = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
         if at.size > 0:
             m = bracketed_roots(determinant, fractions[at], fractions[at + 1], values[at], values[at + 1])
@@ -258,14 +289,16 @@ def _contradiction(plant: SampledPlant, margin_s: float) -> str:
     known_s = margin_s if margin_s < inf else 5.0 * plant.period_s
     if plant.A.shape[0] + plant.B.shape[1] * (known_s / plant.period_s + 2.0) > _LARGEST_CHECK:
         return ""
-    checks = [(fraction * known_s, True) for fraction in _BELOW]
-    if margin_s < inf:
-        checks.append((_ABOVE * known_s, False))
-    for delay_s, stable in checks:
-        radius = block_radius(plant, delay_s)
-        if (radius < 1.0) != stable:
-            return (
-                f"the sampled delay margin is {margin_s} s at a period of {plant.period_s} s, but the spectral radius "
-                f"of the one-period map at {delay_s} s is {radius}"
-            )
-    return ""
+    radii = {fraction: block_radius(plant, fraction * known_s) for fraction in _BELOW}
+    wrong = next((fraction for fraction, radius in radii.items() if radius >= 1.0 + _AT_ONE), None)
+    if wrong is None and margin_s < inf:
+        radii[_ABOVE], least = block_radius(plant, _ABOVE * known_s), 1.0 - _AT_ONE
+        # it may touch one at a whole period and be smaller on both sides
+        if radii[_ABOVE] < least and block_radius(plant, known_s) < least:
+            wrong = _ABOVE
+    if wrong is None:
+        return ""
+    return (
+        f"the sampled delay margin is {margin_s} s at a period of {plant.period_s} s, but the spectral radius "
+        f"of the one-period map at {wrong * known_s} s is {radii[wrong]}"
+    )

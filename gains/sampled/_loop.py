@@ -10,7 +10,7 @@ from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, distinct_blocks
 from gains.delay._loci import factor_rank
 
-# a delay this close to a whole number of periods (in periods) is that number: (3 * 0.02) / 0.02 is not exactly 3
+# delays this close to a whole number of periods (in periods) count as it: (3 * 0.02) / 0.02 is not exactly 3
 _WHOLE = 1e-12
 
 
@@ -30,13 +30,13 @@ class SampledPlant(Protocol):
     def period_s(self) -> float: ...
 
     def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Maps over the last `duration_s` (k,) of a period: of the state (k, n, n), of an input held (k, n, r)."""
+        """Maps over the last `duration_s` (k,) of a period: of the state (k, n, n), of a held input (k, n, r)."""
         ...
 
 
 @dataclass(frozen=True)
 class HeldPlant:
-    """One strongly connected block of the loop: A (n, n), B (n, r), K (r, n) of full rank r, and the period in s."""
+    """One strongly connected block of the loop: A (n, n), B (n, r), K (r, n) of full rank r, and the period."""
 
     A: FloatArray
     B: FloatArray
@@ -59,14 +59,14 @@ class HeldPlant:
 def matrix_exponentials(exponents: FloatArray) -> FloatArray:
     """e^X for a stack of matrices (k, n, n), by a Taylor polynomial, scaling and squaring.
 
-    SciPy's `expm` takes a stack matrix by matrix, 60 us each; the margins need hundreds of small ones.
+    SciPy's `expm` takes 60 us for each matrix of a stack; the margins need hundreds of small ones.
     """
     norm = float(np.abs(exponents).sum(axis=-1).max(initial=0.0))
     squarings = max(0, int(np.ceil(np.log2(norm / 0.5)))) if norm > 0.0 else 0
     scaled = exponents / 2.0**squarings
     identity = np.eye(exponents.shape[-1])
     result = identity + scaled / 14.0
-    # Horner; the first term left out is 0.5^15 / 15! < 2e-17
+    # Horner's scheme; the first omitted term is 0.5^15 / 15! < 2e-17
     for degree in range(13, 0, -1):
         result = identity + scaled @ result / degree
     for _ in range(squarings):

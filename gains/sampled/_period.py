@@ -1,18 +1,27 @@
-"""The least period at which one block of the sampled and held loop of `gains.sampled.constant` loses stability."""
+"""All sampling periods at which the sampled and held loop is stable without further delay.
 
+A loop may be stable again at periods beyond its first limit, or need a long period in the first place (an oscillator
+pushed at the right instants). The march through the periods therefore goes on past the first limit, up to a horizon.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 from math import inf
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gains.core._bracketing import Functions, bracketed_roots, may_reach_zero, peaks
-from gains.core.arrays import FloatArray
-from gains.core.errors import GainsError
-from gains.delay._loci import factor_rank
-from gains.sampled._loop import HeldPlant
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.sampled._loop import HeldPlant, held_blocks
+from gains.sampled.constant import checked_loop
 
-# periods looked at in one go, and goes before giving up
-_CHUNK, _CHUNKS = 256, 200
-# growth of the period from one look to the next, and its largest step in periods of the fastest oscillation
+# windows are listed up to this many times the first limit; without a limit, of ten time constants
+_HORIZON = 20.0
+# periods in one step of the march, and in all: a march through very many oscillations of the plant stops there
+_CHUNK, _MOST_PERIODS = 256, 40_000
+# ratio of neighbouring periods, and their largest distance in periods of the plant's fastest oscillation
 _RATIO, _STEP = 1.03, 0.02
 # e^{A T} is zero to rounding where its slowest motion has decayed by e^-40, and hides the rest where one has grown by
 # e^30
@@ -21,58 +30,144 @@ _DECAYED, _GROWN = 40.0, 30.0
 _TOUCH = 1e-7
 
 
-def block_period_limit(A: FloatArray, BK: FloatArray) -> float:
-    """The least T (s) at which e^{A T} + int_0^T e^{A s} ds B K has spectral radius one.
+@dataclass(frozen=True)
+class PeriodCrossing:
+    """At the period `period_s` eigenvalues e^{+-j omega T} of the one-period map are on the unit circle.
 
-    0 if A + B K is not Hurwitz, `inf` if there is none.
+    `direction` is +1 when they leave the unit circle as the period grows, -1 when they enter it, 0 when they touch it
+    and return, as at a period in which an undamped plant turns once and no sample sees it move.
     """
-    loop_roots = np.linalg.eigvals(A + BK).astype(np.complex128)
-    if float(loop_roots.real.max()) >= 0.0:
-        return 0.0
-    if not BK.any():
-        return inf
-    plant = HeldPlant(A, *factor_rank(BK), period_s=1.0)
 
-    def log_radius(period_s: FloatArray) -> FloatArray:
-        states, hold = plant.transition(period_s)
-        return np.log(np.maximum(np.abs(np.linalg.eigvals(states + hold @ plant.K)).max(axis=1), 1e-300))
+    omega_rad_s: float
+    period_s: float
+    direction: int
 
-    # below this the held loop and the continuous one differ by less than the damping of any mode
-    start_s = 1e-3 * float((-loop_roots.real).min()) / (float(np.linalg.norm(A) + np.linalg.norm(BK)) ** 2)
-    end_s, decays = last_period(A)
-    for _ in range(_CHUNKS):
-        periods_s = next_periods(start_s, end_s, A)
-        periods_s, logs = with_peaks(log_radius, periods_s, log_radius(periods_s))
-        above = np.flatnonzero(logs >= 0.0)
-        if above.size > 0 and above[0] > 0:
-            i = above[:1]
-            return float(bracketed_roots(log_radius, periods_s[i - 1], periods_s[i], logs[i - 1], logs[i])[0])
-        if above.size > 0:
-            return start_s
-        start_s = float(periods_s[-1])
-        if start_s >= end_s:
-            break
-    if decays and start_s >= end_s:
-        return inf
-    raise GainsError(
-        f"the loop is stable up to a period of {start_s} s and no limit was found; is A meant to be that slow?"
+
+@dataclass(frozen=True)
+class PeriodAnalysis:
+    """Open windows of stable periods, complete up to `complete_to_s`, and where they begin and end.
+
+    `limit_s` is the end of the window that begins at 0, or 0 when none does. `unstable_roots_at_zero_period` counts
+    eigenvalues of A + B K with positive real part.
+    """
+
+    stable_intervals_s: tuple[tuple[float, float], ...]
+    limit_s: float
+    crossings: tuple[PeriodCrossing, ...]
+    unstable_roots_at_zero_period: int
+    complete_to_s: float
+
+
+def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
+    """Windows of the period of the loop x' = A x + B u, u = K x sampled and held.
+
+    Listed up to twenty times the first limit at least. Found by a march through the periods: a search, not a proof.
+    Arguments and exceptions as of `gains.sampled.constant.sampled_delay_margin`.
+
+    Examples
+    --------
+    x' = u, u = -x: x_{k+1} = (1 - T) x_k is stable up to T = 2, where it changes sign from sample to sample.
+
+    >>> from gains.sampled._period import analyse_period
+    >>> found = analyse_period([[0]], [[1]], [[-1]])
+    >>> round(found.limit_s, 6), [(round(c.omega_rad_s, 4), c.direction) for c in found.crossings]
+    (2.0, [(1.5708, 1)])
+    """
+    plant, entry, feedback = checked_loop(A, B, K)
+    loop_roots = np.linalg.eigvals(plant + entry @ feedback).astype(np.complex128)
+    blocks = held_blocks(plant, entry, feedback, period_s=1.0)
+    wanted_s, forgets = _horizon(plant, entry @ feedback, min(_first_limit(block) for block in blocks))
+    crossings: list[PeriodCrossing] = []
+    reached_s = wanted_s
+    for block in blocks:
+        steps = list(_marched(block, wanted_s))
+        crossings += [crossing for found, _ in steps for crossing in found]
+        reached_s = min(reached_s, steps[-1][1])
+    crossings = sorted((c for c in crossings if c.period_s < reached_s), key=lambda crossing: crossing.period_s)
+    # once e^{A T} has died out nothing depends on the period any more
+    end_s = inf if forgets and reached_s == wanted_s else reached_s
+    edges_s = [0.0, *(crossing.period_s for crossing in crossings), end_s]
+    windows = tuple(window for window in pairwise(edges_s) if _is_stable(blocks, window, reached_s))
+    return PeriodAnalysis(
+        stable_intervals_s=windows,
+        limit_s=next((end_s for start_s, end_s in windows if start_s == 0.0), 0.0),
+        crossings=tuple(crossings),
+        unstable_roots_at_zero_period=int(np.count_nonzero(loop_roots.real > 0.0)),
+        complete_to_s=end_s,
     )
 
 
-def last_period(A: FloatArray) -> tuple[float, bool]:
-    """The period (s) up to which a march says something, and whether all motions of the plant have died out there.
+def _first_limit(block: HeldPlant) -> float:
+    """The least period (s) at which the block loses stability; 0 if none is short enough, `inf` if none is found."""
+    if float(np.linalg.eigvals(block.A + block.B @ block.K).real.max()) >= 0.0:
+        return 0.0
+    return next((found[0].period_s for found, _ in _marched(block, _last_period(block.A)[0]) if found), inf)
 
-    From then on the loop no longer depends on the period.
-    """
+
+def _horizon(A: FloatArray, BK: FloatArray, limit_s: float) -> tuple[float, bool]:
+    """How far (s) to look, and whether e^{A T} has died out there."""
+    rate = float(np.linalg.norm(A) + np.linalg.norm(BK))
+    horizon_s = _HORIZON * (limit_s if 0.0 < limit_s < inf else 10.0 / rate if rate > 0.0 else 1.0)
+    last_s, decays = _last_period(A)
+    return (max(horizon_s, last_s), True) if decays else (min(horizon_s, last_s), False)
+
+
+def _last_period(A: FloatArray) -> tuple[float, bool]:
+    """The period (s) beyond which nothing new is seen, and whether all motions of the plant have died out there."""
     slowest = float(np.linalg.eigvals(A).real.max())
     if slowest == 0.0:
         return inf, False
     return (_DECAYED / -slowest, True) if slowest < 0.0 else (_GROWN / slowest, False)
 
 
-def next_periods(start_s: float, end_s: float, A: FloatArray) -> FloatArray:
-    """Ascending periods from `start_s`, geometric until the steps would skip an oscillation of the plant; to the end
-    or as many as are looked at in one go."""
+def _is_stable(blocks: list[HeldPlant], window: tuple[float, float], last_s: float) -> bool:
+    start_s, end_s = window[0], min(window[1], last_s)
+    middle = np.array([(start_s + end_s) / 2.0])
+    return end_s > start_s * (1.0 + 1e-12) and all(np.abs(_eigenvalues(block, middle)).max() < 1.0 for block in blocks)
+
+
+def _eigenvalues(block: HeldPlant, periods_s: FloatArray) -> ComplexArray:
+    """Those of the one-period map at each period (k,), shape (k, n)."""
+    states, hold = block.transition(periods_s)
+    return np.linalg.eigvals(states + hold @ block.K).astype(np.complex128)
+
+
+def _marched(block: HeldPlant, horizon_s: float) -> Iterator[tuple[list[PeriodCrossing], float]]:
+    """Crossings of one block's spectral radius through one, step by step, and how far (s) the march has come."""
+
+    def log_radius(periods_s: FloatArray) -> FloatArray:
+        return np.log(np.maximum(np.abs(_eigenvalues(block, periods_s)).max(axis=1), 1e-300))
+
+    def minus_log_radius(periods_s: FloatArray) -> FloatArray:
+        return -log_radius(periods_s)
+
+    def crossing(period_s: float, direction: int) -> PeriodCrossing:
+        [eigenvalues] = _eigenvalues(block, np.array([period_s]))
+        angle = abs(float(np.angle(eigenvalues[np.argmax(np.abs(eigenvalues))])))
+        return PeriodCrossing(angle / period_s, period_s, direction)
+
+    rate = float(np.linalg.norm(block.A) + np.linalg.norm(block.B @ block.K))
+    start_s, looked_at = 1e-5 / rate if rate > 0.0 else horizon_s, 0
+    while start_s < horizon_s and looked_at < _MOST_PERIODS:
+        periods_s = _next_periods(start_s, horizon_s, block.A)
+        looked_at, start_s = looked_at + periods_s.size, float(periods_s[-1])
+        periods_s, logs = _with_peaks(log_radius, periods_s, log_radius(periods_s))
+        # dips into stability between two looks
+        periods_s, negative = _with_peaks(minus_log_radius, periods_s, -logs)
+        touches_s, off = periods_s[negative == 0.0], negative != 0.0
+        periods_s, logs = periods_s[off], -negative[off]
+        at = np.flatnonzero(np.sign(logs[1:]) != np.sign(logs[:-1]))
+        roots_s = bracketed_roots(log_radius, periods_s[at], periods_s[at + 1], logs[at], logs[at + 1])
+        ways = np.sign(logs[at + 1]).astype(int).tolist()
+        found = [crossing(touch_s, 0) for touch_s in touches_s.tolist()]
+        found += [crossing(root_s, way) for root_s, way in zip(roots_s.tolist(), ways, strict=True)]
+        yield sorted(found, key=lambda each: each.period_s), min(start_s, horizon_s)
+    if looked_at == 0:
+        yield [], horizon_s
+
+
+def _next_periods(start_s: float, end_s: float, A: FloatArray) -> FloatArray:
+    """Ascending periods of one step of the march: geometric until they would skip an oscillation of the plant."""
     fastest = float(np.abs(np.linalg.eigvals(A).imag).max())
     largest_step_s = 2.0 * np.pi * _STEP / fastest if fastest > 0.0 else inf
     periods_s = [start_s]
@@ -81,10 +176,10 @@ def next_periods(start_s: float, end_s: float, A: FloatArray) -> FloatArray:
     return np.array(periods_s)
 
 
-def with_peaks(log_radius: Functions, periods_s: FloatArray, logs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The samples with those local maxima of the radius below one added that may reach it, located.
+def _with_peaks(log_radius: Functions, periods_s: FloatArray, logs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The samples, with those local maxima below zero located and added that may reach it.
 
-    One that comes as near to one as can be told has the logarithm zero: it touches.
+    A maximum as near to zero as can be told has the value zero: the radius touches one.
     """
     at = np.flatnonzero(may_reach_zero(periods_s, logs[:, np.newaxis]))
     if at.size == 0:

@@ -1,8 +1,7 @@
 """Vehicles that act on each other, block by block: the margin of each block and its growth at any loop delay.
 
-The states of a formation fall into blocks that do not act on those ahead of them: in a leader-follower tree every
-vehicle is a block of its own. The formation is stable exactly when every block is, each at its own loop delay, so the
-block with the least room (margin minus loop delay) is the one that breaks first.
+The states of a formation fall into blocks that do not act on the blocks ahead of them: in a leader-follower tree every
+vehicle is a block of its own. The formation is stable exactly when every block is, each at its own loop delay.
 
 The margins are those of `gains.sampled.multirate`, or of `gains.sampled.onboard` if the vehicles feed back their own
 errors. `gcs stress` flies formations to see whether these predictions hold.
@@ -38,7 +37,7 @@ class CoupledBlock:
 
     @property
     def has_late_terms(self) -> bool:
-        """Whether any feedback inside the block is late; in the onboard loop a vehicle on its own has none."""
+        """Whether any feedback inside the block is late; in the onboard loop a single vehicle has none."""
         return self.onboard is None or bool(self.onboard.late.any())
 
     def margin_s(self) -> float:
@@ -109,8 +108,7 @@ def coupled_blocks(
     system_ids
         One for each vehicle, in the order of `model`.
     timing, onboard
-        When the station samples and commands, and the timing of the onboard loop; without `onboard` the station closes
-        every loop.
+        The timing of the station and of the onboard loop; without `onboard` the station closes every loop.
 
     Examples
     --------

@@ -1,16 +1,16 @@
 """Telemetry at one rate, control at another: when samples are used, and the margin of the loop that results.
 
-The vehicle samples its state every `telemetry_s`, the station computes a command every `control_s` from the newest
+The vehicle samples its state every `telemetry_s`; the station computes a command every `control_s` from the newest
 sample that has arrived. Only the slower of the two counts: a command from a sample that was used before repeats what is
-already held, and a sample that is overtaken by a newer one is never used. Over a common period T of both, n commands
-act, n being the number of periods of the slower one in T:
+already held, and a sample that a newer one overtakes is never used. In a common period T of both, n commands act, where
+n is the number of slower periods in T:
 
-* The slower period is a whole multiple of the faster one, n = 1: every command is late by the same, and the loop is
-  that of `gains.sampled.constant` with the slower period.
-* Otherwise a command's loop delay is the least one plus 0, g, 2 g, ... (n - 1) g, in an order that the rates fix, with
-  g the faster period divided by n. The phase between vehicle and station, and how the delay is split between uplink and
-  downlink, only rotate this order. The least loop delay therefore determines the loop, and so does the mean one, which
-  is longer by (n - 1) g / 2 and changes less from rate to rate. *Loop delay* here is that mean, over the commands that
+* If the slower period is a whole multiple of the faster one, n = 1. Every command is late by the same time, and the
+  loop is that of `gains.sampled.constant` with the slower period.
+* Otherwise the commands are late by the least loop delay plus 0, g, 2 g, ..., (n - 1) g, in an order that the rates
+  fix; g is the faster period divided by n. The phase between vehicle and station, and the share of the uplink in the
+  delay, only rotate this order. The least loop delay therefore determines the loop. So does the mean one, which is
+  longer by (n - 1) g / 2 and changes less from rate to rate. *Loop delay* here is that mean, over the commands that
   are the first from their sample.
 """
 
@@ -24,7 +24,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core._bracketing import met_end
+from gains.core._bracketing import met_end, peaks
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.delay.constant import delay_margin
@@ -33,22 +33,21 @@ from gains.sampled.constant import checked_loop, growth_rate, sampled_delay_marg
 
 # instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
 _SAME_INSTANT = 1e-11
-# Periods of the slower one in a common period at most. Rates that have no such period take those nearest to them that
-# have one: over so many the phase of real ones creeps by less than a clock drifts within seconds.
+# Most slower periods in a common period. Rates without such a common period are replaced by the nearest that have one:
+# over so many periods the phase of the real ones creeps by less than a clock drifts within seconds.
 _MOST_COMMANDS = 20
-# delays looked at in the time of the slower period, in which no motion that it shows turns by more than half a circle,
-# or in that of the continuous margin
+# delays looked at in one slower period, in which no visible motion turns by more than half a circle, and in one
+# continuous margin; the longer step is taken
 _LOOKS, _LOOKS_MARGIN = 6, 40
 # the margin is searched up to this many continuous margins, and slower periods more
 _SEARCHED_MARGINS, _SEARCHED_PERIODS = 3.0, 10.0
-# Margins of more of the slower periods are those of one rate: measured, two parts in 10^4 at most are left to the order
-# of the loop delays, and the search, with eigenvalues of ever larger maps, would take minutes.
+# Longer margins, in slower periods, are computed as if there were one rate. By measurement the order of the loop delays
+# changes them by at most two parts in 10^4, and the search among ever larger maps would take minutes.
 _MOST_PERIODS = 30.0
 # the radius at a margin is this far below one at most
 _RESOLUTION = 1e-13
 # a local maximum of the radius is refined when its sample is above this
 _NEAR_ONE = 0.99
-_GOLDEN = (3.0 - 5.0**0.5) / 2.0
 
 
 @dataclass(frozen=True)
@@ -127,19 +126,7 @@ class Timing:
 
 
 class LiftedPlant(Protocol):
-    """The plant under held commands: linear, and the same in every common period.
-
-    Examples
-    --------
-    x' = u from 0 to 0.3 s and on to 0.5 s:
-
-    >>> import numpy as np
-    >>> from gains.sampled.multirate import LiftedPlant
-    >>> from gains.sampled._loop import HeldPlant
-    >>> plant: LiftedPlant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
-    >>> [part.ravel().round(6).tolist() for part in plant.between([0.0, 0.3, 0.5])]
-    [[1.0, 1.0], [0.3, 0.2]]
-    """
+    """The plant under held commands: linear, and the same in every common period."""
 
     @property
     def K(self) -> FloatArray: ...  # noqa: N802 - the source's letter
@@ -182,10 +169,10 @@ def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timi
 def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
     """The least (mean) loop delay (s) at which the loop loses stability; 0 if at once, `inf` if none is found.
 
-    If the slower period is a multiple of the faster one, the margin is that of `gains.sampled.constant`, exact; if the
-    margin is long against both, that of the slower period alone, see `hardly_sampled`. Otherwise the least loop delay
-    is raised in small steps and peaks are refined, up to three times the margin of the continuous loop plus ten of the
-    slower periods: a search, not a proof. Arguments as of `multirate_growth_rate`.
+    If the slower period is a multiple of the faster one, the margin is that of `gains.sampled.constant`, exact. If it
+    is longer than thirty slower periods, it is that of the slower period alone. Otherwise the least loop delay is
+    raised in small steps and peaks are refined, up to three times the margin of the continuous loop plus ten slower
+    periods: a search, not a proof. Arguments as of `multirate_growth_rate`.
 
     Raises
     ------
@@ -212,19 +199,7 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
 
 
 def multirate_map(plant: LiftedPlant, timing: Timing, *, delay_s: float) -> FloatArray:
-    """The matrix that takes (x, K x(sample -1), K x(sample -2), ...) one common period on.
-
-    Examples
-    --------
-    x' = u, u = -x, a sample and a command every 0.5 s that acts 0.25 s later:
-
-    >>> import numpy as np
-    >>> from gains.sampled.multirate import Timing, multirate_map
-    >>> from gains.sampled._loop import HeldPlant
-    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
-    >>> multirate_map(plant, Timing(0.5, 0.5), delay_s=0.25).round(6).tolist()
-    [[0.75, 0.25], [-1.0, 0.0]]
-    """
+    """The matrix that takes (x, K x(sample -1), K x(sample -2), ...) one common period on."""
     inputs, n = plant.K.shape
     common_s, count, least_s = timing.common_s, timing.commands, max(0.0, delay_s - timing.spread_s)
     earlier = count * (ceil(least_s / common_s) + 2)
@@ -247,50 +222,18 @@ def multirate_map(plant: LiftedPlant, timing: Timing, *, delay_s: float) -> Floa
 
 
 def lifted_growth(plants: Sequence[LiftedPlant], timing: Timing, *, delay_s: float) -> float:
-    """As `multirate_growth_rate`, of the blocks of a loop whose plants run in a common period.
-
-    Examples
-    --------
-    x' = u, u = -x, sampled every 0.5 s: x_{k+1} = 0.5 x_k.
-
-    >>> import numpy as np
-    >>> from gains.sampled.multirate import Timing, lifted_growth
-    >>> from gains.sampled._loop import HeldPlant
-    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=0.5)
-    >>> round(lifted_growth([plant], Timing(0.5, 0.5), delay_s=0.0), 6)
-    -1.386294
-    """
+    """`multirate_growth_rate` of a loop from its blocks, whose plants run in a common period."""
     radius = max(_radius(plant, timing, delay_s) for plant in plants)
     return float(np.log(radius)) / timing.common_s if radius > 0.0 else -inf
 
 
 def hardly_sampled(timing: Timing, *, near_s: float) -> bool:
-    """Whether a margin near this is so long against the periods that only the mean loop delay and the mean time for
-    which a command is held count.
-
-    Examples
-    --------
-    >>> from gains.sampled.multirate import Timing, hardly_sampled
-    >>> [hardly_sampled(Timing(0.02, 0.03), near_s=near_s) for near_s in (0.3, 3.0)]
-    [False, True]
-    """
+    """Whether a margin near this is so long that only the means count: of the loop delay, and of the time of a hold."""
     return _MOST_PERIODS * timing.held_s < near_s < inf
 
 
 def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: float) -> float:
-    """As `multirate_delay_margin`, likewise; `near_s` is the margin of the continuous loop.
-
-    Examples
-    --------
-    x' = u, u = -x, sampled every second:
-
-    >>> import numpy as np
-    >>> from gains.sampled.multirate import Timing, lifted_margin
-    >>> from gains.sampled._loop import HeldPlant
-    >>> plant = HeldPlant(np.zeros((1, 1)), np.ones((1, 1)), -np.ones((1, 1)), period_s=1.0)
-    >>> round(lifted_margin([plant], Timing(1.0, 1.0), near_s=np.pi / 2), 6)
-    1.0
-    """
+    """`multirate_delay_margin` from the blocks likewise; `near_s` is the margin of the continuous loop."""
     known_s = near_s if isfinite(near_s) else 0.0
     last_s = _SEARCHED_MARGINS * known_s + _SEARCHED_PERIODS * timing.held_s
     step_s = max(timing.held_s / _LOOKS, known_s / _LOOKS_MARGIN)
@@ -325,23 +268,12 @@ def _first_unstable(radius: Callable[[float], float], looks: list[float]) -> flo
             return _edge(radius, looks[i - 1], look) if i > 0 else 0.0
         # a peak between two looks
         if i > 1 and radii[i - 1] > _NEAR_ONE and radii[i - 2] < radii[i - 1] > radii[i]:
-            peak_s = _peak(radius, looks[i - 2], look)
+            [peak_s] = peaks(np.vectorize(radius, [float]), np.array(looks[i - 2 : i - 1]), np.array([look])).tolist()
             if radius(peak_s) >= 1.0:
                 return _edge(radius, looks[i - 2], peak_s)
     return inf
 
 
 def _edge(radius: Callable[[float], float], stable_s: float, unstable_s: float) -> float:
-    def excess(delay_s: float) -> float:
-        return 1.0 - radius(delay_s)
-
-    met, missed = ((delay_s, excess(delay_s)) for delay_s in (stable_s, unstable_s))
-    return met_end(excess, met, missed, resolution=_RESOLUTION)
-
-
-def _peak(radius: Callable[[float], float], begin_s: float, end_s: float) -> float:
-    """Place of the local maximum within a bracket, by golden section."""
-    for _ in range(30):
-        third, two_thirds = begin_s + _GOLDEN * (end_s - begin_s), end_s - _GOLDEN * (end_s - begin_s)
-        begin_s, end_s = (begin_s, two_thirds) if radius(third) > radius(two_thirds) else (third, end_s)
-    return (begin_s + end_s) / 2.0
+    met, missed = ((delay_s, 1.0 - radius(delay_s)) for delay_s in (stable_s, unstable_s))
+    return met_end(lambda delay_s: 1.0 - radius(delay_s), met, missed, resolution=_RESOLUTION)

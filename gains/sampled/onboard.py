@@ -1,21 +1,21 @@
 """The onboard loop as it is flown: each vehicle feeds back its own errors, a station those of others, late.
 
-Every vehicle uses its own errors at once, those of others tau late (Sahoo 2012, eqs. 5.1, 5.2)::
+Every vehicle uses its own errors at once and those of others tau late (Sahoo 2012, eqs. 5.1, 5.2)::
 
     x'(t) = (A + B K_own) x(t) + B K_others x(t - tau)
 
-In flight nothing of this is continuous. With the control period T of the station:
+In flight both parts are sampled and held. T is the control period of the station:
 
 * The vehicle computes its own part of the command `steps` times in T and holds it. It knows its velocity error at that
-  instant. Its spacing error comes from a sensor that looks at every `steps_per_sample`-th step; between two looks the
-  spacing is extrapolated with the relative velocity that the sensor saw.
-* The station computes its part from states that all vehicles sampled at one instant t_k = k T, with the first of the
-  vehicles' steps. It acts from t_k + tau on, at that very instant, and is held for T. With telemetry at another rate
-  than control T is the slower period, or the common one as `gains.sampled.multirate` has it.
+  instant. A sensor measures its spacing error at every `steps_per_sample`-th step; in between, the spacing is
+  extrapolated with the relative velocity of the last measurement.
+* The station computes its part from states that all vehicles sample at one instant t_k = k T, at the first of their
+  steps. It acts from t_k + tau on and is held for T. If telemetry has another rate than control, T is the slower
+  period, or the common period as in `gains.sampled.multirate`.
 
 Over one period T the local loop is therefore a linear map of the state alone, and the late part enters it as the
-command of a held loop enters a plant: everything that `_crossings` says of such loops holds here too. The vehicles are
-assumed to step together; clocks that differ by less than a step change the margin only to second order in the step.
+command of a held loop enters a plant, so `_crossings` applies here too. The vehicles are assumed to step together;
+clocks that differ by less than a step change the margin only to second order in the step.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ from gains.sampled._crossings import block_delay_margin
 from gains.sampled._loop import HeldPlant, block_radius, matrix_exponentials
 from gains.sampled.multirate import Timing, hardly_sampled, lifted_growth, lifted_margin
 
-# an instant this close to a step (in steps) is that of the step
+# instants this close to a step (in steps) coincide with it
 _SAME_INSTANT = 1e-9
 
 
@@ -51,9 +51,9 @@ class OnboardTiming:
     steps
         Steps of the vehicle's own loop in a control period.
     steps_per_sample
-        The sensor looks once in this many steps; a divisor of `steps`.
+        The sensor measures once in this many steps; a divisor of `steps`.
     telemetry_s
-        Period (s) of telemetry; that of the control if None.
+        Period (s) of telemetry; `control_s` if None.
 
     Examples
     --------
@@ -85,7 +85,7 @@ class OnboardTiming:
 
     @property
     def common(self) -> "OnboardTiming":
-        """The same over the common period of control and telemetry, as the period of both."""
+        """The same loop with the common period of control and telemetry as the period of both."""
         common_s = self.rates.common_s
         times = round(common_s / self.control_s)
         return OnboardTiming(common_s, self.steps * times, self.steps_per_sample)
@@ -93,9 +93,9 @@ class OnboardTiming:
 
 @dataclass(frozen=True, eq=False)
 class OnboardLoop:
-    """Matrices (n, n) of x' = A x + sensed x + known x + late x(t - tau), and when their parts act.
+    """Matrices (n, n) of x' = A x + sensed x + known x + late x(t - tau), and when each part acts.
 
-    `sensed` is B K_own on the spacing errors, `known` on the velocity errors, `late` is B K_others.
+    `sensed` is B K_own on the spacing errors, `known` is B K_own on the velocity errors, `late` is B K_others.
     """
 
     A: FloatArray
@@ -105,7 +105,7 @@ class OnboardLoop:
     timing: OnboardTiming
 
     def part(self, states: IntArray) -> "OnboardLoop":
-        """The loop of some of the states, those of vehicles that act on each other."""
+        """The loop of some of the states: those of vehicles that act on each other."""
         at = np.ix_(states, states)
         return OnboardLoop(self.A[at], self.sensed[at], self.known[at], self.late[at], self.timing)
 
@@ -139,11 +139,11 @@ class OnboardLoop:
         return float(np.log(radius)) / rates.held_s if radius > 0.0 else -inf
 
     def continuous_at_once(self) -> list[tuple[FloatArray, float]]:
-        """What is not late in the continuous model, each term with its delay (s): a hold counts as half a step."""
+        """The terms of the continuous model that are not late, with their delays (s): a hold counts as half a step."""
         return [(self.A, 0.0), (self.sensed + self.known, self.timing.control_s / self.timing.steps / 2.0)]
 
     def plants(self) -> "list[LocalPlant]":
-        """The blocks that have late terms of their own or none, one of each kind."""
+        """The distinct strongly connected blocks, with or without late terms."""
         plants: list[LocalPlant] = []
         for block in distinct_blocks(self.A, self.sensed, self.known, self.late):
             A, sensed, known, late = balanced(*block.matrices)
@@ -153,7 +153,7 @@ class OnboardLoop:
 
 @dataclass(frozen=True, eq=False)
 class LocalPlant:
-    """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`: only what is late is missing."""
+    """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`; the late part is its input."""
 
     free: FloatArray
     sensed: FloatArray
@@ -167,7 +167,7 @@ class LocalPlant:
 
     @property
     def A(self) -> FloatArray:  # noqa: N802 - the source's letter
-        """A + B K_own: what the sampled local loop comes close to."""
+        """A + B K_own, which the sampled local loop approximates."""
         return self.free + self.sensed + self.known
 
     @property
@@ -183,10 +183,10 @@ class LocalPlant:
         return factor_rank(self.late)
 
     def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The state at a period's end, of that `duration_s` earlier and of an input held since then.
+        """Maps to the state at a period's end: from the state `duration_s` earlier, and from an input held since.
 
-        Shapes (k, n, n) and (k, n, r) for k durations up to the period. The steps still to come answer to both. For a
-        whole period the first is the map of the local loop from its first step on, sensor and all.
+        Shapes (k, n, n) and (k, n, r) for k durations up to the period. Both include the responses of the steps in
+        between. For a whole period the first is the map of the local loop from its first step on, sensor included.
         """
         step_s = self.period_s / self.timing.steps
         begin = (self.period_s - duration_s) / step_s
@@ -198,10 +198,10 @@ class LocalPlant:
 
     @cached_property
     def _ends(self) -> tuple[FloatArray, FloatArray]:
-        """The state at the period's end, of the state just before each step and of an input held from then on.
+        """Maps to the state at the period's end: from the state just before each step, and from an input held since.
 
-        The last entries are those of the end itself. The state is all there is to remember before each step: what the
-        sensor saw at an earlier one is no answer to what comes in after that.
+        The last entries are those of the end itself. A map needs the state alone: what the sensor saw at an earlier
+        step does not depend on it.
         """
         n, steps = len(self.free), self.timing.steps
         step_s = self.period_s / steps
@@ -226,9 +226,9 @@ class LocalPlant:
 
 @dataclass(frozen=True, eq=False)
 class SteppedPlant:
-    """A local plant that can be looked at between its steps too, as a `gains.sampled.multirate.LiftedPlant`.
+    """A local plant between any instants, as a `gains.sampled.multirate.LiftedPlant`.
 
-    Its state is that of the block, what the sensor saw of it last, and what the vehicle itself adds to x'.
+    Its state is that of the block, the last sensor measurement of it, and what the vehicle itself adds to x'.
     """
 
     local: LocalPlant
@@ -239,7 +239,7 @@ class SteppedPlant:
         return np.hstack([K, np.zeros((len(K), 2 * K.shape[1]))])
 
     def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """From each of the instants of a period to the next: maps of the state, and of an input held since then."""
+        """As of the protocol."""
         local, step_s = self.local, self.local.period_s / self.local.timing.steps
         n, inputs = local.B.shape
         generator = np.zeros((3 * n + inputs, 3 * n + inputs))
@@ -256,7 +256,7 @@ class SteppedPlant:
         return every[:, : 3 * n, : 3 * n], every[:, : 3 * n, 3 * n :]
 
     def _step(self, number: int) -> FloatArray:
-        """What a step of the vehicle's loop does to the state and the input held."""
+        """The map of the state and the held input over one step of the vehicle's loop."""
         local, timing = self.local, self.local.timing
         n, inputs = local.B.shape
         age_steps = number % timing.steps_per_sample
@@ -276,7 +276,7 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
 
     Examples
     --------
-    A follower uses what is its own at once, and its leader needs nobody: no delay destabilises the pair.
+    A follower uses its own errors at once, and its leader needs nobody: no delay destabilises the pair.
 
     >>> import numpy as np
     >>> from gains.formation.model import FormationModel

@@ -1,7 +1,7 @@
 """Delays that vary: how large may tau(t) become in x'(t) = A0 x(t) + A1 x(t - tau(t))?
 
-No exact bound is known. `varying_delay_bound` proves a lower one: the loop is stable for every delay of the stated kind
-below it, and it never exceeds the margin for constant delays.
+No exact bound is known. `varying_delay_bound` proves a lower one: the loop is stable at every delay of the stated kind
+below it. It never exceeds the margin for constant delays.
 
 * |tau'| <= mu, 0 <= tau(t) <= h: a Lyapunov-Krasovskii functional and Wirtinger's inequality. A. Seuret and
   F. Gouaisbaut, "Wirtinger-based integral inequality: application to time-delay systems", Automatica 49(9), 2013,
@@ -9,8 +9,8 @@ below it, and it never exceeds the margin for constant delays.
 * Any variation at all: small gain on v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain from
   x' is at most h.
 
-Every Lyapunov functional found is checked by the eigenvalues of its matrices, see `gains.varying._lmi`. A delay that
-stays near its mean may be bounded higher by `gains.varying.jitter`.
+Every Lyapunov functional found is checked by eigenvalues (`gains.core._semidefinite`). For a delay that stays near its
+mean, `gains.varying.jitter` may prove more.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,12 +19,12 @@ from math import inf
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
 from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
-from gains.varying._lmi import Unknown, positive_definite_solution
 
 # bisection stops at this relative accuracy
 _ACCURACY = 1e-4
@@ -37,10 +37,10 @@ _LARGEST_BLOCK = 8
 def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     """A delay h (s) such that the loop is stable for every tau(t) in [0, h] with |tau'(t)| <= `rate`.
 
-    `rate` inf admits any variation, jumps included; the better of the functional without use of the rate and the small
-    gain is returned. `inf` when one functional proves stability whatever the length of the delay; 0 when the loop is
-    unstable without delay. The bound is the end of a bisection, so a functional for every delay below it is implied by
-    the one found at it. Finite bounds are not looked for beyond 1000 / (||A0|| + ||A1||).
+    An infinite `rate` admits any variation, jumps included; the result is then the better of a functional that does not
+    use the rate and the small gain. `inf` if one functional proves stability whatever the length of the delay, 0 if the
+    loop is unstable without delay. The functional found at the bound proves every shorter delay too. Finite bounds are
+    sought up to 1000 / (||A0|| + ||A1||).
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
 
 
 def _checked_blocks(A0: ArrayLike, A1: ArrayLike) -> list[tuple[FloatArray, FloatArray, float]]:
-    """The distinct blocks in their own unit of time, the third entry (1/s): the solver then sees numbers near one."""
+    """The distinct blocks, scaled by a unit of time of their own (third entry, 1/s) to numbers near one."""
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
     largest = max(len(block.indices) for block in blocks)
     if largest > _LARGEST_BLOCK:
@@ -84,7 +84,7 @@ def _checked_blocks(A0: ArrayLike, A1: ArrayLike) -> list[tuple[FloatArray, Floa
 
 
 def _upper_end(now: FloatArray, late: FloatArray) -> float:
-    """Where a bisection begins: the exact margin for constant delays, or a thousand time constants."""
+    """The upper end of a bisection: the exact margin for constant delays, or a thousand time constants."""
     return min(delay_margin(now, late), _LONGEST)
 
 

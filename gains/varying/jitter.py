@@ -1,8 +1,8 @@
 """The stability bound that covers the delay of a real link, be it constant, slowly varying or jumping.
 
 The margin for constant delays is exact but says nothing about a delay that varies; the bounds for varying delays are
-proved but lower. For an observed delay (mean, spread, rate of change) `bound_covering` tries the bounds from the least
-to the most demanding one and reports the first that covers the observation, with the others for comparison.
+proved but lower. For an observed delay (mean, spread, rate of change) `bound_covering` tries them from the least to the
+most demanding one and reports the first that covers the observation, with the others for comparison.
 """
 
 from collections.abc import Sequence
@@ -13,21 +13,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
 from gains.delay._loci import factor_rank, highest_frequency
 from gains.delay.constant import analyse_delay
-from gains.varying._lmi import Unknown, positive_definite_solution
 from gains.varying.bounds import varying_delay_bound
 
 Cover = Literal["constant", "rate", "spread", "any", "none"]
 
 # frequencies at which the scaling is chosen, and at which the gain is then read
 _FREQUENCIES_SCALING, _FREQUENCIES_GAIN = 60, 4000
-# bisection of the gain that a scaling can reach; the gain is read again afterwards, so this costs quality only
+# halvings in the bisection of the gain that a scaling reaches; the gain is read again afterwards, so few are enough
 _HALVINGS = 12
-# the gain is read on a grid: its peak may lie this much above, relative to it
+# the gain is read on a grid: its peak may be higher by this share
 _GRID_ERROR = 1e-3
 
 
@@ -35,8 +35,8 @@ _GRID_ERROR = 1e-3
 class Jitter:
     """An observed effective delay: `mean_s`, the largest distance `spread_s` from it, and the largest |d delay / dt|.
 
-    `rate` (s/s) is inf for a delay that jumps from message to message, as delays of queued datagrams do; a sampled and
-    held loop has a sawtooth of rate 1 and jumps. Values out of range are reported by the functions that take it.
+    `rate` (s/s) is inf for a delay that jumps from message to message, as those of queued datagrams do; a sampled and
+    held loop has a sawtooth of rate 1 with jumps. The functions that take a jitter report values out of range.
 
     Examples
     --------
@@ -68,8 +68,7 @@ class CoveringBound:
     largest_s
         The largest delay observed, mean + spread.
     constant_margin_s, rate_bound_s, spread_bound_s, any_bound_s
-        What each bound admits as largest delay; 0 where a bound does not apply: a rate that
-        is inf, a mean delay that is unstable itself.
+        The largest delay that each bound admits; 0 if it does not apply (an infinite rate, an unstable mean delay).
     """
 
     cover: Cover
@@ -80,19 +79,11 @@ class CoveringBound:
     spread_bound_s: float
     any_bound_s: float
 
-    @property
-    def is_covered(self) -> bool:
-        """Whether some bound proves the loop stable under the jitter."""
-        return self.cover != "none"
-
 
 def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBound:
     """The least demanding bound that proves x'(t) = A0 x(t) + A1 x(t - tau(t)) stable under `jitter`.
 
-    Parameters
-    ----------
-    A0, A1
-        Real matrices (n, n), 1/s; up to 8 states in a strongly connected block.
+    Arguments as of `gains.varying.bounds.varying_delay_bound`.
 
     Raises
     ------
@@ -201,7 +192,7 @@ def _is_inside(windows: tuple[tuple[float, float], ...], delay_s: float) -> bool
 
 
 def _first(jitter: Jitter, bounds: dict[Cover, float], windows: tuple[tuple[float, float], ...]) -> tuple[Cover, float]:
-    """The first cover, in the order of `bounds`, and the delay it admits."""
+    """The first cover, in the order of `bounds`, and the largest delay that it admits."""
     if jitter.spread_s == 0.0:
         for start_s, end_s in windows:
             if _is_inside(((start_s, end_s),), jitter.mean_s):
@@ -221,7 +212,7 @@ def _spread_admitted(A0: ArrayLike, A1: ArrayLike, mean_s: float, rate: float) -
 
 
 def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float) -> float:
-    """The reciprocal of the largest gain of the loop about the mean delay."""
+    """The reciprocal of the loop's largest gain about the mean delay."""
     now, late = matrices
     B, C = factor_rank(late)
     r = B.shape[1]
@@ -250,7 +241,7 @@ def _loop_gains(
 def _scaling(loops: ComplexArray) -> FloatArray:
     """D that makes the largest ||D G D^{-1}|| over the given loops nearly as small as possible."""
     r = loops.shape[1]
-    # a complex Hermitian matrix is positive definite when the real one of twice the size is
+    # a complex Hermitian matrix is positive definite if its real form of twice the size is
     real = np.concatenate(
         [np.concatenate([loops.real, -loops.imag], axis=2), np.concatenate([loops.imag, loops.real], axis=2)], axis=1
     )

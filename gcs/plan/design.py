@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field
 
+from gains.core._semidefinite import SolverFacts
 from gains.core.requirement import Requirement
-from gains.performance.robust import SolverFacts
 from gcs.published import Published
 
 Matrix = tuple[tuple[float, ...], ...]

@@ -105,8 +105,7 @@ def _inclusion() -> Iterator[Claim]:
     for restriction in ("a", "b"):
         expansion = expand(CHAIN, restriction)
         K_expanded = modified_gain(CHAIN, inclusion_gain(CHAIN, *gains))
-        residuals = verify_inclusion(expansion, CHAIN.A, CHAIN.B, K=K, K_expanded=K_expanded)
-        worst = max(worst, *(float(value) for value in vars(residuals).values()))
+        worst = max(worst, verify_inclusion(expansion, CHAIN.A, CHAIN.B, K=K, K_expanded=K_expanded))
         worst = max(worst, float(np.abs(contracted_gain(expansion, K_expanded) - K).max()))
     yield Claim(
         "(3.5)-(3.19)", "conditions of the inclusion, types (a) and (b), and the contracted gain", "hold",

@@ -9,11 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
-from gains.delay._commensurate import analyse_commensurate, circle_sweep_margin
-from gains.delay._crossing_error import DelayedTerm
+from gains.delay._commensurate import analyse_commensurate
+from gains.delay._crossings import DelayedTerm
 from gains.delay._mixed import analyse_mixed
 from gains.delay.constant import analyse_delay
 from gains.delay.rightmost import rightmost_root
+from gains.delay.sweep import circle_sweep_margin
 from tests.support.paths import DATA
 
 Matrix = NDArray[np.float64]

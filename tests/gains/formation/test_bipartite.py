@@ -157,7 +157,7 @@ def test_partitions_that_do_not_fit_are_refused_with_the_link() -> None:
         ((*graphs, Subgraph((2,), (2,))), r"link \(2, 2\) is in more than one"),
     ):
         with pytest.raises(BadModelError, match=message):
-            expanded_gain(pattern, Partition(subgraphs, "search", 1))
+            expanded_gain(pattern, Partition(subgraphs, 1))
 
 
 def test_loops_that_differ_are_refused() -> None:

@@ -17,10 +17,10 @@ from gains.formation.pattern import (
     checked_pattern_gain,
     formation_plant,
     leader_follower,
-    split_own,
     with_links,
     without_links,
 )
+from gains.sampled.onboard import own_part
 
 # The gains printed in chapter 5 of the source, with its slip in k33 ("0.5003") put right.
 K11 = np.array([[-18.0874, 0.0005], [0.0005, -18.0874]])
@@ -50,18 +50,18 @@ def test_chapter_5_pattern_of_three_vehicles_is_the_bidirectional_chain() -> Non
 def test_printed_gains_take_1_00796_s_with_own_feedback_at_once_and_0_077736_s_with_all_late() -> None:
     # both recomputed for this project by two methods; the source prints 0.19 s for the former, which no split gives
     plant = formation_plant(CHAIN)
-    own, others = split_own(bidirectional(CHAIN), PRINTED)
+    own = own_part(CHAIN, PRINTED)
+    others = PRINTED - own
     # the figures have 6 and 5 digits
     assert delay_margin(plant.closed_loop(own), plant.B @ others) == pytest.approx(1.00796, rel=5e-6)
     assert delay_margin(plant.A, plant.B @ PRINTED) == pytest.approx(0.077736, rel=1e-5)
 
 
-def test_split_gives_own_blocks_and_the_rest() -> None:
-    own, others = split_own(bidirectional(CHAIN), PRINTED)
-    assert np.array_equal(own + others, PRINTED)
+def test_own_part_is_the_blocks_on_the_diagonal() -> None:
+    own = own_part(CHAIN, PRINTED)
     assert np.array_equal(own[2:4, 2:6], K22)
     assert not own[2:4, :2].any()
-    assert not others[4:, 6:].any()
+    assert not (PRINTED - own)[4:, 6:].any()
 
 
 @given(trees())

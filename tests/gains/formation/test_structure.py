@@ -12,7 +12,6 @@ from gains.core.errors import BadModelError
 from gains.core.structure import (
     balanced,
     distinct_blocks,
-    project_out_equilibria,
     square_matrices,
     strongly_connected_blocks,
     without_equilibria,
@@ -80,7 +79,8 @@ def test_balancing_is_an_exact_similarity() -> None:
 
 def test_consensus_loses_its_common_value_only() -> None:
     laplacian = np.array([[2.0, -1.0, -1.0], [-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
-    A0, A1 = project_out_equilibria(np.zeros((3, 3)), -laplacian)
+    (A0, A1), gone = without_equilibria(np.zeros((3, 3)), -laplacian)
+    assert gone == 1
     assert not A0.any()
     # eigenvalues 0, 1, 3 of the Laplacian; 1e-14 is rounding
     assert np.sort(np.linalg.eigvals(-A1).real) == pytest.approx([1.0, 3.0], rel=1e-14)
@@ -90,7 +90,8 @@ def test_formation_at_constant_velocity_loses_position_and_velocity() -> None:
     laplacian = np.array([[1.0, -1.0], [-1.0, 1.0]])
     A0 = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(2))
     A1 = np.kron([[0.0, 0.0], [-1.0, -1.0]], laplacian)
-    reduced = project_out_equilibria(A0, A1)
+    reduced, gone = without_equilibria(A0, A1)
+    assert gone == 2
     # one relative motion is left: s^2 + 2 s + 2
     assert np.poly(reduced[0] + reduced[1]) == pytest.approx([1.0, 2.0, 2.0], rel=1e-14)
 
@@ -109,11 +110,6 @@ def test_formation_at_constant_velocity_loses_position_and_velocity() -> None:
 def test_wrong_matrices_are_named(matrices: dict[str, FloatArray], message: str) -> None:
     with pytest.raises(BadModelError, match=message):
         square_matrices(**matrices)
-
-
-def test_nothing_but_equilibria_is_an_error() -> None:
-    with pytest.raises(BadModelError, match="nothing but equilibria"):
-        project_out_equilibria(np.zeros((2, 2)), np.zeros((2, 2)))
 
 
 def test_equilibria_go_block_by_block_and_the_other_roots_stay() -> None:

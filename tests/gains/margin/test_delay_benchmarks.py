@@ -14,7 +14,7 @@ from gains.delay.constant import analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.delay.sweep import frequency_sweep_margin
 from gains.margin.opinions import checked_delay_margin
-from gains.sampled.constant import sampling_period_limit
+from gains.sampled._period import analyse_period
 from tests.support.paths import DATA
 
 BENCHMARKS: list[dict[str, Any]] = json.loads((DATA / "delay_benchmarks.json").read_text())
@@ -123,7 +123,7 @@ def test_rightmost_root_is_on_the_axis_at_the_critical_delays(entry: dict[str, A
 
 @of_kind("sampled_data_periodic")
 def test_largest_sampling_period(entry: dict[str, Any]) -> None:
-    assert sampling_period_limit(entry["A"], entry["B"], entry["K"]) == pytest.approx(
+    assert analyse_period(entry["A"], entry["B"], entry["K"]).limit_s == pytest.approx(
         entry["computed"][0], rel=RELATIVE
     )
     # the loop's constant-delay margin, quoted in the notes to 7 digits

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from gains.delay._commensurate import circle_sweep_margin
 from gains.delay.constant import analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
-from gains.delay.sweep import frequency_sweep_margin
+from gains.delay.sweep import circle_sweep_margin, frequency_sweep_margin
 from gains.margin.loop_margin import loop_margin
 from gains.margin.model_file import parse_model
 from gains.margin.opinions import checked_delay_margin

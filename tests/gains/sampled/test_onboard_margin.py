@@ -11,10 +11,9 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.delay.sweep import frequency_sweep_margin
 from gains.formation.model import FormationModel
-from gains.formation.pattern import bidirectional, split_own
 from gains.sampled._loop import lifted_map
 from gains.sampled.constant import growth_rate, sampled_delay_margin
-from gains.sampled.onboard import LocalPlant, OnboardLoop, OnboardTiming, onboard_loop
+from gains.sampled.onboard import LocalPlant, OnboardLoop, OnboardTiming, onboard_loop, own_part
 
 FINE = OnboardTiming(0.02, steps=2, steps_per_sample=1)
 CHAIN = FormationModel((-1, 0, 1), axes=1)
@@ -65,7 +64,8 @@ def marched(loop: OnboardLoop, delay_s: float, *, periods: int) -> FloatArray:
 
 def test_continuous_margin_of_the_printed_gains_is_that_of_the_erratum_in_two_ways() -> None:
     loop = onboard_loop(CHAIN, PRINTED, FINE)
-    own, others = split_own(bidirectional(CHAIN), PRINTED)
+    own = own_part(CHAIN, PRINTED)
+    others = PRINTED - own
     assert loop.continuous_margin_s() == pytest.approx(1.00796, rel=1e-3)  # which is with the off-diagonal entries
     assert frequency_sweep_margin(CHAIN.A + CHAIN.B @ own, CHAIN.B @ others) == pytest.approx(
         loop.continuous_margin_s(), rel=1e-9

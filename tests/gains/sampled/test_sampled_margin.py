@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from gains.delay.constant import delay_margin
-from gains.sampled.constant import sampled_delay_margin, sampling_period_limit, spectral_radius
+from gains.sampled._period import analyse_period
+from gains.sampled.constant import sampled_delay_margin, spectral_radius
 
 Matrix = NDArray[np.float64]
 Loop = tuple[Matrix, Matrix, Matrix]
@@ -85,6 +86,22 @@ def test_leader_limit_at_whole_periods_is_the_closed_form(whole: int) -> None:
     assert radius == pytest.approx(1.0, abs=1e-13)
 
 
+@pytest.mark.parametrize("period_s", [0.02, 0.1, 0.2, 0.37])
+@pytest.mark.parametrize("whole", range(1, 6))
+def test_a_margin_of_whole_periods_is_found(whole: int, period_s: float) -> None:
+    # the gain above; with one period, K T = 1, the radius leaves one without a slope, by (tau / T - 1)^2 / 2
+    k1 = 2.0 * np.sin(pi / (2.0 * (2.0 * whole + 1.0))) / period_s
+    margin_s = sampled_delay_margin([[0.0]], [[1.0]], [[-k1]], period_s=period_s)
+    assert margin_s == pytest.approx(whole * period_s, rel=1e-12)
+
+
+@pytest.mark.parametrize("share", [-1e-8, -1e-12, 1e-12, 1e-8])
+def test_a_margin_beside_a_whole_period_is_found(share: float) -> None:
+    # K T = 1 + share: with x = tau / T - 1 the radius is about 1 + share / 2 + x / 2 below T and + x^2 / 2 above
+    margin_s = sampled_delay_margin([[0.0]], [[1.0]], [[-5.0 * (1.0 + share)]], period_s=0.2)
+    assert margin_s == pytest.approx(0.2, rel=2e-4)
+
+
 def test_decoupled_axes_have_the_margin_of_one() -> None:
     A, B, K = (np.kron(matrix, np.eye(2)).astype(np.float64) for matrix in FOLLOWER)
     alone_s = sampled_delay_margin(*FOLLOWER, period_s=0.02)
@@ -143,18 +160,18 @@ def test_margin_scales_with_time() -> None:
 
 def test_period_limit_of_a_leader_is_two_over_its_gain() -> None:
     # x_{k+1} = (1 - k1 T) x_k
-    assert sampling_period_limit([[0.0]], [[1.0]], [[-4.0]]) == pytest.approx(0.5, rel=1e-12)
+    assert analyse_period([[0.0]], [[1.0]], [[-4.0]]).limit_s == pytest.approx(0.5, rel=1e-12)
 
 
 def test_period_limit_of_a_follower_is_the_closed_form() -> None:
     # e' = -v, v' = k3 e - k1 v held for T: Jury's criterion gives 1 - k1 T + k3 T^2 / 2 < 1 and 4 - 2 k1 T > 0
-    assert sampling_period_limit(*FOLLOWER) == pytest.approx(2.0, rel=1e-12)
-    assert sampling_period_limit(FOLLOWER[0], FOLLOWER[1], [[9.0, -1.0]]) == pytest.approx(2.0 / 9.0, rel=1e-12)
+    assert analyse_period(*FOLLOWER).limit_s == pytest.approx(2.0, rel=1e-12)
+    assert analyse_period(FOLLOWER[0], FOLLOWER[1], [[9.0, -1.0]]).limit_s == pytest.approx(2.0 / 9.0, rel=1e-12)
 
 
 def test_period_has_no_limit_where_the_plant_is_stable_and_the_gain_small() -> None:
-    assert sampling_period_limit([[-1.0]], [[1.0]], [[-0.5]]) == inf
+    assert analyse_period([[-1.0]], [[1.0]], [[-0.5]]).limit_s == inf
 
 
 def test_period_limit_of_an_unstable_loop_is_zero() -> None:
-    assert sampling_period_limit([[1.0]], [[1.0]], [[-0.5]]) == 0.0
+    assert analyse_period([[1.0]], [[1.0]], [[-0.5]]).limit_s == 0.0
