@@ -35,12 +35,8 @@ class ScenarioMargin:
 def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
     """The margin of a JSON model.
 
-    Raises
-    ------
-    ModelFileError
-        One line with file, key, what was read and what was wanted.
-    DisagreementError
-        Independent methods gave different answers.
+    Raises ModelFileError with one line: file, key, what was read and what was wanted; and DisagreementError if
+    independent methods give different answers.
     """
     try:
         return loop_margin(parse_model(file.read_text(encoding="utf-8-sig")))

@@ -21,7 +21,7 @@ from gcs.plan.design import Block, Design, GainSet, ResponsePart, VehicleRespons
 from gcs.plan.flight_plan import FlightPlan, loop_timing
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.onboard import onboard_plan, timing_of
-from gcs.plan.responses import Responses, given_responses, margins_with
+from gcs.plan.responses import Responses, given_responses
 from scenarios.schema import Scenario
 
 NOT_YET_KNOWN = "not yet known"
@@ -65,17 +65,17 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
 
 def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None) -> tuple[Design, FlightPlan]:
     """Design and plan with the margins of given responses."""
-    if responses is None:
-        if plan.scenario.dynamics == "autopilot":
-            whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
-        if plan.timing.commands == 1:  # what the design was found with
-            return whole, plan
-        plan = plan.with_margins(margins_with(plan.model, plan.gains, None, plan.timing), None)
-        continuous_s = [entry.delay_margin_continuous_s for entry in whole.schedule]
-        return whole.with_schedule(_with_margins(whole, plan.margins_s, continuous_s)), plan
-    of = responses.in_order(plan.formation.system_ids)
-    plan = plan.with_margins(margins_with(plan.model, plan.gains, of, plan.timing), responses)
-    return described(whole, plan), plan
+    if responses is None and plan.scenario.dynamics == "autopilot":
+        whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
+    if responses is None and plan.timing.commands == 1:  # what the design was found with
+        return whole, plan
+    of = None if responses is None else responses.in_order(plan.formation.system_ids)
+    margins_s = tuple(sampled_margin(plan.model, K, of, timing=plan.timing) for K in plan.gains)
+    plan = plan.with_margins(margins_s, responses)
+    if responses is not None:
+        return described(whole, plan), plan
+    continuous_s = [entry.delay_margin_continuous_s for entry in whole.schedule]
+    return whole.with_schedule(_with_margins(whole, margins_s, continuous_s)), plan
 
 
 def described(design: Design, plan: FlightPlan) -> Design:

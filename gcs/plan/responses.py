@@ -1,13 +1,10 @@
-"""How vehicles with autopilots respond to set-points, and the margins with these responses."""
+"""How vehicles with autopilots respond to set-points."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from gains.core.arrays import FloatArray
-from gains.formation.model import FormationModel
-from gains.performance.response import Response, sampled_margin
-from gains.sampled.multirate import Timing
+from gains.performance.response import Response
 from scenarios.schema import Scenario
 
 
@@ -30,10 +27,3 @@ def given_responses(scenario: Scenario) -> Responses | None:
         return None
     response = Response(given.lag_s, given.velocity_gain_1_s)
     return Responses("given", {vehicle.system_id: response for vehicle in scenario.vehicles})
-
-
-def margins_with(
-    model: FormationModel, gains: Sequence[FloatArray], responses: Sequence[Response] | None, timing: Timing
-) -> tuple[float, ...]:
-    """The sampled delay margin of each gain matrix with these responses, one for each vehicle of the model."""
-    return tuple(sampled_margin(model, K, responses, timing=timing) for K in gains)

@@ -47,12 +47,8 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     `unwritten` is given at the end of a flight: its events that could not be written. What cannot be written now is
     then named in the summary, as `not_logged`, and the log of ticks stays as it is.
 
-    Raises
-    ------
-    InputError
-        If the folder is not a run, or a file of it is damaged.
-    OSError
-        If a file cannot be written, unless `unwritten` is given.
+    Raises InputError if the folder is not a run, or a file of it is damaged, and OSError if a file cannot be written,
+    unless `unwritten` is given.
     """
     scenario = read_scenario(folder)
     design = read_design(folder / DESIGN_FILE)
