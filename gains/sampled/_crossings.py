@@ -206,7 +206,7 @@ def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
     residual, terms, _ = _residual(plant, delay_s, angle)
     relative = residual / sum(float(np.linalg.norm(term)) for term in terms)
     if _ROUNDING < relative < _SAME_PLACE and np.isnan(found_s):
-        return float(np.fmin(*(_newton(plant, start_s, angle) for start_s in (delay_s - beside_s, delay_s + beside_s))))
+        return float(np.fmin(_newton(plant, delay_s - beside_s, angle), _newton(plant, delay_s + beside_s, angle)))
     return delay_s if relative <= _ROUNDING else found_s
 
 
