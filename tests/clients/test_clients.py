@@ -23,7 +23,7 @@ from tests.support.flown_fleet import PATIENCE_S, copters, fleet
 HINT = "is not installed: python3 make.py clients"
 MAVPROXY = shutil.which("mavproxy.py", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
 
-pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("clients")]
 
 
 class Console:

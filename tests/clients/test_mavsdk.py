@@ -23,7 +23,7 @@ from scenarios import files
 from tests.support.flown_fleet import PATIENCE_S, SCENARIOS, copters, fleet, until
 from tests.support.sim_client import parse
 
-pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("clients")]
 
 
 class Client:

@@ -18,7 +18,7 @@ from scenarios.signing.stamps import Stamps
 from sim_vehicles.services.mavlink import CRC_EXTRA
 from tests.support.flown_fleet import copters, fleet, until
 
-pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("clients")]
 
 
 def a_client(connection: str) -> Any:

@@ -186,7 +186,7 @@ def test_what_a_page_says_to_type_works(name: str, folder: Path, monkeypatch: py
 
 @pytest.mark.realtime
 @pytest.mark.timeout(300)
-@pytest.mark.xdist_group("realtime")
+@pytest.mark.xdist_group("documentation")
 @pytest.mark.parametrize("name", [n for n in SESSIONS if any(step.realtime for step in steps_of(PAGES[n]))])
 def test_what_a_page_says_to_type_works_in_real_time(name: str, folder: Path) -> None:
     steps = [step for step in steps_of(PAGES[name]) if step.realtime or step.file or "gcs key" in step.text]

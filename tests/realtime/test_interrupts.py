@@ -10,7 +10,7 @@ import pytest
 
 from tests.support.paths import ROOT
 
-pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
 
 STRESS = ["stress", "scenarios/chain3.toml", "--delay", "0.1:0.3:3", "--workers", "2", "--out"]
 FLY = ["fly", "scenarios/chain3.toml", "--listen", "127.0.0.1:0", "--out"]

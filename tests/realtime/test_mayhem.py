@@ -31,7 +31,7 @@ from sim_vehicles.links.truth import read_truth
 from tests.realtime.test_fly_realtime import free_port, until
 from tests.support.paths import SCENARIOS
 
-pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime"), pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes"), pytest.mark.timeout(400)]
 
 TIMES = int(os.environ.get("MAYHEM", "1"))
 SEED = int(os.environ.get("MAYHEM_SEED", "1"))

@@ -30,7 +30,7 @@ from tests.support.flown_fleet import until
 from tests.support.paths import ROOT
 from tests.support.signed_peer import EPOCH_NS, KEY, NOW_NS, a_sender
 
-pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
 
 GCS = [sys.executable, "-m", "gcs.cli.main"]
 PATIENCE_S = 60.0

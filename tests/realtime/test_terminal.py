@@ -14,7 +14,7 @@ from scenarios.files import dump, load
 from tests.support.paths import ROOT
 from tests.support.terminals import Terminal, is_restored, rows, terminal, wait_for
 
-pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
 
 MODES = re.compile("|".join(Mode.__members__))
 NOMINAL = re.compile("NOMINAL")
