@@ -175,9 +175,9 @@ def onset_real_time(runner: Runner) -> str:
 
 
 _MAPS = {
-    "jitter each way": ("chain3", "--delay 0.22:0.32:3 --jitter 0.02,0.05,0.08 --seeds 2", "jitter", "±{} ms"),
-    "loss each way": ("chain3", "--delay 0.19:0.29:3 --loss 0.1,0.2,0.4 --seeds 2", "loss", "{} %"),
-    "control rate": ("chain3", "--delay 0.15:0.3:4 --rate 10,20,50", "rate", "{} Hz"),
+    "jitter each way": ("chain3", "--delay 0.21:0.33:5 --jitter 0.04,0.08 --seeds 3", "jitter", "±{} ms"),
+    "loss each way": ("chain3", "--delay 0.18:0.3:5 --loss 0.2,0.4 --seeds 2", "loss", "{} %"),
+    "control rate": ("triangle5", "--delay 0.15:0.3:6 --rate 10,20,50", "rate", "{} Hz"),
 }  # fmt: skip
 
 
