@@ -17,16 +17,11 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from tests.soak.soak_experiments import Experiment, experiment
-from tests.soak.soak_judge import Result, judge
+from tests.soak.soak_judge import Result, fly_numbers, judge
 
 warnings.simplefilter("error")
 BATCH = 8
 """Flights that a process takes at a time."""
-
-
-def fly_numbers(seed: int, numbers: list[int]) -> list[tuple[int, Result]]:
-    """Some flights of a seed."""
-    return [(number, judge(experiment(seed, number))) for number in numbers]
 
 
 def fly_all(seed: int, numbers: range, workers: int) -> Iterator[tuple[int, Result]]:

@@ -11,7 +11,7 @@ from gcs.plan.planner import flight_plan
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Trial, sparse_gain
 from tests.soak.soak_checks import Broken, checked
-from tests.soak.soak_experiments import Experiment
+from tests.soak.soak_experiments import Experiment, experiment
 from tests.soak.soak_flight import fly
 
 
@@ -105,3 +105,8 @@ def _margin_kept(plan: FlightPlan, ratio: float) -> Result:
         return Result((Broken("margin", text),))
     where = "stable below" if share < 0.9 else "near it" if share <= 1.1 else "unstable above"
     return Result(ended=f"margin: {where if margin_s > 0.0 else 'none, and unstable'}")
+
+
+def fly_numbers(seed: int, numbers: list[int]) -> list[tuple[int, Result]]:
+    """Some flights of a seed; here, as worker processes do not import a `__main__`."""
+    return [(number, judge(experiment(seed, number))) for number in numbers]

@@ -3,6 +3,9 @@
 `python3 make.py soak --flights 10000 --seed 1` flies more. Each test flies a part, so that they share the processors.
 """
 
+import re
+import subprocess
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +21,7 @@ from tests.soak.soak_checks import checked
 from tests.soak.soak_experiments import Experiment, experiment, whole
 from tests.soak.soak_flight import Flown, fly
 from tests.soak.soak_judge import judge
-from tests.support.paths import SCENARIOS
+from tests.support.paths import ROOT, SCENARIOS
 
 SEED, PARTS, FLIGHTS = 20, 20, 10
 
@@ -134,3 +137,10 @@ def test_an_experiment_is_read_back_as_it_was_saved(tmp_path: Path) -> None:
         drawn.save(file)
         assert Experiment.load(file) == drawn
         assert files.load(file) == drawn.scenario
+
+
+def test_two_workers_fly_what_one_flies() -> None:
+    command = [sys.executable, "-m", "tests.soak", "--flights", "4", "--seed", str(SEED), "--workers"]
+    told = [subprocess.run([*command, n], cwd=ROOT, capture_output=True, text=True, check=True).stdout for n in "12"]
+    assert re.sub(r"in \d+ s", "", told[0]) == re.sub(r"in \d+ s", "", told[1])
+    assert "4 flights" in told[0]
