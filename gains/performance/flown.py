@@ -1,4 +1,4 @@
-"""What delay leaves of a formation's robustness and string stability when it is flown.
+"""Robustness and string stability of a formation as flown, at a loop delay.
 
 `gains.performance.robust` and the requirement's `string_peak_max` describe a loop without delay. In flight a command
 is late by the loop delay τ and held for a control period T, which adds T/2 on average::

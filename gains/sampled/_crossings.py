@@ -194,10 +194,10 @@ def _sweep_points(plant: SampledPlant, loci: Loci) -> FloatArray:
 
 
 def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:
-    """`_newton` and what it misses at whole periods, where the residual has a kink, and perhaps one slope only.
+    """The solution that `_newton` finds, or one at a whole number of periods, which it can miss.
 
-    A start there that is a solution stays one, wherever a step from it leads. From one that nearly is a solution,
-    steps begin on both sides.
+    The residual has a kink there, so a step may lead away from a solution: a start that is a solution is kept. A start
+    that nearly is one is tried again from both sides.
     """
     found_s, beside_s = _newton(plant, delay_s, angle), _SAME_PLACE * plant.period_s
     from_whole_s = abs(delay_s - round(delay_s / plant.period_s) * plant.period_s)

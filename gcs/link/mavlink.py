@@ -34,7 +34,7 @@ HOME_POSITION = 242
 STATUSTEXT = 253
 
 MAGIC, MAGIC_1 = 0xFD, 0xFE
-_HEADER, _HEADER_1 = struct.Struct("<BBBBBBBHB"), 6
+_HEADER, _HEADER_1_BYTES = struct.Struct("<BBBBBBBHB"), 6
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
 _OVERHEAD, _OVERHEAD_1 = 12, 8
@@ -178,8 +178,8 @@ def _checked(data: bytes, refused: Counter[str]) -> Frame | None:
         _, length, _, _, sequence, system_id, component_id, id_low, id_high = _HEADER.unpack_from(data)
         msg_id, begin = id_low | id_high << 16, _HEADER.size
     else:
-        _, length, sequence, system_id, component_id, msg_id = data[:_HEADER_1]
-        begin = _HEADER_1
+        _, length, sequence, system_id, component_id, msg_id = data[:_HEADER_1_BYTES]
+        begin = _HEADER_1_BYTES
     layout = _LAYOUTS.get(msg_id)
     if layout is None:
         refused["SETUP_SIGNING" if msg_id == SETUP_SIGNING else "unknown message"] += 1

@@ -54,13 +54,13 @@ def _mean_jitter_s(jitter: Jitter) -> float:
 
 
 def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
-    """The design with `at_loop_delay`: the figures at the expected loop delay, and how much delay leaves them whole."""
+    """The design with `at_loop_delay`: the figures at the expected loop delay, and the delays up to which they hold."""
     flown, chains = _flown(design, scenario)
     if not flown:
         return design
     requirement = design.requirement
     peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
-    # of different vehicles the one that leaves least
+    # where vehicles differ, the least counts
     alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(formation.alpha(0.0) for formation in flown)
     figures = FiguresAtExpectedDelay(
         **figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump(),
@@ -86,7 +86,7 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
 
 
 def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
-    """What is flown, as far as it has an α at all, and the loops of its followers where errors run down chains."""
+    """The formations flown, empty where no α is defined, and the loops of followers in a leader-follower tree."""
     if design.vehicles < 2:
         return [], []
     entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)

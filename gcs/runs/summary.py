@@ -201,7 +201,7 @@ def _settling_time_s(errors: dict[int, Errors], spacing_m: dict[int, float], fra
 
 
 def _settled_velocity_s(scenario: Scenario, flown: TickArray) -> float | None:
-    """When a vehicle without followers came to its nominal velocity for good, within the same part of its speed."""
+    """When a vehicle without followers came to its nominal velocity for good, within the same fraction of its speed."""
     speed_m_s = float(np.hypot(*scenario.nominal_velocity[-1].velocity_ne_m_s))
     error_m_s = np.hypot(flown["velocity_error_north_m_s"], flown["velocity_error_east_m_s"])
     known = np.isfinite(error_m_s)

@@ -205,6 +205,7 @@ class FormationMonitor:
         changes: list[tuple[int, VehicleState, VehicleState]] = []
         states: list[VehicleState] = []
         for row, (before, seen, delay_s) in enumerate(zip(self.states, fleet, delays_s, strict=True)):
+            # the same observation with the loop delay that is judged, not that of this tick
             after = monitored(before, Observation(*seen[:5], delay_s), self.margins_s, self._policy)
             if after is not before:
                 if after.released and not before.released and row != self._next_to_release():

@@ -27,7 +27,7 @@ _MOST_SAMPLES = 300
 _ENVELOPE_S = 1.0
 _FEWEST_ENVELOPE = 4
 _PARTS = 8
-"""Parts of a window whose slopes show how far its mean growth rate is left to chance."""
+"""Parts of a window: the scatter of their slopes gives the standard error of the mean growth rate."""
 _FEWEST_SIGNS = 3
 """Fewest changes of sign that give a frequency: one full cycle."""
 _LONGEST_HANKEL = 120

@@ -126,12 +126,11 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
     for round_number in range(1, _ROUNDS + 1):
         spread = centre_s + width_s * np.linspace(-1.0, 1.0, _FLIGHTS_A_ROUND)
         links_s = dict.fromkeys(round(float(delay_s), 6) for delay_s in np.maximum(spread, 0.0))
-        # On random links each flight draws its own delays: with the same ones all rates would be off alike, and their
-        # scatter would not show it.
-        seeds = range(first_seed + len(flights), first_seed + len(flights) + len(links_s))
+        # On random links each flight draws its own delays. With the same draws all rates would have the same error,
+        # which their scatter could not show.
         trials = [
-            study.trial("probe", {"delay": link_s}, seed=seed if random_links else first_seed)
-            for link_s, seed in zip(links_s, seeds, strict=True)
+            study.trial("probe", {"delay": link_s}, seed=first_seed + (len(flights) + k if random_links else 0))
+            for k, link_s in enumerate(links_s)
         ]
         flown = run(trials)
         flights |= {outcome.id: outcome for outcome in flown}
