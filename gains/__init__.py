@@ -15,8 +15,6 @@ more, each room using those below it:
 A module whose name begins with an underscore is internal. Matrices are arrays or nested lists; A, B and K are those of
 x' = A x + B u, u = +K x. Times are in s, frequencies in rad/s, state matrices in 1/s.
 
-Examples
---------
 Gains for a leader and two followers that take 0.3 s at 50 Hz; without sampling the loop takes half a period more:
 
 >>> from gains import FormationModel, Requirement, delay_margin, design
@@ -44,21 +42,24 @@ if TYPE_CHECKING:
     from gains.margin.loop_margin import LoopMargin, loop_margin
     from gains.margin.model_file import parse_model
     from gains.margin.opinions import checked_delay_margin
+    from gains.performance.predicted import PredictedLoop
     from gains.performance.response import Response
     from gains.performance.robust import robustness
     from gains.sampled.constant import sampled_delay_margin
     from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
     from gains.sampled.multirate import Timing, multirate_delay_margin
     from gains.sampled.onboard import OnboardTiming, onboard_loop
+    from gains.sampled.prediction import mismatch_window, mismatch_window_continuous, predicted_growth_rate
     from gains.varying.bounds import varying_delay_bound
     from gains.varying.jitter import Jitter, bound_covering, spread_bound
 
 __all__ = [
     "BadModelError", "CoupledBlock", "DelayAnalysis", "Design", "DisagreementError", "FormationModel", "GainsError",
-    "InfeasibleError", "Jitter", "LoopMargin", "OnboardTiming", "Pattern", "Requirement", "Response", "SolverError",
-    "Timing", "all_to_all", "analyse_delay", "bidirectional", "bound_covering", "boundary_of_two_delays",
-    "checked_delay_margin", "coupled_blocks", "delay_box", "delay_margin", "design", "evaluate_gains", "fixed_modes",
-    "formation_plant", "leader_follower", "loop_margin", "multirate_delay_margin", "onboard_loop", "parse_model",
+    "InfeasibleError", "Jitter", "LoopMargin", "OnboardTiming", "Pattern", "PredictedLoop", "Requirement", "Response",
+    "SolverError", "Timing", "all_to_all", "analyse_delay", "bidirectional", "bound_covering",
+    "boundary_of_two_delays", "checked_delay_margin", "coupled_blocks", "delay_box", "delay_margin", "design",
+    "evaluate_gains", "fixed_modes", "formation_plant", "leader_follower", "loop_margin", "mismatch_window",
+    "mismatch_window_continuous", "multirate_delay_margin", "onboard_loop", "parse_model", "predicted_growth_rate",
     "rightmost_root", "robustness", "sampled_delay_margin", "spread_bound", "trade_off", "varying_delay_bound",
 ]  # fmt: skip
 
@@ -75,12 +76,14 @@ _NAMES = {
     "margin.loop_margin": "LoopMargin loop_margin",
     "margin.model_file": "parse_model",
     "margin.opinions": "checked_delay_margin",
+    "performance.predicted": "PredictedLoop",
     "performance.response": "Response",
     "performance.robust": "robustness",
     "sampled.constant": "sampled_delay_margin",
     "sampled.coupled_block": "CoupledBlock coupled_blocks",
     "sampled.multirate": "Timing multirate_delay_margin",
     "sampled.onboard": "OnboardTiming onboard_loop",
+    "sampled.prediction": "mismatch_window mismatch_window_continuous predicted_growth_rate",
     "varying.bounds": "varying_delay_bound",
     "varying.jitter": "Jitter bound_covering spread_bound",
 }

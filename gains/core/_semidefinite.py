@@ -1,10 +1,8 @@
 """Semidefinite programs: modelled with cvxpy, solved by Clarabel, and proved by plain linear algebra.
 
 A status is not a proof. `solved` takes "optimal" alone for a solution, and its callers check the certificate again.
-`positive_definite_solution` finds a solution of homogeneous inequalities and checks it by itself, whatever the status.
-
-Clarabel without cvxpy was measured too: the bounds of `gains.varying` are the same to the last bit, and a set of seven
-takes 11 s in place of 21 s. `gcs margin` needs no such program and `gcs design` one, so there is no second path.
+`positive_definite_solution` checks what it finds by itself, whatever the status. Clarabel without cvxpy gives the same
+bounds of `gains.varying` to the last bit, a set of seven in 11 s in place of 21 s: not worth a second path.
 """
 
 import warnings
@@ -52,7 +50,7 @@ class Unknown:
 
     @property
     def count(self) -> int:
-        """How many independent entries it has."""
+        """The number of independent entries."""
         return self.rows * self.columns or self.rows * (self.rows + 1) // 2
 
     def matrix(self, entries: FloatArray) -> FloatArray:
@@ -104,25 +102,8 @@ def positive_definite_solution(unknowns: Sequence[Unknown], inequalities: Inequa
     """Values of the unknowns, entries up to 1, that make every matrix positive definite; None if none were found.
 
     The least eigenvalue is made as large as the solver can. Its solution counts if numpy finds the matrices positive
-    definite there; None is not a proof that there is none.
-
-    Parameters
-    ----------
-    unknowns
-        Their shapes, in the order in which `inequalities` takes them.
-    inequalities
-        From the unknown matrices to symmetric matrices, linear and homogeneous.
-
-    Examples
-    --------
-    x' = a x is stable if there is a p > 0 with −2 a p > 0:
-
-    >>> from gains.core._semidefinite import Unknown, positive_definite_solution
-    >>> [
-    ...     positive_definite_solution([Unknown(1)], lambda x: [x[0], -2 * a * x[0]]) is not None
-    ...     for a in (-1.0, 1.0)
-    ... ]
-    [True, False]
+    definite there; None is not a proof that there is none. `inequalities` takes the unknown matrices, in the order of
+    `unknowns`, to symmetric matrices, linear and homogeneous.
     """
     import cvxpy as cp
 

@@ -1,13 +1,11 @@
-"""Exceptions of the control mathematics.
+"""Exceptions of the control mathematics::
 
-::
-
-    ValueError
-    └── GainsError             what `gains` raises on purpose
-        ├── BadModelError      an argument is not what was wanted: its shape, its sign, not finite
-        ├── InfeasibleError    the design problem has no solution for the data given
-        ├── SolverError        the optimiser stopped without a solution that can be trusted
-        └── DisagreementError  independent methods give different answers to one question
+ValueError
+└── GainsError             what `gains` raises on purpose
+    ├── BadModelError      an argument is not what was wanted: its shape, its sign, not finite
+    ├── InfeasibleError    the design problem has no solution for the data given
+    ├── SolverError        the optimiser stopped without a solution that can be trusted
+    └── DisagreementError  independent methods give different answers to one question
 """
 
 

@@ -17,14 +17,7 @@ ALPHA_MIN, DELAY_MARGIN_MAX_S = 5e-4, 30.0
 
 @dataclass(frozen=True)
 class OnboardPeak:
-    """A limit on the growth of spacing errors in the onboard loop, where only the errors of other vehicles arrive late.
-
-    Examples
-    --------
-    >>> from gains.core.requirement import OnboardPeak, Requirement
-    >>> Requirement(string_peak_max=1.2, loop="onboard").peak_limit == OnboardPeak(1.2)
-    True
-    """
+    """A limit on the growth of spacing errors in the onboard loop, where only the errors of others arrive late."""
 
     peak: float
 
@@ -38,44 +31,31 @@ class Requirement:
 
     With `delay_margin_s` the design makes α as large as possible, and must reach `alpha` and `decay_rate_1_s` if they
     are given. Without it, the delay margin is made as large as these two allow. With none of the three, a margin of
-    0.3 s is required.
+    0.3 s is required. BadModelError if a number is out of its range.
 
-    Attributes
-    ----------
-    delay_margin_s
-        Least sampled delay margin, up to 30 s.
-    alpha
-        Least sector bound, from 5e-4 (1/s).
-    decay_rate_1_s
-        Least decay rate of the continuous loop without delay, 1/s.
-    string_peak_max
-        Limit, at least 1, on the growth of spacing errors from vehicle to vehicle: in the ground loop without delay
-        and at half the margin, in the onboard loop at every delay. 1 lets no error grow down the chain and costs
-        little α. Not limited if None.
-    loop
-        The loop that is flown. On board a pattern without cycles takes any delay; `delay_margin_s` then limits each
-        vehicle's own gains, as if a ground station closed their loops. On a pattern with cycles the onboard loop must
-        have this margin too.
-
-    Raises
-    ------
-    BadModelError
-        A number is out of its range.
-
-    Examples
-    --------
     A delay margin of 0.3 s is wanted when nothing is given:
 
-    >>> from gains.core.requirement import Requirement
+    >>> from gains import Requirement
     >>> Requirement().delay_margin_s, Requirement(alpha=0.4).delay_margin_s
     (0.3, None)
+    >>> Requirement(string_peak_max=1.2, loop="onboard").peak_limit
+    OnboardPeak(peak=1.2)
     """
 
     delay_margin_s: float | None = None
+    """Least sampled delay margin, up to 30 s."""
     alpha: float | None = None
+    """Least sector bound, from 5e-4 (1/s)."""
     string_peak_max: float | None = None
+    """Limit, at least 1, on the growth of spacing errors from vehicle to vehicle: in the ground loop without delay and
+    at half the margin, in the onboard loop at every delay. 1 lets no error grow down the chain and costs little α. Not
+    limited if None."""
     decay_rate_1_s: float | None = None
+    """Least decay rate of the continuous loop without delay, 1/s."""
     loop: Literal["ground", "onboard"] = "ground"
+    """The loop that is flown. On board a pattern without cycles takes any delay; `delay_margin_s` then limits each
+    vehicle's own gains, as if a ground station closed their loops. On a pattern with cycles the onboard loop must have
+    this margin too."""
 
     def __post_init__(self) -> None:
         for name in ("delay_margin_s", "alpha", "decay_rate_1_s"):

@@ -1,10 +1,10 @@
 """Splitting of a linear model into the blocks that really interact.
 
 A leader-follower tree is block triangular. Its identical followers share one defective eigenvalue, whose multiplicity
-N is the depth of the tree, and rounding spreads such an eigenvalue over a circle of radius eps^(1/N): from about eight
-vehicles on, every method that takes the whole matrix at once returns wrong verdicts. The strongly connected components
-of the pattern are the diagonal blocks of the triangular form. The spectrum, with or without delays, is the union of
-their spectra, so each block is analysed on its own, and equal blocks once.
+N is the depth of the tree, and rounding spreads it over a circle of radius eps^(1/N): from about eight vehicles on,
+every method that takes the whole matrix at once returns wrong verdicts. The strongly connected components of the
+pattern are the diagonal blocks of the triangular form. The spectrum, with or without delays, is the union of theirs, so
+each block is analysed on its own, and equal blocks once.
 """
 
 import heapq
@@ -65,6 +65,13 @@ def real_matrix(name: str, value: ArrayLike) -> FloatArray:
     return matrix.astype(np.float64)
 
 
+def positive_seconds(name: str, value: float) -> float:
+    """`value` if it is positive and finite, else BadModelError with the name."""
+    if not (np.isfinite(value) and value > 0.0):
+        raise BadModelError(f"{name} is {value}; a positive number of seconds is wanted")
+    return float(value)
+
+
 def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     """Index sets of the strongly connected components of the union of the patterns of square matrices.
 
@@ -72,17 +79,18 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     lowest index first in a tie: in this order of states every matrix is block lower triangular. Indices within a set
     ascend.
 
-    Examples
-    --------
     x_1 and x_2 drive each other, x_0 drives both:
 
-    >>> import numpy as np
-    >>> from gains.core.structure import strongly_connected_blocks
     >>> [block.tolist() for block in strongly_connected_blocks(np.array([[-1, 0, 0], [1, 0, 1], [0, 1, 0]]))]
     [[0], [1, 2]]
     """
     pattern = np.any([matrix != 0.0 for matrix in matrices], axis=0)
-    label = _labels_by_closure(pattern) if pattern.shape[0] <= _LARGEST_CLOSURE else _labels_by_graph(pattern)
+    if pattern.shape[0] <= _LARGEST_CLOSURE:
+        label = _labels_by_closure(pattern)
+    else:
+        from scipy.sparse import csgraph, csr_array  # takes longer to import than a small model to analyse
+
+        label = csgraph.connected_components(csr_array(pattern), directed=True, connection="strong")[1]
     count = int(label.max()) + 1
     if count == 1:
         return [np.arange(label.size)]
@@ -98,16 +106,6 @@ def distinct_blocks(*matrices: RealArray) -> list[Block]:
 
     Blocks are equal if they are to the last bit, with the states in ascending order. 400 identical followers, described
     one after the other, give one block.
-
-    Examples
-    --------
-    A chain of three equal followers:
-
-    >>> import numpy as np
-    >>> from gains.core.structure import distinct_blocks
-    >>> [block] = distinct_blocks(np.array([[-1, 0, 0], [1, -1, 0], [0, 1, -1]]))
-    >>> block.copies, block.indices.tolist(), block.matrices[0].tolist()
-    (3, [0], [[-1.0]])
     """
     first: dict[bytes, IntArray] = {}
     copies: dict[bytes, int] = {}
@@ -131,25 +129,10 @@ def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], in
     """The matrices without the directions along which nothing ever acts, and the number of states removed.
 
     A consensus loses its common value, a formation at constant velocity its position and then its velocity. A direction
-    v with A_k v = 0 for every k (or w with w'A_k = 0, a conserved quantity) carries a root of
-    det(sI - A_0 - A_1 e^{-s tau} - ...) at s = 0 for every delay. An orthonormal basis whose first columns span these
-    directions makes all matrices block triangular, and the other diagonal block is kept; this is repeated in each
-    strongly connected block until no such direction is left. The blocks are put side by side, which keeps all other
-    roots. A block in which nothing moves at all (an integrator that nobody feeds back) stays as it is.
-
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size.
-
-    Examples
-    --------
-    A consensus of two vehicles, whose difference decays like e^{-2t}, beside a loop of its own:
-
-    >>> from gains.core.structure import without_equilibria
-    >>> [moving], taken_out = without_equilibria([[-1, 1, 0], [1, -1, 0], [0, 0, -3]])
-    >>> moving.round(6).tolist(), taken_out
-    ([[-2.0, 0.0], [0.0, -3.0]], 1)
+    v with A_k v = 0 for every k (or w with w'A_k = 0, a conserved quantity) carries a root of det(sI - A_0 - A_1 e^{-s
+    tau} - ...) at s = 0 for every delay. It is split off by an orthonormal basis, in each strongly connected block,
+    until none is left; all other roots stay. A block in which nothing moves at all (an integrator that nobody feeds
+    back) stays as it is. BadModelError unless the matrices are square, finite and of one size.
     """
     checked = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
     size = checked[0].shape[0]
@@ -201,17 +184,6 @@ def is_singular_for_any_delay(matrices: Iterable[FloatArray] | FloatArray) -> bo
     """Whether the sum of the matrices is singular to rounding: s = 0 is then a root at every delay.
 
     Each row is judged in its own unit, so a motion that is merely slow beside others does not count as a standstill.
-
-    Examples
-    --------
-    x'(t) = -x(t) + x(t - tau) stays where it is; a slow decay beside a fast one does not:
-
-    >>> import numpy as np
-    >>> from gains.core.structure import is_singular_for_any_delay
-    >>> is_singular_for_any_delay([np.array([[-1]]), np.array([[1]])])
-    True
-    >>> is_singular_for_any_delay([np.diag([-1e9, -1e-9])])
-    False
     """
     stacked = np.array(list(matrices))
     size = np.linalg.norm(stacked, axis=(0, 2))
@@ -260,13 +232,6 @@ def _labels_by_closure(pattern: NDArray[np.bool_]) -> IntArray:
     # the lowest state of each component stands for it
     lowest = np.argmax(reach & reach.T, axis=1)
     return np.unique(lowest, return_inverse=True)[1]
-
-
-def _labels_by_graph(pattern: NDArray[np.bool_]) -> IntArray:
-    # its import costs more than the analysis of a small model
-    from scipy.sparse import csgraph, csr_array
-
-    return csgraph.connected_components(csr_array(pattern), directed=True, connection="strong")[1]
 
 
 def _drivers_first(lowest_index: list[int], edges: Iterable[tuple[int, int]]) -> list[int]:

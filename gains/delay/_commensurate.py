@@ -1,16 +1,19 @@
 """Several delays that are multiples of one unknown: x'(t) = A_0 x(t) + A_1 x(t - tau) + ... + A_m x(t - m tau).
 
-With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda. At each frequency the equation
-det(j omega I - sum_k A_k lambda^{-k}) = 0 therefore has finitely many solutions, the eigenvalues of a block companion
-matrix. They are loci like those of one delay (`_loci`): a root is on the imaginary axis where a modulus is one, and it
-moves to the right where that modulus falls with the frequency, whatever the delay. The frequencies come from a pencil
-and from Newton's method along the unit circle (`_circle_angles`) or, for a single delay (m = 1), from `_crossings`.
+With lambda = e^{s tau} the characteristic matrix is a polynomial in 1/lambda. At each frequency its roots lambda are
+the eigenvalues of a block companion matrix: loci like those of one delay (`_loci`). A root is on the imaginary axis
+where a modulus is one, and it moves to the right where that modulus falls with the frequency, whatever the delay.
 
-See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, for the same problem as a
-polynomial eigenvalue problem.
+The frequencies come from `_crossings` for a single delay (m = 1), else from angles: where an eigenvalue of
+A(theta) = sum_k A_k e^{-j k theta} is j omega, tau = theta / omega is critical. A matrix pencil gives a finite list of
+angles that contains every crossing. Where it is too large or too ill-conditioned, a grid on the unit circle with
+refined extrema and Newton's method finds them.
+
+See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import pi
 
 import numpy as np
@@ -19,17 +22,8 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
-from gains.delay._circle_angles import (
-    PAST_HALF,
-    at_angle,
-    candidate_angles,
-    circle_loci,
-    circle_points,
-    norm_of,
-    passes_zero,
-)
 from gains.delay._crossings import (
-    AxisCrossing,
+    Crossing,
     DelayedTerm,
     axis_crossings,
     crossings_of_loci,
@@ -38,7 +32,14 @@ from gains.delay._crossings import (
     polish,
     separating_points,
 )
-from gains.delay._loci import Loci, UnitCrossing, highest_frequency, solved_beside_poles, unit_crossings
+from gains.delay._loci import (
+    Loci,
+    UnitCrossing,
+    highest_frequency,
+    near_unit_extrema,
+    solved_beside_poles,
+    unit_crossings,
+)
 from gains.delay._windows import (
     BlockAnalysis,
     DelayAnalysis,
@@ -55,6 +56,19 @@ _LARGEST_LOCI = 30
 _LARGEST_PRODUCT = 3000
 # candidates are kept this close to the imaginary axis, relative to the norm; a false one costs little
 _CANDIDATE_TOLERANCE = 1e-3
+# the pencil's companion matrix takes 0.1 s at this size; larger problems are left to the grid
+_LARGEST_PENCIL = 450
+# the polynomial in cos(theta) is expanded here: outside [-1, 1], and at no special value
+_EXPANSION = 1.3717
+# grid angles on the upper half of the unit circle: at least this many, and this many per turn of the longest delay. The
+# grid ends a little beyond pi, so that it brackets a crossing at pi itself.
+_ANGLES, _ANGLES_A_TURN, _PAST_HALF = 400, 40, 1.01 * pi
+# Newton's method starts at grid angles whose first step is at most this many grid steps; each step doubles the digits
+_REACH, _NEWTON_STEPS = 1.5, 3
+# below this share of the highest frequency a root may be one that passes zero, which a look this far (rad) beside tells
+_SLOW, _BESIDE = 1e-6, 0.05
+# a local extremum of a real part is refined when its sample is this close to the axis, relative to the norm
+_NEAR_AXIS = 0.1
 
 
 def analyse_commensurate(
@@ -62,29 +76,8 @@ def analyse_commensurate(
 ) -> DelayAnalysis:
     """Stability windows, critical delays and margin in tau of x'(t) = sum_k A_k x(t - k tau).
 
-    Parameters
-    ----------
-    matrices
-        A_0, A_1, ..., A_m, real (n, n), 1/s; A_k acts k tau late.
-    horizon_s, leave_out_zero
-        As of `gains.delay.constant.analyse_delay`.
-
-    Raises
-    ------
-    BadModelError
-        No matrix, matrices that are not square, finite and of one size, m n too large, or a horizon that is not a
-        positive number.
-    DisagreementError
-        Crossings and eigenvalues contradict each other (a loop at the limit of double precision).
-
-    Examples
-    --------
-    x'(t) = -x(t - tau) - x(t - 2 tau) is stable up to tau = pi / (3 sqrt(3)), where it oscillates at sqrt(3) rad/s:
-
-    >>> from gains.delay._commensurate import analyse_commensurate
-    >>> found = analyse_commensurate([[[0]], [[-1]], [[-1]]])
-    >>> round(found.delay_margin_s, 6), round(found.crossings[0].omega_rad_s, 6)
-    (0.6046, 1.732051)
+    `matrices` are A_0, A_1, ..., A_m, real (n, n), 1/s. The options, and what is raised, are those of
+    `gains.delay.constant.analyse_delay`; BadModelError also without a matrix or if m n is too large.
     """
     check_horizon(horizon_s)
     blocks = distinct_blocks(*_checked(matrices))
@@ -106,8 +99,8 @@ def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
     return block_analysis(block.copies, delayed, found, unstable, passage, highest_frequency(terms))
 
 
-def _block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
-    """Crossings of the imaginary axis of one block, omega > 0, ascending; theta = omega tau modulo 2 pi."""
+def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
+    """Crossings of the imaginary axis of one block, omega > 0, ascending."""
     present = [k for k, matrix in enumerate(terms) if k > 0 and matrix.any()]
     if not present:
         return []
@@ -115,7 +108,7 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
         # one delay of k tau: its angle modulo 2 pi belongs to k angles of tau
         [k] = present
         return [
-            AxisCrossing(crossing.omega, (crossing.theta + 2.0 * pi * turn) / k, crossing.direction)
+            replace(crossing, delay_s=(crossing.delay_s + 2.0 * pi * turn / crossing.omega_rad_s) / k)
             for crossing in axis_crossings(terms[0], terms[k])
             for turn in range(k)
         ]
@@ -130,17 +123,17 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
     loci = companion_loci(terms_at, column_space(used[1:]))
     found = crossings_of_loci(loci, _candidates(used, highest), highest)
     polished = [polish(used, crossing) for crossing in found if is_root(used, crossing)]
-    return sorted(polished, key=lambda crossing: crossing.omega)
+    return sorted(polished, key=lambda crossing: crossing.omega_rad_s)
 
 
-def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
+def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
     """The same from the n eigenvalues s of A(theta), however many delays there are.
 
     With theta = omega tau, a root j omega moves right with growing tau where omega d(Re s) / d theta > 0.
     """
-    loci, candidates = circle_loci(terms), candidate_angles(terms)
-    counted = unit_crossings(loci, np.union1d(circle_points(terms), separating_points(candidates, PAST_HALF)))
-    crossings: list[AxisCrossing] = []
+    loci, candidates = circle_loci(terms), _candidate_angles(terms)
+    counted = unit_crossings(loci, np.union1d(circle_points(terms), separating_points(candidates, _PAST_HALF)))
+    crossings: list[Crossing] = []
     # opposite crossings at one angle are common: if all multiples are odd, all roots cross at a quarter turn
     for crossing in (*counted, *hidden_crossings(loci, candidates, counted)):
         theta, omega = crossing.omega, float(np.angle(crossing.locus)) * norm_of(terms)
@@ -151,7 +144,7 @@ def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[AxisCrossing]:
         if theta <= pi:
             locus = UnitCrossing(abs(omega), complex(np.exp(1j * turn)), way * crossing.outward)
             crossings.append(polish(terms, locus))
-    return sorted(crossings, key=lambda crossing: crossing.omega)
+    return sorted(crossings, key=lambda crossing: crossing.omega_rad_s)
 
 
 def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
@@ -167,8 +160,10 @@ def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
                 return True
         # a determinant that vanishes at more angles than its degree vanishes at all; three unrelated angles stand for
         # them, with a tolerance far above rounding
-        elif all(_least_singular(terms, omega, theta) < 1e-12 * scale for theta in (0.0, 1.0, 2.5)):
-            return True
+        else:
+            matrices = 1j * omega * np.eye(terms[0].shape[0]) - _at_angle(terms, np.array([0.0, 1.0, 2.5]))
+            if np.linalg.svd(matrices, compute_uv=False)[:, -1].max() < 1e-12 * scale:
+                return True
     return False
 
 
@@ -183,11 +178,6 @@ def _checked(matrices: Sequence[ArrayLike]) -> list[FloatArray]:
             f"a product of at most {_LARGEST_PRODUCT} is wanted"
         )
     return checked
-
-
-def _least_singular(terms: Sequence[FloatArray], omega: float, theta: float) -> float:
-    matrix = 1j * omega * np.eye(terms[0].shape[0]) - at_angle(terms, np.array([theta]))[0]
-    return float(np.linalg.svd(matrix, compute_uv=False)[-1])
 
 
 def companion_loci(terms_at: Callable[[FloatArray], ComplexArray], B: FloatArray) -> Loci:
@@ -223,10 +213,144 @@ def column_space(late: Sequence[FloatArray]) -> FloatArray:
 
 def _candidates(terms: Sequence[FloatArray], highest: float) -> FloatArray:
     """Frequencies that come near every crossing, ascending."""
-    theta = candidate_angles(terms)
+    theta = _candidate_angles(terms)
     if theta.size == 0:
         return np.empty(0)
-    roots = np.linalg.eigvals(at_angle(terms, theta))
+    roots = np.linalg.eigvals(_at_angle(terms, theta))
     near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
     omega = np.unique(np.abs(roots.imag[near_axis]))
     return omega[(omega > 0.0) & (omega < 1.1 * highest)]
+
+
+def _at_angle(terms: Sequence[FloatArray], theta: FloatArray) -> ComplexArray:
+    """sum_k A_k e^{-j k theta}, shape (angles, n, n)."""
+    turns = np.exp(-1j * theta[:, np.newaxis] * np.arange(len(terms)))
+    return np.tensordot(turns, np.array(terms), axes=1)
+
+
+def norm_of(terms: Sequence[FloatArray]) -> float:
+    """Sum of the Frobenius norms, a bound of every eigenvalue of A(theta)."""
+    return sum(float(np.linalg.norm(matrix)) for matrix in terms)
+
+
+def circle_loci(terms: Sequence[FloatArray]) -> Loci:
+    """theta (k,) -> e^{s / scale} for the eigenvalues s of A(theta), scale the sum of the norms.
+
+    The modulus is one on the axis. As |s| / scale <= 1, the frequency can be read from the angle.
+    """
+    scale = norm_of(terms)
+
+    def loci(theta: FloatArray) -> ComplexArray:
+        return np.exp(np.linalg.eigvals(_at_angle(terms, theta)) / scale).astype(np.complex128)
+
+    return loci
+
+
+def circle_points(terms: Sequence[FloatArray]) -> FloatArray:
+    """Grid angles, and the extrema at which a real part comes near the axis and turns back."""
+    theta = _grid_angles(terms)
+    return np.union1d(theta, near_unit_extrema(circle_loci(terms), theta, near=_NEAR_AXIS))
+
+
+def passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool:
+    """Whether a root at the frequency omega >= 0 is one that passes s = 0, which no finite delay brings about.
+
+    An eigenvalue of A(theta) that passes zero is slow at this angle only; the slow motions of a loop are slow at the
+    angles beside it too.
+    """
+    if omega > _SLOW * highest_frequency(terms):
+        return False
+    beside = np.abs(np.linalg.eigvals(_at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
+    return bool(beside.min() > 1e3 * omega)
+
+
+def _grid_angles(terms: Sequence[FloatArray]) -> FloatArray:
+    return np.linspace(1e-9, _PAST_HALF, max(_ANGLES, _ANGLES_A_TURN * len(terms)))
+
+
+def _candidate_angles(terms: Sequence[FloatArray]) -> FloatArray:
+    """Angles that come near every crossing, ascending.
+
+    A well-conditioned pencil (few multiples) misses none. Newton's method starts from each grid eigenvalue whose slope
+    leads to the axis; it separates crossings that a count between neighbouring angles cannot.
+    """
+    grid = _grid_angles(terms)
+    step = grid[1] - grid[0]
+    roots, slopes = _roots_and_slopes(terms, grid)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = -roots.real / slopes
+    row, column = np.nonzero(np.abs(steps) < _REACH * step)
+    theta, along = grid[row] + steps[row, column], roots[row, column].imag
+    for _ in range(_NEWTON_STEPS):
+        roots, slopes = _roots_and_slopes(terms, theta)
+        nearest = np.argmin(np.abs(roots - 1j * along[:, np.newaxis]), axis=1)[:, np.newaxis]
+        root, slope = (np.take_along_axis(part, nearest, 1)[:, 0] for part in (roots, slopes))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            move = -root.real / slope
+        theta, along = theta + np.where(np.abs(move) < step, move, 0.0), root.imag
+    return np.sort(np.concatenate([_pencil_angles(terms), theta[(theta > 0.0) & (theta < _PAST_HALF)]]))
+
+
+def _roots_and_slopes(terms: Sequence[FloatArray], theta: FloatArray) -> tuple[ComplexArray, FloatArray]:
+    """Eigenvalues s of A(theta), shape (angles, n), and d(Re s) / d theta: zero where an eigenvalue is defective."""
+    roots, right = np.linalg.eig(_at_angle(terms, theta))
+    k = np.arange(len(terms))
+    change = np.tensordot(-1j * k * np.exp(-1j * theta[:, np.newaxis] * k), np.array(terms), axes=1)
+    try:
+        slopes = np.real(np.einsum("tii->ti", np.linalg.solve(right, change @ right)))
+    except np.linalg.LinAlgError:
+        slopes = np.zeros(roots.shape)
+    return roots.astype(np.complex128), slopes.astype(np.float64)
+
+
+def _pencil_angles(terms: Sequence[FloatArray]) -> FloatArray:
+    """Angles theta in [0, pi] at which an eigenvalue of A(theta) may be imaginary; none if the pencil is too large.
+
+    If A(theta) v = j omega v, X = v v* solves A X + X A* = 0. Write A = C - j sin(theta) D, where C = sum A_k
+    cos(k theta) and D = sum A_k sin(k theta) / sin(theta) are polynomials in c = cos(theta), and X = R + j S. With
+    S' = S sin(theta), the real part and sin(theta) times the imaginary part are
+
+        C R + R C' + D S' - S' D' = 0,    C S' + S' C' - (1 - c^2) (D R - R D') = 0,
+
+    a real polynomial eigenvalue problem in c of degree m + 1 with n^2 unknowns (R symmetric, S' skew).
+    """
+    n, degree = terms[0].shape[0], len(terms)
+    if degree * n * n > _LARGEST_PENCIL:
+        return np.empty(0)
+    # values at Chebyshev nodes give the polynomial in powers of c - _EXPANSION
+    nodes = np.cos(pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    values = np.array([_pencil_at(terms, c) for c in nodes.tolist()])
+    powers = np.vander(nodes - _EXPANSION, increasing=True)
+    coefficients = np.linalg.solve(powers, values.reshape(degree + 1, -1)).reshape(values.shape)
+    size = n * n
+    try:
+        scaled = np.linalg.solve(coefficients[0], coefficients[1:].swapaxes(0, 1).reshape(size, degree * size))
+    except np.linalg.LinAlgError:
+        return np.empty(0)
+    # in 1 / (c - _EXPANSION) the matrix polynomial is monic
+    companion = np.zeros((degree * size, degree * size))
+    companion[:size] = -scaled
+    companion[size:, :-size] = np.eye((degree - 1) * size)
+    inverse = np.linalg.eigvals(companion).astype(np.complex128)
+    inverse = inverse[np.abs(inverse) > 1e-3]
+    c = _EXPANSION + 1.0 / inverse
+    # an eigenvalue of multiplicity q is known to eps^(1/q)
+    near = (np.abs(c.imag) < 1e-3) & (np.abs(c.real) < 1.0 + 1e-3)
+    return np.arccos(np.clip(c.real[near], -1.0, 1.0))
+
+
+def _pencil_at(terms: Sequence[FloatArray], c: float) -> FloatArray:
+    """The equations of `_pencil_angles` at one c as a matrix (n^2, n^2) that acts on the entries of R and S'."""
+    n = terms[0].shape[0]
+    theta, k, identity = float(np.arccos(c)), np.arange(len(terms)), np.eye(n)
+    C = np.tensordot(np.cos(k * theta), np.array(terms), axes=1)
+    D = np.tensordot(np.sin(k * theta) / np.sin(theta), np.array(terms), axes=1)
+    # of X, row by row: C X + X C' and D X - X D'
+    plus, minus = np.kron(C, identity) + np.kron(identity, C), np.kron(D, identity) - np.kron(identity, D)
+    units = np.eye(n * n).reshape(n * n, n, n)
+    upper, strict = (np.ravel_multi_index(np.triu_indices(n, above), (n, n)) for above in (0, 1))
+    symmetric, skew = (units + sign * units.swapaxes(1, 2) for sign in (1.0, -1.0))
+    R, S = symmetric.reshape(n * n, -1)[upper].T, skew.reshape(n * n, -1)[strict].T
+    return np.block(
+        [[(plus @ R)[upper], (minus @ S)[upper]], [-(1.0 - c * c) * (minus @ R)[strict], (plus @ S)[strict]]]
+    )

@@ -2,10 +2,8 @@
 
 An algebraic test gives a finite list of frequencies near every crossing. Counts of the loci of the loop (`_loci`)
 between these frequencies then tell the number and direction of the crossings and bracket them, however accurate the
-list is. Newton's method on the characteristic matrix gives the last digits.
-
-Every method in double precision blurs a multiple root, and all of them blur it alike, however well they agree. The
-error of a crossing is therefore estimated from its own sensitivity to rounding.
+list is. Newton's method on the characteristic matrix gives the last digits, and its sensitivity to rounding their
+error, which at a multiple root is large and alike for every method.
 """
 
 from collections.abc import Sequence
@@ -23,10 +21,10 @@ from gains.delay._loci import (
     factor_rank,
     highest_frequency,
     slope_sign,
+    sweep_frequencies,
     unit_crossings,
     without_limits_at_zero,
 )
-from gains.delay.sweep import sweep_frequencies
 
 # n^2 eigenvalues of an n^2 x n^2 matrix: 0.3 s at 20, and growing with the sixth power
 LARGEST_ALGEBRAIC_BLOCK = 24
@@ -59,7 +57,7 @@ class DelayedTerm:
 
 
 def by_multiple(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
-    """A_0, A_1, ..., A_m of sum_k A_k x(t - k tau), from terms without known delays."""
+    """A_0, A_1, ..., A_m of x' = sum_k A_k x(t - k tau), from terms without known delays."""
     matrices = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
     for term in terms:
         matrices[term.multiple] = matrices[term.multiple] + term.matrix
@@ -67,19 +65,21 @@ def by_multiple(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
 
 
 @dataclass(frozen=True)
-class AxisCrossing:
-    """Roots +-j omega at the delays (theta + 2 pi k) / omega, k = 0, 1, ..., theta in [0, 2 pi).
+class Crossing:
+    """Roots +-j `omega_rad_s` on the imaginary axis at the delays `delay_s` + 2 pi k / `omega_rad_s`, k = 0, 1, ...
 
-    `direction` is +1 when the pair goes into the right half plane as the delay grows, -1 when it comes out of it, and
-    0 when it touches the axis and returns.
+    `direction` is +1 if they move into the right half plane as the delay grows, -1 if they move out of it, 0 if they
+    touch the axis and return; it is the same for every k. `roots` counts the roots that cross together: 2, times the
+    number of equal blocks. At frequency 0 a single real root passes s = 0, where another one stays: once, at `delay_s`.
     """
 
-    omega: float
-    theta: float
+    omega_rad_s: float
+    delay_s: float
     direction: int
+    roots: int
 
 
-def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
+def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[Crossing]:
     """All crossings of the imaginary axis of one block, omega > 0, in ascending frequency.
 
     As |e^{j omega tau}| = 1, the root moves right exactly where the modulus of the locus falls with the frequency:
@@ -92,7 +92,7 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[AxisCrossing]:
     highest = highest_frequency((A0, A1))
     found = crossings_of_loci(delay_loci(A0, B, C), _candidates(A0, A1, B, C, highest), highest)
     polished = [polish((A0, A1), crossing) for crossing in found if is_root((A0, A1), crossing)]
-    return sorted(polished, key=lambda crossing: (crossing.omega, crossing.theta))
+    return sorted(polished, key=lambda crossing: (crossing.omega_rad_s, crossing.delay_s))
 
 
 def is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
@@ -165,7 +165,7 @@ def hidden_crossings(loci: Loci, candidates: FloatArray, found: list[UnitCrossin
     return hidden
 
 
-def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> AxisCrossing:
+def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> Crossing:
     """Newton steps on u*(j w I - sum_k A_k e^{-j k theta}) v = 0, u, v the singular vectors of the least value.
 
     Steps go on while they lower the least singular value. None is taken where two singular values are small (several
@@ -197,7 +197,7 @@ def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> AxisCrossi
     omega, theta = result
     # a theta of -1e-17 is a crossing at zero delay, not one a whole period later
     theta = 0.0 if abs(theta) < _ZERO_ANGLE else theta % (2.0 * np.pi)
-    return AxisCrossing(omega=omega, theta=theta, direction=crossing.outward)
+    return Crossing(omega, theta / omega, crossing.outward, roots=2)
 
 
 def crossing_error(terms: Sequence[DelayedTerm], omega: float, tau_s: float) -> tuple[float, float]:
@@ -207,16 +207,6 @@ def crossing_error(terms: Sequence[DelayedTerm], omega: float, tau_s: float) -> 
     moves the crossing by the solution of a d omega + b d tau = -u*E v with a = u*(dM/d omega) v, b = u*(dM/d tau) v:
     two real equations. Near a multiple root a and b become small; the estimate is capped by epsilon^(1/n), which no
     multiplicity exceeds.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau), known to rounding:
-
-    >>> import numpy as np
-    >>> from gains.delay._crossings import DelayedTerm, crossing_error
-    >>> omega_error, delay_error_s = crossing_error([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], 1.0, np.pi / 2.0)
-    >>> delay_error_s < 1e-14
-    True
     """
     delays_s, multiples = np.array([term.delay_s(tau_s) for term in terms]), np.array([t.multiple for t in terms])
     worst, least = (0.0, 0.0), inf

@@ -1,11 +1,9 @@
 """Curves of solutions (omega, alpha, beta) of det(j omega I - A0 - A1 e^{-j alpha} - A2 e^{-j beta}) = 0, omega > 0.
 
-These are two real equations in three unknowns: their solutions are curves above the torus of the two angles. Starting
-points come from a grid of alpha and a grid of beta. A predictor along the tangent and a Newton corrector then follow
-each curve until it closes or omega reaches zero.
+These are two real equations in three unknowns. Starting points come from a grid of alpha and a grid of beta. A
+predictor along the tangent and a Newton corrector then follow each curve until it closes or omega reaches zero.
 """
 
-from dataclasses import dataclass
 from math import pi
 
 import numpy as np
@@ -27,17 +25,11 @@ _LOWEST = 1e-4
 _ON_CURVE, _SAME_CURVE = 1.5, 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """Points along one curve: `omega` (k,) in rad/s; `alpha` and `beta` (k,) in rad, unwrapped."""
+def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[FloatArray]:
+    """The curves of one block that pass through the starting points of the grids.
 
-    omega: FloatArray
-    alpha: FloatArray
-    beta: FloatArray
-
-
-def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[Curve]:
-    """The curves of one block that pass through the starting points of the grids."""
+    Each is an array (k, 3) of omega in rad/s and of alpha and beta in rad, unwrapped.
+    """
     scale = sum(float(np.linalg.norm(matrix)) for matrix in (A0, A1, A2))
     if scale == 0.0:
         return []
@@ -50,7 +42,7 @@ def crossing_solutions(A0: FloatArray, A1: FloatArray, A2: FloatArray) -> list[C
         for start in [*_solutions_at(terms, angle), *swapped]:
             if not any(_passes(curve, start) for curve in curves):
                 curves.append(_followed(terms, start))
-    return [Curve(curve[:, 0] * scale, curve[:, 1], curve[:, 2]) for curve in curves if len(curve) > 1]
+    return [curve * np.array([scale, 1.0, 1.0]) for curve in curves if len(curve) > 1]
 
 
 def at_delay(
@@ -61,21 +53,18 @@ def at_delay(
     That delay is (angle + 2 pi turns) / omega; the angle is alpha if `which` is 0, beta if it is 1.
     """
     scale = sum(float(np.linalg.norm(matrix)) for matrix in matrices)
-    terms = np.array(matrices) / scale
-    here = point / np.array([scale, 1.0, 1.0])
-    wanted = delay_s * scale
+    terms, units = np.array(matrices) / scale, np.array([scale, 1.0, 1.0])
+    here, of_delay = point / units, np.zeros(3)
+    of_delay[[0, 1 + which]] = -delay_s * scale, 1.0
     for _ in range(20):
-        here[1 + which] = wanted * here[0] - 2.0 * pi * turns
         value, slopes = _equation(terms, here)
-        if abs(value) < 1e-14:
-            return here * np.array([scale, 1.0, 1.0])
-        # the angle follows the frequency
-        pair = np.stack([slopes[:, 0] + wanted * slopes[:, 1 + which], slopes[:, 2 - which]], axis=1)
-        step = np.linalg.lstsq(pair, np.array([value.real, value.imag]), rcond=1e-10)[0]
+        missed = np.array([value.real, value.imag, of_delay @ here + 2.0 * pi * turns])
+        if np.abs(missed).max() < 1e-14 * max(1.0, float(np.abs(here).max())):
+            return here * units
+        step = np.linalg.lstsq(np.vstack([slopes, of_delay]), missed, rcond=1e-10)[0]
         if float(np.linalg.norm(step)) > 2.0 * _STEP:
             return None
-        here[0] -= step[0]
-        here[2 - which] -= step[1]
+        here = here - step
     return None
 
 

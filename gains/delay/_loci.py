@@ -1,10 +1,9 @@
 """Eigenvalue loci of a delayed loop, and the frequencies at which one of them crosses the unit circle.
 
 x'(t) = A0 x(t) + A1 x(t - tau) with A1 = B C of rank r has the root s = j omega at the delay tau exactly when
-e^{j omega tau} is an eigenvalue of the r x r loop G(j omega) = C (j omega I - A0)^{-1} B. The moduli of these
-eigenvalues do not depend on tau: crossings of the imaginary axis happen at the frequencies where a modulus is one.
-Sorted moduli are continuous functions of the frequency however the eigenvalues are numbered, which makes
-bracketing safe: between two frequencies at which a different number of moduli exceeds one, there is a crossing.
+e^{j omega tau} is an eigenvalue of the r x r loop G(j omega) = C (j omega I - A0)^{-1} B. The moduli of these loci do
+not depend on tau. Sorted, they are continuous functions of the frequency however the eigenvalues are numbered: between
+two frequencies at which a different number of moduli exceeds one, there is a crossing.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,6 +27,9 @@ _NEAR_UNIT = 1.0
 _SAME_PLACE = 1e-10
 # log of the modulus of a locus at such a place
 _ON_CIRCLE = 1e-8
+# points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
+_POINTS_PER_DECADE = 60
+_DECADES = 9
 # below this share of the highest frequency a locus that moves by less than this per octave is at its limit
 _SLOW, _FLAT = 1e-5, 1e-2
 
@@ -59,12 +61,26 @@ def highest_frequency(terms: Sequence[FloatArray]) -> float:
     return turning + float(sum(np.linalg.norm(matrix) for matrix in terms[1:]))
 
 
-def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray) -> Loci:
-    """The function omega (k,) -> eigenvalues (k, r) of C (j omega I - A0)^{-1} B."""
+def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
+    """Ascending frequencies (rad/s) up to the bound of every crossing frequency, dense around resonances."""
+    highest = 1.1 * highest_frequency((A0, A1))
+    grid = [highest * np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE)]
+    roots = np.concatenate([np.linalg.eigvals(A0), np.linalg.eigvals(A0 + A1)])
+    offsets = np.sinh(np.linspace(-5.0, 5.0, 41))
+    for root in roots[roots.imag > 0.0]:
+        width = max(abs(root.real), 1e-6 * abs(root.imag))
+        grid.append(root.imag + width * offsets)
+    # away from the pole itself, where the resolvent does not exist
+    omega = np.unique(np.concatenate(grid)) * (1.0 + 1e-9)
+    return omega[(omega > 0.0) & (omega <= highest)]
+
+
+def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | float = 0.0) -> Loci:
+    """The function omega (k,) -> eigenvalues (k, r) of C (j omega I - A0)^{-1} B + D."""
     identity = np.eye(A0.shape[0])
 
     def loci(omega: FloatArray) -> ComplexArray:
-        loop = C @ solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - A0, B)
+        loop = C @ solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - A0, B) + D
         return (loop[:, :, 0] if B.shape[1] == 1 else np.linalg.eigvals(loop)).astype(np.complex128, copy=False)
 
     return loci

@@ -1,10 +1,8 @@
 """Known delays beside one unknown: x'(t) = sum_i A_i x(t - d_i - k_i tau) with d_i in seconds and k_i whole.
 
-As in `_commensurate`, the loci lambda(j omega) = e^{j omega tau} are eigenvalues of a block companion matrix, but the
-known delays make its blocks depend on the frequency, by e^{-j omega d_i}. A root is on the imaginary axis where a
-modulus is one, and it moves to the right where the modulus falls, for every delay. The frequencies do not follow from
-algebra. They come from a sweep that resolves the turning of e^{-j omega d_i} and refines extrema near one. The argument
-principle counts the roots that are unstable at tau = 0.
+The loci are those of `_commensurate`, but the known delays make them depend on the frequency by e^{-j omega d_i}, so
+the crossing frequencies do not follow from algebra: they come from a sweep that resolves the turning of e^{-j omega
+d_i} and refines extrema near one. The argument principle counts the roots that are unstable at tau = 0.
 """
 
 from collections.abc import Sequence
@@ -18,8 +16,8 @@ from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 from gains.delay._commensurate import column_space, companion_loci
-from gains.delay._crossings import AxisCrossing, DelayedTerm
-from gains.delay._loci import Loci, highest_frequency, near_unit_extrema, unit_crossings, without_limits_at_zero
+from gains.delay._crossings import Crossing, DelayedTerm
+from gains.delay._loci import highest_frequency, near_unit_extrema, unit_crossings, without_limits_at_zero
 from gains.delay._windows import (
     BlockAnalysis,
     DelayAnalysis,
@@ -46,25 +44,9 @@ def analyse_mixed(
     """Stability windows, critical delays and margin in tau of x'(t) = sum A x(t - known_s - multiple tau).
 
     `unstable_roots_at_zero_delay` counts the roots at tau = 0, with the known delays. The crossing frequencies come
-    from a sweep: a search, not a proof. Options as of `gains.delay.constant.analyse_delay`.
-
-    Raises
-    ------
-    BadModelError
-        No term, matrices that are not square, finite and of one size, a delay that is negative or not finite, known
-        delays so long that the sweep would be too large, or a horizon that is not a positive number.
-    DisagreementError
-        A root too close to the imaginary axis at tau = 0 to count it on either side.
-
-    Examples
-    --------
-    x'(t) = -x(t - 0.5 - tau) leaves pi / 2 - 0.5 for tau:
-
-    >>> import numpy as np
-    >>> from gains.delay._crossings import DelayedTerm
-    >>> from gains.delay._mixed import analyse_mixed
-    >>> round(analyse_mixed([DelayedTerm(np.array([[-1.0]]), known_s=0.5, multiple=1)]).delay_margin_s, 6)
-    1.070796
+    from a sweep: a search, not a proof. Options as of `gains.delay.constant.analyse_delay`. Raises BadModelError if
+    terms do not fit, a delay is negative or not finite, or the known delays are so long that the sweep would be too
+    large; DisagreementError if a root is too close to the imaginary axis at tau = 0 to count it.
     """
     matrices = _checked(terms)
     check_horizon(horizon_s)
@@ -79,9 +61,8 @@ def _analyse_block(block: Block, known_s: FloatArray, multiples: IntArray, leave
     passage = zero_passage(parts.matrices, known_s, multiples) if leave_out_zero else None
     if passage is None and is_singular_for_any_delay(parts.matrices):
         return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
-    found = [AxisCrossing(*crossing) for crossing in _crossings(parts)]
     unstable = _unstable_roots(parts, passage is not None)
-    return block_analysis(block.copies, delayed, found, unstable, passage, parts.highest())
+    return block_analysis(block.copies, delayed, _crossings(parts), unstable, passage, parts.highest())
 
 
 def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_zero: bool = False) -> int:
@@ -89,14 +70,6 @@ def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_
 
     `terms` are pairs (A, d): a real matrix (n, n) in 1/s and its delay in s. With `leave_out_zero` the simple root at
     s = 0 of a block whose matrices have a singular sum is not counted. Exceptions as of `analyse_mixed`.
-
-    Examples
-    --------
-    x'(t) = -x(t - 2), beyond its margin of pi / 2:
-
-    >>> from gains.delay._mixed import count_unstable_roots
-    >>> count_unstable_roots([([[-1]], 2.0)])
-    2
     """
     checked = [DelayedTerm(np.asarray(matrix, dtype=np.float64), delay_s, 0) for matrix, delay_s in terms]
     blocks, delays_s = distinct_blocks(*_checked(checked)), np.array([term.known_s for term in checked])
@@ -142,22 +115,16 @@ class _Parts:
         return np.union1d(turning[1:], decades) * (1.0 + 1e-9)
 
 
-def _crossings(parts: _Parts) -> list[tuple[float, float, int]]:
-    """Frequency, angle theta = omega tau modulo 2 pi and direction of every crossing of the imaginary axis."""
+def _crossings(parts: _Parts) -> list[Crossing]:
     if parts.degree == 0:
         return []
-    loci = _loci(parts)
+    loci = companion_loci(parts.at, column_space(list(parts.matrices[parts.multiples > 0])))
     omega = parts.frequencies(1.1 * parts.highest())
     omega = np.union1d(omega, near_unit_extrema(loci, omega))
     return [
-        (crossing.omega, float(np.angle(crossing.locus)) % (2.0 * pi), crossing.outward)
-        for crossing in without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
+        Crossing(each.omega, float(np.angle(each.locus)) % (2.0 * pi) / each.omega, each.outward, roots=2)
+        for each in without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
     ]
-
-
-def _loci(parts: _Parts) -> Loci:
-    late = [matrix for matrix, k in zip(parts.matrices, parts.multiples, strict=True) if k > 0]
-    return companion_loci(parts.at, column_space(late))
 
 
 def _unstable_roots(parts: _Parts, at_zero: bool) -> int:

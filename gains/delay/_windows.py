@@ -2,16 +2,6 @@
 
 Every crossing belongs to an arithmetic sequence of delays, (theta + 2 pi k) / omega. The count of unstable roots starts
 at that without delay and changes at each crossing, in the order of the delays; where it is zero, the loop is stable.
-
-A simple root may stay at s = 0 at every delay, as the common value of a consensus does. With M(s) = sI - sum_k A_k
-e^{-s d_k}, M(0) = -sum_k A_k does not depend on the delays: where it is singular, s = 0 is a root at all of them, even
-where no state stands still by itself, as in x' = -x + x(t - tau). With w'M(0) = 0 and M(0) v = 0, the other roots near
-zero solve
-
-    f(s) / s = w'M'v + s w'(M''/2 - M' G M') v + ...,   M' = I + sum_k d_k A_k,  M'' = -sum_k d_k^2 A_k,
-
-with M' and M'' taken at s = 0, and G any matrix with M(0) G M(0) = M(0). The delays are d_k = known_k + multiple_k tau,
-so w'M'v is linear in tau: at most one real root passes zero, at one delay.
 """
 
 from collections.abc import Sequence
@@ -24,7 +14,7 @@ import numpy as np
 from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import is_singular_for_any_delay
-from gains.delay._crossings import AxisCrossing, DelayedTerm, crossing_error
+from gains.delay._crossings import Crossing, DelayedTerm, crossing_error
 
 # more critical delays than this are not listed: a near-tangent pair of crossings can have millions
 _MOST_EVENTS = 200_000
@@ -39,51 +29,25 @@ _BLUR, _TURN = 1e-3, 1e-3
 
 
 @dataclass(frozen=True)
-class Crossing:
-    """Roots +-j `omega_rad_s` on the imaginary axis at the delays `delay_s` + 2 pi k / `omega_rad_s`, k = 0, 1, ...
-
-    `direction` is +1 if they move into the right half plane as the delay grows, -1 if they move out of it, 0 if they
-    touch the axis and return; it is the same for every k. `roots` counts the roots that cross together: 2, times the
-    number of equal blocks. At frequency 0 a single real root passes s = 0, where another one stays: once, at `delay_s`.
-    """
-
-    omega_rad_s: float
-    delay_s: float
-    direction: int
-    roots: int
-
-
-@dataclass(frozen=True)
 class DelayAnalysis:
-    """Verdict on x'(t) = A0 x(t) + A1 x(t - tau) for every constant delay tau >= 0.
-
-    Attributes
-    ----------
-    stable_intervals_s
-        The open windows of asymptotic stability, `inf` for one without end. A window that begins at 0 includes zero
-        delay itself, unless A0 + A1 has roots on the imaginary axis that move to the left as the delay grows.
-    delay_margin_s
-        The end of the window that begins at 0, or 0 if none does.
-    delay_independent
-        Whether the loop is stable at every delay.
-    crossings
-        In ascending order of delay.
-    unstable_roots_at_zero_delay
-        The number of eigenvalues of A0 + A1 with positive real part.
-    complete_to_s
-        The delay up to which all windows are listed: `inf` unless the caller gave a horizon or there were too many
-        critical delays to list. The margin is exact in either case.
-    roots_fixed_at_zero
-        The number of roots at s = 0 that were left out at the caller's request.
-    """
+    """Verdict on x'(t) = A0 x(t) + A1 x(t - tau) for every constant delay tau >= 0."""
 
     stable_intervals_s: tuple[tuple[float, float], ...]
+    """The open windows of asymptotic stability, `inf` for one without end. A window that begins at 0 includes zero
+    delay itself, unless A0 + A1 has roots on the imaginary axis that move to the left as the delay grows."""
     delay_margin_s: float
+    """The end of the window that begins at 0, or 0 if none does."""
     delay_independent: bool
+    """Whether the loop is stable at every delay."""
     crossings: tuple[Crossing, ...]
+    """In ascending order of delay."""
     unstable_roots_at_zero_delay: int
+    """The number of eigenvalues of A0 + A1 with positive real part."""
     complete_to_s: float
+    """The delay up to which all windows are listed: `inf` unless the caller gave a horizon or there are too many
+    critical delays to list. The margin is exact in either case."""
     roots_fixed_at_zero: int = 0
+    """The number of roots at s = 0 that were left out at the caller's request."""
 
 
 @dataclass(frozen=True)
@@ -96,14 +60,14 @@ class ZeroPassage:
     delay_s: float
     direction: int
 
-    def is_seen_at(self, omega: float, theta: float, highest: float) -> bool:
-        """Whether a crossing at the angle theta = omega tau is the root at zero, blurred by rounding.
+    def is_seen_as(self, crossing: Crossing, highest: float) -> bool:
+        """Whether a crossing is the root at zero, blurred by rounding.
 
-        The locus e^{s tau} of that root is 1 + s delay_s + ...: at low frequencies its modulus is one to rounding, and
-        its noise may cross one any number of times.
+        The locus of that root has modulus one to rounding at low frequencies, so its noise may cross one many times.
         """
-        limit = omega * self.delay_s if np.isfinite(self.delay_s) else 0.0
-        return omega < _BLUR * highest and abs(float(np.angle(np.exp(1j * (theta - limit))))) < _TURN
+        omega = crossing.omega_rad_s
+        apart_s = crossing.delay_s - (self.delay_s if np.isfinite(self.delay_s) else 0.0)
+        return omega < _BLUR * highest and abs(float(np.angle(np.exp(1j * omega * apart_s)))) < _TURN
 
 
 @dataclass(frozen=True)
@@ -176,7 +140,7 @@ def check_horizon(horizon_s: float | None) -> None:
 def block_analysis(
     copies: int,
     terms: Sequence[DelayedTerm],
-    found: Sequence[AxisCrossing],
+    found: Sequence[Crossing],
     unstable: int,
     passage: ZeroPassage | None,
     highest: float,
@@ -185,34 +149,26 @@ def block_analysis(
 
     `passage` is what `zero_passage` says of a root at zero that is left out, None if there is none.
     """
-    crossings = [
-        Crossing(crossing.omega, crossing.theta / crossing.omega, crossing.direction, 2)
-        for crossing in found
-        if passage is None or not passage.is_seen_at(crossing.omega, crossing.theta, highest)
-    ]
+    crossings = [crossing for crossing in found if passage is None or not passage.is_seen_as(crossing, highest)]
     if passage is not None and passage.direction != 0:
         crossings.append(Crossing(0.0, passage.delay_s, passage.direction, 1))
     return BlockAnalysis(copies, terms, crossings, unstable, fixed_at_zero=passage is not None)
 
 
-def unstable_roots(roots: ComplexArray, found: Sequence[AxisCrossing], passage: ZeroPassage | None) -> int:
+def unstable_roots(roots: ComplexArray, found: Sequence[Crossing], passage: ZeroPassage | None) -> int:
     """The number of roots without delay right of the axis, without those that are known to be on it."""
     # a pair that crosses at zero delay is on the axis there: rounding must not put it in either half plane
     for crossing in found:
-        if crossing.theta == 0.0:
+        if crossing.delay_s == 0.0:
             for sign in (1.0, -1.0):
-                roots = np.delete(roots, np.argmin(np.abs(roots - sign * 1j * crossing.omega)))
+                roots = np.delete(roots, np.argmin(np.abs(roots - sign * 1j * crossing.omega_rad_s)))
     if passage is not None:
         roots = np.delete(roots, np.argmin(np.abs(roots)))
     return int(np.count_nonzero(roots.real > 0.0))
 
 
 def stability_windows(
-    crossings: Sequence[Crossing],
-    unstable: int,
-    horizon_s: float | None,
-    *,
-    errors: Sequence[tuple[float, float]] = (),
+    crossings: Sequence[Crossing], unstable: int, horizon_s: float | None, *, errors: Sequence[tuple[float, float]] = ()
 ) -> tuple[tuple[tuple[float, float], ...], float]:
     """The windows without unstable roots, and the delay up to which they are complete.
 
@@ -285,16 +241,12 @@ def zero_passage(
 ) -> ZeroPassage | None:
     """The root that passes the simple root of a block at s = 0; None unless s = 0 is a simple root at every delay.
 
-    A_k of `matrices`, (n, n) in 1/s, acts known_s[k] + multiples[k] tau late.
+    A_k of `matrices`, (n, n) in 1/s, acts d_k = known_s[k] + multiples[k] tau late. With w'M(0) = 0 and M(0) v = 0 for
+    M(s) = sI - sum_k A_k e^{-s d_k}, the other roots near zero solve
 
-    Examples
-    --------
-    x' = x - x(t - tau), s = 1 - e^{-s tau}: a root passes zero to the right at tau = 1.
+        w'M'v + s w'(M''/2 - M' G M') v + ... = 0,   M' = I + sum_k d_k A_k,  M'' = -sum_k d_k^2 A_k,
 
-    >>> import numpy as np
-    >>> from gains.delay._windows import zero_passage
-    >>> zero_passage([np.array([[1.0]]), np.array([[-1.0]])], np.zeros(2), np.arange(2))
-    ZeroPassage(delay_s=1.0, direction=1)
+    for any G with M(0) G M(0) = M(0). w'M'v is linear in tau, so at most one root passes zero, at one delay.
     """
     terms: FloatArray = np.array(matrices, dtype=np.float64)
     if not terms.any() or not is_singular_for_any_delay(terms):

@@ -6,16 +6,14 @@ one, see `gains.core.structure`. One delay is the least case of `_commensurate`,
 
 Methods of this kind are set side by side in E. Jarlebring and M. E. Hochstenbach, "Polynomial two-parameter eigenvalue
 problems and matrix pencil methods for stability of delay-differential equations", arXiv:0809.3634.
-
-Go on to `gains.margin.loop_margin` for loops with other delays beside the unknown one, to `gains.sampled.constant` for
-a loop that is sampled and held, and to `gains.varying` for delays that change.
 """
 
 from numpy.typing import ArrayLike
 
 from gains.core.structure import distinct_blocks, square_matrices
 from gains.delay._commensurate import analyse_block
-from gains.delay._windows import Crossing, DelayAnalysis, check_horizon, combined_analysis
+from gains.delay._crossings import Crossing
+from gains.delay._windows import DelayAnalysis, check_horizon, combined_analysis
 
 __all__ = ["Crossing", "DelayAnalysis", "analyse_delay", "delay_margin"]
 
@@ -25,37 +23,23 @@ def analyse_delay(
 ) -> DelayAnalysis:
     """Stability windows, critical delays and delay margin of x'(t) = A0 x(t) + A1 x(t - tau).
 
+    A0 and A1 are real matrices (n, n) in 1/s. All windows are listed, of which there are finitely many, or with
+    `horizon_s` only those that begin before this delay.
+
     A loop with a root that stays on the imaginary axis at every delay is asymptotically stable at none: no window,
-    margin 0. A loop with singular A0 + A1 is one (s = 0). If that root is merely the common value of a consensus, ask
-    for `leave_out_zero`. States on which neither A0 nor A1 acts can also be taken out of the matrices, with
-    `gains.core.structure.without_equilibria`.
+    margin 0. One is s = 0 if A0 + A1 is singular. If that root is merely the common value of a consensus, ask for
+    `leave_out_zero`, which judges a block with a simple root at s = 0 by its other roots, or remove states on which
+    nothing acts with `gains.core.structure.without_equilibria`.
 
-    Parameters
-    ----------
-    A0, A1
-        Real matrices (n, n), 1/s.
-    horizon_s
-        List only windows that begin before this delay. By default all are listed; there are finitely many.
-    leave_out_zero
-        Judge a block that has a simple root at s = 0 at every delay by its other roots.
+    Raises BadModelError unless the matrices are square, finite and of one size and the horizon is positive, and
+    DisagreementError if crossings and eigenvalues contradict each other (a loop at the limit of double precision).
 
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size, or the horizon is not a positive number.
-    DisagreementError
-        Crossings and eigenvalues contradict each other (a loop at the limit of double precision).
-
-    Examples
-    --------
     x'' - 0.1 x' + 2 x = x(t - tau) is stable for delays between 0.1 s and 1.7 s only:
 
-    >>> from gains.delay.constant import analyse_delay
+    >>> from gains import analyse_delay
     >>> found = analyse_delay([[0, 1], [-2, 0.1]], [[0, 0], [1, 0]])
     >>> [(round(start_s, 4), round(end_s, 4)) for start_s, end_s in found.stable_intervals_s]
     [(0.1002, 1.7179)]
-    >>> found.unstable_roots_at_zero_delay, found.delay_margin_s
-    (2, 0.0)
     """
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
     check_horizon(horizon_s)
@@ -67,12 +51,8 @@ def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 
     `inf` if no delay does, 0 if the loop is unstable without delay. Arguments and exceptions as of `analyse_delay`.
 
-    Examples
-    --------
-    x'(t) = -x(t - tau) is stable up to tau = pi / 2:
-
-    >>> from gains.delay.constant import delay_margin
-    >>> round(delay_margin([[0]], [[-1]]), 6)
+    >>> from gains import delay_margin
+    >>> round(delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796
     """
     # only the first critical delay is wanted: the shortest horizon lists the fewest windows

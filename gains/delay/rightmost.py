@@ -1,8 +1,7 @@
 """Rightmost root of a linear system with any number of constant delays: the spectrum at given delays.
 
-x'(t) = sum_k A_k x(t - tau_k) is the abstract ordinary equation u' = D u on functions over [-tau_max, 0] with the
-equation itself as boundary condition. On Chebyshev points D is a matrix whose eigenvalues approximate the roots;
-Newton's method on the characteristic matrix makes the rightmost ones exact.
+x'(t) = sum_k A_k x(t - tau_k) is u' = D u on functions over [-tau_max, 0]. On Chebyshev points D is a matrix whose
+eigenvalues approximate the roots; Newton's method on the characteristic matrix makes the rightmost ones exact.
 
 This approach and others are compared in D. Breda, "Methods for numerical computation of characteristic roots for delay
 differential equations: experimental comparison", Scientiae Mathematicae Japonicae Online 8 (2003), 317-328.
@@ -27,23 +26,14 @@ _LARGEST_MATRIX = 1500
 def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
     """The root of det(sI - sum_k A_k e^{-s tau_k}) with the largest real part (1/s), imaginary part >= 0.
 
-    Parameters
-    ----------
-    terms
-        Pairs (A_k, tau_k): a real matrix (n, n) in 1/s and its delay in s; zero for what acts at once.
+    `terms` are pairs (A_k, tau_k): a real matrix (n, n) in 1/s and its delay in s, zero for what acts at once. Raises
+    BadModelError if there is none, the matrices are not square, finite and of one size, a delay is negative or not
+    finite, or delays are so long against the time constants that the discretisation would be too large.
 
-    Raises
-    ------
-    BadModelError
-        No term, matrices that are not square, finite and of one size, a delay that is negative or not finite, or
-        delays so long against the time constants that the discretisation would be too large.
-
-    Examples
-    --------
     At tau = pi / 2 x'(t) = -x(t - tau) has the roots +-j, and with tau = 1 one that is Lambert's W(-1):
 
     >>> from math import pi
-    >>> from gains.delay.rightmost import rightmost_root
+    >>> from gains import rightmost_root
     >>> rightmost, later = (rightmost_root([([[-1]], delay_s)]) for delay_s in (1, pi / 2))
     >>> round(rightmost.real, 6), round(rightmost.imag, 6), round(later.imag, 6)
     (-0.318132, 1.337236, 1.0)

@@ -1,14 +1,11 @@
 """Several independent delays, one for each link: the combinations at which the loop is stable.
 
 x'(t) = A0 x(t) + A1 x(t - tau_1) + A2 x(t - tau_2) has a root j omega where det(j omega I - A0 - A1 e^{-j alpha} -
-A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. At a fixed alpha one delay is left, whose crossings
-are found along the unit circle of beta; from there the curves of solutions (omega, alpha, beta) are followed. Each
-solution belongs to the delays ((alpha + 2 pi p) / omega, (beta + 2 pi q) / omega), p and q whole: curves in the plane
-of delays across which the number of unstable roots changes. The edge of the stable region is made of their pieces on
-which no root lies right of the axis.
-
-A leader-follower formation is block triangular. If each block has one delay only, the region is a rectangle
-(`delay_box`).
+A2 e^{-j beta}) = 0 with alpha = omega tau_1, beta = omega tau_2. `_curves` follows the solutions (omega, alpha, beta).
+Each belongs to the delays ((alpha + 2 pi p) / omega, (beta + 2 pi q) / omega), p and q whole: curves in the plane of
+delays across which the number of unstable roots changes. The edge of the stable region is made of their pieces on
+which no root lies right of the axis. If each block has one delay only, as in a leader-follower tree with a delay for
+each vehicle, the region is a rectangle (`delay_box`).
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634, which parameterises the
 same curves.
@@ -16,7 +13,7 @@ same curves.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import ceil, inf, isfinite, pi
+from math import inf, isfinite, pi
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import distinct_blocks, real_matrix, square_matrices
-from gains.delay._curves import Curve, at_delay, crossing_solutions
+from gains.delay._curves import at_delay, crossing_solutions
 from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
 
@@ -65,23 +62,12 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
     """The rectangle of delays that x'(t) = A0 x(t) + sum_k late[k] x(t - tau_k) takes, block by block.
 
     Couplings between strongly connected blocks do not matter: in a leader-follower tree with one delay for each vehicle
-    every block has one delay, and the box is exact.
+    every block has one delay, and the box is exact. A0 acts at once and late[k] tau_k late, real matrices (n, n) in
+    1/s; BadModelError unless they are square, finite and of one size.
 
-    Parameters
-    ----------
-    A0, late
-        Real matrices (n, n), 1/s: what acts at once, and what acts tau_1, tau_2, ... late.
-
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size.
-
-    Examples
-    --------
     x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2): up to pi / 2 and pi / 4, whatever the other delay is.
 
-    >>> from gains.delay.several import delay_box
+    >>> from gains import delay_box
     >>> box = delay_box([[0, 0], [1, 0]], [[[-1, 0], [0, 0]], [[0, 0], [0, -2]]])
     >>> [round(limit_s, 6) for limit_s in box.limits_s], box.is_exact
     ([1.570796, 0.785398], True)
@@ -107,11 +93,8 @@ def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list
     B is (n, p), K is (p, n), u = K x, and `inputs` has the place of each vehicle's command in u, as
     `gains.formation.model.FormationModel.input_slice`. Raises BadModelError if B and K do not fit.
 
-    Examples
-    --------
     Two vehicles of one axis, each with a command of its own:
 
-    >>> from gains.delay.several import late_by_vehicle
     >>> [late.tolist() for late in late_by_vehicle([[1, 0], [0, 1]], [[-1, 0], [1, -1]], [slice(0, 1), slice(1, 2)])]
     [[[-1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [1.0, -1.0]]]
     """
@@ -124,10 +107,9 @@ def late_by_vehicle(B: ArrayLike, K: ArrayLike, inputs: Sequence[slice]) -> list
 def crossing_curves(
     A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, *, longest_s: tuple[float, float]
 ) -> tuple[Polyline, ...]:
-    """All curves in the plane of two delays along which roots lie on the imaginary axis, up to `longest_s`.
+    """All curves in the plane of two delays (s) along which roots lie on the imaginary axis, up to `longest_s`.
 
-    At every point the least singular value of the characteristic matrix is zero to rounding. The curves are followed
-    from crossings on a grid of angles: a search, not a proof.
+    Followed from crossings on a grid of angles: a search, not a proof. Arguments as of `boundary_of_two_delays`.
     """
     if not all(isfinite(longest) and longest > 0.0 for longest in longest_s):
         raise BadModelError(f"longest_s is {longest_s}; two positive numbers of seconds are wanted")
@@ -135,7 +117,7 @@ def crossing_curves(
     lines: list[Polyline] = []
     for block in distinct_blocks(now, first, second):
         for curve in crossing_solutions(*block.matrices):
-            lines += _offspring(block.matrices, curve, longest_s)
+            lines += _images(block.matrices, curve, longest_s)
     return tuple(lines)
 
 
@@ -145,25 +127,13 @@ def boundary_of_two_delays(
     """The edge of the stable region in the plane of two delays, up to `longest_s`: pieces of `crossing_curves`.
 
     A piece is part of the edge if no root lies right of the axis on it. The edge may surround several regions; where it
-    has no piece, the axes and `longest_s` bound them. A search, not a proof.
+    has no piece, the axes and `longest_s` bound them. A search, not a proof. A0, A1 and A2 are real matrices (n, n) in
+    1/s that act at once, tau_1 late and tau_2 late; BadModelError unless they are square, finite and of one size and
+    both of `longest_s` are positive and finite.
 
-    Parameters
-    ----------
-    A0, A1, A2
-        Real matrices (n, n), 1/s: what acts at once, tau_1 late and tau_2 late.
-    longest_s
-        The largest tau_1 and tau_2 of interest.
-
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size, or a longest delay is not positive and finite.
-
-    Examples
-    --------
     Without tau_2 the loop x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) takes tau_1 up to acos(-0.5) / sqrt(0.75) = 2.4184:
 
-    >>> from gains.delay.several import boundary_of_two_delays
+    >>> from gains import boundary_of_two_delays
     >>> edge = boundary_of_two_delays([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
     >>> at_once = min((pair for line in edge for pair in line.delays_s.tolist()), key=lambda pair: pair[1])
     >>> round(at_once[0], 4), at_once[1]
@@ -171,35 +141,30 @@ def boundary_of_two_delays(
     """
     pieces: list[Polyline] = []
     for line in crossing_curves(A0, A1, A2, longest_s=longest_s):
-        edge = np.array([_is_edge(A0, A1, A2, pair) for pair in line.delays_s.tolist()])
-        pieces += _runs(line, edge)
+        roots = [rightmost_root([(A0, 0.0), (A1, first_s), (A2, second_s)]) for first_s, second_s in line.delays_s]
+        edge = np.array([root.real <= _ON_AXIS * abs(root) for root in roots])
+        pieces += [
+            Polyline(line.delays_s[begin:end], line.omega_rad_s[begin:end])
+            for begin, end in _runs(edge)
+            if end - begin >= _LEAST_POINTS
+        ]
     return tuple(pieces)
 
 
-def _is_edge(A0: ArrayLike, A1: ArrayLike, A2: ArrayLike, delays_s: list[float]) -> bool:
-    root = rightmost_root([(A0, 0.0), (A1, delays_s[0]), (A2, delays_s[1])])
-    return root.real <= _ON_AXIS * abs(root)
-
-
-def _offspring(matrices: tuple[FloatArray, ...], curve: Curve, longest_s: tuple[float, float]) -> Iterator[Polyline]:
+def _images(matrices: tuple[FloatArray, ...], curve: FloatArray, longest_s: tuple[float, float]) -> Iterator[Polyline]:
     """The images of one curve of solutions in the box of delays, for all whole turns p and q."""
-    omega = curve.omega
-    turns = [
-        range(
-            ceil(float((-angle / (2.0 * pi)).min())),
-            int(np.floor(float(((longest * omega - angle) / (2.0 * pi)).max()))) + 1,
-        )
-        for angle, longest in ((curve.alpha, longest_s[0]), (curve.beta, longest_s[1]))
-    ]
-    for p in turns[0]:
-        for q in turns[1]:
-            delays_s = np.stack([(curve.alpha + 2.0 * pi * p) / omega, (curve.beta + 2.0 * pi * q) / omega], axis=1)
-            yield from _inside(matrices, curve, Polyline(delays_s, omega), (p, q), longest_s)
+    omega, angles = curve[:, :1], curve[:, 1:]
+    first = np.ceil((-angles / (2.0 * pi)).min(axis=0)).astype(int)
+    last = np.floor(((np.array(longest_s) * omega - angles) / (2.0 * pi)).max(axis=0)).astype(int)
+    for p in range(first[0], last[0] + 1):
+        for q in range(first[1], last[1] + 1):
+            line = Polyline((angles + 2.0 * pi * np.array([p, q])) / omega, curve[:, 0])
+            yield from _inside(matrices, curve, line, (p, q), longest_s)
 
 
 def _inside(
     matrices: tuple[FloatArray, ...],
-    curve: Curve,
+    curve: FloatArray,
     line: Polyline,
     turns: tuple[int, int],
     longest_s: tuple[float, float],
@@ -207,8 +172,7 @@ def _inside(
     """The stretches of a polyline in the box, each up to the points where the curve enters and leaves it."""
     delays_s = line.delays_s
     inside = np.all((delays_s >= 0.0) & (delays_s <= np.array(longest_s)), axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+    for begin, end in _runs(inside):
         points, omega = delays_s[begin:end], line.omega_rad_s[begin:end]
         for last, beyond, at in ((begin, begin - 1, 0), (end - 1, end, end - begin)):
             if 0 <= beyond < len(delays_s):
@@ -222,7 +186,7 @@ def _inside(
 
 def _edge_point(
     matrices: tuple[FloatArray, ...],
-    curve: Curve,
+    curve: FloatArray,
     delays_s: FloatArray,
     between: tuple[int, int],
     turns: tuple[int, int],
@@ -241,8 +205,7 @@ def _edge_point(
     if not met or min(met)[0] <= 0.0:
         return None
     share, which, bound_s = min(met)
-    vertices = np.stack([curve.omega, curve.alpha, curve.beta], axis=1)
-    start = vertices[last] + share * (vertices[beyond] - vertices[last])
+    start = curve[last] + share * (curve[beyond] - curve[last])
     found = at_delay(matrices, start, which=which, delay_s=bound_s, turns=turns[which])
     if found is None:
         return None
@@ -254,9 +217,7 @@ def _edge_point(
     return pair_s, float(found[0])
 
 
-def _runs(line: Polyline, kept: NDArray[np.bool_]) -> Iterator[Polyline]:
-    """The stretches of a polyline whose points are all kept."""
+def _runs(kept: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Begin and end of each stretch that is kept."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(np.int8)))
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        if end - begin >= _LEAST_POINTS:
-            yield Polyline(line.delays_s[begin:end], line.omega_rad_s[begin:end])
+    return zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)

@@ -2,9 +2,7 @@
 
 P. R. Sahoo, "Decentralized Control Design Approaches for Formation Control of Unmanned Aerial Vehicles", M.Tech
 thesis, NIT Rourkela, 2012, Theorem 2: with A0 + A1 Hurwitz, the margin is the least theta / omega over all omega > 0
-with a generalised eigenvalue lambda(j omega I - A0, A1) = e^{-j theta}. `frequency_sweep_margin` computes these as the
-reciprocals of the eigenvalues of (j omega I - A0)^{-1} A1. `circle_sweep_margin` sweeps theta in place of omega, which
-allows multiples of the delay too.
+with a generalised eigenvalue lambda(j omega I - A0, A1) = e^{-j theta}.
 """
 
 from collections.abc import Sequence
@@ -15,18 +13,15 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._circle_angles import circle_loci, circle_points, norm_of, passes_zero
+from gains.delay._commensurate import circle_loci, circle_points, norm_of, passes_zero
 from gains.delay._loci import (
     delay_loci,
-    highest_frequency,
     near_unit_extrema,
+    sweep_frequencies,
     unit_crossings,
     without_limits_at_zero,
 )
 
-# points a decade; a peak of damping ratio 0.01 is 0.009 decades wide
-_POINTS_PER_DECADE = 60
-_DECADES = 9
 # a root of A(theta) this close to the imaginary axis, relative to the norm, is on it
 _ON_AXIS = 1e-9
 
@@ -34,26 +29,11 @@ _ON_AXIS = 1e-9
 def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """Delay margin (s) of x'(t) = A0 x(t) + A1 x(t - tau) by a frequency sweep, refined where a modulus is near one.
 
-    0 when A0 + A1 is not Hurwitz, `inf` when no modulus reaches one. The sweep is dense near the natural frequencies
-    of A0 and of A0 + A1. Every local extremum near one of every sorted modulus is located, which separates two
-    crossings between neighbouring grid points.
+    0 when A0 + A1 is not Hurwitz, `inf` when no modulus reaches one. The sweep is dense near the natural frequencies of
+    A0 and of A0 + A1, and every local extremum near one of every sorted modulus is located. A0 and A1 are real matrices
+    (n, n) in 1/s; BadModelError unless they are square, finite and of one size.
 
-    Parameters
-    ----------
-    A0, A1
-        Real matrices (n, n), 1/s.
-
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau) is stable up to tau = pi / 2:
-
-    >>> from gains.delay.sweep import frequency_sweep_margin
-    >>> round(frequency_sweep_margin([[0]], [[-1]]), 6)
+    >>> round(frequency_sweep_margin([[0]], [[-1]]), 6)  # pi / 2
     1.570796
     """
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
@@ -63,35 +43,13 @@ def frequency_sweep_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
     """Delay margin (s) of x'(t) = sum_k A_k x(t - k tau) by a sweep along the unit circle.
 
-    The eigenvalues s of A(theta) = sum_k A_k e^{-j k theta} are computed on a grid of angles; where one crosses the
-    imaginary axis at j omega, tau = theta / omega is critical. Sorted real parts are continuous in the angle, so
-    crossings can be bracketed, and local extrema near zero are refined. 0 if the loop is unstable without delay, `inf`
-    if no crossing is found. Arguments and exceptions as of `gains.delay._commensurate.analyse_commensurate`.
-
-    Examples
-    --------
-    The margin pi / (3 sqrt(3)) of x'(t) = -x(t - tau) - x(t - 2 tau):
-
-    >>> from gains.delay.sweep import circle_sweep_margin
-    >>> round(circle_sweep_margin([[[0]], [[-1]], [[-1]]]), 6)
-    0.6046
+    Where an eigenvalue s of A(theta) = sum_k A_k e^{-j k theta} crosses the imaginary axis at j omega, tau = theta /
+    omega is critical. Sorted real parts are continuous in the angle, so crossings can be bracketed, and local extrema
+    near zero are refined. 0 if the loop is unstable without delay, `inf` if no crossing is found. Arguments and
+    exceptions as of `gains.delay._commensurate.analyse_commensurate`.
     """
     checked = square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)})
     return min(_circle_margin(balanced(*block.matrices)) for block in distinct_blocks(*checked))
-
-
-def sweep_frequencies(A0: FloatArray, A1: FloatArray) -> FloatArray:
-    """Ascending frequencies (rad/s) up to the bound of every crossing frequency, dense around resonances."""
-    highest = 1.1 * highest_frequency((A0, A1))
-    grid = [highest * np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE)]
-    roots = np.concatenate([np.linalg.eigvals(A0), np.linalg.eigvals(A0 + A1)])
-    offsets = np.sinh(np.linspace(-5.0, 5.0, 41))
-    for root in roots[roots.imag > 0.0]:
-        width = max(abs(root.real), 1e-6 * abs(root.imag))
-        grid.append(root.imag + width * offsets)
-    # away from the pole itself, where the resolvent does not exist
-    omega = np.unique(np.concatenate(grid)) * (1.0 + 1e-9)
-    return omega[(omega > 0.0) & (omega <= highest)]
 
 
 def _frequency_margin(A0: FloatArray, A1: FloatArray) -> float:

@@ -2,36 +2,29 @@
 
 `design` finds gains of largest robustness α with a wanted delay margin, or of largest delay margin with a wanted α;
 `evaluate_gains` reports the same figures of given gains. Both check their result on the whole formation, with methods
-that share no formula with the search.
-
-The margin asked for is that of the loop as flown: `sampled`, with period and zero-order hold, and `ground`, with all
-feedback late. It is about half a period less than the continuous one. Both are reported.
+that share no formula with the search. The margin asked for is that of the loop as flown, sampled and held, with all
+feedback late: about half a period less than the continuous one. Both are reported.
 
 Source: Sahoo 2012 (see `gains.formation.model`), sections 3 and 5.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
-from gains.core.errors import BadModelError, DisagreementError, SolverError
-from gains.core.requirement import ALPHA_MIN, PeakLimit, Requirement, plain
+from gains.core.errors import DisagreementError, SolverError
+from gains.core.requirement import ALPHA_MIN, Requirement, plain
+from gains.core.structure import positive_seconds
 from gains.delay.constant import delay_margin
 from gains.design.graph import GraphDesign, GraphMethod, assess, graph_design
 from gains.design.required import required_gains
 from gains.design.search import largest_alpha
 from gains.formation.model import FormationModel, checked_gain
 from gains.formation.pattern import Pattern, checked_pattern_gain, leader_follower
-from gains.performance.behaviour import (
-    Behaviour,
-    BlockMargin,
-    behaviour,
-    block_margin,
-    diagonal_blocks,
-)
+from gains.performance.behaviour import Behaviour, BlockMargin, behaviour, block_margin, diagonal_blocks
 from gains.performance.robust import Certificate, certify, robustness
 from gains.performance.string_stability import Gains
 from gains.sampled.constant import sampled_delay_margin
@@ -55,40 +48,28 @@ class TradeOffPoint:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Gains, what they are good for, and how that is known.
-
-    Attributes
-    ----------
-    K1, K2, K3
-        Gains on the own velocity error (1/s), that of the vehicle in front (1/s) and the spacing error (1/s²), each of
-        shape (axes, axes).
-    alpha
-        Exact sector bound for W = I, `gains.performance.robust.robustness`; 0 if the loop is unstable.
-    certificate
-        Lyapunov proof of 0.9999 α; None if the loop is unstable, its α is below 5e-4, or the solver finds none for
-        given gains.
-    delay_margin_s, delay_margin_continuous_s
-        Margin of the sampled loop and of the continuous one, all feedback late.
-    leader, follower
-        The continuous margin block by block.
-    trade_off
-        Points of the curve of best designs with this period and limit on spacing errors.
-    """
+    """Gains, what they are good for, and how that is known."""
 
     K1: FloatArray
     K2: FloatArray
     K3: FloatArray
+    """Gains on the own velocity error (1/s), that of the vehicle in front (1/s) and the spacing error (1/s²), each of
+    shape (axes, axes)."""
     alpha: float
+    """Exact sector bound for W = I, `gains.performance.robust.robustness`; 0 if the loop is unstable."""
     delay_margin_s: float
     delay_margin_continuous_s: float
+    """Margin of the sampled loop and of the continuous one, all feedback late."""
     period_s: float
     vehicles: int
     leader: BlockMargin
     follower: BlockMargin
+    """The continuous margin block by block."""
     behaviour: Behaviour
     certificate: Certificate | None
+    """Lyapunov proof of 0.9999 α; None if the loop is unstable, its α is below 5e-4, or the solver finds none for given
+    gains."""
     requirement: Requirement | None = None
-    trade_off: tuple[TradeOffPoint, ...] = field(default=())
     method: Literal["inclusion", "given"] = "inclusion"
     loop: Literal["ground"] = "ground"
     pattern: str = PATTERN
@@ -132,37 +113,18 @@ def design(
 ) -> Design | GraphDesign:
     """Return the gains that meet the requirement and are best in what it leaves open.
 
-    Parameters
-    ----------
-    formation
-        A leader and any number of followers. A leader alone gets the same gains, with the margin of its own velocity
-        loop.
-    requirement
-        A sampled delay margin of 0.3 s if not given.
-    period_s
-        Period of the control loop: sample, hold.
-    method
-        The inclusion principle, or a method of the graph route, see `gains.design.graph`.
-    pattern, onboard
-        For the graph route: who may use whose output, the leader-follower pattern (4.6) if not given; and the timing of
-        the onboard loop, if that is flown.
+    The formation is a leader and any number of followers; a leader alone gets the same gains, with the margin of its
+    own loop. The requirement is a sampled delay margin of 0.3 s if not given. Commands are sampled and held every
+    `period_s`. `method` is the inclusion principle, or a method of the graph route (`gains.design.graph`), which also
+    takes a `pattern` that says who may use whose output, the leader-follower pattern (4.6) if not given, and `onboard`,
+    the timing of the onboard loop, if that is flown.
 
-    Raises
-    ------
-    BadModelError
-        If the period is not positive.
-    InfeasibleError
-        If no gains meet the requirement; the message says what can be reached.
-    DisagreementError
-        If the exact analysis contradicts the search.
+    Raises BadModelError if the period is not positive, InfeasibleError if no gains meet the requirement, with what can
+    be reached, and DisagreementError if the exact analysis contradicts the search.
 
-    Examples
-    --------
     A leader and two followers in a chain, with a delay margin of 0.3 s at 50 Hz:
 
-    >>> from gains.design.design import design
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.core.requirement import Requirement
+    >>> from gains import FormationModel, Requirement, design
     >>> found = design(FormationModel((-1, 0, 1)), Requirement(delay_margin_s=0.3), period_s=0.02)
     >>> round(found.delay_margin_s, 4), found.K1.shape
     (0.3, (2, 2))
@@ -171,7 +133,7 @@ def design(
         links = leader_follower(formation) if pattern is None else pattern
         return graph_design(formation, links, requirement, method=method, period_s=period_s, onboard=onboard)
     wanted = Requirement() if requirement is None else requirement
-    _check_period(period_s)
+    positive_seconds("period_s", period_s)
     gains = required_gains(wanted, period_s)
     identity = np.eye(formation.axes)
     matrices = 0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity
@@ -206,28 +168,14 @@ def evaluate_gains(
 ) -> Design | GraphDesign:
     """Return margins, robustness and decay of given gains.
 
-    Gains of an unstable loop are reported too: α and the margins are 0 and there is no certificate.
+    Gains of an unstable loop are reported too: α and the margins are 0 and there is no certificate. `gains` are K1, K2
+    and K3, each of shape (axes, axes), or with a `pattern`, which says who may use whose output, K of u = K e, shape
+    (inputs, states). Commands are sampled and held every `period_s`. Raises BadModelError if a gain is not finite, not
+    of its shape or not in the pattern, or the period is not positive.
 
-    Parameters
-    ----------
-    gains
-        K1, K2 and K3, each of shape (axes, axes); with a pattern, K of u = K e, shape (inputs, states).
-    period_s
-        Period of the control loop: sample, hold.
-    pattern
-        Who may use whose output.
-
-    Raises
-    ------
-    BadModelError
-        If a gain is not finite, not of its shape or not in the pattern, or the period is not positive.
-
-    Examples
-    --------
     K1 = −1, K3 = 1: a follower takes 0.711119 s, or half a period less when sampled.
 
-    >>> from gains.design.design import evaluate_gains
-    >>> from gains.formation.model import FormationModel
+    >>> from gains import FormationModel, evaluate_gains
     >>> found = evaluate_gains(FormationModel((-1, 0), axes=1), ([[-1]], [[0]], [[1]]), period_s=0.02)
     >>> round(found.delay_margin_continuous_s, 6), round(found.delay_margin_s, 3)
     (0.711119, 0.701)
@@ -273,7 +221,6 @@ def _assess(formation: FormationModel, gains: Gains, *, period_s: float, require
         behaviour=behaviour(gains, (margin_s + period_s) / 2),
         certificate=_certificate(gains, alpha, given=requirement is None),
         requirement=requirement,
-        trade_off=_trade_off(period_s, requirement.peak_limit if requirement else None),
         method="inclusion" if requirement else "given",
     )
 
@@ -295,34 +242,15 @@ def trade_off(
 ) -> tuple[TradeOffPoint, ...]:
     """Return the largest α at sampled delay margins from 0.05 to 1 s, without those that no gains have.
 
-    Parameters
-    ----------
-    period_s
-        Period of the control loop: sample, hold.
-    string_peak_max, loop
-        As in `gains.core.requirement.Requirement`.
+    Arguments as in `gains.core.requirement.Requirement`; commands are sampled and held every `period_s`. Raises
+    BadModelError if the period is not positive or the limit is below 1.
 
-    Raises
-    ------
-    BadModelError
-        If the period is not positive or the limit is below 1.
-
-    Examples
-    --------
-    >>> from gains.design.design import trade_off
+    >>> from gains import trade_off
     >>> points = trade_off(period_s=0.02)
     >>> points[0].delay_margin_s, points[-1].delay_margin_s, points[0].alpha > points[-1].alpha
     (0.05, 1.0, True)
     """
-    _check_period(period_s)
-    return _trade_off(period_s, Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit)
-
-
-def _trade_off(period_s: float, limit: PeakLimit) -> tuple[TradeOffPoint, ...]:
+    positive_seconds("period_s", period_s)
+    limit = Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit
     points = ((margin_s, largest_alpha(margin_s, period_s, limit)) for margin_s in _TRADE_OFF_MARGINS_S)
     return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)
-
-
-def _check_period(period_s: float) -> None:
-    if not (np.isfinite(period_s) and period_s > 0):
-        raise BadModelError(f"period_s = {period_s}; wanted a positive number of seconds")

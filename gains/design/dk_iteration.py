@@ -5,13 +5,13 @@ For x' = A x + B u, y = C x, u = K y find K with the pattern and a small α with
     (A + B K C)'P + P (A + B K C) ⪯ α P,    I ⪯ P ⪯ κ I,    ‖K‖ ≤ k̄                         (1)
 
 so that every motion of the loop decays at least like e^{αt/2}. With K fixed (1) is linear in P, with P fixed in K and
-α; each step can only lower α. The start is K = 0 and the α of P = I. P is not block diagonal: the pattern is imposed on
-K alone. P is perturbed by ε 11' before every gain step, because no gain helps where P decouples states from inputs.
+α; each step can only lower α. The start is K = 0 and the α of P = I. P is perturbed by ε 11' before every gain step,
+because no gain helps where P decouples states from inputs.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4.4. It prints "… + αI ⪯ 0, minimise α", which is unbounded
-below; with αP and P normalised, its stop at α < 0 is the test of stability that is meant. Its bound
-[[k̄, K], [K', I]] ≻ 0 with 0.1 < k̄ < 100 allows ‖K‖ < 10 only, less than the gains it prints; here k̄ bounds ‖K‖ itself.
-Its fixed ε = 0.1 can raise α; here ε is halved until it does not.
+below; with αP and P normalised, its stop at α < 0 is the test of stability that is meant. Its bound on K allows
+‖K‖ < 10 only, less than the gains it prints; here k̄ bounds ‖K‖ itself. Its fixed ε = 0.1 can raise α; here ε is halved
+until it does not.
 """
 
 from collections.abc import Callable
@@ -49,66 +49,41 @@ class DkIterate:
 
 @dataclass(frozen=True, eq=False)
 class DecayProof:
-    """P of (1) and the eigenvalues that were checked: V = x'Px proves that motions decay like e^{αt/2}.
-
-    Attributes
-    ----------
-    P
-        Symmetric, shape (n, n).
-    alpha
-        1/s; negative: the loop is stable.
-    P_eigenvalue_min
-        Positive.
-    inequality_eigenvalue_max
-        Largest eigenvalue of A_K'P + P A_K − αP, not positive.
-    """
+    """P of (1) and the eigenvalues that were checked: V = x'Px proves that motions decay like e^{αt/2}."""
 
     P: FloatArray
+    """Symmetric, shape (n, n)."""
     alpha: float
+    """1/s; negative: the loop is stable."""
     P_eigenvalue_min: float
+    """Positive."""
     inequality_eigenvalue_max: float
+    """Largest eigenvalue of A_K'P + P A_K − αP, not positive."""
 
 
 @dataclass(frozen=True, eq=False)
 class DkDesign:
-    """Gain of the D-K type iteration.
-
-    Attributes
-    ----------
-    K
-        Shape (inputs, outputs), with the pattern's zeros.
-    proof
-        Of the last α; the decay rate is −α/2 or more.
-    iterates
-        All of them, the first with K = 0; α falls.
-    solver
-        Of all steps together: seconds and iterations are sums. None if K = 0 is stable.
-    """
+    """Gain of the D-K type iteration."""
 
     K: FloatArray
+    """Shape (inputs, outputs), with the pattern's zeros."""
     proof: DecayProof
+    """Of the last α; the decay rate is −α/2 or more."""
     iterates: tuple[DkIterate, ...]
+    """All of them, the first with K = 0; α falls."""
     solver: SolverFacts | None
+    """Of all steps together: seconds and iterations are sums. None if K = 0 is stable."""
 
 
 def dk_iteration(plant: Plant, pattern: Pattern) -> DkDesign:
     """Return the first gain of the iteration that is proved to stabilise.
 
-    Raises
-    ------
-    BadModelError
-        If sizes do not fit, or the plant has more than `LARGEST_STATES` states.
-    InfeasibleError
-        If the iteration settles before; the message says at which rate.
-    SolverError
-        If the solver ends a step with a status other than "optimal".
+    Raises BadModelError if sizes do not fit or there are more than `LARGEST_STATES` states, InfeasibleError if the
+    iteration settles before, with the rate, and SolverError if the solver ends a step with a status other than
+    "optimal".
 
-    Examples
-    --------
     Two integrators in a row, both measured:
 
-    >>> from gains.design.dk_iteration import dk_iteration
-    >>> from gains.formation.pattern import Pattern, Plant
     >>> found = dk_iteration(Plant([[0, 1], [0, 0]], [[0], [1]]), Pattern([[1]], (1,), (2,)))
     >>> found.proof.alpha < 0, found.iterates[-1].abscissa < 0
     (True, True)
@@ -227,10 +202,6 @@ def _proved_alpha(closed_loop: FloatArray, P: FloatArray) -> float:
 def abscissa(closed_loop: FloatArray) -> float:
     """Return the largest real part (1/s) of an eigenvalue, by strongly connected blocks (`gains.core.structure`).
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from gains.design.dk_iteration import abscissa
     >>> round(abscissa(np.array([[0.0, 1.0], [-2.0, -3.0]])), 6)
     -1.0
     """
@@ -241,19 +212,7 @@ def abscissa(closed_loop: FloatArray) -> float:
 def decay_proof(closed_loop: FloatArray, P: FloatArray) -> DecayProof:
     """Return the least α that P proves for a closed loop A_K, both (n, n), checked by numpy's eigenvalues alone.
 
-    Raises
-    ------
-    SolverError
-        If P is not positive definite or proves no decay.
-
-    Examples
-    --------
-    V = x'x proves that x' = −x decays like e^{−t}:
-
-    >>> import numpy as np
-    >>> from gains.design.dk_iteration import decay_proof
-    >>> round(decay_proof(-np.eye(2), np.eye(2)).alpha, 6)
-    -2.0
+    SolverError if P is not positive definite or proves no decay.
     """
     P_min = float(np.linalg.eigvalsh(P)[0])
     if P_min <= 0:

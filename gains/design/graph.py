@@ -1,11 +1,9 @@
 """Gains on any information pattern, designed to a requirement: the graph route.
 
 A base gain comes from the structured LQR (`gains.design.structured_lqr`) or the D-K type iteration
-(`gains.design.dk_iteration`), for one axis; the other axes get the same. A change of the time scale then brings it to
-the requirement (`gains.design.time_scale`).
-
-What a slower or faster loop cannot give, its shape may: the LQR route tries several ratios of the weights of spacing
-and velocity errors, and keeps the best in what the requirement leaves open.
+(`gains.design.dk_iteration`), for one axis; the other axes get the same. A change of the time scale brings it to the
+requirement (`gains.design.time_scale`). The LQR route tries several ratios of the weights of spacing and velocity
+errors, and keeps the best in what the requirement leaves open.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4. The scaling to a requirement is ours.
 """
@@ -44,44 +42,31 @@ _PROVED_SHARES = (0.9, 0.5, 0.1, 0.01)
 
 @dataclass(frozen=True, eq=False)
 class GraphDesign:
-    """A gain with an information pattern, what it is good for, and how that is known.
-
-    Attributes
-    ----------
-    K
-        u = K e, shape (inputs, states) of `gains.formation.model.FormationModel`.
-    links
-        The pattern: (i, j) where vehicle i uses the output of vehicle j, spacing and velocity error.
-    alpha
-        Exact sector bound of the whole formation for W = I: 1 / ‖(sI − A − BK)^{-1}‖∞. It falls with the length of a
-        chain, unlike that of one vehicle behind another, which `gains.design.design` reports.
-    decay_rate_1_s
-        Of the slowest motion without delay; negative if unstable.
-    delay_margin_s, delay_margin_continuous_s
-        Margin of the sampled loop and of the continuous one, all feedback late.
-    certificate
-        P that proves a share of the decay rate, checked by eigenvalues; None if the loop is unstable.
-    cost_loss
-        Share by which the LQR cost is above that of the centralised optimum; None for other methods.
-    subgraphs, subgraphs_smallest
-        Complete bipartite subgraphs of the partition by input and of the smallest one found.
-    solver
-        Of the base gain; None where no solver was used.
-    """
+    """A gain with an information pattern, what it is good for, and how that is known."""
 
     K: FloatArray
+    """u = K e, shape (inputs, states) of `gains.formation.model.FormationModel`."""
     links: tuple[Link, ...]
+    """The pattern: (i, j) where vehicle i uses the output of vehicle j, spacing and velocity error."""
     alpha: float
+    """Exact sector bound of the whole formation for W = I: 1 / ‖(sI − A − BK)^{-1}‖∞. It falls with the length of a
+    chain, unlike that of one vehicle behind another, which `gains.design.design` reports."""
     decay_rate_1_s: float
+    """Of the slowest motion without delay; negative if unstable."""
     delay_margin_s: float
     delay_margin_continuous_s: float
+    """Margin of the sampled loop and of the continuous one, all feedback late."""
     period_s: float
     vehicles: int
     certificate: DecayProof | None
+    """P that proves a share of the decay rate, checked by eigenvalues; None if the loop is unstable."""
     cost_loss: float | None
+    """Share by which the LQR cost is above that of the centralised optimum; None for other methods."""
     subgraphs: int
     subgraphs_smallest: int
+    """Complete bipartite subgraphs of the partition by input and of the smallest one found."""
     solver: SolverFacts | None
+    """Of the base gain; None where no solver was used."""
     requirement: Requirement | None
     method: Literal["graph-dk", "graph-lqr", "given"]
     loop: Literal["ground"] = "ground"
@@ -102,39 +87,14 @@ def graph_design(
 ) -> GraphDesign:
     """Return the gain with the pattern that meets the requirement and is best in what it leaves open.
 
-    Arguments are those of `gains.design.design.design`, with these differences:
+    Arguments are those of `gains.design.design.design`, but the requirement's `string_peak_max` is not used, as errors
+    run both ways in a general pattern. D-K takes at most 40 states an axis. With `onboard`, the timing of the onboard
+    loop, the requirement bounds the margin of that loop and that of the vehicles' own gains
+    (`gains.design.time_scale`). The margins reported are those of the ground loop in any case.
 
-    Parameters
-    ----------
-    pattern
-        One of the formation with one axis or with all of them; D-K takes at most 40 states an axis.
-    requirement
-        Its `string_peak_max` is not used, as errors run both ways in a general pattern.
-    onboard
-        Timing of the onboard loop, if that is flown: the requirement then bounds its margin, and that of the vehicles'
-        own gains (`gains.design.time_scale`). The margins reported are those of the ground loop in any case.
-
-    Raises
-    ------
-    BadModelError
-        If the pattern is not one of the formation, or the period is not positive.
-    InfeasibleError
-        If a mode cannot be moved by the pattern (the message names the missing link), or the requirement cannot be met
-        (the message says what to relax).
-    SolverError
-        If the base gain is not found: see `gains.design.structured_lqr` and `gains.design.dk_iteration`.
-
-    Examples
-    --------
-    A chain of three in which each vehicle sees its neighbours on both sides:
-
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.design.graph import graph_design
-    >>> from gains.formation.pattern import bidirectional
-    >>> chain = FormationModel((-1, 0, 1))
-    >>> found = graph_design(chain, bidirectional(chain), method="graph-lqr", period_s=0.02)
-    >>> round(found.delay_margin_s, 6), found.K.shape
-    (0.3, (6, 10))
+    Raises BadModelError if the pattern is not one of the formation or the period is not positive; InfeasibleError if
+    the pattern cannot move a mode, with the missing link, or the requirement cannot be met, with what to relax;
+    SolverError if the base gain is not found (`gains.design.structured_lqr`, `gains.design.dk_iteration`).
     """
     wanted = requirement or Requirement()
     single = FormationModel(formation.predecessors, axes=1)

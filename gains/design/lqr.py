@@ -27,16 +27,7 @@ from gains.formation.pattern import Plant
 class Weights:
     """Weights of the cost: Q (n, n) on states and R (inputs, inputs).
 
-    Raises
-    ------
-    BadModelError
-        If a weight is not symmetric, Q not positive semidefinite, or R not positive definite.
-
-    Examples
-    --------
-    >>> from gains.design.lqr import Weights
-    >>> Weights([[1, 0], [0, 2]], [[1]]).Q.tolist()
-    [[1.0, 0.0], [0.0, 2.0]]
+    BadModelError if a weight is not symmetric, Q not positive semidefinite, or R not positive definite.
     """
 
     Q: FloatArray
@@ -165,16 +156,8 @@ class Cost:
 def centralised_lqr(plant: Plant, weights: Weights) -> tuple[FloatArray, float]:
     """Return the optimal K = −R⁻¹B'P, shape (inputs, states), and its cost trace(P), of the algebraic Riccati equation.
 
-    Raises
-    ------
-    InfeasibleError
-        If the Riccati equation has no stabilising solution.
+    InfeasibleError if the Riccati equation has no stabilising solution.
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from gains.formation.pattern import Plant
-    >>> from gains.design.lqr import Weights, centralised_lqr
     >>> integrator = Plant(A=np.zeros((1, 1)), B=np.eye(1), C=np.eye(1))
     >>> K, cost = centralised_lqr(integrator, Weights(Q=4 * np.eye(1), R=np.eye(1)))
     >>> K.round(12).tolist(), round(cost, 12)

@@ -26,22 +26,8 @@ def required_gains(wanted: Requirement, period_s: float) -> ScalarGains:
     """Return the gains that meet the requirement and are the best in what it leaves open.
 
     With a delay margin they have the largest α of all that meet the rest; without one the largest margin, and of those
-    the largest α. `period_s` is that of the control loop: sample, hold.
-
-    Raises
-    ------
-    InfeasibleError
-        If no gains meet the requirement; the message says which part of it to relax, and how far.
-
-    Examples
-    --------
-    Two equal poles at −1 have the largest margin of all gains that decay like e^{−t}:
-
-    >>> from gains.design.required import required_gains
-    >>> from gains.core.requirement import Requirement
-    >>> gains = required_gains(Requirement(decay_rate_1_s=1.0), 0.02)
-    >>> round(gains.k1, 3), round(gains.k3, 3)
-    (2.0, 1.0)
+    the largest α. `period_s` is that of the control loop: sample, hold. InfeasibleError if no gains meet the
+    requirement, with what to relax and how far.
     """
     gains = _best_gains(wanted, period_s)
     if gains is None:
@@ -122,24 +108,14 @@ def _rounded_down(value: float) -> float:
 
 
 def requirement_with(requirement: Requirement, response: Response | None, *, timing: Timing) -> Requirement:
-    """Return the requirement whose design has the wanted margin with this response and these periods.
+    """Return the requirement whose design has the wanted margin on vehicles with this response, at these periods.
 
-    It is one on vehicles that respond at once, with the slower period for telemetry and control. Its margin, found by
-    false position, grows with the wanted one. A requirement without a margin stays as it is.
+    The design assumes vehicles that respond at once and one period, the slower one, so it must ask for a longer margin.
+    False position finds how long. A requirement without a margin stays as it is. InfeasibleError if no gains have the
+    wanted margin with this response and these periods.
 
-    Raises
-    ------
-    InfeasibleError
-        If no gains have this margin with the response and the periods.
-
-    Examples
-    --------
     Without a delay margin there is nothing to find:
 
-    >>> from gains.sampled.multirate import Timing
-    >>> from gains.core.requirement import Requirement
-    >>> from gains.design.required import requirement_with
-    >>> from gains.performance.response import Response
     >>> wanted = Requirement(alpha=0.4)
     >>> requirement_with(wanted, Response(0.1, 0.0), timing=Timing(0.02, 0.02)) == wanted
     True

@@ -1,10 +1,5 @@
 """Gains of largest robustness by a linear matrix inequality, for one follower and for a centralised controller.
 
-`robust_lmi` is the source's design of a follower (3.25-3.29); `gcs thesis` compares it with what was published.
-`centralised_lmi` gives every vehicle the state of all: what decentralised designs are measured by. Its full Lyapunov
-matrix grows with the number of vehicles, which decentralised designs avoid. The inclusion route does not use either:
-`gains.design.search` finds the optimum by formula.
-
 Sources: Sahoo 2012 (see `gains.formation.model`). Its LMI as printed has no solution: with a block-diagonal Y the
 (2, 2) block of A Y + Y A' + B L + L'B' is identically zero. `robust_lmi` solves it in sheared coordinates, which keep
 the structure of the gain. S. Boyd, L. El Ghaoui, E. Feron, V. Balakrishnan, "Linear Matrix Inequalities in System and
@@ -45,29 +40,14 @@ def robust_lmi(*, shear: float, gain_bound: float, lyapunov_bound: float) -> Rob
         [[A_z Y + Y A_z' + B_z L + L'B_z' + T T', Y T^{-T}], [T^{-1} Y, −γ I]] ≺ 0,   ‖L‖ ≤ κ_L,   Y ⪰ I / κ_Y
         Y = diag(y1, y2, y1),   L = [[l1, 0, 0], [l2, l3, l1]],   A_z = T A T^{-1},   B_z = T B
 
-    One Schur complement less than the source: with its constant block −I kept, Clarabel often ends inaccurate.
-    K = L Y^{-1} T = [[k1, 0, 0], [k2, k3, k1]] has the wanted pattern, with the same k1 twice. Unbounded gains would
-    reach the supremum α = |c| / √(1 + c²); ‖K T^{-1}‖ is at most κ_L κ_Y.
+    One Schur complement less than the source: with its constant block −I kept, Clarabel often ends inaccurate. K = L
+    Y^{-1} T = [[k1, 0, 0], [k2, k3, k1]] has the wanted pattern, with the same k1 twice. Unbounded gains would reach
+    the supremum α = |c| / √(1 + c²); ‖K T^{-1}‖ is at most κ_L κ_Y. `shear` is c < 0 in 1/s, `gain_bound` κ_L and
+    `lyapunov_bound` κ_Y; BadModelError for other signs. SolverError if the solver does not end with status "optimal",
+    or the exact bound of K is below the one claimed.
 
-    Parameters
-    ----------
-    shear
-        c < 0, 1/s.
-    gain_bound, lyapunov_bound
-        κ_L and κ_Y.
-
-    Raises
-    ------
-    BadModelError
-        If c is not negative or a bound not positive.
-    SolverError
-        If the solver does not end with status "optimal", or the exact bound of K is below the one claimed.
-
-    Examples
-    --------
     Near to the supremum 1 / √2 = 0.7071 of c = −1:
 
-    >>> from gains.design.robust_lmi import robust_lmi
     >>> found = robust_lmi(shear=-1.0, gain_bound=10.0, lyapunov_bound=10.0)
     >>> round(found.alpha, 3)
     0.707
@@ -85,17 +65,13 @@ def robust_lmi(*, shear: float, gain_bound: float, lyapunov_bound: float) -> Rob
 
 
 def centralised_lmi(plant: Plant, *, gain_bound: float, lyapunov_bound: float) -> RobustGain:
-    """Return the K of largest sector bound α (W = I) that one full Lyapunov matrix proves.
+    """Return the K of largest sector bound α (W = I) that one full Lyapunov matrix proves: every vehicle knows all.
 
     The inequality is that of `robust_lmi` with T = I and full Y and L, and so are arguments and exceptions; ‖K‖ is at
     most κ_L κ_Y.
 
-    Examples
-    --------
     x' = u + w: L = −2 and Y = 1/2 give K = −4 and γ = Y² / (−2 L − 1) = 1/12.
 
-    >>> from gains.design.robust_lmi import centralised_lmi
-    >>> from gains.formation.pattern import Plant
     >>> found = centralised_lmi(Plant([[0]], [[1]]), gain_bound=2.0, lyapunov_bound=2.0)
     >>> found.K.round(3).tolist(), round(found.alpha, 3)
     ([[-4.0]], 3.464)

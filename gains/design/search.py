@@ -19,24 +19,20 @@ from gains.performance.scalar_gains import (
     onboard_front_gain_limit,
 )
 
-# Points along the curve and over k2 in the first, coarse scan and in the later ones, and points over the spare margin.
-# A round keeps ±2 cells around the best point, so the window halves; 18 rounds leave 1e-5 of it (k2 starts five rounds
-# later: 1e-4), and α, flat at its maximum, is then exact to about 1e-9.
+# Points along the curve and over k2 in the first scan and in later ones, and over the spare margin. A round halves the
+# window; 18 leave 1e-5 of it (1e-4 of that of k2, five rounds behind), and α, flat at its maximum, is exact to 1e-9.
 _ROUNDS_ALL_FRONT = 5
 _SCAN_FIRST, _SCAN_NEXT, _SCAN_SPARE, _ROUNDS = (25, 17), (9, 9), 9, 18
-# The angle of the crossing, as a share of the one at which k3 = 0 in the continuous loop. The sampled loop's share goes
-# a little above 1; what lies beyond k3 = 0 is discarded.
+# The angle of the crossing, as a share of the one at which k3 = 0 in the continuous loop; above 1 in the sampled loop.
 _SHARE_MIN, _SHARE_MAX = 0.02, 1.3
 # |k2| is sought up to this multiple of k1. The optimum of α is near k1.
 _FRONT_MAX = 2.0
-# Without delay the sampled leader moves by the factor 1 − k1 T a period. At k1 T = 2 it is unstable with no delay at
-# all; this keeps the factor above −0.8.
+# k1 T at most: without delay the sampled leader moves by the factor 1 − k1 T a period, which this keeps above −0.8.
 _OWN_STEP_MAX = 1.8
 # α is exact to about this, so an α asked for is aimed at from above by it, and no finer root is sought.
 _ALPHA_RESOLUTION = 1e-9
-# Where the margin is short against the period, the gains of exactly this margin are so high that few are usable, and a
-# larger margin comes with a larger α. So up to the first number of periods, margins longer by up to the second are
-# searched too.
+# Few of the high gains of a margin that is short against the period are usable, and a longer one may have a larger α:
+# up to the first number of periods, margins longer by up to the second are searched too.
 _SHORT_MARGIN, _SPARE_MAX = 2.0, 2.0
 # Where the search for a margin begins, and where it ends: α is then below 1e-4, which is of no use.
 _MARGIN_FIRST_S, _MARGIN_MAX_S = 0.3, 75.0
@@ -49,27 +45,10 @@ def largest_alpha(
 ) -> ScalarGains | None:
     """Return the gains of largest α among those with at least the given delay margin, None if there are none.
 
-    Parameters
-    ----------
-    delay_margin_s
-        Margin of the loop with all feedback late, sampled with `period_s`, or continuous if `period_s` is 0.
-    period_s
-        Period of sample and hold.
-    string_peak_max
-        Largest growth of spacing errors from vehicle to vehicle, both without delay and with half the margin as loop
-        delay (plus half a period for the hold); on board at every delay; not limited if None.
-    decay_rate_1_s
-        Least decay rate of the continuous loop without delay.
-
-    Examples
-    --------
-    The gains found have the margin asked for:
-
-    >>> from gains.delay.constant import delay_margin
-    >>> from gains.design.search import largest_alpha
-    >>> gains = largest_alpha(0.3, 0.0)
-    >>> round(delay_margin([[0, -1], [0, 0]], [[0, 0], [gains.k3, -gains.k1]]), 6)
-    0.3
+    The margin is that of the loop with all feedback late, sampled and held every `period_s`, or continuous if that is
+    0. Spacing errors grow from vehicle to vehicle by at most `string_peak_max`, both without delay and with half the
+    margin as loop delay (plus half a period for the hold), or on board at every delay. The continuous loop without
+    delay decays at least with `decay_rate_1_s`.
     """
     # Axes of the scan: share of the crossing angle, k2 as a share of its limit, margin left over in periods.
     shares = (_SHARE_MIN, _SHARE_MAX)
@@ -105,15 +84,6 @@ def largest_margin(
     """Return the largest delay margin (s) at which α can be reached, and the gains; None if no margin is left.
 
     The largest α falls as the margin grows; this is the inverse, by false position.
-
-    Examples
-    --------
-    The largest α at a margin is not reached at a longer one:
-
-    >>> from gains.design.search import largest_alpha, largest_margin
-    >>> margin_s, _ = largest_margin(largest_alpha(0.3, 0.02).alpha, 0.02)
-    >>> round(margin_s, 4)
-    0.3
     """
 
     def excess(margin_s: float) -> float:
@@ -143,16 +113,6 @@ def fastest_decay(delay_margin_s: float, period_s: float, string_peak_max: PeakL
     """Return the largest decay rate (1/s), without delay, of gains with a margin; 0 if no gains have the margin.
 
     Arguments as of `largest_alpha`.
-
-    Examples
-    --------
-    Critical damping, k3 = k1² / 4, is the fastest:
-
-    >>> from gains.delay.constant import delay_margin
-    >>> from gains.design.search import fastest_decay
-    >>> k1 = 2 * fastest_decay(0.3, 0.0)
-    >>> round(delay_margin([[0, -1], [0, 0]], [[0, 0], [k1**2 / 4, -k1]]), 6)
-    0.3
     """
     return _fastest(delay_margin_s, period_s, string_peak_max)[0]
 
@@ -218,11 +178,7 @@ def _usable_gains(
 
 
 def _best_of_grid(
-    grids: list[FloatArray],
-    delay_margin_s: float,
-    period_s: float,
-    string_peak_max: PeakLimit,
-    decay_rate_1_s: float,
+    grids: list[FloatArray], delay_margin_s: float, period_s: float, string_peak_max: PeakLimit, decay_rate_1_s: float
 ) -> tuple[ScalarGains, tuple[float, float, float]] | None:
     """The gains of largest α on the grids of share, front and spare, and where they are; None if none can be used."""
     front = grids[1]

@@ -1,9 +1,7 @@
 """Linear quadratic gains with a given information pattern, to first-order optimality.
 
-The cost J(K) of `gains.design.lqr` is minimised over the gains with the pattern.
-
-The gradient is exact and is projected on the pattern. J grows without bound towards the border of the stabilising
-gains, so a descent never leaves them. J need not be convex: what is found is a local minimum, and the centralised
+The gradient of the cost J(K) of `gains.design.lqr` is exact and is projected on the pattern. J grows without bound
+towards the border of the stabilising gains, so a descent never leaves them. It finds a local minimum; the centralised
 optimum, with all states for every input, bounds how much better any other could be.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.5), which solves it by other means.
@@ -57,27 +55,9 @@ class StructuredLqr:
 def structured_lqr(plant: Plant, pattern: Pattern, weights: Weights) -> StructuredLqr:
     """Return a gain with the pattern at which the quadratic cost has a local minimum.
 
-    The descent starts from `stabilising_gain`. 50 vehicles of one axis (99 states) take a few seconds.
-
-    Raises
-    ------
-    BadModelError
-        If sizes do not fit.
-    InfeasibleError
-        If no stabilising gain is found.
-    SolverError
-        If the descent ends where the cost is not stationary.
-
-    Examples
-    --------
-    x' = u with ∫ x² + u² dt: u = −x, and the cost is x(0)².
-
-    >>> from gains.formation.pattern import Pattern, Plant
-    >>> from gains.design.lqr import Weights
-    >>> from gains.design.structured_lqr import structured_lqr
-    >>> found = structured_lqr(Plant([[0]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]))
-    >>> found.K.round(4).tolist(), round(found.cost, 6)
-    ([[-1.0]], 1.0)
+    The descent starts from `stabilising_gain`. 50 vehicles of one axis (99 states) take a few seconds. Raises
+    BadModelError if sizes do not fit, InfeasibleError if no stabilising gain is found, and SolverError if the descent
+    ends where the cost is not stationary.
     """
     start = stabilising_gain(plant, pattern, weights)
     cost = Cost(plant, pattern.mask, weights)
@@ -101,24 +81,9 @@ def stabilising_gain(plant: Plant, pattern: Pattern, weights: Weights) -> FloatA
 
     A − σI is stable for large σ. A few descent steps on its cost give a gain that stabilises a smaller σ too; σ is then
     lowered nearly as far, until it is 0. Where that ends at a σ > 0, as in patterns in which vehicles steer only each
-    other, the real part of the rightmost eigenvalue itself is lowered, from seeded random gains.
-
-    Raises
-    ------
-    InfeasibleError
-        If no gain is found. To decide whether any static gain stabilises is NP-hard in general: there may be one all
-        the same, but none exists if `gains.formation.fixed_modes` finds an unstable mode.
-
-    Examples
-    --------
-    x' = x + u needs a gain below −1:
-
-    >>> from gains.formation.pattern import Pattern, Plant
-    >>> from gains.design.lqr import Weights
-    >>> from gains.design.structured_lqr import stabilising_gain
-    >>> gain = stabilising_gain(Plant([[1]], [[1]]), Pattern([[1]], (1,), (1,)), Weights([[1]], [[1]]))
-    >>> bool(gain[0, 0] < -1)
-    True
+    other, the real part of the rightmost eigenvalue itself is lowered, from seeded random gains. InfeasibleError if no
+    gain is found: whether any static gain stabilises is NP-hard to decide, so there may be one all the same, but not if
+    `gains.formation.fixed_modes` finds an unstable mode.
     """
     check_fits(plant, pattern)
     weights.check_fits(plant)
@@ -211,9 +176,7 @@ def _descend(cost: Cost, point: CostPoint, most: int, tolerance: float) -> tuple
 
 
 def _quasi_newton(
-    point: CostPoint,
-    steps: list[tuple[FloatArray, FloatArray]],
-    scaled: Callable[[CostPoint, FloatArray], FloatArray],
+    point: CostPoint, steps: list[tuple[FloatArray, FloatArray]], scaled: Callable[[CostPoint, FloatArray], FloatArray]
 ) -> FloatArray:
     """Two-loop recursion of L-BFGS with M⁻¹ for the inverse Hessian at the far end (Nocedal and Wright, alg. 7.4)."""
     q = point.gradient.copy()

@@ -1,12 +1,11 @@
 """Bring a gain on any pattern to a requirement by a change of the time scale, which keeps the pattern.
 
 With velocity gains K_v / s and spacing gains K_p / s² a loop of double integrators does the same things s times slower:
-its continuous delay margin is s times larger and its decay rate s times smaller, exactly. The margin asked for is that
-of the sampled loop, about half a period less; a few steps of a fixed-point iteration on s find it.
+its continuous delay margin is s times larger and its decay rate s times smaller, exactly. A few steps of a fixed-point
+iteration on s find the margin of the sampled loop, about half a period less.
 
 On board only the errors of other vehicles are late, and a pattern without cycles takes every delay, so that gains could
-rise without bound. So the vehicles' own gains must have the margin too, as if a ground station closed their loops. Both
-margins change with the time scale as that of the ground loop does.
+rise without bound. So the vehicles' own gains must have the margin too, as if a ground station closed their loops.
 """
 
 from collections.abc import Sequence
@@ -76,11 +75,6 @@ def time_scaled(formation: FormationModel, K: FloatArray, scale: float) -> Float
 
     K is of shape (any, states): K_v are its columns of velocity errors, K_p those of spacing errors.
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.design.time_scale import time_scaled
     >>> time_scaled(FormationModel((-1, 0), axes=1), np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]), 2.0).tolist()
     [[-0.5, 0.0, 0.0], [0.0, 0.25, -0.5]]
     """
@@ -93,10 +87,7 @@ def time_scaled(formation: FormationModel, K: FloatArray, scale: float) -> Float
 def scaled_to(wanted: Requirement, margins: BoundedMargins, bases: Sequence[BaseGain]) -> tuple[BaseGain, FloatArray]:
     """Return the best base and its gain in the time scale that meets the requirement.
 
-    Raises
-    ------
-    InfeasibleError
-        If no time scale of any base does; the message says what can be reached.
+    InfeasibleError if no time scale of any base does; the message says what can be reached.
     """
     base, scale = (_slowest if wanted.delay_margin_s is None else _at_margin)(wanted, margins, bases)
     return base, time_scaled(margins.model, base.K, scale)

@@ -1,11 +1,9 @@
 """A gain with an information pattern as a block-diagonal gain, one block for each complete bipartite subgraph.
 
-The links of a pattern are the edges of a bipartite graph with the inputs on one side and the outputs on the other. A
-partition of the edges into complete bipartite subgraphs (bicliques) expands the gain: K = φ1 K̄ φ2, where K̄ has one
-diagonal block for each subgraph and φ1, φ2 are constant 0/1 matrices that repeat inputs and outputs as needed. The
-expanded plant has B̄ = B φ1 and C̄ = φ2 C. As B̄ K̄ C̄ = B K C, its closed loop is the same.
-
-The partition is not unique. The one by inputs has φ1 = I; finding the smallest one is NP-hard in general.
+The links of a pattern are the edges of a bipartite graph of inputs and outputs. A partition of the edges into complete
+bipartite subgraphs (bicliques) expands the gain: K = φ1 K̄ φ2, where K̄ has one diagonal block for each subgraph and
+the 0/1 matrices φ1, φ2 repeat inputs and outputs. The plant with B̄ = B φ1 and C̄ = φ2 C has the same closed loop. The
+partition is not unique: the one by inputs has φ1 = I; to find the smallest one is NP-hard in general.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eqs. (4.3), (4.4), (4.6), (4.7).
 """
@@ -44,12 +42,6 @@ class Partition:
     """Subgraphs, sorted by their first link, that hold every link of a pattern exactly once.
 
     No partition has fewer than `lower_bound` subgraphs.
-
-    Examples
-    --------
-    >>> from gains.formation.bipartite import Partition, Subgraph
-    >>> Partition((Subgraph((0, 1), (0,)),), lower_bound=1).smallest
-    True
     """
 
     subgraphs: tuple[Subgraph, ...]
@@ -63,34 +55,15 @@ class Partition:
 
 @dataclass(frozen=True, eq=False)
 class ExpandedGain:
-    """The maps of K = φ1 K̄ φ2 for a partition.
-
-    Attributes
-    ----------
-    phi1, phi2
-        0/1 matrices, shapes (inputs, expanded inputs) and (expanded outputs, outputs).
-    mask
-        Entries of K̄ that may be nonzero: block diagonal, shape (expanded inputs, expanded outputs).
-
-    Examples
-    --------
-    Expanded, and back again:
-
-    >>> from gains.formation.bipartite import expanded_gain, partition_by_input
-    >>> from gains.formation.pattern import Pattern
-    >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 1))
-    >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
-    >>> expanded.expand([[-1, 0], [2, -3]]).tolist()
-    [[-1.0, 0.0, 0.0], [0.0, 2.0, -3.0]]
-    >>> (expanded.phi1 @ expanded.expand([[-1, 0], [2, -3]]) @ expanded.phi2).tolist()
-    [[-1.0, 0.0], [2.0, -3.0]]
-    """
+    """The maps of K = φ1 K̄ φ2 for a partition."""
 
     pattern: Pattern
     partition: Partition
     phi1: FloatArray
     phi2: FloatArray
+    """0/1 matrices, shapes (inputs, expanded inputs) and (expanded outputs, outputs)."""
     mask: NDArray[np.bool_]
+    """Entries of K̄ that may be nonzero: block diagonal, shape (expanded inputs, expanded outputs)."""
 
     def expand(self, K: ArrayLike) -> FloatArray:
         """K̄ with φ1 K̄ φ2 = K (4.3); BadModelError if K does not have the pattern."""
@@ -109,11 +82,7 @@ def partition_by_input(pattern: Pattern) -> Partition:
 
     The pattern (4.6) gives {K11}, {K21, K22}, {K32, K33}.
 
-    Examples
-    --------
-    >>> from gains.formation.bipartite import partition_by_input
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import leader_follower
+    >>> from gains import FormationModel, leader_follower
     >>> [graph.links for graph in partition_by_input(leader_follower(FormationModel((-1, 0, 1)))).subgraphs]
     [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
     """
@@ -123,23 +92,12 @@ def partition_by_input(pattern: Pattern) -> Partition:
 def smallest_partition(pattern: Pattern) -> Partition:
     """The partition with the fewest subgraphs, or the best that was found: see `Partition.smallest`.
 
-    Equal rows, and equal columns, share their subgraphs. The best of three heuristics (by input, by output, largest
-    first) is the smallest partition if it meets the rank of the pattern, which bounds all partitions from below (Graham
-    and Pollak). If it does not, all smaller partitions are tried, up to `LARGEST_SEARCH_LINKS` different links and
-    within a fixed number of steps.
-
-    Examples
-    --------
-    All to all is one subgraph for any number of vehicles:
-
-    >>> from gains.formation.bipartite import smallest_partition
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import all_to_all
-    >>> found = smallest_partition(all_to_all(FormationModel((-1, 0, 1))))
-    >>> len(found.subgraphs), found.smallest
-    (1, True)
+    The best of three heuristics (by input, by output, largest first) is the smallest if it meets the rank of the
+    pattern, which bounds all partitions from below (Graham and Pollak). If not, all smaller partitions are tried, up to
+    `LARGEST_SEARCH_LINKS` links between different rows and columns and within a fixed number of steps.
     """
-    core, row_class, column_class = _without_repeats(pattern.blocks)
+    row_class, column_class = _classes(pattern.blocks), _classes(pattern.blocks.T)
+    core = pattern.blocks[np.ix_([rows[0] for rows in row_class], [columns[0] for columns in column_class])]
     bound = _rank_bound(core)
     by_output = [Subgraph(graph.outputs, graph.inputs) for graph in _rows(core.T)]
     best = min(_rows(core), by_output, _largest_first(core), key=len)
@@ -151,21 +109,22 @@ def smallest_partition(pattern: Pattern) -> Partition:
             if not exhausted:
                 break
             bound = bound + 1 if found is None else bound
-    copied = [_with_repeats(graph, row_class, column_class) for graph in best]
+    copied = [
+        Subgraph(
+            tuple(sorted(i for k in graph.inputs for i in row_class[k])),
+            tuple(sorted(j for k in graph.outputs for j in column_class[k])),
+        )
+        for graph in best
+    ]
     return Partition(tuple(sorted(copied, key=lambda graph: graph.links)), bound)
 
 
 def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
     """φ1, φ2 and the mask of a partition; BadModelError if it does not hold every link of the pattern exactly once.
 
-    Examples
-    --------
     The sizes of (4.7), and φ1 = I:
 
-    >>> import numpy as np
-    >>> from gains.formation.bipartite import expanded_gain, partition_by_input
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import leader_follower
+    >>> from gains import FormationModel, leader_follower
     >>> pattern = leader_follower(FormationModel((-1, 0, 1)))
     >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
     >>> expanded.mask.shape, expanded.phi2.shape, np.array_equal(expanded.phi1, np.eye(6))
@@ -183,17 +142,9 @@ def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
 def verify_expansion(plant: Plant, expanded: ExpandedGain, K: ArrayLike) -> float:
     """Largest difference of the closed loops A + B K C and A + B̄ K̄ C̄, relative to the largest entry of the latter.
 
-    Raises
-    ------
-    BadModelError
-        K, of shape (inputs, outputs), does not have the pattern, or the plant does not fit it.
-    DisagreementError
-        The difference is more than rounding.
+    K has the shape (inputs, outputs). Raises BadModelError if it does not have the pattern or the plant does not fit,
+    and DisagreementError if the difference is more than rounding.
 
-    Examples
-    --------
-    >>> from gains.formation.bipartite import expanded_gain, partition_by_input, verify_expansion
-    >>> from gains.formation.pattern import Pattern, Plant
     >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 1))
     >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
     >>> verify_expansion(Plant([[0, 0], [1, 0]], [[1, 0], [0, 1]]), expanded, [[-1, 0], [2, -3]])
@@ -233,29 +184,12 @@ def _rank_bound(blocks: NDArray[np.bool_]) -> int:
     return int(np.linalg.matrix_rank(blocks.astype(float)))
 
 
-def _without_repeats(
-    blocks: NDArray[np.bool_],
-) -> tuple[NDArray[np.bool_], list[list[int]], list[list[int]]]:
-    """The distinct nonempty rows and columns, and the original indices of each."""
-    row_class = _classes(blocks)
-    column_class = _classes(blocks.T)
-    core = blocks[np.ix_([rows[0] for rows in row_class], [columns[0] for columns in column_class])]
-    return core, row_class, column_class
-
-
 def _classes(rows: NDArray[np.bool_]) -> list[list[int]]:
+    """Indices of the rows that are not empty, equal ones together."""
     found: dict[bytes, list[int]] = {}
-    for k, row in enumerate(rows):
-        if row.any():
-            found.setdefault(row.tobytes(), []).append(k)
+    for k in np.flatnonzero(rows.any(axis=1)).tolist():
+        found.setdefault(rows[k].tobytes(), []).append(k)
     return list(found.values())
-
-
-def _with_repeats(graph: Subgraph, row_class: list[list[int]], column_class: list[list[int]]) -> Subgraph:
-    return Subgraph(
-        tuple(sorted(i for k in graph.inputs for i in row_class[k])),
-        tuple(sorted(j for k in graph.outputs for j in column_class[k])),
-    )
 
 
 def _rows(blocks: NDArray[np.bool_]) -> list[Subgraph]:

@@ -1,24 +1,18 @@
 """Modes that no gain with a given information pattern can move, and the links that would free them.
 
 λ is a fixed mode of x' = A x + B u, y = C x under a pattern if it is an eigenvalue of A + B K C for every K with the
-pattern. If it lies in the closed right half plane, no such gain stabilises the plant. Two methods must agree on it:
+pattern. If it lies in the closed right half plane, no such gain stabilises the plant. Two methods must agree on it, for
+one strongly connected component of plant and pattern at a time: random gains, and a rank. λ is fixed if and only if
+the inputs can be split into two sets D and E such that, with C_E the outputs that the inputs in E use,
 
-* Rank: λ is fixed if and only if the inputs can be split into two sets D and E such that
-
-      rank [[A − λI, B_D], [C_E, 0]] < n                                                          (1)
-
-  where C_E are the outputs that the inputs in E use. The rank is a submodular function of D, so the least rank is
-  found without trying all 2^m sets.
-* Random gains: λ is an eigenvalue of A + B K C for several random K with the pattern.
-
-Both treat one strongly connected component of plant and pattern at a time: the closed loop is block triangular, and λ
-is fixed if and only if it is fixed in one of the diagonal blocks.
+    rank [[A − λI, B_D], [C_E, 0]] < n                                                              (1)
 
 Sources: Sahoo 2012 (see `gains.formation.model`), section 4, for the expanded decentralised plant, in which every input
 is a station; B. D. O. Anderson and D. J. Clements, "Algebraic characterization of fixed modes in decentralized
 control", Automatica 17 (1981), 703-712, for (1).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +21,6 @@ from numpy.typing import NDArray
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import DisagreementError, InfeasibleError
 from gains.core.structure import distinct_blocks, strongly_connected_blocks
-from gains.formation._submodular import least_exhaustive, least_submodular
 from gains.formation.pattern import Link, Pattern, Plant, check_fits
 
 # with up to this many inputs in one component all subsets are tried (256 ranks), with more Wolfe's algorithm
@@ -37,29 +30,25 @@ _RANK_TOLERANCE = 1e-10
 # eigenvalues of A closer than this share of its norm are one defective eigenvalue; their mean is exact to rounding
 _SAME_EIGENVALUE = 1e-5
 _RANDOM_GAINS = 3
+# rounds of Wolfe's algorithm
+_ROUNDS = 1000
+
+SetFunction = Callable[[frozenset[int]], int]
 
 
 @dataclass(frozen=True)
 class FixedMode:
-    """An eigenvalue of A + B K C that is the same for every K with the pattern.
-
-    Attributes
-    ----------
-    mode
-        λ, 1/s; of a complex pair the one with positive imaginary part.
-    states
-        Indices of the states of the components in which λ is fixed.
-    cut
-        The inputs (vehicles) D of (1) in those components; all others there are E.
-    remedies
-        Sets of links each of which, added to the pattern, frees the mode; empty if λ is not controllable or not
-        observable even with all inputs and outputs.
-    """
+    """An eigenvalue of A + B K C that is the same for every K with the pattern."""
 
     mode: complex
+    """λ, 1/s; of a complex pair the one with positive imaginary part."""
     states: tuple[int, ...]
+    """Indices of the states of the components in which λ is fixed."""
     cut: tuple[int, ...]
+    """The inputs (vehicles) D of (1) in those components; all others there are E."""
     remedies: tuple[tuple[Link, ...], ...]
+    """Sets of links each of which, added to the pattern, frees the mode; empty if λ is not controllable or not
+    observable even with all inputs and outputs."""
 
     @property
     def unstable(self) -> bool:
@@ -83,22 +72,13 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     """Every mode that no gain with the pattern moves, in ascending order of real part.
 
     The position of a formation's leader is not a state of its error model and therefore no fixed mode. `seed` is that
-    of the random gains.
+    of the random gains. Raises BadModelError if plant and pattern do not fit, and DisagreementError if the two methods
+    contradict each other: λ is nearly fixed.
 
-    Raises
-    ------
-    BadModelError
-        Plant and pattern do not fit.
-    DisagreementError
-        The rank test and the random gains contradict each other: λ is nearly fixed.
-
-    Examples
-    --------
     A leader that may not use its own velocity error keeps its integrator, unless a link is added:
 
-    >>> from gains.formation.fixed_modes import fixed_modes
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import formation_plant, leader_follower, without_links
+    >>> from gains import FormationModel, fixed_modes, formation_plant, leader_follower
+    >>> from gains.formation.pattern import without_links
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> [found] = fixed_modes(formation_plant(pair), without_links(leader_follower(pair), [(0, 0)]))
     >>> abs(found.mode) < 1e-9, found.states, found.remedies
@@ -106,13 +86,10 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     """
     check_fits(plant, pattern)
     gains = _random_gains(plant, pattern, seed)
-    known: dict[bytes, list[tuple[complex, frozenset[int]]]] = {}
+    feedbacks = [plant.B @ gain @ plant.C for gain in gains]
     found: dict[complex, tuple[set[int], set[int]]] = {}
     for component in _components(plant, pattern):
-        key = _fingerprint(component)
-        if key not in known:
-            known[key] = _fixed_in(component, [plant.B @ gain @ plant.C for gain in gains])
-        for mode, cut in known[key]:
+        for mode, cut in _fixed_in(component, feedbacks):
             states, inputs = found.setdefault(mode, (set(), set()))
             states.update(component.states.tolist())
             inputs.update(component.inputs[k] for k in cut)
@@ -126,23 +103,7 @@ def check_stabilisable(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tupl
     """The fixed modes, if all of them are stable.
 
     A dynamic controller with the pattern then stabilises the plant; a static gain need not exist. Arguments and further
-    exceptions as of `fixed_modes`.
-
-    Raises
-    ------
-    InfeasibleError
-        A fixed mode is unstable; the message names the links to add.
-
-    Examples
-    --------
-    The leader-follower pattern leaves no fixed mode:
-
-    >>> from gains.formation.fixed_modes import check_stabilisable
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import formation_plant, leader_follower
-    >>> pair = FormationModel((-1, 0), axes=1)
-    >>> check_stabilisable(formation_plant(pair), leader_follower(pair))
-    ()
+    exceptions as of `fixed_modes`. InfeasibleError if a fixed mode is unstable; the message names the links to add.
     """
     modes = fixed_modes(plant, pattern, seed=seed)
     unstable = [mode for mode in modes if mode.unstable]
@@ -159,30 +120,13 @@ def _components(plant: Plant, pattern: Pattern) -> list[_Component]:
     feedback = (plant.B != 0.0).astype(float) @ pattern.mask.astype(float) @ (plant.C != 0.0).astype(float)
     found: list[_Component] = []
     for states in strongly_connected_blocks(plant.A, feedback):
+        B = [plant.B[states, pattern.input_slice(i)] for i in range(len(pattern.input_sizes))]
         C = plant.C[:, states]
-        seen = (C != 0.0).any(axis=1)
-        inputs = [
-            i for i in range(len(pattern.input_sizes)) if plant.B[np.ix_(states, _range(pattern.input_slice(i)))].any()
-        ]
-        rows = [np.repeat(pattern.blocks[i], pattern.output_sizes) & seen for i in inputs]
-        found.append(
-            _Component(
-                states=states,
-                A=plant.A[np.ix_(states, states)],
-                B=tuple(plant.B[np.ix_(states, _range(pattern.input_slice(i)))] for i in inputs),
-                C=C,
-                inputs=tuple(inputs),
-                rows=tuple(rows),
-            )
-        )
+        inputs = tuple(i for i, block in enumerate(B) if block.any())
+        rows = tuple(np.repeat(pattern.blocks[i], pattern.output_sizes) & C.any(axis=1) for i in inputs)
+        A = plant.A[np.ix_(states, states)]
+        found.append(_Component(states, A, tuple(B[i] for i in inputs), C, inputs, rows))
     return found
-
-
-def _fingerprint(component: _Component) -> bytes:
-    """Bytes that are equal for components that differ only in the indices of states, inputs and outputs."""
-    used = np.any(component.rows, axis=0) if component.rows else np.zeros(component.C.shape[0], dtype=bool)
-    parts = [component.A, *component.B, component.C[used], *(rows[used].astype(float) for rows in component.rows)]
-    return b"".join(repr(part.shape).encode() + (part + 0.0).tobytes() for part in parts)
 
 
 def _fixed_in(component: _Component, feedbacks: list[FloatArray]) -> list[tuple[complex, frozenset[int]]]:
@@ -227,7 +171,7 @@ def _least_rank(component: _Component, mode: complex) -> tuple[int, frozenset[in
         return kept + _rank(np.vstack([above, below]), _size(shifted))
 
     size = len(component.inputs)
-    return least_exhaustive(rank, size) if size <= LARGEST_EXHAUSTIVE else least_submodular(rank, size)
+    return _least_exhaustive(rank, size) if size <= LARGEST_EXHAUSTIVE else _least_submodular(rank, size)
 
 
 def _candidates(A: FloatArray) -> list[complex]:
@@ -268,44 +212,38 @@ def _remedies(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -
     If M and N are the left and right null spaces of A + B K C − λI for a random K, a full block K_ij raises the rank by
     min(rank M'B_i, rank C_j N).
     """
-    singles = _links_that_help(plant, pattern, mode, gain)
-    if not singles:
-        return ()
-    nullity, most = singles[0][1], max(freed for _, _, freed in singles)
-    if most == nullity:
-        return tuple((link,) for link, _, freed in singles if freed == nullity)
+    nullity, helpful = _links_that_help(plant, pattern, mode, gain)
+    if alone := tuple((link,) for link, freed in helpful if freed == nullity):
+        return alone
     chosen: list[Link] = []
     rng = np.random.default_rng(1)
     gain = gain.copy()
-    while singles:
-        link = next(link for link, _, freed in singles if freed == max(freed for _, _, freed in singles))
+    while helpful:
+        link = max(helpful, key=lambda entry: entry[1])[0]
         chosen.append(link)
-        at = np.ix_(_range(pattern.input_slice(link[0])), _range(pattern.output_slice(link[1])))
+        at = pattern.input_slice(link[0]), pattern.output_slice(link[1])
         gain[at] = float(np.abs(gain).max() or 1.0) * rng.uniform(0.5, 1.5, gain[at].shape)
-        if _nullity(plant.closed_loop(gain), mode) == 0:
+        nullity, helpful = _links_that_help(plant, pattern, mode, gain)
+        if nullity == 0:
             return (tuple(chosen),)
-        singles = [entry for entry in _links_that_help(plant, pattern, mode, gain) if entry[0] not in chosen]
+        helpful = [entry for entry in helpful if entry[0] not in chosen]
     return ()
 
 
-def _links_that_help(plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray) -> list[tuple[Link, int, int]]:
-    """(link, nullity, rank gained) of every link outside the pattern that raises the rank."""
-    shifted = plant.closed_loop(gain) - mode * np.eye(plant.states)
-    left, singular, right = np.linalg.svd(shifted)
+def _links_that_help(
+    plant: Plant, pattern: Pattern, mode: complex, gain: FloatArray
+) -> tuple[int, list[tuple[Link, int]]]:
+    """The nullity, and every link outside the pattern that raises the rank, with the rank gained."""
+    left, singular, right = np.linalg.svd(plant.closed_loop(gain) - mode * np.eye(plant.states))
     nullity = int(np.count_nonzero(singular <= _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
     if nullity == 0:
-        return []
+        return 0, []
     M, N = left[:, -nullity:].conj().T, right[-nullity:].conj().T
     moved = [_rank(M @ plant.B[:, pattern.input_slice(i)]) for i in range(len(pattern.input_sizes))]
     seen = [_rank(plant.C[pattern.output_slice(j)] @ N) for j in range(len(pattern.output_sizes))]
-    missing = [(int(i), int(j)) for i, j in np.argwhere(~pattern.blocks)]
-    helpful = [((i, j), nullity, min(moved[i], seen[j])) for i, j in missing if min(moved[i], seen[j]) > 0]
-    return sorted(helpful, key=lambda entry: (abs(entry[0][0] - entry[0][1]), entry[0]))
-
-
-def _nullity(matrix: FloatArray, mode: complex) -> int:
-    singular = np.linalg.svd(matrix - mode * np.eye(matrix.shape[0]), compute_uv=False)
-    return int(np.count_nonzero(singular <= _RANK_TOLERANCE * max(float(singular[0]), 1e-300)))
+    gained = {(int(i), int(j)): min(moved[i], seen[j]) for i, j in np.argwhere(~pattern.blocks)}
+    helpful = [(link, freed) for link, freed in gained.items() if freed > 0]
+    return nullity, sorted(helpful, key=lambda entry: (abs(entry[0][0] - entry[0][1]), entry[0]))
 
 
 def _rank(matrix: FloatArray | ComplexArray, scale: float = 1.0) -> int:
@@ -322,10 +260,6 @@ def _size(matrix: FloatArray | ComplexArray) -> float:
     return largest if largest > 0.0 else 1.0
 
 
-def _range(place: slice) -> NDArray[np.intp]:
-    return np.arange(place.start, place.stop)
-
-
 def _advice(remedies: tuple[tuple[Link, ...], ...]) -> str:
     if not remedies:
         return "it is not controllable, or not observable, with all inputs and outputs; no link helps"
@@ -336,3 +270,65 @@ def _advice(remedies: tuple[tuple[Link, ...], ...]) -> str:
 
 def _number(mode: complex) -> str:
     return f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode.real:.6g} ± {abs(mode.imag):.6g}j"
+
+
+def _least_exhaustive(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
+    """The least value of a function of subsets of range(size), and a set with that value, by trying all 2^size."""
+    subsets = [frozenset(k for k in range(size) if code >> k & 1) for code in range(2**size)]
+    return min(((value_of(subset), subset) for subset in subsets), key=lambda item: item[0])
+
+
+def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
+    """The least value of an integer submodular function of subsets of range(size), and a set with that value.
+
+    A rank is submodular: a column raises the rank of a set by no more than that of any of its subsets. Wolfe's
+    algorithm approaches the point x of least norm in the base polytope of f − f(∅). Every x on the way proves the lower
+    bound f(∅) + Σ min(x_k, 0), and every set on the way gives an upper bound. Values are integers, so a gap below one
+    closes; a rank that rounding decides need not be submodular. (S. Fujishige, Submodular Functions and Optimization,
+    2nd ed. 2005, section 7.1.)
+    """
+    empty = value_of(frozenset())
+    best = (empty, frozenset[int]())
+
+    def vertex(x: FloatArray) -> FloatArray:
+        """The vertex of the base polytope least in the direction x (Edmonds' greedy algorithm)."""
+        nonlocal best
+        point, subset, value = np.zeros(size), frozenset[int](), empty
+        for k in np.argsort(x, kind="stable").tolist():
+            subset |= {k}
+            next_value = value_of(subset)
+            point[k], value = next_value - value, next_value
+            best = min(best, (value, subset), key=lambda item: item[0])
+        return point
+
+    points = vertex(np.zeros(size))[np.newaxis]
+    weights = np.ones(1)
+    for _ in range(_ROUNDS):
+        x = weights @ points
+        if empty + np.minimum(x, 0.0).sum() > best[0] - 1 + 1e-6:
+            return best
+        points, weights = _nearest_to_origin(np.vstack([points, vertex(x)]), np.append(weights, 0.0))
+    raise DisagreementError(
+        f"the least rank is between {empty + np.minimum(weights @ points, 0.0).sum():.3f} and {best[0]}; the ranks are "
+        "decided by rounding: scale the plant so that its entries are of like size"
+    )
+
+
+def _nearest_to_origin(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Wolfe's minor cycle: the points whose hull holds the point of least norm, and the weights of that point."""
+    while True:
+        count = len(points)
+        # least norm in the affine hull, by Lagrange's conditions; least squares because points may be dependent
+        system = np.block([[points @ points.T, np.ones((count, 1))], [np.ones((1, count)), np.zeros((1, 1))]])
+        affine = np.linalg.lstsq(system, np.append(np.zeros(count), 1.0), rcond=None)[0][:count]
+        if affine.min() > -1e-10:
+            kept = affine > 1e-10
+            return points[kept], affine[kept] / affine[kept].sum()
+        outward = affine < weights - 1e-14
+        outward &= affine < 1e-10
+        step = float((weights[outward] / (weights[outward] - affine[outward])).min()) if outward.any() else 0.0
+        weights = weights + min(step, 1.0) * (affine - weights)
+        kept = weights > 1e-12
+        if kept.all():
+            kept[np.argmin(weights)] = False
+        points, weights = points[kept], weights[kept] / weights[kept].sum()

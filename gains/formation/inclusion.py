@@ -1,23 +1,23 @@
 """Inclusion principle: from overlapping to disjoint subsystems and back, for any leader-follower chain or tree.
 
 The subsystems {e_0^v} and, for every follower i behind j, {e_j^v, e_i^p, e_i^v} overlap: they share velocity errors. In
-an expanded space each subsystem has its own copy of what it shares. The subsystems are then disjoint, gains can be
-designed for one at a time, and contraction takes them back to the formation. All matrices are sparse, so hundreds of
-vehicles are verified in milliseconds.
+an expanded space each has its own copy of what it shares, so gains can be designed for one subsystem at a time;
+contraction takes them back to the formation. All matrices are sparse.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 3, Theorems 2 and 3, eqs. (3.5)-(3.19), (3.25), (3.26).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_array
+from scipy.sparse import block_diag, csr_array
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
-from gains.formation.model import FormationModel, checked_gain
+from gains.formation.model import FormationModel
 
 # a two-dimensional sparse array of scipy, which has no types
 Sparse = Any
@@ -29,79 +29,50 @@ class Expansion:
     """The expanded system x~' = A~ x~ + B~ u~ and the maps to and from it.
 
     x~ = V x and u~ = R u expand; x = U x~ and u = Q u~ contract, UV = I, QR = I (3.5, 3.6). U = (V'V)^{-1} V' and
-    Q = (R'R)^{-1} R' take the mean of the copies.
-
-    Attributes
-    ----------
-    V, U
-        State maps, shapes (expanded states, states) and (states, expanded states).
-    R, Q
-        Input maps, shapes (expanded inputs, inputs) and (inputs, expanded inputs).
-    A, B
-        A~ and B~ of the expanded system.
-    M, N
-        Complementary matrices: A~ = V A U + M, B~ = V B Q + N. A restriction needs MV = 0 and NR = 0 for type (a),
-        N = 0 for type (b).
-    restriction
-        "a": A~V = VA and B~R = VB. "b": A~V = VA and B~ = VBQ (Theorem 2).
-
-    Examples
-    --------
-    U takes the mean of the copies that V makes, UV = I:
-
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.inclusion import expand
-    >>> expansion = expand(FormationModel((-1, 0, 1)))
-    >>> np.array_equal((expansion.U @ expansion.V).toarray(), np.eye(10))
-    True
+    Q = (R'R)^{-1} R' take the mean of the copies. V (expanded states, states), R (expanded inputs, inputs), and so on.
     """
 
     V: Sparse
     U: Sparse
+    """State maps, shapes (expanded states, states) and (states, expanded states)."""
     R: Sparse
     Q: Sparse
+    """Input maps, shapes (expanded inputs, inputs) and (inputs, expanded inputs)."""
     A: Sparse
     B: Sparse
+    """A~ and B~ of the expanded system."""
     M: Sparse
     N: Sparse
+    """Complementary matrices: A~ = V A U + M, B~ = V B Q + N. A restriction needs MV = 0 and NR = 0 for type (a), N = 0
+    for type (b)."""
     restriction: Restriction
+    """"a": A~V = VA and B~R = VB. "b": A~V = VA and B~ = VBQ (Theorem 2)."""
 
 
 def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansion:
     """The expanded system, in which the subsystems of the formation are disjoint.
 
     The expanded state is e_0^v, followed by (e_j^v, e_i^p, e_i^v) for every follower i behind j; the expanded input is
-    u_0, followed by (u_j, u_i) (3.11-3.13). For type (a), A~ and B~ are block diagonal with the blocks (3.25). For type
-    (b), A~ is the same and B~ = VBQ, which is not block diagonal: it moves all copies of a vehicle by the mean of its
-    copied inputs.
+    u_0, followed by (u_j, u_i) (3.11-3.13). For type (a), A~ and B~ are block diagonal with the blocks (3.25). For
+    type (b), A~ is the same and B~ = VBQ moves all copies of a vehicle by the mean of its copied inputs. BadModelError
+    for any other type.
 
-    Raises
-    ------
-    BadModelError
-        The restriction is neither "a" nor "b".
+    In a chain of three, e_0^v, e_1^v, u_0 and u_1 have two copies each, of which U takes the mean:
 
-    Examples
-    --------
-    In a chain of three, e_0^v, e_1^v, u_0 and u_1 have two copies each.
-
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.inclusion import expand
     >>> expansion = expand(FormationModel((-1, 0, 1)))
-    >>> expansion.V.shape, expansion.R.shape
-    ((14, 10), (10, 6))
+    >>> expansion.V.shape, expansion.R.shape, np.array_equal((expansion.U @ expansion.V).toarray(), np.eye(10))
+    ((14, 10), (10, 6), True)
     """
     if restriction not in ("a", "b"):
         raise BadModelError(f"restriction = {restriction!r}; wanted 'a' or 'b'")
-    n = formation.axes
     state_source, input_source = _copied_blocks(formation)
-    V = _selection(state_source, formation.states, n)
-    R = _selection(input_source, formation.inputs, n)
+    V = _selection(state_source, formation.states, formation.axes)
+    R = _selection(input_source, formation.inputs, formation.axes)
     U, Q = _mean_of_copies(V), _mean_of_copies(R)
     A, B = csr_array(formation.A), csr_array(formation.B)
-    A_expanded, B_disjoint = _disjoint_subsystems(formation)
+    A_expanded = _disjoint(formation, lambda subsystem: subsystem.A)
     mean_input = V @ B @ Q
-    B_expanded = B_disjoint if restriction == "a" else mean_input
+    B_expanded = _disjoint(formation, lambda subsystem: subsystem.B) if restriction == "a" else mean_input
     return Expansion(
         V=V, U=U, R=R, Q=Q, A=A_expanded, B=B_expanded,
         M=A_expanded - V @ A @ U, N=B_expanded - mean_input, restriction=restriction,
@@ -111,26 +82,13 @@ def expand(formation: FormationModel, restriction: Restriction = "a") -> Expansi
 def expanded_gain(formation: FormationModel, K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> Sparse:
     """The block-diagonal gain K~ of the disjoint subsystems, sparse, shape (expanded inputs, expanded states).
 
-    The block of {e_0^v} is K1, that of every follower [K1 0 0; K2 K3 K1] (3.26): within this subsystem only K1 acts on
-    the vehicle in front. Arguments and exceptions as of `gains.formation.model.FormationModel.overlapping_gain`.
+    The block of {e_0^v} is K1, that of every follower [K1 0 0; K2 K3 K1] (3.26). Arguments and exceptions as of
+    `gains.formation.model.FormationModel.overlapping_gain`.
 
-    Examples
-    --------
-    A leader and one follower of one axis, [K1] and [K1 0 0; K2 K3 K1]:
-
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.inclusion import expanded_gain
     >>> expanded_gain(FormationModel((-1, 0), axes=1), [[-3]], [[2]], [[1]]).toarray().tolist()
     [[-3.0, 0.0, 0.0, 0.0], [0.0, -3.0, 0.0, 0.0], [0.0, 2.0, 1.0, -3.0]]
     """
-    n = formation.axes
-    own, front, spacing = (checked_gain(name, gain, n) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3)))
-    entries = [(0, 0, own)]
-    for i in formation.followers:
-        row, column = 2 * i - 1, 3 * i - 2
-        entries += [(row, column, own), (row + 1, column, front)]
-        entries += [(row + 1, column + 1, spacing), (row + 1, column + 2, own)]
-    return _blocks(entries, (2 * formation.vehicles - 1, 3 * formation.vehicles - 2), n)
+    return _disjoint(formation, lambda subsystem: subsystem.overlapping_gain(K1, K2, K3))
 
 
 def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
@@ -139,12 +97,8 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
     In the gain of `expanded_gain` the copies of u_j disagree: K1 e_j^v in the subsystem of the vehicle behind j, the
     full law in j's own. K~V = RK then has no solution K, and contraction would mix the two laws (3.17-3.19).
 
-    Examples
-    --------
     In a chain of three, the copy of u_1 in the subsystem behind gets the law of vehicle 1:
 
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.inclusion import expanded_gain, modified_gain
     >>> chain = FormationModel((-1, 0, 1), axes=1)
     >>> modified_gain(chain, expanded_gain(chain, [[-3]], [[2]], [[1]])).toarray()[3].tolist()
     [0.0, 2.0, 1.0, -3.0, 0.0, 0.0, 0.0]
@@ -161,12 +115,8 @@ def modified_gain(formation: FormationModel, gain: Sparse) -> Sparse:
 def contracted_gain(expansion: Expansion, gain: Sparse) -> FloatArray:
     """K = Q K~ V, shape (inputs, states), of a gain K~ of shape (expanded inputs, expanded states).
 
-    Examples
-    --------
     Back to the gain (3.19) of the formation, u_1 = 2 e_0^v + e_1^p − 3 e_1^v:
 
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.inclusion import contracted_gain, expand, expanded_gain, modified_gain
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> contracted_gain(expand(pair), modified_gain(pair, expanded_gain(pair, [[-3]], [[2]], [[1]]))).tolist()
     [[-3.0, 0.0, 0.0], [2.0, 1.0, -3.0]]
@@ -175,37 +125,15 @@ def contracted_gain(expansion: Expansion, gain: Sparse) -> FloatArray:
 
 
 def verify_inclusion(
-    expansion: Expansion,
-    A: ArrayLike,
-    B: ArrayLike,
-    *,
-    K: ArrayLike,
-    K_expanded: Sparse,
-    tolerance: float = 1e-9,
+    expansion: Expansion, A: ArrayLike, B: ArrayLike, *, K: ArrayLike, K_expanded: Sparse, tolerance: float = 1e-9
 ) -> float:
     """The largest absolute entry by which the closed loop misses a condition for its inclusion in the expanded one.
 
     The conditions are UV = I, QR = I (3.5, 3.6), A~V = VA, K = QK~V and, for restriction (a), B~R = VB and K~V = RK;
-    for (b), B~ = VBQ.
+    for (b), B~ = VBQ. A (states, states), B (states, inputs) and K are the original system and its gain, `K_expanded`
+    is that of the expanded system. `tolerance` is relative to the largest entry of the matrices compared (at least 1).
+    Raises BadModelError if a condition is missed, with its name and residual.
 
-    Parameters
-    ----------
-    A, B, K
-        The original system, shapes (states, states) and (states, inputs), and its gain.
-    K_expanded
-        The gain of the expanded system.
-    tolerance
-        Largest residual accepted, relative to the largest entry of the matrices compared (at least 1).
-
-    Raises
-    ------
-    BadModelError
-        A condition is missed; the message names it, its residual and the tolerance.
-
-    Examples
-    --------
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
     >>> chain, gains = FormationModel((-1, 0, 1), axes=1), ([[-3]], [[2]], [[1]])
     >>> K, K_expanded = chain.overlapping_gain(*gains), modified_gain(chain, expanded_gain(chain, *gains))
     >>> verify_inclusion(expand(chain), chain.A, chain.B, K=K, K_expanded=K_expanded)
@@ -235,6 +163,12 @@ def verify_inclusion(
     return max(residuals.values())
 
 
+def _disjoint(formation: FormationModel, matrix: Callable[[FormationModel], FloatArray]) -> Sparse:
+    """Block diagonal of a matrix of the subsystems (3.25): the leader, and each follower behind its predecessor."""
+    leader, pair = (csr_array(matrix(FormationModel(who, formation.axes))) for who in ((-1,), (-1, 0)))
+    return csr_array(block_diag([leader, *[pair] * len(formation.followers)], format="csr"))
+
+
 def _copied_blocks(formation: FormationModel) -> tuple[list[int], list[int]]:
     """The index of the original block that each block of the expanded state, and of the expanded input, copies."""
     states, inputs = [0], [0]
@@ -256,32 +190,6 @@ def _mean_of_copies(copies: Sparse) -> Sparse:
     """(V'V)^{-1} V' of a selection matrix V; V'V is diagonal and counts the copies."""
     counts = np.asarray(copies.sum(axis=0)).ravel()
     return csr_array(copies.T.multiply(1.0 / counts[:, None]))
-
-
-def _disjoint_subsystems(formation: FormationModel) -> tuple[Sparse, Sparse]:
-    """Block-diagonal A~ and B~ of the subsystems (3.25)."""
-    n = formation.axes
-    identity = np.eye(n)
-    state_entries: list[tuple[int, int, FloatArray]] = []
-    input_entries = [(0, 0, identity)]
-    for i in formation.followers:
-        front, spacing, own = 3 * i - 2, 3 * i - 1, 3 * i
-        state_entries += [(spacing, front, identity), (spacing, own, -identity)]
-        input_entries += [(front, 2 * i - 1, identity), (own, 2 * i, identity)]
-    states, inputs = 3 * formation.vehicles - 2, 2 * formation.vehicles - 1
-    return _blocks(state_entries, (states, states), n), _blocks(input_entries, (states, inputs), n)
-
-
-def _blocks(entries: list[tuple[int, int, FloatArray]], shape: tuple[int, int], n: int) -> Sparse:
-    """Sparse matrix of n×n blocks given as (block row, block column, block); `shape` counts blocks."""
-    full_shape = (shape[0] * n, shape[1] * n)
-    if not entries:
-        return csr_array(full_shape)
-    row = np.array([entry[0] for entry in entries])[:, None, None] * n + np.arange(n)[None, :, None]
-    column = np.array([entry[1] for entry in entries])[:, None, None] * n + np.arange(n)[None, None, :]
-    value = np.array([entry[2] for entry in entries])
-    row, column = np.broadcast_to(row, value.shape), np.broadcast_to(column, value.shape)
-    return csr_array((value.ravel(), (row.ravel(), column.ravel())), shape=full_shape)
 
 
 def _largest(matrix: Sparse) -> float:

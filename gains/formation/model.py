@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import strongly_connected_blocks
+from gains.core.structure import real_matrix, strongly_connected_blocks
 
 LEADER = -1
 
@@ -27,39 +27,25 @@ class FormationModel:
         e_i^v = Z_i^v − v_d             velocity error, e_i^v' = u_i
 
     The state is e = (e_0^v, e_1^p, e_1^v, e_2^p, e_2^v, ...), the input u = (u_0, u_1, ...), each entry with `axes`
-    components.
+    components. BadModelError unless `predecessors` are whole numbers that name the leader first and then, for each
+    vehicle, an earlier one.
 
-    Parameters
-    ----------
-    predecessors
-        For each vehicle the index of the one it follows, −1 for the leader. Every vehicle comes after the one it
-        follows, so the leader comes first.
-    axes
-        Number of controlled axes, 2 for north and east.
-
-    Raises
-    ------
-    BadModelError
-        The sequence is empty, not of whole numbers, has no leader or more than one, or names a vehicle that does not
-        come earlier.
-
-    Examples
-    --------
     A leader and two followers in a chain. With K1 = −1, K3 = 1 per axis a follower has the loop
     s² + (s + 1) e^{−sτ} = 0 and a delay margin of 0.711119 s:
 
     >>> import numpy as np
-    >>> from gains.delay.constant import delay_margin
-    >>> from gains.formation.model import FormationModel
+    >>> from gains import FormationModel, delay_margin
     >>> chain = FormationModel((-1, 0, 1))
-    >>> chain.states, chain.inputs, chain.depth
-    (10, 6, 2)
+    >>> chain.states, chain.inputs
+    (10, 6)
     >>> round(delay_margin(*chain.ground_loop(-np.eye(2), 0 * np.eye(2), np.eye(2))), 6)
     0.711119
     """
 
     predecessors: tuple[int, ...]
+    """For each vehicle the index of the one it follows, −1 for the leader."""
     axes: int = 2
+    """Number of controlled axes, 2 for north and east."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "predecessors", _checked_predecessors(self.predecessors))
@@ -85,14 +71,6 @@ class FormationModel:
     def inputs(self) -> int:
         """Length of the input vector u."""
         return self.axes * self.vehicles
-
-    @property
-    def depth(self) -> int:
-        """Number of followers on the longest path from the leader."""
-        depths = [0]
-        for i in self.followers:
-            depths.append(depths[self.predecessors[i]] + 1)
-        return max(depths)
 
     def velocity_slice(self, vehicle: int) -> slice:
         """Place of e_i^v in the state."""
@@ -142,13 +120,9 @@ class FormationModel:
             u_0 = K1 e_0^v
             u_i = K1 e_i^v + K2 e_j^v + K3 e_i^p     for a follower i behind j
 
-        K1 is negative and K3 positive (definite) in a stable loop, because e_i^p grows as vehicle i falls behind.
-
-        Parameters
-        ----------
-        K1, K2, K3
-            Gains on the vehicle's own velocity error (1/s), the velocity error of the vehicle in front (1/s) and the
-            spacing error (1/s²), each a finite matrix of shape (axes, axes); else BadModelError.
+        K1 is negative and K3 positive (definite) in a stable loop, because e_i^p grows as vehicle i falls behind. K1,
+        K2 and K3 act on the vehicle's own velocity error (1/s), that of the vehicle in front (1/s) and the spacing
+        error (1/s²); BadModelError unless each is a finite matrix of shape (axes, axes).
         """
         own, front, spacing = (
             checked_gain(name, gain, self.axes) for name, gain in (("K1", K1), ("K2", K2), ("K3", K3))
@@ -183,14 +157,9 @@ class FormationModel:
 
 def checked_gain(name: str, gain: ArrayLike, axes: int) -> FloatArray:
     """The gain as a finite array of shape (axes, axes), or BadModelError with its name."""
-    try:
-        array = np.array(gain, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise BadModelError(f"{name} = {gain!r} is not a matrix of numbers") from error
+    array = real_matrix(name, gain)
     if array.shape != (axes, axes):
         raise BadModelError(f"{name} has shape {array.shape}; wanted ({axes}, {axes})")
-    if not np.isfinite(array).all():
-        raise BadModelError(f"{name} = {array.tolist()} is not finite")
     return array
 
 

@@ -1,8 +1,7 @@
 """Who may use whose output: information patterns of a decentralised static feedback u = K y, y = C x.
 
 A pattern is a binary block matrix: block (i, j) is 1 where the input of vehicle i may use the output of vehicle j. The
-gain may have any entries in these blocks and is zero elsewhere. A leader-follower tree, bidirectional coupling and
-vehicles with several predecessors are all patterns.
+gain may have any entries in these blocks and is zero elsewhere.
 
 Source: Sahoo 2012 (see `gains.formation.model`), section 4, eq. (4.6), and section 5.
 """
@@ -25,19 +24,7 @@ Link = tuple[int, int]
 class Plant:
     """Linear plant x' = A x + B u, y = C x with A (n, n), B (n, inputs) and C (outputs, n), the identity if not given.
 
-    Raises
-    ------
-    BadModelError
-        A matrix is not finite and real, or the shapes do not fit.
-
-    Examples
-    --------
-    Two integrators in a row, of which the position is measured:
-
-    >>> from gains.formation.pattern import Plant
-    >>> plant = Plant([[0, 1], [0, 0]], [[0], [1]], [[1, 0]])
-    >>> plant.closed_loop([[-4]]).tolist()
-    [[0.0, 1.0], [-4.0, 0.0]]
+    BadModelError if a matrix is not finite and real, or the shapes do not fit.
     """
 
     A: FloatArray
@@ -69,31 +56,14 @@ class Plant:
 class Pattern:
     """Binary block matrix of the gain K: which output each input may use.
 
-    Attributes
-    ----------
-    blocks
-        Shape (vehicles with an input, vehicles with an output); True at (i, j) if u_i may use y_j.
-    input_sizes, output_sizes
-        Length of every u_i and y_j; they may differ from vehicle to vehicle.
-
-    Raises
-    ------
-    BadModelError
-        An entry is not 0 or 1, a size is not a positive whole number, or shape and sizes do not fit.
-
-    Examples
-    --------
-    u_0 uses y_0, u_1 uses both outputs; y_1 has two entries:
-
-    >>> from gains.formation.pattern import Pattern
-    >>> pattern = Pattern([[1, 0], [1, 1]], (1, 1), (1, 2))
-    >>> pattern.links, pattern.mask.astype(int).tolist()
-    (((0, 0), (1, 0), (1, 1)), [[1, 0, 0], [1, 1, 1]])
+    BadModelError if an entry is not 0 or 1, a size is not a positive whole number, or shape and sizes do not fit.
     """
 
     blocks: BoolArray
+    """Shape (vehicles with an input, vehicles with an output); True at (i, j) if u_i may use y_j."""
     input_sizes: tuple[int, ...]
     output_sizes: tuple[int, ...]
+    """Length of every u_i and y_j; they may differ from vehicle to vehicle."""
 
     def __post_init__(self) -> None:
         blocks = _checked_blocks(self.blocks)
@@ -140,10 +110,7 @@ def leader_follower(formation: FormationModel) -> Pattern:
 
     C = I: the leader's output is its velocity error, a follower's its spacing and velocity errors.
 
-    Examples
-    --------
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import leader_follower
+    >>> from gains import FormationModel, leader_follower
     >>> leader_follower(FormationModel((-1, 0, 1))).links
     ((0, 0), (1, 0), (1, 1), (2, 1), (2, 2))
     """
@@ -156,10 +123,7 @@ def leader_follower(formation: FormationModel) -> Pattern:
 def bidirectional(formation: FormationModel) -> Pattern:
     """Every vehicle uses its own output and those of the vehicles in front and behind, as in section 5.
 
-    Examples
-    --------
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import bidirectional
+    >>> from gains import FormationModel, bidirectional
     >>> bidirectional(FormationModel((-1, 0, 1))).blocks.astype(int).tolist()
     [[1, 1, 0], [1, 1, 1], [0, 1, 1]]
     """
@@ -170,10 +134,7 @@ def bidirectional(formation: FormationModel) -> Pattern:
 def all_to_all(formation: FormationModel) -> Pattern:
     """Every vehicle uses all outputs: the centralised controller.
 
-    Examples
-    --------
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import all_to_all
+    >>> from gains import FormationModel, all_to_all
     >>> all_to_all(FormationModel((-1, 0))).links
     ((0, 0), (0, 1), (1, 0), (1, 1))
     """
@@ -183,12 +144,8 @@ def all_to_all(formation: FormationModel) -> Pattern:
 def with_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
     """The pattern with these links (i, j) added; BadModelError if one names a vehicle that is not in the pattern.
 
-    Examples
-    --------
     Vehicle 2 sees the leader as well:
 
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import leader_follower, with_links
     >>> with_links(leader_follower(FormationModel((-1, 0, 1))), [(2, 0)]).blocks.astype(int).tolist()
     [[1, 0, 0], [1, 1, 0], [1, 1, 1]]
     """
@@ -198,10 +155,6 @@ def with_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
 def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
     """The pattern without these links (i, j). Exceptions as of `with_links`.
 
-    Examples
-    --------
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import leader_follower, without_links
     >>> without_links(leader_follower(FormationModel((-1, 0, 1))), [(2, 1)]).links
     ((0, 0), (1, 0), (1, 1), (2, 2))
     """
@@ -211,10 +164,7 @@ def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
 def formation_plant(formation: FormationModel, C: ArrayLike | None = None) -> Plant:
     """The error model of the formation with outputs y = C e, C of shape (outputs, states); C = I if not given.
 
-    Examples
-    --------
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.formation.pattern import formation_plant
+    >>> from gains import FormationModel, formation_plant
     >>> plant = formation_plant(FormationModel((-1, 0, 1)))
     >>> plant.A.shape, plant.B.shape, plant.C.shape
     ((10, 10), (10, 6), (10, 10))

@@ -2,11 +2,10 @@
 
 The analysis depends on the model: `gains.delay._commensurate` for multiples of the unknown delay, `gains.delay._mixed`
 if there are known delays beside it, `gains.sampled.constant` for a held loop of known period, and
-`gains.sampled._period` if the period is the unknown. `gains.margin.opinions` confirms what it can. `gcs margin` prints
-the result.
+`gains.sampled._period` if the period is the unknown. `gains.margin.opinions` confirms what it can.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from math import ceil, floor, gcd, inf, log10, pi
@@ -17,7 +16,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
 from gains.delay._crossings import DelayedTerm, by_multiple, crossing_error
-from gains.delay.constant import Crossing, DelayAnalysis
+from gains.delay.constant import Crossing
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
 
@@ -54,35 +53,25 @@ class MarginCrossing:
     delay_error_s: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LoopMargin:
-    """The verdict on a loop for all values of its `unknown`: a delay, or the sampling period.
-
-    Attributes
-    ----------
-    unknown
-        Its name; "period" for the sampling period.
-    stable_intervals_s
-        The windows of stability, complete up to `complete_to_s`; the last may end at inf.
-    delay_margin_s, delay_margin_error_s
-        The end of the window that begins at 0, or 0 without one, and its estimated error.
-    unstable_roots_at_zero_delay
-        The number of roots right of the axis with the unknown at zero.
-    roots_fixed_at_zero
-        The number of roots that stay at 0 and are left out of all else.
-    checked_by
-        The methods that confirmed the windows.
-    """
+    """The verdict on a loop for all values of its `unknown`: a delay, or the sampling period."""
 
     unknown: str
+    """Its name; "period" for the sampling period."""
     stable_intervals_s: tuple[tuple[float, float], ...]
+    """The windows of stability, complete up to `complete_to_s`; the last may end at inf."""
     delay_margin_s: float
     delay_margin_error_s: float
+    """The end of the window that begins at 0, or 0 without one, and its estimated error."""
     crossings: tuple[MarginCrossing, ...]
     unstable_roots_at_zero_delay: int
-    roots_fixed_at_zero: int
+    """The number of roots right of the axis with the unknown at zero."""
+    roots_fixed_at_zero: int = 0
+    """The number of roots that stay at 0 and are left out of all else."""
     complete_to_s: float
-    checked_by: tuple[str, ...]
+    checked_by: tuple[str, ...] = ()
+    """The methods that confirmed the windows."""
     notes: tuple[str, ...]
 
 
@@ -102,17 +91,10 @@ class LoopAtGivenDelays:
 def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays:
     """The delays, or the sampling periods, at which the loop of a model is stable.
 
-    Raises
-    ------
-    BadModelError
-        The model cannot be analysed; the message names what was read and what was wanted.
-    DisagreementError
-        Independent methods gave different answers.
+    Raises BadModelError if the model cannot be analysed, with what was read and what was wanted, and DisagreementError
+    if independent methods gave different answers.
 
-    Examples
-    --------
-    >>> from gains.margin.loop_margin import loop_margin
-    >>> from gains.margin.model_file import parse_model
+    >>> from gains import loop_margin, parse_model
     >>> found = loop_margin(parse_model('{"A0": [[0]], "A1": [[-1]]}'))
     >>> round(found.delay_margin_s, 6), found.checked_by
     (1.570796, ('sweep', 'rightmost root'))
@@ -125,9 +107,6 @@ def loop_margin(model: DelayModel | HeldModel) -> LoopMargin | LoopAtGivenDelays
 def as_known(value: float, error: float) -> str:
     """A number with the digits that its error leaves, six at most; the last one is off by at most one.
 
-    Examples
-    --------
-    >>> from gains.margin.loop_margin import as_known
     >>> as_known(0.8152534, 1e-12), as_known(0.8152534, 8e-5), as_known(0.8152534, 0.4)
     ('0.815253', '0.815', '0.8')
     """
@@ -147,6 +126,9 @@ def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
 
 
 def _with_unknown_delay(model: DelayModel) -> LoopMargin:
+    from gains.delay._commensurate import analyse_commensurate
+    from gains.delay._mixed import analyse_mixed
+
     matrices, taken_out = without_equilibria(*(term.matrix for term in model.terms))
     unit = _common_divisor([term.multiple for term in model.terms])
     steps = [int(term.multiple / unit) for term in model.terms]
@@ -157,9 +139,12 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
         )
     known_s = [term.fixed_s for term in model.terms]
     terms = [DelayedTerm(*parts) for parts in zip(matrices, known_s, steps, strict=True)]
-    analysis = _analysed(terms)
+    # in the common divisor of the delays; the unknown is that divided by `unit`
+    if any(known_s):
+        analysis = analyse_mixed(terms, leave_out_zero=True)
+    else:
+        analysis = analyse_commensurate(by_multiple(terms), leave_out_zero=True)
     opinions = second_opinions(analysis, terms)
-    # the analysis is in the common divisor of the delays; the unknown is that divided by `unit`
     scale = 1.0 / float(unit)
     fixed = taken_out + analysis.roots_fixed_at_zero
     at_zero = () if analysis.stable_intervals_s or fixed else _singular_note(matrices)
@@ -178,16 +163,6 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
         checked_by=opinions.checked_by,
         notes=(_fixed_note(fixed),) if fixed else at_zero,
     )
-
-
-def _analysed(terms: Sequence[DelayedTerm]) -> DelayAnalysis:
-    """The windows in the common divisor of the delays."""
-    from gains.delay._commensurate import analyse_commensurate
-    from gains.delay._mixed import analyse_mixed
-
-    if any(term.known_s for term in terms):
-        return analyse_mixed(terms, leave_out_zero=True)
-    return analyse_commensurate(by_multiple(terms), leave_out_zero=True)
 
 
 def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
@@ -216,9 +191,7 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
         delay_margin_error_s=max((c.delay_error_s for c in crossings if c.delay_s == analysis.limit_s), default=0.0),
         crossings=crossings,
         unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_period,
-        roots_fixed_at_zero=0,
         complete_to_s=analysis.complete_to_s,
-        checked_by=(),
         notes=("the unknown is the sampling period: u = K x, sampled and held",),
     )
 
@@ -257,7 +230,6 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
         delay_margin_error_s=max((crossing.delay_error_s for crossing in crossings), default=0.0),
         crossings=crossings,
         unstable_roots_at_zero_delay=int(np.count_nonzero(np.abs(at_once) > 1.0)),
-        roots_fixed_at_zero=0,
         complete_to_s=margin_s,
         checked_by=checks,
         notes=(f"u = K x, sampled and held every {period_s:g} s, acts tau late{beyond}",),

@@ -1,6 +1,4 @@
-"""The JSON model of a linear loop with delays that `gcs margin` reads.
-
-It has one of four forms::
+"""The JSON model of a linear loop with delays that `gcs margin` reads, in one of four forms::
 
     {"A0": [[..]], "A1": [[..]]}                                   x'(t) = A0 x(t) + A1 x(t - tau)
     {"terms": [{"A": [[..]], "delay": 0.1}, {"A": [[..]], "delay": "2*tau"}, ...]}   x'(t) = sum A x(t - delay)
@@ -50,18 +48,7 @@ class Term:
 
 @dataclass(frozen=True)
 class DelayModel:
-    """x'(t) = sum of the terms; `unknown` is the name of the unknown delay, empty if all delays are numbers.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau):
-
-    >>> from fractions import Fraction
-    >>> import numpy as np
-    >>> from gains.margin.model_file import DelayModel, Term
-    >>> DelayModel((Term(np.array([[-1.0]]), 0.0, Fraction(1)),), "tau").unknown
-    'tau'
-    """
+    """x'(t) = sum of the terms; `unknown` is the name of the unknown delay, empty if all delays are numbers."""
 
     terms: tuple[Term, ...]
     unknown: str
@@ -72,15 +59,6 @@ class HeldModel:
     """x' = A x + B u with u = K x sampled and held; A (n, n), B (n, p), K (p, n).
 
     The unknown is the delay of u if the period is given, else the period.
-
-    Examples
-    --------
-    x' = u, u = -x every 0.02 s:
-
-    >>> import numpy as np
-    >>> from gains.margin.model_file import HeldModel
-    >>> HeldModel(np.array([[0.0]]), np.array([[1.0]]), np.array([[-1.0]]), period_s=0.02).period_s
-    0.02
     """
 
     A: FloatArray
@@ -92,14 +70,9 @@ class HeldModel:
 def parse_model(text: str) -> DelayModel | HeldModel:
     """The model that `text` describes.
 
-    Raises
-    ------
-    BadModelError
-        One line: the key, what was read, what was wanted.
+    BadModelError says in one line which key, what was read and what was wanted.
 
-    Examples
-    --------
-    >>> from gains.margin.model_file import parse_model
+    >>> from gains import parse_model
     >>> model = parse_model('{"terms": [{"A": [[-1]], "delay": "0.1 + 2*tau"}]}')
     >>> model.unknown, model.terms[0].fixed_s, model.terms[0].multiple
     ('tau', 0.1, Fraction(2, 1))

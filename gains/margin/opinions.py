@@ -1,8 +1,8 @@
 """Second opinions on an analysis of one unknown delay, and how many of its digits are known.
 
-The exact analysis is compared with a sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`) and with the
-rightmost root beside the ends of the windows or, where a root at zero is left out, with a root count by the argument
-principle. None of them shares algebra with it. A difference that rounding does not explain is an error.
+A sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`), and the rightmost root beside the ends of the
+windows or, where a root at zero is left out, a root count by the argument principle: none shares algebra with the exact
+analysis. A difference that rounding does not explain is an error.
 """
 
 from collections.abc import Iterator, Sequence
@@ -49,21 +49,11 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root below and above it.
 
     A hundred times slower: for a design that is to be flown, not for the inside of an optimisation. Arguments as of
-    `gains.delay.constant.delay_margin`.
+    `gains.delay.constant.delay_margin`. Raises BadModelError unless the matrices are square, finite and of one size,
+    and DisagreementError if the methods differ, with what each one found.
 
-    Raises
-    ------
-    BadModelError
-        The matrices are not square, finite and of one size.
-    DisagreementError
-        The methods differ; the message says what each one found.
-
-    Examples
-    --------
-    x'(t) = -x(t - tau) is stable up to tau = pi / 2:
-
-    >>> from gains.margin.opinions import checked_delay_margin
-    >>> round(checked_delay_margin([[0]], [[-1]]), 6)
+    >>> from gains import checked_delay_margin
+    >>> round(checked_delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796
     """
     now, late = square_matrices(A0=A0, A1=A1)
@@ -75,8 +65,7 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 def second_opinions(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], *, thorough: bool = False) -> Opinions:
     """Confirm an analysis of x'(t) = sum of the terms by the methods that take no more than a fraction of a second.
 
-    If `thorough`, more delays are checked, and by every method, however long it takes. Raises DisagreementError if a
-    method contradicts the analysis.
+    If `thorough`, more delays are checked, and by every method. DisagreementError if a method contradicts the analysis.
     """
     error_s = _margin_error_s(analysis, terms)
     checks: list[str] = []

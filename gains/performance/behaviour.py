@@ -1,7 +1,7 @@
 """How a formation behaves inside its delay margin: block by block, with and without delay, and down the chain.
 
-A leader-follower tree is block triangular: whatever its size, its roots are those of the leader's block and of one
-follower's block, and errors pass from vehicle to vehicle by one transfer function.
+Whatever the size of a leader-follower tree, its roots are those of the leader's block and of one follower's block, and
+errors pass from vehicle to vehicle by one transfer function.
 
 Source: Sahoo 2012 (see `gains.formation.model`), eq. (2.11) with the gains (3.26).
 """
@@ -29,45 +29,27 @@ class BlockMargin:
 
 @dataclass(frozen=True)
 class Behaviour:
-    """How the loop behaves inside its margin.
-
-    Attributes
-    ----------
-    decay_rate_1_s, damping
-        −Re of the rightmost root of the whole formation, and the least damping ratio −Re s / |s|, without delay.
-    decay_rate_delayed_1_s, damping_delayed
-        Decay rate, and damping ratio of the follower's rightmost root, at the delay `delay_s`.
-    string_peak, string_peak_delayed
-        Largest growth of a spacing error from one vehicle to the next, over all frequencies, without delay and at
-        `delay_s`; down a chain of n followers errors grow by its (n − 1)th power at most.
-    delay_s
-        The constant delay of the figures with delay; `gains.design.design` takes half the sampled margin, plus half a
-        period for the hold.
-    """
+    """How the loop behaves inside its margin."""
 
     decay_rate_1_s: float
     damping: float
+    """−Re of the rightmost root of the whole formation, and the least damping ratio −Re s / |s|, without delay."""
     decay_rate_delayed_1_s: float
     damping_delayed: float
+    """Decay rate, and damping ratio of the follower's rightmost root, at the delay `delay_s`."""
     string_peak: float
     string_peak_delayed: float
+    """Largest growth of a spacing error from one vehicle to the next, over all frequencies, without delay and at
+    `delay_s`; down a chain of n followers errors grow by its (n − 1)th power at most."""
     delay_s: float
+    """The constant delay of the figures with delay; `gains.design.design` takes half the sampled margin, plus half a
+    period for the hold."""
 
 
 def diagonal_blocks(gains: Gains) -> list[tuple[FloatArray, FloatArray]]:
     """(A0, A1) of e' = A0 e + A1 e(t − τ) of the leader, e_0^v, and of a follower, (e_i^p, e_i^v).
 
     K2 couples the two and is in neither.
-
-    Examples
-    --------
-    e_0^v' = −e_0^v late; e^p' = −e^v at once, e^v' = e^p − e^v late:
-
-    >>> import numpy as np
-    >>> from gains.performance.behaviour import diagonal_blocks
-    >>> blocks = diagonal_blocks((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
-    >>> [(A0 + A1).tolist() for A0, A1 in blocks]
-    [[[-1.0]], [[0.0, -1.0], [1.0, -1.0]]]
     """
     axes = len(gains[0])
     A0, A1 = FormationModel((-1, 0), axes).ground_loop(*gains)
@@ -78,15 +60,6 @@ def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
     """Return the margin of x'(t) = A0 x(t) + A1 x(t − τ) and the frequency of the crossing at its end.
 
     The frequency is NaN if there is no crossing. Arguments as of `gains.delay.constant.analyse_delay`.
-
-    Examples
-    --------
-    s² + (s + 1) e^{−sτ} has roots on the axis at ω² = (1 + √5) / 2 and τ = atan(ω) / ω:
-
-    >>> from gains.performance.behaviour import block_margin
-    >>> found = block_margin([[0, -1], [0, 0]], [[0, 0], [1, -1]])
-    >>> round(found.delay_margin_s, 6), round(found.crossing_rad_s, 6)
-    (0.711119, 1.27202)
     """
     analysis = analyse_delay(A0, A1, horizon_s=1e-300)
     first = min(analysis.crossings, key=lambda crossing: abs(crossing.delay_s - analysis.delay_margin_s), default=None)
@@ -96,19 +69,11 @@ def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
 def behaviour(gains: Gains, delay_s: float, *, own_delay_s: float | None = None) -> Behaviour:
     """Return the behaviour of a formation whose leader and followers have the gains K1, K2 and K3.
 
-    Parameters
-    ----------
-    delay_s
-        Constant delay of all feedback for the figures with delay.
-    own_delay_s
-        That of a vehicle's own errors, where only those of the vehicle in front are late by `delay_s`.
+    For the figures with delay all feedback is late by the constant `delay_s`, except that a vehicle's own errors are
+    late by `own_delay_s` if that is given.
 
-    Examples
-    --------
     The leader's root is −1, the follower's s² + s + 1 has damping 1/2:
 
-    >>> import numpy as np
-    >>> from gains.performance.behaviour import behaviour
     >>> found = behaviour((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), delay_s=0.3)
     >>> round(found.decay_rate_1_s, 6), round(found.damping, 6)
     (0.5, 0.5)

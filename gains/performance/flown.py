@@ -1,7 +1,6 @@
 """Robustness and string stability of a formation as flown, at a loop delay.
 
-`gains.performance.robust` and the requirement's `string_peak_max` describe a loop without delay. In flight a command
-is late by the loop delay τ and held for a control period T, which adds T/2 on average::
+In flight a command is late by the loop delay τ and held for a control period T, which adds T/2 on average::
 
     x'(t) = A x(t) + B K_own x(t − τ_own) + B K_others x(t − τ − T/2) + w
 
@@ -11,10 +10,6 @@ is late by the loop delay τ and held for a control period T, which adds T/2 on 
 The loop stays stable under any disturbance |w| ≤ α |x| up to α(τ), the least singular value over all frequencies of
 its characteristic matrix (the complex stability radius). A complex disturbance of one axis is a real one of two, so no
 larger real bound exists for north and east together. The sampled loop differs in the second order of T.
-
-`FlownFormation` has the robustness of any formation. `FlownLoop` adds the growth of spacing errors from vehicle to
-vehicle: it is one follower behind another, which stands for all followers of a leader-follower tree with equal gains.
-On any other pattern vehicles act on each other both ways, and no such growth is defined.
 """
 
 from dataclasses import dataclass
@@ -48,30 +43,20 @@ _ROUNDING, _NOTHING = 1e-9, 1e-12
 class FlownTiming:
     """When feedback acts in flight.
 
-    Attributes
-    ----------
-    delay_margin_s
-        Least loop delay (s) at which the loop as flown is unstable; `inf` if there is none.
-    period_s
-        Control period T: commands are held for it.
-    loop
-        Where the vehicles' own loops are closed.
-    step_s
-        Period of the loop on board.
-
-    Examples
-    --------
     A hold of 20 ms delays by 10 ms; on board a vehicle feeds back its own errors at once:
 
-    >>> from gains.performance.flown import FlownTiming
     >>> FlownTiming(0.3, 0.02).delays_s(0.1), FlownTiming(0.3, 0.02, "onboard").delays_s(0.1)
     ((0.11, 0.11), (0.0, 0.11))
     """
 
     delay_margin_s: float
+    """Least loop delay (s) at which the loop as flown is unstable; `inf` if there is none."""
     period_s: float
+    """Control period T: commands are held for it."""
     loop: Literal["ground", "onboard"] = "ground"
+    """Where the vehicles' own loops are closed."""
     step_s: float = 0.0
+    """Period of the loop on board."""
 
     def delays_s(self, delay_s: float) -> tuple[float, float]:
         """Delays of a vehicle's own errors and of those of others at a loop delay (s), holds included."""
@@ -85,13 +70,8 @@ class FlownFormation:
 
     Its `responses` are in the order of the model; without them vehicles answer at once.
 
-    Examples
-    --------
     A vehicle alone: σ_min is |jω + e^{−jωτ}|, least where the phase of the loop is nearest to −π:
 
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.performance.flown import FlownFormation, FlownTiming
     >>> lone = FlownFormation(FormationModel((-1,), axes=1), np.array([[-1.0]]), FlownTiming(np.pi / 2, period_s=0.0))
     >>> [round(lone.alpha(delay_s), 3) for delay_s in (0.0, 1.0, 1.5)]
     [1.0, 0.43, 0.039]
@@ -180,17 +160,13 @@ class FlownFormation:
 
 @dataclass(frozen=True)
 class FlownLoop:
-    """One follower behind another, flown by a station.
+    """One follower behind another, flown by a station, which stands for all followers of a tree with equal gains.
 
     `gains` are k1, k2 and k3, which act on every axis alike; their α is not used. The vehicle answers at once if it has
     no `response`.
 
-    Examples
-    --------
     A loop with a margin of 0.71 s, whose errors grow more the nearer it comes:
 
-    >>> from gains.performance.flown import FlownLoop, FlownTiming
-    >>> from gains.performance.scalar_gains import ScalarGains
     >>> loop = FlownLoop(ScalarGains(1.0, 0.0, 1.0, 0.0), FlownTiming(delay_margin_s=0.711119, period_s=0.0))
     >>> [round(loop.string_peak(delay_s), 2) for delay_s in (0.0, 0.4, 0.6)]
     [1.15, 1.69, 4.39]

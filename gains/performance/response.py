@@ -26,18 +26,7 @@ from gains.sampled.multirate import Timing, multirate_delay_margin
 class Response:
     """The response of one vehicle: `lag_s` > 0 from wanted to real acceleration, velocity gain g >= 0 in 1/s.
 
-    Raises
-    ------
-    BadModelError
-        If the lag is below 1e-6 s, the gain negative, or either not finite.
-
-    Examples
-    --------
-    An autopilot with a lag of 0.2 s that also corrects the velocity:
-
-    >>> from gains.performance.response import Response
-    >>> Response(lag_s=0.2, velocity_gain_1_s=1.5)
-    Response(lag_s=0.2, velocity_gain_1_s=1.5)
+    BadModelError if the lag is below 1e-6 s, the gain negative, or either not finite.
     """
 
     lag_s: float
@@ -63,24 +52,10 @@ def formation_loop(
     """Return (A, B, K) of the formation u = K e whose vehicles have these responses, one for each in the model's order.
 
     The state is e of `gains.formation.model`, followed by a and d of each vehicle; a vehicle with g = 0 has no d.
+    BadModelError unless K has the shape (inputs, states) of the model and there is one response for each vehicle.
 
-    Parameters
-    ----------
-    K
-        Gain of u = K e, shape (inputs, states) of the model.
-
-    Raises
-    ------
-    BadModelError
-        If K is of another shape or there is not one response for each vehicle.
-
-    Examples
-    --------
     A leader by itself, of one axis: e' = a, 0.5 a' = u − a, u = −e.
 
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.performance.response import Response, formation_loop
     >>> A, B, K = formation_loop(FormationModel((-1,), axes=1), np.array([[-1.0]]), [Response(0.5, 0.0)])
     >>> (A + B @ K).tolist()
     [[0.0, 1.0], [-2.0, -2.0]]
@@ -118,14 +93,8 @@ def sampled_margin(
     Without responses they respond at once. Arguments and exceptions as of `formation_loop` and
     `gains.sampled.multirate.multirate_delay_margin`.
 
-    Examples
-    --------
     The leader of `continuous_margin`, sampled: 1.1506 s less half a period or so.
 
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.sampled.multirate import Timing
-    >>> from gains.performance.response import Response, sampled_margin
     >>> leader, K = FormationModel((-1,), axes=1), np.array([[-1.0]])
     >>> round(sampled_margin(leader, K, [Response(1.0, 0.0)], timing=Timing(0.02, 0.02)), 3)
     1.141
@@ -139,13 +108,8 @@ def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[
 
     Arguments and exceptions as of `formation_loop` and `gains.delay.constant.delay_margin`.
 
-    Examples
-    --------
     A leader with s (s + 1) + e^{−sτ} = 0: ω² (1 + ω²) = 1 and τ = (π/2 − atan ω) / ω.
 
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.performance.response import Response, continuous_margin
     >>> round(continuous_margin(FormationModel((-1,), axes=1), np.array([[-1.0]]), [Response(1.0, 0.0)]), 4)
     1.1506
     """

@@ -2,7 +2,7 @@
 
 The subsystem E = (e_j^v, e_i^p, e_i^v) of a follower i behind j is disturbed by w (wind, model error) within a sector,
 w'w ≤ α² E'W'W E (3.25-3.29). Every follower has the same subsystem, so nothing here grows with the number of vehicles.
-α is in 1/s for W = I with the state in m and m/s. `gains.design.robust_lmi` finds gains by such an inequality.
+α is in 1/s for W = I with the state in m and m/s.
 
 Source: Sahoo 2012 (see `gains.formation.model`), eqs. (3.20)-(3.29).
 """
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from gains.core._semidefinite import SolverFacts, negative, solved
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, InfeasibleError, SolverError
+from gains.core.structure import real_matrix
 from gains.formation.model import FormationModel
 
 # The level-set search stops when no frequency exceeds the largest gain found by this share: far above the rounding of a
@@ -26,39 +27,24 @@ _LEVEL_ROUNDS = 60
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Lyapunov function V = E'PE that proves the bound α, with the eigenvalues that were checked.
-
-    Attributes
-    ----------
-    P
-        Symmetric, shape (3 n, 3 n).
-    alpha
-        The bound proved.
-    P_eigenvalue_min
-        Positive.
-    s_procedure_eigenvalue_max
-        Largest eigenvalue of [[A_cl'P + P A_cl + α² W'W, P], [P, −I]]; negative.
-    solver
-        How P was found. The eigenvalues do not depend on it: they are from numpy alone.
-    """
+    """Lyapunov function V = E'PE that proves the sector bound α, with the eigenvalues that were checked."""
 
     P: FloatArray
+    """Symmetric, shape (3 n, 3 n)."""
     alpha: float
+    """The bound proved."""
     P_eigenvalue_min: float
+    """Positive."""
     s_procedure_eigenvalue_max: float
+    """Largest eigenvalue of [[A_cl'P + P A_cl + α² W'W, P], [P, −I]]; negative."""
     solver: SolverFacts
+    """How P was found. The eigenvalues do not depend on it: they are from numpy alone."""
 
 
 def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
     """Return the closed loop A_cl = [[K1, 0, 0], [I, 0, −I], [K2, K3, K1]] of (3.25, 3.26), shape (3 n, 3 n).
 
     It is that of a leader and one follower. Arguments and exceptions as of `robustness`.
-
-    Examples
-    --------
-    >>> from gains.performance.robust import subsystem_loop
-    >>> subsystem_loop(-3, 2, 1).tolist()
-    [[-3.0, 0.0, 0.0], [1.0, 0.0, -1.0], [2.0, 1.0, -3.0]]
     """
     gains = [np.atleast_2d(np.asarray(gain, dtype=float)) for gain in (K1, K2, K3)]
     A0, A1 = FormationModel((-1, 0), axes=len(gains[0])).ground_loop(*gains)
@@ -68,28 +54,17 @@ def subsystem_loop(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike) -> FloatArray:
 def robustness(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, W: ArrayLike | None = None) -> float:
     """Return the exact α of the gains: 1 / ‖W (sI − A_cl)^{-1}‖∞, and 0 if the loop without disturbance is not stable.
 
-    A quadratic Lyapunov function, with a full matrix, that proves the sector bound α exists if and only if
-    α ‖W (sI − A_cl)^{-1}‖∞ < 1 (Kalman-Yakubovich-Popov). For W = I this is the complex stability radius of A_cl, the
-    least of σ_min(jωI − A_cl) over ω, which the SLICOT routine AB13FD also computes.
+    A quadratic Lyapunov function, with a full matrix, that proves the sector bound α exists if and only if α ‖W (sI −
+    A_cl)^{-1}‖∞ < 1 (Kalman-Yakubovich-Popov). For W = I this is the complex stability radius of A_cl, the least of
+    σ_min(jωI − A_cl) over ω, which the SLICOT routine AB13FD also computes. K1, K2 and K3 have the shape (n, n), or are
+    numbers; the weight W of the sector has the shape (q, 3 n), the identity if not given. BadModelError if one is not
+    finite or of another shape.
 
-    Parameters
-    ----------
-    K1, K2, K3
-        Gains of shape (n, n), or numbers.
-    W
-        Weight of the sector, shape (q, 3 n); the identity if not given.
-
-    Raises
-    ------
-    BadModelError
-        If a gain or W is not finite or not of its shape.
-
-    Examples
-    --------
     These gains are weakest at ω = 0, where α is the least singular value of A_cl:
 
     >>> import numpy as np
-    >>> from gains.performance.robust import robustness, subsystem_loop
+    >>> from gains import robustness
+    >>> from gains.performance.robust import subsystem_loop
     >>> least = np.linalg.svd(subsystem_loop(-3, 2, 2), compute_uv=False)[-1]
     >>> round(robustness(-3, 2, 2), 6), round(float(least), 6)
     (0.532094, 0.532094)
@@ -107,12 +82,8 @@ def disturbance_bound(A: FloatArray, W: FloatArray) -> float:
     lower bound γ, the frequencies at which the level is crossed bound the intervals above it; the response at their
     middles gives the next γ, until no crossing is left. The result is on the safe side by at most 1e-10 of itself.
 
-    Examples
-    --------
     x' = −2 x + w stays stable for w² ≤ α² x² up to α = 2:
 
-    >>> import numpy as np
-    >>> from gains.performance.robust import disturbance_bound
     >>> round(disturbance_bound(np.array([[-2.0]]), np.eye(1)), 6)
     2.0
     """
@@ -147,23 +118,9 @@ def certify(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, alpha: float, W: ArrayL
 
     With time in units of 1/α, maximise t subject to [[A_cl'P + P A_cl + W'W, P], [P, −I]] ⪯ −t I, P ⪰ t I. This does
     not use `robustness`, with which it agrees: α below the exact bound has a proof, α above has none. Gains and W as of
-    `robustness`.
-
-    Raises
-    ------
-    BadModelError
-        If α is not positive, or a gain or W is not finite or not of its shape.
-    InfeasibleError
-        If no quadratic Lyapunov function proves α.
-    SolverError
-        If the solver does not end with status "optimal", or its P fails the check.
-
-    Examples
-    --------
-    >>> from gains.performance.robust import certify, robustness
-    >>> proof = certify(-3, 2, 2, alpha=0.999 * robustness(-3, 2, 2))
-    >>> proof.P_eigenvalue_min > 0, proof.s_procedure_eigenvalue_max < 0
-    (True, True)
+    `robustness`. Raises BadModelError if α is not positive or a gain or W not finite or of its shape, InfeasibleError
+    if no quadratic Lyapunov function proves α, and SolverError if the solver does not end with status "optimal" or its
+    P fails the check.
     """
     import cvxpy as cp
 
@@ -187,11 +144,9 @@ def certify(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, alpha: float, W: ArrayL
 def _checked_weight(W: ArrayLike | None, m: int) -> FloatArray:
     if W is None:
         return np.eye(m)
-    weight = np.array(W, dtype=float)
-    if weight.ndim != 2 or weight.shape[1] != m:
+    weight = real_matrix("W", W)
+    if weight.shape[1] != m:
         raise BadModelError(f"W has shape {weight.shape}; wanted (any, {m})")
-    if not np.isfinite(weight).all():
-        raise BadModelError("W is not finite; wanted finite weights")
     return weight
 
 

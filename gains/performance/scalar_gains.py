@@ -19,14 +19,7 @@ _FREQUENCIES, _FREQUENCIES_CLOSER, _CLOSER_LOOKS = 40, 9, 3
 
 @dataclass(frozen=True)
 class ScalarGains:
-    """Gains of u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p (1/s, 1/s, 1/s²) and the α they have.
-
-    Examples
-    --------
-    >>> from gains.performance.scalar_gains import ScalarGains
-    >>> ScalarGains(k1=3.0, k2=2.0, k3=2.0, alpha=0.532).k1
-    3.0
-    """
+    """Gains of u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p (1/s, 1/s, 1/s²) and the sector bound α (1/s) they have."""
 
     k1: float
     k2: float
@@ -47,31 +40,9 @@ def gains_of_margin(share: FloatArray, delay_margin_s: FloatArray, period_s: flo
         G_v(z) = T z^{−l−1} (f + (1 − f) z) / (z − 1)
         G_p(z) = −(T G_v + T² z^{−l−1} (f − f²/2 + (1 − f)² z / 2)) / (z − 1)
 
-    and 1 = −k1 G_v + k3 G_p at z = e^{jωT} is again linear in the gains.
-
-    Parameters
-    ----------
-    share
-        ω (τ + T/2) / (π/2), of any shape, in (0, 1.3).
-    delay_margin_s, period_s
-        τ, of any shape that fits that of `share`, and T; T = 0 for the continuous loop.
-
-    Returns
-    -------
-    tuple
-        k1 and k3. Only those with k1 > 0, k3 > 0 and, sampled, k1 T < 2 (stable without delay)
-        are gains of that margin.
-
-    Examples
-    --------
-    A crossing at ω = π/4 with a margin of 1 s:
-
-    >>> import numpy as np
-    >>> from gains.delay.constant import delay_margin
-    >>> from gains.performance.scalar_gains import gains_of_margin
-    >>> k1, k3 = gains_of_margin(np.array(0.5), np.array(1.0), 0.0)
-    >>> round(delay_margin([[0, -1], [0, 0]], [[0, 0], [k3, -k1]]), 6)
-    1.0
+    and 1 = −k1 G_v + k3 G_p at z = e^{jωT} is again linear in the gains. `share` is ω (τ + T/2) / (π/2) in (0, 1.3), of
+    any shape that fits that of τ. Only those k1 > 0, k3 > 0 with k1 T < 2 (stable without delay) are gains of that
+    margin.
     """
     if period_s == 0:
         angle = share * np.pi / 2
@@ -97,21 +68,7 @@ def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string
 
         k2² ≤ L² (ω² − 2 (k3 cos ωτ + k1 ω sin ωτ) + k1²) + (L² − 1) k3² / ω²     for all ω > 0,
 
-    without delay and with L = 1: k2² ≤ k1² − 2 k3.
-
-    Returns
-    -------
-    array
-        Of the shape of `k1`; NaN where no k2 will do.
-
-    Examples
-    --------
-    Without delay √(k1² − 2 k3):
-
-    >>> import numpy as np
-    >>> from gains.performance.scalar_gains import front_gain_limit
-    >>> front_gain_limit(np.array([2.0]), np.array([1.0]), np.array([0.0]), 1.0).round(6).tolist()
-    [1.414214]
+    without delay and with L = 1: k2² ≤ k1² − 2 k3. The result has the shape of `k1`: NaN where no k2 will do.
     """
     at_rest = k1**2 - 2 * k3 if string_peak_max == 1 else np.full_like(k1, np.inf)
     omega = _frequencies_below_growth(k1, k3)
@@ -133,20 +90,9 @@ def onboard_front_gain_limit(k1: FloatArray, k3: FloatArray, string_peak_max: fl
 
         Γ(s) = (k3 + k2 s e^{−sτ}) / (s² + k1 s + k3)
 
-    |Γ| ≤ L for every delay is k3 + |k2| ω ≤ L |D(jω)| for every frequency. With L = 1 that leaves k2 = 0, if
-    k1² ≥ 2 k3 at all: at low frequencies k2² + 2 k3 + 2 k2 k3 τ ≤ k1² is wanted.
-
-    Returns
-    -------
-    array
-        Of the shape of `k1`; NaN where no k2 will do.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from gains.performance.scalar_gains import onboard_front_gain_limit
-    >>> onboard_front_gain_limit(np.array([2.0, 1.0]), np.array([1.0, 1.0]), 1.0).tolist()
-    [0.0, nan]
+    |Γ| ≤ L for every delay is k3 + |k2| ω ≤ L |D(jω)| for every frequency. With L = 1 that leaves k2 = 0, if k1² ≥ 2 k3
+    at all: at low frequencies k2² + 2 k3 + 2 k2 k3 τ ≤ k1² is wanted. The result has the shape of `k1`: NaN where no k2
+    will do.
     """
     if string_peak_max == 1.0:
         return np.where(k1**2 >= 2 * k3, 0.0, np.nan)
@@ -166,18 +112,6 @@ def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: 
 
     σ_min² is the least root of λ³ − c2 λ² + c1 λ − c0, whose coefficients are the sums of the squared 1×1, 2×2 and 3×3
     minors of jωI − A_cl. Newton's iteration from λ = 0 rises to it without overshoot, because all roots are real.
-
-    Examples
-    --------
-    The same as of `gains.performance.robust.subsystem_loop` with K1 = −k1, K2 = k2, K3 = k3:
-
-    >>> import numpy as np
-    >>> from gains.performance.robust import subsystem_loop
-    >>> from gains.performance.scalar_gains import least_singular_value
-    >>> least = np.linalg.svd(1j * np.eye(3) - subsystem_loop(-3, 2, 2), compute_uv=False)[-1]
-    >>> found = least_singular_value(np.array(3.0), np.array(2.0), np.array(2.0), np.array(1.0))
-    >>> round(float(found), 6) == round(float(least), 6)
-    True
     """
     x, a2 = omega**2, k1**2
     own = x + a2
@@ -192,20 +126,7 @@ def least_singular_value(k1: FloatArray, k2: FloatArray, k3: FloatArray, omega: 
 
 
 def alpha_of(k1: FloatArray, k2: FloatArray, k3: FloatArray) -> FloatArray:
-    """Return α for W = I, the least of σ_min(jωI − A_cl) over ω, for each of the gains (broadcast).
-
-    Examples
-    --------
-    The same as `gains.performance.robust.robustness`, for many gains at a time:
-
-    >>> import numpy as np
-    >>> from gains.performance.robust import robustness
-    >>> from gains.performance.scalar_gains import alpha_of
-    >>> alpha_of(np.array([3.0, 2.0]), np.array([2.0, 1.0]), np.array([2.0, 1.0])).round(6).tolist()
-    [0.532094, 0.39909]
-    >>> round(robustness(-3, 2, 2), 6), round(robustness(-2, 1, 1), 6)
-    (0.532094, 0.39909)
-    """
+    """Return α for W = I, the least of σ_min(jωI − A_cl) over ω, for each of the gains (broadcast)."""
     k1, k2, k3 = (gain[..., None] for gain in np.broadcast_arrays(k1, k2, k3))
     slow, fast = min(1.0, np.sqrt(k3.min()), k1.min()), max(1.0, np.sqrt(k3.max()), k1.max())
     omega = np.broadcast_to(
@@ -221,17 +142,7 @@ def alpha_of(k1: FloatArray, k2: FloatArray, k3: FloatArray) -> FloatArray:
 
 
 def decay_rate_of(k1: FloatArray, k3: FloatArray) -> FloatArray:
-    """Return the decay rate (1/s) of s² + k1 s + k3, without delay; the leader, s + k1, decays no slower.
-
-    Examples
-    --------
-    s² + 2 s + 1 = (s + 1)²:
-
-    >>> import numpy as np
-    >>> from gains.performance.scalar_gains import decay_rate_of
-    >>> float(decay_rate_of(np.array(2.0), np.array(1.0)))
-    1.0
-    """
+    """Return the decay rate (1/s) of s² + k1 s + k3, without delay; the leader, s + k1, decays no slower."""
     return k1 / 2 - np.sqrt(np.maximum(k1**2 / 4 - k3, 0.0))
 
 

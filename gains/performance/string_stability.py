@@ -1,8 +1,7 @@
 """String stability: how much a spacing error grows from one vehicle to the next, at the worst frequency.
 
 Each follower repeats the motion of the vehicle in front through one transfer function Γ(s). A loop that is stable for
-each vehicle may still amplify errors down the chain unless |Γ(jω)| ≤ 1 at every frequency. The growth at a loop delay
-in flight is in `gains.performance.flown`.
+each vehicle may still amplify errors down the chain unless |Γ(jω)| ≤ 1 at every frequency.
 """
 
 from collections.abc import Callable
@@ -36,19 +35,11 @@ def string_peak(
 
         Γ(s) = (s² I − (s K1 − K3) h e^{−sa})^{-1} (s K2 e^{−sb} + K3 e^{−sa}) h
 
-    Parameters
-    ----------
-    delay_s, front_delay_s
-        a and b; b = a if not given, as when a ground station closes every loop.
-    answer
-        h(jω), from wanted to real acceleration; one if not given.
+    a is `delay_s` and b `front_delay_s`, the same if not given, as when a ground station closes every loop. h(jω) is
+    `answer`, from wanted to real acceleration.
 
-    Examples
-    --------
     |1 / (s² + s + 1)| peaks at 2 / √3:
 
-    >>> import numpy as np
-    >>> from gains.performance.string_stability import string_peak
     >>> round(string_peak((np.array([[-1.0]]), np.array([[0.0]]), np.array([[1.0]])), 0.0), 4)
     1.1547
     """
@@ -75,18 +66,9 @@ def largest_magnitude(response: Callable[[FloatArray], NDArray[Any]], *, near_ra
     """Return the largest magnitude of a response (k,) to frequencies (k,), from a sweep whose maxima are refined.
 
     The sweep goes from four decades below `near_rad_s`, a frequency around which the response changes, to two above.
+    BadModelError if that is not a positive number.
 
-    Raises
-    ------
-    BadModelError
-        If `near_rad_s` is not a positive number.
-
-    Examples
-    --------
-    |s / (s² + s + 1)| is largest, 1, at 1 rad/s:
-
-    >>> from gains.performance.string_stability import largest_magnitude
-    >>> round(largest_magnitude(lambda omega: omega / (1 - omega**2 + 1j * omega), near_rad_s=3.0), 9)
+    >>> round(largest_magnitude(lambda omega: omega / (1 - omega**2 + 1j * omega), near_rad_s=3.0), 9)  # at 1 rad/s
     1.0
     """
     if not (isfinite(near_rad_s) and near_rad_s > 0.0):
@@ -97,15 +79,7 @@ def largest_magnitude(response: Callable[[FloatArray], NDArray[Any]], *, near_ra
 
 
 def largest_value(function: Callable[[FloatArray], FloatArray], grid: FloatArray) -> float:
-    """Return the largest value of a function (k,) -> (k,) on a rising grid, with every local maximum refined.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from gains.performance.string_stability import largest_value
-    >>> round(largest_value(np.sin, np.linspace(0.0, 3.0, 8)), 12)
-    1.0
-    """
+    """Return the largest value of a function (k,) -> (k,) on a rising grid, with every local maximum refined."""
     values = function(grid)
     inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
     largest = float(values.max())

@@ -5,10 +5,9 @@ tau = (q + m) T, q whole and 0 <= m < 1, exactly when z^{q+1} is an eigenvalue o
 
     H_m(z) = K (z I - Phi)^{-1} (G0(m) z + G1(m)).
 
-The moduli of the eigenvalues of H_m do not depend on q: for each m there are finitely many angles phi at which one of
-them is one. These angles, and the delays that belong to them, change little within a period, so the angles at a few m
-lead to every crossing without a march through the delays. For one input the angles come from the eigenvalues of a
-Hamiltonian matrix and none is missed; for several, from a refined sweep.
+For each m there are finitely many angles phi, whatever q, at which an eigenvalue of H_m has modulus one. They change
+little within a period, so those at a few m lead to every crossing without a march through the delays. For one input
+they are eigenvalues of a Hamiltonian matrix and none is missed; for several, they come from a refined sweep.
 """
 
 from math import ceil, floor, inf, pi
@@ -18,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core._bracketing import bracketed_roots
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._crossings import separating_points
-from gains.delay._loci import Loci, delay_loci, near_unit_extrema, solved_beside_poles, unit_crossings
-from gains.delay.sweep import sweep_frequencies
+from gains.delay._loci import Loci, delay_loci, near_unit_extrema, sweep_frequencies, unit_crossings
 from gains.sampled._loop import SampledPlant, block_radius, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
@@ -43,10 +41,7 @@ _ROUNDING, _SAME_PLACE = 1e-11, 1e-6
 def block_delay_margin(plant: SampledPlant) -> float:
     """The least delay tau (s) at which the block loses stability; 0 when unstable at once, `inf` when never.
 
-    Raises
-    ------
-    DisagreementError
-        The eigenvalues of the one-period map contradict the crossings found.
+    DisagreementError if the eigenvalues of the one-period map contradict the crossings found.
     """
     if block_radius(plant, 0.0) >= 1.0:
         return 0.0
@@ -125,11 +120,10 @@ def _unit_angles(plant: SampledPlant, m: float) -> list[tuple[float, complex]]:
     phi = 2 atan(Omega T / 2), and H_m(z) = D + K (w I - F)^{-1} G, well scaled for any period.
     """
     F, G, D = _tustin(plant, m)
+    loci = delay_loci(F, G, plant.K, D)
     if plant.B.shape[1] == 1:
-        loci = _scalar_loci(F, G, plant.K, float(D[0, 0]))
         points = _hamiltonian_points(F, G, plant.K, float(D[0, 0]), plant.period_s)
     else:
-        loci = _matrix_loci(F, G, plant.K, D)
         points = _sweep_points(plant, loci)
     return [
         (2.0 * float(np.arctan(crossing.omega * plant.period_s / 2.0)), crossing.locus)
@@ -149,25 +143,6 @@ def _tustin(plant: SampledPlant, m: float) -> tuple[FloatArray, FloatArray, Floa
     F, both, difference = solved[:, :n], solved[:, n : n + inputs], solved[:, n + inputs :]
     rate = 2.0 / period_s
     return rate * F, rate * (both + F @ difference), plant.K @ difference
-
-
-def _scalar_loci(F: FloatArray, G: FloatArray, K: FloatArray, D: float) -> Loci:
-    strictly_proper = delay_loci(F, G, K)
-
-    def loci(omega: FloatArray) -> ComplexArray:
-        return strictly_proper(omega) + D
-
-    return loci
-
-
-def _matrix_loci(F: FloatArray, G: FloatArray, K: FloatArray, D: FloatArray) -> Loci:
-    identity = np.eye(F.shape[0])
-
-    def loci(omega: FloatArray) -> ComplexArray:
-        states = solved_beside_poles(1j * omega[:, np.newaxis, np.newaxis] * identity - F, G)
-        return np.linalg.eigvals(D + K @ states).astype(np.complex128)
-
-    return loci
 
 
 def _hamiltonian_points(F: FloatArray, G: FloatArray, K: FloatArray, D: float, period_s: float) -> FloatArray:

@@ -1,7 +1,7 @@
 """All sampling periods at which the sampled and held loop is stable without further delay.
 
 A loop may be stable again at periods beyond its first limit, or need a long period in the first place (an oscillator
-pushed at the right instants). The march through the periods therefore goes on past the first limit, up to a horizon.
+pushed at the right instants), so the march through the periods goes on past the first limit.
 """
 
 from collections.abc import Iterator
@@ -63,15 +63,6 @@ def analyse_period(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> PeriodAnalysis:
 
     Listed up to twenty times the first limit at least. Found by a march through the periods: a search, not a proof.
     Arguments and exceptions as of `gains.sampled.constant.sampled_delay_margin`.
-
-    Examples
-    --------
-    x' = u, u = -x: x_{k+1} = (1 - T) x_k is stable up to T = 2, where it changes sign from sample to sample.
-
-    >>> from gains.sampled._period import analyse_period
-    >>> found = analyse_period([[0]], [[1]], [[-1]])
-    >>> round(found.limit_s, 6), [(round(c.omega_rad_s, 4), c.direction) for c in found.crossings]
-    (2.0, [(1.5708, 1)])
     """
     plant, entry, feedback = checked_loop(A, B, K)
     loop_roots = np.linalg.eigvals(plant + entry @ feedback).astype(np.complex128)

@@ -9,9 +9,6 @@ downlink. With tau = q T + e, 0 <= e < T, the state at the next sample is
 
 the modified z-transform in state space. The loop is stable exactly if the spectral radius of this one-period map is
 below one. For small T the margin in tau is the continuous one less T / 2, up to terms in T^2.
-
-Go on to `multirate` if telemetry and control have different rates, to `onboard` if vehicles feed back their own
-errors, and to `coupled_block` for the blocks of a formation.
 """
 
 import numpy as np
@@ -19,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import real_matrix, square_matrices
+from gains.core.structure import positive_seconds, real_matrix, square_matrices
 from gains.sampled._crossings import block_delay_margin
 from gains.sampled._loop import HeldPlant, block_radius, held_blocks, lifted_map
 
@@ -27,29 +24,10 @@ from gains.sampled._loop import HeldPlant, block_radius, held_blocks, lifted_map
 def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> FloatArray:
     """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one period on, size n + s p for p inputs.
 
-    s is q for a delay of exactly q periods, else q + 1.
-
-    Parameters
-    ----------
-    A, B, K
-        Real matrices (n, n), (n, p), (p, n); the feedback is u = +K x.
-    period_s, delay_s
-        T > 0 and tau >= 0 (s).
-
-    Raises
-    ------
-    BadModelError
-        Naming the argument, what was read and what was wanted.
-
-    Examples
-    --------
-    x' = u, u = -x with T = 1 s and tau = 0.25 s: x_{k+1} = x_k + 0.75 u_k + 0.25 u_{k-1}.
-
-    >>> from gains.sampled.constant import period_map
-    >>> period_map([[0]], [[1]], [[-1]], period_s=1.0, delay_s=0.25).round(6).tolist()
-    [[0.25, 0.25], [-1.0, 0.0]]
+    s is q for a delay of exactly q periods, else q + 1. A (n, n), B (n, p) and K (p, n) are real, with the feedback u =
+    +K x; T = `period_s` > 0 and tau = `delay_s` >= 0 are in s. BadModelError names an argument that is not.
     """
-    plant = HeldPlant(*checked_loop(A, B, K), _checked_period(period_s))
+    plant = HeldPlant(*checked_loop(A, B, K), positive_seconds("period_s", period_s))
     return lifted_map(plant, _checked_delay(delay_s))
 
 
@@ -57,16 +35,8 @@ def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float
     """Factor by which the slowest motion shrinks (< 1) or grows (> 1) in one period. Arguments as of `period_map`.
 
     Strongly connected blocks are taken one by one, so that equal followers do not spoil each other's eigenvalues.
-
-    Examples
-    --------
-    x' = u, u = -x without delay: x_{k+1} = (1 - T) x_k.
-
-    >>> from gains.sampled.constant import spectral_radius
-    >>> round(spectral_radius([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.0), 6)
-    0.5
     """
-    plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
+    plants = held_blocks(*checked_loop(A, B, K), period_s=positive_seconds("period_s", period_s))
     return max(block_radius(plant, _checked_delay(delay_s)) for plant in plants)
 
 
@@ -76,11 +46,8 @@ def growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, de
     For a loop at rest after finitely many periods (deadbeat) it is -inf or, by rounding, very negative. Arguments as of
     `period_map`.
 
-    Examples
-    --------
-    x' = u, u = -x without delay: ln(1 - T) / T.
+    x' = u, u = -x without delay: x_{k+1} = (1 - T) x_k.
 
-    >>> from gains.sampled.constant import growth_rate
     >>> round(growth_rate([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.0), 6)
     -1.386294
     """
@@ -92,31 +59,17 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
     """The least delay tau (s) at which the sampled and held loop loses stability.
 
     0 if it is unstable at tau = 0, `inf` if it is stable at every delay. Accurate to about 1e-12 relative, 1e-6 if the
-    radius leaves one without a slope, and checked against the spectral radius of the one-period map below and above.
+    radius leaves one without a slope. A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; `period_s`
+    is the period T of telemetry and control. BadModelError names an argument that does not fit; DisagreementError if
+    the spectral radius of the one-period map below or above the margin contradicts it.
 
-    Parameters
-    ----------
-    A, B, K
-        Real matrices (n, n), (n, p), (p, n); the feedback is u = +K x.
-    period_s
-        Period T (s) of telemetry and control.
-
-    Raises
-    ------
-    BadModelError
-        Naming the argument, what was read and what was wanted.
-    DisagreementError
-        The eigenvalues of the one-period map contradict the crossings found.
-
-    Examples
-    --------
     x' = u, u = -x with a period of 1 s takes a delay of 1 s; with a short one pi / 2 - T / 2 or so:
 
-    >>> from gains.sampled.constant import sampled_delay_margin
+    >>> from gains import sampled_delay_margin
     >>> [round(sampled_delay_margin([[0]], [[1]], [[-1]], period_s=period_s), 3) for period_s in (1.0, 0.02)]
     [1.0, 1.561]
     """
-    plants = held_blocks(*checked_loop(A, B, K), period_s=_checked_period(period_s))
+    plants = held_blocks(*checked_loop(A, B, K), period_s=positive_seconds("period_s", period_s))
     return float(min(block_delay_margin(plant) for plant in plants))
 
 
@@ -129,12 +82,6 @@ def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, 
     if feedback.shape != entry.shape[::-1]:
         raise BadModelError(f"K has shape {feedback.shape}; {entry.shape[::-1]} is wanted, the transpose of B's")
     return plant, entry, feedback
-
-
-def _checked_period(period_s: float) -> float:
-    if not (np.isfinite(period_s) and period_s > 0.0):
-        raise BadModelError(f"period_s is {period_s}; a positive number of seconds is wanted")
-    return float(period_s)
 
 
 def _checked_delay(delay_s: float) -> float:

@@ -2,12 +2,9 @@
 
 The states of a formation fall into blocks that do not act on the blocks ahead of them: in a leader-follower tree every
 vehicle is a block of its own. The formation is stable exactly when every block is, each at its own loop delay.
-
-The margins are those of `gains.sampled.multirate`, or of `gains.sampled.onboard` if the vehicles feed back their own
-errors. `gcs stress` flies formations to see whether these predictions hold.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,10 +84,12 @@ class CoupledBlock:
 
     def same_as(self, other: "CoupledBlock") -> bool:
         """Whether the other block is the same system, made of other vehicles."""
-        mine, its = (self.A, self.B, self.K), (other.A, other.B, other.K)
-        return self.timing == other.timing and all(
-            a.shape == b.shape and bool((a == b).all()) for a, b in zip(mine, its, strict=True)
-        )
+        return self.kind == other.kind
+
+    @property
+    def kind(self) -> Hashable:
+        """Equal for blocks that are the same system."""
+        return self.timing, *((part.shape, (part + 0.0).tobytes()) for part in (self.A, self.B, self.K))
 
 
 def coupled_blocks(
@@ -103,15 +102,9 @@ def coupled_blocks(
 ) -> list[CoupledBlock]:
     """The blocks of a formation flown with the gain K (inputs, states) of u = K e, those ahead first.
 
-    Parameters
-    ----------
-    system_ids
-        One for each vehicle, in the order of `model`.
-    timing, onboard
-        The timing of the station and of the onboard loop; without `onboard` the station closes every loop.
+    `system_ids` has one for each vehicle, in the order of `model`. Without `onboard`, the timing of the onboard loop,
+    the station closes every loop.
 
-    Examples
-    --------
     A chain of three: each vehicle is a block, and the two followers are alike. Sampling at 50 Hz costs half a period:
 
     >>> import numpy as np
@@ -143,22 +136,17 @@ def coupled_blocks(
 
 def unlike_blocks(blocks: Sequence[CoupledBlock]) -> list[CoupledBlock]:
     """The first block of each kind."""
-    kinds: list[CoupledBlock] = []
-    for block in blocks:
-        if not any(block.same_as(kind) for kind in kinds):
-            kinds.append(block)
-    return kinds
+    return list({block.kind: block for block in reversed(blocks)}.values())[::-1]
 
 
 def critical_block(blocks: Sequence[CoupledBlock], loop_delay_s: Mapping[int, float]) -> CoupledBlock:
-    """The block of largest predicted growth at the loop delays of its vehicles; the first one in a tie."""
-    rates: list[float] = []
-    known: list[tuple[CoupledBlock, list[float], float]] = []
-    for block in blocks:
-        delays_s = [round(loop_delay_s[system_id], 9) for system_id in block.system_ids]
-        rate = next((r for other, d, r in known if d == delays_s and other.same_as(block)), None)
-        if rate is None:
-            rate = block.growth_at_1_s(loop_delay_s)
-            known.append((block, delays_s, rate))
-        rates.append(rate)
-    return blocks[int(np.argmax(rates))]
+    """The block whose predicted growth (1/s) at the loop delays (s) of its vehicles is largest; the first in a tie."""
+    known: dict[Hashable, float] = {}
+
+    def growth_1_s(block: CoupledBlock) -> float:
+        key = block.kind, tuple(round(loop_delay_s[system_id], 9) for system_id in block.system_ids)
+        if key not in known:
+            known[key] = block.growth_at_1_s(loop_delay_s)
+        return known[key]
+
+    return max(blocks, key=growth_1_s)

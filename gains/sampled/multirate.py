@@ -8,27 +8,27 @@ n is the number of slower periods in T:
 * If the slower period is a whole multiple of the faster one, n = 1. Every command is late by the same time, and the
   loop is that of `gains.sampled.constant` with the slower period.
 * Otherwise the commands are late by the least loop delay plus 0, g, 2 g, ..., (n - 1) g, in an order that the rates
-  fix; g is the faster period divided by n. The phase between vehicle and station, and the share of the uplink in the
-  delay, only rotate this order. The least loop delay therefore determines the loop. So does the mean one, which is
-  longer by (n - 1) g / 2 and changes less from rate to rate. *Loop delay* here is that mean, over the commands that
-  are the first from their sample.
+  fix; g is the faster period divided by n. Phases only rotate this order, so the least loop delay determines the loop,
+  and so does the mean over the commands that are the first from their sample, (n - 1) g / 2 longer. *Loop delay* here
+  is that mean: it changes less from rate to rate.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from math import ceil, floor, inf, isfinite
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core._bracketing import met_end, peaks
 from gains.core.arrays import FloatArray
-from gains.core.errors import BadModelError
+from gains.core.structure import positive_seconds
 from gains.delay.constant import delay_margin
 from gains.sampled._loop import held_blocks
+from gains.sampled._predictor import LiftedPlant, Predictor
 from gains.sampled.constant import checked_loop, growth_rate, sampled_delay_margin
 
 # instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
@@ -41,8 +41,7 @@ _MOST_COMMANDS = 20
 _LOOKS, _LOOKS_MARGIN = 6, 40
 # the margin is searched up to this many continuous margins, and slower periods more
 _SEARCHED_MARGINS, _SEARCHED_PERIODS = 3.0, 10.0
-# Longer margins, in slower periods, are computed as if there were one rate. By measurement the order of the loop delays
-# changes them by at most two parts in 10^4, and the search among ever larger maps would take minutes.
+# Longer margins, in slower periods, are computed as if there were one rate: by measurement right to two parts in 10^4.
 _MOST_PERIODS = 30.0
 # the radius at a margin is this far below one at most
 _RESOLUTION = 1e-13
@@ -54,16 +53,11 @@ _NEAR_ONE = 0.99
 class Timing:
     """Periods (s) of control and telemetry, and what follows from them.
 
-    Raises
-    ------
-    BadModelError
-        A period that is not positive and finite.
+    BadModelError if a period is not positive and finite.
 
-    Examples
-    --------
     Control at 50 Hz, telemetry at 20 Hz: samples at 0 and 50 ms are first used at 0 and 60 ms.
 
-    >>> from gains.sampled.multirate import Timing
+    >>> from gains import Timing
     >>> timing = Timing(control_s=0.02, telemetry_s=0.05)
     >>> timing.held_s, timing.commands, timing.common_s, timing.spread_s
     (0.05, 2, 0.1, 0.005)
@@ -74,8 +68,7 @@ class Timing:
 
     def __post_init__(self) -> None:
         for name in ("control_s", "telemetry_s"):
-            if not (isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                raise BadModelError(f"{name} is {getattr(self, name)}; a positive number of seconds is wanted")
+            positive_seconds(name, getattr(self, name))
 
     @property
     def held_s(self) -> float:
@@ -112,53 +105,32 @@ class Timing:
         """Slower over faster period."""
         return Fraction(self.held_s / min(self.control_s, self.telemetry_s)).limit_denominator(_MOST_COMMANDS)
 
-    def commands_from(self, first: int, last: int) -> list[tuple[float, float]]:
+    @property
+    def ticks(self) -> int:
+        """The number of control periods in a common period."""
+        return self._ratio.numerator if self.telemetry_s > self.control_s else self.commands
+
+    def commands_from(self, first: int, last: int, *, every_tick: bool = False) -> list[tuple[float, float]]:
         """(Instant of its sample, instant at which it is computed) of the commands first to last, without any delay.
 
-        Command 0 is computed from a sample that arrives just then, at 0.
+        Command 0 is computed from a sample that arrives just then, at 0. With `every_tick` commands that repeat a
+        sample count too.
         """
         slower_s, faster_s = self.held_s, self.faster_s
         near = _SAME_INSTANT * self.commands
         numbers = range(first, last + 1)
+        if self.telemetry_s >= self.control_s and every_tick:
+            return [(floor(i * faster_s / slower_s + near) * slower_s, i * faster_s) for i in numbers]
         if self.telemetry_s >= self.control_s:
             return [(i * slower_s, ceil(i * slower_s / faster_s - near) * faster_s) for i in numbers]
         return [(floor(i * slower_s / faster_s + near) * faster_s, i * slower_s) for i in numbers]
 
 
-class LiftedPlant(Protocol):
-    """The plant under held commands: linear, and the same in every common period."""
-
-    @property
-    def K(self) -> FloatArray: ...  # noqa: N802 - the source's letter
-
-    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """From each instant to the next: maps of the state (k, n, n), and of an input held since then (k, n, r)."""
-        ...
-
-
 def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing, *, delay_s: float) -> float:
     """Exponential rate (1/s) of the slowest motion at a (mean) loop delay: negative when stable.
 
-    Parameters
-    ----------
-    A, B, K
-        Real matrices (n, n), (n, p), (p, n); the feedback is u = +K x.
-    delay_s
-        Loop delay; one below the least that these rates can have counts as that.
-
-    Raises
-    ------
-    BadModelError
-        Naming the argument, what was read and what was wanted.
-
-    Examples
-    --------
-    x' = u, u = -x with a sample every 0.5 s and two commands from it, which are the same: x_{k+1} = (1 - T) x_k.
-
-    >>> from math import exp
-    >>> from gains.sampled.multirate import Timing, multirate_growth_rate
-    >>> round(exp(0.5 * multirate_growth_rate([[0]], [[1]], [[-1]], Timing(0.25, 0.5), delay_s=0.0)), 6)
-    0.5
+    A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; BadModelError names one that does not fit. A
+    `delay_s` (s) below the least that these rates can have counts as that.
     """
     if timing.commands == 1:
         return growth_rate(A, B, K, period_s=timing.held_s, delay_s=delay_s)
@@ -172,20 +144,12 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
     If the slower period is a multiple of the faster one, the margin is that of `gains.sampled.constant`, exact. If it
     is longer than thirty slower periods, it is that of the slower period alone. Otherwise the least loop delay is
     raised in small steps and peaks are refined, up to three times the margin of the continuous loop plus ten slower
-    periods: a search, not a proof. Arguments as of `multirate_growth_rate`.
+    periods: a search, not a proof. Arguments as of `multirate_growth_rate`. Errors are those of
+    `gains.sampled.constant.sampled_delay_margin`.
 
-    Raises
-    ------
-    BadModelError
-        Naming the argument, what was read and what was wanted.
-    DisagreementError
-        See `gains.sampled.constant.sampled_delay_margin`.
-
-    Examples
-    --------
     x' = u, u = -x: with a period of 1 s it takes a delay of 1 s, whichever of the two rates has it.
 
-    >>> from gains.sampled.multirate import Timing, multirate_delay_margin
+    >>> from gains import Timing, multirate_delay_margin
     >>> [round(multirate_delay_margin([[0]], [[1]], [[-1]], Timing(*s)), 6) for s in ((1.0, 0.2), (0.2, 1.0))]
     [1.0, 1.0]
     """
@@ -198,16 +162,26 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
     return lifted_margin(held_blocks(plant, entry, feedback, period_s=timing.common_s), timing, near_s=continuous_s)
 
 
-def multirate_map(plant: LiftedPlant, timing: Timing, *, delay_s: float) -> FloatArray:
-    """The matrix that takes (x, K x(sample -1), K x(sample -2), ...) one common period on."""
+def multirate_map(
+    plant: LiftedPlant, timing: Timing, *, delay_s: float, predictor: Predictor | None = None
+) -> FloatArray:
+    """The matrix that takes (x, u(command -1), u(command -2), ...) one common period on.
+
+    u = K x(sample), or with a predictor, at every control tick, K times the state predicted for when it acts.
+    """
     inputs, n = plant.K.shape
-    common_s, count, least_s = timing.common_s, timing.commands, max(0.0, delay_s - timing.spread_s)
-    earlier = count * (ceil(least_s / common_s) + 2)
-    known = list(enumerate(timing.commands_from(-earlier, count - 1), start=-earlier))
+    common_s, count = timing.common_s, timing.commands if predictor is None else timing.ticks
+    least_s, least_assumed_s = (
+        max(0.0, late_s - timing.spread_s) for late_s in (delay_s, predictor.assumed_s if predictor else 0.0)
+    )
+    earlier = count * (ceil(max(least_s, least_assumed_s) / common_s) + 2)
+    schedule = timing.commands_from(-earlier, count - 1, every_tick=predictor is not None)
+    known = list(enumerate(schedule, start=-earlier))
     close_s = _SAME_INSTANT * common_s
     acting = [(computed_s + least_s, i) for i, (_, computed_s) in known]
+    assumed_s = [computed_s + least_assumed_s - close_s for _, computed_s in schedule]
     oldest = max(i for acts_s, i in acting if acts_s <= close_s)
-    kept = max(0, -oldest)
+    kept = max(0, -oldest, earlier + 1 - bisect_right(assumed_s, 0.0) if predictor else 0)
     start = np.eye(n + kept * inputs)
     x = start[:n]
     samples = {-age: start[n + (age - 1) * inputs : n + age * inputs] for age in range(1, kept + 1)}
@@ -215,14 +189,18 @@ def multirate_map(plant: LiftedPlant, timing: Timing, *, delay_s: float) -> Floa
     inside = [acts_s for acts_s, i in acting if i > oldest and acts_s < common_s - close_s]
     instants = _merged([0.0, *inside, *(taken_s for taken_s, _ in sampled), common_s], close_s)
     for instant, Phi, hold in zip(instants, *plant.between(instants), strict=False):
-        samples |= {i: plant.K @ x for taken_s, i in sampled if abs(taken_s - instant) <= close_s}
+        for taken_s, i in sampled:
+            if abs(taken_s - instant) <= close_s:
+                acting_s = assumed_s[: i + earlier + 1]
+                state = predictor.predicted(x, samples, acting_s, taken_s=taken_s, first=-earlier) if predictor else x
+                samples[i] = plant.K @ state
         command = max(i for acts_s, i in acting if acts_s <= instant + close_s)
         x = Phi @ x + hold @ samples[command]
     return np.vstack([x, *(samples[count - age] for age in range(1, kept + 1))])
 
 
 def lifted_growth(plants: Sequence[LiftedPlant], timing: Timing, *, delay_s: float) -> float:
-    """`multirate_growth_rate` of a loop from its blocks, whose plants run in a common period."""
+    """`multirate_growth_rate` (1/s) at a mean loop delay (s), from the plants of the blocks in a common period."""
     radius = max(_radius(plant, timing, delay_s) for plant in plants)
     return float(np.log(radius)) / timing.common_s if radius > 0.0 else -inf
 
@@ -242,7 +220,7 @@ def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: floa
     for plant in plants:
         # without feedback one look tells; beyond the margin of another plant none does
         seen = [look for look in looks if look < least_s + step_s] if plant.K.any() else looks[:1]
-        least_s = min(least_s, _first_unstable(partial(_radius, plant, timing), seen))
+        least_s = min(least_s, first_unstable(partial(_radius, plant, timing), seen))
     return least_s
 
 
@@ -259,7 +237,7 @@ def _merged(instants: list[float], close_s: float) -> list[float]:
     return merged
 
 
-def _first_unstable(radius: Callable[[float], float], looks: list[float]) -> float:
+def first_unstable(radius: Callable[[float], float], looks: list[float]) -> float:
     """The least delay at which the radius reaches one: 0 if at the first look, `inf` if at none."""
     radii: list[float] = []
     for i, look in enumerate(looks):

@@ -4,18 +4,17 @@ Every vehicle uses its own errors at once and those of others tau late (Sahoo 20
 
     x'(t) = (A + B K_own) x(t) + B K_others x(t - tau)
 
-In flight both parts are sampled and held. T is the control period of the station:
+In flight both parts are sampled and held. T is the control period of the station, or the slower or the common period
+if telemetry has another rate, as in `gains.sampled.multirate`:
 
 * The vehicle computes its own part of the command `steps` times in T and holds it. It knows its velocity error at that
   instant. A sensor measures its spacing error at every `steps_per_sample`-th step; in between, the spacing is
   extrapolated with the relative velocity of the last measurement.
 * The station computes its part from states that all vehicles sample at one instant t_k = k T, at the first of their
-  steps. It acts from t_k + tau on and is held for T. If telemetry has another rate than control, T is the slower
-  period, or the common period as in `gains.sampled.multirate`.
+  steps. It acts from t_k + tau on and is held for T.
 
-Over one period T the local loop is therefore a linear map of the state alone, and the late part enters it as the
-command of a held loop enters a plant, so `_crossings` applies here too. The vehicles are assumed to step together;
-clocks that differ by less than a step change the margin only to second order in the step.
+Over T the local loop is thus a linear map of the state alone, and the late part enters it as a held command enters a
+plant (`_crossings`). Clocks that differ by less than a step change the margin only to second order in the step.
 """
 
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray, IntArray
 from gains.core.errors import BadModelError
-from gains.core.structure import balanced, distinct_blocks
+from gains.core.structure import balanced, distinct_blocks, positive_seconds
 from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
@@ -42,36 +41,19 @@ _SAME_INSTANT = 1e-9
 
 @dataclass(frozen=True)
 class OnboardTiming:
-    """The periods of the onboard loop: of the station, of the vehicles' steps and of their sensors.
-
-    Attributes
-    ----------
-    control_s
-        Period (s) of the station's commands.
-    steps
-        Steps of the vehicle's own loop in a control period.
-    steps_per_sample
-        The sensor measures once in this many steps; a divisor of `steps`.
-    telemetry_s
-        Period (s) of telemetry; `control_s` if None.
-
-    Examples
-    --------
-    A station at 10 Hz, vehicles at 50 Hz:
-
-    >>> from gains.sampled.onboard import OnboardTiming
-    >>> OnboardTiming(control_s=0.1, steps=5)
-    OnboardTiming(control_s=0.1, steps=5, steps_per_sample=1, telemetry_s=None)
-    """
+    """The periods of the onboard loop: of the station, of the vehicles' steps and of their sensors."""
 
     control_s: float
+    """Period (s) of the station's commands."""
     steps: int = 1
+    """Steps of the vehicle's own loop in a control period."""
     steps_per_sample: int = 1
+    """The sensor measures once in this many steps; a divisor of `steps`."""
     telemetry_s: float | None = None
+    """Period (s) of telemetry; `control_s` if None."""
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.control_s < inf:
-            raise BadModelError(f"control_s is {self.control_s}; a positive number of seconds is wanted")
+        positive_seconds("control_s", self.control_s)
         if self.steps < 1 or self.steps_per_sample < 1 or self.steps % self.steps_per_sample:
             raise BadModelError(
                 f"steps is {self.steps} and steps_per_sample {self.steps_per_sample}; positive whole numbers are "
@@ -116,10 +98,7 @@ class OnboardLoop:
     def sampled_margin_s(self) -> float:
         """The least delay tau at which the loop as flown loses stability; 0 if at once, `inf` if never.
 
-        Raises
-        ------
-        gains.core.errors.DisagreementError
-            See `gains.sampled.constant.sampled_delay_margin`.
+        DisagreementError as of `gains.sampled.constant.sampled_delay_margin`.
         """
         plants, rates = self.plants(), self.timing.rates
         if rates.commands == 1:
@@ -144,43 +123,28 @@ class OnboardLoop:
 
     def plants(self) -> "list[LocalPlant]":
         """The distinct strongly connected blocks, with or without late terms."""
-        plants: list[LocalPlant] = []
-        for block in distinct_blocks(self.A, self.sensed, self.known, self.late):
-            A, sensed, known, late = balanced(*block.matrices)
-            plants.append(LocalPlant(A, sensed, known, late, self.timing.common))
-        return plants
+        blocks = distinct_blocks(self.A, self.sensed, self.known, self.late)
+        return [local_plant(balanced(*block.matrices), self.timing.common) for block in blocks]
 
 
 @dataclass(frozen=True, eq=False)
 class LocalPlant:
-    """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`; the late part is its input."""
+    """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`; the late part B K is its input.
 
+    A = `free` + `sensed` + `known` is what the sampled local loop approximates.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    K: FloatArray
     free: FloatArray
     sensed: FloatArray
     known: FloatArray
-    late: FloatArray
     timing: OnboardTiming
 
     @property
     def period_s(self) -> float:
         return self.timing.control_s
-
-    @property
-    def A(self) -> FloatArray:  # noqa: N802 - the source's letter
-        """A + B K_own, which the sampled local loop approximates."""
-        return self.free + self.sensed + self.known
-
-    @property
-    def B(self) -> FloatArray:  # noqa: N802 - the source's letter
-        return self._factors[0]
-
-    @property
-    def K(self) -> FloatArray:  # noqa: N802 - the source's letter
-        return self._factors[1]
-
-    @cached_property
-    def _factors(self) -> tuple[FloatArray, FloatArray]:
-        return factor_rank(self.late)
 
     def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Maps to the state at a period's end: from the state `duration_s` earlier, and from an input held since.
@@ -222,6 +186,12 @@ class LocalPlant:
             from_both = from_both @ np.block(one_step)
             on_state.append(from_both[:, :n])
         return np.array(on_state[::-1]), np.array(on_input[::-1])
+
+
+def local_plant(parts: Sequence[FloatArray], timing: OnboardTiming) -> LocalPlant:
+    """The plant of A, `sensed`, `known` and `late` (n, n) of an `OnboardLoop`, its input of full rank."""
+    free, sensed, known, late = parts
+    return LocalPlant(free + sensed + known, *factor_rank(late), free, sensed, known, timing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,13 +244,10 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
 
     The own part K_own are its blocks (i, i), by which vehicle i uses its own errors; the rest is K_others.
 
-    Examples
-    --------
     A follower uses its own errors at once, and its leader needs nobody: no delay destabilises the pair.
 
     >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.sampled.onboard import OnboardTiming, onboard_loop
+    >>> from gains import FormationModel, OnboardTiming, onboard_loop
     >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
     >>> loop = onboard_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
     >>> loop.late.tolist(), loop.continuous_margin_s(), loop.sampled_margin_s()
@@ -300,13 +267,8 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
 
 
 def own_part(model: FormationModel, K: FloatArray) -> FloatArray:
-    """K with its blocks (i, i) only.
+    """K (inputs, states) with its blocks (i, i) only, by which vehicle i uses its own errors.
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.sampled.onboard import own_part
     >>> own_part(FormationModel((-1, 0), axes=1), np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])).tolist()
     [[-1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]
     """

@@ -1,7 +1,6 @@
 """Delays that vary: how large may tau(t) become in x'(t) = A0 x(t) + A1 x(t - tau(t))?
 
-No exact bound is known. `varying_delay_bound` proves a lower one: the loop is stable at every delay of the stated kind
-below it. It never exceeds the margin for constant delays.
+No exact bound is known. `varying_delay_bound` proves a lower one, which never exceeds the margin for constant delays:
 
 * |tau'| <= mu, 0 <= tau(t) <= h: a Lyapunov-Krasovskii functional and Wirtinger's inequality. A. Seuret and
   F. Gouaisbaut, "Wirtinger-based integral inequality: application to time-delay systems", Automatica 49(9), 2013,
@@ -9,8 +8,7 @@ below it. It never exceeds the margin for constant delays.
 * Any variation at all: small gain on v(t) = x(t) - x(t - tau(t)), the integral of x' over the delay, whose gain from
   x' is at most h.
 
-Every Lyapunov functional found is checked by eigenvalues (`gains.core._semidefinite`). For a delay that stays near its
-mean, `gains.varying.jitter` may prove more.
+For a delay that stays near its mean, `gains.varying.jitter` may prove more.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,25 +38,12 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
     An infinite `rate` admits any variation, jumps included; the result is then the better of a functional that does not
     use the rate and the small gain. `inf` if one functional proves stability whatever the length of the delay, 0 if the
     loop is unstable without delay. The functional found at the bound proves every shorter delay too. Finite bounds are
-    sought up to 1000 / (||A0|| + ||A1||).
+    sought up to 1000 / (||A0|| + ||A1||). A0 and A1 are real matrices (n, n) in 1/s with up to 8 states in a strongly
+    connected block, `rate` is mu >= 0; BadModelError if they are not.
 
-    Parameters
-    ----------
-    A0, A1
-        Real matrices (n, n), 1/s; up to 8 states in a strongly connected block.
-    rate
-        mu >= 0.
-
-    Raises
-    ------
-    BadModelError
-        Matrices that do not fit, a rate that is negative or not a number, or a block too large.
-
-    Examples
-    --------
     A loop of the paper of 2013: 6.059 s for a constant delay, where the exact margin is 6.1726 s.
 
-    >>> from gains.varying.bounds import varying_delay_bound
+    >>> from gains import varying_delay_bound
     >>> round(varying_delay_bound([[-2, 0], [0, -0.9]], [[-1, 0], [-1, -1]], rate=0.0), 2)
     6.06
     """

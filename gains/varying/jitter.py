@@ -1,8 +1,8 @@
 """The stability bound that covers the delay of a real link, be it constant, slowly varying or jumping.
 
 The margin for constant delays is exact but says nothing about a delay that varies; the bounds for varying delays are
-proved but lower. For an observed delay (mean, spread, rate of change) `bound_covering` tries them from the least to the
-most demanding one and reports the first that covers the observation, with the others for comparison.
+proved but lower. For an observed delay (mean, spread, rate of change) `bound_covering` reports the first bound that
+covers it, from the least to the most demanding one.
 """
 
 from collections.abc import Sequence
@@ -37,15 +37,6 @@ class Jitter:
 
     `rate` (s/s) is inf for a delay that jumps from message to message, as those of queued datagrams do; a sampled and
     held loop has a sawtooth of rate 1 with jumps. The functions that take a jitter report values out of range.
-
-    Examples
-    --------
-    A delay of 80 to 120 ms that jumps from message to message:
-
-    >>> from math import inf
-    >>> from gains.varying.jitter import Jitter
-    >>> Jitter(mean_s=0.1, spread_s=0.02, rate=inf)
-    Jitter(mean_s=0.1, spread_s=0.02, rate=inf)
     """
 
     mean_s: float
@@ -55,48 +46,33 @@ class Jitter:
 
 @dataclass(frozen=True)
 class CoveringBound:
-    """Which bound proves the loop stable under an observed jitter.
-
-    Attributes
-    ----------
-    cover
-        "constant": the delay does not vary and lies in a window of the exact analysis. "rate": bounded rate of change,
-        delays from 0 up to `bound_s`. "spread": any variation within `bound_s` - mean of the mean. "any": any
-        variation from 0 up to `bound_s`. "none": no bound covers it; the loop may be stable all the same.
-    bound_s
-        The largest delay that this bound admits, nan for "none".
-    largest_s
-        The largest delay observed, mean + spread.
-    constant_margin_s, rate_bound_s, spread_bound_s, any_bound_s
-        The largest delay that each bound admits; 0 if it does not apply (an infinite rate, an unstable mean delay).
-    """
+    """Which bound proves the loop stable under an observed jitter."""
 
     cover: Cover
+    """"constant": the delay does not vary and lies in a window of the exact analysis. "rate": bounded rate of change,
+    delays from 0 up to `bound_s`. "spread": any variation within `bound_s` - mean of the mean. "any": any variation
+    from 0 up to `bound_s`. "none": no bound covers it; the loop may be stable all the same."""
     bound_s: float
+    """The largest delay that this bound admits, nan for "none"."""
     largest_s: float
+    """The largest delay observed, mean + spread."""
     constant_margin_s: float
     rate_bound_s: float
     spread_bound_s: float
     any_bound_s: float
+    """The largest delay that each bound admits; 0 if it does not apply (an infinite rate, an unstable mean delay)."""
 
 
 def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBound:
     """The least demanding bound that proves x'(t) = A0 x(t) + A1 x(t - tau(t)) stable under `jitter`.
 
-    Arguments as of `gains.varying.bounds.varying_delay_bound`.
+    Arguments as of `gains.varying.bounds.varying_delay_bound`. BadModelError if the matrices do not fit, a block is too
+    large, or the jitter is negative, not a number, or has a spread above the mean.
 
-    Raises
-    ------
-    BadModelError
-        Matrices that do not fit, a block too large, or a jitter that is negative, not a number, or has a spread above
-        the mean.
-
-    Examples
-    --------
     x'(t) = -x(t - tau(t)): a constant delay may come near pi / 2, one that jumps may not.
 
     >>> from math import inf
-    >>> from gains.varying.jitter import Jitter, bound_covering
+    >>> from gains import Jitter, bound_covering
     >>> [bound_covering([[0]], [[-1]], Jitter(1.4, spread_s, inf)).cover for spread_s in (0.0, 0.15)]
     ['constant', 'none']
     """
@@ -129,46 +105,21 @@ def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBoun
 def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = inf) -> float:
     """The spread (s) that the loop takes on both sides of a constant delay, however the delay varies within it.
 
+    A0 and A1 are real matrices (n, n) in 1/s. `rate` is the largest tau'(t), inf if the delay may jump upwards; jumps
+    downwards are free, so the sawtooth of a loop that samples and holds has the rate 1. BadModelError if the matrices
+    do not fit, the mean is negative or not finite, or the rate negative.
+
     With v(t) = C (x(t - mean) - x(t - tau(t))), A1 = B C, the loop is G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B
-    closed by the integral of C x' over the interval I(t) between t - mean and t - tau(t). If the gain of that integral
-    is at most g times the spread, the loop is stable for a spread below 1 / (g max over omega of
-    ||D G(j omega) D^{-1}||), for any D. The mean is the most that is returned, and 0 if the loop is unstable at the
-    mean delay. The maximum is read from a fine grid, with a part in a thousand allowed for what lies between: a
-    search, not a proof.
+    closed by the integral of C x' between t - mean and t - tau(t), whose gain is at most g times the spread: g = 1 if
+    tau' <= 1 upwards, else sqrt(7/4) (proof in docs/explanation/delay-margin.md). The loop is stable for a spread below
+    1 / (g max over omega of ||D G(j omega) D^{-1}||), for any D. The maximum is read from a fine grid, with a part in a
+    thousand allowed for what lies between: a search, not a proof. At most the mean is returned; 0 if the loop is
+    unstable at the mean delay.
 
-    g^2 = 7 / 4 for any variation. Let T be the integral and r the spread. The kernel of T T' is |I(t) n I(t')| but for
-    the sign, so by Schur's test g^2 r^2 is at most the largest integral of this overlap over t'. Intervals longer than
-    they are, of length r, only add to it. Put t - mean = 0 and I(t) = [0, r]. The interval that begins or ends at t'
-    overlaps it by at most r - |t'| for t' in [-r, 0], by the larger of t' and r - t' in [0, r], and by 2 r - t' in
-    [r, 2 r]: r^2 (1 / 2 + 3 / 4 + 1 / 2).
-
-    g = 1 where tau' <= 1, upwards only: t - tau(t) never falls, so no state is ever overtaken by an older one. By
-    Cauchy's inequality g^2 r^2 is at most the largest integral, over those t with s in I(t), of |tau(t) - mean|. With
-    u = t - mean - s these are t with u > 0 > s' or u < 0 < s', where s' = t - tau(t) - s. As s' does not fall with t,
-    one of the two kinds is empty for each s, and the other lasts for at most r.
-
-    E. Shustin and E. Fridman, "An improved stability method for linear systems with fast-varying delays", IFAC ROCOND
-    2006, bound the same integral for every rate between these two as well (seen: its abstract).
-
-    Parameters
-    ----------
-    A0, A1
-        Real matrices (n, n), 1/s.
-    rate
-        The largest tau'(t), or inf if the delay may jump upwards. Jumps downwards are free: the sawtooth of a loop that
-        samples and holds has the rate 1.
-
-    Raises
-    ------
-    BadModelError
-        Matrices that do not fit, a mean that is negative or not finite, or a rate that is negative.
-
-    Examples
-    --------
     x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
 
     >>> from math import inf
-    >>> from gains.varying.jitter import spread_bound
+    >>> from gains import spread_bound
     >>> [round(spread_bound([[0]], [[-1]], mean_s=0.5, rate=rate), 2) for rate in (1.0, inf)]
     [0.5, 0.47]
     """

@@ -13,7 +13,7 @@ from gains.delay.sweep import frequency_sweep_margin
 from gains.formation.model import FormationModel
 from gains.sampled._loop import lifted_map
 from gains.sampled.constant import growth_rate, sampled_delay_margin
-from gains.sampled.onboard import LocalPlant, OnboardLoop, OnboardTiming, onboard_loop, own_part
+from gains.sampled.onboard import OnboardLoop, OnboardTiming, local_plant, onboard_loop, own_part
 
 FINE = OnboardTiming(0.02, steps=2, steps_per_sample=1)
 CHAIN = FormationModel((-1, 0, 1), axes=1)
@@ -77,7 +77,7 @@ def test_continuous_margin_of_the_printed_gains_is_that_of_the_erratum_in_two_wa
 def test_map_is_a_march_event_by_event(timing: OnboardTiming, delay_s: float) -> None:
     loop = onboard_loop(CHAIN, PRINTED, timing)
     states = marched(loop, delay_s, periods=60)
-    step = lifted_map(LocalPlant(loop.A, loop.sensed, loop.known, loop.late, timing), delay_s)
+    step = lifted_map(local_plant((loop.A, loop.sensed, loop.known, loop.late), timing), delay_s)
     whole = np.zeros(len(step))
     whole[:5] = states[0]
     for state in states:

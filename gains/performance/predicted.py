@@ -1,0 +1,202 @@
+"""String stability and robustness of a predicted loop, and the feed-forward of the command in front.
+
+The station predicts every vehicle over tau^ where the loop delay is tau (`gains.sampled.prediction`). It may also feed
+a share k_ff of the command of the vehicle in front forward, which it has computed in the same tick::
+
+    u_i = k_ff u_j + K1 e_i^v + K2 e_j^v + K3 e_i^p     for a follower i behind j
+
+All commands together are u = (I - k_ff N)^{-1} K x^, N being one where i follows j: lower triangular, with the diagonal
+blocks of K. Feed-forward therefore changes neither the roots nor the margin, but who acts on whom. With K2 = -K1 and
+k_ff = 1 the vehicle in front and its follower do the same, and no spacing error arises from it at any delay.
+
+A motion that its own command explains is known to the station before it happens. Between two samples it propagates as
+
+    U_i / U_j = (k_ff + K_i S_j) / (1 - K_i S_i),   S(z) = (z I - Phi)^{-1} (G + Phi(tau^) (g_tau(z) - g_tau^(z))),
+
+in which g_tau = (G0 z + G1) z^{-q-1} is the entry of a held command that acts tau late: exact, and without mismatch
+free of the delay. Only a motion that no command explains is seen late, by the first vehicle behind it.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import inf, pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
+from gains.performance.response import Response, formation_loop
+from gains.performance.scalar_gains import ScalarGains
+from gains.performance.string_stability import largest_value
+from gains.sampled._loop import HeldPlant, split_delay
+from gains.sampled.multirate import Timing
+from gains.sampled.prediction import mismatch_window
+
+# frequencies of the first look at a response, and how far below the slowest motion they begin
+_FREQUENCIES, _LOWEST = 1500, 1e-3
+
+
+def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArray:
+    """The gain (inputs, states) of u = K e with `share` of the command of the vehicle in front added to each command.
+
+    A follower gets half the leader's command beside its own gains:
+
+    >>> import numpy as np
+    >>> from gains.formation.model import FormationModel
+    >>> from gains.performance.predicted import fed_forward
+    >>> pair = FormationModel((-1, 0), axes=1)
+    >>> fed_forward(pair, np.array([[-3.0, 0.0, 0.0], [1.0, 2.0, -3.0]]), 0.5).tolist()
+    [[-3.0, 0.0, 0.0], [-0.5, 2.0, -3.0]]
+    """
+    whole = K.copy()
+    for i in model.followers:  # those in front come first
+        whole[model.input_slice(i)] += share * whole[model.input_slice(model.predecessors[i])]
+    return whole
+
+
+@dataclass(frozen=True)
+class PredictedLoop:
+    """One follower behind another, flown by a station that predicts both over `assumed_s`; without prediction it is 0.
+
+    `gains` are k1, k2 and k3, which act on every axis alike; their alpha is not used. Commands are sampled and held for
+    `period_s`. Vehicles answer at once if they have no `response`. `feed_forward` is k_ff.
+
+    The gains of `triangle5`, with and without prediction over 0.25 s, at that loop delay:
+
+    >>> from gains.performance.predicted import PredictedLoop
+    >>> from gains.performance.scalar_gains import ScalarGains
+    >>> gains = ScalarGains(k1=3.408, k2=0.631, k3=5.608, alpha=0.817)
+    >>> loops = [PredictedLoop(gains, period_s=0.02, assumed_s=assumed_s) for assumed_s in (0.0, 0.25)]
+    >>> [round(loop.string_peak(0.25), 2) for loop in loops], [round(loop.alpha(0.25), 2) for loop in loops]
+    ([2.49, 1.0], [0.31, 0.66])
+    """
+
+    gains: ScalarGains
+    period_s: float
+    assumed_s: float
+    response: Response | None = None
+    feed_forward: float = 0.0
+
+    @cached_property
+    def window_s(self) -> tuple[float, float]:
+        """The least and the largest stable true loop delay in s, see `gains.sampled.prediction.mismatch_window`."""
+        A, B, K = self._matrices
+        return mismatch_window(A, B, K, Timing(self.period_s, self.period_s), assumed_s=self.assumed_s)
+
+    def string_peak(self, delay_s: float) -> float:
+        """Largest ratio of a follower's commanded motion to that in front, over all frequencies that samples have.
+
+        At least one; `inf` outside the window.
+        """
+        if not self.is_stable(delay_s):
+            return inf
+        _, _, K = self._matrices
+
+        def growth(omega: FloatArray) -> FloatArray:
+            front, own = (K[1] @ self._seen_sampled(omega, delay_s)).T
+            return np.abs((self.feed_forward + front) / (1.0 - own))
+
+        nyquist = pi / self.period_s
+        return max(1.0, largest_value(growth, np.geomspace(_LOWEST * self._slowest, nyquist, _FREQUENCIES)))
+
+    def first_string_peak(self, delay_s: float) -> float:
+        """The same from a motion in front that no command explains: the vehicle behind sees it late.
+
+        The hold counts as half a period, and the rates of samples are not seen.
+        """
+        if not self.is_stable(delay_s):
+            return inf
+        _, B, K = self._matrices
+
+        def growth(omega: FloatArray) -> FloatArray:
+            s, resolvent = self._resolvents(omega)
+            moved, answered = resolvent[:, :, 0] @ (K[1] @ self._ahead), resolvent[:, 2] @ B[:, 1]
+            late = np.exp(-s * (delay_s + self.period_s / 2.0))[:, 0, 0]
+            own = self._seen(s, resolvent, delay_s)[:, :, 1] @ K[1]
+            return np.abs(answered * late * moved / (1.0 - own) / resolvent[:, 0, 0])
+
+        return max(1.0, largest_value(growth, self._frequencies))
+
+    def alpha(self, delay_s: float) -> float:
+        """Disturbances |w| up to alpha |e| (1/s) are withstood at a true loop delay; 0 outside the window.
+
+        The complex stability radius, as of `gains.performance.flown`: the hold counts as half a period.
+        """
+        if not self.is_stable(delay_s):
+            return 0.0
+        _, B, _ = self._matrices
+        K = self._whole_gain
+
+        def gain(omega: FloatArray) -> FloatArray:
+            s, resolvent = self._resolvents(omega)
+            late = B * np.exp(-s * (delay_s + self.period_s / 2.0))
+            commands = np.linalg.solve(np.eye(2) - K @ self._seen(s, resolvent, delay_s), K @ self._ahead @ resolvent)
+            disturbed = resolvent + resolvent @ late @ commands
+            return np.linalg.norm(disturbed[:, :3, :3], ord=2, axis=(1, 2))
+
+        return 1.0 / largest_value(gain, self._frequencies)
+
+    def is_stable(self, delay_s: float) -> bool:
+        """Whether a true delay is in the window."""
+        least_s, most_s = self.window_s
+        return least_s < delay_s < most_s or delay_s == least_s == 0.0 < most_s
+
+    @cached_property
+    def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A, B and K of a vehicle and its follower, of one axis; K without feed-forward."""
+        k, model = self.gains, FormationModel((-1, 0), axes=1)
+        K = model.overlapping_gain([[-k.k1]], [[k.k2]], [[k.k3]])
+        if self.response is None:
+            return model.A, model.B, K
+        return formation_loop(model, K, (self.response, self.response))
+
+    @cached_property
+    def _whole_gain(self) -> FloatArray:
+        return fed_forward(FormationModel((-1, 0), axes=1), self._matrices[2], self.feed_forward)
+
+    @cached_property
+    def _plant(self) -> HeldPlant:
+        return HeldPlant(*self._matrices, self.period_s)
+
+    @cached_property
+    def _ahead(self) -> FloatArray:
+        """e^{A tau^}."""
+        return self._plant.transition(np.array([self.assumed_s]))[0][0]
+
+    @cached_property
+    def _slowest(self) -> float:
+        A, B, K = self._matrices
+        return float(np.abs(np.linalg.eigvals(A + B @ K)).min())
+
+    @cached_property
+    def _frequencies(self) -> FloatArray:
+        A, B, K = self._matrices
+        highest = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ K, 2) + np.linalg.norm(B @ K @ self._ahead, 2))
+        return np.geomspace(_LOWEST * self._slowest, highest, _FREQUENCIES)
+
+    def _resolvents(self, omega: FloatArray) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """s (k, 1, 1) and (s I - A)^{-1} (k, n, n)."""
+        s, A = (1j * omega[:, np.newaxis, np.newaxis]).astype(np.complex128), self._matrices[0]
+        return s, np.linalg.inv(s * np.eye(len(A)) - A).astype(np.complex128)
+
+    def _seen(
+        self, s: NDArray[np.complex128], resolvent: NDArray[np.complex128], delay_s: float
+    ) -> NDArray[np.complex128]:
+        """What the predicted state answers to commands, (k, n, 2), in continuous time."""
+        B = self._matrices[1]
+        mismatch = np.exp(-s * delay_s) - np.exp(-s * self.assumed_s)
+        return resolvent @ (B + self._ahead @ B * mismatch) * np.exp(-s * self.period_s / 2.0)
+
+    def _seen_sampled(self, omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
+        """S(z) at z = e^{j omega T}, shape (k, n, 2)."""
+        z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
+        Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
+
+        def entry(late_s: float) -> NDArray[np.complex128]:
+            whole, rest_s = split_delay(late_s, self.period_s)
+            newer = self._plant.transition(np.array([self.period_s - rest_s]))[1][0]
+            return (newer * (z - 1.0) + G) * z ** (-whole - 1)
+
+        mismatch = self._ahead @ (entry(delay_s) - entry(self.assumed_s))
+        return np.linalg.solve(z * np.eye(len(Phi)) - Phi, G + mismatch)

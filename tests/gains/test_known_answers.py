@@ -1,0 +1,73 @@
+"""Functions that only other modules of `gains` call, each with an answer known by hand or from another function."""
+
+import numpy as np
+import pytest
+
+from gains.core.structure import is_singular_for_any_delay
+from gains.delay._crossings import DelayedTerm, crossing_error
+from gains.delay._mixed import count_unstable_roots
+from gains.delay._windows import ZeroPassage, zero_passage
+from gains.delay.constant import delay_margin
+from gains.design.dk_iteration import decay_proof
+from gains.design.search import fastest_decay
+from gains.performance.behaviour import block_margin, diagonal_blocks
+from gains.performance.robust import subsystem_loop
+from gains.performance.scalar_gains import decay_rate_of, least_singular_value
+from gains.performance.string_stability import largest_value
+
+
+def test_a_loop_that_stays_where_it_is_has_a_root_at_zero_at_every_delay() -> None:
+    """x'(t) = -x(t) + x(t - tau); a slow decay beside a fast one is no standstill."""
+    assert is_singular_for_any_delay([np.array([[-1]]), np.array([[1]])])
+    assert not is_singular_for_any_delay([np.diag([-1e9, -1e-9])])
+
+
+def test_a_pair_of_roots_is_unstable_beyond_the_margin() -> None:
+    """x'(t) = -x(t - tau) at 1.5 and 2 s, on both sides of its margin of pi / 2."""
+    assert [count_unstable_roots([([[-1]], delay_s)]) for delay_s in (1.5, 2.0)] == [0, 2]
+
+
+def test_a_simple_crossing_is_known_to_rounding() -> None:
+    _, delay_error_s = crossing_error([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], 1.0, np.pi / 2.0)
+    assert 0.0 < delay_error_s < 1e-14
+
+
+def test_a_root_passes_the_one_at_zero_once() -> None:
+    """s = 1 - e^{-s tau} = s tau - ...: the second root at zero, at tau = 1."""
+    found = zero_passage([np.array([[1.0]]), np.array([[-1.0]])], np.zeros(2), np.arange(2))
+    assert found == ZeroPassage(delay_s=1.0, direction=1)
+
+
+def test_a_unit_lyapunov_matrix_proves_a_unit_decay() -> None:
+    """V = x'x proves that x' = -x decays like e^{-t}."""
+    assert decay_proof(-np.eye(2), np.eye(2)).alpha == pytest.approx(-2.0, abs=1e-8)
+
+
+def test_critical_damping_decays_fastest_at_a_margin() -> None:
+    k1 = 2 * fastest_decay(0.3, 0.0)
+    assert delay_margin([[0, -1], [0, 0]], [[0, 0], [k1**2 / 4, -k1]]) == pytest.approx(0.3, abs=1e-6)
+
+
+def test_a_pair_falls_into_the_blocks_of_leader_and_follower() -> None:
+    blocks = diagonal_blocks((np.array([[-1.0]]), np.array([[1.0]]), np.array([[1.0]])))
+    assert [(A0 + A1).tolist() for A0, A1 in blocks] == [[[-1.0]], [[0.0, -1.0], [1.0, -1.0]]]
+
+
+def test_a_block_crosses_the_axis_at_the_frequency_of_the_closed_form() -> None:
+    """s^2 + (s + 1) e^{-s tau}: omega^2 = (1 + sqrt 5) / 2 and tau = atan(omega) / omega."""
+    found, omega = block_margin([[0, -1], [0, 0]], [[0, 0], [1, -1]]), ((1 + 5**0.5) / 2) ** 0.5
+    assert (found.delay_margin_s, found.crossing_rad_s) == pytest.approx((np.arctan(omega) / omega, omega), rel=1e-9)
+
+
+def test_the_least_singular_value_is_that_of_the_subsystem() -> None:
+    least = np.linalg.svd(1j * np.eye(3) - subsystem_loop(-3, 2, 2), compute_uv=False)[-1]
+    found = least_singular_value(np.array(3.0), np.array(2.0), np.array(2.0), np.array(1.0))
+    assert float(found) == pytest.approx(float(least), rel=1e-6)
+
+
+def test_a_double_pole_decays_with_its_own_rate() -> None:
+    assert float(decay_rate_of(np.array(2.0), np.array(1.0))) == 1.0
+
+
+def test_a_maximum_between_grid_points_is_found() -> None:
+    assert largest_value(np.sin, np.linspace(0.0, 3.0, 8)) == pytest.approx(1.0, abs=1e-12)
