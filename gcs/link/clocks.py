@@ -1,9 +1,9 @@
 """Round trip and clock offset of one vehicle, from its TIMESYNC exchanges.
 
 One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The error of this offset
-is half the difference between the ways up and down, at most RTT / 2. Exchanges with a short round trip say most, so the
-estimate is a straight line through the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. It works at
-any RTT and follows the drift of the vehicle's clock.
+is half the difference between the delays down and up, at most RTT / 2. Short round trips say most, so the estimate is a
+straight line fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. It works at any RTT and
+follows the drift of the vehicle's clock.
 
 The bound of the error does not depend on that line. The vehicle read its clock after the request left and before the
 reply arrived, so t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits move apart by
@@ -14,8 +14,9 @@ Limits that contradict each other show that the clock has jumped. A jump shorter
 them, but makes exchanges differ from the line by more than their round trips and the earlier residuals explain. The
 first such exchange resets the limits; the third in a row is reported as a clock jump.
 
-Telemetry shows a jump sooner: no state is sampled after it is received, nor before the state sent before it. Such a
-state is refused, and an exchange is due at once to decide.
+Telemetry shows a jump sooner: a state cannot have been sampled after it was received, nor before one that was sent
+earlier. Such a state is refused, and an exchange is due at once to decide. An overtaken state may predate a jump: it
+proves nothing, and after a jump it is refused.
 
 The loop delay of a loop closed over the ground is free of the offset's error, see `gcs.control.loop_delay`.
 """
@@ -40,7 +41,7 @@ DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
 DOUBTS = 3
 """This many doubtful exchanges, with none between them that fits the line, are reported as a jump."""
 _UNUSUAL = 1.5
-"""A sample this many times farther from the line than any in the window is an outlier, not jitter."""
+"""An exchange this many times farther from the line than any in the window is an outlier, not jitter."""
 _READING_NS = 1000
 """Resolution of the stamps: those of a telemetry log are whole microseconds."""
 _BOOT_MS_NS = 1_000_000
@@ -57,7 +58,7 @@ _sum = np.add.reduce
 
 
 class ClockEstimate(NamedTuple):
-    """Offset of one vehicle's boot clock against the station's, at `reference_ns` of the station's clock.
+    """A vehicle's boot clock minus the station's clock, at `reference_ns` of the station's clock.
 
     `bound_ns` is the largest error of the offset there; `bound_at_ns` gives it at other times.
     """
@@ -93,7 +94,7 @@ class VehicleClock:
         self.rtt_ns: int | None = None
         """Round trip of the newest exchange."""
         self.down_ns: int | None = None
-        """One-way delay from station to vehicle of the newest exchange, by the estimated offset."""
+        """One-way delay from station to vehicle in the newest exchange, by the estimated offset."""
         self.down_bound_ns = 0.0
         """Its largest error."""
         self.unmatched = 0
@@ -163,12 +164,15 @@ class VehicleClock:
         boot_ns = self.boot_ns(boot_ms, received_ns)
         sample_ns = known.to_station_ns(boot_ns)
         if sample_ns - received_ns > known.bound_at_ns(sample_ns) + _BOOT_MS_NS:
-            self.lost, self._since_ns, self._count = True, received_ns, 0
-            self.estimate = UNKNOWN._replace(skew=known.skew)
+            if newest:  # else it may be of the clock before a jump
+                self.lost, self._since_ns, self._count = True, received_ns, 0
+                self.estimate = UNKNOWN._replace(skew=known.skew)
             return None
         if newest and boot_ns < self._newest_boot_ns:
             self._doubtful_state = True  # or a replay too old for sequence numbers to show: the exchange decides
             return None
+        if not newest and sample_ns < self._since_ns:
+            return None  # of the clock before a jump that an exchange has shown: its instant is unknown
         self._newest_boot_ns = max(boot_ns, self._newest_boot_ns)
         return sample_ns
 

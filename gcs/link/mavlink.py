@@ -125,13 +125,13 @@ def decode_1(datagram: bytes, refused: Counter[str]) -> list[Frame]:
 
 
 def decode_either(datagram: bytes, refused: Counter[str]) -> list[Frame]:
-    """The valid frames of a datagram of MAVLink 1 or of MAVLink 2."""
+    """The valid frames of one datagram, which holds either MAVLink 1 or MAVLink 2."""
     return decode_1(datagram, refused) if datagram[:1] == b"\xfe" else decode(datagram, refused)
 
 
-def first_heartbeats(datagram: bytes) -> list[Frame]:
+def first_heartbeats(datagram: bytes, refused: Counter[str]) -> list[Frame]:
     """The MAVLink 1 heartbeats of a datagram: PX4 sends these until it hears MAVLink 2."""
-    return [frame for frame in decode_1(datagram, Counter()) if frame.msg_id == HEARTBEAT]
+    return [frame for frame in decode_1(datagram, refused) if frame.msg_id == HEARTBEAT]
 
 
 def _decode(datagram: bytes, magic: int, refused: Counter[str]) -> list[Frame]:
@@ -156,14 +156,14 @@ def _decode(datagram: bytes, magic: int, refused: Counter[str]) -> list[Frame]:
 
 
 def is_magic(data: bytes, at: int) -> bool:
-    """Whether a frame may begin there or the data end there."""
+    """Whether a frame may begin at this place, or the data end there."""
     return at >= len(data) or data[at] in (MAGIC, MAGIC_1)
 
 
 def frame_end(data: bytes, at: int) -> int:
-    """Where the frame that begins there ends; 0 if none begins there or it is truncated.
+    """Where the frame that begins at this place ends; 0 if none begins there or it is truncated.
 
-    This is the only place that computes a frame's length. A decoder asks it before reading anything behind the magic.
+    This is the only function that computes a frame's length. Decoders call it before they read past the magic byte.
     """
     if at + _OVERHEAD_1 > len(data) or data[at] not in (MAGIC, MAGIC_1):
         return 0

@@ -1,10 +1,10 @@
 """The axes of a campaign: the quantities of a scenario that vary, and their values.
 
-*Link delay* here is the total of a vehicle's two links, up plus down, which compares directly with the delay margin:
-the loop delay is the link delay plus the time that telemetry waits for the next control tick, less than one period. The
-up link takes a whole number of control periods, as near to half as possible, and the down link the rest. With any other
-split the waiting would jump by a period whenever the up link crossed a whole period, and the loop delay would grow in
-steps; with this one it grows with the link delay.
+Here *link delay* is the total of a vehicle's two links, up plus down, which compares directly with the delay margin:
+the loop delay is the link delay plus the time, less than one period, that telemetry waits for the next control tick.
+The up link takes a whole number of control periods, as near to half as possible, and the down link takes the rest. The
+loop delay then grows evenly with the link delay. With any other split the wait would jump by a period whenever the up
+link crossed a whole period.
 """
 
 from collections.abc import Mapping
@@ -14,17 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from gcs.errors import InputError
 from scenarios.link_schema import Jitter, Link, VehicleLinks
 from scenarios.schema import Scenario
 
 
-class AxisError(Exception):
-    """The values of an axis cannot be used: what was read and what was wanted."""
-
-
 @dataclass(frozen=True)
 class Axis:
-    """One varied quantity. `name` is "delay", "jitter", "loss", "rate", or "delay_<system id>"."""
+    """One quantity that varies. `name` is "delay", "jitter", "loss", "rate", or "delay_<system id>"."""
 
     name: str
     values: tuple[float, ...]
@@ -43,20 +40,27 @@ _LABELS = {
     "loss": "loss of datagrams, each way",
     "rate": "control and telemetry rate [Hz]",
 }
+_FORM = "FROM:TO:N"
 _MOST = 10_000
 """Most values of an axis."""
 _RANGES = {"delay": (0.0, 60.0), "jitter": (0.0, 10.0), "loss": (0.0, 1.0), "rate": (1.0, 500.0)}
 
 
-def parse_axis(name: str, text: str) -> Axis:
-    """The axis of an option's text: FROM:TO:COUNT, or values with commas between them.
+def parse_axis(option: str, text: str, system_ids: tuple[int, ...] = ()) -> Axis:
+    """The axis that an option's text describes: FROM:TO:N, or values separated by commas.
 
-    Raises
-    ------
-    AxisError
-        If it is neither, or a value is out of range.
+    The text of --delay-of begins with the system id of a vehicle in `system_ids`: ID=FROM:TO:N.
+
+    Raises InputError if the text has neither form, or a value is out of range.
     """
-    low, high = _RANGES[name.split("_", maxsplit=1)[0]]
+    name = option.removeprefix("--")
+    low, high = _RANGES[name.split("-", maxsplit=1)[0]]
+    if name == "delay-of":
+        system_id, equals, values_text = text.partition("=")
+        if not equals or system_id not in map(str, system_ids):
+            wanted = f"ID={_FORM} with the system id of a vehicle of this scenario"
+            raise InputError(f"{option}: read {text!r}, wanted {wanted}")
+        name, text = f"delay_{system_id}", values_text
     try:
         if ":" in text:
             first, last, count = text.split(":")
@@ -69,23 +73,9 @@ def parse_axis(name: str, text: str) -> Axis:
     # rounded to what a user would write, so that ids do not depend on how a range was divided
     values = [round(value, 9) for value in values]
     if not values or not all(low <= value <= high for value in values):
-        wanted = f"FROM:TO:COUNT or values as 0.1,0.2, from {low:g} to {high:g}, at most {_MOST}"
-        raise AxisError(f"read {text!r}, wanted {wanted}")
+        wanted = f"{_FORM} or values as 0.1,0.2, from {low:g} to {high:g}, at most {_MOST}"
+        raise InputError(f"{option}: read {text!r}, wanted {wanted}")
     return Axis(name, tuple(dict.fromkeys(values)))
-
-
-def parse_vehicle_axis(text: str, system_ids: tuple[int, ...]) -> Axis:
-    """The axis of one vehicle's link delay from ID=FROM:TO:COUNT.
-
-    Raises
-    ------
-    AxisError
-        If there is no such vehicle, or the values cannot be used.
-    """
-    system_id, equals, values = text.partition("=")
-    if not equals or system_id not in map(str, system_ids):
-        raise AxisError(f"read {text!r}, wanted ID=FROM:TO:COUNT with the system id of a vehicle of this scenario")
-    return parse_axis(f"delay_{system_id}", values)
 
 
 def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenario:
@@ -117,7 +107,7 @@ def has_constant_links(scenario: Scenario) -> bool:
 
 
 def every_link(scenario: Scenario) -> list[Link]:
-    """The links of all vehicles, and those that vehicles have of their own."""
+    """The links that all vehicles share, and those of single vehicles."""
     links = scenario.links
     return [links.up, links.down, *(link for own in links.vehicles for link in (own.up, own.down) if link is not None)]
 
@@ -153,12 +143,9 @@ def _with_jitter(link: Link, scale_s: float) -> Link:
 
 
 def _with_vehicle_delay(scenario: Scenario, system_id: int, delay_s: float) -> Scenario:
-    up_s, down_s = split_delay(delay_s, 1.0 / scenario.rates.control_hz)
-    up, down = scenario.link_of(system_id)
-    own = VehicleLinks(
-        system_id=system_id,
-        up=up.model_copy(update={"delay_s": up_s, "delay_points": ()}),
-        down=down.model_copy(update={"delay_s": down_s, "delay_points": ()}),
-    )
+    delays_s = split_delay(delay_s, 1.0 / scenario.rates.control_hz)
+    links = zip(scenario.link_of(system_id), delays_s, strict=True)
+    up, down = (link.model_copy(update={"delay_s": own_s, "delay_points": ()}) for link, own_s in links)
+    own = VehicleLinks(system_id=system_id, up=up, down=down)
     others = tuple(links for links in scenario.links.vehicles if links.system_id != system_id)
     return scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (*others, own)})})

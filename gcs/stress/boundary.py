@@ -1,4 +1,4 @@
-"""The map of a campaign with two axes: where the formation breaks in flight, where by prediction, where it cannot."""
+"""The map of a campaign with two axes: where the formation breaks in flight and by prediction, and where it cannot."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -79,12 +79,8 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     maximum (`gains.varying.bounds.varying_delay_bound`). None for other axes, for unbounded jitter, and for the onboard
     loop, where not all feedback is late.
     """
-    scenario = study.plan.scenario
-    if (
-        [axis.name for axis in axes] != ["delay", "jitter"]
-        or len(axes[0].values) < 2
-        or scenario.control.loop != "ground"
-    ):
+    scenario, names = study.plan.scenario, [axis.name for axis in axes]
+    if names != ["delay", "jitter"] or len(axes[0].values) < 2 or scenario.control.loop != "ground":
         return None
     jittery = every_link(at_coordinates(scenario, {"jitter": 1.0}))
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in jittery):
@@ -98,8 +94,7 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     delays_s = np.linspace(axes[0].values[0], axes[0].values[-1], _POINTS)
     around_s = [min(spread_bound(A0, A1, mean_s=delay + period_s) for A0, A1 in loops) for delay in delays_s.tolist()]
     jitter_s = np.maximum((np.array(around_s) - period_s) / 2.0, (any_s - 2.0 * period_s - delays_s) / 2.0)
-    # delays cannot be negative
-    jitter_s = np.minimum(jitter_s, delays_s / 2.0)
+    jitter_s = np.minimum(jitter_s, delays_s / 2.0)  # delays cannot be negative
     return np.stack([delays_s, jitter_s], axis=1)[jitter_s >= 0.0]
 
 
@@ -108,10 +103,10 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
 
     Empty for other axes, for the onboard loop, and for vehicles in a loop with others, whose delays matter too.
     """
-    if not all(axis.name.startswith("delay_") for axis in axes) or study.plan.scenario.control.loop != "ground":
+    plan = study.plan
+    if not all(axis.name.startswith("delay_") for axis in axes) or plan.scenario.control.loop != "ground":
         return []
     ids = [int(axis.name.removeprefix("delay_")) for axis in axes]
-    plan = study.plan
     if any(system_id in loop.system_ids and len(loop.system_ids) > 1 for loop in plan_loops(plan) for system_id in ids):
         return []
     model, places = plan.model, [plan.formation.row(system_id) for system_id in ids]
@@ -144,7 +139,7 @@ def _mark(plot: Any, axes: Sequence[Axis], verdicts: Sequence[Outcome], dark: ND
 
 
 def cell_edges(values: FloatArray) -> FloatArray:
-    """The edges of cells around rising values: halfway between them, and as far beyond the outer ones."""
+    """The edges of cells around rising values: halfway between neighbours, and equally far beyond the outer values."""
     if values.size < 2:
         half = 0.1 * abs(float(values[0])) or 0.01
         return np.array([values[0] - half, values[0] + half])

@@ -1,7 +1,7 @@
 """Fly many trials on all processors or on a cluster, and store each as soon as it ends.
 
 The store is one file of JSON lines. A finished trial is appended with one system call, so a killed campaign loses no
-finished trial, and a later one resumes it: a trial whose id is stored is not flown again.
+finished trial. A later campaign resumes it: a trial whose id is stored is not flown again.
 """
 
 import contextlib
@@ -12,10 +12,10 @@ import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, replace
+from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 from gcs.errors import InputError
 from gcs.interrupts import FROM_TERMINAL, held_back
@@ -93,7 +93,7 @@ def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None
 def run_campaign(
     trials: Sequence[Trial], store: Store, fly: Fly, *, ended: Callable[[Outcome, int], None] | None = None
 ) -> list[Outcome]:
-    """Return the outcomes of trials in their order; those not stored are flown, each once.
+    """Return the outcomes of trials in the given order; those not stored are flown, each once.
 
     `ended` is called with each outcome and the number of trials still to come.
 
@@ -121,15 +121,17 @@ def run_campaign(
 def local_workers(count: int) -> Generator[Fly]:
     """While entered, fly trials in `count` processes; if one, in this process."""
     if count == 1:
-        yield _here
+        yield partial(map, fly_trial)
         return
     with contextlib.ExitStack() as stack:
         pools: list[ProcessPoolExecutor] = []
 
         def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
             if not pools:
+                # spawn: a fork would copy the threads' locks of whatever the user's process has loaded
+                spawn = get_context("spawn")
                 with held_back():  # multiprocessing's resource tracker, which starts here, would die of SIGHUP
-                    pools.append(_pool(count))
+                    pools.append(ProcessPoolExecutor(count, spawn, _prepare_worker, (os.getpid(),)))
                 stack.callback(pools[0].shutdown, cancel_futures=True)
             try:
                 with held_back():  # workers that are starting leave Ctrl-C to this process
@@ -175,29 +177,12 @@ def write_parquet(outcomes: Iterable[Outcome], folder: Path) -> Path:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    rows = [_row(outcome) for outcome in outcomes]
-    names = dict.fromkeys(name for row in rows for name in row)
+    rows = [vars(o) | {f"at_{name}": value for name, value in o.coordinates.items()} for o in outcomes]
+    names = dict.fromkeys(name for row in rows for name in row if name != "coordinates")
     table = pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
     with replacing(folder / PARQUET_FILE) as part:
         pq.write_table(table, part, compression="zstd")
     return folder / PARQUET_FILE
-
-
-def _row(outcome: Outcome) -> dict[str, Any]:
-    row = asdict(outcome)
-    coordinates = row.pop("coordinates")
-    return row | {f"at_{name}": value for name, value in coordinates.items()}
-
-
-def _here(trials: Sequence[Trial]) -> Iterator[Outcome]:
-    return map(fly_trial, trials)
-
-
-def _pool(count: int) -> ProcessPoolExecutor:
-    # spawn: a fork would copy the threads' locks of whatever the user's process has loaded
-    return ProcessPoolExecutor(
-        count, mp_context=get_context("spawn"), initializer=_prepare_worker, initargs=(os.getpid(),)
-    )
 
 
 def _leave_to_parent(*_: object) -> None: ...

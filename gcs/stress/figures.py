@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gains.core.arrays import FloatArray
-from gains.sampled.coupled_block import CoupledBlock, unlike_blocks
+from gains.sampled.coupled_block import unlike_blocks
 from gcs.stress.axes import Axis, place_text
 from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, plan_loops
@@ -34,7 +34,10 @@ def growth_figure(
     figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
     room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 240)
-    sampled, continuous = _curves(unlike_blocks(plan_loops(study.plan)), grid_s)
+    # of the formation: the largest over its loops
+    kinds = unlike_blocks(plan_loops(study.plan))
+    sampled = np.max([[kind.growth_1_s(at) for at in grid_s.tolist()] for kind in kinds], axis=0)
+    continuous = np.max([[kind.growth_continuous_1_s(at) for at in grid_s.tolist()] for kind in kinds], axis=0)
     above.axhline(0.0, color=LIMIT, linewidth=0.8)
     above.plot(grid_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
     above.plot(grid_s, sampled, color=SAMPLED, linewidth=1.4, label="sampled model, exact")
@@ -44,14 +47,16 @@ def growth_figure(
     margin_s = study.plan.delay_margin_s
     if grid_s[0] <= margin_s <= grid_s[-1]:
         above.axvline(margin_s, color=SAMPLED, linestyle="--", linewidth=1.0)
-        text = f" margin {margin_s:.4f} s"
-        above.annotate(text, (margin_s, float(measured.min())), color=SAMPLED, ha="left", va="bottom", fontsize=9)
+        at = (margin_s, float(measured.min()))
+        above.annotate(f" margin {margin_s:.4f} s", at, color=SAMPLED, ha="left", va="bottom", fontsize=9)
     if onset is not None:
         above.plot([onset.loop_delay_s], [0.0], marker="D", color="none", markeredgecolor=MEASURED, markersize=11)
         text = f"onset in flight {onset.loop_delay_s:.4f} s"
         at = (onset.loop_delay_s, 0.0)
         above.annotate(text, at, xytext=(12, -16), textcoords="offset points", color=MEASURED, ha="left", fontsize=9)
-        _link_delay_axis(above, onset)
+        waiting_s = onset.waiting_s
+        top = above.secondary_xaxis("top", functions=(partial(np.add, -waiting_s), partial(np.add, waiting_s)))
+        top.set_xlabel(f"link delay of vehicle {onset.critical}, up + down [s]: {1e3 * waiting_s:.1f} ms less")
     above.set_ylabel("growth rate of errors [1/s]\n< 0 they die away, > 0 they grow")
     figure.legend(loc="outside upper left", ncols=3, frameon=False, fontsize=9)
     below.axhline(0.0, color=LIMIT, linewidth=0.8)
@@ -116,13 +121,6 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
     return list(apart.values())[:_WORST]
 
 
-def _curves(kinds: Sequence[CoupledBlock], delay_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Growth rates of the formation by the sampled and the continuous model: the largest over its loops."""
-    sampled = [[kind.growth_1_s(at) for at in delay_s.tolist()] for kind in kinds]
-    continuous = [[kind.growth_continuous_1_s(at) for at in delay_s.tolist()] for kind in kinds]
-    return np.max(sampled, axis=0), np.max(continuous, axis=0)
-
-
 def figure_of(
     rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
 ) -> tuple[Any, Any]:
@@ -148,13 +146,6 @@ def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
             label = f"own initial states: {verdict}"
             edge = {"transform": plot.get_xaxis_transform(), "clip_on": False}
             plot.plot(at, [0.02] * len(at), marker, color=color, markersize=5, fillstyle="none", label=label, **edge)
-
-
-def _link_delay_axis(plot: Any, onset: Onset) -> None:
-    """Add the link delays as a second axis at the top."""
-    waiting_s = onset.waiting_s
-    top = plot.secondary_xaxis("top", functions=(partial(np.add, -waiting_s), partial(np.add, waiting_s)))
-    top.set_xlabel(f"link delay of vehicle {onset.critical}, up + down [s]: {1e3 * waiting_s:.1f} ms less")
 
 
 def saved(figure: Any, file: Path) -> Path:

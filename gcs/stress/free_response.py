@@ -9,10 +9,10 @@ A probe removes everything that would hide the loop:
 
 * Clock drift moves the sampling instants, and with them the loop delay while it is being measured.
 * Vehicles on the launcher report a velocity but do not move. The station extrapolates their states to one instant, so
-  it would see errors of up to v T where there are none, and push every vehicle at the start. This error is absent if
-  all vehicles sample at the same instant, so all clocks are equal. How long telemetry of the probed loop waits for the
-  control tick then no longer follows from its clock; moving less than one period of delay between its up and down links
-  keeps it.
+  it would see errors of up to v T where there are none, and push every vehicle at the start. A probe gives all vehicles
+  the same clock: they sample at the same instant, and this error is absent. The probed loop's wait for the control tick
+  then no longer follows from its clock; it is restored by moving less than one period of delay between the up and down
+  links.
 * Links that differ start the vehicles at different instants. They also leave each clock wrong by half the asymmetry of
   its links, which the station sees as errors. So all vehicles have the links of the probed one. Its loop is unchanged:
   the station extrapolates the others' states to the instant of its own.

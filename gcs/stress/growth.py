@@ -226,18 +226,22 @@ def _slowest_mode(values: FloatArray, period_s: float, modes: int) -> tuple[comp
     if len(values) < FEWEST_SAMPLES or not values.any():
         return None
     time_s = np.arange(len(values)) * period_s
-    z = _modes(values, modes)
-    if z is None:
+    first = _modes(values, modes)
+    if first is None:
         return None
-    slowest = _slowest(z, values)
+    slowest = _slowest(first, values)
     trend_1_s = float(np.log(abs(slowest)) / period_s)
     # relative to the middle of the window, so that the weights do not overflow
     flattened = values * np.exp(np.clip(-trend_1_s * (time_s - time_s.mean()), -300.0, 300.0))[:, np.newaxis]
     z = _modes(flattened, modes)
     if z is None:
         return None
-    z, error = _with_error(z, flattened, period_s)
-    return complex(trend_1_s, 0.0) + complex(np.log(z)) / period_s, error
+    # The mode has turned to one that stays. Where others outweigh it now, the motion as it was shows it better.
+    flat = _slowest(z, flattened)
+    same = z[np.abs(z - slowest / abs(slowest)).argmin()]
+    if not np.isclose(abs(flat), abs(same), rtol=1e-9, atol=0.0):
+        return complex(np.log(slowest)) / period_s, _rate_error(first, slowest, values, period_s)
+    return complex(trend_1_s, 0.0) + complex(np.log(flat)) / period_s, _rate_error(z, flat, flattened, period_s)
 
 
 def _modes(values: FloatArray, most: int) -> ComplexArray | None:
@@ -271,16 +275,15 @@ def _slowest(z: ComplexArray, values: FloatArray) -> complex:
     return complex(counting[np.abs(counting).argmax()])
 
 
-def _with_error(z: ComplexArray, values: FloatArray, period_s: float) -> tuple[complex, float]:
-    """The slowest mode and the standard error of its rate, from the misfit.
+def _rate_error(z: ComplexArray, mode: complex, values: FloatArray, period_s: float) -> float:
+    """The standard error (1/s) of the rate of one of the modes, from the misfit.
 
     A change of the rate adds t e^{st}; the part of it that the amplitudes cannot reproduce determines the rate.
     """
-    slowest = _slowest(z, values)
     powers, amplitudes = _amplitudes(z, values)
     misfit = values - (powers @ amplitudes).real
-    k = int(np.argmin(np.abs(z - slowest)))
+    k = int(np.argmin(np.abs(z - mode)))
     n = np.arange(len(values))
-    own = np.outer(powers[:, k], amplitudes[k]).real * (1 if abs(slowest.imag) < 1e-9 else 2)
+    own = np.outer(powers[:, k], amplitudes[k]).real * (1 if abs(mode.imag) < 1e-9 else 2)
     slope = own * (n - n.mean())[:, np.newaxis] * period_s
-    return slowest, float(np.sqrt((misfit**2).mean()) / max(np.linalg.norm(slope), np.finfo(float).tiny))
+    return float(np.sqrt((misfit**2).mean()) / max(np.linalg.norm(slope), np.finfo(float).tiny))

@@ -1,6 +1,6 @@
 """Fly a trial and judge it: the growth rate of the loop that breaks first, and the verdict of the whole flight.
 
-A *probe* measures the growth rate of one loop from its free response, in one flight or in a pair of flights
+A *probe* measures the growth rate of one loop from its free response, in one flight or in two
 (`gcs.stress.free_response`). An *own* trial flies the scenario's own initial states, large errors included, and gives
 the verdict that `gcs fly` would give. In both the monitor only watches: a trial tests the margin of the designed gains,
 not the actions that keep a flight within it.
@@ -10,6 +10,7 @@ import time  # noqa: TID251 - how long a trial takes is only reported; nothing f
 import traceback
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,11 +39,12 @@ _PILOT_S, _PILOT_PERIODS = 1.0, 6.0
 _SETTLED_LOOP_DELAYS = 4.0
 """After this many loop delays, modes other than the slowest are gone, or small enough to be fitted with it."""
 _FLYING_LOOP_DELAYS = 1.0
-"""Until then the station uses states of vehicles on the launcher; enough to wait where no feedback is late."""
+"""For this many loop delays the station uses states of vehicles on the launcher. Without late feedback, this wait is
+enough."""
 _BEGUN_LOOP_DELAYS = 2.0
-"""After this many loop delays, no command depends on what a vehicle did at the start any more."""
+"""After this many loop delays, no command depends on the start any more."""
 _CALM_SHARE = 0.8
-"""A disturbed flight is long enough if it stays in the linear range this share of the calm one's time."""
+"""A disturbed flight is long enough if it stays in the linear range for this share of the calm flight's time."""
 _WANTED_LOOP_DELAYS = 8.0
 _WANTED_SAMPLES = 60
 _WANTED_ERROR = 0.01
@@ -53,17 +55,11 @@ def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
     """Fly a trial and judge it. An exception becomes the outcome's `error`; only a full disk is raised, as OSError.
 
     With `folder`, the files of its flight are kept there as `gcs fly` leaves them; a probe has one folder for each size
-    of the initial error flown. In real time files are always written, and deleted again without `folder`.
+    of the initial error. In real time files are always written, and deleted again without `folder`.
     """
     began_s = time.perf_counter()
-    outcome = Outcome(
-        id=trial.id,
-        kind=trial.kind,
-        seed=trial.scenario.seed,
-        coordinates=dict(trial.coordinates),
-        real_time=trial.real_time,
-        probe=trial.probe,
-    )
+    at = dict(trial.coordinates)
+    outcome = Outcome(trial.id, trial.kind, trial.scenario.seed, at, trial.real_time, trial.probe)
     try:
         measure = _own if trial.kind == "own" else _pair if _needs_pair(trial) else _probe
         outcome = measure(trial, outcome, folder)
@@ -97,27 +93,28 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 
 
 def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
-    """Probe one loop in one flight, with the links of the loop that breaks first for all vehicles."""
+    """Probe one loop in one flight, with the links of the loop that breaks first for all vehicles.
+
+    That loop may be far down the tree, where vehicles ahead would drive it. The equal loop nearest to the leader is
+    therefore probed in its place, with the links and the wait of the loop that breaks first.
+    """
     base = plan_of(trial)
     pilot_s = max(_PILOT_S, _PILOT_PERIODS * base.timing.held_s)
     pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": pilot_s})))
     fresh = first_uses(pilot.ticks)
-    probed, critical, waiting_s = _choose(base, median_delays_s(fresh, base.formation.system_ids), trial.probe)
+    delays_s, loops = median_delays_s(fresh, base.formation.system_ids), plan_loops(base)
+    critical = _loop_of(loops, delays_s, trial.probe)
+    probed = next(loop for loop in loops if loop.same_as(critical)) if trial.probe == CRITICAL else critical
+    waiting_s = _slowest(base, critical, delays_s)[2] % critical.timing.step_s
     up, down = links = base.scenario.link_of(critical.system_ids[0])
-    outcome = replace(
-        outcome,
-        probed=probed.system_ids[0],
-        critical=critical.system_ids[0],
-        link_delay_s=up.delay_s + down.delay_s,
-        waiting_s=round(waiting_s, 9),
-    )
+    outcome = replace(outcome, link_delay_s=up.delay_s + down.delay_s, waiting_s=round(waiting_s, 9))
 
     def respond(amplitude: float) -> FreeResponse:
         scenario = probe_scenario(base, probed.system_ids, amplitude=amplitude, links=links, waiting_s=waiting_s)
         run = _folder_of(folder, amplitude)
         return response_alone(base, scenario, probed.system_ids, real_time=trial.real_time, folder=run)
 
-    return _with_response(probed, respond, outcome)
+    return _with_response(probed, critical, respond, outcome)
 
 
 def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
@@ -125,31 +122,30 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     base = plan_of(trial)
     calm = fly_calm(base, _folder_of(folder, 0.0))
     delays_s = effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
-    loops = plan_loops(base)
-    probed = _loop_of(loops, delays_s, trial.probe)
+    probed = _loop_of(plan_loops(base), delays_s, trial.probe)
     _, link_s, waiting_s = _slowest(base, probed, delays_s)
-    outcome = replace(
-        outcome,
-        probed=probed.system_ids[0],
-        critical=probed.system_ids[0],
-        link_delay_s=link_s,
-        waiting_s=round(waiting_s, 9),
-        past_limits=past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]]),
-    )
+    past = past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]])
+    outcome = replace(outcome, link_delay_s=link_s, waiting_s=round(waiting_s, 9), past_limits=past)
 
     def respond(amplitude: float) -> FreeResponse:
         run = _folder_of(folder, amplitude)
         return response_paired(base, calm, probed.system_ids, amplitude=amplitude, folder=run)
 
-    return _with_response(probed, respond, outcome)
+    return _with_response(probed, probed, respond, outcome)
 
 
 def _folder_of(folder: Path | None, amplitude: float) -> Path | None:
     return None if folder is None else folder / f"error-{amplitude:g}-m"
 
 
-def _with_response(loop: CoupledBlock, respond: Callable[[float], FreeResponse], outcome: Outcome) -> Outcome:
-    """The outcome with the growth rate after an initial error of a metre, or of less if that grows too fast."""
+def _with_response(
+    loop: CoupledBlock, critical: CoupledBlock, respond: Callable[[float], FreeResponse], outcome: Outcome
+) -> Outcome:
+    """The outcome with the growth rate of a loop, which stands for the critical one.
+
+    The initial error is a metre, or less if that grows too fast.
+    """
+    outcome = replace(outcome, probed=loop.system_ids[0], critical=critical.system_ids[0])
     for amplitude in AMPLITUDES:
         response = respond(amplitude)
         outcome = with_summary(response.plan, response.flight, replace(outcome, amplitude_m=amplitude))
@@ -162,19 +158,6 @@ def _with_response(loop: CoupledBlock, respond: Callable[[float], FreeResponse],
     return outcome
 
 
-def _choose(plan: FlightPlan, loop_delay_s: dict[int, float], probe: int) -> tuple[CoupledBlock, CoupledBlock, float]:
-    """The loop to be probed, the loop it stands for, and how long the latter's telemetry waits for the control tick.
-
-    The loop that breaks first may be far down the tree, where vehicles ahead would drive it. So the equal loop nearest
-    to the leader is probed instead, with the links and the waiting of the former.
-    """
-    loops = plan_loops(plan)
-    critical = _loop_of(loops, loop_delay_s, probe)
-    probed = next(loop for loop in loops if loop.same_as(critical)) if probe == CRITICAL else critical
-    _, _, waiting_s = _slowest(plan, critical, loop_delay_s)
-    return probed, critical, waiting_s % critical.timing.step_s
-
-
 def _loop_of(loops: list[CoupledBlock], loop_delay_s: dict[int, float], probe: int) -> CoupledBlock:
     """The loop of a vehicle, or the one that is predicted to break first."""
     if probe == CRITICAL:
@@ -183,7 +166,7 @@ def _loop_of(loops: list[CoupledBlock], loop_delay_s: dict[int, float], probe: i
 
 
 def _slowest(plan: FlightPlan, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> tuple[float, float, float]:
-    """Loop delay, link delay (up plus down) and the rest (s) of the vehicle of a loop whose loop delay is longest."""
+    """Loop delay, link delay (up plus down) and their difference (s) for a loop's vehicle of longest loop delay."""
     slowest = max(loop.system_ids, key=lambda system_id: loop_delay_s[system_id])
     up, down = plan.scenario.link_of(slowest)
     longest_s = loop_delay_s[slowest]
@@ -211,10 +194,8 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
     # one for each state and one for each late state; given gains may differ north and east, or couple them
     modes = 2 * max(FOLLOWER_MODES, len(loop.A))
     motion = motion_of(own, loop.system_ids, period_s=loop.timing.held_s)
-    if response.varying:
-        growth = norm_growth(motion, start_s=start_s, end_s=response.until_s)
-    else:
-        growth = fit_growth(motion, start_s=start_s, end_s=response.until_s, modes=modes)
+    grown = norm_growth if response.varying else partial(fit_growth, modes=modes)
+    growth = grown(motion, start_s=start_s, end_s=response.until_s)
     if growth is None:
         return replace(outcome, fit_start_s=round(start_s, 6), fit_end_s=round(min(response.until_s, since_s[-1]), 6))
     window = own[(since_s >= growth.start_s) & (since_s <= growth.end_s)]
@@ -230,7 +211,7 @@ def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
         outcome,
         growth_1_s=finite(growth.growth_1_s),
         growth_error_1_s=finite(growth.error_1_s),
-        frequency_rad_s=None if growth.frequency_rad_s is None else finite(growth.frequency_rad_s),
+        frequency_rad_s=finite(growth.frequency_rad_s),
         fit_start_s=round(growth.start_s, 6),
         fit_end_s=round(growth.end_s, 6),
         fit_samples=growth.samples,
@@ -241,11 +222,11 @@ def _left_linear_range_too_soon(outcome: Outcome) -> bool:
     """Whether a smaller error would show more: the errors grew, and the window is too short."""
     if outcome.fit_start_s is None or outcome.fit_end_s is None:
         return False
-    if outcome.growth_1_s is None:
-        return outcome.fit_end_s < PROBE_S / 2.0
-    short = (outcome.fit_samples or 0) < _WANTED_SAMPLES
-    short |= outcome.fit_end_s - outcome.fit_start_s < _WANTED_LOOP_DELAYS * (outcome.loop_delay_s or 0.0)
-    short |= (
-        outcome.fit_end_s < PROBE_S / 2.0 and (outcome.growth_error_1_s or 0.0) > _WANTED_ERROR * outcome.growth_1_s
+    growth_1_s, early = outcome.growth_1_s, outcome.fit_end_s < PROBE_S / 2.0
+    if growth_1_s is None:
+        return early
+    return growth_1_s > 0.0 and (
+        (outcome.fit_samples or 0) < _WANTED_SAMPLES
+        or outcome.fit_end_s - outcome.fit_start_s < _WANTED_LOOP_DELAYS * (outcome.loop_delay_s or 0.0)
+        or (early and (outcome.growth_error_1_s or 0.0) > _WANTED_ERROR * growth_1_s)
     )
-    return short and outcome.growth_1_s > 0.0

@@ -22,7 +22,7 @@ class GrowthPoint:
 
 @dataclass(frozen=True)
 class Zero:
-    """Where growth passes from below to above zero; `error_s` is the standard error, `slope_1_s2` dg/dtau there.
+    """The delay at which growth rises through zero; `error_s` is its standard error, `slope_1_s2` is dg/dtau there.
 
     `inside` says that there are flights on both sides; otherwise the zero is extrapolated. `misfit` is the distance of
     the flights from the curve in standard errors: well above one where no parabola fits, as across a kink. The growth
@@ -39,8 +39,8 @@ class Zero:
 def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
     """The loop delay of zero growth, from at least two flights at different delays.
 
-    A line, or with four and more flights a parabola, by least squares weighted with the flights' errors. None when
-    growth does not rise with delay in them.
+    Fits a line, or a parabola to four or more flights, by least squares weighted with the flights' errors. None if
+    growth does not rise with delay in these flights.
     """
     if len({round(point.loop_delay_s, 6) for point in points}) < 2:
         return None
@@ -70,7 +70,7 @@ def locate_zero(points: Sequence[GrowthPoint]) -> Zero | None:
 
 
 def _rising_root(coefficients: FloatArray, *, nearest_to: float) -> float | None:
-    """The root at which a polynomial rises; of several the one nearest to a place."""
+    """The root at which a polynomial rises; if there are several, the one nearest to a given place."""
     roots = np.roots(coefficients)
     real = roots[np.abs(roots.imag) < 1e-9].real
     rising = real[np.polyval(np.polyder(coefficients), real) > 0.0]

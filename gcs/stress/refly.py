@@ -9,7 +9,7 @@ from gcs.runs.record import SCENARIO_FILE
 from gcs.stress.campaign import Store, check_campaign
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from gcs.stress.trial import Outcome, Trial
+from gcs.stress.trial import Outcome
 from gcs.views.observer import recover_run
 
 
@@ -25,42 +25,33 @@ class Reflown:
     differs: list[str]
 
 
-def refly(study: Study, folder: Path, wanted: str, *, real_time: bool) -> Reflown:
+def refly(study: Study, folder: Path, wanted: str) -> Reflown:
     """Fly again the one trial in a campaign's folder whose id begins with `wanted`.
 
-    Its runs are left in `flights` beside the campaign's table. With `real_time` it is flown over UDP, even if it was
+    Its runs are left in `flights` beside the campaign's table. A study in real time flies it over UDP, even if it was
     first flown in virtual time.
 
     Raises InputError if not exactly one id begins so, or the trial was flown with another scenario.
     """
-    stored = _stored(folder, wanted)
-    trial = _trial_of(study, stored, folder)
-    again = replace(trial, real_time=trial.real_time or real_time)
+    check_campaign(folder, "--trial")
+    with contextlib.closing(Store(folder)) as store:
+        found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
+    if len(found) != 1:
+        raise InputError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
+    [stored] = found
+    first = replace(study, real_time=stored.real_time)
+    trial = first.trial(stored.kind, stored.coordinates, seed=stored.seed, probe=stored.probe)
+    if trial.id != stored.id:
+        raise InputError(
+            f"--trial: {stored.id} was flown with another scenario or design; wanted {folder / SCENARIO_FILE}"
+        )
+    again = replace(trial, real_time=trial.real_time or study.real_time)
     run = _free(folder / "flights", f"{stored.id}{'-real-time' if again.real_time else ''}")
     outcome = fly_trial(again, run)
     runs = [run] if (run / SCENARIO_FILE).exists() else sorted(run.iterdir()) if run.is_dir() else []
     for flight in runs:
         recover_run(flight)
     return Reflown(outcome, runs, [] if again.real_time else _differences(outcome, stored))
-
-
-def _stored(folder: Path, wanted: str) -> Outcome:
-    check_campaign(folder, "--trial")
-    with contextlib.closing(Store(folder)) as store:
-        found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
-    if len(found) != 1:
-        raise InputError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
-    return found[0]
-
-
-def _trial_of(study: Study, stored: Outcome, folder: Path) -> Trial:
-    study = replace(study, real_time=stored.real_time)
-    trial = study.trial(stored.kind, stored.coordinates, seed=stored.seed, probe=stored.probe)
-    if trial.id != stored.id:
-        raise InputError(
-            f"--trial: {stored.id} was flown with another scenario or design; wanted {folder / SCENARIO_FILE}"
-        )
-    return trial
 
 
 def _differences(outcome: Outcome, stored: Outcome) -> list[str]:

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import InstanceOf, PlainSerializer
+from pydantic import PlainSerializer
 
 from gcs.plan.design import Design
 from gcs.published import Published
+from gcs.runs.record import write_whole
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.figures import worst_of
 from gcs.stress.study import NoOnset, Onset, Study, curve_error
@@ -23,9 +24,12 @@ from gcs.views.page import data_uri, rendered
 REPORT_FILE = "report.html"
 _TEMPLATE = "stress_report.html.j2"
 MOST_ROWS = 200
+RESULT_FILE = "stress.json"
 _GAINS = {"K1_1_s", "K2_1_s", "K3_1_s2", "blocks"}
-_FLOWN = ("id", "kind", "seed", "coordinates", "verdict")
-_POINT = (*_FLOWN, "loop_delay_s", "growth_1_s", "growth_error_1_s", "predicted_growth_1_s", "spacing_error_max_m")
+_POINT = (
+    "id", "kind", "seed", "coordinates", "verdict", "loop_delay_s", "growth_1_s", "growth_error_1_s",
+    "predicted_growth_1_s", "spacing_error_max_m",
+)  # fmt: skip
 _FAILED = ("id", "seed", "coordinates", "error")
 _PACKAGES = ("formation-gcs", "numpy", "scipy", "clarabel", "cvxpy", "pymavlink")
 
@@ -34,12 +38,9 @@ def _gains(design: Design) -> dict[str, Any]:
     return design.model_dump(mode="json", include=_GAINS, exclude_unset=True)
 
 
-def _point(outcome: Outcome) -> dict[str, Any]:
-    return {name: getattr(outcome, name) for name in _POINT}
-
-
-def _failed(outcome: Outcome) -> dict[str, Any]:
-    return {name: getattr(outcome, name) for name in _FAILED}
+def _only(*names: str) -> PlainSerializer:
+    """Writes only these fields of a record."""
+    return PlainSerializer(lambda record: {name: getattr(record, name) for name in names})
 
 
 class Typical(Published):
@@ -81,10 +82,10 @@ class CampaignResult(Published):
     delay_margin_s: float | None
     delay_margin_continuous_s: float | None
     period_s: float
-    gains: Annotated[InstanceOf[Design], PlainSerializer(_gains)]
+    gains: Annotated[Design, PlainSerializer(_gains)]
     real_time: bool
     axes: dict[str, tuple[float, ...]]
-    onset: Annotated[InstanceOf[Onset], PlainSerializer(Onset.to_dict)] | None
+    onset: Onset | None
     onset_missing: str
     onset_missing_as_predicted: bool
     curve_error: float | None
@@ -93,10 +94,10 @@ class CampaignResult(Published):
     passed: bool
     trials: int
     trials_of_kind: dict[str, int]
-    trials_failed: tuple[Annotated[InstanceOf[Outcome], PlainSerializer(_failed)], ...]
+    trials_failed: tuple[Annotated[Outcome, _only(*_FAILED)], ...]
     worst: tuple[str, ...]
     flight_time_s: float
-    points: tuple[Annotated[InstanceOf[Outcome], PlainSerializer(_point)], ...]
+    points: tuple[Annotated[Outcome, _only(*_POINT)], ...]
     past_limits: int
     noise: Noise | None
     provenance: Provenance
@@ -109,8 +110,7 @@ def result_of(
     *,
     axes: Sequence[Axis],
     sweep: Sequence[Outcome],
-    onset: Onset | None,
-    no_onset: NoOnset | None,
+    onset: Onset | NoOnset | None,
     allowed: float | None,
 ) -> CampaignResult:
     """The result of a campaign: `outcomes` are all of its trials, `sweep` those of its points.
@@ -119,11 +119,15 @@ def result_of(
     and not found.
     """
     failed = tuple(outcome for outcome in outcomes if outcome.error is not None)
+    onset, missing = (None, onset) if isinstance(onset, NoOnset) else (onset, None)
     failure = ""
-    if allowed is not None and onset is not None:
-        failure = _parted(onset, allowed)
-    elif allowed is not None and no_onset is not None and not no_onset.as_predicted:
-        failure = str(no_onset)
+    if allowed is not None and missing is not None and not missing.as_predicted:
+        failure = str(missing)
+    elif allowed is not None and onset is not None and abs(onset.difference) > allowed:
+        failure = (
+            f"the onset is at {onset.loop_delay_s:.5f} s of loop delay, {onset.difference:+.3%} from the margin "
+            f"{onset.predicted_s:.5f} s; {100.0 * allowed:.3g}% is allowed"
+        )
     return CampaignResult(
         scenario=study.plan.scenario.name,
         delay_margin_s=design.delay_margin_s,
@@ -133,8 +137,8 @@ def result_of(
         real_time=study.real_time,
         axes={axis.name: tuple(axis.values) for axis in axes},
         onset=onset,
-        onset_missing=str(no_onset or ""),
-        onset_missing_as_predicted=no_onset is not None and no_onset.as_predicted,
+        onset_missing=str(missing or ""),
+        onset_missing_as_predicted=missing is not None and missing.as_predicted,
         curve_error=curve_error([*(sweep if exact(study, axes) else ()), *(onset.flights if onset else ())]),
         assert_onset=allowed,
         failure=failure,
@@ -185,15 +189,6 @@ def _commit() -> str | None:
     return commit.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
-def _parted(onset: Onset, allowed: float) -> str:
-    if abs(onset.difference) <= allowed:
-        return ""
-    return (
-        f"the onset is at {onset.loop_delay_s:.5f} s of loop delay, {onset.difference:+.3%} from the margin "
-        f"{onset.predicted_s:.5f} s; {100.0 * allowed:.3g}% is allowed"
-    )
-
-
 def exact(study: Study, axes: Sequence[Axis]) -> bool:
     """Whether the models predict all flights over these axes exactly: no link is random."""
     at = {axis.name: max(axis.values) for axis in axes}
@@ -201,25 +196,21 @@ def exact(study: Study, axes: Sequence[Axis]) -> bool:
 
 
 def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Sequence[Axis]) -> Path:
-    """Write report.html with its figures embedded, and the figures as PNG files beside it."""
+    """Write stress.json, the figures as PNG files, and report.html with the figures embedded."""
     # matplotlib takes half a second to import
     from gcs.stress.boundary import map_figure
     from gcs.stress.figures import axis_figure, growth_figure, worst_figure
 
+    write_whole(folder / RESULT_FILE, result.to_json().encode())
     onset = result.onset
     probes, own = ([outcome for outcome in result.points if outcome.kind == kind] for kind in ("probe", "own"))
-    points = probes or own
+    points, searched = probes or own, onset.flights if onset is not None else ()
     fitted = len(axes) == 1 and axes[0].name == "delay" and bool(probes)
-    flights = [*(probes if fitted else ()), *(onset.flights if onset is not None else ())]
-    flights = list({outcome.id: outcome for outcome in flights}.values())
+    flights = list({outcome.id: outcome for outcome in (*(probes if fitted else ()), *searched)}.values())
     large = [*own, *(onset.own if onset is not None else ())]
-    everything = [*large, *probes, *(onset.flights if onset is not None else ())]
-    figures: dict[str, tuple[str, Path | None]] = {
-        "growth": (
-            "Growth of errors against delay",
-            growth_figure(folder / "growth.png", study=study, outcomes=flights, own=large, onset=onset),
-        )
-    }
+    everything = [*large, *probes, *searched]
+    growth = growth_figure(folder / "growth.png", study=study, outcomes=flights, own=large, onset=onset)
+    figures: dict[str, tuple[str, Path | None]] = {"growth": ("Growth of errors against delay", growth)}
     if len(axes) == 1 and not fitted:
         figures["axis"] = ("Growth of errors", axis_figure(folder / "axis.png", axis=axes[0], outcomes=points))
     if len(axes) == 2:

@@ -1,13 +1,14 @@
 """Which trials a campaign flies: over its axes, and in search of the onset."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import PlainSerializer
 
-from gains.sampled.coupled_block import CoupledBlock, unlike_blocks
+from gains.sampled.coupled_block import unlike_blocks
 from gcs.plan.flight_plan import FlightPlan
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.campaign import Run
@@ -26,7 +27,7 @@ _SMOOTH_MISFIT = 3.0
 
 @dataclass(frozen=True)
 class Study:
-    """The trials of a scenario: one plan, whose gains stay the same whatever varies."""
+    """The trials of a scenario: one plan, whose gains stay the same whatever else varies."""
 
     plan: FlightPlan
     real_time: bool = False
@@ -57,12 +58,16 @@ class Study:
         return [self.trial(kind, point, seed=first + k) for kind, point, k in product(kinds, points, range(seeds))]
 
 
+_Flights = tuple[Annotated[Outcome, PlainSerializer(lambda outcome: outcome.id)], ...]
+"""Outcomes, which JSON names by their ids."""
+
+
 @dataclass(frozen=True)
 class Onset:
     """Where the formation breaks, in flight and in the models.
 
     All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
-    down, that causes this loop delay, shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
+    down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
     `difference` is measured / predicted − 1. `predicted_continuous_s` is the continuous model's margin less half a
     period for the hold.
     """
@@ -79,22 +84,15 @@ class Onset:
     probed: int
     critical: int
     rounds: int
-    flights: tuple[Outcome, ...]
-    checks: tuple[Outcome, ...]
+    flights: _Flights
+    checks: _Flights
     """Probes of the other kinds of loops and of the last vehicle, at the onset."""
-    own: tuple[Outcome, ...]
+    own: _Flights
     """Own trials at 0.9 and 1.1 times the onset's link delay."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain types for JSON, with the ids of the flights."""
-        plain = asdict(self)
-        for name in ("flights", "checks", "own"):
-            plain[name] = [outcome.id for outcome in getattr(self, name)]
-        return plain
 
 
 class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
-    """No delay breaks the formation, or none was found: one line that says why.
+    """No delay breaks the formation, or none was found; the text is one line that says why.
 
     `as_predicted` says that the margin has no limit and that the flights confirm it.
     """
@@ -105,11 +103,11 @@ class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a f
 
 
 def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
-    """Fly probes around the predicted onset, ever closer, until the zero of their growth rates is located.
+    """Fly probes ever closer around the predicted onset, until the zero of their growth rates is located.
 
-    A round is a few flights at once, spread evenly over three tolerances to either side, then over one, then over a
-    fraction of one if no smooth curve fits the flights. The search follows the measured growth; the prediction only
-    says where to start.
+    The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
+    and those of later rounds over a fraction of one if no smooth curve fits. The search follows the measured growth;
+    the prediction is only its start.
 
     Raises NoOnset with the reason.
     """
@@ -135,9 +133,15 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         flown = run(trials)
         flights |= {outcome.id: outcome for outcome in flown}
         near = [o for o in flights.values() if abs((o.link_delay_s or 0.0) - centre_s) <= 1.001 * width_s]
-        zero = locate_zero(_points(near))
+        grown = (
+            GrowthPoint(o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
+            for o in near
+            if o.loop_delay_s is not None and o.growth_1_s is not None
+        )
+        zero = locate_zero(list(grown))
         if zero is None:
-            centre_s, width_s = centre_s + _downhill(near) * width_s, 2.0 * width_s
+            all_grow = min((o.growth_1_s for o in near if o.growth_1_s is not None), default=0.0) > 0.0
+            centre_s, width_s = centre_s + (-width_s if all_grow else width_s), 2.0 * width_s
             continue
         waiting_s = _waiting_s(near)
         ahead_s = max(0.0, zero.loop_delay_s - waiting_s) - centre_s
@@ -176,15 +180,6 @@ def _no_limit(study: Study, run: Run, *, tolerance: float) -> NoOnset:
     )
 
 
-def _points(outcomes: Sequence[Outcome]) -> list[GrowthPoint]:
-    """The measured growth rates of the outcomes that have one."""
-    return [
-        GrowthPoint(o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
-        for o in outcomes
-        if o.growth_1_s is not None and o.loop_delay_s is not None
-    ]
-
-
 def _growth_pairs(outcomes: Sequence[Outcome]) -> list[tuple[float, float]]:
     """Measured and predicted growth rates, where both are known."""
     pairs = ((outcome.growth_1_s, outcome.predicted_growth_1_s) for outcome in outcomes)
@@ -199,12 +194,6 @@ def curve_error(outcomes: Sequence[Outcome]) -> float | None:
     measured, predicted = np.array(pairs, dtype=float).T
     spread = float(np.ptp(predicted))
     return float(np.abs(measured - predicted).max()) / spread if spread > 0.0 else None
-
-
-def _downhill(near: Sequence[Outcome]) -> float:
-    """+1 to search at longer delays, -1 at shorter ones."""
-    rates = [outcome.growth_1_s for outcome in near if outcome.growth_1_s is not None]
-    return -1.0 if rates and min(rates) > 0.0 else 1.0
 
 
 def _median(known: Sequence[float]) -> float | None:
@@ -231,7 +220,9 @@ def _found(
     waiting_s = _waiting_s(near)
     link_s = max(0.0, zero.loop_delay_s - waiting_s)
     seed = study.plan.scenario.seed
-    at_onset, others = {"delay": round(link_s, 6)}, _to_check(loops, loop)
+    at_onset = {"delay": round(link_s, 6)}
+    others = [kind.system_ids[0] for kind in unlike_blocks(loops) if not kind.same_as(loop)]
+    others = dict.fromkeys([*others, loops[-1].system_ids[-1]])
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
     own = run([study.trial("own", {"delay": round(part * link_s, 6)}, seed=seed) for part in (0.9, 1.1)])
     return Onset(
@@ -251,9 +242,3 @@ def _found(
         checks=tuple(checks),
         own=tuple(own),
     )
-
-
-def _to_check(loops: Sequence[CoupledBlock], probed: CoupledBlock) -> list[int]:
-    """One vehicle of each other kind of loop, and the last vehicle."""
-    others = [kind.system_ids[0] for kind in unlike_blocks(loops) if not kind.same_as(probed)]
-    return list(dict.fromkeys([*others, loops[-1].system_ids[-1]]))

@@ -30,7 +30,7 @@ TRACE_PERIOD_S = 0.25
 
 @dataclass(frozen=True)
 class Trial:
-    """Everything a trial depends on, and its `coordinates` in the campaign, which have no effect on it.
+    """Everything a trial depends on, and its `coordinates` in the campaign, which do not affect the flight.
 
     `gain` holds the nonzero entries (row, column, value) of K. `probe` is the system id of a vehicle in the loop to be
     probed, or `CRITICAL`.
@@ -57,15 +57,15 @@ class Outcome:
     """The outcome of a trial: one row of the campaign's table. None where a value is unknown or does not apply.
 
     `verdict` is that of the whole flight for an own trial, and the sign of the growth rate for a probe. `probed` is the
-    first vehicle of the measured loop; it stands for the loop of vehicle `critical`, and its telemetry waits as long
-    for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit
-    (`gcs.runs.effective_delay`; on constant links all are equal), and for an own trial the median measured in flight.
-    `loop_delay_spread_s` is the 90th percentile of the measured ones minus their median. `predicted_*` are the models'
-    growth rates at that delay. The growth of an own trial is that of the envelope of all spacing errors, a rough
-    figure. `ticks_sha256` is that of the tick log in virtual time; the same trial has the same one in any process.
-    `past_limits` says that random links alone, without any error, push vehicles past the scenario's limits; a probe is
-    flown without these limits. `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`. `error`
-    holds a traceback if the trial failed.
+    first vehicle of the measured loop. That loop stands for the loop of vehicle `critical`, and its telemetry waits as
+    long for the control tick (`waiting_s`). `loop_delay_s` is the effective loop delay over the window of the fit
+    (`gcs.runs.effective_delay`; on constant links all are equal); for an own trial it is the measured median.
+    `loop_delay_spread_s` is the 90th percentile of the measured loop delays minus their median. `predicted_*` are the
+    models' growth rates at that delay. The growth of an own trial is that of the envelope of all spacing errors, a
+    rough figure. `ticks_sha256` is the hash of the tick log in virtual time; the same trial has the same one in any
+    process. `past_limits` says that random links alone, without any error, push vehicles past the scenario's limits; a
+    probe is flown without these limits. `trace_m` is the largest spacing error of all vehicles, every `trace_period_s`.
+    `error` holds a traceback if the trial failed.
     """
 
     id: str
@@ -165,6 +165,6 @@ def _trace(ticks: TickArray) -> list[float]:
     return [float(f"{value:.4g}") for value in largest]
 
 
-def finite(value: float) -> float | None:
+def finite(value: float | None) -> float | None:
     """The value rounded to nine decimals; None if it is not finite."""
-    return round(float(value), 9) if np.isfinite(value) else None
+    return round(float(value), 9) if value is not None and np.isfinite(value) else None

@@ -18,7 +18,7 @@ from gcs.runs.grade import instants, true_loop_delays_s
 from gcs.runs.summary import summarise
 from scenarios.link_schema import Link
 from scenarios.schema import Scenario
-from sim_vehicles.links.truth import SAMPLED
+from sim_vehicles.links.truth import ACTED, SAMPLED
 from tests.soak.soak_flight import Flown, Stretch
 
 ALWAYS = ("time_s", "due_ns", "sent_ns")
@@ -167,9 +167,12 @@ def _loop_delay_true(flown: Flown, stretch: Stretch, *, until_ns: int) -> Iterat
     if not _constant_delays(scenario):
         return
     ticks = stretch.ticks.ravel()
-    known = (flown.truth["time_ns"] >= stretch.start_ns) & (flown.truth["time_ns"] < until_ns)
+    truth = flown.truth
+    known = (truth["time_ns"] >= stretch.start_ns) & (truth["time_ns"] < until_ns)
+    # a set-point's key is its time since its station's start: what acts before that was sent by the station before
+    known &= (truth["kind"] != ACTED) | (truth["time_ns"] >= stretch.start_ns + truth["key"].astype(np.int64) * 10**6)
     age_s = ticks["loop_delay_s"] + ticks["repeated_s"]
-    error_s = np.abs(age_s - true_loop_delays_s(ticks, flown.truth[known]))
+    error_s = np.abs(age_s - true_loop_delays_s(ticks, truth[known]))
     if scenario.control.loop == "onboard":
         error_s -= np.repeat(np.nanmax(stretch.ticks["sample_bound_s"], axis=1, initial=0.0), len(scenario.vehicles))
         error_s -= ticks["down_bound_s"]

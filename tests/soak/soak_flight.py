@@ -103,8 +103,6 @@ class World:
 
     def step(self, received: Sent, now_ns: int) -> Sent:
         """As Fleet.step, with the faults."""
-        while self._steps and _ns(self._steps[0].from_s) <= now_ns:
-            self._set_clocks(self._steps.popleft(), now_ns)
         for _, data, time_ns in received:
             self._note(data, time_ns)
         received = self._passed(received)
@@ -118,6 +116,9 @@ class World:
             self.digest.update(b"%d %d " % (system_id, time_ns) + data)
         for system_id in under_fire:
             arrived += [(system_id, data, now_ns) for data in self._garbage(self._up, None)]
+        # last: setting a clock brings its vehicle up to now, past what was received meanwhile
+        while self._steps and _ns(self._steps[0].from_s) <= now_ns:
+            self._set_clocks(self._steps.popleft(), now_ns)
         return arrived
 
     def strangers(self, now_ns: int) -> list[Datagram]:

@@ -99,8 +99,9 @@ def _margin_kept(plan: FlightPlan, ratio: float) -> Result:
     share = found.loop_delay_s / margin_s if margin_s > 0.0 else 2.0
     growth, error = found.growth_1_s, found.growth_error_1_s
     text = f"grows by {growth:.4f} 1/s (± {error}) at {share:.3f} of the margin of {margin_s:.4f} s"
-    # an integrator left to itself has no margin either, and its errors stay what they are
-    stays = -3.0 * (error or 0.0) - 1e-6 if margin_s == 0.0 else 0.0
+    # An integrator left to itself has no margin either, and its errors stay what they are, but for rounding: float32
+    # rounds positions of 2 km by 1e-4 m, of errors of a metre within 20 s.
+    stays = -3.0 * (error or 0.0) - 2e-5 if margin_s == 0.0 else 0.0
     if (share < 0.9 and growth > 0.0) or (share > 1.1 and growth < stays):
         return Result((Broken("margin", text),))
     where = "stable below" if share < 0.9 else "near it" if share <= 1.1 else "unstable above"

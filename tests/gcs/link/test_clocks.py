@@ -234,6 +234,18 @@ def test_an_overtaken_state_asks_for_no_exchange() -> None:
     assert not truth.clock.exchange_due
 
 
+@pytest.mark.parametrize("by_s", [229, -50])
+def test_an_overtaken_state_from_before_a_jump_is_refused_without_doubt(by_s: int) -> None:
+    truth = exchanged()
+    before_ms = truth.boot_ns(9 * S) // MS
+    truth.offset_ns += by_s * S
+    truth.at(10 * S, down_ns=20 * MS, up_ns=20 * MS)
+    assert truth.clock.jumps == 1
+    assert truth.clock.sampled_ns(before_ms, 10 * S + 60 * MS, newest=False) is None
+    assert not truth.clock.exchange_due
+    assert state(truth, 10 * S + 50 * MS) == pytest.approx(10 * S + 50 * MS, abs=MS)
+
+
 def test_time_boot_ms_wraps_after_49_days_in_the_air() -> None:
     truth = Exchange(offset_ns=(1 << 32) * MS - 10 * S, drift=0.0)
     for k in range(200):

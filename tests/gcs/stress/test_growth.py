@@ -48,6 +48,13 @@ def test_a_real_mode_is_found_beside_an_oscillation() -> None:
     assert found.frequency_rad_s == pytest.approx(0.0, abs=1e-6)
 
 
+def test_a_fast_growth_is_found_beside_an_error_that_stays() -> None:
+    """As of a loop that feeds back velocities alone: the error of position outweighs the growth until the end."""
+    found = fit_growth(motion((14.3, 2e-5), (1e-9, 1.0), seconds=0.9, noise=1e-6), start_s=0.0)
+    assert found is not None
+    assert found.growth_1_s == pytest.approx(14.3, abs=1e-3)
+
+
 def test_the_error_says_how_far_noise_has_moved_the_rate() -> None:
     """Over many seeds: within three standard errors nearly always, and the errors are not just large."""
     misses = 0

@@ -4,12 +4,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gcs.errors import InputError
 from gcs.stress.axes import (
-    AxisError,
     at_coordinates,
     has_constant_links,
     parse_axis,
-    parse_vehicle_axis,
     split_delay,
 )
 from scenarios.link_schema import Jitter, Link
@@ -17,21 +16,21 @@ from tests.support.stress_pair import SCENARIO
 
 
 def test_axis_is_a_range_or_a_list() -> None:
-    assert parse_axis("delay", "0:0.6:4").values == (0.0, 0.2, 0.4, 0.6)
-    assert parse_axis("delay", "0.3,0.1,0.3").values == (0.3, 0.1)
-    assert parse_vehicle_axis("2=0:0.1:2", (1, 2)).name == "delay_2"
+    assert parse_axis("--delay", "0:0.6:4").values == (0.0, 0.2, 0.4, 0.6)
+    assert parse_axis("--delay", "0.3,0.1,0.3").values == (0.3, 0.1)
+    assert parse_axis("--delay-of", "2=0:0.1:2", (1, 2)).name == "delay_2"
 
 
 @pytest.mark.parametrize("text", ["", "a", "0:1", "0:1:x", "0:1:0", "-0.1:0.1:3", "0:61:2", "nan", "0:inf:3"])
 def test_a_bad_axis_is_refused_with_what_was_read(text: str) -> None:
-    with pytest.raises(AxisError, match="wanted FROM:TO:COUNT"):
-        parse_axis("delay", text)
+    with pytest.raises(InputError, match="wanted FROM:TO:N"):
+        parse_axis("--delay", text)
 
 
 @pytest.mark.parametrize("text", ["3=0:1:2", "0:1:2", "two=0:1:2", "2"])
 def test_axis_of_a_vehicle_names_a_vehicle_of_the_scenario(text: str) -> None:
-    with pytest.raises(AxisError, match="system id"):
-        parse_vehicle_axis(text, (1, 2))
+    with pytest.raises(InputError, match="system id"):
+        parse_axis("--delay-of", text, (1, 2))
 
 
 @given(total_ms=st.integers(0, 2000), period_ms=st.sampled_from([2, 5, 10, 20, 50, 200]))

@@ -16,7 +16,7 @@ from gcs.cli.stress import stress
 from gcs.cli.stress_output import write_junit
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
-from gcs.runs.summary import SUMMARY_FILE
+from gcs.runs.record import SUMMARY_FILE
 from gcs.stress.campaign import TRIALS_FILE, Store, local_workers, run_campaign
 from gcs.stress.report import CampaignResult
 from gcs.stress.study import Onset, Study, find_onset
