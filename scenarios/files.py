@@ -3,21 +3,23 @@
 Every fault is a ScenarioError: one line with file, key, what was read and what was wanted.
 """
 
+import contextlib
 import csv
 import difflib
 import hashlib
 import itertools
 import math
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import to_json
 
 from scenarios.errors import ScenarioError
-from scenarios.link_schema import Jitter, Link, Links, Outage
+from scenarios.link_schema import Jitter, Link, Links
 from scenarios.part import MOST
 from scenarios.places import line_of, location_of, named, wanted_of
 from scenarios.schema import Scenario
@@ -25,15 +27,16 @@ from scenarios.schema import Scenario
 TRACE_DELAYS = 100_000
 """Most delays of a trace."""
 TRACE_COLUMN = "delay_s"
+_A_VEHICLE = "the system_id of a vehicle of this scenario"
+_Fault = tuple[str, object, str]
+"""A key, what was read and what was wanted."""
 
 
 def load(path: Path) -> Scenario:
     """The scenario in a TOML file, fully checked.
 
-    Raises
-    ------
-    ScenarioError
-        If the file cannot be read, a key is unknown, missing or of a wrong type, or the formation is not one tree.
+    Raises ScenarioError if the file cannot be read, a key is unknown, missing or of a wrong type, or keys contradict
+    each other.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -51,8 +54,8 @@ def parse(text: str, file: Path) -> Scenario:
     except ValueError as error:  # a TOMLDecodeError, or a number of thousands of digits
         raise ScenarioError(file, "file", str(error), "valid TOML") from None
     try:
-        # TOML arrays become Python lists, which strict validation accepts as tuples only from JSON text.
-        scenario = Scenario.model_validate_json(_json(data))
+        # Strict validation accepts lists as tuples only from JSON text, in which a TOML date is a string.
+        scenario = Scenario.model_validate_json(to_json(data))
     except ValidationError as errors:
         raise _at_line(file, text, data, *_first_error(errors, data)) from None
     for key, read, wanted in _contradictions(scenario):
@@ -63,10 +66,7 @@ def parse(text: str, file: Path) -> Scenario:
 def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path) -> Scenario:
     """The scenario with its loop closed elsewhere; `file` is named in errors.
 
-    Raises
-    ------
-    ScenarioError
-        If the scenario cannot be flown with this loop.
+    Raises ScenarioError if the scenario cannot be flown with this loop.
     """
     control = scenario.control.model_copy(update={"loop": loop})
     changed = scenario.model_copy(update={"control": control})
@@ -87,12 +87,6 @@ def fingerprint(scenario: Scenario) -> str:
     return hashlib.sha256(scenario.model_dump_json(exclude_none=True).encode()).hexdigest()[:16]
 
 
-def _json(data: dict[str, Any]) -> str:
-    import json
-
-    return json.dumps(data, default=str)  # a TOML date becomes a string, which no numeric key accepts
-
-
 def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object, wanted: str) -> ScenarioError:
     """The error, with the line in the file and the system id in place of a vehicle's index."""
     line, key = line_of(text, location_of(key.split(" (", maxsplit=1)[0])), named(key, data)
@@ -103,10 +97,8 @@ def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object
 
 def _first_error(errors: ValidationError, data: dict[str, Any]) -> tuple[str, object, str]:
     """The first of pydantic's errors: key, what was read, what was wanted."""
-    found = errors.errors()
-    first = next(
-        (e for e in found if e["type"] == "extra_forbidden"), found[0]
-    )  # a misspelt key explains the missing one
+    # a misspelt key explains the missing one
+    first = min(errors.errors(), key=lambda error: error["type"] != "extra_forbidden")
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
     if first["type"] == "extra_forbidden":
         name = str(first["loc"][-1])
@@ -124,8 +116,7 @@ def _model_at(location: tuple[int | str, ...]) -> type[BaseModel]:
     model: type[BaseModel] = Scenario
     for part in location:
         if isinstance(part, str):
-            annotation = model.model_fields[part].annotation
-            model = next(iter(_models_in(annotation)))
+            model = next(_models_in(model.model_fields[part].annotation))
     return model
 
 
@@ -145,12 +136,14 @@ def _value_at(data: Any, location: tuple[int | str, ...]) -> object:
     return data
 
 
-def _contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
-    """Faults that no single key shows: (key, what was read, what was wanted)."""
+def _contradictions(scenario: Scenario) -> Iterator[_Fault]:
+    """Faults that no single key shows."""
     yield from _formation_contradictions(scenario)
     yield from _velocity_contradictions(scenario)
     yield from _links_contradictions(scenario)
     yield from _control_contradictions(scenario)
+    yield from _block_contradictions(scenario)
+    yield from _hearing_contradictions(scenario)
     yield from _monitor_contradictions(scenario)
     yield from _onboard_contradictions(scenario)
     yield from _autopilot_contradictions(scenario)
@@ -159,51 +152,49 @@ def _contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
         yield "limits.speed_max_m_s", limits.speed_max_m_s, f"more than speed_min_m_s = {limits.speed_min_m_s:g}"
 
 
-def _control_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
-    control, vehicles = scenario.control, {vehicle.system_id: vehicle for vehicle in scenario.vehicles}
+def _control_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+    control = scenario.control
     requirements = ("alpha", "delay_margin_s", "decay_rate_1_s")
-    required = any(getattr(control, name) is not None for name in requirements)
+    required, wanted = any(getattr(control, name) is not None for name in requirements), ", ".join(requirements)
     if control.gains is not None and required:
-        yield "control.gains", control.gains.model_dump(), f"either gains or a requirement ({', '.join(requirements)})"
+        yield "control.gains", control.gains.model_dump(), f"either gains or a requirement ({wanted})"
     if control.blocks and (required or control.gains is not None):
-        wanted = f"either blocks, or gains, or a requirement ({', '.join(requirements)})"
-        yield "control.blocks", f"{len(control.blocks)} blocks", wanted
+        yield "control.blocks", f"{len(control.blocks)} blocks", f"either blocks, or gains, or a requirement ({wanted})"
     if scenario.dynamics == "autopilot" and (control.method != "inclusion" or control.blocks):
         wanted = "inclusion without blocks, with dynamics autopilot: only for its gains are margins computed with a lag"
         yield "control.method", control.method, wanted
     if control.gains is not None and control.method != "inclusion":
         yield "control.method", control.method, "inclusion, with gains given; a graph's gains are given as blocks"
-    yield from _block_contradictions(scenario)
-    known = "the system_id of a vehicle of this scenario"
+
+
+def _hearing_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+    control, known = scenario.control, {vehicle.system_id for vehicle in scenario.vehicles}
     for k, vehicle in enumerate(scenario.vehicles):
         for other in vehicle.hears:
-            if other not in vehicles or other in (vehicle.system_id, vehicle.follows):
-                yield f"vehicles[{k}].hears", other, f"{known}, but not itself and not the vehicle it follows"
+            if other not in known - {vehicle.system_id, vehicle.follows}:
+                yield f"vehicles[{k}].hears", other, f"{_A_VEHICLE}, but not itself and not the vehicle it follows"
         if vehicle.hears and (control.method == "inclusion" or control.blocks):
             wanted = "no hears, unless control.method is graph-lqr or graph-dk without blocks"
             yield f"vehicles[{k}].hears", list(vehicle.hears), wanted
 
 
-def _block_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
-    vehicles = {vehicle.system_id: vehicle for vehicle in scenario.vehicles}
+def _block_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+    columns = {vehicle.system_id: 2 if vehicle.follows is None else 4 for vehicle in scenario.vehicles}
     seen: set[tuple[int, int]] = set()
     for k, block in enumerate(scenario.control.blocks):
         for name, system_id in (("vehicle", block.vehicle), ("of", block.of)):
-            if system_id not in vehicles:
-                yield f"control.blocks[{k}].{name}", system_id, "the system_id of a vehicle of this scenario"
-        if block.of in vehicles:
-            columns = 2 if vehicles[block.of].follows is None else 4
-            if any(len(row) != columns for row in block.gain):
-                wanted = (
-                    f"two rows of {columns} numbers, as vehicle {block.of} {'leads' if columns == 2 else 'follows'}"
-                )
-                yield f"control.blocks[{k}].gain", [list(row) for row in block.gain], wanted
+            if system_id not in columns:
+                yield f"control.blocks[{k}].{name}", system_id, _A_VEHICLE
+        count = columns.get(block.of)
+        if count is not None and any(len(row) != count for row in block.gain):
+            wanted = f"two rows of {count} numbers, as vehicle {block.of} {'leads' if count == 2 else 'follows'}"
+            yield f"control.blocks[{k}].gain", [list(row) for row in block.gain], wanted
         if (block.vehicle, block.of) in seen:
             yield f"control.blocks[{k}]", (block.vehicle, block.of), "each pair of vehicles once"
         seen.add((block.vehicle, block.of))
 
 
-def _monitor_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+def _monitor_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     monitor = scenario.monitor
     if monitor.critical_headroom >= monitor.caution_headroom:
         wanted = f"less than caution_headroom = {monitor.caution_headroom:g}"
@@ -213,7 +204,7 @@ def _monitor_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, s
         yield "monitor.time_scales", list(scales), "1 first, then increasing factors"
 
 
-def _onboard_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+def _onboard_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     if scenario.control.loop != "onboard":
         return
     own, control_hz = scenario.onboard, scenario.rates.control_hz
@@ -226,15 +217,14 @@ def _onboard_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, s
         yield "onboard.rate_hz", own.rate_hz, f"a whole multiple of onboard.sensor_hz = {own.sensor_hz:g}"
 
 
-def _formation_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+def _formation_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     vehicles = scenario.vehicles
     system_ids = [v.system_id for v in vehicles]
     leaders = [v.system_id for v in vehicles if v.follows is None]
+    yield from _repeated("vehicles", "system_id", system_ids, "a different number for each vehicle")
     for k, vehicle in enumerate(vehicles):
-        if vehicle.system_id in system_ids[:k]:
-            yield f"vehicles[{k}].system_id", vehicle.system_id, "a different number for each vehicle"
         if vehicle.follows is not None and vehicle.follows not in system_ids:
-            yield f"vehicles[{k}].follows", vehicle.follows, "the system_id of a vehicle of this scenario"
+            yield f"vehicles[{k}].follows", vehicle.follows, _A_VEHICLE
         if (vehicle.follows is None) != (vehicle.offset_ne_m is None):
             wanted = "both follows and offset_ne_m, or neither for the leader"
             yield f"vehicles[{k}].offset_ne_m", vehicle.offset_ne_m, wanted
@@ -244,16 +234,13 @@ def _formation_contradictions(scenario: Scenario) -> Iterator[tuple[str, object,
         TopologicalSorter({v.system_id: [] if v.follows is None else [v.follows] for v in vehicles}).prepare()
     except CycleError as error:
         cycle = " follows ".join(str(system_id) for system_id in reversed(error.args[1]))
-        yield (
-            "vehicles.follows",
-            f"a cycle: {cycle}",
-            "a tree: every vehicle follows the leader, directly or through others",
-        )
+        wanted = "a tree: every vehicle follows the leader, directly or through others"
+        yield "vehicles.follows", f"a cycle: {cycle}", wanted
     if len(leaders) != 1:
         yield "vehicles.follows", f"vehicles without it: {leaders}", "exactly one vehicle without it, the leader"
 
 
-def _autopilot_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+def _autopilot_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     times_s = [jump.at_s for jump in scenario.autopilot.clock_jumps]
     if times_s != sorted(times_s):
         yield "autopilot.clock_jumps", times_s, "times that do not decrease"
@@ -268,36 +255,33 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[tuple[str, object,
         yield "response", scenario.response.model_dump(), "nothing, without dynamics autopilot"
 
 
-def _velocity_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+def _velocity_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     lowest, highest = scenario.limits.speed_min_m_s, scenario.limits.speed_max_m_s or math.inf
     wanted_speed = f"a speed within the limits, {lowest:g} to {highest:g} m/s"
-    times = [entry.from_s for entry in scenario.nominal_velocity]
+    before_s = -math.inf
     for k, entry in enumerate(scenario.nominal_velocity):
-        if (k == 0 and entry.from_s != 0) or (k > 0 and entry.from_s <= times[k - 1]):
+        if entry.from_s <= before_s or (k == 0 and entry.from_s != 0):
             yield f"nominal_velocity[{k}].from_s", entry.from_s, "0 for the first entry, then increasing times"
         if not lowest <= math.hypot(*entry.velocity_ne_m_s) <= highest:
             yield f"nominal_velocity[{k}].velocity_ne_m_s", entry.velocity_ne_m_s, wanted_speed
+        before_s = entry.from_s
+    on_ground = scenario.dynamics == "autopilot"
     for k, vehicle in enumerate(scenario.vehicles):
-        if scenario.dynamics == "autopilot":
-            if vehicle.velocity_ne_m_s != (0.0, 0.0):
-                yield f"vehicles[{k}].velocity_ne_m_s", vehicle.velocity_ne_m_s, "[0, 0] with dynamics autopilot"
-        elif not lowest <= math.hypot(*vehicle.velocity_ne_m_s) <= highest:
-            yield f"vehicles[{k}].velocity_ne_m_s", vehicle.velocity_ne_m_s, wanted_speed
+        speed_m_s = math.hypot(*vehicle.velocity_ne_m_s)
+        if not (speed_m_s == 0 if on_ground else lowest <= speed_m_s <= highest):
+            wanted = "[0, 0] with dynamics autopilot" if on_ground else wanted_speed
+            yield f"vehicles[{k}].velocity_ne_m_s", vehicle.velocity_ne_m_s, wanted
 
 
-def _links_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str]]:
+def _links_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     links = scenario.links
-    system_ids = [v.system_id for v in scenario.vehicles]
     own = [link.system_id for link in links.vehicles]
-    for k, system_id in enumerate(own):
-        if system_id not in system_ids:
-            yield f"links.vehicles[{k}].system_id", system_id, "the system_id of a vehicle of this scenario"
-        if system_id in own[:k]:
-            yield f"links.vehicles[{k}].system_id", system_id, "one entry per vehicle"
+    for k in (k for k, system_id in enumerate(own) if system_id not in {v.system_id for v in scenario.vehicles}):
+        yield f"links.vehicles[{k}].system_id", own[k], _A_VEHICLE
+    yield from _repeated("links.vehicles", "system_id", own, "one entry per vehicle")
     names = [channel.name for channel in links.channels]
+    yield from _repeated("links.channels", "name", names, "a different name for each channel")
     for k, channel in enumerate(links.channels):
-        if channel.name in names[:k]:
-            yield f"links.channels[{k}].name", channel.name, "a different name for each channel"
         if (channel.queue_bytes is None) == (channel.queue_datagrams is None):
             read = "neither" if channel.queue_bytes is None else "both"
             yield f"links.channels[{k}]", read, "either queue_bytes or queue_datagrams"
@@ -307,18 +291,23 @@ def _links_contradictions(scenario: Scenario) -> Iterator[tuple[str, object, str
         yield from _link_contradictions(key, link)
 
 
+def _repeated(part: str, name: str, values: Sequence[object], wanted: str) -> Iterator[_Fault]:
+    """The values of a key that an earlier entry of a list already has."""
+    for k, value in enumerate(values):
+        if value in values[:k]:
+            yield f"{part}[{k}].{name}", value, wanted
+
+
 def _places(links: Links) -> Iterator[tuple[str, Link]]:
     """Each link of the file with its key."""
-    yield "links.up", links.up
-    yield "links.down", links.down
-    for k, own in enumerate(links.vehicles):
-        if own.up is not None:
-            yield f"links.vehicles[{k}].up", own.up
-        if own.down is not None:
-            yield f"links.vehicles[{k}].down", own.down
+    parts = ("links", links), *((f"links.vehicles[{k}]", own) for k, own in enumerate(links.vehicles))
+    for key, part in parts:
+        for name, link in (("up", part.up), ("down", part.down)):
+            if link is not None:
+                yield f"{key}.{name}", link
 
 
-def _link_contradictions(key: str, link: Link) -> Iterator[tuple[str, object, str]]:
+def _link_contradictions(key: str, link: Link) -> Iterator[_Fault]:
     times_s = [point.at_s for point in link.delay_points]
     if times_s and link.delay_s:
         yield f"{key}.delay_s", link.delay_s, "either delay_s or delay_points"
@@ -329,54 +318,46 @@ def _link_contradictions(key: str, link: Link) -> Iterator[tuple[str, object, st
             yield f"{key}.delay_points[{k}].at_s", time_s, "at most two points at one time, which make a step"
     if link.loss_bursts is not None and link.loss_probability:
         yield f"{key}.loss_probability", link.loss_probability, "either loss_probability or loss_bursts"
-    last = Outage(from_s=0.0, until_s=1e-9)
+    before_s = 0.0
     for k, outage in enumerate(link.outages):
         if outage.until_s <= outage.from_s:
             yield f"{key}.outages[{k}].until_s", outage.until_s, f"more than from_s = {outage.from_s:g}"
-        if k and outage.from_s < last.until_s:
-            yield (
-                f"{key}.outages[{k}].from_s",
-                outage.from_s,
-                f"at least until_s = {last.until_s:g} of the outage before",
-            )
-        last = outage
+        if outage.from_s < before_s:
+            wanted = f"at least until_s = {before_s:g} of the outage before"
+            yield f"{key}.outages[{k}].from_s", outage.from_s, wanted
+        before_s = outage.until_s
     if link.jitter is not None:
         yield from _jitter_contradictions(f"{key}.jitter", link.jitter)
 
 
-def _jitter_contradictions(key: str, jitter: Jitter) -> Iterator[tuple[str, object, str]]:
+def _jitter_contradictions(key: str, jitter: Jitter) -> Iterator[_Fault]:
     given = [name for name in ("scale_s", "shape", "trace_file", "trace_s") if getattr(jitter, name) is not None]
     if jitter.distribution == "trace":
-        if len(given) != 1 or given[0] not in ("trace_file", "trace_s"):
+        if given not in (["trace_file"], ["trace_s"]):
             yield key, ", ".join(given) or "neither", "either trace_file or trace_s with distribution trace"
         if jitter.trace_s is not None and not 1 <= len(jitter.trace_s) <= TRACE_DELAYS:
             yield f"{key}.trace_s", f"{len(jitter.trace_s)} delays", f"1 to {TRACE_DELAYS}"
-    else:
-        wanted = ["scale_s", "shape"] if jitter.distribution == "gamma" else ["scale_s"]
-        if given != wanted:
-            read, text = ", ".join(given) or "nothing", " and ".join(wanted)
-            yield key, read, f"{text} and nothing else with distribution {jitter.distribution}"
+        return
+    wanted = ["scale_s", "shape"] if jitter.distribution == "gamma" else ["scale_s"]
+    if given != wanted:
+        text = f"{' and '.join(wanted)} and nothing else with distribution {jitter.distribution}"
+        yield key, ", ".join(given) or "nothing", text
 
 
 def _with_traces(scenario: Scenario, file: Path) -> Scenario:
     """The scenario with delays in place of the names of trace files, so that it is complete without them."""
+    traces: dict[str, tuple[float, ...]] = {}
+    for key, link in _places(scenario.links):
+        if link.jitter is not None and (name := link.jitter.trace_file) is not None:
+            traces[name] = _read_trace(file.parent / name, file, f"{key}.jitter.trace_file")
 
-    def read(key: str, link: Link | None) -> Link | None:
-        if link is None or link.jitter is None or link.jitter.trace_file is None:
+    def read(link: Link) -> Link:
+        if link.jitter is None or link.jitter.trace_file is None:
             return link
-        trace_s = _read_trace(file.parent / link.jitter.trace_file, file, f"{key}.jitter.trace_file")
-        jitter = link.jitter.model_copy(update={"trace_file": None, "trace_s": trace_s})
-        return link.model_copy(update={"jitter": jitter})
+        update = {"trace_file": None, "trace_s": traces[link.jitter.trace_file]}
+        return link.model_copy(update={"jitter": link.jitter.model_copy(update=update)})
 
-    links = scenario.links
-    own = tuple(
-        v.model_copy(
-            update={"up": read(f"links.vehicles[{k}].up", v.up), "down": read(f"links.vehicles[{k}].down", v.down)}
-        )
-        for k, v in enumerate(links.vehicles)
-    )
-    whole = {"up": read("links.up", links.up), "down": read("links.down", links.down), "vehicles": own}
-    return scenario.model_copy(update={"links": links.model_copy(update=whole)})
+    return scenario.with_links(read, read) if traces else scenario
 
 
 def _read_trace(path: Path, file: Path, key: str) -> tuple[float, ...]:
@@ -385,17 +366,17 @@ def _read_trace(path: Path, file: Path, key: str) -> tuple[float, ...]:
         rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ScenarioError(file, key, str(error), "a readable file with a delay in s on each line, or CSV") from None
-    column, first = 0, 0
-    if rows and TRACE_COLUMN in (cells := [cell.strip() for cell in rows[0]]):
-        column, first = cells.index(TRACE_COLUMN), 1
+    cells = [cell.strip() for cell in rows[0]] if rows else []
+    first = int(TRACE_COLUMN in cells)
+    column = cells.index(TRACE_COLUMN) if first else 0
     delays: list[float] = []
     for number, row in enumerate(rows[first:], first + 1):
         if not row:
             continue
-        try:
-            delay_s = float(row[column]) if first or len(row) == 1 else math.nan
-        except (ValueError, IndexError):
-            delay_s = math.nan
+        delay_s = math.nan
+        if first or len(row) == 1:
+            with contextlib.suppress(ValueError, IndexError):
+                delay_s = float(row[column])
         if not 0 <= delay_s <= MOST:
             wanted = f"a delay from 0 to {MOST:g} s on each line, or CSV with a column {TRACE_COLUMN}"
             raise ScenarioError(file, key, f"{path.name} line {number}: {','.join(row)}", wanted)

@@ -21,15 +21,18 @@ def design(
     scenario_file: ScenarioFile,
     method: Annotated[
         Literal["inclusion", "graph-dk", "graph-lqr"] | None,
-        typer.Option(help="in place of the scenario's: inclusion principle, or a graph method"),
+        typer.Option(help="design method; default as in the scenario"),
     ] = None,
     loop: LoopOption = None,
     allow_unstable: AllowUnstable = False,
     as_json: AsJson = False,
 ) -> None:
-    """Design the gains of a scenario: gains, robustness, delay margins, and the trade-off they sit on."""
+    """Design the gains of a scenario.
+
+    Shows the gains, their robustness and delay margins, and the trade-off between the two.
+    """
     from gcs.drive.preflight import unstable_loop
-    from gcs.plan.planner import flight_plan
+    from gcs.plan.planner import flight_plan, with_trade_off
     from gcs.views.report import print_design
 
     scenario = load_scenario(scenario_file, loop)
@@ -39,7 +42,7 @@ def design(
     result, plan = flight_plan(scenario)
     if (unstable := unstable_loop(plan)) is not None:
         refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
-    answer(result, print_design, as_json=as_json)
+    answer(with_trade_off(result), print_design, as_json=as_json)
 
 
 def margin(
@@ -47,12 +50,15 @@ def margin(
         Path,
         typer.Argument(
             metavar="MODEL.json|SCENARIO.toml",
-            help="matrices and delays of any linear loop, or of one sampled and held (see docs/models), or a scenario",
+            help="any linear loop with delays, or one sampled and held (docs/reference/margin.md), or a scenario",
         ),
     ],
     as_json: AsJson = False,
 ) -> None:
-    """How much delay any linear loop takes, or that of a scenario: stability windows, margin, crossings."""
+    """Find how much delay a linear loop or a scenario takes.
+
+    Shows the delays at which it is stable, the margin, and where roots cross the stability boundary.
+    """
     from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario, print_margin
 
     found = margin_of_scenario(model_file) if model_file.suffix == ".toml" else margin_of_file(model_file)

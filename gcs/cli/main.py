@@ -5,6 +5,7 @@ Each command imports what it needs when it runs: cvxpy, rerun and matplotlib are
 
 import os
 import sys
+from typing import Annotated
 
 import typer
 
@@ -12,6 +13,7 @@ from gcs.cli import BAD_INPUT, FAILED, INTERRUPTED
 from gcs.cli.design import design, margin
 from gcs.cli.fly import fly, key
 from gcs.cli.runs import grade, recover, view
+from gcs.cli.scenarios import check, new, scenarios
 from gcs.cli.stress import stress
 from gcs.cli.studies import bench, capacity, compare, thesis
 from gcs.cli.watch import monitor, replay
@@ -19,20 +21,36 @@ from gcs.errors import InputError
 from gcs.output import DISK_FULL
 
 app = typer.Typer(
-    add_completion=False,
+    add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="Fly UAV formations over MAVLink and see how much link delay they can take.",
 )
 
 
+def _show_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"gcs {version('formation-gcs')}")
+        raise typer.Exit
+
+
 @app.callback(invoke_without_command=True)
-def help_without_command(context: typer.Context) -> None:
+def help_without_command(
+    context: typer.Context,
+    version: Annotated[  # noqa: ARG001 - its callback answers
+        bool, typer.Option("--version", help="print the version", callback=_show_version, is_eager=True)
+    ] = False,
+) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
 
-_COMMANDS = (fly, design, compare, margin, thesis, bench, capacity, grade, view, recover, key, stress, monitor, replay)
+_COMMANDS = (
+    *(scenarios, new, check, fly, design, compare, margin, thesis, bench, capacity, grade, view, recover, key, stress),
+    *(monitor, replay),
+)
 for _command in _COMMANDS:
     app.command()(_command)
 

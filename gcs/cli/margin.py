@@ -3,16 +3,18 @@
 The mathematics is in `gains.margin.loop_margin`.
 """
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 from gains.core.errors import BadModelError
-from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, as_known, loop_margin
+from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
 from gains.margin.model_file import DelayModel, Term, parse_model
 
 _ROWS = 20
@@ -25,7 +27,7 @@ class ModelFileError(BadModelError):
 
 @dataclass(frozen=True)
 class ScenarioMargin:
-    """The margin of the loop that a scenario flies, by the continuous model, and as flown: sampled and held."""
+    """The margin of the loop that a scenario flies: by the continuous model, and as flown, sampled and held."""
 
     margin: LoopMargin
     loop: str
@@ -35,7 +37,7 @@ class ScenarioMargin:
 def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
     """The margin of a JSON model.
 
-    Raises ModelFileError with one line: file, key, what was read and what was wanted; and DisagreementError if
+    Raises ModelFileError, whose one line names file, key, what was read and what was wanted, or DisagreementError if
     independent methods give different answers.
     """
     try:
@@ -75,43 +77,26 @@ def margin_of_scenario(file: Path) -> ScenarioMargin:
 
 
 def margin_fields(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> dict[str, Any]:
-    """The JSON of a margin: null for an unbounded number; what is not told of a crossing is left out."""
+    """The JSON of a margin: null for an unbounded number; a crossing has only the fields that are known."""
     if isinstance(found, ScenarioMargin):
         flown = {"loop": found.loop, "delay_margin_sampled_s": found.delay_margin_sampled_s}
         return margin_fields(found.margin) | flown
     if isinstance(found, LoopAtGivenDelays):
-        return {
-            "unknown": None,
+        unknown = dict.fromkeys(("unknown", "stable_intervals_s", "delay_margin_s", "delay_independent"))
+        return unknown | {
             "stable": found.is_stable,
             "rightmost_root": [found.rightmost_root.real, found.rightmost_root.imag],
             "unstable_roots_at_zero_delay": found.unstable_roots_at_zero_delay,
-            "stable_intervals_s": None,
-            "delay_margin_s": None,
-            "delay_independent": None,
             "crossings": [],
         }
-    fields: dict[str, Any] = asdict(found) | {"delay_independent": not isfinite(found.delay_margin_s)}
-    told = [{name: value for name, value in crossing.items() if value is not None} for crossing in fields["crossings"]]
-    return _plain(fields | {"crossings": told})
-
-
-def _plain(value: Any) -> Any:
-    match value:
-        case float():
-            return value if isfinite(value) else None
-        case dict():
-            return {name: _plain(inner) for name, inner in value.items()}
-        case list() | tuple():
-            return [_plain(inner) for inner in value]
-        case _:
-            return value
+    crossings = [{name: known for name, known in vars(c).items() if known is not None} for c in found.crossings]
+    fields = vars(found) | {"crossings": crossings, "delay_independent": not isfinite(found.delay_margin_s)}
+    return to_jsonable_python(fields, inf_nan_mode="null")
 
 
 def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None:
     """Print the verdict, the crossings and the notes."""
-    from rich.table import Table
-
-    from gcs.views.console import plain_console
+    from gcs.views.console import plain_console, table_of
 
     console = plain_console()
     if isinstance(found, LoopAtGivenDelays):
@@ -122,21 +107,22 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
     for line in _verdict_lines(margin):
         console.print(line)
     if margin.crossings:
-        unknown = "period s" if margin.unknown == "period" else "delay s"
-        table = Table(
-            "omega rad/s", unknown, "roots go", title="crossings of the stability boundary", title_justify="left"
-        )
-        for crossing in margin.crossings[:_ROWS]:
-            way = {1: "right: unstable", -1: "left: stable", 0: "touch"}[crossing.direction]
-            # both have about the same relative error
-            share = crossing.delay_error_s / max(crossing.delay_s, 1e-300)
-            omega = as_known(crossing.omega_rad_s, share * crossing.omega_rad_s)
-            table.add_row(omega, as_known(crossing.delay_s, crossing.delay_error_s), way)
-        console.print(table)
+        columns: dict[str, Callable[[MarginCrossing], str]] = {
+            "omega rad/s": _omega,
+            "period s" if margin.unknown == "period" else "delay s": lambda c: as_known(c.delay_s, c.delay_error_s),
+            "roots go": lambda c: {1: "right: unstable", -1: "left: stable", 0: "touch"}[c.direction],
+        }
+        console.print(table_of(margin.crossings[:_ROWS], columns, title="crossings of the stability boundary"))
         if len(margin.crossings) > _ROWS:
             console.print(f"and {len(margin.crossings) - _ROWS} more crossings")
     for note in margin.notes:
         console.print(note)
+
+
+def _omega(crossing: MarginCrossing) -> str:
+    """The frequency, which has about the same relative error as the delay."""
+    share = crossing.delay_error_s / max(crossing.delay_s, 1e-300)
+    return as_known(crossing.omega_rad_s, share * crossing.omega_rad_s)
 
 
 def _verdict_lines(margin: LoopMargin) -> list[str]:

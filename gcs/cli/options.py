@@ -21,26 +21,28 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-
 Loop = Literal["ground", "onboard"]
 """Where the loop is closed, as `control.loop` of a scenario."""
-ScenarioFile = Annotated[Path, typer.Argument(metavar="SCENARIO", help="scenario file, as scenarios/triangle5.toml")]
+ScenarioFile = Annotated[
+    Path, typer.Argument(metavar="SCENARIO", help="scenario file, or the name of one that ships (see gcs scenarios)")
+]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="run folder")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
+OutFolder = Annotated[Path | None, typer.Option(metavar="DIR", help="new or empty folder; default runs/NAME-TIME")]
 AllowUnstable = Annotated[
     bool, typer.Option("--allow-unstable", help="accept gains whose loop is unstable without any delay")
 ]
 LoopOption = Annotated[
     Loop | None,
-    typer.Option("--loop", help="in place of the scenario's: own errors fed back by the station or on board"),
+    typer.Option("--loop", help="who closes the loop on a vehicle's own errors; default as in the scenario"),
 ]
 KeyFile = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="sign, and take only what is signed with this key (see gcs key)")
+    Path | None, typer.Option(metavar="FILE", help="sign, and accept only what is signed, with this key (gcs key)")
 ]
 
 
 def print_json(result: Any) -> None:
-    """Print a result as `--json` asks for it; records in it are written with their fields."""
+    """Print a result as JSON, with records as objects of their fields."""
 
     def fields(record: Any) -> Any:
         return record.to_dict() if hasattr(record, "to_dict") else asdict(record)
@@ -57,13 +59,17 @@ def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> 
 
 
 def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":
-    """The scenario in a file, with its loop closed elsewhere if `loop` is given.
+    """The scenario in a file, or the shipped one of that name; with `loop`, its loop is closed there instead.
 
     Raises scenarios.errors.ScenarioError if the file cannot be used, or not with this loop.
     """
     from scenarios.files import load, with_loop
+    from scenarios.shipped import located
 
-    scenario = load(file)
+    found = located(str(file))
+    if not found.exists():
+        raise InputError(f"{file}: read no such file, wanted a scenario file or the name of one (see gcs scenarios)")
+    scenario = load(found)
     return scenario if loop is None else with_loop(scenario, loop, file)
 
 
@@ -130,21 +136,21 @@ def address(option: str, text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def listening(option: str, text: str) -> "StationSocket":
-    """A socket that listens at the HOST:PORT given to an option."""
+def listening(option: str, text: str, guard: "Guard | None" = None) -> "StationSocket":
+    """A socket that listens at the HOST:PORT given to an option; with a guard, its frames are signed and verified."""
     from gcs.drive.udp import StationSocket
 
     host, port = address(option, text)
     try:
-        return StationSocket(host, port)
+        return StationSocket(host, port, guard)
     except OSError as error:
         raise InputError(f"{option}: {text}: {error.strerror}; wanted a free UDP port of this machine") from None
 
 
-def warn_if_open(link: "StationSocket", *, signed: bool) -> None:
+def warn_if_open(link: "StationSocket") -> None:
     """Warn of a socket that other machines can reach while nothing is signed."""
     host, port = link.address
-    if not signed and not ip_address(host).is_loopback:
+    if link.guard is None and not ip_address(host).is_loopback:
         text = "others can reach it and nothing is signed; gcs key FILE makes a key for --key"
         typer.echo(f"warning: {host}:{port} is open: {text}", err=True)
 
@@ -159,7 +165,7 @@ def opened_guard(key: Path | None, *, role: str) -> "Guard | None":
     return open_guard(key, epoch_ns=realtime_offset_ns(), role=role)
 
 
-def mirroring(text: str, link: "StationSocket", guard: "Guard | None", *, commands: bool) -> "Mirror":
+def mirroring(text: str, link: "StationSocket", *, commands: bool) -> "Mirror":
     """The mirror that --mirror HOST:PORT asks for; `link` is where this station itself listens."""
     from gcs.drive.mirror import Mirror
 
@@ -167,12 +173,13 @@ def mirroring(text: str, link: "StationSocket", guard: "Guard | None", *, comman
     if port == 0:
         raise InputError(f"--mirror: read {text}, wanted the port of a ground station")
     try:
-        mirror = Mirror(host, port, commands=commands, signed=guard and guard.mirror_link)
+        mirror = Mirror(host, port, commands=commands, signed=link.guard and link.guard.mirror_link)
     except OSError as error:
         raise InputError(f"--mirror: {text}: {error.strerror}; wanted the address of a ground station") from None
     (to_host, to_port), (own_host, own_port) = mirror.address, link.address
     here = to_host == own_host or (ip_address(own_host).is_unspecified and ip_address(to_host).is_loopback)
     if here and to_port == own_port:
-        mirror.close()
-        raise InputError(f"--mirror: read {text}, which is this station's own, wanted that of another ground station")
+        with mirror:
+            wanted = "wanted that of another ground station"
+            raise InputError(f"--mirror: read {text}, which is this station's own, {wanted}")
     return mirror

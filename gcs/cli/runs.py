@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 
 def grade(run: RunFolder, as_json: AsJson = False) -> None:
-    """How true a flight's latencies were, and how punctual its emulated links: errors against the truth log."""
+    """Compare a flight's latencies with the truth log.
+
+    Shows the errors of the measured latencies, and those of the emulated link delays.
+    """
     from gcs.runs.grade import grade as graded
 
     answer(graded(run), print_grade, as_json=as_json)
@@ -25,11 +28,8 @@ def print_grade(result: "Grade") -> None:
     from gcs.views.console import ms_text
 
     print(f"errors against the truth, {result.vehicles} vehicles, ms")
-    for title, own in (
-        ("loop delay, measured", result.loop_delay),
-        ("round trip, measured", result.rtt),
-        ("link delay, applied upwards", result.link_delay),
-    ):
+    titles = "loop delay, measured", "round trip, measured", "link delay, applied upwards"
+    for title, own in zip(titles, (result.loop_delay, result.rtt, result.link_delay), strict=True):
         errors_s = own.error_p50_s, own.error_p99_s, own.error_max_s
         p50, p99, largest = (ms_text(error_s, ".3f", unit="") for error_s in errors_s)
         print(f"{title:<28} p50 {p50}  p99 {p99}  max {largest}  of {own.samples}")
@@ -37,14 +37,17 @@ def print_grade(result: "Grade") -> None:
 
 def view(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="run folder, or a .rrd file")],
-    picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="write a picture; open no window")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="write a picture instead of opening a window")
+    ] = None,
     at: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="scenario time of the picture; 10, or the end if sooner")
+        float | None,
+        typer.Option(metavar="SECONDS", help="scenario time of the picture; default 10, or the end if sooner"),
     ] = None,
 ) -> None:
-    """Open a recording in the Rerun viewer, or write a picture of it, which needs no screen.
+    """Open a recording in Rerun, or write a picture of it, which needs no screen.
 
-    Exit code 1 if a view of the picture reports a fault.
+    Exit code 1 if the viewer reports a fault in the picture.
     """
     from gcs.views.viewer import find_recording, picture_time_s, screenshot
     from gcs.views.viewer import view as open_viewer
@@ -67,7 +70,10 @@ def view(
 
 
 def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run that was killed")]) -> None:
-    """Finish the files of a run whose processes were killed: ticks.parquet, summary.json, flight.rrd."""
+    """Finish the files of a run whose processes were killed.
+
+    Writes ticks.parquet, summary.json and flight.rrd.
+    """
     from gcs.views.observer import recover_run
     from gcs.views.report import print_summary
 

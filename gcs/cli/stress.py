@@ -6,8 +6,7 @@ The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
 import contextlib
 import itertools
 import os
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,6 +18,7 @@ from gcs.cli.options import (
     AsJson,
     Loop,
     LoopOption,
+    OutFolder,
     ScenarioFile,
     answer,
     load_scenario,
@@ -38,232 +38,194 @@ if TYPE_CHECKING:
     from gcs.stress.study import Onset, Study
     from gcs.stress.trial import Outcome
 
-RESULT_FILE = "stress.json"
-SCENARIO_FILE = "scenario.toml"
-
-
-@dataclass(frozen=True)
-class StressOptions:
-    """The options of a campaign, as `stress` documents them."""
-
-    scenario_file: Path
-    loop: Loop | None
-    axes: tuple[tuple[str, str], ...]
-    onset: bool
-    tolerance: float
-    seeds: int
-    workers: int
-    dask: str
-    resume: bool
-    real_time: bool
-    assert_onset: float | None
+_AXIS = "FROM:TO:N"
 
 
 def stress(
     scenario_file: ScenarioFile,
-    delay: Annotated[
-        str,
-        typer.Option(
-            metavar="FROM:TO:N",
-            help="total link delay in s, up + down (the loop delay is this and the waiting for the control tick)",
-        ),
-    ] = "",
+    delay: Annotated[str, typer.Option(metavar=_AXIS, help="link delay in s, up + down")] = "",
     delay_of: Annotated[
-        list[str] | None, typer.Option(metavar="ID=FROM:TO:N", help="total link delay in s of one vehicle; repeatable")
+        list[str] | None, typer.Option(metavar=f"ID={_AXIS}", help="link delay in s of one vehicle; repeatable")
     ] = None,
     jitter: Annotated[
-        str, typer.Option(metavar="FROM:TO:N", help="jitter each way in s: half width, or scale of the link's own kind")
+        str, typer.Option(metavar=_AXIS, help="scale of the jitter in s, each way; uniform on links without jitter")
     ] = "",
-    loss: Annotated[str, typer.Option(metavar="FROM:TO:N", help="fraction of the datagrams lost, each way")] = "",
-    rate: Annotated[
-        str, typer.Option(metavar="FROM:TO:N", help="control rate in Hz, with the gains designed for the scenario's")
-    ] = "",
+    loss: Annotated[str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way")] = "",
+    rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
     loop: LoopOption = None,
-    onset: Annotated[bool, typer.Option("--onset", help="find the delay at which it breaks")] = False,
+    onset: Annotated[bool, typer.Option("--onset", help="find the delay at which the formation breaks")] = False,
     tolerance: Annotated[
-        float, typer.Option(metavar="FRACTION", help="half width of the last round of flights around the onset")
+        float, typer.Option(metavar="FRACTION", help="how close to the onset the last flights are")
     ] = 0.02,
-    seeds: Annotated[
-        int, typer.Option(metavar="N", min=1, help="flights at each point, each with a seed of its own")
-    ] = 1,
+    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights at each point, each with its own seed")] = 1,
     workers: Annotated[
         int,
-        typer.Option(metavar="N", min=0, show_default=False, help="processes; default all processors, 1 in real time"),
+        typer.Option(metavar="N", min=0, show_default=False, help="processes; default one per processor, real time 1"),
     ] = 0,
     dask: Annotated[str, typer.Option(metavar="ADDRESS", help="fly on the workers of this Dask scheduler")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="resume the campaign in --out")] = False,
     trial: Annotated[
-        str, typer.Option(metavar="ID", help="fly one trial of the campaign in --out again, with a recording")
+        str, typer.Option(metavar="ID", help="fly one trial of the campaign in --out again and record it")
     ] = "",
-    real_time: Annotated[bool, typer.Option("--real-time", help="over UDP, in processes, on the real clock")] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", help="fly over UDP on the real clock")] = False,
     assert_onset: Annotated[
         float | None,
-        typer.Option(metavar="FRACTION", help="exit 1 if onset and margin differ by more; implies --onset"),
+        typer.Option(metavar="FRACTION", help="exit with 1 if onset and margin differ by more; implies --onset"),
     ] = None,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/<scenario>-stress-<time>")] = None,
+    out: OutFolder = None,
     as_json: AsJson = False,
 ) -> None:
-    """Turn the link delay up until the formation breaks, and compare with the margin.
+    """Raise the link delay until the formation breaks.
 
-    An axis (--delay, --delay-of, --jitter, --loss, --rate) is FROM:TO:N, N values with the ends, or a list as
-    0.1,0.2,0.4. One axis is a sweep, two make a map.
+    --delay, --delay-of, --jitter, --loss and --rate take FROM:TO:N (N values, ends included) or a list (0.1,0.2,0.4).
+    One of them makes a sweep, two make a map. The loop delay is the link delay plus the wait for the control tick. The
+    measured onset is compared with the delay margin.
 
-    Exit code 1 if --assert-onset is missed, a trial failed, or one flown again is not the same.
+    Exit code 1 if --assert-onset is missed, a trial failed, or a trial flown again differs.
     """
-    named = [("delay", delay), *(("delay_of", text) for text in delay_of or ())]
-    named += [("jitter", jitter), ("loss", loss), ("rate", rate)]
-    options = StressOptions(
-        scenario_file=scenario_file,
-        loop=loop,
-        axes=tuple((name, text) for name, text in named if text),
-        onset=onset or assert_onset is not None,
-        tolerance=tolerance,
-        seeds=seeds,
-        workers=workers,
-        dask=dask,
-        resume=resume,
-        real_time=real_time,
-        assert_onset=assert_onset,
-    )
-    _check(options, out, trial)
+    options = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
+    given = [(option, text) for option, texts in options.items() for text in texts or () if text]
+    onset = onset or assert_onset is not None
+    if (trial or resume) and (out is None or not out.is_dir()):
+        flag = "--trial" if trial else "--resume"
+        raise InputError(f"--out: read {out}, wanted the folder of a campaign, as {flag} is given")
+    if not (trial or onset or given):
+        raise InputError("nothing to fly; wanted --onset, or an axis as --delay 0:0.6:13")
+    if len(given) > 2:
+        raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
+    for name, value in (("--tolerance", tolerance), ("--assert-onset", assert_onset)):
+        if value is not None and not 0.0 < value < 1.0:
+            raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, as 0.02")
     outlive_readers()
     if junit is not None:
         out_file("--junit", junit)
-    from gcs.cli.stress_output import print_result, write_junit
+    from gcs.cli.stress_output import print_reflown, print_result, write_junit
+    from gcs.drive.preflight import endless_link
+    from gcs.stress.axes import parse_axis
+    from gcs.stress.refly import refly
 
+    study, design = _study(scenario_file, loop, real_time=real_time)
     if trial:
         assert out is not None
-        raise typer.Exit(_refly(options, out, trial, as_json=as_json))
-    result, folder = _campaign(options, out, shown=not as_json)
+        reflown = refly(study, out, trial)
+        typer.echo(reflown.outcome.to_json()) if as_json else print_reflown(reflown)
+        raise typer.Exit(FAILED if reflown.outcome.error is not None or reflown.differs else 0)
+    axes = [parse_axis(option, text, study.plan.formation.system_ids) for option, text in given]
+    refuse(scenario_file, *(endless_link(one.scenario) for one in (study.sweep(axes, seeds=1) if axes else [])))
+    result, folder = _campaign(
+        study,
+        design,
+        axes,
+        # flights in real time disturb each other: one at a time unless the user knows better
+        _workers(dask, workers or (1 if real_time else len(os.sched_getaffinity(0)))),
+        out,
+        resume=resume,
+        seeds=seeds,
+        tolerance=tolerance if onset else None,
+        allowed=assert_onset,
+        shown=not as_json,
+    )
     if junit is not None:
         write_junit(result, junit)
     answer(result, partial(print_result, folder=folder), as_json=as_json)
     raise typer.Exit(0 if result.passed else FAILED)
 
 
-def _check(options: StressOptions, out: Path | None, trial: str) -> None:
-    """Refuse combinations of options that contradict each other."""
-    if (trial or options.resume) and (out is None or not out.is_dir()):
-        flag = "--trial" if trial else "--resume"
-        raise InputError(f"--out: read {out}, wanted the folder of a campaign, as {flag} is given")
-    if not (trial or options.onset or options.axes):
-        raise InputError("nothing to fly; wanted --onset, or an axis as --delay 0:0.6:13")
-    if len(options.axes) > 2:
-        raise InputError(f"read {len(options.axes)} axes, wanted one (a sweep) or two (a map)")
-    for name, value in (("--tolerance", options.tolerance), ("--assert-onset", options.assert_onset)):
-        if value is not None and not 0.0 < value < 1.0:
-            raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, as 0.02")
+def _study(file: Path, loop: Loop | None, *, real_time: bool) -> "tuple[Study, Design]":
+    from gcs.drive.preflight import bad_start, unstable_loop
+    from gcs.plan.planner import flight_plan
+    from gcs.stress.study import Study
+
+    scenario = load_scenario(file, loop)
+    if scenario.dynamics == "autopilot":
+        wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
+        raise InputError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
+    # a campaign does not fly the slower gains of the schedule, so they need not be designed
+    refuse(file, bad_start(scenario))
+    design, plan = flight_plan(scenario.with_calm_monitor())
+    refuse(file, unstable_loop(plan))
+    return Study(plan, real_time=real_time), design
 
 
-def _campaign(options: StressOptions, out: Path | None, *, shown: bool) -> "tuple[CampaignResult, Path]":
-    """Fly the campaign; returns its result, and the folder that holds it."""
+def _workers(dask: str, count: int) -> "contextlib.AbstractContextManager[Fly]":
+    from gcs.stress.campaign import dask_workers, local_workers
+
+    return dask_workers(dask) if dask else local_workers(count)
+
+
+def _campaign(
+    study: "Study",
+    design: "Design",
+    axes: "list[Axis]",
+    workers: "contextlib.AbstractContextManager[Fly]",
+    out: Path | None,
+    *,
+    resume: bool,
+    seeds: int,
+    tolerance: float | None,
+    allowed: float | None,
+    shown: bool,
+) -> "tuple[CampaignResult, Path]":
+    """Fly the sweep over the axes and, with a tolerance, search for the onset; the result, and its folder."""
     from gcs.drive.fly import new_folder
-    from gcs.runs.record import write_whole
+    from gcs.runs.record import SCENARIO_FILE, write_whole
     from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
     from gcs.stress.report import result_of, write_report
     from gcs.stress.study import NoOnset, find_onset
     from scenarios.files import dump
 
-    study, design = _study(options)
     scenario = dump(study.plan.scenario)
-    if options.resume:
+    if resume:
         assert out is not None
         check_campaign(out, "--resume", scenario)
-    axes = _axes(options, study)
-    onset: Onset | None = None
-    no_onset: NoOnset | None = None
+    sweep: list[Outcome] = []
+    onset: Onset | NoOnset | None = None
     with raised(), contextlib.ExitStack() as stack:
-        fly = stack.enter_context(_workers(options))
+        fly = stack.enter_context(workers)
         if out is None:
             folder = new_folder(f"{study.plan.scenario.name}-stress")
         else:
-            folder = out if options.resume else out_folder(out, "a new or empty folder, or --resume")
+            folder = out if resume else out_folder(out, "a new or empty folder, or --resume")
         write_whole(folder / SCENARIO_FILE, scenario.encode())
         store = stack.enter_context(contextlib.closing(Store(folder)))
         progress = stack.enter_context(_progress(shown))
         try:
-            sweep: list[Outcome] = []
             if axes:
-                trials = study.sweep(axes, seeds=options.seeds)
+                trials = study.sweep(axes, seeds=seeds)
                 sweep = run_campaign(trials, store, fly, ended=progress("flights", len(trials)))
-            if options.onset:
-                ended = progress("onset", None)
-                try:
-                    onset = find_onset(
-                        study, lambda trials: run_campaign(trials, store, fly, ended=ended), tolerance=options.tolerance
-                    )
-                except NoOnset as reason:
-                    no_onset = reason
+            if tolerance is not None:
+                run = partial(run_campaign, store=store, fly=fly, ended=progress("onset", None))
+                onset = find_onset(study, run, tolerance=tolerance)
+        except NoOnset as reason:
+            onset = reason
         except KeyboardInterrupt:
             typer.echo(store.resume, err=True)
             raise
-        outcomes = list(store.outcomes.values())
-        write_parquet(outcomes, folder)
-    allowed = options.assert_onset
-    result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, no_onset=no_onset, allowed=allowed)
-    write_whole(folder / RESULT_FILE, result.to_json().encode())
+    outcomes = list(store.outcomes.values())
+    write_parquet(outcomes, folder)
+    result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, allowed=allowed)
     write_report(folder, result, study=study, axes=axes)
     return result, folder
 
 
-def _study(options: StressOptions) -> "tuple[Study, Design]":
-    from gcs.drive.preflight import bad_start, unstable_loop
-    from gcs.plan.planner import flight_plan
-    from gcs.stress.study import Study
-
-    scenario = load_scenario(options.scenario_file, options.loop)
-    if scenario.dynamics == "autopilot":
-        wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
-        raise InputError(f"{options.scenario_file}: dynamics: read 'autopilot', wanted {wanted}")
-    # a campaign does not fly the slower gains of the schedule, so they need not be designed
-    refuse(options.scenario_file, bad_start(scenario))
-    design, plan = flight_plan(scenario.with_calm_monitor())
-    refuse(options.scenario_file, unstable_loop(plan))
-    return Study(plan, real_time=options.real_time), design
-
-
-def _axes(options: StressOptions, study: "Study") -> "list[Axis]":
-    from gcs.stress.axes import AxisError, parse_axis, parse_vehicle_axis
-
-    ids = study.plan.formation.system_ids
-    axes: list[Axis] = []
-    for name, text in options.axes:
-        try:
-            axes.append(parse_vehicle_axis(text, ids) if name == "delay_of" else parse_axis(name, text))
-        except AxisError as error:
-            raise InputError(f"--{name.replace('_', '-')}: {error}") from None
-    return axes
-
-
-def _workers(options: StressOptions) -> "contextlib.AbstractContextManager[Fly]":
-    from gcs.stress.campaign import dask_workers, local_workers
-
-    # flights in real time disturb each other: one at a time unless the user knows better
-    count = options.workers or (1 if options.real_time else len(os.sched_getaffinity(0)))
-    return dask_workers(options.dask) if options.dask else local_workers(count)
-
-
 @contextlib.contextmanager
-def _progress(shown: bool) -> Generator[Any]:
+def _progress(shown: bool) -> "Generator[Callable[[str, int | None], Callable[[Outcome, int], None]]]":
     """While entered, provides a function (name, total or None) -> callback that advances a progress bar."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress
 
     from gcs.views.console import plain_console
 
     console = plain_console(stderr=True, soft_wrap=False)
     columns = (
-        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as bar:
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
+    )
+    with progress.Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as bar:
 
         def begin(name: str, total: int | None) -> Any:
             task = bar.add_task(name, total=total)
@@ -276,17 +238,3 @@ def _progress(shown: bool) -> Generator[Any]:
             return ended
 
         yield begin
-
-
-def _refly(options: StressOptions, folder: Path, wanted: str, *, as_json: bool) -> int:
-    """Fly a stored trial again, print how it went, and return the exit code."""
-    from gcs.cli.stress_output import print_reflown
-    from gcs.stress.refly import refly
-
-    study, _ = _study(options)
-    reflown = refly(study, folder, wanted, real_time=options.real_time)
-    if as_json:
-        typer.echo(reflown.outcome.to_json())
-    else:
-        print_reflown(reflown)
-    return FAILED if reflown.outcome.error is not None or reflown.differs else 0

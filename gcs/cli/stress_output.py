@@ -1,26 +1,25 @@
 """What `gcs stress` prints, and the JUnit XML it writes for CI."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from gcs.stress.axes import place_text
 from gcs.stress.refly import Reflown
-from gcs.stress.report import MOST_ROWS, REPORT_FILE, CampaignResult, Noise, refly_command
+from gcs.stress.report import MOST_ROWS, REPORT_FILE, RESULT_FILE, CampaignResult, Noise, refly_command
 from gcs.stress.trial import Outcome
-from gcs.views.console import UNKNOWN, ms_text, plain_console
+from gcs.views.console import UNKNOWN, ms_text, plain_console, table_of
 from gcs.views.console import number_text as _number
 
 _ms = partial(ms_text, form=".2f")
 _FILE_WIDTH = 120
 _ID = 8
 """Characters of an id that are shown; `--trial` accepts the beginning of an id."""
+_KINDS = {"probe": "probes with small errors", "own": "flights from the scenario's initial states"}
 
 
 def print_result(result: CampaignResult, folder: Path) -> None:
@@ -28,12 +27,12 @@ def print_result(result: CampaignResult, folder: Path) -> None:
     console = plain_console()
     if not console.is_terminal:
         console.width = _FILE_WIDTH
-    onset, margin_s = result.onset, result.delay_margin_s
+    onset, margin_s, points = result.onset, result.delay_margin_s, result.points
     console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
-    console.print(f"trials   {result.trials}: {_kinds(result.trials_of_kind)}")
+    kinds = ", ".join(f"{count} {_KINDS[kind]}" for kind, count in sorted(result.trials_of_kind.items(), reverse=True))
+    console.print(f"trials   {result.trials}: {kinds}")
     if onset is not None:
-        frequency_rad_s = onset.frequency_rad_s
-        breaks = "" if frequency_rad_s is None else f"; breaks at {frequency_rad_s:.2f} rad/s"
+        breaks = "" if onset.frequency_rad_s is None else f"; breaks at {onset.frequency_rad_s:.2f} rad/s"
         console.print(
             f"onset    {_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms in flight, "
             f"{onset.difference:+.3%} from the sampled margin of this loop, {_ms(onset.predicted_s)}; "
@@ -50,27 +49,20 @@ def print_result(result: CampaignResult, folder: Path) -> None:
         console.print(f"curve    measured and predicted growth differ by at most {result.curve_error:.3%} of the range")
     if result.past_limits:
         console.print(
-            f"limits   the links alone push vehicles past [limits] in {result.past_limits} probes, which are flown "
-            "without; where limits bind, errors last that the loop alone would bring down",
+            f"limits   the links alone push vehicles past [limits] in {result.past_limits} probes, which fly without "
+            "limits; where limits bind, errors persist that the loop alone would bring down",
             markup=False,
         )
     _print_noise(console, result.noise)
-    points = [point for point in result.points if point.kind == "probe"] or result.points
-    if points:
-        console.print(_table(points))
+    if points := [point for point in points if point.kind == "probe"] or points:
+        console.print(table_of(points[:MOST_ROWS], _columns(list(points[0].coordinates)), dense=True))
     for failed in result.trials_failed:
         console.print(f"failed   {failed.id}, seed {failed.seed}, {place_text(failed.coordinates)}: {_fault(failed)}")
-    console.print(f"files    {folder}: {REPORT_FILE}, stress.json, trials.jsonl, trials.parquet")
+    console.print(f"files    {folder}: {REPORT_FILE}, {RESULT_FILE}, trials.jsonl, trials.parquet")
     if result.worst:
         console.print(f"again    {refly_command(folder, result.worst[0])}")
     if result.failure:
         console.print(Text.assemble(("failed", "bold red"), f"   {result.failure}"))
-
-
-def _kinds(trials_of_kind: dict[str, int]) -> str:
-    """How many trials of each kind."""
-    words = {"probe": "probes with small errors", "own": "flights from the scenario's initial states"}
-    return ", ".join(f"{trials_of_kind[kind]} {text}" for kind, text in words.items() if kind in trials_of_kind)
 
 
 def _print_noise(console: Console, noise: Noise | None) -> None:
@@ -85,22 +77,16 @@ def _print_noise(console: Console, noise: Noise | None) -> None:
     )
 
 
-def _table(points: Sequence[Outcome]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    names = list(points[0].coordinates)
-    for name in ("trial", *names, "loop, ms", "growth, 1/s", "±", "model", "verdict"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for point in points[:MOST_ROWS]:
-        table.add_row(
-            point.id[:_ID],
-            *(f"{point.coordinates[name]:g}" for name in names),
-            _ms(point.loop_delay_s, unit=""),
-            _number(point.growth_1_s),
-            _number(point.growth_error_1_s, "0.1g"),
-            _number(point.predicted_growth_1_s),
-            point.verdict or UNKNOWN,
-        )
-    return table
+def _columns(axes: list[str]) -> dict[str, Callable[[Outcome], str]]:
+    return {
+        "trial": lambda point: point.id[:_ID],
+        **{name: lambda point, name=name: f"{point.coordinates[name]:g}" for name in axes},
+        "loop, ms": lambda point: _ms(point.loop_delay_s, unit=""),
+        "growth, 1/s": lambda point: _number(point.growth_1_s),
+        "±": lambda point: _number(point.growth_error_1_s, "0.1g"),
+        "model": lambda point: _number(point.predicted_growth_1_s),
+        "verdict": lambda point: point.verdict or UNKNOWN,
+    }
 
 
 def print_reflown(reflown: Reflown) -> None:

@@ -1,32 +1,33 @@
 """`gcs compare`, `thesis`, `bench` and `capacity`; what they print is in `gcs.cli.study_output`."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from gcs.cli import FAILED
-from gcs.cli.options import AsJson, ScenarioFile, answer, load_scenario, print_json, run_folder
+from gcs.cli.options import AsJson, OutFolder, ScenarioFile, answer, load_scenario, print_json, refuse, run_folder
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
 
 def compare(
     scenario_file: ScenarioFile,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/<scenario>-compare-<time>")] = None,
+    out: OutFolder = None,
     sizes: Annotated[bool, typer.Option(help="also time designs of growing chains")] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Design and fly a scenario by the inclusion principle and on the graph, side by side: figures, a page, JSON.
+    """Design and fly a scenario by every method, side by side.
 
     Exit code 1 if no route could be designed.
     """
     from gcs.cli.study_output import print_comparison
+    from gcs.drive.preflight import bad_start, endless_link
     from gcs.studies import compare as comparing
     from gcs.studies.compare_cost import design_costs
 
     outlive_readers()
     scenario = load_scenario(scenario_file)
+    refuse(scenario_file, bad_start(scenario), endless_link(scenario))
     folder = run_folder(out, f"{scenario.name}-compare")
     routes, flights = comparing.compare(scenario)
     grown = design_costs() if sizes else []
@@ -40,10 +41,10 @@ def compare(
 
 
 def thesis(
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="default runs/thesis-<time>")] = None,
+    out: OutFolder = None,
     as_json: AsJson = False,
 ) -> None:
-    """Reproduce the figures and numbers of the source, published and computed side by side."""
+    """Reproduce the source: published and computed figures side by side."""
     from gcs.studies import thesis as source
 
     folder = run_folder(out, "thesis")
@@ -61,23 +62,28 @@ def thesis(
 def bench(
     scenario_file: ScenarioFile,
     vehicles: Annotated[
-        int, typer.Option(metavar="N", min=0, max=250, help="as many vehicles instead, in columns behind a leader")
+        int, typer.Option(metavar="N", min=0, max=250, help="number of vehicles, in columns behind a leader")
     ] = 0,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, max=86400, help="flight time of each flight")] = 8.0,
-    repeat: Annotated[int, typer.Option(metavar="N", min=1, help="flights; the fastest counts")] = 10,
+    repeat: Annotated[int, typer.Option(metavar="N", min=1, help="number of flights; the fastest counts")] = 10,
     real_time: Annotated[
-        bool, typer.Option("--real-time", help="one flight over UDP instead: is it punctual, are its latencies true?")
+        bool, typer.Option("--real-time", help="fly once over UDP: punctuality, and errors of the measured latencies")
     ] = False,
     signed: Annotated[bool, typer.Option("--signed", help="also measure what signing costs")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """How much faster than real time flights are computed, and what the station takes of its control period."""
+    """Measure how much faster than real time flights are computed.
+
+    Also measures how much of its control period the station needs.
+    """
     from gcs.cli.study_output import print_benchmark, print_real_time
+    from gcs.drive.preflight import bad_start, endless_link
     from gcs.studies import benchmark
 
     scenario = load_scenario(scenario_file)
     if vehicles:
         scenario = benchmark.with_vehicles(scenario, vehicles)
+    refuse(scenario_file, bad_start(scenario), endless_link(scenario))
     if real_time:
         answer(benchmark.benchmark_real_time(scenario, seconds=seconds), print_real_time, as_json=as_json)
     else:
@@ -89,10 +95,13 @@ def capacity(
     scenario_file: ScenarioFile,
     rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
     most: Annotated[int, typer.Option(metavar="N", min=2, max=250, help="largest formation tried")] = 100,
-    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights of each formation; it is carried in all")] = 3,
+    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights of each formation; all must hold")] = 3,
     as_json: AsJson = False,
 ) -> None:
-    """How many vehicles, at which rate, the scenario's links carry before the delay margin is gone."""
+    """Find how many vehicles the links carry at each rate.
+
+    The links carry a formation if its loop delay stays within the delay margin.
+    """
     from gcs.cli.study_output import print_capacity
     from gcs.studies.capacity import capacity as capacity_of
 

@@ -1,18 +1,15 @@
 """What `gcs compare`, `bench` and `capacity` print."""
 
 import os
+from collections.abc import Callable
 from shutil import which
-from typing import Any
-
-from rich import box
-from rich.table import Table
 
 from gcs.cli.runs import print_grade
-from gcs.runs.grade import Grade
+from gcs.studies.benchmark import Benchmark, RealTimeBenchmark
 from gcs.studies.capacity import FEWEST, Capacity, Load
 from gcs.studies.compare import Route, rows
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
-from gcs.views.console import number_text, plain_console
+from gcs.views.console import ms_text, plain_console, table_of
 from scenarios.schema import Scenario
 
 _WHOLE_CORE = 0.95
@@ -22,23 +19,22 @@ _WHOLE_CORE = 0.95
 def print_comparison(scenario: Scenario, routes: list[Route], grown: list[DesignCost]) -> None:
     """Print each route's figures side by side, and what designs cost as the formation grows."""
     console = plain_console()
+    columns: dict[str, Callable[[tuple[str, list[str]]], str]] = {"": lambda row: row[0]}
+    columns |= {route.method: lambda row, k=k: row[1][k] for k, route in enumerate(routes)}
     title = f"{scenario.name}: designed for what it asks for, flown over its links"
-    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="")
-    for heading in ("", *(route.method for route in routes)):
-        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
-    for title, texts in rows(routes):
-        table.add_row(title, *texts)
-    console.print(table)
+    console.print(table_of(rows(routes), columns, title=title))
     for route in routes:
         if route.failed:
             console.print(f"{route.method}: {route.failed}")
     if grown:
-        table = Table(box=box.SIMPLE_HEAD)
-        for heading in ("design of a chain", "vehicles", "free gains an axis", "time, s", RATIO):
-            table.add_column(heading, justify="right", no_wrap=not table.columns)
-        for size, ratio in zip(grown, ratios(grown), strict=True):
-            table.add_row(size.method, str(size.vehicles), str(size.free_gains), f"{size.design_s:.3f}", f"{ratio:.2f}")
-        console.print(table)
+        costs: dict[str, Callable[[tuple[DesignCost, float]], str]] = {
+            "design of a chain": lambda row: row[0].method,
+            "vehicles": lambda row: str(row[0].vehicles),
+            "free gains an axis": lambda row: str(row[0].free_gains),
+            "time, s": lambda row: f"{row[0].design_s:.3f}",
+            RATIO: lambda row: f"{row[1]:.2f}",
+        }
+        console.print(table_of(zip(grown, ratios(grown), strict=True), costs))
         for line in left_out(grown):
             console.print(line)
 
@@ -46,14 +42,9 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Design
 def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
     """Print, for each rate, the largest formation that is carried and the next, which is not."""
     console = plain_console()
-    table = Table(box=box.SIMPLE_HEAD, title=f"{scenario.name}: what its links carry", title_justify="left")
-    for heading in ("Hz", "UAVs", "loop delay, ms\np50  p99", "margin\nms", "byte/s", "lost, %\nup  down", ""):
-        table.add_column(heading, justify="right", no_wrap=True, min_width=4)
-    for capacity in found:
-        for load in (capacity.most, capacity.next):
-            if load is not None:
-                table.add_row(*_row(load), style="" if load.holds else "dim")
-    console.print(table)
+    loads = [load for capacity in found for load in (capacity.most, capacity.next) if load is not None]
+    title = f"{scenario.name}: what its links carry"
+    console.print(table_of(loads, _LOAD_COLUMNS, title=title, is_dim=lambda load: not load.holds))
     for capacity in found:
         if capacity.failed:
             console.print(f"{capacity.rate_hz:g} Hz: {capacity.failed}")
@@ -61,54 +52,58 @@ def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
             console.print(f"{capacity.rate_hz:g} Hz: not even {FEWEST} vehicles")
 
 
-def _row(load: Load) -> list[str]:
-    def ms(value: float | None) -> str:
-        return number_text(None if value is None else 1e3 * value, ".0f")
+def _ms(seconds: float | None) -> str:
+    return ms_text(seconds, ".0f", unit="")
 
+
+def _outcome(load: Load) -> str:
     gone = load.headroom_p01 is None or load.headroom_p01 <= 0.0
-    return [
-        f"{load.rate_hz:g}",
-        str(load.vehicles),
-        f"{ms(load.loop_delay_p50_s)}  {ms(load.loop_delay_p99_s)}",
-        ms(load.delay_margin_s),
-        f"{load.station_bytes_s:.0f}",
-        f"{100.0 * load.lost_up:.1f}  {100.0 * load.lost_down:4.1f}",
-        "holds" if load.holds else "margin gone" if gone else load.reason,
-    ]
+    return "holds" if load.holds else "margin gone" if gone else load.reason
 
 
-def print_benchmark(result: dict[str, Any]) -> None:
+_LOAD_COLUMNS: dict[str, Callable[[Load], str]] = {
+    "Hz": lambda load: f"{load.rate_hz:g}",
+    "UAVs": lambda load: str(load.vehicles),
+    "loop delay, ms\np50  p99": lambda load: f"{_ms(load.loop_delay_p50_s)}  {_ms(load.loop_delay_p99_s)}",
+    "margin\nms": lambda load: _ms(load.delay_margin_s),
+    "byte/s": lambda load: f"{load.station_bytes_s:.0f}",
+    "lost, %\nup  down": lambda load: f"{100.0 * load.lost_up:.1f}  {100.0 * load.lost_down:4.1f}",
+    "": _outcome,
+}
+
+
+def print_benchmark(result: Benchmark) -> None:
     """Print how much faster than real time flights are, and the station's share of its period."""
-    how = "compiled" if result["compiled"] else "interpreted"
-    print(f"{result['vehicles']} vehicles at {result['control_hz']:g} Hz, one core, hot path {how}")
+    how = "compiled" if result.compiled else "interpreted"
+    print(f"{result.vehicles} vehicles at {result.control_hz:g} Hz, one core, hot path {how}")
     print(
-        f"virtual time    {result['real_time_factor']:.3g} times real time "
-        f"(best of {result['flights']}; median {result['real_time_factor_p50']:.3g})"
+        f"virtual time    {result.real_time_factor:.3g} times real time "
+        f"(best of {result.flights}; median {result.real_time_factor_p50:.3g})"
     )
-    if result["core_share"] < _WHOLE_CORE:
-        whole = result["real_time_factor"] / result["core_share"]
-        print(f"                with {result['core_share']:.0%} of a core; {whole:.3g} times with all of it")
+    if result.core_share < _WHOLE_CORE:
+        whole = result.real_time_factor / result.core_share
+        print(f"                with {result.core_share:.0%} of a core; {whole:.3g} times with all of it")
     print(
-        f"station alone   {1e6 * result['station_s_per_tick']:.0f} µs a tick, "
-        f"{100 * result['station_share_of_period']:.1f} % of its period"
+        f"station alone   {1e6 * result.station_s_per_tick:.0f} µs a tick, "
+        f"{100 * result.station_share_of_period:.1f} % of its period"
     )
-    if (cost := result["signed"]) is not None:
+    if (cost := result.signed) is not None:
         print(
-            f"signed          takes {cost['time_ratio']:.2f} times as long (median {cost['time_ratio_p50']:.2f}), "
-            f"the station {cost['station_time_ratio']:.2f} times (median {cost['station_time_ratio_p50']:.2f})"
+            f"signed          takes {cost.time_ratio:.2f} times as long (median {cost.time_ratio_p50:.2f}), "
+            f"the station {cost.station_time_ratio:.2f} times (median {cost.station_time_ratio_p50:.2f})"
         )
-    if not result["compiled"]:
+    if not result.compiled:
         first = "" if which(os.environ.get("CC", "cc")) else "install a C compiler, then "
         print(f"twice as fast:  {first}python3 make.py compile")
 
 
-def print_real_time(result: dict[str, Any]) -> None:
+def print_real_time(result: RealTimeBenchmark) -> None:
     """Print how punctual the station was, and the errors of its measurements."""
-    control = result["control"]
-    late = control["lateness_s"]
-    print(f"{result['reason']}; load {result['load_average']:.1f}, {result['steal_share']:.1%} taken by the host")
+    control = result.control
+    p50, p99 = (ms_text(late_s, ".3f") for late_s in (control.lateness_s.p50, control.lateness_s.p99))
+    print(f"{result.reason}; load {result.load_average:.1f}, {result.steal_share:.1%} taken by the host")
     print(
-        f"set-points sent after they were due: p50 {1e3 * late['p50']:.3f} ms, p99 {1e3 * late['p99']:.3f} ms, "
-        f"{control['deadline_misses']} deadline misses of {control['ticks']} ticks"
+        f"set-points sent after they were due: p50 {p50}, p99 {p99}, "
+        f"{control.deadline_misses} deadline misses of {control.ticks} ticks"
     )
-    print_grade(Grade.model_validate(result))
+    print_grade(result)

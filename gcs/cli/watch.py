@@ -1,4 +1,4 @@
-"""`gcs monitor` and `gcs replay`: what links and telemetry logs say, without commanding anything."""
+"""`gcs monitor` and `gcs replay`: what links and telemetry logs show, without commanding anything."""
 
 import sys
 from dataclasses import replace
@@ -13,9 +13,8 @@ from gcs.errors import InputError
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
-    from gcs.watch.links import WatchReport
+    from gcs.plan.design import Design
     from gcs.watch.rebuild_report import RebuildReport
-    from scenarios.schema import Scenario
 
 _TIMESYNC_HZ = 10.0
 ComparedMargin = Annotated[
@@ -25,36 +24,40 @@ ComparedMargin = Annotated[
 
 def monitor(
     scenario_file: Annotated[
-        Path | None, typer.Argument(metavar="[SCENARIO]", help="the vehicles expected, and the margin of their gains")
+        Path | None, typer.Argument(metavar="[SCENARIO]", help="the expected vehicles, and the margin of their gains")
     ] = None,
     listen: Annotated[
-        str, typer.Option("--listen", "--connect", metavar="HOST:PORT", help="where vehicles or a mirror send to")
+        str,
+        typer.Option("--listen", "--connect", metavar="HOST:PORT", help="address that vehicles or a mirror send to"),
     ] = "127.0.0.1:14550",
     margin: ComparedMargin = None,
     design: Annotated[
         Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margin of a run's design.json")
     ] = None,
     key: KeyFile = None,
-    silent: Annotated[bool, typer.Option("--silent", help="send nothing; delays are then lower bounds")] = False,
+    silent: Annotated[bool, typer.Option("--silent", help="send nothing; delays may then be lower bounds")] = False,
     seconds: Annotated[float, typer.Option("--for", metavar="SECONDS", help="stop after this time", min=0.1)] = float(
         "inf"
     ),
     as_json: AsJson = False,
 ) -> None:
-    """Watch the latencies of vehicles against a margin, without commanding anything.
+    """Watch latencies against a margin, commanding nothing.
 
     The monitor sends only TIMESYNC requests (10 a second to each address), which vehicles answer with their clock. It
-    sends no heartbeat. With --silent it sends nothing: it uses the exchanges of a station on the same stream, if there
-    are any; otherwise it measures delays against the fastest frames, which makes them lower bounds.
+    sends no heartbeat. With --silent it sends nothing and uses the exchanges of a station on the same stream. Without
+    any exchange, delays are measured against the fastest frames, which makes them lower bounds.
 
-    Exit code 1 if an expected vehicle, or any at all, was not heard, or if the loop delay (p99) was past the margin.
+    Exit code 1 if an expected vehicle was never heard, if none was heard, or if a loop delay (p99) exceeded the margin.
     """
-    _refuse_both(margin, design)
+    given, margin_of = _given(margin, design)
     if sys.stdout.isatty():  # a closed terminal ends the command by a signal, a reader that has enough by EPIPE
         outlive_readers()
-    guard = opened_guard(key, role="monitor")
-    with listening("--listen", listen) as link:
-        scenario, margin_s, margin_of = _compared_with(scenario_file, margin, design)
+    with listening("--listen", listen, opened_guard(key, role="monitor")) as link:
+        scenario = None if scenario_file is None else load_scenario(scenario_file)
+        if scenario is not None and given is None:
+            from gcs.plan.planner import flight_plan
+
+            given, margin_of = flight_plan(scenario)[0], f"of {scenario.name}'s gains"
         # Imported after the socket is open: datagrams that come meanwhile keep their receive stamps.
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
@@ -62,7 +65,7 @@ def monitor(
 
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
         options = WatchOptions(
-            margin_s=margin_s,
+            margin_s=None if given is None else given.delay_margin_s,
             margin_of=margin_of,
             timesync_hz=0.0 if silent else asked_hz,
             seconds=seconds,
@@ -70,7 +73,7 @@ def monitor(
         )
         watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
         with stop_signals() as stop_reason:
-            report = watch_links(link, watch, options, stop_reason, guard)
+            report = watch_links(link, watch, options, stop_reason)
             interrupted = bool(stop_reason())
     if as_json:
         print_json(report)
@@ -80,15 +83,14 @@ def monitor(
 
         console = plain_console(soft_wrap=False)
         console.print(render(report, width=console.width))
-    raise typer.Exit(INTERRUPTED if interrupted else _exit_code(report))
+    bad = {"not heard", "past the margin"} & {vehicle.status for vehicle in report.vehicles}
+    raise typer.Exit(INTERRUPTED if interrupted else FAILED if bad or not report.vehicles else 0)
 
 
 def replay(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN|FILE.tlog", help="a run's folder, or a telemetry log of any tool")
-    ],
+    run: Annotated[Path, typer.Argument(metavar="RUN|FILE.tlog", help="run folder, or the telemetry log of any tool")],
     scenario_file: Annotated[
-        Path | None, typer.Argument(metavar="[SCENARIO]", help="the formation flown, where it is not in the run")
+        Path | None, typer.Argument(metavar="[SCENARIO]", help="the formation, if it is not in the run")
     ] = None,
     margin: ComparedMargin = None,
     design: Annotated[
@@ -96,26 +98,21 @@ def replay(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Rebuild latencies, errors and margins from a telemetry log alone.
+    """Rebuild latencies, errors and margins from a telemetry log.
 
     Round trips come from the TIMESYNC exchanges in the log. Without them, delays are measured against the fastest
     frames, which makes them lower bounds. Spacing errors need the formation, from the run's folder or from SCENARIO.
     Damaged parts of the log are left out and counted.
     """
-    _refuse_both(margin, design)
-    from gcs.plan.design import Design
-    from gcs.runs.files import read_design
+    given, _ = _given(margin, design)
     from gcs.watch.rebuild_report import found, rebuild_report
     from gcs.watch.tlog import read_tlog
 
     there = found(run)
-    given = None if design is None else read_design(design)
     log = read_tlog(there.log_file)
     if scenario_file is not None:
         there = replace(there, scenario=load_scenario(scenario_file), design=None, recorded=None)
-    if margin is not None:
-        there = replace(there, design=Design(delay_margin_s=margin))
-    elif given is not None:
+    if given is not None:
         there = replace(there, design=given)
     elif there.design is None and there.scenario is not None:
         from gcs.plan.planner import flight_plan
@@ -143,29 +140,13 @@ def _print_rebuilt(report: "RebuildReport") -> None:
         console.print(f"recorded {report.recorded.verdict}: {delay_text(report.recorded)}")
 
 
-def _refuse_both(margin: float | None, design: Path | None) -> None:
+def _given(margin: float | None, design: Path | None) -> "tuple[Design | None, str]":
+    """The design that --margin or --design gives, if only by its margin, and the source of the margin in words."""
     if margin is not None and design is not None:
         raise InputError("read --margin and --design, wanted one of them")
+    if margin is None and design is None:
+        return None, ""
+    from gcs.plan.design import Design
+    from gcs.runs.files import read_design
 
-
-def _exit_code(report: "WatchReport") -> int:
-    bad = {"not heard", "past the margin"} & {vehicle.status for vehicle in report.vehicles}
-    return FAILED if bad or not report.vehicles else 0
-
-
-def _compared_with(
-    scenario_file: Path | None, margin: float | None, design: Path | None
-) -> "tuple[Scenario | None, float | None, str]":
-    """The scenario, the delay margin in s (None if none is known), and the source of that margin in words."""
-    scenario = None if scenario_file is None else load_scenario(scenario_file)
-    if margin is not None:
-        return scenario, margin, "given"
-    if design is not None:
-        from gcs.runs.files import read_design
-
-        return scenario, read_design(design).delay_margin_s, f"of {design}"
-    if scenario is not None:
-        from gcs.plan.planner import flight_plan
-
-        return scenario, flight_plan(scenario)[0].delay_margin_s, f"of {scenario.name}'s gains"
-    return None, None, ""
+    return (Design(delay_margin_s=margin), "given") if design is None else (read_design(design), f"of {design}")

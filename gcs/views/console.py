@@ -3,17 +3,22 @@
 What users, files and vehicles wrote is never read as markup.
 """
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from math import isnan
+from typing import TypeVar
 
 from rich import box
 from rich.console import Console, RenderableType
 from rich.live import Live
-from rich.table import Column, Table
+from rich.table import Table
 from rich.text import Text
 
 UNKNOWN = "–"
+
+Item = TypeVar("Item")
+FittedColumn = tuple[str, int, int, Callable[[Item], str | Text]]
+"""Heading, least width, least width of the terminal that shows the column, and the text for an item."""
 
 
 def plain_console(*, stderr: bool = False, soft_wrap: bool = True) -> Console:
@@ -30,31 +35,40 @@ def number_text(value: float | None, form: str = ".5f", *, factor: float = 1) ->
 
 
 def ms_text(seconds: float | None, form: str = ".1f", *, unit: str = " ms") -> str:
-    """A time in milliseconds."""
+    """A time in milliseconds, or a dash for None and NaN."""
     return UNKNOWN if seconds is None or isnan(seconds) else f"{1e3 * seconds:{form}}{unit}"
 
 
-def numbers_table(*headings: str, title: str | None = None) -> Table:
-    """An empty table of columns that end on the right."""
-    columns = (Column(heading, justify="right") for heading in headings)
-    return Table(*columns, box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="")
-
-
-def fitted_table(
-    columns: Sequence[tuple[str, int, int]], rows: Iterable[Sequence[str | Text]], *, width: int, gap: int
+def table_of(
+    items: Iterable[Item],
+    columns: Mapping[str, Callable[[Item], str]],
+    *,
+    title: str | None = None,
+    dense: bool = False,
+    is_dim: Callable[[Item], bool] = lambda _: False,
 ) -> Table:
-    """A table that leaves out columns on a narrow terminal.
+    """A table with a row for each item; `columns` maps each heading to the function that gives an item's text.
 
-    Each column has a heading, a least width, so that it stands still while its numbers change, and the width of the
-    terminal from which it is shown.
+    Columns are aligned to the right, except one without a heading.
     """
+    padding = (0, 1, 0, 0) if dense else (0, 1)
+    table = Table(box=box.SIMPLE_HEAD, padding=padding, title=title, title_justify="left", title_style="")
+    for heading in columns:
+        table.add_column(heading, justify="right" if heading else "left", no_wrap=dense)
+    for item in items:
+        table.add_row(*(text(item) for text in columns.values()), style="dim" if is_dim(item) else "")
+    return table
+
+
+def fitted_table(items: Iterable[Item], columns: Sequence[FittedColumn[Item]], *, width: int, gap: int) -> Table:
+    """A table that leaves out columns on a narrow terminal; its columns stand still while their numbers change."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, gap, 0, 0))
-    shown = [k for k, (_, _, from_width) in enumerate(columns) if width >= from_width]
-    for heading, least, _ in (columns[k] for k in shown):
+    shown = [column for column in columns if width >= column[2]]
+    for heading, least, _, _ in shown:
         justify = "left" if heading in ("", "mode") else "right"
         table.add_column(heading, justify=justify, no_wrap=True, min_width=least)
-    for row in rows:
-        table.add_row(*(row[k] for k in shown))
+    for item in items:
+        table.add_row(*(text(item) for *_, text in shown))
     return table
 
 
@@ -74,6 +88,6 @@ def live_display(*, shown: bool, transient: bool = False) -> Generator[Live | No
         yield live
 
 
-def draw(live: Live, picture: Callable[[int, int], RenderableType]) -> None:
-    """Draw a picture of a width and height; the terminal's last line stays free, or the cursor would scroll it."""
-    live.update(picture(live.console.width, live.console.height - 1), refresh=True)
+def draw(live: Live, picture: Callable[..., RenderableType]) -> None:
+    """Draw a picture of a `width` and `height`; the terminal's last line stays free, or the cursor would scroll it."""
+    live.update(picture(width=live.console.width, height=live.console.height - 1), refresh=True)

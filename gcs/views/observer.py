@@ -4,9 +4,9 @@ It draws the live table and writes the Rerun recording, so that the control proc
 
     python -m gcs.views.observer FOLDER --parent PID [--no-table]
 
-The file FOLDER/.observer-ready exists from when all slow imports are done until the observer ends. It ends after the
-run's "end" event, on SIGTERM, or when its parent has died and nothing new is written; in each case the recording is
-whole. SIGINT and SIGHUP are left to the parent, which decides how the flight ends.
+The file FOLDER/.observer-ready exists from the end of all slow imports until the observer ends. The observer ends
+after the run's "end" event, on SIGTERM, or when its parent has died and nothing new is written; in each case the
+recording is whole. It leaves SIGINT and SIGHUP to the parent, which decides how the flight ends.
 """
 
 import argparse
@@ -17,17 +17,14 @@ import time  # noqa: TID251 (this process is a driver: it runs at the pace of th
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 from gcs.plan.design import Design
-from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
-from gcs.runs.record import DESIGN_FILE, NEW_DESIGN, READY_FILE, RECORDING_FILE
+from gcs.runs.files import RunTail, by_tick, read_design, read_scenario, read_ticks
+from gcs.runs.record import DESIGN_FILE, END, NEW_DESIGN, READY_FILE, RECORDING_FILE
 from gcs.runs.summary import finish
 from gcs.runs.summary_record import Summary
 from gcs.views.console import live_display
-from gcs.views.grid import WholeTicks
 from gcs.views.table import Display, FlightState
 from scenarios.schema import Scenario
 
@@ -47,6 +44,7 @@ class Parent:
     stop: bool = False
 
     def gone(self) -> bool:
+        """Whether it has died."""
         return os.getppid() != self.pid
 
 
@@ -65,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
         signal.signal(decided_by_parent, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, stop)
     outlive_readers()
-    os.environ.setdefault("RUST_LOG", "off")  # Rerun would write over the table what is told in one line at the end
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun would write errors over the table; one line at the end says them
     import gcs.views.recording  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
     os.nice(10)  # not before: the station waits until this is ready
@@ -89,8 +87,8 @@ def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent,
     """Follow the run in `folder` until it ends or is left alone."""
     from gcs.views.recording import Recording  # Rerun is slow to import
 
-    tail = RunTail(folder)
-    whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])
+    system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
+    tail = RunTail(folder, len(system_ids))
     state = FlightState(scenario, design)
     with Recording(folder, scenario, design) as recording, live_display(shown=show_table) as live:
         display = Display(state, live, shown=show_table)
@@ -98,12 +96,10 @@ def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent,
         ended = False
         while not ended:
             last_look = parent.stop or (parent.gone() and time.monotonic() - news > ORPHAN_S)
-            # Events before ticks: whatever was written before the "end" event is then read as well.
+            # Events before ticks: then all ticks that were written before the "end" event are read, too.
             events = tail.events()
-            ticks = whole.add(tail.ticks())
-            ended = last_look or any(event.kind == "end" for event in events)
-            if ended:
-                ticks = np.concatenate([ticks, whole.rest()])
+            ticks = by_tick(tail.ticks(), system_ids)
+            ended = last_look or any(event.kind == END for event in events)
             if any(event.kind == NEW_DESIGN for event in events):
                 design = read_design(folder / DESIGN_FILE)
                 state.redesigned(design)
@@ -136,19 +132,18 @@ def record_run(folder: Path) -> Path:
     from gcs.views.recording import Recording
 
     scenario, design = read_scenario(folder), read_design(folder / DESIGN_FILE)
-    rows = read_ticks(folder)
-    whole = WholeTicks([vehicle.system_id for vehicle in scenario.vehicles])
+    ticks = by_tick(read_ticks(folder), [vehicle.system_id for vehicle in scenario.vehicles])
     with Recording(folder, scenario, design) as recording:
-        recording.add(rows[:0], RunTail(folder).events())
-        for start in range(0, rows.size, ROWS_AT_ONCE):
-            recording.add(whole.add(rows[start : start + ROWS_AT_ONCE]), [])
+        recording.add(ticks[:0], RunTail(folder).events())
+        step = ROWS_AT_ONCE // len(scenario.vehicles)
+        for start in range(0, len(ticks), step):
+            recording.add(ticks[start : start + step], [])
             recording.send()
-        recording.add(whole.rest(), [])
     return folder / RECORDING_FILE
 
 
 def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, Design] | None:
-    """The run's scenario and design once both are written; None if the parent goes before that."""
+    """The run's scenario and design once both are written; None if the parent is gone before that."""
     while True:
         try:
             design = read_design(folder / DESIGN_FILE)

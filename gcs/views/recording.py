@@ -1,8 +1,8 @@
 """The Rerun recording of a run, and the screen made for it. The one file that knows Rerun.
 
-All is on the timeline sim_time, which starts with the flight; of the time before, only the events are kept, at 0. An
-entity holds one value for each vehicle, in the scenario's order, so that a tick of two hundred vehicles costs about as
-much as a tick of two.
+Everything is on the timeline sim_time, which starts with the flight; of the time before, only the events are kept, at
+0. An entity holds one value for each vehicle, in the scenario's order, so that a tick of two hundred vehicles costs
+about as much as a tick of two.
 
     formation/...   vehicles, trails, wanted places and links as seen from the leader, in m north, east, down of it
     ground/...      the same over the ground, local NED
@@ -19,7 +19,6 @@ import math
 import os
 import warnings
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -30,7 +29,7 @@ from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
 from gcs.control.phases import patience_s
-from gcs.control.tick import Event, Mode, TickArray
+from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.design import Design
 from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 from gcs.views.scene import (
@@ -87,9 +86,9 @@ class Level(NamedTuple):
 
 
 class Recording:
-    """Writes flight.rrd of one run folder: `add` as often as wanted, `send` about once a second, `close` at the end.
+    """Writes flight.rrd of one run folder while entered: `add` as often as wanted, `send` about once a second.
 
-    Until it is closed the file has another name, so a flight.rrd is always whole.
+    Until the end the file has another name, so a flight.rrd is always whole.
     """
 
     def __init__(self, folder: Path, scenario: Scenario, design: Design) -> None:
@@ -107,7 +106,7 @@ class Recording:
         self._modes = np.full(count, -1)
         self._picture_times = PictureTimes(PICTURE_S)
         self._trail_times = PictureTimes(TRAIL_STEP_S)
-        self._trail_ends_m: Floats | None = None
+        self._trail_ends_m: dict[str, Floats] = {}
         self._stream = rr.RecordingStream("formation-gcs")
         self._stream.save(folder / UNFINISHED_FILE, default_blueprint=_blueprint(scenario, design))
         self._stream.send_recording_name(scenario.name)
@@ -116,9 +115,6 @@ class Recording:
 
     def __enter__(self) -> Self:
         return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self.close()
 
     def add(self, ticks: TickArray, events: list[Event]) -> None:
         """Take whole ticks, shape (ticks, vehicles), and events; nothing is written yet."""
@@ -134,18 +130,15 @@ class Recording:
         """Write what was added."""
         if self._events:
             self._send_events(self._events)
-            self._events = []
-        if not self._ticks:
-            return
-        ticks = np.concatenate(self._ticks)
-        self._ticks = []
+        ticks = np.concatenate(self._ticks) if self._ticks else np.empty((0, 1), TICK)
+        self._events, self._ticks = [], []
         ticks = ticks[ticks["time_s"][:, 0] >= 0]
         if ticks.size:
             self._send_series(ticks)
             self._send_modes(ticks)
             self._send_scene(ticks)
 
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Write what is left and give the file its final name; raises OSError if not all of it could be written."""
         self.send()
         try:
@@ -205,7 +198,7 @@ class Recording:
         for root, place_m in places_m.items():
             self._send_places(root, times_s, place_m)
         for k in self._trail_times.pick(times_s):
-            self._send_trail(times_s[[k]], np.stack([place_m[k] for place_m in places_m.values()]), list(places_m))
+            self._send_trail(times_s[[k]], {root: place_m[k] for root, place_m in places_m.items()})
 
     def _send_places(self, root: str, times_s: Floats, place_m: Floats) -> None:
         count, tree = place_m.shape[1], self._tree
@@ -222,23 +215,21 @@ class Recording:
         centers = rr.Ellipsoids3D.columns(centers=wanted_m.reshape(-1, 3)).partition(lengths)
         self._columns(f"{root}/wanted", times_s, centers)
 
-    def _send_trail(self, time_s: Floats, ends_m: Floats, roots: list[str]) -> None:
+    def _send_trail(self, time_s: Floats, ends_m: dict[str, Floats]) -> None:
         """The piece flown since the piece before, each logged once; the view shows those of the last seconds."""
         before_m, self._trail_ends_m = self._trail_ends_m, ends_m
-        if before_m is not None:
-            for root, start_m, end_m in zip(roots, before_m, ends_m, strict=True):
-                pieces = rr.LineStrips3D.columns(strips=_segments(start_m, end_m)).partition([len(end_m)])
-                self._columns(f"{root}/trails", time_s, pieces)
+        for root, start_m in before_m.items():
+            pieces = rr.LineStrips3D.columns(strips=_segments(start_m, ends_m[root])).partition([len(start_m)])
+            self._columns(f"{root}/trails", time_s, pieces)
 
     def _send_events(self, events: list[Event]) -> None:
         """One entry for what one tick says of several vehicles."""
-        entries: list[tuple[Event, list[int]]] = []
-        for _, same in itertools.groupby(events, key=lambda event: (event.time_s, event.kind, event.text)):
-            group = list(same)
-            entries.append((group[0], [system_id for event in group for system_id in event.about]))
-        times_s = np.array([max(event.time_s, 0.0) for event, _ in entries])
-        texts = [event_text(event, system_ids, self._before_s) for event, system_ids in entries]
-        levels = [_event_level(event) for event, _ in entries]
+        same = itertools.groupby(events, key=lambda event: (event.time_s, event.kind, event.text))
+        groups = [list(group) for _, group in same]
+        times_s = np.array([max(group[0].time_s, 0.0) for group in groups])
+        about = [[system_id for event in group for system_id in event.about] for group in groups]
+        texts = [event_text(group[0], ids, self._before_s) for group, ids in zip(groups, about, strict=True)]
+        levels = [_event_level(group[0]) for group in groups]
         self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
 
     def _log_scene_styles(self) -> None:
@@ -298,7 +289,7 @@ def viewer_client(address: str) -> Any:
 
 
 def _levels(scenario: Scenario) -> list[Level]:
-    """What the curves are to be compared with, and zero where it would be out of sight."""
+    """What the curves are compared with, and zero where it would be out of sight."""
     levels = [Level("delay/zero", "0", 0.0), Level("headroom/all", "100 %", 100.0)]
     levels.append(Level("headroom/none", "0 %: loop delay = margin", 0.0, limit=True))
     spacings_m = [math.hypot(*v.offset_ne_m) for v in scenario.vehicles if v.offset_ne_m is not None]

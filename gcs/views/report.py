@@ -1,17 +1,16 @@
-"""What the terminal shows before and after a flight."""
+"""What the terminal shows before and after a flight: the design, and the summary."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
-from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, ResponsePart
+from gcs.plan.design import Block, Design, FiguresAtDelay, FiguresAtExpectedDelay, ResponsePart, TradeOffPoint
 from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
-from gcs.runs.summary_record import Summary
-from gcs.views.console import UNKNOWN, ms_text, number_text, numbers_table, plain_console
+from gcs.runs.summary_record import Summary, VehicleSummary
+from gcs.views.console import UNKNOWN, ms_text, number_text, plain_console, table_of
 
 
 def print_design(design: Design, console: Console | None = None) -> None:
@@ -27,7 +26,7 @@ def print_design(design: Design, console: Console | None = None) -> None:
         console.print(_response(design.response), end="")
         bound, decay_1_s = "robustness bound", design.behaviour.decay_rate_1_s
     else:
-        console.print(_blocks_table(design))
+        console.print(table_of(design.blocks, _BLOCK_COLUMNS))
         _print_margins(design, console)
         bound, decay_1_s = "robustness bound of the whole formation", design.decay_rate_1_s
     loss = "" if design.cost_loss is None else f"; costs {design.cost_loss:.1%} more than with all information"
@@ -35,10 +34,7 @@ def print_design(design: Design, console: Console | None = None) -> None:
     if design.at_loop_delay is not None:
         _print_figures_at_delay(design.at_loop_delay, console)
     if design.trade_off:
-        table = numbers_table("delay margin, ms", "largest alpha", title="the trade-off it sits on")
-        for point in design.trade_off:
-            table.add_row(ms_text(point.delay_margin_s, unit=""), f"{point.alpha:.3f}")
-        console.print(table)
+        console.print(table_of(design.trade_off, _TRADE_OFF_COLUMNS, title="the trade-off it sits on"))
 
 
 def _print_margins(design: Design, console: Console) -> None:
@@ -85,21 +81,35 @@ def _up_to(delay_s: float | None) -> str:
     return "at no loop delay" if delay_s == 0.0 else f"up to {ms_text(delay_s)} of it"
 
 
-def _blocks_table(design: Design) -> Table:
-    """The gain matrix by blocks: who uses whose errors, and how."""
-    table = numbers_table("vehicle", "uses", "spacing error, 1/s²", "velocity error, 1/s")
-    for block in design.blocks:
-        *spacing, north, east = zip(*block.gain, strict=True)
-        table.add_row(str(block.vehicle), str(block.of), _matrix(spacing), _matrix([north, east]))
-    return table
-
-
 def _matrix(columns: Sequence[Sequence[float]]) -> str:
     """A block: one number if it is the same on both axes and does not couple them, else all four."""
     if not columns:
         return UNKNOWN
     (a, c), (b, d) = columns
     return f"{a:+.4f}" if a == d and b == c == 0.0 else f"[{a:+.4f} {b:+.4f}; {c:+.4f} {d:+.4f}]"
+
+
+_TRADE_OFF_COLUMNS: dict[str, Callable[[TradeOffPoint], str]] = {
+    "delay margin, ms": lambda point: ms_text(point.delay_margin_s, unit=""),
+    "largest alpha": lambda point: f"{point.alpha:.3f}",
+}
+_BLOCK_COLUMNS: dict[str, Callable[[Block], str]] = {
+    "vehicle": lambda block: str(block.vehicle),
+    "uses": lambda block: str(block.of),
+    "spacing error, 1/s²": lambda block: _matrix(list(zip(*block.gain, strict=True))[:-2]),
+    "velocity error, 1/s": lambda block: _matrix(list(zip(*block.gain, strict=True))[-2:]),
+}
+"""The gain matrix by blocks: who uses whose errors, and how."""
+_VEHICLE_COLUMNS: dict[str, Callable[[VehicleSummary], str]] = {
+    "vehicle": lambda own: str(own.system_id),
+    "final error, m": lambda own: number_text(own.spacing_error_final_m, ".2f"),
+    "largest, m": lambda own: number_text(own.spacing_error_max_m, ".2f"),
+    "RTT p50, ms": lambda own: ms_text(own.rtt_s.p50, unit=""),
+    "loop p50, ms": lambda own: ms_text(own.loop_delay_s.p50, unit=""),
+    "p99, ms": lambda own: ms_text(own.loop_delay_s.p99, unit=""),
+    "lost": lambda own: number_text(own.lost, "d"),
+    "late": lambda own: number_text(own.late, "d"),
+}
 
 
 def print_summary(summary: Summary, folder: Path, console: Console | None = None) -> None:
@@ -133,24 +143,11 @@ def print_flight(summary: Summary, console: Console) -> None:
             console.print(f"refused  by the {who}: {in_words(counts)}")
     if summary.mirror:
         console.print(f"mirror   {in_words(summary.mirror)}")
-    headings = ("vehicle", "final error, m", "largest, m", "RTT p50, ms", "loop p50, ms", "p99, ms", "lost", "late")
-    table = numbers_table(*headings)
-    for vehicle in summary.vehicles:
-        table.add_row(
-            str(vehicle.system_id),
-            number_text(vehicle.spacing_error_final_m, ".2f"),
-            number_text(vehicle.spacing_error_max_m, ".2f"),
-            ms_text(vehicle.rtt_s.p50, unit=""),
-            ms_text(vehicle.loop_delay_s.p50, unit=""),
-            ms_text(vehicle.loop_delay_s.p99, unit=""),
-            number_text(vehicle.lost, "d"),
-            number_text(vehicle.late, "d"),
-        )
-    console.print(table)
+    console.print(table_of(summary.vehicles, _VEHICLE_COLUMNS))
 
 
 def _reason(summary: Summary) -> str:
-    """How the flight ended; of one that was flown to its end and is not stable, why."""
+    """How the flight ended; for a completed flight that is unstable, why."""
     final_m, most_m = summary.spacing_error_final_m, summary.spacing_error_max_m
     completed = summary.reason.startswith("completed")
     if summary.verdict != "unstable" or not completed or final_m is None or most_m is None:
@@ -174,7 +171,7 @@ def delay_text(summary: Summary) -> str:
 
 
 def _response(response: ResponsePart | None) -> str:
-    """A line on how the vehicles respond to set-points; empty if they do at once."""
+    """A line on how the vehicles respond to set-points; empty if they respond at once."""
     if response is None:
         return ""
     if not response.vehicles:

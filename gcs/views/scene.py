@@ -1,4 +1,4 @@
-"""The formation as a picture: from tick rows to points and lines in space. Arrays only; who draws them is elsewhere."""
+"""The formation as a picture: from tick rows to points and lines in space. Arrays only; `recording` draws them."""
 
 import colorsys
 import math
@@ -16,10 +16,10 @@ Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
 
 PICTURE_S = 0.04
-"""Least time between two pictures: 25 a second are enough for the eye."""
+"""Least time between two pictures: 25 a second look smooth."""
 TRAIL_STEP_S = 0.2
 
-# Ten colours that stay apart on a dark ground; more vehicles take hues around the circle.
+# Ten colours that are easy to tell apart on a dark ground; more vehicles take hues around the circle.
 PALETTE: tuple[Color, ...] = (
     (240, 240, 240),
     (66, 165, 245),
@@ -50,14 +50,14 @@ def dimmed(color: Color) -> Color:
 
 @dataclass(frozen=True)
 class Tree:
-    """Who follows whom, by index in the scenario's order."""
+    """Who follows whom, as indices in the scenario's order."""
 
     leader: int
     followers: list[int]
     fronts: list[int]
-    """For each follower, whom it follows."""
+    """For each follower, the vehicle that it follows."""
     offsets_m: Floats
-    """For each follower, where it is to be relative to that vehicle: (followers, 3), NED."""
+    """For each follower, its wanted position relative to that vehicle: (followers, 3), NED."""
 
 
 def tree_of(scenario: Scenario) -> Tree:
@@ -80,7 +80,7 @@ def wanted_extent_m(scenario: Scenario) -> tuple[Floats, Floats]:
 
 
 class Newest:
-    """Fills gaps in time: where a value is NaN, the newest one that was not."""
+    """Fills gaps in time: NaN is replaced by the newest known value."""
 
     def __init__(self, *shape: int) -> None:
         self._last = np.full(shape, np.nan)
@@ -94,7 +94,7 @@ class Newest:
 
 
 class PictureTimes:
-    """Picks instants at least some time apart out of a stream of them."""
+    """Picks from a stream of instants those that are at least some time apart."""
 
     def __init__(self, step_s: float) -> None:
         self._step_s = step_s
@@ -108,10 +108,10 @@ class PictureTimes:
 
 
 def positions_m(ticks: TickArray) -> Floats:
-    """Positions (ticks, vehicles, 3), NED, all brought to the instant of their tick.
+    """Positions (ticks, vehicles, 3), NED, all extrapolated to the instant of their tick.
 
-    The states used by one tick were sampled at different instants; at 91 m/s that is several metres.
-    Where the age of a state is unknown, the position is the one it gives.
+    The states used by one tick were sampled at different instants; at 91 m/s that makes several metres. A state of
+    unknown age is not extrapolated.
     """
     sampled_m = np.stack([ticks["north_m"], ticks["east_m"], ticks["down_m"]], axis=2)
     axes = ("velocity_north_m_s", "velocity_east_m_s", "velocity_down_m_s")

@@ -5,6 +5,7 @@ terminal, and `Display` chooses between the two.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,21 +20,20 @@ from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.runs.refusals import REFUSED
-from gcs.views.console import UNKNOWN, draw, fitted_table, ms_text, not_shown, number_text
-from gcs.views.grid import unknown
+from gcs.views.console import UNKNOWN, FittedColumn, draw, fitted_table, ms_text, not_shown, number_text
 from gcs.views.scene import Floats, Newest
 from scenarios.schema import Scenario
 
 WINDOW_S = 5.0
-"""What "the last seconds" are: percentiles and least headroom are taken over them."""
+"""The last seconds, over which percentiles and the least headroom are taken."""
 PLAIN_EVERY_S = 5.0
 EVENTS_SHOWN = 3
 TOGETHER_S = 0.5
-"""Events that say the same within this time share a line."""
+"""Equal events within this time share a line."""
 NAMED_MAX = 12
 
 HEADROOM_GOOD = 0.3
-"""Headroom from which it is shown in green."""
+"""Headroom of at least this much is shown in green."""
 MODE_STYLES: dict[Mode, str] = {
     Mode.NOMINAL: "green",
     Mode.WAITING: "dim",
@@ -48,7 +48,7 @@ _BADNESS = list(MODE_STYLES)
 
 
 class FlightState:
-    """What is known of a flight, as far as its ticks and events have been read."""
+    """What is known of a flight from the ticks and events read so far."""
 
     def __init__(self, scenario: Scenario, design: Design) -> None:
         self.scenario = scenario
@@ -57,18 +57,21 @@ class FlightState:
         self.redesigned(design)
         self.phase = UNKNOWN
         self.refused = ""
-        """What did not get in, in words."""
+        """What the station refused, in words."""
         self.time_s = np.nan
         self.before_s = patience_s(scenario)
-        """Until the flight begins at 0, scenario time plus this is the time since the station started."""
+        """Scenario time plus this is the time since the station started; shown until the flight begins at 0."""
         self.skipped = 0
         """Ticks that were left out."""
         self.news: list[str] = []
-        """The newest events, one line for those that say the same of several vehicles."""
+        """The newest events; equal events of several vehicles are one line."""
         self._last_event: tuple[str, str, float] | None = None
         self._named: list[int] = []
         self.system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
-        self.newest = unknown(self.system_ids)
+        self.newest: TickArray = np.zeros(len(self.system_ids), TICK)
+        for name in TICK.names or ():
+            if TICK[name].kind == "f":
+                self.newest[name] = np.nan
         self._newest_rtt_s = Newest(len(self.system_ids))
         self.rtt_s = self.newest["rtt_s"]
         self._window: TickArray = np.empty((0, len(self.system_ids)), TICK)
@@ -125,20 +128,20 @@ class FlightState:
     def figures(self) -> "Figures":
         """The figures to be shown; NaN where unknown."""
         now = self.newest
-        loop_delay_s = _quantiles(self._window["loop_delay_s"], (0.5, 0.99))
+        loop_delay_s = self._window["loop_delay_s"]
         spacings_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in self.scenario.vehicles]
         late_s = (self._window["sent_ns"][:, :1] - self._window["due_ns"][:, :1]) / 1e9
         return Figures(
             spacing_error_m=np.hypot(now["spacing_error_north_m"], now["spacing_error_east_m"]),
             spacing_m=np.array(spacings_m),
             rtt_s=self.rtt_s,
-            loop_delay_s_p50=loop_delay_s[0],
-            loop_delay_s_p99=loop_delay_s[1],
-            headroom=_quantiles(self._window["headroom"], (0.0,))[0],
+            loop_delay_s_p50=_quantile(loop_delay_s, 0.5),
+            loop_delay_s_p99=_quantile(loop_delay_s, 0.99),
+            headroom=_quantile(self._window["headroom"], 0.0),
             lost=now["lost"],
             late=now["late"],
             modes=[Mode(int(mode)) for mode in now["mode"]],
-            lateness_s_p99=float(_quantiles(late_s, (0.99,))[0, 0]),
+            lateness_s_p99=float(_quantile(late_s, 0.99)[0]),
         )
 
 
@@ -169,7 +172,7 @@ class Figures:
 
 
 def render(state: FlightState, *, width: int, height: int) -> RenderableType:
-    """The whole display, at most `height` lines: what fits of the vehicles, and how many do not."""
+    """The whole display, in at most `height` lines: as many vehicles as fit, and how many do not."""
     figures = state.figures()
     head: list[RenderableType] = [_headline(state), _progress(state, width)]
     foot = _footer(state, figures)
@@ -200,47 +203,26 @@ def _progress(state: FlightState, width: int) -> RenderableType:
     return line
 
 
-_COLUMNS = (
-    ("id", 3, 0),
-    ("follows", 7, 101),
-    ("spacing\nerror m", 7, 0),
-    ("error\n%", 5, 76),
-    ("RTT\nms", 6, 76),
-    ("delay p50\nms", 9, 76),
-    ("delay p99\nms", 9, 0),
-    ("margin\nms", 6, 101),
-    ("headroom\n%", 8, 0),
-    ("", 10, 113),
-    ("lost", 5, 76),
-    ("late", 5, 76),
-    ("mode", 8, 0),
-)
-"""As `fitted_table` takes them."""
-
-
 def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
     """One row for each vehicle in `order`."""
 
-    def row(k: int) -> list[str | Text]:
-        vehicle, error_m, mode = state.scenario.vehicles[k], figures.spacing_error_m[k], figures.modes[k]
-        headroom = float(figures.headroom[k])
-        return [
-            str(vehicle.system_id),
-            number_text(vehicle.follows, "d"),
-            number_text(error_m, ".2f"),
-            number_text(100 * error_m / figures.spacing_m[k], ".1f"),
-            ms_text(figures.rtt_s[k], unit=""),
-            ms_text(figures.loop_delay_s_p50[k], unit=""),
-            ms_text(figures.loop_delay_s_p99[k], unit=""),
-            ms_text(state.newest["delay_margin_s"][k], ".0f", unit=""),
-            Text(number_text(headroom, ".0f", factor=100), headroom_style(headroom)),
-            Text(_bar(headroom), headroom_style(headroom)),
-            str(figures.lost[k]),
-            str(figures.late[k]),
-            Text(mode.name, MODE_STYLES[mode]),
-        ]
-
-    return fitted_table(_COLUMNS, map(row, order), width=width, gap=1 if width >= 101 else 0)
+    vehicles, headroom, error_m = state.scenario.vehicles, figures.headroom, figures.spacing_error_m
+    columns: list[FittedColumn[int]] = [
+        ("id", 3, 0, lambda k: str(vehicles[k].system_id)),
+        ("follows", 7, 101, lambda k: number_text(vehicles[k].follows, "d")),
+        ("spacing\nerror m", 7, 0, lambda k: number_text(error_m[k], ".2f")),
+        ("error\n%", 5, 76, lambda k: number_text(100 * error_m[k] / figures.spacing_m[k], ".1f")),
+        ("RTT\nms", 6, 76, lambda k: ms_text(figures.rtt_s[k], unit="")),
+        ("delay p50\nms", 9, 76, lambda k: ms_text(figures.loop_delay_s_p50[k], unit="")),
+        ("delay p99\nms", 9, 0, lambda k: ms_text(figures.loop_delay_s_p99[k], unit="")),
+        ("margin\nms", 6, 101, lambda k: ms_text(state.newest["delay_margin_s"][k], ".0f", unit="")),
+        ("headroom\n%", 8, 0, lambda k: headroom_text(headroom[k])),
+        ("", 10, 113, lambda k: Text(_bar(headroom[k]), headroom_style(headroom[k]))),
+        ("lost", 5, 76, lambda k: str(figures.lost[k])),
+        ("late", 5, 76, lambda k: str(figures.late[k])),
+        ("mode", 8, 0, lambda k: Text(figures.modes[k].name, MODE_STYLES[figures.modes[k]])),
+    ]
+    return fitted_table(order, columns, width=width, gap=1 if width >= 101 else 0)
 
 
 def _footer(state: FlightState, figures: Figures) -> list[Text]:
@@ -286,7 +268,7 @@ def event_text(event: Event, system_ids: list[int], before_s: float) -> str:
 
 
 class Display:
-    """Shows a flight on standard output: as a picture on a terminal, else as lines of text."""
+    """Shows a flight on standard output: as a live table on a terminal, else as lines of text."""
 
     def __init__(self, state: FlightState, live: Live | None, *, shown: bool) -> None:
         self._state = state
@@ -295,32 +277,28 @@ class Display:
         self._line_due_s = -np.inf
 
     def events(self, events: list[Event]) -> None:
-        """Say each event once, where there is no picture to keep them on."""
+        """Print each event once, where there is no live table to show it."""
         for event in events if self._says_lines else ():
             print(event_text(event, event.about, self._state.before_s), flush=True)
 
     def show(self, *, last: bool = False) -> None:
-        """Show the flight as it is now."""
+        """Show the flight as it is now; as text, every `PLAIN_EVERY_S` of scenario time and if `last`."""
         state = self._state
         if self._live is not None:
-            draw(self._live, lambda width, height: render(state, width=width, height=height))
+            draw(self._live, partial(render, state))
         elif self._says_lines and (state.time_s >= self._line_due_s or last):
             self._line_due_s = (state.time_s // PLAIN_EVERY_S + 1) * PLAIN_EVERY_S
             print(plain_line(state), flush=True)
 
 
-def _quantiles(values: Floats, probabilities: tuple[float, ...]) -> Floats:
-    """Quantiles (as the nearest value above) over axis 0, of the values that are not NaN; NaN where there are none.
+def _quantile(values: Floats, probability: float) -> Floats:
+    """A quantile (as the nearest value above) over axis 0, of the values that are not NaN; NaN where there are none.
 
     As np.nanquantile, which takes a hundred times longer with a NaN in every column.
     """
-    ordered = np.sort(values, axis=0)  # NaN last
-    count = np.sum(~np.isnan(values), axis=0)
-    result = np.full((len(probabilities), values.shape[1]), np.nan)
-    known = np.nonzero(count)[0]
-    for line, probability in zip(result, probabilities, strict=True):
-        line[known] = ordered[np.ceil(probability * (count[known] - 1)).astype(int), known]
-    return result
+    ordered = np.sort(np.vstack([values, np.full(values.shape[1], np.nan)]), axis=0)  # NaN last
+    place = np.ceil(probability * (np.sum(~np.isnan(values), axis=0) - 1)).astype(int)  # -1 where nothing is known
+    return ordered[place, np.arange(values.shape[1])]
 
 
 def _worst(values: Floats) -> float:
@@ -334,10 +312,16 @@ def _worst_headroom(state: FlightState, figures: Figures) -> str:
     return f"{100 * figures.headroom[worst]:.0f} % (vehicle {state.system_ids[worst]})"
 
 
-def headroom_style(headroom: float) -> str:
-    if np.isnan(headroom):
+def headroom_style(headroom: float | None) -> str:
+    """The style of a headroom, dim where it is unknown."""
+    if headroom is None or np.isnan(headroom):
         return "dim"
     return "green" if headroom >= HEADROOM_GOOD else "yellow" if headroom >= 0 else "bold red"
+
+
+def headroom_text(headroom: float | None, before: str = "") -> Text:
+    """A headroom in percent, in its style."""
+    return Text(before + number_text(headroom, ".0f", factor=100), headroom_style(headroom))
 
 
 def _bar(headroom: float) -> str:

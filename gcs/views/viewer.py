@@ -35,9 +35,9 @@ def view(folder_or_rrd: Path) -> int:
 
 
 def picture_time_s(recording: Path, wanted_s: float | None) -> float:
-    """The scenario time of a picture: the one wanted, if the recording is that long, else ten seconds or its end.
+    """The scenario time of a picture: the one wanted; by default ten seconds, or the end of the recording if sooner.
 
-    Raises InputError if the recording ends before, or holds no flight.
+    Raises InputError if the recording ends before the time wanted, or holds no flight.
     """
     from gcs.views.recording import length_s  # Rerun is slow to import, and the viewer itself does not need it
 
@@ -94,7 +94,7 @@ def find_recording(folder_or_rrd: Path) -> Path:
 
 
 def vulkan_missing() -> bool:
-    """Whether no Vulkan driver is installed, which a picture without a screen needs."""
+    """Whether no Vulkan driver is installed; a picture without a screen needs one."""
     folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
     return not any(any(Path(folder).glob("*.json")) for folder in folders)
 
@@ -108,7 +108,7 @@ def _headless(width: int, height: int) -> Generator[Any]:
     from gcs.views.recording import viewer_client
 
     with raised(), tempfile.TemporaryFile() as log:
-        environment = os.environ | {"RERUN_APP_ONLY": "true"}  # what the package sets when it starts a viewer itself
+        environment = os.environ | {"RERUN_APP_ONLY": "true"}  # as the package sets it when it starts a viewer
         process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
         try:
             yield viewer_client(_address(process, log))
@@ -118,7 +118,7 @@ def _headless(width: int, height: int) -> Generator[Any]:
 
 
 def _settled_picture(viewer: Any) -> bytes:
-    """A picture without the notes of a starting viewer, and with what it loads after its first frames."""
+    """A picture once three in a row are equal: the viewer has loaded everything and removed its starting notes."""
     pictures = [viewer.take_screenshot()]
     give_up = time.monotonic() + SETTLE_S
     while pictures[-3:] != 3 * pictures[-1:] and time.monotonic() < give_up:
@@ -127,7 +127,7 @@ def _settled_picture(viewer: Any) -> bytes:
 
 
 def _address(process: subprocess.Popen[bytes], log: IO[bytes]) -> str:
-    """Where a starting viewer listens: it says so in its log, and then that it draws."""
+    """The address of a starting viewer, once its log says that it listens there and that it draws."""
     give_up = time.monotonic() + START_S
     while True:
         text = os.pread(log.fileno(), 1 << 20, 0).decode(errors="replace")
@@ -141,7 +141,7 @@ def _address(process: subprocess.Popen[bytes], log: IO[bytes]) -> str:
 
 
 def _program() -> str:
-    """The viewer's binary, which the Python package brings along."""
+    """The viewer's binary, which comes with the Python package."""
     package = importlib.util.find_spec("rerun_cli")
     program = Path(package.origin or "").parent / "rerun" if package else Path("rerun")
     if not program.is_file():

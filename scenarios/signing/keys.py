@@ -40,10 +40,7 @@ def read_key(file: Path) -> Key:
     32 raw bytes, as pymavlink takes them; 64 hexadecimal digits, as `make_key` writes them; or one line of text, a
     passphrase whose SHA-256 is the key, as in MAVProxy, Mission Planner and QGroundControl.
 
-    Raises
-    ------
-    KeyFileError
-        If it cannot be read, holds none of these, belongs to another user, or others may read or write it.
+    Raises KeyFileError if it cannot be read, holds none of these, belongs to another user, or others have access.
     """
     try:
         with file.open("rb") as opened:
@@ -78,10 +75,7 @@ def _secret(data: bytes, file: Path) -> bytes:
 def make_key(file: Path) -> None:
     """Write a new random key, as hexadecimal digits, to a new file.
 
-    Raises
-    ------
-    KeyFileError
-        If the file exists, or cannot be written.
+    Raises KeyFileError if the file exists, or cannot be written.
     """
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

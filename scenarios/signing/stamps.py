@@ -49,10 +49,7 @@ class Stamps:
 def open_stamps(file: Path) -> Stamps:
     """The timestamps in a file, created if missing and locked until this process ends.
 
-    Raises
-    ------
-    KeyFileError
-        If the file cannot be used, is of another kind, or another process has it.
+    Raises KeyFileError if the file cannot be used, is of another kind, or another process has it.
     """
     try:
         descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -59,7 +59,7 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         (f"stress {CHAIN} --onset --junit {{run}}", "run: Is a directory, wanted a file that can be written"),
         (f"stress {CHAIN} --onset --tolerance nan", "--tolerance: read nan, wanted a fraction between 0 and 1"),
         (f"stress {CHAIN} --delay 0:x:3", "--delay: "),
-        (f"stress {CHAIN} --delay 0:1:1000000000", "--delay: read '0:1:1000000000', wanted FROM:TO:COUNT or values"),
+        (f"stress {CHAIN} --delay 0:1:1000000000", "--delay: read '0:1:1000000000', wanted FROM:TO:N or values"),
         (f"bench {CHAIN} --seconds 1e9", "86400"),
     ],
 )
@@ -140,7 +140,7 @@ def test_ticks_of_unknown_vehicles_are_refused(
 @pytest.mark.parametrize(("listens", "mirror"), [("127.0.0.1", "localhost"), ("0.0.0.0", "127.0.0.1")])
 def test_a_mirror_to_the_stations_own_port_is_refused(listens: str, mirror: str) -> None:
     with listening("--listen", f"{listens}:0") as link, pytest.raises(InputError, match="which is this station's own"):
-        mirroring(f"{mirror}:{link.address[1]}", link, None, commands=False)
+        mirroring(f"{mirror}:{link.address[1]}", link, commands=False)
 
 
 def test_a_picture_is_a_png_within_the_recording(

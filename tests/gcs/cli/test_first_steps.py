@@ -1,0 +1,122 @@
+"""From nothing to an own answer: new scenarios, what they would fly, and flights in virtual time."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gcs.cli.main import main
+from gcs.drive.check import check
+from gcs.plan.planner import flight_plan
+from gcs.runs.files import read_ticks
+from gcs.runs.grade import grade
+from gcs.runs.record import TLOG_FILE
+from gcs.watch.tlog import parse_tlog
+from scenarios.files import load, parse
+from scenarios.schema import Scenario
+from scenarios.shipped import columns, copied, names
+
+pytestmark = pytest.mark.xdist_group("processes")  # the observer
+
+
+def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
+    """The exit code of a command."""
+    monkeypatch.setattr(sys, "argv", ["gcs", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_copy_of_a_shipped_scenario_differs_by_its_name_only(name: str, tmp_path: Path) -> None:
+    text = copied(name, "mine")
+    assert load_text(text, tmp_path).model_copy(update={"name": name}) == load_text(copied(name, name), tmp_path)
+
+
+def load_text(text: str, folder: Path) -> Scenario:
+    return parse(text, folder / "mine.toml")
+
+
+@pytest.mark.parametrize(("count", "length"), [(1, 1), (1, 2), (1, 40), (3, 4), (2, 1), (7, 6)])
+def test_new_columns_fly_in_their_places(count: int, length: int, tmp_path: Path) -> None:
+    scenario = load_text(columns("mine", count, length), tmp_path)
+    assert len(scenario.vehicles) == count * length
+    found = check(flight_plan(scenario)[1])
+    assert found.closest_m is None or found.closest_m >= 40.0
+    assert max((v.spacing_error_m or 0.0) for v in found.vehicles) < 8.0
+    assert len({v.place_ne_m for v in found.vehicles}) == count * length
+
+
+def test_the_commands_foretold_are_those_of_the_first_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up to what extrapolation makes of vehicles on the launcher, which report 25 m/s and do not move: one period of it
+    in every spacing error, times K3 = 5.6 1/s²."""
+    monkeypatch.chdir(tmp_path)
+    assert gcs(monkeypatch, "new", "five.toml", "--chain", "5") == 0
+    assert gcs(monkeypatch, "fly", "five.toml", "--virtual", "--out", "run", "--json") == 0
+    foretold = {v.system_id: v.command_m_s2 for v in check(flight_plan(load(Path("five.toml")))[1]).vehicles}
+    ticks = read_ticks(tmp_path / "run")
+    first = ticks[ticks["commanded"]][: len(foretold)]
+    size = np.hypot(first["command_north_m_s2"], first["command_east_m_s2"])
+    for system_id, flown in zip(first["system_id"].tolist(), size.tolist(), strict=True):
+        assert flown == pytest.approx(foretold[system_id], abs=25.0 * 0.02 * 5.7)
+
+
+def test_a_virtual_flight_leaves_the_files_of_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert gcs(monkeypatch, "new", "trio.toml") == 0
+    for folder in ("one", "two"):
+        assert gcs(monkeypatch, "fly", "trio.toml", "--virtual", "--out", folder, "--json") == 0
+    files = {file.name for file in Path("one").iterdir()}
+    assert files == {
+        "design.json", "events.jsonl", "flight.rrd", "flight.tlog", "scenario.toml", "summary.json", "ticks.parquet",
+        "truth.bin",
+    }  # fmt: skip
+    graded = grade(Path("one"))
+    assert graded.loop_delay.error_max_s == pytest.approx(0.0, abs=1e-5)
+    assert graded.link_delay.error_max_s == 0.0
+    assert read_ticks(Path("one")).tobytes() == read_ticks(Path("two")).tobytes()
+    frames = parse_tlog((Path("one") / TLOG_FILE).read_bytes()).frames
+    times = [time_ns for time_ns, _ in frames]
+    assert times == sorted(times)
+    assert {84, 32, 111} <= {frame.msg_id for _, frame in frames}  # set-points, positions, TIMESYNC
+
+
+def test_names_of_shipped_scenarios_are_taken_in_place_of_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert gcs(monkeypatch, "scenarios", "--json") == 0
+    assert list(json.loads(capsys.readouterr().out)) == names()
+    assert gcs(monkeypatch, "check", "chain3", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["delay_margin_s"] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        ("fly chain3 --virtual --listen 127.0.0.1:0", "read --virtual and --listen, wanted one of them"),
+        ("fly chain3 --speed 2", "read --speed without --virtual, wanted both"),
+        ("fly chain3 --virtual --speed 0", "--speed: read 0, wanted a multiple of real time from 0.01"),
+        ("fly chain33 --virtual", "chain33"),
+        ("new mine.txt", "read mine.txt, wanted a file name that ends in .toml"),
+        ("new there.toml", "there.toml: read a file that exists, wanted a new one"),
+        ("new mine.toml --chain 0", "--chain: read 0, wanted 1 to 254 vehicles"),
+        ("new mine.toml --columns 20x20", "--columns: read '20x20', wanted columns and vehicles in each, as 3x4"),
+        ("new mine.toml --columns ax4", "--columns: read 'ax4', wanted"),
+        ("new mine.toml --like nothing", "--like: read nothing, wanted one of chain20, chain3"),
+        ("new mine.toml --chain 3 --like chain3", "read several of --like, --chain and --columns"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(
+    arguments: str, wanted: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("there.toml").touch()
+    assert gcs(monkeypatch, *arguments.split()) == 2
+    told = capsys.readouterr().err
+    assert wanted in told
+    assert told.count("\n") == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["there.toml"]
