@@ -1,12 +1,16 @@
-"""The `gains` API: every function and class whose docstring has an example, which are those that a user calls."""
+"""The `gains` API: what `gains` exports, and every other function and class whose docstring has an example.
+
+An example in a docstring finds the names of its module; on the page it begins with the imports that it needs.
+"""
 
 import ast
+import doctest
 import importlib
 import inspect
 import pkgutil
 import re
+from collections.abc import Iterator
 from types import ModuleType
-from typing import Any
 
 import gains
 
@@ -18,32 +22,71 @@ def api_page() -> str:
     return "\n\n".join(text for module in modules if (text := _module(module)))
 
 
+def documented(module: ModuleType) -> dict[str, str]:
+    """The docstrings of what a module offers, by name, with examples that run in an empty session."""
+    return {node.name: _with_imports(module, ast.get_docstring(node) or "") for node in _offered(module)}
+
+
 def _module(module: ModuleType) -> str:
-    source = ast.parse(inspect.getsource(module))
-    entries = [
-        _entry(node)
-        for node in source.body
-        if isinstance(node, ast.FunctionDef | ast.ClassDef)
-        and not node.name.startswith("_")
-        and "Examples\n--------" in (ast.get_docstring(node) or "")
-    ]
+    texts = documented(module)
+    entries = [_entry(node, texts[node.name]) for node in _offered(module)]
     if not entries:
         return ""
     return "\n\n".join([f"## `{module.__name__}`", _markdown(inspect.getdoc(module) or ""), *entries])
 
 
-def _entry(node: Any) -> str:
-    text = _markdown(ast.get_docstring(node) or "")
+def _offered(module: ModuleType) -> list[ast.FunctionDef | ast.ClassDef]:
+    implemented = {
+        node.name: node  # of an overloaded function the last, which has the docstring
+        for node in ast.parse(inspect.getsource(module)).body
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
+    }
+    return [
+        node for name, node in implemented.items() if name in gains.__all__ or ">>> " in (ast.get_docstring(node) or "")
+    ]
+
+
+def _with_imports(module: ModuleType, docstring: str) -> str:
+    """A docstring whose example begins with the imports of what it takes from its module."""
+    source = "".join(example.source for example in doctest.DocTestParser().get_examples(docstring))
+    used: dict[str, list[str]] = {}
+    nodes = list(ast.walk(ast.parse(source)))
+    known = {alias.name for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+    for name in sorted({node.id for node in nodes if isinstance(node, ast.Name)} - known):
+        value = vars(module).get(name)
+        if isinstance(value, ModuleType):
+            used[f"import {value.__name__} as {name}"] = []
+        elif value is not None:
+            home = "gains" if name in gains.__all__ else getattr(value, "__module__", "math")
+            used.setdefault(f"from {home} import ", []).append(name)
+    lines = "".join(f">>> {start}{', '.join(names)}\n" for start, names in used.items())
+    return docstring.replace(">>> ", lines + ">>> ", 1)
+
+
+def _entry(node: ast.FunctionDef | ast.ClassDef, docstring: str) -> str:
     if isinstance(node, ast.ClassDef):
         fields = [each for each in node.body if isinstance(each, ast.AnnAssign)]
         signature = "\n    ".join([f"class {node.name}:", *(ast.unparse(each) for each in fields)])
+        described = [f"* `{name}`: {' '.join(about.split())}" for name, about in _described_fields(node)]
     else:
-        overloaded = any("overload" in ast.unparse(decorator) for decorator in node.decorator_list)
-        assert not overloaded, node.name  # its implementation has the docstring
         result = f" -> {ast.unparse(node.returns)}" if node.returns else ""
-        signature = f"{node.name}({_arguments(node.args)}){result}"
+        signature, described = f"{node.name}({_arguments(node.args)}){result}", []
     signature = signature.replace("'", '"')  # as ruff formats it, in Markdown too
+    text = "\n\n".join([_markdown(docstring), *(["\n".join(described)] if described else [])])
     return f"### `{node.name}`\n\n```python\n{signature}\n```\n\n{text}"
+
+
+def _described_fields(node: ast.ClassDef) -> Iterator[tuple[str, str]]:
+    """The fields with a docstring below them; fields of one type in a row may share it."""
+    names: list[str] = []
+    annotation = ""
+    for each in node.body:
+        if isinstance(each, ast.AnnAssign):
+            names = [*names, ast.unparse(each.target)] if ast.unparse(each.annotation) == annotation else []
+            names, annotation = names or [ast.unparse(each.target)], ast.unparse(each.annotation)
+        elif isinstance(each, ast.Expr) and isinstance(each.value, ast.Constant) and names:
+            yield "`, `".join(names), str(each.value.value)
+            names, annotation = [], ""
 
 
 def _arguments(arguments: ast.arguments) -> str:
@@ -53,9 +96,8 @@ def _arguments(arguments: ast.arguments) -> str:
 
 
 def _markdown(docstring: str) -> str:
-    """A numpydoc docstring as Markdown: sections in bold, examples and displayed equations as code."""
-    text = re.sub(r"^(\w[\w ]*)\n-{3,}$", r"**\1**\n", docstring, flags=re.MULTILINE)
-    return "\n\n".join(_paragraph(each) for each in re.split(r"\n{2,}", text))
+    """A docstring as Markdown: examples and displayed equations as code."""
+    return "\n\n".join(_paragraph(each) for each in re.split(r"\n{2,}", docstring))
 
 
 def _paragraph(text: str) -> str:
@@ -64,19 +106,4 @@ def _paragraph(text: str) -> str:
         return "```python\n" + text + "\n```"
     if all(line.startswith("    ") for line in lines):
         return "```text\n" + inspect.cleandoc(text) + "\n```"
-    if len(lines) > 1 and all(line.startswith("    ") for line in lines[1:]):  # a name, and what it is
-        return f"`{lines[0]}`: " + " ".join(line.strip() for line in lines[1:])
-    if any(line.startswith("    ") for line in lines) and not lines[0].startswith(" "):
-        return _definitions(lines)
     return text
-
-
-def _definitions(lines: list[str]) -> str:
-    """Names, each with its indented description, as a list."""
-    items: list[str] = []
-    for line in lines:
-        if line.startswith(" ") and items:
-            items[-1] += (" " if ": " in items[-1] else ": ") + line.strip()
-        else:
-            items.append(f"* `{line}`")
-    return "\n".join(items)

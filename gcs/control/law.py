@@ -4,7 +4,7 @@ For the leader-follower pattern u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, and u_
 2.10 and 3.25); any other gain matrix K is flown by the same code.
 
 All errors in u_i are formed at one instant, that of vehicle i's newest state; the states of the others are brought to
-it. So the loop around vehicle i is delayed by vehicle i's own link only, and a slow link ahead does not use up its
+it. The loop around vehicle i is therefore delayed by vehicle i's own link only; a slow link ahead does not use up its
 margin.
 """
 
@@ -50,7 +50,7 @@ FeedbackLaw = tuple[VehicleLaw | None, ...]
 
 
 def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequence[bool]) -> FeedbackLaw:
-    """The law of a schedule of gain matrices K, without the lost vehicles.
+    """The law for a schedule of gain matrices K, without the lost vehicles.
 
     Each K is (inputs, states) in the order of `gains.formation.model.FormationModel`.
 

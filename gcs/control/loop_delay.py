@@ -10,8 +10,8 @@ command computed from it acts:
 * *down*: the delay of the set-point. It is not measured for each set-point but taken from the newest TIMESYNC request,
   so jitter makes the two differ.
 * *repetition*: when telemetry is slower than control, several commands are computed from one state. The repetition
-  does not count as delay, because the margin already accounts for the telemetry period. What lost telemetry adds to
-  that period does count.
+  does not count as delay, because the margin already accounts for the telemetry period. The extra age that lost
+  telemetry causes does count.
 * With the loop on the ground the state is the vehicle's newest. With loops on board it is the oldest among the newest
   states that the streamed command needs (`VehicleControl.used_ns`).
 
@@ -37,7 +37,7 @@ def loop_delay_s(used_ns: int, sent_ns: int, down_s: float, repeated_s: float = 
 
 
 def headroom(delay_s: float, delay_margin_s: float) -> float:
-    """1 - loop delay / margin; NaN while the loop delay is unknown, minus infinity if there is no margin."""
+    """1 - loop delay / margin; NaN while the loop delay is unknown, minus infinity if the margin is 0."""
     return 1.0 - delay_s / delay_margin_s if delay_margin_s > 0 else float("-inf")
 
 

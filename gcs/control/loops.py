@@ -1,9 +1,9 @@
-"""Where the loop around each vehicle is closed, and so what the station computes, uploads and sends.
+"""Where the loop around each vehicle is closed, which decides what the station computes, uploads and sends.
 
 `loop_of` chooses once; nothing else in the station asks for the scenario's `loop`. With the loop on board, a vehicle
 feeds back its own errors and the station streams the rest: K_ij e_j of the other vehicles. All errors streamed to a
-vehicle are those of one instant, that of the oldest among the newest states it needs. So nothing is extrapolated, and
-its loop delay counts from that instant.
+vehicle are taken at one instant, that of the oldest among the newest states it needs. Nothing is extrapolated, and the
+loop delay counts from that instant.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class Loop(Protocol):
     """What depends on where the loop is closed."""
 
     def law(self, lost: Sequence[bool]) -> FeedbackLaw:
-        """What the station computes of each vehicle's command, around lost vehicles."""
+        """The station's share of each vehicle's command, with lost vehicles left out."""
         ...
 
     def control(

@@ -7,7 +7,7 @@ from scenarios.schema import Scenario
 
 
 class Phase(StrEnum):
-    """How far a flight has come."""
+    """The phase of a flight."""
 
     CONNECTING = "connecting"  # until every vehicle is heard, armed and guided, and its clock is known
     IDENTIFYING = "identifying"  # vehicles with autopilots show how they respond to set-points
@@ -22,7 +22,7 @@ def next_phase(
     """The phase that follows.
 
     CONNECTING is followed by FLYING once all are ready, or by IDENTIFYING if they are not identified yet. A stop for
-    whatever reason leads from all three to ENDING. ENDED follows when all vehicles hold, or after `END_PATIENCE_S`.
+    any reason leads from each of these to ENDING, and ENDED follows when all hold, or after `END_PATIENCE_S`.
     """
     match phase:
         case Phase.CONNECTING | Phase.IDENTIFYING | Phase.FLYING if stop:

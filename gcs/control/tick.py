@@ -11,27 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 CLOCK_JUMPED = "its clock jumped"
-"""Text of the event."""
+"""Text of the event that reports a clock jump."""
 GAIN_SET = "gain set "
-"""Begins the part of a STATUSTEXT, after the vehicle's name, that announces its new gain set."""
+"""What a STATUSTEXT says after the vehicle's name to announce its new gain set; the number follows."""
 TickArray = NDArray[Any]
 """A structured array of dtype TICK: one row for each vehicle."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something that happened in a flight, as a line of events.jsonl has it; `time_s` is scenario time."""
+    """Something that happened in a flight: one line of events.jsonl. `time_s` is scenario time."""
 
     time_s: float
     kind: str
     system_id: int | None = None
     text: str
     counts: dict[str, int] | None = None
-    """How often each thing named in the text happened, where it counts them."""
+    """How often each thing named in the text happened; None if the event counts nothing."""
 
     @property
     def about(self) -> list[int]:
-        """The vehicle that it is about, in a list; empty if it is about none."""
+        """The vehicle that the event is about, as a list; empty if it is about none."""
         return [] if self.system_id is None else [self.system_id]
 
 

@@ -1,20 +1,30 @@
-"""Flies a plan to its end, in virtual time or in real time as `gcs fly` does, and returns its log."""
+"""Flies a plan to its end, in virtual time or in real time as `gcs fly` does, and returns its log.
 
+In real time the load of the machine is measured, too.
+"""
+
+import errno
+import shutil
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from gains.core.arrays import IntArray
 from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.effective_delay import truth_of
-from gcs.runs.files import write_design
-from gcs.runs.grade import Truth
-from gcs.runs.record import END, SCENARIO_FILE, RunWriter
+from gcs.runs.files import RunTail, read_ticks, write_design
+from gcs.runs.grade import Truth, read_truth
+from gcs.runs.record import END, EVENTS_FILE, SCENARIO_FILE, TICKS_FILE, TRUTH_FILE, RunWriter
 from gcs.station.station import Station
 from scenarios import files as scenario_files
+
+_IDLE, _WAITING, _STEAL = 3, 4, 7
+"""Fields of the cpu line of /proc/stat: idle, waiting for a disk, and time taken by the host."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +50,7 @@ def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, w
     """
     if not real_time:
         return fly_virtual(plan, folder, with_truth=with_truth)
-    from gcs.drive.realtime_flight import fly_real_time  # processes and sockets: not for flights in virtual time
-
-    ticks, events, truth, spent = fly_real_time(plan, margins_of(plan), folder)
-    return Flight(ticks, events, truth, steal_share=spent.steal, busy_share=spent.busy)
+    return fly_real_time(plan, margins_of(plan), folder)
 
 
 def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:
@@ -62,6 +69,41 @@ def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: boo
             writer.event(event)
         writer.close()
     return Flight(np.concatenate(rows), events, truth_of(records) if with_truth else None)
+
+
+def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flight:
+    """Fly a plan in real time. With a folder, which is created, the run is left there; otherwise it is deleted."""
+    from gcs.drive.fly import FlyOptions, fly  # processes and sockets: not for flights in virtual time
+    from gcs.drive.udp import StationSocket
+
+    kept = folder is not None
+    folder = folder if folder is not None else Path(tempfile.mkdtemp(prefix="stress-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        before = _processor_times()
+        with StationSocket("127.0.0.1", 0) as link:
+            summary = fly(plan, design, link, FlyOptions(folder=folder, show_table=False))
+        needed = (TICKS_FILE, EVENTS_FILE, TRUTH_FILE)
+        if lost := [text for text in summary.not_logged if text.startswith(needed)]:
+            raise OSError(errno.ENOSPC, "; ".join(lost), str(folder))
+        spent = _processor_times() - before
+        shares = spent / max(1, spent.sum())
+        return Flight(
+            read_ticks(folder),
+            RunTail(folder).events(),
+            read_truth(folder / TRUTH_FILE),
+            steal_share=float(shares[_STEAL]),
+            busy_share=float(1.0 - shares[_IDLE] - shares[_WAITING]),
+        )
+    finally:
+        if not kept:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _processor_times() -> IntArray:
+    """Ticks of all processors since boot: user, nice, system, idle, iowait, irq, softirq, steal."""
+    line = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0]
+    return np.array(line.split()[1:9], dtype=np.int64)
 
 
 def margins_of(plan: FlightPlan) -> Design:

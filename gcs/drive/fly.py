@@ -1,4 +1,4 @@
-"""One flight in real time: start the vehicles, fly, record, sum up."""
+"""One flight, in real or virtual time: start the vehicles, fly, record, summarise."""
 
 import contextlib
 import os
@@ -7,27 +7,38 @@ import sys
 import time  # noqa: TID251 - names the run's folder; the flight's own clock is in the driver
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
 from gcs.control.tick import Event
-from gcs.drive.guard import Guard
+from gcs.drive.lockstep import EPOCH_NS, START_NS, RecordedVehicles, fly_lockstep
 from gcs.drive.mirror import Mirror
 from gcs.drive.sitl import VehicleProcess
 from gcs.drive.udp import StationSocket, clock_ns, drive, prepare_real_time
 from gcs.interrupts import held_back, stop_signals
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.planner import described
+from gcs.plan.planner import described, identified
 from gcs.runs.files import write_design
-from gcs.runs.record import DESIGN_FILE, END, FLEET, NEW_DESIGN, READY_FILE, SCENARIO_FILE, RunWriter
+from gcs.runs.record import (
+    DESIGN_FILE,
+    END,
+    FLEET,
+    NEW_DESIGN,
+    READY_FILE,
+    SCENARIO_FILE,
+    TRUTH_FILE,
+    RunWriter,
+)
+from gcs.runs.refusals import REFUSED, Refusals, in_words
 from gcs.runs.summary import finish
 from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
 from scenarios import files as scenario_files
+from scenarios.schema import NS_PER_S
 
-_NS = 1_000_000_000
 _OBSERVER_PATIENCE_S = 60.0
-_START_DELAY_NS = _NS // 5
+_START_DELAY_NS = NS_PER_S // 5
 
 
 @dataclass(frozen=True)
@@ -38,11 +49,11 @@ class FlyOptions:
     show_table: bool
     """Whether to show the live table, or its plain lines without a terminal."""
     fleet: str = ""
-    """Who provides the vehicles, in words; empty to start simulated ones."""
+    """Who provides the vehicles, in words; empty if this flight starts simulated ones."""
     outlive_station: bool = False
     """Whether the simulated vehicles wait to be taken over if this process is killed."""
     key_file: Path | None = None
-    """The guard's key, for the simulated vehicles."""
+    """The guard's key file, passed to the simulated vehicles."""
 
 
 def fly(
@@ -50,16 +61,91 @@ def fly(
     design: Design,
     link: StationSocket,
     options: FlyOptions,
-    guard: Guard | None = None,
     mirror: Mirror | None = None,
 ) -> Summary:
     """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder."""
     folder = options.folder
+    _describe(folder, plan, design)
+    with stop_signals() as asked_to_stop:
+        unwritten = _flown(plan, design, link, options, mirror, asked_to_stop)
+        return finish(folder, unwritten=unwritten)
+
+
+def fly_in_virtual_time(
+    plan: FlightPlan, design: Design, folder: Path, *, show_table: bool, speed: float | None = None
+) -> Summary:
+    """Fly on one virtual clock, with the same files as in real time; returns the summary.
+
+    Parameters
+    ----------
+    speed
+        Most virtual seconds per second of real time; None for as many as can be computed.
+    """
+    _describe(folder, plan, design)
+    with stop_signals() as asked_to_stop:
+        with _observer(folder, show_table=show_table) as observer:
+            if speed is not None:  # otherwise the observer catches up with the flight
+                _wait_until_ready(observer, folder, asked_to_stop)
+            unwritten = _flown_virtually(plan, design, folder, asked_to_stop, speed)
+            if unwritten:
+                observer.terminate()
+        return finish(folder, unwritten=unwritten)
+
+
+def _describe(folder: Path, plan: FlightPlan, design: Design) -> None:
+    """Write what is to be flown into the run's folder."""
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
     write_design(folder, design)
-    with stop_signals() as asked_to_stop:
-        unwritten = _flown(plan, design, link, options, guard, mirror, asked_to_stop)
-        return finish(folder, unwritten=unwritten)
+
+
+def _flown_virtually(
+    plan: FlightPlan, design: Design, folder: Path, asked_to_stop: Callable[[], str], speed: float | None
+) -> list[Event]:
+    """Fly in virtual time and leave the logs in the folder; returns the events that could not be written."""
+    station = Station(plan, start_ns=START_NS)
+    writer, vehicles = RunWriter(folder), RecordedVehicles(plan, folder / TRUTH_FILE)
+    began_s, time_s, flown = time.monotonic(), 0.0, plan
+    for rows in fly_lockstep(plan, station=station, vehicles=vehicles):
+        writer.tick(rows)
+        frames = sorted(station.frames + vehicles.take_sent(), key=itemgetter(1))
+        writer.frames((frame, EPOCH_NS + time_ns) for frame, time_ns in frames)
+        for event in station.events:
+            writer.event(event)
+        station.events.clear()
+        time_s = float(rows["time_s"][0])
+        if station.plan is not flown:
+            flown = station.plan
+            _note_design(writer, folder, design, flown, time_s)
+        if reason := asked_to_stop():
+            station.request_stop(reason)
+        if speed is not None:
+            time.sleep(max(0.0, began_s + (int(rows["due_ns"][0]) - START_NS) / NS_PER_S / speed - time.monotonic()))
+    _complete_design(writer, folder, design, plan, flown)
+    if counts := Refusals().news(station.counters, last=True):
+        writer.event(Event(time_s=time_s, kind=REFUSED, text=in_words(counts), counts=counts))
+    writer.event(Event(time_s=time_s, kind=END, text=station.end_reason))
+    vehicles.close()
+    return writer.close()
+
+
+def _note_design(writer: RunWriter, folder: Path, design: Design, found: FlightPlan, time_s: float) -> None:
+    """Write the design again with the responses that identification found, and record that as an event."""
+    _write_design(writer, folder, identified(design, found))
+    text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
+    writer.event(Event(time_s=time_s, kind=NEW_DESIGN, text=text))
+
+
+def _complete_design(writer: RunWriter, folder: Path, design: Design, plan: FlightPlan, flown: FlightPlan) -> None:
+    """Add to the design the figures that take too long to compute in flight."""
+    if flown is not plan:
+        _write_design(writer, folder, described(design, flown))
+
+
+def _write_design(writer: RunWriter, folder: Path, design: Design) -> None:
+    try:
+        write_design(folder, design)
+    except OSError as error:
+        writer.ended(DESIGN_FILE, error)
 
 
 def _flown(
@@ -67,14 +153,13 @@ def _flown(
     design: Design,
     link: StationSocket,
     options: FlyOptions,
-    guard: Guard | None,
     mirror: Mirror | None,
     asked_to_stop: Callable[[], str],
 ) -> list[Event]:
     """Fly and leave the logs in the folder; returns the events that could not be written."""
     folder = options.folder
     with contextlib.ExitStack() as stack:
-        # Left in the reverse order: first the vehicles end, then the observer finishes the recording.
+        # The stack unwinds in reverse: first the vehicles end, then the observer finishes the recording.
         vehicles: VehicleProcess | None = None
         observer = stack.enter_context(_observer(folder, show_table=options.show_table))
         if not options.fleet:
@@ -94,18 +179,14 @@ def _flown(
             writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=FLEET, text=options.fleet))
 
         def new_plan(found: FlightPlan) -> None:
-            try:
-                write_design(folder, described(design, found))
-            except OSError as error:
-                writer.ended(DESIGN_FILE, error)
-            text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
-            writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=NEW_DESIGN, text=text))
+            _note_design(writer, folder, design, found, station.scenario_time_s(clock_ns()))
 
         def stop() -> str:
             return asked_to_stop() or ("" if vehicles is None else vehicles.complaint())
 
         try:
-            drive(station, link, writer, stop, new_plan, guard, mirror)
+            drive(station, link, writer, stop, new_plan, mirror)
+            _complete_design(writer, folder, design, plan, station.plan)
             writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=END, text=station.end_reason))
         finally:
             unwritten = writer.close()
@@ -117,17 +198,16 @@ def _flown(
 def new_folder(scenario_name: str) -> Path:
     """A new folder for a run in runs/, named after the scenario and the local time."""
     stem = f"{scenario_name}-{time.strftime('%Y%m%d-%H%M%S')}"
-    for count in range(1, 1000):
-        folder = Path("runs") / (stem if count == 1 else f"{stem}-{count}")
+    for end in ("", *(f"-{count}" for count in range(2, 1000))):
         with contextlib.suppress(FileExistsError):
-            folder.mkdir(parents=True)
+            (folder := Path("runs") / f"{stem}{end}").mkdir(parents=True)
             return folder
     raise FileExistsError(f"runs/{stem}: 1000 runs in one second")
 
 
 @contextlib.contextmanager
 def _observer(folder: Path, *, show_table: bool) -> Generator["subprocess.Popen[bytes]"]:
-    """The process that shows and records the flight. On leaving the context it has ended by itself or been ended."""
+    """The process that shows and records the flight; it has ended when the context is left."""
     command = [sys.executable, "-m", "gcs.views.observer", str(folder), "--parent", str(os.getpid())]
     with held_back():  # once started, it ignores Ctrl-C by itself
         process = subprocess.Popen(command + ([] if show_table else ["--no-table"]), stdin=subprocess.DEVNULL)

@@ -53,10 +53,7 @@ class Guard:
 def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:
     """The guard with the key in a file; the timestamps it has seen are kept beside that, separately for each role.
 
-    Raises
-    ------
-    KeyFileError
-        If one of the files cannot be used.
+    Raises KeyFileError if one of the files cannot be used.
     """
     key = read_key(key_file)
     return Guard(key, epoch_ns=epoch_ns, stamps=open_stamps(key_file.with_name(f"{key_file.name}.{role}")))

@@ -1,11 +1,13 @@
 """Vehicles, links and station on one virtual clock in one process: the same code and bytes as in real time.
 
-Deterministic: the same plan gives the same ticks to the last bit. Nothing waits, so a flight is as fast as its
-computation. The station is called when something of its own is due. Datagrams that arrive before wait with their
-receive stamps, as in a socket; the station decides nothing in between.
+The same plan gives the same ticks to the last bit. Nothing sleeps, so a flight takes only its computing time. The
+station is called when something of its own is due. Datagrams that arrive earlier wait with their receive stamps, as in
+a socket; the station decides nothing in between.
 """
 
+from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Protocol
 
 from gcs.control.phases import Phase
@@ -18,7 +20,7 @@ from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.drive.guard import signed_links
-from sim_vehicles.links.truth import DROPPED, LINK_DOWN, LINK_UP, Record, Row
+from sim_vehicles.links.truth import DROPPED, LINK_DOWN, LINK_UP, Record, Row, TruthLog
 
 START_NS = 1_000_000_000
 """Virtual time at which vehicles and station start; not zero, so that a forgotten time is noticed."""
@@ -31,42 +33,61 @@ Sent = list[tuple[int, bytes, int]]
 
 
 class Vehicles(Protocol):
-    """The vehicles behind their links: takes the station's datagrams, returns those that arrive at the station."""
+    """The vehicles behind their links: `step` takes the station's datagrams and returns those that reach it."""
 
     def step(self, received: Sent, now_ns: int) -> Sent: ...
 
 
 class LinkLosses:
-    """Counts all datagrams on the links and those lost, from the truth that `vehicles_of` records."""
+    """Counts the datagrams that entered the links and those lost, from the truth that `vehicles_of` records."""
 
     def __init__(self) -> None:
-        self.entered = {LINK_UP: 0, LINK_DOWN: 0}
-        self.lost = {LINK_UP: 0, LINK_DOWN: 0}
+        self._entered: Counter[int] = Counter()
+        self._lost: Counter[int] = Counter()
 
     def record(self, row: Row) -> None:
-        kind = row[0]
-        if kind in (LINK_UP, LINK_DOWN):
-            self.entered[kind] += 1
-            self.lost[kind] += len(row) == 8 and row[6] & DROPPED != 0
+        """Take a record of the truth."""
+        self._entered[row[0]] += 1
+        self._lost[row[0]] += row[0] in (LINK_UP, LINK_DOWN) and len(row) == 8 and row[6] & DROPPED != 0
 
-    @property
-    def share_up(self) -> float:
-        """Share of the datagrams from vehicles that were lost."""
-        return self.lost[LINK_UP] / max(self.entered[LINK_UP], 1)
-
-    @property
-    def share_down(self) -> float:
-        """Share of the datagrams to vehicles that were lost."""
-        return self.lost[LINK_DOWN] / max(self.entered[LINK_DOWN], 1)
+    def share(self, direction: int) -> float:
+        """Fraction of the datagrams that were lost up (LINK_UP, from vehicles) or down (LINK_DOWN)."""
+        return self._lost[direction] / max(self._entered[direction], 1)
 
 
 def vehicles_of(plan: FlightPlan, *, record: Record | None = None) -> Vehicles:
-    """The simulated vehicles of a plan and their links, at the start; `record` takes the truth about them."""
+    """The simulated vehicles of a plan and their links, at the start; `record` is called with each truth record."""
     return Fleet(plan.scenario, START_NS, record=record)
 
 
+class RecordedVehicles:
+    """The simulated vehicles of a plan, which log what they log in real time: their truth and what was sent to them."""
+
+    def __init__(self, plan: FlightPlan, truth_file: Path) -> None:
+        self._truth = TruthLog(truth_file)
+        self._vehicles = vehicles_of(plan, record=self._record)
+        self._sent: list[tuple[bytes, int]] = []
+
+    def step(self, received: Sent, now_ns: int) -> Sent:
+        self._sent += [(data, time_ns) for _, data, time_ns in received]
+        return self._vehicles.step(received, now_ns)
+
+    def take_sent(self) -> list[tuple[bytes, int]]:
+        """The frames that the station sent since the last call, with their times in ns."""
+        sent, self._sent = self._sent, []
+        return sent
+
+    def close(self) -> None:
+        self._truth.close()
+
+    def _record(self, row: Row) -> None:
+        if row[0] == LINK_UP:  # logged as leaving when due, though it is computed later
+            row = (*row[:3], row[5], *row[4:])  # pyright: ignore[reportAssignmentType] - as long as it was
+        self._truth.record(row)
+
+
 def signed_ends(plan: FlightPlan, key: Key) -> tuple[Vehicles, Guard]:
-    """The same vehicles and the guard of their station, with a common key and no memory of earlier flights."""
+    """The vehicles of `vehicles_of` and the guard of their station, with one key and no memory of earlier flights."""
     links = signed_links(key, plan.formation.system_ids, epoch_ns=EPOCH_NS, stamps=Stamps())
     vehicles = Fleet(plan.scenario, START_NS, signed=links)
     return vehicles, Guard(key, epoch_ns=EPOCH_NS, stamps=Stamps())
@@ -77,7 +98,7 @@ def fly_lockstep(
 ) -> Iterator[TickArray]:
     """Fly a plan in virtual time; yields the rows (a fresh copy) of each control tick.
 
-    Pass a station to read its events and end reason afterwards, vehicles to go on from an earlier flight, a guard to
+    Pass a station to read its events and end reason afterwards, vehicles to continue an earlier flight, and a guard to
     sign and verify at the station's end. The address of a vehicle is (a fixed name, its system id).
     """
     station = station or Station(plan, start_ns=START_NS)

@@ -8,7 +8,6 @@ import contextlib
 import socket
 from collections import Counter
 from collections.abc import Iterable
-from types import TracebackType
 from typing import Self
 
 from gcs.link import mavlink
@@ -48,10 +47,7 @@ class Mirror:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
-
-    def close(self) -> None:
+    def __exit__(self, *_: object) -> None:
         self._socket.close()
 
     def forward(self, frames: Iterable[bytes], now_ns: int) -> None:

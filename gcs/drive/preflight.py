@@ -5,7 +5,7 @@ A fault is one line: the scenario's key, what was read and what was wanted. None
 
 from dataclasses import replace
 from itertools import combinations
-from math import hypot
+from math import dist
 
 import numpy as np
 
@@ -78,7 +78,7 @@ def bad_start(scenario: Scenario) -> str | None:
     """Initial states that violate a safety limit at the first tick: a collision or a spacing error beyond its limit."""
     safety, vehicles = scenario.safety, scenario.leader_first()
     for one, two in combinations(vehicles, 2):
-        apart_m = hypot(*(a - b for a, b in zip(one.position_ne_m, two.position_ne_m, strict=True)))
+        apart_m = dist(one.position_ne_m, two.position_ne_m)
         if apart_m < safety.collision_distance_m:
             read = f"vehicles {one.system_id} and {two.system_id} {apart_m:g} m apart"
             wanted = f"at least safety.collision_distance_m = {safety.collision_distance_m:g} m between any two"
@@ -88,7 +88,8 @@ def bad_start(scenario: Scenario) -> str | None:
         if vehicle.follows is None or vehicle.offset_ne_m is None:
             continue
         ahead = place[vehicle.follows]
-        error_m = hypot(*(a + o - p for a, o, p in zip(ahead, vehicle.offset_ne_m, vehicle.position_ne_m, strict=True)))
+        wanted_ne_m = [a + o for a, o in zip(ahead, vehicle.offset_ne_m, strict=True)]
+        error_m = dist(wanted_ne_m, vehicle.position_ne_m)
         if error_m > safety.spacing_error_limit_m:
             read = f"vehicle {vehicle.system_id} with a spacing error of {error_m:g} m"
             wanted = f"at most safety.spacing_error_limit_m = {safety.spacing_error_limit_m:g} m"

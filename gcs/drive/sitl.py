@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from gcs.link.datagram import Address
@@ -19,7 +18,7 @@ _STOP_PATIENCE_S = 5.0
 
 
 class VehicleProcess:
-    """The simulated vehicles of a scenario as a child process.
+    """The simulated vehicles of a scenario as a child process; it ends when the context is left.
 
     With `outlive_station`, vehicles whose station is killed fly on in their failsafe and can be taken over. They end
     when no station has commanded them for ORPHAN_S. Otherwise they end with this process.
@@ -63,7 +62,7 @@ class VehicleProcess:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._process.terminate()
         try:
             self._process.wait(_STOP_PATIENCE_S)

@@ -1,15 +1,15 @@
 """Takes over vehicles that are already there before the flight, if they fly the same experiment.
 
 Simulated vehicles whose station was killed fly on for a while. Only a flight with the same scenario, links and seed may
-take them over: otherwise its verdict would be about another experiment. Each vehicle names what it flies in the
-extended parameter SCENARIO, which other ground stations do not ask for.
+take them over: otherwise its verdict would be about another experiment. Each vehicle names its scenario in the extended
+parameter SCENARIO, which other ground stations do not ask for.
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import partial
 
 from gcs.control.phases import longest_round_trip_s
-from gcs.drive.guard import Guard
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.errors import InputError
 from gcs.link import mavlink
@@ -21,28 +21,22 @@ TAKEN_OVER = "taken over: they were there already"
 CONNECTED = "not started here (--connect)"
 _SCENARIO = "SCENARIO"
 _SHUTDOWN, _KEEP, _SHUT_DOWN = 246, 0.0, 2.0
-"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: do nothing, which as a command restarts the
-minute that vehicles without a station fly on; and shut down."""
+"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: do nothing, and shut down. Even the former
+restarts the minute for which vehicles without a station fly on."""
 _HEARTBEAT_PERIOD_S = 1.2
 """Vehicles already in flight are heard within this time."""
 _ASK_AGAIN_NS = NS_PER_S // 4
 _LEAST_PATIENCE_S = 3.0
 _ROUND_TRIPS = 4.0
-"""Answers are awaited for this many round trips of the links, and for the time above at least."""
-
-Make = Callable[[int], tuple[int, tuple[object, ...]]]
-"""The message (id and fields) for a vehicle."""
-Answer = Callable[[mavlink.Frame], str]
-"""The answer in a frame; "" if it is none."""
+"""Answers are awaited for this many round trips of the links, but at least for the time above."""
 
 
 class Presence:
     """The vehicles of a scenario that already send to the station's socket before its flight."""
 
-    def __init__(self, link: StationSocket, scenario: Scenario, guard: Guard | None) -> None:
+    def __init__(self, link: StationSocket, scenario: Scenario) -> None:
         self._link = link
         self._scenario = scenario
-        self._guard = guard
         self._wanted = {vehicle.system_id for vehicle in scenario.vehicles}
         self._addresses: dict[int, Address] = {}
         self._sequence = 0
@@ -50,20 +44,12 @@ class Presence:
     def taken_over(self) -> list[int]:
         """The system ids of the vehicles that are present and to be flown; empty if there are none.
 
-        Raises
-        ------
-        InputError
-            If the vehicles present fly another scenario, or do not say which.
+        Raises InputError if the vehicles present fly another scenario, or do not say which.
         """
         self._listen(self._link.bound_ns + round(_HEARTBEAT_PERIOD_S * NS_PER_S))
         there = sorted(self._addresses)
         said = self._ask(
-            there,
-            lambda system_id: (
-                mavlink.PARAM_EXT_REQUEST_READ,
-                mavlink.param_request_read(_SCENARIO, target_system=system_id),
-            ),
-            _scenario_of,
+            there, mavlink.PARAM_EXT_REQUEST_READ, partial(mavlink.param_request_read, _SCENARIO), _scenario_of
         )
         for system_id in there:
             if (text := said.get(system_id, "")).split(" ")[0] != fingerprint(self._scenario):
@@ -73,23 +59,30 @@ class Presence:
         return there
 
     def shut_down(self) -> None:
-        """End the processes of the vehicles taken over. A vehicle whose own station lives does not obey."""
+        """End the processes of the vehicles taken over. A vehicle whose own station is alive does not obey."""
         self._command(sorted(self._addresses), _SHUT_DOWN)
 
     def _command(self, system_ids: list[int], wanted: float) -> list[int]:
         """The vehicles that acknowledged the command."""
-        said = self._ask(
-            system_ids,
-            lambda system_id: (
-                mavlink.COMMAND_LONG,
-                mavlink.command_long(_SHUTDOWN, target_system=system_id, parameters=(wanted,)),
-            ),
-            lambda frame: "done" if frame.msg_id == mavlink.COMMAND_ACK and frame.fields[0] == _SHUTDOWN else "",
-        )
-        return sorted(said)
 
-    def _ask(self, system_ids: Iterable[int], make: Make, answer: Answer) -> dict[int, str]:
-        """Each vehicle's answer to a message, which is repeated until the answer arrives or time is up."""
+        def acknowledgement(frame: mavlink.Frame) -> str:
+            return "done" if frame.msg_id == mavlink.COMMAND_ACK and frame.fields[0] == _SHUTDOWN else ""
+
+        fields = partial(mavlink.command_long, _SHUTDOWN, parameters=(wanted,))
+        return sorted(self._ask(system_ids, mavlink.COMMAND_LONG, fields, acknowledgement))
+
+    def _ask(
+        self,
+        system_ids: Iterable[int],
+        msg_id: int,
+        fields: Callable[..., tuple[object, ...]],
+        answer: Callable[[mavlink.Frame], str],
+    ) -> dict[int, str]:
+        """Each vehicle's answer to a message, which is repeated until the answer arrives or time is up.
+
+        `fields` gives the fields of the message for a `target_system`; `answer` is the text in a frame, "" if it is no
+        answer.
+        """
         said: dict[int, str] = {}
         left = set(system_ids)
         patience_s = max(_LEAST_PATIENCE_S, _ROUND_TRIPS * longest_round_trip_s(self._scenario))
@@ -98,9 +91,9 @@ class Presence:
             outgoing: list[Outgoing] = []
             for system_id in sorted(left):
                 self._sequence += 1
-                frame = mavlink.encode(*make(system_id), sequence=self._sequence)
+                frame = mavlink.encode(msg_id, fields(target_system=system_id), sequence=self._sequence)
                 outgoing.append(Outgoing(frame, self._addresses[system_id]))
-            self._link.send(outgoing if self._guard is None else self._guard.sent(outgoing, now_ns))
+            self._link.send(outgoing)
             for frame in self._listen(now_ns + _ASK_AGAIN_NS):
                 if frame.system_id in left and (text := answer(frame)):
                     said[frame.system_id] = text
@@ -108,16 +101,13 @@ class Presence:
         return said
 
     def _listen(self, until_ns: int) -> list[mavlink.Frame]:
-        """The frames received until then from vehicles of the scenario, whose addresses are noted."""
+        """The frames received until a time from vehicles of the scenario, whose addresses are noted."""
         frames: list[mavlink.Frame] = []
         now_ns = 0
         while now_ns < until_ns:
             self._link.wait(until_ns)
             now_ns = clock_ns()  # before the socket is read: what came by then is among what is received
-            datagrams = self._link.receive()
-            if self._guard is not None:
-                datagrams = self._guard.received(datagrams, now_ns, Counter())
-            for datagram in datagrams:
+            for datagram in self._link.receive():
                 for frame in mavlink.decode_either(datagram.data, Counter()):
                     if frame.system_id in self._wanted:
                         self._addresses[frame.system_id] = datagram.address

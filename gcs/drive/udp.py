@@ -10,8 +10,8 @@ import select
 import socket
 import struct
 import time  # noqa: TID251 - this is a driver
+from collections import Counter
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
 from gcs.control.phases import Phase
@@ -51,12 +51,13 @@ def realtime_offset_ns() -> int:
 
 
 class StationSocket:
-    """One bound UDP socket with kernel receive stamps.
+    """One bound UDP socket with kernel receive stamps; with a guard, all its frames are signed and verified.
 
     Raises OSError if the address cannot be bound.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, guard: Guard | None = None) -> None:
+        self.guard = guard
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -72,7 +73,7 @@ class StationSocket:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._socket.close()
 
     @property
@@ -81,12 +82,17 @@ class StationSocket:
         return host, port
 
     def wait(self, until_ns: int) -> None:
-        """Wait until a datagram is there, or until a time."""
+        """Wait until a datagram arrives or a time is reached."""
         left_s = max(0, until_ns - clock_ns()) * 1e-9
         select.select([self._socket], [], [], left_s)
 
-    def receive(self) -> list[Datagram]:
-        """All waiting datagrams, oldest first, with their arrival on the station's clock."""
+    def receive(
+        self, refused: Counter[str] | None = None, is_another: Callable[[int, Datagram], bool] | None = None
+    ) -> list[Datagram]:
+        """All waiting datagrams, oldest first, with their arrival on the station's clock.
+
+        `refused` and `is_another` are those of `Guard.received`.
+        """
         datagrams: list[Datagram] = []
         begin_ns, to_monotonic_ns = clock_ns(), -realtime_offset_ns()
         oldest_ns = self._emptied_ns
@@ -105,10 +111,12 @@ class StationSocket:
             received_ns = seconds * 1_000_000_000 + nanoseconds + to_monotonic_ns
             received_ns = min(max(received_ns, oldest_ns), read_ns)
             datagrams.append(Datagram(data, address, received_ns, read_ns - received_ns))
+        if self.guard is not None:
+            return self.guard.received(datagrams, clock_ns(), Counter() if refused is None else refused, is_another)
         return datagrams
 
     def send(self, outgoing: list[Outgoing]) -> None:
-        for data, address in outgoing:
+        for data, address in outgoing if self.guard is None else self.guard.sent(outgoing, clock_ns()):
             try:
                 self._socket.sendto(data, address)
             except OSError:  # a full buffer or a closed port is a loss, which the link statistics show
@@ -116,7 +124,7 @@ class StationSocket:
 
 
 def prepare_real_time() -> None:
-    """Make this process wake on time: least timer slack, and no garbage collection of what exists already."""
+    """Make this process wake on time: minimum timer slack, and no garbage collection of objects that exist already."""
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     gc.collect()
     gc.freeze()
@@ -128,18 +136,17 @@ def drive(
     writer: RunWriter,
     stop_reason: Callable[[], str],
     new_plan: Callable[[FlightPlan], None],
-    guard: Guard | None = None,
     mirror: Mirror | None = None,
 ) -> None:
     """Run the station in real time until its flight has ended.
 
     `stop_reason` is called at every tick; a text other than "" ends the flight for that reason. `new_plan` is called
-    when identification has changed the flight plan. With a guard, all frames are signed. A mirror gets every frame
-    received and sent, and may pass on frames to the vehicles.
+    when identification has changed the flight plan. A mirror gets every frame received and sent, and may pass frames on
+    to the vehicles.
     """
     plan = station.plan
     log: list[tuple[bytes, int]] = []
-    """Frames since the last tick, in the order in which they were received and sent, with their times."""
+    """Frames received and sent since the last tick, in order, with their times."""
     refusals = Refusals()
 
     def log_refusals(now_ns: int, *, last: bool = False) -> None:
@@ -149,17 +156,14 @@ def drive(
 
     while station.phase is not Phase.ENDED:
         link.wait(station.next_event_ns)
-        datagrams = link.receive()
+        datagrams = link.receive(station.counters, station.is_another)
         now_ns = clock_ns()
-        if guard is not None:
-            datagrams = guard.received(datagrams, now_ns, station.counters, station.is_another)
         outgoing, tick = station.step(datagrams, now_ns)
-        link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
+        link.send(outgoing)
         sent_ns = clock_ns()
         if mirror is not None:
             mirror.forward([frame for frame, _ in station.frames] + [data for data, _ in outgoing], now_ns)
-            passed_on = mirror.passed_on(station.vehicles, now_ns)
-            link.send(passed_on if guard is None else guard.sent(passed_on, now_ns))
+            link.send(mirror.passed_on(station.vehicles, now_ns))
         log += station.frames
         # A round trip counts from the step that asked, a set-point's age from when it was handed over.
         log += [(data, sent_ns if mavlink.is_set_point(data) else now_ns) for data, _ in outgoing]
@@ -167,7 +171,12 @@ def drive(
         if tick is None:
             continue
         writer.tick(station.complete(tick, sent_ns))
-        _log(station, writer, log)
+        offset_ns = realtime_offset_ns()
+        writer.frames([(frame, time_ns + offset_ns) for frame, time_ns in log])
+        for event in station.events:
+            writer.event(event)
+        log.clear()
+        station.events.clear()
         log_refusals(now_ns)
         if station.plan is not plan:
             plan = station.plan
@@ -178,13 +187,3 @@ def drive(
     if mirror is not None:
         time_s, counts = station.scenario_time_s(clock_ns()), dict(mirror.counters)
         writer.event(Event(time_s=time_s, kind=MIRROR, text=in_words(counts), counts=counts))
-
-
-def _log(station: Station, writer: RunWriter, frames: list[tuple[bytes, int]]) -> None:
-    """Write the frames and the events since the last tick."""
-    offset_ns = realtime_offset_ns()
-    writer.frames([(frame, time_ns + offset_ns) for frame, time_ns in frames])
-    frames.clear()
-    for event in station.events:
-        writer.event(event)
-    station.events.clear()

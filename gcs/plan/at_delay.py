@@ -49,7 +49,7 @@ def _mean_jitter_s(jitter: Jitter) -> float:
             return (jitter.scale_s or 0.0) * (jitter.shape or 0.0)
         case "trace":
             return float(np.mean(jitter.trace_s or (0.0,)))
-        case _:
+        case "uniform" | "normal":
             return 0.0
 
 

@@ -52,7 +52,7 @@ class FlightPlan:
         return loop_timing(self.scenario)
 
     def with_margins(self, margins_s: tuple[float, ...], responses: Responses | None) -> "FlightPlan":
-        """The same gains, with their margins on vehicles that respond so."""
+        """The plan with the margins that the same gains have on vehicles with these responses."""
         slower = tuple((gain, s) for (gain, _), s in zip(self.slower, margins_s[1:], strict=True))
         return replace(self, delay_margin_s=margins_s[0], slower=slower, responses=responses)
 

@@ -23,7 +23,7 @@ AXES = "NE"
 
 
 def timing_of(scenario: Scenario) -> OnboardTiming | None:
-    """The timing of the onboard loop, None if the station closes every loop."""
+    """The timing of the onboard loop; None if the station closes every loop."""
     if scenario.control.loop != "onboard":
         return None
     own, control_hz = scenario.onboard, scenario.rates.control_hz

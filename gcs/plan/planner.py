@@ -1,23 +1,27 @@
 """From a scenario to what is flown: formation, gains, margins."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from math import inf
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.requirement import Requirement, plain
+from gains.delay.constant import delay_margin
 from gains.design.design import Design as InclusionDesign
-from gains.design.design import design, evaluate_gains
+from gains.design.design import design, evaluate_gains, trade_off
 from gains.design.graph import GraphDesign
 from gains.design.required import requirement_with
 from gains.design.time_scale import time_scaled
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, leader_follower, with_links, without_links
 from gains.performance.response import Response, continuous_margin, sampled_margin
+from gains.performance.robust import robustness
 from gains.performance.string_stability import string_peak
+from gains.sampled.constant import sampled_delay_margin
 from gcs.plan.at_delay import with_figures_at_delay
-from gcs.plan.design import Block, Design, GainSet, ResponsePart, VehicleResponse
+from gcs.plan.design import Block, Design, GainSet, ResponsePart, TradeOffPoint, VehicleResponse
 from gcs.plan.flight_plan import FlightPlan, loop_timing
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.onboard import onboard_plan, timing_of
@@ -29,7 +33,7 @@ _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
 
 _MORE = 1.1
-"""A design whose margin is too short at these rates is repeated for a margin larger by the shortage times this."""
+"""A design whose margin falls short at these rates is repeated for a margin larger by this times the shortfall."""
 
 
 def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
@@ -43,17 +47,29 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
         return _flown_loop(*_graph_plan(scenario, formation))
     responses = given_responses(scenario)
     found = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
-    schedule = _schedule(scenario, model, found)
+    slower = _slower(scenario, model, found)
     plan = FlightPlan(
         scenario=scenario,
         formation=formation,
         gain=model.overlapping_gain(found.K1, found.K2, found.K3),
         delay_margin_s=found.delay_margin_s,
-        slower=tuple((model.overlapping_gain(s.K1, s.K2, s.K3), s.delay_margin_s) for _, s in schedule),
+        slower=tuple((K, inf if own.delay_margin_s is None else own.delay_margin_s) for K, own in slower),
     )
-    entries = (_entry(1.0, found), *(_entry(*slower) for slower in schedule))
+    entries = (_entry(1.0, found), *(own for _, own in slower))
     whole = Design.model_validate(found.to_dict() | {"schedule": entries})
     return _flown_loop(*_with_responses(whole, plan, responses))
+
+
+def with_trade_off(design: Design) -> Design:
+    """The design with the best α at other delay margins, which takes longer to compute than all its other figures.
+
+    Gains on a general pattern have none.
+    """
+    if design.inclusion_gains is None:
+        return design
+    wanted = design.requirement or Requirement()
+    points = trade_off(period_s=design.period_s, string_peak_max=wanted.string_peak_max, loop=wanted.loop)
+    return design.model_copy(update={"trade_off": tuple(TradeOffPoint(**asdict(point)) for point in points)})
 
 
 def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
@@ -78,14 +94,13 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
     return whole.with_schedule(_with_margins(whole, margins_s, continuous_s)), plan
 
 
-def described(design: Design, plan: FlightPlan) -> Design:
-    """The design with the vehicles' responses, and its margins with them.
+def identified(design: Design, plan: FlightPlan) -> Design:
+    """The design with the vehicles' responses and its sampled margins with them.
 
+    Its other figures, which take a second to compute, are left out: a station in flight cannot wait for them.
     `delay_margin_at_once_s` is the margin of the same gains on vehicles that respond at once.
     """
     assert plan.responses is not None
-    every = plan.responses.in_order(plan.formation.system_ids)
-    continuous_s = [continuous_margin(plan.model, K, every) for K in plan.gains]
     response = ResponsePart(
         source=plan.responses.source,
         model="lag a' = u + g (v_s - v) - a, v_s' = u",
@@ -95,12 +110,24 @@ def described(design: Design, plan: FlightPlan) -> Design:
         ),
         delay_margin_at_once_s=design.delay_margin_s,
     )
+    schedule = _with_margins(design, plan.margins_s, [None] * len(plan.gains))
+    return design.with_schedule(schedule, response=response).model_copy(update={"at_loop_delay": None})
+
+
+def described(design: Design, plan: FlightPlan) -> Design:
+    """The design with the vehicles' responses, and all its figures with them."""
+    known = identified(design, plan)
+    assert plan.responses is not None
+    assert known.response is not None
+    every = plan.responses.in_order(plan.formation.system_ids)
+    continuous_s = [continuous_margin(plan.model, K, every) for K in plan.gains]
+    response = known.response
     if design.inclusion_gains is not None:  # the same for each vehicle, as on a leader-follower tree only
         own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
         peaks = [string_peak((own, front, spacing), 0.0, answer=answer.transfer) for answer in set(every)]
         response = response.model_copy(update={"string_peak": max(peaks)})
     schedule = _with_margins(design, plan.margins_s, continuous_s)
-    return with_figures_at_delay(design.with_schedule(schedule, response=response), plan.scenario)
+    return with_figures_at_delay(known.with_schedule(schedule, response=response), plan.scenario)
 
 
 def _with_margins(
@@ -113,16 +140,24 @@ def _with_margins(
     )
 
 
-def _schedule(scenario: Scenario, model: FormationModel, found: InclusionDesign) -> list[tuple[float, InclusionDesign]]:
-    """The design slowed down by the scenario's factors.
+def _slower(scenario: Scenario, model: FormationModel, found: InclusionDesign) -> list[tuple[FloatArray, GainSet]]:
+    """The gain and the figures of the design slowed down by each of the scenario's factors.
 
     With K1 / s, K2 / s and K3 / s² the loop moves s times slower, so its delay margin is s times larger.
     """
     period_s = loop_timing(scenario).held_s
-    return [
-        (s, evaluate_gains(model, (found.K1 / s, found.K2 / s, found.K3 / s**2), period_s=period_s))
-        for s in scenario.monitor.time_scales[1:]
-    ]
+    slower: list[tuple[FloatArray, GainSet]] = []
+    for s in scenario.monitor.time_scales[1:]:
+        gains = found.K1 / s, found.K2 / s, found.K3 / s**2
+        K = model.overlapping_gain(*gains)
+        figures = {
+            "alpha": robustness(*gains),
+            "delay_margin_s": float(sampled_delay_margin(model.A, model.B, K, period_s=period_s)),
+            "delay_margin_continuous_s": delay_margin(model.A, model.B @ K),
+        }
+        names = dict(zip(("K1_1_s", "K2_1_s", "K3_1_s2"), gains, strict=True))
+        slower.append((K, GainSet.model_validate(plain({"time_scale": s} | names | figures))))
+    return slower
 
 
 def _entry(time_scale: float, found: InclusionDesign | GraphDesign, **gains: Sequence[Block]) -> GainSet:

@@ -20,8 +20,7 @@ def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.in
     """(k, 2) instants in ns at which a vehicle's commands acted and at which the states used were sampled, in order."""
     sampled, acted = (instants(truth[truth["system_id"] == system_id], kind) for kind in (SAMPLED, ACTED))
     rows = ticks[(ticks["system_id"] == system_id) & ticks["commanded"]]
-    keys = zip(rows["key_ms"].tolist(), rows["sample_boot_ms"].tolist(), strict=True)
-    known = [((system_id, key), (system_id, boot)) for key, boot in keys]
+    known = [((system_id, key), (system_id, boot)) for key, boot in rows[["key_ms", "sample_boot_ms"]].tolist()]
     pairs = [(acted[key], sampled[boot]) for key, boot in known if key in acted and boot in sampled]
     return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 

@@ -3,6 +3,7 @@
 A file that is damaged, or of another kind, raises gcs.errors.InputError with one line.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -46,12 +47,12 @@ def read_summary(file: Path) -> Summary:
 
 def read_ticks(folder: Path) -> TickArray:
     """All tick rows of a run, finished or not."""
-    part, parquet = folder / TICKS_FILE, folder / PARQUET_FILE
-    if not part.exists() and not parquet.exists():
+    file = next((file for name in (TICKS_FILE, PARQUET_FILE) if (file := folder / name).exists()), None)
+    if file is None:
         raise InputError(f"{folder}: read neither {TICKS_FILE} nor {PARQUET_FILE}, wanted the folder of a run")
-    ticks = RunTail(folder).ticks() if part.exists() else _from_parquet(parquet)
+    ticks = RunTail(folder).ticks() if file.name == TICKS_FILE else _from_parquet(file)
     if not (np.isfinite(ticks["time_s"]).all() and (ticks["mode"] <= max(Mode)).all()):
-        raise InputError(f"{part if part.exists() else parquet}: read rows that are damaged, wanted the ticks of a run")
+        raise InputError(f"{file}: read rows that are damaged, wanted the ticks of a run")
     return ticks
 
 
@@ -95,17 +96,32 @@ def _first(errors: ValidationError) -> str:
     return f"{key + ': ' if key else ''}read {read if len(read) <= 60 else read[:57] + '...'}, {message}"
 
 
-class RunTail:
-    """Reads what has been added to a run's ticks and events since the last call; the run may still be growing."""
+def by_tick(rows: TickArray, system_ids: Sequence[int]) -> TickArray:
+    """Rows of a run as whole ticks: shape (ticks, vehicles), the vehicles in the order of `system_ids`.
 
-    def __init__(self, folder: Path) -> None:
+    A last tick of which rows are missing, as a killed station may leave it, is left out.
+    """
+    count = len(system_ids)
+    ticks = rows[: rows.size // count * count].reshape(-1, count)
+    written = ticks["system_id"][:1].ravel().tolist()
+    return ticks[:, [written.index(system_id) for system_id in system_ids]] if written else ticks
+
+
+class RunTail:
+    """Reads what has been added to a run's ticks and events since the last call; the run may still be growing.
+
+    `vehicles` are the rows of a tick; 1 also gives single rows of a tick that was not written whole.
+    """
+
+    def __init__(self, folder: Path, vehicles: int = 1) -> None:
         self._folder = folder
+        self._tick_bytes = vehicles * TICK.itemsize
         self._ticks_read = 0
         self._events_read = 0
 
     def ticks(self) -> TickArray:
-        """New rows, in the order they were written; a half-written one is left for the next call."""
-        data, count = self._new(TICKS_FILE, self._ticks_read, TICK.itemsize)
+        """New rows, in the order they were written; a half-written tick is left for the next call."""
+        data, count = self._new(TICKS_FILE, self._ticks_read, self._tick_bytes)
         self._ticks_read += count
         return np.frombuffer(data[:count], dtype=TICK)
 

@@ -1,4 +1,4 @@
-"""`gcs grade`: what a flight measured of its links, against the truth that vehicles and emulated links wrote down.
+"""`gcs grade`: the latencies that a flight measured, against the truth that vehicles and emulated links recorded.
 
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
 loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
@@ -27,7 +27,7 @@ _TIMESYNC = 111
 
 
 class Graded(Published):
-    """How far measurements are from the truth; with no sample, the errors are None and not 0."""
+    """The errors of measurements against the truth; None without a sample."""
 
     status: str
     samples: int
@@ -113,21 +113,20 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
 
 
 def true_loop_delays_s(ticks: TickArray, truth: Truth) -> FloatArray:
-    """The true age (s) of the state behind each row's set-point when that acted; NaN where it never did, or no state is
-    known.
+    """The true age (s) of the state behind each row's set-point when the set-point acted.
+
+    NaN where it never acted, or no state is known.
 
     `ticks` are whole: a row for every vehicle.
     """
     sampled, acted = (instants(truth, kind) for kind in (SAMPLED, ACTED))
-    out = np.full(len(ticks), np.nan)
-    used = _rows_used(ticks)
-    for k in np.flatnonzero(ticks["commanded"]):
-        row, source = ticks[k], ticks[used[k]]
-        since_ns = sampled.get((int(source["system_id"]), int(source["sample_boot_ms"])))
-        until_ns = acted.get((int(row["system_id"]), int(row["key_ms"])))
-        if since_ns is not None and until_ns is not None:
-            out[k] = (until_ns - since_ns) * 1e-9
-    return out
+    states = ticks[["system_id", "sample_boot_ms"]][_rows_used(ticks)].tolist()
+    set_points = ticks[["system_id", "key_ms"]].tolist()
+    delays_s = [
+        (acted.get(command, np.nan) - sampled.get(state, np.nan)) * 1e-9
+        for command, state in zip(set_points, states, strict=True)
+    ]
+    return np.where(ticks["commanded"], delays_s, np.nan)
 
 
 def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
@@ -147,13 +146,8 @@ def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
 
 def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
     """The first instant (ns) of each (system id, time_boot_ms)."""
-    own = truth[truth["kind"] == kind]
-    found: dict[tuple[int, int], int] = {}
-    for system_id, key, time_ns in zip(
-        own["system_id"].tolist(), own["key"].tolist(), own["time_ns"].tolist(), strict=True
-    ):
-        found.setdefault((system_id, key), time_ns)
-    return found
+    own = truth[truth["kind"] == kind][::-1]  # of several records the first is the last to be set
+    return {(system_id, key): time_ns for system_id, key, time_ns in own[["system_id", "key", "time_ns"]].tolist()}
 
 
 def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:

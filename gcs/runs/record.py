@@ -1,8 +1,8 @@
 """What a run leaves behind while it flies: the tick record, the events, the telemetry log.
 
-All three are append-only files written with one system call a tick, so a killed process loses nothing that it had
-logged, and others (the live table, the Rerun recording) follow the flight by reading files: the control loop
-never waits for them.
+All three are append-only files, written with one system call a tick: a killed process loses nothing that it had logged.
+The live table and the Rerun recording follow the flight by reading these files, so the control loop never waits for
+them.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ import json
 import os
 import struct
 from collections.abc import Generator, Iterable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +57,7 @@ class RunWriter:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._ticks, self._events, self._tlog = (
-            RecordLog(folder / name) for name in (TICKS_FILE, EVENTS_FILE, TLOG_FILE)
-        )
+        self._logs = {name: RecordLog(folder / name) for name in (TICKS_FILE, EVENTS_FILE, TLOG_FILE)}
         self._ended: set[str] = set()
         self._waiting: list[Event] = []
         """Events that could not be written yet."""
@@ -67,23 +65,24 @@ class RunWriter:
         """Of the newest tick."""
 
     def tick(self, rows: TickArray) -> None:
+        """Log the rows of a tick."""
         self._time_s = float(rows["time_s"][0])
-        self._add(TICKS_FILE, self._ticks, rows.tobytes())
+        self._add(TICKS_FILE, rows.tobytes())
 
     def event(self, event: Event) -> None:
-        rounded = replace(event, time_s=round(event.time_s, 6))
+        """Log an event, and those before it that could not be written yet."""
         if len(self._waiting) < _MOST_WAITING or event.kind == END:
-            self._waiting.append(rounded)
+            self._waiting.append(replace(event, time_s=round(event.time_s, 6)))
         with contextlib.suppress(OSError):
             lines = (json.dumps(event_fields(waiting)) + "\n" for waiting in self._waiting)
-            self._events.add("".join(lines).encode())
+            self._logs[EVENTS_FILE].add("".join(lines).encode())
             self._waiting.clear()
 
     def frames(self, frames: Iterable[tuple[bytes, int]]) -> None:
         """Log frames, each with its time in ns since 1970, in the .tlog layout: big-endian µs, then the frame."""
         entries = b"".join(struct.pack(">Q", time_ns // 1000) + frame for frame, time_ns in frames)
         if entries:
-            self._add(TLOG_FILE, self._tlog, entries)
+            self._add(TLOG_FILE, entries)
 
     def ended(self, name: str, error: OSError) -> None:
         """Note that a file of the run could not be written; it is left as it is from now on."""
@@ -92,25 +91,22 @@ class RunWriter:
 
     def close(self) -> list[Event]:
         """Close the files; returns the events that could not be written."""
-        for log in (self._ticks, self._events, self._tlog):
+        for log in self._logs.values():
             log.close()
         return self._waiting
 
-    def _add(self, name: str, log: "RecordLog", data: bytes) -> None:
+    def _add(self, name: str, data: bytes) -> None:
         if name in self._ended:
             return
         try:
-            log.add(data)
+            self._logs[name].add(data)
         except OSError as error:
             self.ended(name, error)
 
 
 def event_fields(event: Event) -> dict[str, Any]:
     """The fields of a line of events.jsonl; `counts` only where the event has them."""
-    fields = asdict(event)
-    if event.counts is None:
-        del fields["counts"]
-    return fields
+    return {name: value for name, value in vars(event).items() if name != "counts" or value is not None}
 
 
 class RecordLog:

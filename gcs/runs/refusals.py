@@ -1,7 +1,7 @@
 """What the station refuses, by reason, for the log of a run: each reason once, so that no attacker can fill the log."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import TypeAdapter
@@ -57,7 +57,6 @@ def refused_by_vehicles(folder: Path) -> dict[str, int] | None:
     return {name.replace("_", " "): count for name, count in refused.items()}
 
 
-def counts_of(events: Iterable[Event], kind: str) -> dict[str, int]:
+def counts_of(events: Sequence[Event], kind: str) -> dict[str, int]:
     """The newest counts in the events of a kind."""
-    counts = [event.counts for event in events if event.kind == kind and event.counts is not None]
-    return counts[-1] if counts else {}
+    return next((event.counts for event in reversed(events) if event.kind == kind and event.counts is not None), {})

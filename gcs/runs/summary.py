@@ -14,24 +14,8 @@ from gcs.control.tick import CLOCK_JUMPED, TICK, Event, Mode, TickArray
 from gcs.errors import InputError
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
+from gcs.runs import record
 from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
-from gcs.runs.record import (
-    DESIGN_FILE,
-    END,
-    EVENTS_FILE,
-    FLEET,
-    LOG_ENDED,
-    MIRROR,
-    PARQUET_FILE,
-    RECORDING_FILE,
-    SCENARIO_FILE,
-    STARTED,
-    SUMMARY_FILE,
-    TICKS_FILE,
-    TRUTH_FILE,
-    replacing,
-    write_whole,
-)
 from gcs.runs.refusals import REFUSED, counted_by_vehicles, counts_of, refused_by_vehicles
 from gcs.runs.summary_record import Clock, Control, Estimate, MarginRange, OneWayDelay, Spread, Summary, VehicleSummary
 from scenarios.schema import Scenario
@@ -51,20 +35,19 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     unless `unwritten` is given.
     """
     scenario = read_scenario(folder)
-    design = read_design(folder / DESIGN_FILE)
+    design = read_design(folder / record.DESIGN_FILE)
     ticks = read_ticks(folder)
     if strangers := set(ticks["system_id"].tolist()) - {vehicle.system_id for vehicle in scenario.vehicles}:
-        raise InputError(
-            f"{folder}: read ticks of vehicles {sorted(strangers)}, wanted those of its {SCENARIO_FILE} only"
-        )
+        wanted = f"wanted those of its {record.SCENARIO_FILE} only"
+        raise InputError(f"{folder}: read ticks of vehicles {sorted(strangers)}, {wanted}")
     summary = summarise(scenario, design, ticks, [*RunTail(folder).events(), *(unwritten or ())])
     not_logged = list(summary.not_logged)
     if unwritten:
-        not_logged.append(f"{EVENTS_FILE}: the last {len(unwritten)}")
-    if unwritten is not None and not (folder / RECORDING_FILE).exists():
-        not_logged.append(f"{RECORDING_FILE}: see gcs recover")
+        not_logged.append(f"{record.EVENTS_FILE}: the last {len(unwritten)}")
+    if unwritten is not None and not (folder / record.RECORDING_FILE).exists():
+        not_logged.append(f"{record.RECORDING_FILE}: see gcs recover")
     if lost := (counted_by_vehicles(folder) or {}).get("truth_lost"):
-        not_logged.append(f"{TRUTH_FILE}: {lost} records")
+        not_logged.append(f"{record.TRUTH_FILE}: {lost} records")
 
     def write(name: str, how: Callable[[], None]) -> None:
         try:
@@ -81,9 +64,9 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     def there() -> set[str]:
         return {file.name for file in folder.iterdir() if not file.name.startswith(".")}
 
-    write(PARQUET_FILE, lambda: _write_parquet(folder, ticks))
-    text = whole(there() | {SUMMARY_FILE}).to_json().encode()
-    write(SUMMARY_FILE, lambda: write_whole(folder / SUMMARY_FILE, text))
+    write(record.PARQUET_FILE, lambda: _write_parquet(folder, ticks))
+    text = whole(there() | {record.SUMMARY_FILE}).to_json().encode()
+    write(record.SUMMARY_FILE, lambda: record.write_whole(folder / record.SUMMARY_FILE, text))
     return whole(there())
 
 
@@ -93,9 +76,9 @@ def _write_parquet(folder: Path, ticks: TickArray) -> None:
     import pyarrow.parquet as pq
 
     table = pa.table({name: np.ascontiguousarray(ticks[name]) for name in TICK.names or ()})
-    with replacing(folder / PARQUET_FILE) as part:
+    with record.replacing(folder / record.PARQUET_FILE) as part:
         pq.write_table(table, part, compression="zstd")
-    (folder / TICKS_FILE).unlink(missing_ok=True)
+    (folder / record.TICKS_FILE).unlink(missing_ok=True)
 
 
 def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> Summary:
@@ -103,25 +86,28 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
     commanded = ticks["tick"][ticks["commanded"]]
     flown = ticks[(ticks["time_s"] >= 0) & (ticks["tick"] <= (commanded[-1] if commanded.size else -1))]
     sent = flown[flown["commanded"]]
-    said = {kind: [event.text for event in events if event.kind == kind] for kind in (END, FLEET)}
-    reason = (said[END] or [SILENT_END])[-1]
-    not_logged = tuple(f"{event.text}, from {event.time_s:.2f} s on" for event in events if event.kind == LOG_ENDED)
-    followers = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
-    errors = {system_id: _error(flown, system_id) for system_id in followers}
-    settled = _settling_time_s(errors, followers, scenario.safety.settled_fraction)
-    if not followers:
-        settled = _settled_velocity_s(scenario, flown)
+    said = {kind: [event.text for event in events if event.kind == kind] for kind in (record.END, record.FLEET)}
+    reason = (said[record.END] or [SILENT_END])[-1]
+    not_logged = tuple(
+        f"{event.text}, from {event.time_s:.2f} s on" for event in events if event.kind == record.LOG_ENDED
+    )
+    errors = {
+        v.system_id: _error(flown, v.system_id, "spacing_error_{}_m")
+        for v in scenario.vehicles
+        if v.follows is not None
+    }
+    settled = _settling_time_s(scenario, errors, flown)
     jumps: dict[int | None, list[float]] = defaultdict(list)
     for event in events:
         if event.text == CLOCK_JUMPED:
             jumps[event.system_id].append(event.time_s)
-    headroom_end, logged = _headroom_end(flown), not any(text.startswith(TICKS_FILE) for text in not_logged)
+    headroom_end, logged = _headroom_end(flown), not any(text.startswith(record.TICKS_FILE) for text in not_logged)
     slowest_s = max(_medians(sent, "loop_delay_s"), default=None)
     return Summary(
         scenario=scenario.name,
         verdict=verdict(reason, settled, headroom_end=headroom_end, logged=logged),
         reason=reason,
-        fleet=(said[FLEET] or [STARTED])[-1],
+        fleet=(said[record.FLEET] or [record.STARTED])[-1],
         not_logged=not_logged,
         loop=scenario.control.loop,
         delay_margin_s=design.delay_margin_s,
@@ -140,7 +126,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         ),
         control=_control(scenario, flown),
         refused=counts_of(events, REFUSED),
-        mirror=counts_of(events, MIRROR),
+        mirror=counts_of(events, record.MIRROR),
         mode_changes=tuple(event for event in events if event.kind == "mode" and event.time_s >= 0),
     )
 
@@ -152,7 +138,7 @@ def _medians(rows: TickArray, name: str) -> list[float]:
 
 
 Errors = tuple[FloatArray, FloatArray]
-"""Times (s) and the norm of the spacing error (m) of one follower."""
+"""Times (s) and the norm of an error of one vehicle: of spacing (m) or of velocity (m/s)."""
 
 
 def verdict(
@@ -160,11 +146,11 @@ def verdict(
 ) -> str:
     """ "stable", "unstable", "aborted" or "unknown".
 
-    Stable: flown to the end of its duration, every spacing error had settled by then, and the loop delay was within
-    the margin at the end. Unstable: a limit was broken; or a spacing error had not settled, be it that it grows,
-    circles in a limit cycle or shrinks too slowly for the scenario's duration; or the errors were small, but the loop
-    delay was past the margin at the end: there they grow slowly, or limits hold them in a small cycle. Aborted: ended
-    early for any other reason. Unknown: flown to the end, but not all of it is in the log of ticks.
+    Stable: flown to the end of its duration, every spacing error settled, and the loop delay within the margin at the
+    end. Unstable: a limit was broken; or a spacing error had not settled, because it grows, circles in a limit cycle or
+    shrinks too slowly; or errors were small but the loop delay was past the margin at the end, where errors grow slowly
+    or limits hold them in a small cycle. Aborted: ended early for any other reason. Unknown: flown to the end, but the
+    log of ticks is incomplete.
     """
     if reason.startswith("broken"):
         return "unstable"
@@ -181,33 +167,32 @@ def _headroom_end(flown: TickArray) -> float | None:
     return min(_medians(late, "headroom"), default=None)
 
 
-def _error(flown: TickArray, system_id: int) -> Errors:
+def _error(flown: TickArray, system_id: int, column: str) -> Errors:
+    """The norm over north and east of an error of a vehicle, where it is known."""
     rows = flown[flown["system_id"] == system_id]
-    error = np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
+    error = np.hypot(rows[column.format("north")], rows[column.format("east")])
     known = np.isfinite(error)
     return rows["time_s"][known], error[known]
 
 
-def _settling_time_s(errors: dict[int, Errors], spacing_m: dict[int, float], fraction: float) -> float | None:
-    """When the last follower came within its band for good; None if one has not."""
+def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown: TickArray) -> float | None:
+    """When the last follower came within a fraction of its spacing for good; None if one has not.
+
+    A vehicle without followers settles within the same fraction of its speed, of at least 1 m/s.
+    """
+    whole = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
+    if not whole:
+        [alone] = (vehicle.system_id for vehicle in scenario.vehicles)
+        whole = {alone: max(float(np.hypot(*scenario.nominal_velocity[-1].velocity_ne_m_s)), 1.0)}
+        errors = {alone: _error(flown, alone, "velocity_error_{}_m_s")}
     latest = 0.0
-    for system_id, (time_s, error_m) in errors.items():
-        outside = np.flatnonzero(error_m > fraction * spacing_m[system_id])
+    for system_id, (time_s, error) in errors.items():
+        outside = np.flatnonzero(error > scenario.safety.settled_fraction * whole[system_id])
         if not time_s.size or (outside.size and outside[-1] == time_s.size - 1):
             return None
         if outside.size:
             latest = max(latest, float(time_s[outside[-1] + 1]))
     return round(latest, 6)
-
-
-def _settled_velocity_s(scenario: Scenario, flown: TickArray) -> float | None:
-    """When a vehicle without followers came to its nominal velocity for good, within the same fraction of its speed."""
-    speed_m_s = float(np.hypot(*scenario.nominal_velocity[-1].velocity_ne_m_s))
-    error_m_s = np.hypot(flown["velocity_error_north_m_s"], flown["velocity_error_east_m_s"])
-    known = np.isfinite(error_m_s)
-    [leader] = scenario.vehicles
-    errors = {leader.system_id: (flown["time_s"][known], error_m_s[known])}
-    return _settling_time_s(errors, {leader.system_id: max(speed_m_s, 1.0)}, scenario.safety.settled_fraction)
 
 
 def _vehicle(

@@ -1,4 +1,4 @@
-"""Which vehicles are absent from the formation: those that are lost, and those that somebody else flies."""
+"""Which vehicles are absent from the formation: those that are lost, and those that a pilot or autopilot flies."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ def describe_change(was: str, now: str) -> str:
 
 
 def end_reason(vehicles: Sequence[RemoteVehicle], absent: Sequence[str]) -> str:
-    """Why a flight ends: its duration is over, or no vehicle is left."""
+    """Why a flight ends: its duration has passed, or no vehicle is left. Absent vehicles are named."""
     if all(reason == LOST for reason in absent):
         return "lost: all vehicles"
     kinds = (("lost", LOST), ("taken over", TAKEN_OVER))

@@ -1,7 +1,7 @@
 """Ends a flight whose formation is broken: after a collision, or a spacing error beyond the limit.
 
-A vehicle that returns from its pilot, its failsafe or silence may be far from its place. The vehicles behind it are
-then as far from theirs, which are relative to it. Their errors say nothing about the loop until they have had time to
+A vehicle that returns from its pilot, its failsafe or silence may be far from its place, and the vehicles behind it,
+whose places are relative to it, as far from theirs. Their errors say nothing about the loop until they have had time to
 return. A vehicle is granted this time again only if it has been within the limit since, or if its pilot flew it: a
 formation that diverges while its vehicles keep entering their failsafe is broken.
 """
@@ -24,7 +24,7 @@ _AWAY = (Mode.LOST, Mode.FAILSAFE)
 
 
 class Breakage:
-    """Judges every tick of a flight, and remembers which vehicles are returning."""
+    """Judges each tick of a flight, and remembers which vehicles are returning."""
 
     def __init__(self, plan: FlightPlan) -> None:
         n = len(plan.formation.system_ids)
@@ -93,7 +93,7 @@ class Breakage:
 
 
 def slowest_decay_1_s(plan: FlightPlan) -> float:
-    """Decay rate, without delay, of the slowest gains of the schedule, with which a vehicle returns."""
+    """Decay rate in 1/s, without delay, of the slowest gains of the schedule: those with which a vehicle returns."""
     model = plan.model
     closed_loop = model.A + model.B @ plan.gains[-1]
     loops = [closed_loop]
@@ -104,7 +104,7 @@ def slowest_decay_1_s(plan: FlightPlan) -> float:
 
 
 def recovery_time_s(plan: FlightPlan, decay_1_s: float, way_m: float, speed_m_s: float) -> float:
-    """Time that a vehicle has to return over a distance before its spacing error is judged again.
+    """Time that a vehicle is given to return over a distance before its spacing error is judged again.
 
     Three time constants of the slowest gains, plus the time in which the error decays to the spacing error limit.
     Limits of acceleration and speed add twice the time that the distance takes under them alone: to speed up and slow

@@ -1,4 +1,4 @@
-"""What depends on the kind of vehicles, double integrators or multicopters with autopilots.
+"""What depends on the kind of vehicles: double integrators or multicopters with autopilots.
 
 `fleet_of` chooses once, when the station is built; nothing else in the station reads the scenario's `dynamics`. Where
 the loop is closed is another choice, see `gcs.control.loops`.
@@ -21,7 +21,7 @@ class FleetKind(Protocol):
 
     @property
     def plan(self) -> FlightPlan:
-        """The flight plan; once the vehicles are identified, with the margins that they have."""
+        """The flight plan; once the vehicles are identified, with margins for their responses."""
         ...
 
     @property
@@ -51,7 +51,7 @@ class FleetKind(Protocol):
         ...
 
     def startup_failure(self, due_ns: int, start_ns: int) -> str:
-        """Why the flight cannot begin: a vehicle cannot be flown, or its time is up. Empty while it still may."""
+        """Why the flight cannot begin: a vehicle cannot be flown, or took too long. Empty while it still may begin."""
         ...
 
     def locate(self, history: StateHistory) -> None:

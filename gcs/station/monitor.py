@@ -100,7 +100,7 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
 
 
 def _is_calm(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> bool:
-    """NOMINAL with enough or unknown headroom and no condition lasting: most ticks of most flights."""
+    """Whether the vehicle is NOMINAL with enough or unknown headroom and no condition lasts: true of most ticks."""
     nominal = state.mode is Mode.NOMINAL and state.pressed_s is None and state.eased_s is None
     return nominal and not headroom(seen.loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
 
@@ -174,8 +174,8 @@ def _lasted(since_s: float | None, wanted_s: float, now_s: float) -> bool:
 class FormationMonitor:
     """The monitor of a whole formation: one state for each vehicle, and how far the formation is opened.
 
-    `separable`: every vehicle's loop has its own margin, as in a leader-follower tree. Otherwise the largest loop delay
-    counts for all vehicles, and all change gains together.
+    `separable` says that every vehicle's loop has its own margin, as in a leader-follower tree. If not, the largest
+    loop delay counts for all vehicles, and all change gains together.
     """
 
     def __init__(

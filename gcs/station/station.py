@@ -95,8 +95,8 @@ class Station:
 
         Returns
         -------
-        datagrams to send, and the control tick if one was due. The driver passes it to `complete` once the datagrams
-        are sent.
+        datagrams to send, and the control tick if one was due. The driver passes the tick to `complete` once the
+        datagrams are sent.
         """
         self._now_ns = now_ns
         outgoing: list[Outgoing] = []
@@ -119,7 +119,7 @@ class Station:
         return rows
 
     def scenario_time_s(self, now_ns: int) -> float:
-        """Time since the formation flight began; before that negative, the time since the start minus `patience_s`."""
+        """Time since the formation flight began; before that, the time since the start minus `patience_s`: negative."""
         if self._flight_start_ns is None:
             return (now_ns - self._start_ns) / NS_PER_S - self.patience_s
         return (now_ns - self._flight_start_ns) / NS_PER_S
@@ -133,7 +133,8 @@ class Station:
 
     def _receive(self, datagram: Datagram, outgoing: list[Outgoing]) -> None:
         if self._fleet.speaks_mavlink_1_first and datagram.data[:1] == b"\xfe":
-            frames = mavlink.first_heartbeats(datagram.data)  # once answered in MAVLink 2, the vehicle uses that
+            # once answered in MAVLink 2, the vehicle uses that
+            frames = mavlink.first_heartbeats(datagram.data, self.counters)
         else:
             frames = mavlink.decode(datagram.data, self.counters)
         for frame in frames:

@@ -6,12 +6,16 @@ import time  # noqa: TID251 - run time is what is measured; nothing flown depend
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import NamedTuple
 
+from gcs.drive.flown import fly_real_time
 from gcs.drive.lockstep import Sent, Vehicles, fly_lockstep, signed_ends, vehicles_of
 from gcs.interrupts import raised
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
+from gcs.published import Published
+from gcs.runs.grade import Grade, grade
+from gcs.runs.summary_record import Control
 from gcs.station import station
 from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
@@ -19,6 +23,52 @@ from scenarios.signing.keys import KEY_BYTES, Key
 _COLUMN = 10
 """Vehicles behind one another in a large formation, whose columns follow one leader."""
 _SPACING_M = 100.0
+
+
+class SigningCost(Published):
+    """Run time of signed over unsigned flights, for the whole and for the station: fastest flights and median."""
+
+    time_ratio: float
+    time_ratio_p50: float
+    station_time_ratio: float
+    station_time_ratio_p50: float
+
+
+class Benchmark(Published):
+    """How fast flights of a scenario are computed: the figures of the fastest, and the median of the speed.
+
+    `core_share` is the share of one processor that the fastest flight had.
+    """
+
+    vehicles: int
+    control_hz: float
+    compiled: bool
+    real_time_factor: float
+    real_time_factor_p50: float
+    core_share: float
+    station_s_per_tick: float
+    station_share_of_period: float
+    ticks: int
+    flights: int
+    signed: SigningCost | None
+
+
+class RealTimeBenchmark(Grade):
+    """How punctual a flight over UDP was, how loaded the machine, and the errors of the flight's latencies."""
+
+    control: Control
+    reason: str
+    steal_share: float
+    load_average: float
+
+
+class _Flown(NamedTuple):
+    """The run time of a flight."""
+
+    ticks: int
+    core_share: float
+    s_per_tick: float
+    station_s_per_tick: float
 
 
 @dataclass
@@ -54,67 +104,69 @@ def with_vehicles(scenario: Scenario, count: int) -> Scenario:
     return scenario.model_copy(update={"vehicles": tuple(vehicles)})
 
 
-def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool = False) -> dict[str, Any]:
-    """Fly `seconds` of a scenario `repeat` times in virtual time: figures of the fastest and of the median flight.
+def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool = False) -> Benchmark:
+    """Fly `seconds` of a scenario `repeat` times in virtual time.
 
-    With `signed`, unsigned and signed flights alternate, and the result's `signed` is the cost of signing.
+    With `signed`, unsigned and signed flights alternate, and the result has the cost of signing.
     """
     _, plan = flight_plan(_without_solver(scenario, seconds))
-    flights: list[dict[str, float]] = []
-    signed_flights: list[dict[str, float]] = []
+    flights: list[_Flown] = []
+    signed_flights: list[_Flown] = []
     for _ in range(repeat):
         flights.append(_flight(plan))
         if signed:
             signed_flights.append(_flight(plan, key=Key(os.urandom(KEY_BYTES))))
-    fastest = min(flights, key=lambda flight: flight["s_per_tick"])
+    fastest = min(flights, key=lambda flight: flight.s_per_tick)
     period_s = 1.0 / scenario.rates.control_hz
-    return {
-        "vehicles": len(scenario.vehicles),
-        "control_hz": scenario.rates.control_hz,
-        "compiled": not str(Path(station.__file__)).endswith(".py"),
-        "real_time_factor": period_s / fastest["s_per_tick"],
-        "real_time_factor_p50": period_s / median(flight["s_per_tick"] for flight in flights),
-        "core_share": fastest["core_share"],
-        "station_s_per_tick": fastest["station_s_per_tick"],
-        "station_share_of_period": fastest["station_s_per_tick"] / period_s,
-        "ticks": fastest["ticks"],
-        "flights": repeat,
-        "signed": _cost(signed_flights, flights) if signed else None,
-    }
+    return Benchmark(
+        vehicles=len(scenario.vehicles),
+        control_hz=scenario.rates.control_hz,
+        compiled=not str(Path(station.__file__)).endswith(".py"),
+        real_time_factor=period_s / fastest.s_per_tick,
+        real_time_factor_p50=period_s / median(flight.s_per_tick for flight in flights),
+        core_share=fastest.core_share,
+        station_s_per_tick=fastest.station_s_per_tick,
+        station_share_of_period=fastest.station_s_per_tick / period_s,
+        ticks=fastest.ticks,
+        flights=repeat,
+        signed=_cost(signed_flights, flights) if signed else None,
+    )
 
 
-def _cost(signed: list[dict[str, float]], plain: list[dict[str, float]]) -> dict[str, float]:
-    """Run time of signed flights over that of unsigned ones, for all and for the station: best and median."""
-    names = {"time_ratio": "s_per_tick", "station_time_ratio": "station_s_per_tick"}
-    return {
-        f"{ratio}{suffix}": pick(flight[name] for flight in signed) / pick(flight[name] for flight in plain)
-        for ratio, name in names.items()
-        for suffix, pick in (("", min), ("_p50", median))
-    }
+def _cost(signed: list[_Flown], plain: list[_Flown]) -> SigningCost:
+    (whole, whole_plain), (own, own_plain) = (
+        ([getattr(flight, name) for flight in flights] for flights in (signed, plain))
+        for name in ("s_per_tick", "station_s_per_tick")
+    )
+    return SigningCost(
+        time_ratio=min(whole) / min(whole_plain),
+        time_ratio_p50=median(whole) / median(whole_plain),
+        station_time_ratio=min(own) / min(own_plain),
+        station_time_ratio_p50=median(own) / median(own_plain),
+    )
 
 
-def benchmark_real_time(scenario: Scenario, *, seconds: float) -> dict[str, Any]:
-    """Fly `seconds` of a scenario over UDP: the station's punctuality, and its latencies against the truth."""
-    from gcs.drive.realtime_flight import fly_real_time
-    from gcs.runs.grade import grade
+def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchmark:
+    """Fly `seconds` of a scenario over UDP."""
     from gcs.runs.summary import finish
 
     designed, plan = flight_plan(_without_solver(scenario, seconds))
     with raised(), tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name) / "run"
-        _, _, _, spent = fly_real_time(plan, designed, folder)
+        flight = fly_real_time(plan, designed, folder)
         summary = finish(folder)
         if summary.reason.startswith("interrupted"):
             raise KeyboardInterrupt
         graded = grade(folder)
     assert summary.control is not None
-    return {
-        "control": summary.control.to_dict(),
-        "reason": summary.reason,
-        "steal_share": spent.steal,
-        "load_average": os.getloadavg()[0],
-        **graded.to_dict(),
-    }
+    assert flight.steal_share is not None
+    return RealTimeBenchmark(
+        **vars(graded),
+        control=summary.control,
+        reason=summary.reason,
+        steal_share=flight.steal_share,
+        load_average=os.getloadavg()[0],
+    )
 
 
 def _without_solver(scenario: Scenario, seconds: float) -> Scenario:
@@ -125,15 +177,10 @@ def _without_solver(scenario: Scenario, seconds: float) -> Scenario:
     return scenario.model_copy(update={"duration_s": seconds, "control": control})
 
 
-def _flight(plan: FlightPlan, key: Key | None = None) -> dict[str, float]:
+def _flight(plan: FlightPlan, key: Key | None = None) -> _Flown:
     ends, guard = (vehicles_of(plan), None) if key is None else signed_ends(plan, key)
     vehicles = _Timed(ends)
     begun_s, used_s = time.perf_counter(), time.process_time()
     ticks = sum(1 for _ in fly_lockstep(plan, vehicles=vehicles, guard=guard))
     taken_s, used_s = time.perf_counter() - begun_s, time.process_time() - used_s
-    return {
-        "ticks": ticks,
-        "core_share": min(1.0, used_s / taken_s),
-        "s_per_tick": taken_s / ticks,
-        "station_s_per_tick": (taken_s - vehicles.taken_s) / ticks,
-    }
+    return _Flown(ticks, min(1.0, used_s / taken_s), taken_s / ticks, (taken_s - vehicles.taken_s) / ticks)

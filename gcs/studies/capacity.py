@@ -5,14 +5,15 @@ exceeds the margin of the gains designed for that rate, or the formation no long
 formation flies with several seeds, and is carried only if it holds with all of them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import GainsError
 from gcs.control.tick import TickArray
-from gcs.drive.lockstep import START_NS, LinkLosses, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.drive.lockstep import LINK_DOWN, LINK_UP, START_NS, LinkLosses, Sent, Vehicles, fly_lockstep, vehicles_of
+from gcs.drive.preflight import bad_start, endless_link, unstable_loop
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
@@ -28,24 +29,7 @@ FEWEST = 2
 
 @dataclass(frozen=True)
 class Load:
-    """One flight of a formation at a rate, and what was left of its margin.
-
-    Attributes
-    ----------
-    headroom_p01
-        Least headroom, 1 − loop delay / margin, of all but the worst hundredth of the ticks.
-    station_bytes_s
-        MAVLink bytes per second that the station sends and receives, summed.
-    lost_up, lost_down
-        True shares of the datagrams from and to the vehicles that the links lost.
-    error_end_m
-        Largest spacing error of all vehicles, as the median over the last third of the flight, because a single lost
-        set-point affects it for seconds.
-    reason
-        How the flight ended.
-    holds
-        Errors fell to a tenth of their initial size, and 99 of 100 ticks had headroom.
-    """
+    """One flight of a formation at a rate, and what was left of its margin."""
 
     rate_hz: float
     vehicles: int
@@ -54,12 +38,19 @@ class Load:
     loop_delay_p50_s: float | None
     loop_delay_p99_s: float | None
     headroom_p01: float | None
+    """Least headroom, 1 − loop delay / margin, of all but the worst hundredth of the ticks."""
     station_bytes_s: float
+    """MAVLink bytes per second that the station sends and receives, summed."""
     lost_up: float
+    """True fraction of the datagrams from vehicles that the links lost; `lost_down` is that of those to vehicles."""
     lost_down: float
     error_end_m: float
+    """Largest spacing error of all vehicles: the median over the last third of the flight, because one lost set-point
+    affects it for seconds."""
     reason: str
+    """How the flight ended."""
     holds: bool
+    """Errors fell to a tenth of their initial size, and 99 of 100 ticks had headroom."""
 
 
 @dataclass(frozen=True)
@@ -88,43 +79,40 @@ class _Counted:
 def capacity(
     scenario: Scenario, *, rates_hz: list[float], most: int, seeds: int = 3, seconds: float = 180.0
 ) -> list[Capacity]:
-    """The capacity of each rate, up to `most` vehicles: doubled until one fails, then halved in between.
+    """The capacity at each rate, up to `most` vehicles: the size doubles until one fails, then bisection.
 
     Each formation flies with the scenario's seed and those that follow it. Flights last `seconds`, long because errors
     decay slowly near the margin.
 
-    Raises
-    ------
-    InputError
-        If the scenario gives gains as blocks of its own formation, or its vehicles take off first.
+    Raises InputError if the scenario gives gains as blocks of its own formation, its vehicles take off first, or it
+    cannot fly.
     """
-    blocks = len(scenario.control.blocks)
-    if blocks:
-        raise InputError(
-            f"{scenario.name}: control.blocks: read {blocks} of them, wanted gains for any number of vehicles"
-        )
+    if blocks := len(scenario.control.blocks):
+        wanted = "gains for any number of vehicles"
+        raise InputError(f"{scenario.name}: control.blocks: read {blocks} of them, wanted {wanted}")
     if scenario.dynamics != "double_integrator":
         wanted = "double_integrator: gcs capacity does not fly vehicles that take off first"
         raise InputError(f"{scenario.name}: dynamics: read {scenario.dynamics!r}, wanted {wanted}")
     scenario = scenario.model_copy(update={"duration_s": seconds})
+    formed = _displaced(with_vehicles(scenario, most))
+    for fault in (bad_start(formed), endless_link(formed)):
+        if fault is not None:
+            raise InputError(f"{scenario.name}: {fault}")
     return [_capacity_of(scenario, rate_hz, most, seeds) for rate_hz in rates_hz]
 
 
 def _capacity_of(scenario: Scenario, rate_hz: float, most: int, seeds: int) -> Capacity:
-    best: Load | None = None
-    worst: Load | None = None
-    count = FEWEST
+    found = Capacity(rate_hz, most=None, next=None)
+    low, count = FEWEST - 1, FEWEST
     try:
-        while worst is None or count not in (worst.vehicles, best.vehicles if best else FEWEST - 1):
+        while count > low:
             load = worst_load(scenario, rate_hz, count, seeds)
-            best, worst = (load, worst) if load.holds else (best, load)
-            low = best.vehicles if best else FEWEST - 1
-            if worst is None and low == most:
-                break
-            count = min(2 * low, most) if worst is None else (low + worst.vehicles) // 2
+            found = replace(found, most=load) if load.holds else replace(found, next=load)
+            low = count if load.holds else low
+            count = min(2 * low, most) if found.next is None else (low + found.next.vehicles) // 2
     except GainsError as error:
-        return Capacity(rate_hz, best, worst, failed=str(error))
-    return Capacity(rate_hz, best, worst)
+        return replace(found, failed=str(error))
+    return found
 
 
 def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int) -> Load:
@@ -140,14 +128,13 @@ def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int) ->
 def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
     """Fly this many vehicles with telemetry and control at the rate, and measure.
 
-    Raises
-    ------
-    GainsError
-        If no gains meet the scenario's requirement at this rate.
+    Raises GainsError if no gains meet the scenario's requirement at this rate, or the given ones are unstable at it.
     """
     rates = scenario.rates.model_copy(update={"control_hz": rate_hz, "telemetry_hz": rate_hz})
     formed = with_vehicles(scenario.with_calm_monitor().model_copy(update={"rates": rates}), vehicles)
     _, plan = flight_plan(_displaced(formed))
+    if (unstable := unstable_loop(plan)) is not None:
+        raise GainsError(unstable)
     losses = LinkLosses()
     station, counted = Station(plan, start_ns=START_NS), _Counted(vehicles_of(plan, record=losses.record))
     ticks = np.concatenate(list(fly_lockstep(plan, vehicles=counted, station=station)))
@@ -165,8 +152,8 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
         loop_delay_p99_s=_percentile(commanded["loop_delay_s"], 99),
         headroom_p01=headroom_p01,
         station_bytes_s=counted.bytes_both_ways / float(ticks["time_s"][-1] - ticks["time_s"][0]),
-        lost_up=losses.share_up,
-        lost_down=losses.share_down,
+        lost_up=losses.share(LINK_UP),
+        lost_down=losses.share(LINK_DOWN),
         error_end_m=error_end_m,
         reason=f"off by {error_end_m:.2g} m" if completed else "limit broken",
         holds=completed and error_end_m < _DECAYED * _START_ERROR_M and headroom_p01 is not None and headroom_p01 > 0.0,

@@ -6,7 +6,8 @@ from the same initial states. Robustness and string peak are computed for all ro
 
 import json
 import time  # noqa: TID251 - design time is one of the figures; nothing flown depends on it
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
 from typing import Literal
@@ -23,9 +24,10 @@ from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_virtual
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
+from gcs.runs.record import SCENARIO_FILE
 from gcs.runs.summary import summarise
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
-from gcs.views.console import UNKNOWN, number_text
+from gcs.views.console import UNKNOWN, ms_text, number_text
 from scenarios.files import dump
 from scenarios.schema import Control, Scenario
 
@@ -36,22 +38,7 @@ REPORT_FILE, RESULT_FILE = "compare.html", "compare.json"
 
 @dataclass(frozen=True)
 class Route:
-    """The figures of one route; None where there is none, with the reason in `failed`.
-
-    Attributes
-    ----------
-    overshoot
-        Largest spacing error opposite to its initial direction, as a share of the initial error, over all vehicles.
-    effort_m2_s3
-        Integral of the squared commands of all vehicles over the flight.
-    alpha
-        1 / ‖(sI − A − BK)^{-1}‖∞ of the whole formation.
-    string_peak
-        Largest growth of a spacing error from one follower to the one behind it, over all frequencies, when the leader
-        is disturbed, without delay.
-    links, numbers_used
-        Pairs of vehicles in which one uses the other's errors, and the number of errors used in all.
-    """
+    """The figures of one route; None where there is none, with the reason in `failed`."""
 
     method: Method
     failed: str = ""
@@ -59,16 +46,23 @@ class Route:
     verdict: str | None = None
     settling_time_s: float | None = None
     overshoot: float | None = None
+    """Largest spacing error opposite to its initial direction, as a share of the initial error, over all vehicles."""
     effort_m2_s3: float | None = None
+    """Integral of the squared commands of all vehicles over the flight."""
     command_max_m_s2: float | None = None
     spacing_error_max_m: float | None = None
     alpha: float | None = None
+    """1 / ‖(sI − A − BK)^{-1}‖∞ of the whole formation."""
     delay_margin_s: float | None = None
     delay_margin_continuous_s: float | None = None
     decay_rate_1_s: float | None = None
     string_peak: float | None = None
+    """Largest growth of a spacing error from one follower to the next, over all frequencies, when the leader is
+    disturbed, without delay."""
     links: int | None = None
+    """Pairs of vehicles in which one uses the other's errors."""
     numbers_used: int | None = None
+    """Total number of other vehicles' errors that vehicles use."""
 
 
 Flights = dict[Method, TickArray]
@@ -177,13 +171,9 @@ def write_comparison(
     from gcs.studies.compare_figures import errors_figure, sizes_figure
     from gcs.views.page import data_uri, rendered
 
-    (folder / "scenario.toml").write_text(dump(scenario), encoding="utf-8")
-    result = {
-        "scenario": scenario.name,
-        "routes": [asdict(route) for route in routes],
-        "sizes": [asdict(size) for size in grown],
-    }
-    (folder / RESULT_FILE).write_text(json.dumps(result, indent=2), encoding="utf-8")
+    (folder / SCENARIO_FILE).write_text(dump(scenario), encoding="utf-8")
+    result = {"scenario": scenario.name, "routes": routes, "sizes": grown}
+    (folder / RESULT_FILE).write_text(json.dumps(result, indent=2, default=vars), encoding="utf-8")
     figures = {"Spacing errors and commands in flight": errors_figure(folder / "flights.png", flights.items())}
     if grown:
         figures["Cost of a design against the number of vehicles"] = sizes_figure(folder / "sizes.png", grown)
@@ -203,27 +193,24 @@ def write_comparison(
 
 def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
     """The rows of the table: what is compared, and the figure of each route."""
-    kinds: list[tuple[str, tuple[str, str, float]]] = [
-        ("settling time, s", ("settling_time_s", ".2f", 1.0)),
-        ("overshoot, %", ("overshoot", ".1f", 100.0)),
-        ("control effort, m²/s³", ("effort_m2_s3", ".0f", 1.0)),
-        ("largest command, m/s²", ("command_max_m_s2", ".1f", 1.0)),
-        ("largest spacing error, m", ("spacing_error_max_m", ".1f", 1.0)),
-        ("delay margin, sampled, ms", ("delay_margin_s", ".1f", 1e3)),
-        ("delay margin, continuous, ms", ("delay_margin_continuous_s", ".1f", 1e3)),
-        ("alpha of the whole formation", ("alpha", ".4f", 1.0)),
-        ("decay without delay, 1/s", ("decay_rate_1_s", ".3f", 1.0)),
-        ("string peak", ("string_peak", ".3f", 1.0)),
-        ("links between vehicles", ("links", "d", 1)),
-        ("numbers used over them", ("numbers_used", "d", 1)),
-        ("design time, s", ("design_s", ".2f", 1.0)),
-    ]
 
-    def text(route: Route, name: str, form: str, factor: float) -> str:
-        value: float | None = getattr(route, name)
-        if value is None and name.startswith("delay_margin") and not route.failed:
-            return "no limit"
-        return number_text(None if value is None else factor * value, form)
+    def margin(route: Route, margin_s: float | None) -> str:
+        return "no limit" if margin_s is None and not route.failed else ms_text(margin_s, unit="")
 
-    verdicts = ("verdict of the flight", [route.verdict or UNKNOWN for route in routes])
-    return [verdicts, *((title, [text(route, *kind) for route in routes]) for title, kind in kinds)]
+    texts: dict[str, Callable[[Route], str]] = {
+        "verdict of the flight": lambda route: route.verdict or UNKNOWN,
+        "settling time, s": lambda route: number_text(route.settling_time_s, ".2f"),
+        "overshoot, %": lambda route: number_text(route.overshoot, ".1f", factor=100),
+        "control effort, m²/s³": lambda route: number_text(route.effort_m2_s3, ".0f"),
+        "largest command, m/s²": lambda route: number_text(route.command_max_m_s2, ".1f"),
+        "largest spacing error, m": lambda route: number_text(route.spacing_error_max_m, ".1f"),
+        "delay margin, sampled, ms": lambda route: margin(route, route.delay_margin_s),
+        "delay margin, continuous, ms": lambda route: margin(route, route.delay_margin_continuous_s),
+        "alpha of the whole formation": lambda route: number_text(route.alpha, ".4f"),
+        "decay without delay, 1/s": lambda route: number_text(route.decay_rate_1_s, ".3f"),
+        "string peak": lambda route: number_text(route.string_peak, ".3f"),
+        "links between vehicles": lambda route: number_text(route.links, "d"),
+        "numbers used over them": lambda route: number_text(route.numbers_used, "d"),
+        "design time, s": lambda route: number_text(route.design_s, ".2f"),
+    }
+    return [(title, [text(route) for route in routes]) for title, text in texts.items()]

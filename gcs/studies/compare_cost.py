@@ -20,7 +20,7 @@ RATIO = "times inclusion of 5"
 _REFERENCE = ("inclusion", 5)
 _SIZES = (3, 5, 10, 20, 40, 80, 200)
 _LONGEST_S = 10.0
-"""A method is not tried on a size for which it would take longer, if time grows with the cube of the vehicles."""
+"""A method is not tried on a size that would take it longer than this, if its time grows with the cube of the size."""
 _DK_STATES = LARGEST_STATES // 2
 _REPEATED_BELOW_S = 1.0
 _REPEATS = 5

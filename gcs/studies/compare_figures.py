@@ -15,7 +15,7 @@ _FLOOR_M = 1e-3
 
 
 def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
-    """The largest spacing error and the largest command of all vehicles over time."""
+    """A figure of the largest spacing error and the largest command of all vehicles over time, for each route."""
     figure, (above, below) = figure_of(2, (9.0, 6.0), heights=(1.4, 1.0))
     for (method, ticks), colour in zip(flights, _COLOURS, strict=False):
         flown = ticks[(ticks["time_s"] >= 0.0) & ticks["commanded"]]

@@ -15,7 +15,7 @@ _SHOTS = 7
 
 
 def formation_figure(file: Path, method: str) -> Path:
-    """Figures 3.2-3.6 (inclusion) and 4.3-4.7 (graph): superimposed snapshots and distances, from three flights."""
+    """Figures 3.2-3.6 (inclusion) and 4.3-4.7 (graph): superimposed snapshots and distances of three flights."""
     titles = {"triangle5": "first", "triangle5_scattered": "second", "triangle5_turns": "turns"}
     figure, plots = figure_of(2, (12.0, 7.0), heights=(1.3, 1.0), columns=3)
     for column, (name, title) in enumerate(titles.items()):

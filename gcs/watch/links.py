@@ -3,8 +3,8 @@
 Pure: frames and times in, figures out. `gcs monitor` feeds it from a socket, `gcs replay` from a log.
 
 A TIMESYNC exchange counts no matter who asked: this watch, or a ground station whose requests are on the same stream.
-Before the first one the vehicle's clock is unknown, and delays are measured against the fastest of the last frames:
-then they are lower bounds.
+Before the first exchange the vehicle's clock is unknown. Delays are then measured against the fastest of the last
+frames, which makes them lower bounds.
 """
 
 from array import array
@@ -36,7 +36,7 @@ _GOLDEN = 0.6180339887498949
 _ASKED = 4096
 """Requests remembered: those of 250 vehicles at 10 Hz over 1.6 s, of five over 80 s."""
 _LEAST_NS = 10 * NS_PER_S
-"""The fastest frame is that of the last one to two such spans, in which a drift of 20 ppm adds up to 0.4 ms."""
+"""The fastest frame is that of the last one to two such spans. A drift of 20 ppm adds up to 0.4 ms in two."""
 _AUTOPILOT, _NO_AUTOPILOT, _STATION = 1, 8, 6
 """Component id of an autopilot; MAV_AUTOPILOT_INVALID; MAV_TYPE_GCS."""
 _POSITIONS = (mavlink.LOCAL_POSITION_NED, mavlink.GLOBAL_POSITION_INT)
@@ -86,7 +86,7 @@ class WatchedVehicle:
         self.loop_delay_s = array("d")
         """At each look; NaN where it is unknown, and during a silence, which is not a latency."""
         self._judged = 0
-        """Looks up to the newest state; whether later ones saw a latency or a silence, the next state shows."""
+        """Looks up to the newest state. The next state shows whether later looks saw a latency or a silence."""
         self.states = 0
         """Position reports received."""
         self.first_state_ns = 0
@@ -99,7 +99,7 @@ class WatchedVehicle:
         self._least_ns: tuple[int, int] = (1 << 62, 1 << 62)
 
     def state(self, frame: mavlink.Frame, received_ns: int) -> None:
-        """Take in a position report; local positions count where they are sent, as formations fly by them."""
+        """Take in a position report; once local positions are sent, only they count, as formations fly by them."""
         if frame.msg_id == mavlink.LOCAL_POSITION_NED != self._kind:
             self._kind, self.states = mavlink.LOCAL_POSITION_NED, 0
         boot_ns = self.remote.clock.boot_ns(frame.fields[0], received_ns)
@@ -281,13 +281,13 @@ class Requests:
 
     def due(self, watch: Watch, now_ns: int) -> list[Outgoing]:
         """The request to be sent now, if any."""
-        addresses = {vehicle.remote.address for vehicle in watch.vehicles.values()} - {None}
         if now_ns < self.next_ns:
             return []
+        addresses = {address for vehicle in watch.vehicles.values() if (address := vehicle.remote.address) is not None}
         self.next_ns = now_ns + round(self._period_ns / max(1, len(addresses)))
         if not addresses:
             return []
-        address = min((a for a in addresses if a is not None), key=lambda a: (self._sequences[a], a))
+        address = min(addresses, key=lambda address: (self._sequences[address], address))
         self._sequences[address] += 1
         self.sent += 1
         fields = mavlink.timesync(tc1_ns=0, ts1_ns=watch.ask(now_ns))

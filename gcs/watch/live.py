@@ -7,10 +7,8 @@ station is gone has to notice.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
-from rich.live import Live
-
-from gcs.drive.guard import Guard
 from gcs.drive.udp import StationSocket, clock_ns
 from gcs.link import mavlink
 from gcs.views.console import draw, live_display
@@ -38,11 +36,7 @@ class WatchOptions:
 
 
 def watch_links(
-    link: StationSocket,
-    watch: Watch,
-    options: WatchOptions,
-    stop_reason: Callable[[], str],
-    guard: Guard | None = None,
+    link: StationSocket, watch: Watch, options: WatchOptions, stop_reason: Callable[[], str]
 ) -> WatchReport:
     """Watch for the time asked or until there is a reason to stop; returns the figures of the whole time."""
     requests = Requests(options.timesync_hz)
@@ -68,25 +62,17 @@ def watch_links(
         look_ns, show_ns = start_ns, start_ns + period_ns if options.shown else 1 << 62
         while now_ns < end_ns and not stop_reason():
             link.wait(min(look_ns, end_ns, requests.next_ns))  # not long: a signal does not end the wait
-            datagrams = link.receive()
-            if guard is not None:
-                datagrams = guard.received(datagrams, clock_ns(), watch.counters)
-            for datagram in datagrams:
+            for datagram in link.receive(watch.counters):
                 for frame in mavlink.decode_either(datagram.data, watch.counters):
                     watch.take(frame, datagram.received_ns, datagram.address)
             now_ns = clock_ns()
             look_ns = watch.look(now_ns)
-            outgoing = requests.due(watch, now_ns)
-            link.send(outgoing if guard is None else guard.sent(outgoing, now_ns))
+            link.send(requests.due(watch, now_ns))
             if now_ns >= show_ns:
                 show_ns = now_ns + period_ns
-                _show(live, report(_WINDOW_LOOKS))
+                shown = report(_WINDOW_LOOKS)
+                if live is None:
+                    print(plain_line(shown), flush=True)
+                else:
+                    draw(live, partial(render, shown))
     return report()
-
-
-def _show(live: Live | None, report: WatchReport) -> None:
-    """A table on a terminal, else a line now and then."""
-    if live is None:
-        print(plain_line(report), flush=True)
-    else:
-        draw(live, lambda width, height: render(report, width=width, height=height))

@@ -1,11 +1,11 @@
-"""From a telemetry log alone: the ticks of a flight, with their latencies, errors and modes.
+"""Rebuilds the ticks of a flight, with their latencies, errors and modes, from its telemetry log alone.
 
-The frames of the log are fed in their order to the station's own code: clocks, sequence numbers, states brought to one
-instant. A log of this station shows its ticks by the time_boot_ms of its set-points; any other log is sampled at the
-scenario's control rate.
+The frames of the log are fed in order to the station's own code for clocks, sequence numbers and states at one instant.
+A log of this station shows its ticks by the time_boot_ms of its set-points; any other log is sampled at the scenario's
+control rate.
 
-A log does not say how long telemetry waited in the station's socket, nor by how much the monitor had opened the
-formation, so errors are relative to the formation as designed. Lateness is relative to the most punctual tick.
+A log does not say how long telemetry waited in the station's socket. Nor does it say by how much the monitor had opened
+the formation, so errors are relative to the formation as designed. Lateness is relative to the most punctual tick.
 """
 
 import re
@@ -36,14 +36,14 @@ Frames = list[tuple[int, mavlink.Frame]]
 
 _TOLD = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
 _LONGEST_GAP_NS = 10 * NS_PER_S
-"""No ticks are made in longer gaps of a log."""
+"""Gaps of a log that are longer than this get no ticks."""
 _LEAST_TICKS = 3
 _NO_BLEND = Blend()
 
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """What a log shows of a flight: ticks and events as those of a run, and its links."""
+    """What a log shows of a flight: ticks and events in the form of a run's, and the links."""
 
     ticks: TickArray
     events: list[Event]
@@ -104,7 +104,7 @@ def _outline(frames: Frames, scenario: Scenario) -> _Outline:
         elif frame.msg_id == mavlink.STATUSTEXT and start_key is None and sent_ns:
             told = _told(frame)
             if told is not None and told[1] == Mode.NOMINAL.name:
-                start_key = list(sent_ns)[-1]  # it is told at the tick after
+                start_key = list(sent_ns)[-1]  # the station announces it at the next tick
         exchanges = exchanges or (frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0)
     keys = list(sent_ns)
     period_ms = 1e3 / scenario.rates.control_hz
@@ -130,7 +130,7 @@ def _plan(scenario: Scenario) -> FlightPlan:
 
 
 class _Rebuilding:
-    """What the station knew of the vehicles, frame by frame."""
+    """Rebuilds, frame by frame, what the station knew of the vehicles."""
 
     def __init__(self, scenario: Scenario, margins_s: tuple[float, ...], outline: _Outline) -> None:
         self._scenario, self._margins_s, self._outline = scenario, margins_s, outline
@@ -150,7 +150,7 @@ class _Rebuilding:
         self._states = [VehicleState()] * len(ids)
         self._jumps = [0] * len(ids)
         self._exchanges = [0] * len(ids)
-        """Of each vehicle, the number that earlier ticks have shown."""
+        """For each vehicle, the number of exchanges that earlier ticks have shown."""
         self._period_ns = round(NS_PER_S / scenario.rates.control_hz)
         self._start_ns = outline.base_ns + outline.start_key * 1_000_000
         first_key, last_key = (outline.keys[0], outline.keys[-1]) if outline.keys else (0, -1)
@@ -207,18 +207,15 @@ class _Rebuilding:
             behind = (time_ns - self._outline.base_ns) // self._period_ns
             self._grid_ns = self._outline.base_ns + behind * self._period_ns
         while self._grid_ns < time_ns:
-            if not self._outline.keys:
-                self._tick(self._grid_ns, self._grid_ns, self._all_known(), 0)
+            if not self._outline.keys:  # vehicles count as flown once all have reported
+                commands = dict.fromkeys(self._row, (nan, nan)) if self._history.complete else {}
+                self._tick(self._grid_ns, self._grid_ns, commands, 0)
             elif not self._own_ns[0] <= self._grid_ns <= self._own_ns[1]:
                 self._tick(self._grid_ns, self._grid_ns, {}, 0)
             self._grid_ns += self._period_ns
 
-    def _all_known(self) -> dict[int, tuple[float, float]]:
-        """The commands where the log has no set-points: vehicles count as flown once all have reported."""
-        return dict.fromkeys(self._row, (nan, nan)) if self._history.complete else {}
-
     def _take_told(self, time_ns: int, frame: mavlink.Frame) -> None:
-        """A mode or a gain set, as the station told it."""
+        """Take in a mode or a gain set that the station announced."""
         system_id, told = _told(frame) or (0, "")
         row = self._row.get(system_id)
         if row is None:
@@ -254,9 +251,7 @@ class _Rebuilding:
         origin_north, origin_east, origin_down = self._fleet.frame_ned_m[row]
         if self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             self._telemetry_ns[row] = time_ns
-            self._reported[row] = Reported(
-                boot_ms, down + origin_down, v_down, received_ns=time_ns, bound_s=bound_s
-            )  # fmt: skip
+            self._reported[row] = Reported(boot_ms, down + origin_down, v_down, received_ns=time_ns, bound_s=bound_s)
 
     def _tick(self, due_ns: int, sent_ns: int, commands: dict[int, tuple[float, float]], key_ms: int) -> None:
         """The rows of one tick, from what the station knew when it sent these set-points."""
@@ -278,21 +273,10 @@ class _Rebuilding:
         for row, (vehicle, control, state) in enumerate(zip(self._vehicles, controls, self._states, strict=True)):
             command = commands.get(vehicle.remote.system_id)
             sent = control._replace(command_m_s2=command or (nan, nan))
+            repeated_s = self._repetitions.repeated_s(row, control.used_ns, due_ns)
+            figures = self._fresh_rtt_s(row, vehicle), nearest_m[row], command is not None
             margin_s = self._margins_s[state.gain_set]
-            rtt_s = self._fresh_rtt_s(row, vehicle)
-            seen.append(
-                VehicleTick(
-                    vehicle.remote,
-                    state,
-                    sent,
-                    self._reported[row],
-                    rtt_s,
-                    nearest_m[row],
-                    command is not None,
-                    margin_s,
-                    self._repetitions.repeated_s(row, control.used_ns, due_ns),
-                )
-            )
+            seen.append(VehicleTick(vehicle.remote, state, sent, self._reported[row], *figures, margin_s, repeated_s))
         number = round((due_ns - self._start_ns) / self._period_ns)
         rows, _ = tick_rows(Tick(number, time_s, due_ns, key_ms, seen), sent_ns)
         self._rows.append(rows)

@@ -1,9 +1,10 @@
 """The summary of a telemetry log, as `gcs replay` shows it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, TypeVar
 
 import numpy as np
 from pydantic import PlainSerializer
@@ -22,7 +23,9 @@ from gcs.watch.tlog import TelemetryLog
 from scenarios import files
 from scenarios.schema import Scenario
 
-_COMPARED = ("verdict", "loop", "delay_margin_s", "loop_delay_s", "headroom_min", "settling_time_s", "distance_min_m")
+_COMPARED = {"verdict", "loop", "delay_margin_s", "loop_delay_s", "headroom_min", "settling_time_s", "distance_min_m"}
+
+_Found = TypeVar("_Found")
 
 
 @dataclass(frozen=True)
@@ -38,18 +41,14 @@ class LogSource:
 
 def found(run_or_file: Path) -> LogSource:
     """The log, and the files beside it if it is that of a run's folder."""
-    folder = run_or_file if run_or_file.is_dir() else run_or_file.parent
-    log_file = folder / TLOG_FILE if run_or_file.is_dir() else run_or_file
-    own = log_file.name == TLOG_FILE
-    scenario_file, design_file, summary_file = (folder / name for name in (SCENARIO_FILE, DESIGN_FILE, SUMMARY_FILE))
-    scenario = files.load(scenario_file) if own and scenario_file.exists() else None
-    design = read_design(design_file) if own and design_file.exists() else None
-    recorded = read_summary(summary_file) if own and summary_file.exists() else None
-    return LogSource(log_file, scenario, design, recorded)
+    log_file = run_or_file / TLOG_FILE if run_or_file.is_dir() else run_or_file
 
+    def beside(name: str, read: Callable[[Path], _Found]) -> _Found | None:
+        file = log_file.with_name(name)
+        return read(file) if log_file.name == TLOG_FILE and file.exists() else None
 
-def _compared(recorded: Summary) -> dict[str, Any]:
-    return recorded.model_dump(mode="json", include=set(_COMPARED))
+    scenario, design = beside(SCENARIO_FILE, files.load), beside(DESIGN_FILE, read_design)
+    return LogSource(log_file, scenario, design, beside(SUMMARY_FILE, read_summary))
 
 
 class LogContents(Published):
@@ -69,7 +68,7 @@ class RebuildReport(Published):
     stations: tuple[int, ...]
     links: tuple[LinkFigures, ...]
     flight: Summary | None = None
-    recorded: Annotated[Summary, PlainSerializer(_compared)] | None = None
+    recorded: Annotated[Summary, PlainSerializer(lambda s: s.model_dump(mode="json", include=_COMPARED))] | None = None
     """The summary that the station made of the same flight."""
 
 
@@ -79,10 +78,8 @@ def rebuild_report(log: TelemetryLog, source: LogSource) -> RebuildReport:
     scenario, design = source.scenario, source.design or Design(delay_margin_s=None)
     rebuilt = None if scenario is None else rebuild(log.frames, scenario, design.margins_s)
     watch = watched(log.frames) if rebuilt is None else rebuilt.links
-    parts = {
-        "flight": None if rebuilt is None or scenario is None else _flight(scenario, design, rebuilt),
-        "recorded": source.recorded,
-    }
+    flight = None if rebuilt is None or scenario is None else _flight(scenario, design, rebuilt)
+    parts = {"flight": flight, "recorded": source.recorded}
     return RebuildReport(
         log=LogContents(
             file=str(source.log_file),

@@ -1,22 +1,23 @@
-"""What `gcs monitor` shows: the figures of links as a table, a line, or the last word."""
+"""What `gcs monitor` shows: the figures of links, as a table or as a line."""
 
 from collections.abc import Sequence
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gcs.views.console import UNKNOWN, fitted_table, ms_text, not_shown, number_text
-from gcs.views.table import headroom_style
+from gcs.views.console import UNKNOWN, FittedColumn, fitted_table, ms_text, not_shown, number_text
+from gcs.views.table import headroom_text
 from gcs.watch.links import LOWER_BOUND, LinkFigures, WatchReport
 
 STATUS_STYLES = {"measured": "green", "past the margin": "bold red", "silent": "bold red", "not heard": "bold red"}
 _USUAL, _WIDE = 73, 140
-"""Widths of terminals that more columns have room on."""
+"""Widths of terminals from which more columns are shown."""
 
 
 def render(report: WatchReport, *, width: int, height: int | None = None) -> RenderableType:
-    """The whole display, in at most `height` lines: what fits of the vehicles, the worst, and how many do not."""
+    """The whole display, in at most `height` lines: as many of the worst vehicles as fit, and how many do not."""
     vehicles = report.vehicles
     room = len(vehicles) if height is None else max(1, height - 7)
     if len(vehicles) > room:
@@ -53,55 +54,34 @@ def _headline(report: WatchReport) -> Text:
     return line
 
 
-_COLUMNS = (
-    ("id", 3, 0),
-    ("Hz", 5, _WIDE),
-    ("RTT p50\nms", 8, 0),
-    ("p99\nms", 7, _USUAL),
-    ("age p50\nms", 8, _WIDE),
-    ("p99\nms", 7, _WIDE),
-    ("loop p50\nms", 9, _USUAL),
-    ("p99\nms", 9, 0),
-    ("headroom\n%", 8, 0),
-    ("lost\n%", 6, _USUAL),
-    ("late", 4, _WIDE),
-    ("clock offset\ns", 13, _WIDE),
-    ("±\nms", 7, _WIDE),
-    ("", 15, 0),
-)
-"""As `fitted_table` takes them."""
-
-
 def links_table(vehicles: Sequence[LinkFigures], width: int) -> Table:
     """One row for each vehicle."""
 
-    def row(v: LinkFigures) -> list[str | Text]:
-        bound = "≥ " if v.loop_delay_s.status == LOWER_BOUND else ""
-        at_most = "≤ " if bound and v.headroom is not None else ""
-        style = "dim" if v.headroom is None else headroom_style(v.headroom)
-        expected = v.received + v.lost
-        return [
-            str(v.system_id),
-            number_text(v.telemetry_hz, ".1f"),
-            _ms(v.rtt_s.p50),
-            _ms(v.rtt_s.p99),
-            _ms(v.telemetry_age_s.p50, bound),
-            _ms(v.telemetry_age_s.p99, bound),
-            _ms(v.loop_delay_s.p50, bound),
-            _ms(v.loop_delay_s.p99, bound),
-            Text(at_most + number_text(v.headroom, ".0f", factor=100), style),
-            number_text(100 * v.lost / expected if expected else None, ".1f"),
-            str(v.late),
-            number_text(v.clock.offset_s, ".6f"),
-            _ms(v.clock.bound_s),
-            Text(f" {v.status}", STATUS_STYLES.get(v.status, "yellow")),
-        ]
+    def headroom(v: LinkFigures) -> Text:
+        return headroom_text(v.headroom, "≤ " if _bound(v) and v.headroom is not None else "")
 
-    columns = [
-        (f"loop {name}" if width < _USUAL and name == "p99\nms" else name, least, from_width)
-        for name, least, from_width in _COLUMNS
+    columns: list[FittedColumn[LinkFigures]] = [
+        ("id", 3, 0, lambda v: str(v.system_id)),
+        ("Hz", 5, _WIDE, lambda v: number_text(v.telemetry_hz, ".1f")),
+        ("RTT p50\nms", 8, 0, lambda v: _ms(v.rtt_s.p50)),
+        ("p99\nms", 7, _USUAL, lambda v: _ms(v.rtt_s.p99)),
+        ("age p50\nms", 8, _WIDE, lambda v: _ms(v.telemetry_age_s.p50, _bound(v))),
+        ("p99\nms", 7, _WIDE, lambda v: _ms(v.telemetry_age_s.p99, _bound(v))),
+        ("loop p50\nms", 9, _USUAL, lambda v: _ms(v.loop_delay_s.p50, _bound(v))),
+        ("p99\nms" if width >= _USUAL else "loop p99\nms", 9, 0, lambda v: _ms(v.loop_delay_s.p99, _bound(v))),
+        ("headroom\n%", 8, 0, headroom),
+        ("lost\n%", 6, _USUAL, lambda v: number_text(100 * v.lost / (v.received + v.lost or np.nan), ".1f")),
+        ("late", 4, _WIDE, lambda v: str(v.late)),
+        ("clock offset\ns", 13, _WIDE, lambda v: number_text(v.clock.offset_s, ".6f")),
+        ("±\nms", 7, _WIDE, lambda v: _ms(v.clock.bound_s)),
+        ("", 15, 0, lambda v: Text(f" {v.status}", STATUS_STYLES.get(v.status, "yellow"))),
     ]
-    return fitted_table(columns, map(row, vehicles), width=width, gap=1 if width >= _WIDE else 0)
+    return fitted_table(vehicles, columns, width=width, gap=1 if width >= _WIDE else 0)
+
+
+def _bound(figures: LinkFigures) -> str:
+    """The mark of delays that are lower bounds."""
+    return "≥ " if figures.loop_delay_s.status == LOWER_BOUND else ""
 
 
 def _footer(report: WatchReport) -> Text:

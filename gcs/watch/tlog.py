@@ -23,7 +23,7 @@ _WRONG_STAMP_US = 1_000_000
 
 @dataclass(frozen=True)
 class TelemetryLog:
-    """The frames of a log in its order, each with its time in ns since 1970, and what could not be used."""
+    """The frames of a log in its order, each with its time in ns since 1970, and counts of what was left out."""
 
     frames: list[tuple[int, mavlink.Frame]]
     counters: Counter[str]
@@ -72,9 +72,10 @@ def parse_tlog(data: bytes) -> TelemetryLog:
     if at < len(data):
         counters["damaged places"] += not damaged
         counters["damaged bytes"] += len(data) - at
-    good = _plausible(stamps_us)
-    counters["wrong time stamps"] += len(good) - sum(good)
-    kept = [(us * 1000, frame) for us, frame, ok in zip(stamps_us, frames, good, strict=True) if ok]
+    kept = [
+        (us * 1000, frame) for us, frame, good in zip(stamps_us, frames, _plausible(stamps_us), strict=True) if good
+    ]
+    counters["wrong time stamps"] += len(frames) - len(kept)
     return TelemetryLog(kept, +counters)
 
 

@@ -97,7 +97,7 @@ class Fleet:
 
     @property
     def next_event_ns(self) -> int:
-        """Before this instant `step` returns nothing, unless datagrams arrive."""
+        """Until this instant in ns, `step` returns nothing unless datagrams arrive."""
         heap = self._heap
         while heap and self._members[heap[0][1]].leaves_ns != heap[0][0]:
             heapq.heappop(heap)

@@ -176,7 +176,7 @@ def _delays_of(jitter: link_schema.Jitter | None, rng: np.random.Generator) -> _
                 values = rng.normal(0.0, scale_s, size)
             case "exponential":
                 values = rng.exponential(scale_s, size)
-            case _:
+            case "gamma" | "trace":
                 values = rng.gamma(shape, scale_s, size)
         return [(first, second) for first, second in values.tolist()]
 

@@ -40,13 +40,11 @@ def sender(data: bytes) -> int | None:
 
 
 def holds_key(data: bytes) -> bool:
-    """Whether a frame of a datagram is SETUP_SIGNING, which is never passed on."""
-    at = 0
-    while at + 12 <= len(data) and data[at] == MAGIC_2:
-        if data[at + 7 : at + 10] == SETUP_SIGNING:
-            return True
-        at += 12 + data[at + 1] + 13 * (data[at + 2] & 1)
-    return False
+    """Whether SETUP_SIGNING, which is never passed on, may begin anywhere in a datagram: receivers skip stray bytes."""
+    at = data.find(SETUP_SIGNING, 7)
+    while at >= 0 and data[at - 7] != MAGIC_2:
+        at = data.find(SETUP_SIGNING, at + 1)
+    return at >= 0
 
 
 class Relay:

@@ -140,7 +140,7 @@ class Copter:
     # What arrives
 
     def acts_at(self, time_ns: int) -> int:
-        """The instant at which a message that arrives now acts: never before one that has already acted."""
+        """When a message that arrives at `time_ns` acts, in ns: never before one that has already acted."""
         self._advance(time_ns)
         return self._motion_ns
 

@@ -38,7 +38,7 @@ def px4_mode(main: int, sub: int = 0) -> int:
 
 @dataclass(frozen=True)
 class Rules:
-    """One autopilot."""
+    """How one autopilot, ArduCopter or PX4, behaves and what it reports."""
 
     autopilot: int
     """MAV_AUTOPILOT"""

@@ -36,7 +36,7 @@ class State(NamedTuple):
 
 
 class Command(NamedTuple):
-    """The commanded acceleration u = acceleration + gain (velocity - own velocity), each (north, east)."""
+    """The commanded acceleration u = acceleration + velocity_gain (velocity - own velocity), north and east."""
 
     acceleration_north_m_s2: float = 0.0
     acceleration_east_m_s2: float = 0.0

@@ -21,7 +21,7 @@ from docs.generate.runner import CommandError, Runner
 from docs.generate.sessions import Step, steps_of
 from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario
 from gcs.drive.lockstep import START_NS, fly_lockstep
-from gcs.plan.planner import flight_plan
+from gcs.plan.planner import flight_plan, with_trade_off
 from gcs.runs.files import write_design
 from gcs.runs.record import SCENARIO_FILE, RunWriter
 from gcs.runs.summary import finish
@@ -109,7 +109,8 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     load["two way"] = files.load(ROOT / "scenarios" / "chain3_bidirectional.toml")
     load["onboard"] = files.with_loop(load["chain3"], "onboard", Path("chain3.toml"))
     load["copters5"] = load["copters5"].model_copy(update={"response": Response(lag_s=0.15)})
-    found = [found_fields(flight_plan(scenario)[0].to_dict(), known) for scenario in load.values()]
+    designs = (with_trade_off(flight_plan(scenario)[0]) for scenario in load.values())
+    found = [found_fields(design.to_dict(), known) for design in designs]
     assert set[str]().union(*found) == known.keys()
 
 
@@ -118,7 +119,8 @@ def test_every_field_of_a_margin_is_described_and_no_other(tmp_path: Path) -> No
     numbers = tmp_path / "numbers.json"
     numbers.write_text('{"terms": [{"A": [[0]], "delay": 0}, {"A": [[-1]], "delay": 0.1}]}', encoding="utf-8")
     models = [margin_of_file(file) for file in (numbers, *sorted((ROOT / "docs" / "models").glob("*.json")))]
-    results = [*models, margin_of_scenario(ROOT / "scenarios" / "thesis_delay.toml")]
+    scenarios = (margin_of_scenario(ROOT / "scenarios" / f"thesis_{loop}.toml") for loop in ("delay", "gains"))
+    results = [*models, *scenarios]
     assert set[str]().union(*(found_fields(margin_fields(result), known) for result in results)) == known.keys()
 
 

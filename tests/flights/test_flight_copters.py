@@ -357,6 +357,8 @@ def test_a_px4_that_speaks_mavlink_1_at_first_is_heard_and_answered_in_mavlink_2
     assert station.vehicles[1].address is None
     outgoing, _ = station.step([Datagram(b"\xfe" + bytes(30) + heartbeat, HOME, START_NS)], START_NS + 20_000_000)
     assert station.vehicles[1].address is None  # no frame begins where one should
+    station.step([Datagram(b"\xfe", HOME, START_NS)], START_NS + 40_000_000)
+    assert station.counters == {"bad checksum": 2, "not MAVLink 1": 1, "truncated": 1}
     outgoing, _ = station.step([Datagram(heartbeat * 2, HOME, START_NS)], START_NS + 1_100_000_000)
     assert station.vehicles[1].kind.name == "PX4 multicopter"
     assert all(data[0] == 0xFD for data, _ in outgoing)

@@ -27,7 +27,7 @@ from tests.support.paths import SCENARIOS
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
-GCS = [sys.executable, "-m", "gcs.cli.main"]
+GCS = [sys.executable, "-m", "gcs"]
 PATIENCE_S = 60.0
 
 
@@ -236,6 +236,17 @@ def test_a_reader_that_leaves_neither_ends_nor_changes_a_flight(tmp_path: Path) 
     process.stderr.close()
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (summary["verdict"], summary["not_logged"]) == ("stable", [])
+    assert (tmp_path / "run" / "flight.rrd").exists()
+
+
+def test_a_flight_that_is_started_without_standard_output_flies(tmp_path: Path) -> None:
+    """As `gcs fly >&-` starts it: the observer inherits what stands in for the closed file."""
+    process = fly(
+        short(tmp_path, "chain3", 2.0), "--listen", "127.0.0.1:0", "--out", tmp_path / "run",
+        preexec_fn=lambda: os.close(1),
+    )  # fmt: skip
+    _, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, err) == (0, "")
     assert (tmp_path / "run" / "flight.rrd").exists()
 
 

@@ -19,7 +19,7 @@ from scenarios.files import dump
 from scenarios.link_schema import Jitter, Links
 from sim_vehicles.drive.relay_udp import MOST_PEERS, Peers
 from sim_vehicles.links.links import CAPACITY, LinkSet
-from sim_vehicles.links.relay import Passing, Relay, sender
+from sim_vehicles.links.relay import Passing, Relay, holds_key, sender
 from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, LOST, Row, read_truth
 from sim_vehicles.services.clock import NEVER_NS
 from tests.support.sim_client import MS, SECOND, START, heartbeat, scenario, setpoint
@@ -266,3 +266,11 @@ def test_strangers_take_no_memory_beyond_the_bound() -> None:
             assert len({change.system_id for change in found}) <= 250
         finally:
             peers.sockets.close()
+
+
+@pytest.mark.parametrize("before", [b"", b"\0", b"\xfd", b"\xfe\x09", heartbeat(), heartbeat()[:-1]])
+def test_a_key_is_found_wherever_in_a_datagram_it_begins(before: bytes) -> None:
+    """A receiver that looks for the next magic reads what follows a stray byte, a MAVLink 1 frame or a cut one."""
+    key = dialect.MAVLink_setup_signing_message(1, 1, [7] * 32, 0).pack(dialect.MAVLink(None, srcSystem=255))
+    assert holds_key(before + bytes(key))
+    assert not holds_key(before + setpoint(1.0))

@@ -120,7 +120,7 @@ def test_vehicles_that_start_in_collision_or_past_the_limit_are_found_before_tak
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     near = chain_file(tmp_path, ("[-242.79, 243.09]", "[-122.82, 125.52]"))
-    for command in (("fly",), ("stress", "--onset")):
+    for command in (("fly",), ("stress", "--onset"), ("bench",), ("compare",)):
         line = complaint(capsys, monkeypatch, command[0], str(near), *command[1:])
         assert "read vehicles 2 and 3 3 m apart, wanted at least safety.collision_distance_m = 5 m" in line
     assert flight_plan(load(near))[1].delay_margin_s > 0.29  # designed all the same
@@ -129,7 +129,7 @@ def test_vehicles_that_start_in_collision_or_past_the_limit_are_found_before_tak
 
 
 def test_a_link_slower_than_the_flight_waits_for_is_found_before_take_off(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = str(ROOT / "scenarios/chain3.toml")
     line = complaint(capsys, monkeypatch, "fly", file, "--link-delay", "40")
@@ -137,6 +137,13 @@ def test_a_link_slower_than_the_flight_waits_for_is_found_before_take_off(
         f"{file}: links: read a round trip of 80 s to vehicle 1, wanted less than the 20 s for which an answer is "
         "waited for\n"
     )
+    out = str(tmp_path / "stress")
+    line = complaint(capsys, monkeypatch, "stress", file, "--delay", "0.1,30", "--out", out)
+    assert "read a round trip of 30 s to vehicle 1" in line
+    assert not (tmp_path / "stress").exists()
+    late = str(chain_file(tmp_path, ("delay_s = 0.02", "delay_s = 40.0")))
+    for command in ("bench", "compare", "capacity"):
+        assert "read a round trip of 80 s to vehicle 1" in complaint(capsys, monkeypatch, command, late)
     assert endless_link(CHAIN.with_link_delay(up_s=9.9, down_s=9.9)) is None
     short = CHAIN.with_link_delay(up_s=3.0, down_s=3.0).model_copy(update={"duration_s": 6.0})
     assert "wanted less than duration_s = 6 s" in (endless_link(short) or "")

@@ -9,7 +9,7 @@ from gcs.cli.main import app
 from gcs.errors import InputError
 from gcs.studies.capacity import capacity, fly_loaded, worst_load
 from scenarios.files import load
-from scenarios.schema import Scenario
+from scenarios.schema import FixedGains, Scenario
 from tests.support.paths import SCENARIOS
 
 RADIO = SCENARIOS / "radio57600.toml"
@@ -53,6 +53,15 @@ def test_a_formation_counts_with_its_worst_losses(short: Scenario) -> None:
     assert worst_load(short, 10.0, 3, seeds=3) == min(alone, key=lambda load: load.headroom_p01 or 0.0)
     heavy = worst_load(short, 10.0, 8, seeds=3)
     assert heavy == fly_loaded(short, 10.0, 8), "the first that does not hold is enough"
+
+
+def test_gains_that_are_unstable_at_a_rate_are_not_flown(short: Scenario) -> None:
+    gains = FixedGains(K1=-30.0, K2=0.0, K3=1.0)  # 1 - 30 T is -2 at 10 Hz, and 0.4 at 50 Hz
+    control = short.control.model_copy(update={"gains": gains, "alpha": None, "delay_margin_s": None})
+    given = short.model_copy(update={"control": control})
+    found = capacity(given, rates_hz=[10.0], most=2, seeds=1, seconds=20.0)
+    assert found[0].next is None
+    assert "only sampling makes unstable" in found[0].failed
 
 
 def test_a_rate_without_gains_says_why(short: Scenario) -> None:

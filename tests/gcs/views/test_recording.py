@@ -12,8 +12,8 @@ from rerun.chunk import RrdReader
 from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.errors import InputError
 from gcs.plan.design import Design
+from gcs.runs.files import RunTail, by_tick
 from gcs.runs.record import PARQUET_FILE, RECORDING_FILE, TICKS_FILE, UNFINISHED_FILE
-from gcs.views.grid import WholeTicks
 from gcs.views.observer import record_run
 from gcs.views.recording import Recording
 from gcs.views.scene import vehicle_colors
@@ -174,17 +174,16 @@ def test_gains_without_a_finite_margin_draw_no_margin(tmp_path: Path) -> None:
     assert not drawn
 
 
-def test_ticks_are_given_when_whole_and_gaps_are_unknown() -> None:
-    rows = ticks_of(FIVE, start_s=0.0, count=4).ravel()
-    whole = WholeTicks([vehicle.system_id for vehicle in FIVE.vehicles])
-    assert len(whole.add(rows[:3])) == 0
-    assert len(whole.add(rows[3:7])) == 1
-    second = whole.add(np.concatenate([rows[7:9], rows[10:12]]))  # the last row of the second tick is missing
-    assert second["tick"].tolist() == [[1] * 5]
-    assert np.isnan(second["north_m"]).tolist() == [[False] * 4 + [True]]
-    assert second["system_id"].tolist() == [[5, 4, 3, 2, 1]]
-    assert whole.rest()["tick"].tolist() == [[2] * 5]
-    assert len(whole.rest()) == 0
+def test_ticks_are_given_when_whole_in_the_order_asked_for(tmp_path: Path) -> None:
+    ticks, tail = ticks_of(FIVE, start_s=0.0, count=3), RunTail(tmp_path, 5)
+    data, row = ticks.tobytes(), ticks.itemsize
+    for end, whole in ((3 * row, 0), (7 * row, 1), (15 * row, 2), (15 * row, 0)):
+        (tmp_path / TICKS_FILE).write_bytes(data[:end])
+        assert len(by_tick(tail.ticks(), [1, 2, 3, 4, 5])) == whole
+    (tmp_path / TICKS_FILE).write_bytes(data[: 12 * row])  # a station killed in its third tick
+    found = by_tick(RunTail(tmp_path).ticks(), [1, 2, 3, 4, 5])
+    assert found["system_id"].tolist() == [[1, 2, 3, 4, 5]] * 2
+    assert found[:, ::-1].tobytes() == ticks[:2].tobytes()
 
 
 @pytest.mark.parametrize("count", [5, 20, 250])
@@ -207,14 +206,13 @@ def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path: Path) -> N
         find_recording(tmp_path)
 
 
-def test_a_half_written_row_is_left_out_of_a_recovered_recording(tmp_path: Path) -> None:
+def test_a_half_written_tick_is_left_out_of_a_recovered_recording(tmp_path: Path) -> None:
     ticks = ticks_of(FIVE, start_s=0.0, count=30)
     write_run(tmp_path, FIVE, ticks)
     with (tmp_path / TICKS_FILE).open("r+b") as file:
         file.truncate(ticks.nbytes - 10)
     _, errors_m = read_back(record_run(tmp_path), "/spacing/error_m", "Scalars:scalars")
-    np.testing.assert_array_equal(errors_m[:-1], spacing_errors_m(ticks)[:-1])
-    assert np.isnan(errors_m[-1]).tolist() == [False, False, False, True]
+    np.testing.assert_array_equal(errors_m, spacing_errors_m(ticks)[:-1])
 
 
 def test_a_formation_of_one_vehicle_can_be_recorded(tmp_path: Path) -> None:
