@@ -65,8 +65,8 @@ def fly(
 ) -> Summary:
     """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder."""
     folder = options.folder
-    _describe(folder, plan, design)
     with stop_signals() as asked_to_stop:
+        _describe(folder, plan, design)
         unwritten = _flown(plan, design, link, options, mirror, asked_to_stop)
         return finish(folder, unwritten=unwritten)
 
@@ -81,8 +81,8 @@ def fly_in_virtual_time(
     speed
         Most virtual seconds per second of real time; None for as many as can be computed.
     """
-    _describe(folder, plan, design)
     with stop_signals() as asked_to_stop:
+        _describe(folder, plan, design)
         with _observer(folder, show_table=show_table) as observer:
             if speed is not None:  # otherwise the observer catches up with the flight
                 _wait_until_ready(observer, folder, asked_to_stop)

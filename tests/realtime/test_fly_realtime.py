@@ -314,7 +314,7 @@ def test_killed_vehicles_end_the_flight_with_the_station_saying_which(tmp_path: 
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        (["fly", "nowhere.toml"], "nowhere.toml: file: read"),
+        (["fly", "nowhere.toml"], "nowhere.toml: read no such file"),
         (["fly", "scenarios/chain3.toml", "--listen", "here"], "wanted HOST:PORT"),
         (["fly", "scenarios/chain3.toml", "--listen", "192.0.2.1:14550"], "wanted a free UDP port"),
         (["fly", "scenarios/chain3.toml", "--link-delay", "-1"], "--link-delay: read -1"),

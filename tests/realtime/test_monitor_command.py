@@ -104,7 +104,7 @@ def test_nobody_heard_is_a_failure_and_is_said() -> None:
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        (["nowhere.toml"], "nowhere.toml: file: read"),
+        (["nowhere.toml"], "nowhere.toml: read no such file"),
         (["--listen", "here"], "--listen: read 'here', wanted HOST:PORT"),
         (["--margin", "1", "--design", "x.json"], "read --margin and --design, wanted one of them"),
         (["--margin", "-1"], "--margin"),

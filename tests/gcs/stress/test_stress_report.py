@@ -208,7 +208,7 @@ def test_a_real_time_trial_records_the_machines_noise(tmp_path: Path) -> None:
     ("options", "wanted"),
     [
         ([], "wanted --onset, or an axis"),
-        (["--delay", "x"], "wanted FROM:TO:COUNT"),
+        (["--delay", "x"], "wanted FROM:TO:N"),
         (["--delay-of", "9=0:1:2"], "system id of a vehicle"),
         (["--delay", "0", "--rate", "50", "--loss", "0"], "wanted one (a sweep) or two (a map)"),
         (["--onset", "--tolerance", "2"], "wanted a fraction between 0 and 1"),
