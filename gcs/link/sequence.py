@@ -10,7 +10,9 @@ _NO_DOUBT = 100.0 * _NS_PER_S
 _STEADY_NS = _NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""
 _RATE_NS = _NS_PER_S
-"""The rate is measured over intervals of this length."""
+"""The rate is measured over intervals of this length, of which each weighs less than the next by the factor below: an
+outage of a minute is counted right only if the rate is known to about half a per cent, whatever the jitter."""
+_OLDER = 0.9
 _AHEAD, _LEAST_AHEAD = 127, 32
 """A frame may be this much newer than its time suggests, because the newest one may itself have been late. The farther
 frames have lately been overtaken, the smaller this allowance is, down to the second figure."""
@@ -41,6 +43,8 @@ class SequenceCounter:
         "_rate_ns",
         "_run",
         "_seen",
+        "_steady_frames",
+        "_steady_ns",
         "duplicate",
         "late",
         "lost",
@@ -105,7 +109,7 @@ class SequenceCounter:
         self._newest = -1
         self._newest_ns = self._rate_ns = self._rate_count = self._run = self._last = 0
         self._seen = 0  # bit k: frame number `newest - k` has arrived
-        self._rate_hz = self._lag = 0.0
+        self._rate_hz = self._lag = self._steady_frames = self._steady_ns = 0.0
 
     def _note_rate(self, time_ns: int) -> None:
         """Update the rate of frames sent, from times without a pause."""
@@ -114,5 +118,7 @@ class SequenceCounter:
         if steady and since_ns < _RATE_NS:
             return
         if steady:
-            self._rate_hz = (self._newest - self._rate_count) * _NS_PER_S / since_ns
+            self._steady_frames = _OLDER * self._steady_frames + (self._newest - self._rate_count)
+            self._steady_ns = _OLDER * self._steady_ns + since_ns
+            self._rate_hz = self._steady_frames / self._steady_ns * _NS_PER_S
         self._rate_count, self._rate_ns = self._newest, time_ns

@@ -71,15 +71,14 @@ class TruthLog:
         """Records that could not be written: a full disk stops no vehicle."""
         self._batch: list[bytes] = []
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        size = os.fstat(self._file).st_size
-        if size == 0:
-            os.pwrite(self._file, _MAGIC, 0)
-            size = len(_MAGIC)
-        elif os.pread(self._file, len(_MAGIC), 0) != _MAGIC:
+        head = os.pread(self._file, len(_MAGIC), 0)
+        if not _MAGIC.startswith(head):
             os.close(self._file)
             raise ValueError(f"{path} exists and is not a truth log")
-        self._end = size - (size - len(_MAGIC)) % DTYPE.itemsize
+        size = os.fstat(self._file).st_size
+        self._end = size - (size - len(_MAGIC)) % DTYPE.itemsize if head == _MAGIC else 0
         """Where the next batch goes: after the last complete record, over whatever a failed write left there."""
+        self.flush()
 
     def record(self, row: Row) -> None:
         """Add a record to the batch, and write the batch if it is full."""
@@ -89,13 +88,15 @@ class TruthLog:
 
     def flush(self) -> None:
         """Hand the batch to the operating system."""
-        data = b"".join(self._batch)
+        head = b"" if self._end else _MAGIC
+        data = head + b"".join(self._batch)
         try:
             written = os.pwrite(self._file, data, self._end)
         except OSError:
             written = 0
-        whole = written // DTYPE.itemsize
-        self._end += whole * DTYPE.itemsize
+        whole = max(0, written - len(head)) // DTYPE.itemsize
+        if written >= len(head):
+            self._end += len(head) + whole * DTYPE.itemsize
         self.lost += len(self._batch) - whole
         self._batch.clear()
 
@@ -110,16 +111,18 @@ class TruthLog:
 def read_truth(path: Path) -> npt.NDArray[np.void]:
     """The complete records of a truth log, in the order written, as an array of DTYPE.
 
+    A log that a full disk cut off at its beginning holds none.
+
     Raises
     ------
     ValueError
         If the file is not a truth log, or holds a record of an unknown kind.
     """
     data = path.read_bytes()
-    if not data.startswith(_MAGIC):
+    if not data.startswith(_MAGIC[: len(data)]):
         raise ValueError(f"{path} is not a truth log")
-    count = (len(data) - len(_MAGIC)) // DTYPE.itemsize
-    records = np.frombuffer(data, DTYPE, count, len(_MAGIC))
+    count = max(0, len(data) - len(_MAGIC)) // DTYPE.itemsize
+    records = np.frombuffer(data, DTYPE, count, min(len(_MAGIC), len(data)))
     if (unknown := np.flatnonzero(~np.isin(records["kind"], KINDS))).size:
         raise ValueError(f"{path}: record {unknown[0] + 1} of {count} is of no known kind")
     return records

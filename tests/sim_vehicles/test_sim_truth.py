@@ -41,6 +41,16 @@ def test_a_flushed_batch_survives_without_close(tmp_path: Path) -> None:
     log.close()
 
 
+@pytest.mark.parametrize("kept", [0, 1, 7])
+def test_a_log_cut_off_at_its_beginning_holds_nothing(tmp_path: Path, kept: int) -> None:
+    path = tmp_path / "truth"
+    write(path, ROWS)
+    path.write_bytes(path.read_bytes()[:kept])
+    assert read_truth(path).tolist() == []
+    write(path, ROWS[:1])
+    assert read_truth(path).tolist() == ROWS[:1]
+
+
 @pytest.mark.parametrize("cut", range(1, DTYPE.itemsize))
 def test_a_record_cut_in_two_is_left_out_and_overwritten(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "truth"

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gcs.link.sequence import SequenceCounter
@@ -47,6 +47,7 @@ def test_random_losses_are_counted_exactly(seed: int, share: float) -> None:
     assert counts(counted(kept, [20.0 * n for n in kept])) == (len(kept), 500 - len(kept), 0, 0)
 
 
+@example(323, 290.9375, 55.265625, 0.0)
 @given(st.integers(0, 2**32), st.floats(20.0, 300.0), st.floats(0.0, 60.0), st.floats(0.0, 0.3))
 def test_what_is_lost_in_an_outage_of_up_to_a_minute_is_counted_whole(
     seed: int, rate_hz: float, outage_s: float, share: float
