@@ -209,8 +209,8 @@ def stability_windows(
     known = delays[:-1] <= wanted_s
     if bool(np.any(count[wide & known] < 0)):
         raise DisagreementError(
-            f"{len(crossings)} crossings take more roots out of the right half plane than are in it ({unstable} without "
-            "delay): the loop is at the limit of double precision"
+            f"{len(crossings)} crossings take more roots out of the right half plane than are in it "
+            f"({unstable} without delay): the loop is at the limit of double precision"
         )
     stable = wide & known & (count == 0)
     return tuple(zip(delays[:-1][stable].tolist(), delays[1:][stable].tolist(), strict=True)), complete_to_s
