@@ -21,7 +21,7 @@ def formation_figure(file: Path, method: str) -> Path:
     for column, (name, title) in enumerate(titles.items()):
         ticks, settled_s = flown(name, method)
         above, below = plots[0][column], plots[1][column]
-        until_s = 75.0 if name == "triangle5_turns" else 8.0
+        until_s = 75.0 if name == "triangle5_turns" else 15.0
         _snapshots(above, ticks, until_s)
         _distances(below, ticks, until_s)
         above.set_title(f"{title}: settled after {settled_s:.1f} s" if settled_s is not None else title, fontsize=10)

@@ -17,6 +17,7 @@ from gcs.cli.main import app
 from gcs.studies import thesis_errata as errata
 from gcs.studies.thesis import late_neighbours
 from gcs.studies.thesis_flights import CHAIN, nonlinear_response, printed_gains
+from tests.support.paths import ROOT
 
 
 def test_printed_gains_tolerate_a_second_not_the_published_0_19() -> None:
@@ -95,6 +96,7 @@ def test_page_holds_every_claim_and_its_figures(tmp_path: Path) -> None:
     assert verdicts["α = 0.93, with sheared coordinates"] == "agrees"
     page = (folder / "thesis.md").read_text(encoding="utf-8")
     assert all(claim["computed"].replace("|", "\\|") in page for claim in claims)
+    assert page == (ROOT / "docs" / "thesis" / "thesis.md").read_text(encoding="utf-8")
     for name in ("inclusion.png", "graph.png", "responses.png"):
         assert (folder / name).stat().st_size > 20_000
         assert f"({name})" in page
