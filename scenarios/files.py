@@ -41,7 +41,8 @@ def load(path: Path) -> Scenario:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(path, "file", str(error), "a readable TOML file") from None
+        read = error.strerror if isinstance(error, OSError) else str(error)
+        raise ScenarioError(path, "file", read, "a readable TOML file") from None
     return parse(text, path)
 
 

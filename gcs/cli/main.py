@@ -12,7 +12,7 @@ import typer
 from gcs.cli import BAD_INPUT, FAILED, INTERRUPTED
 from gcs.cli.design import design, margin
 from gcs.cli.fly import fly, key
-from gcs.cli.runs import grade, recover, view
+from gcs.cli.runs import export, grade, recover, view
 from gcs.cli.scenarios import check, new, scenarios
 from gcs.cli.stress import stress
 from gcs.cli.studies import bench, capacity, compare, thesis
@@ -48,7 +48,24 @@ def help_without_command(
 
 
 _COMMANDS = (
-    *(scenarios, new, check, fly, design, compare, margin, thesis, bench, capacity, grade, view, recover, key, stress),
+    *(
+        scenarios,
+        new,
+        check,
+        fly,
+        design,
+        compare,
+        margin,
+        thesis,
+        bench,
+        capacity,
+        grade,
+        view,
+        export,
+        recover,
+        key,
+        stress,
+    ),
     *(monitor, replay),
 )
 for _command in _COMMANDS:

@@ -93,15 +93,15 @@ def refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
     print(f"warning: {file}: {finding}", file=sys.stderr)
 
 
-def out_folder(out: Path, wanted: str = "a new or empty folder") -> Path:
-    """The new or empty folder that --out names; it is created if it does not exist."""
+def out_folder(out: Path, wanted: str = "a new or empty folder", option: str = "--out") -> Path:
+    """The new or empty folder that an option names; it is created if it does not exist."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         used = any(out.iterdir())
     except OSError as error:
-        raise InputError(f"--out: {out}: {error.strerror}, wanted a folder that can be written") from None
+        raise InputError(f"{option}: {out}: {error.strerror}, wanted a folder that can be written") from None
     if used:
-        raise InputError(f"--out: {out} is not empty, wanted {wanted}")
+        raise InputError(f"{option}: {out} is not empty, wanted {wanted}")
     return out
 
 

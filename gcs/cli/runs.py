@@ -1,4 +1,4 @@
-"""`gcs grade`, `view` and `recover`: what is done with the folder of a run."""
+"""`gcs grade`, `view`, `export` and `recover`: what is done with the folder of a run."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gcs.cli import FAILED
-from gcs.cli.options import AsJson, RunFolder, answer, out_file, within
+from gcs.cli.options import AsJson, RunFolder, answer, out_file, out_folder, within
 from gcs.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,6 +67,31 @@ def view(
     for complaint in complaints:
         typer.echo(complaint, err=True)
     raise typer.Exit(FAILED if complaints else 0)
+
+
+def export(
+    source: Annotated[Path, typer.Argument(metavar="RUN|FILE.tlog", help="run folder, or a telemetry log of any tool")],
+    mcap: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="write MCAP, which Foxglove and PlotJuggler read")
+    ] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="DIR", help="write a CSV file for each table here")] = None,
+) -> None:
+    """Write a run or a telemetry log for other tools."""
+    from gcs.watch.export import messages_of, write_csv, write_mcap
+
+    if mcap is None and csv is None:
+        raise InputError("read neither --mcap nor --csv, wanted at least one of them")
+    if not source.exists():
+        raise InputError(f"{source}: read no such file, wanted a run folder or a telemetry log")
+    if mcap is not None:
+        out_file("--mcap", mcap)
+    messages = messages_of(source)
+    if mcap is not None:
+        write_mcap(mcap, messages)
+        typer.echo(f"mcap     {mcap}: {len(messages)} messages")
+    if csv is not None:
+        files = write_csv(out_folder(csv, option="--csv"), messages)
+        typer.echo(f"csv      {csv}: {', '.join(file.name for file in files)}")
 
 
 def recover(run: Annotated[Path, typer.Argument(metavar="RUN", help="folder of a run that was killed")]) -> None:

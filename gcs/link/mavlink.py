@@ -81,6 +81,18 @@ def field_names(msg_id: int) -> list[str]:
     return list(messages[msg_id].ordered_fieldnames)
 
 
+def named_fields(frame: Frame) -> dict[str, Any]:
+    """The fields by their names: an array as a list, characters as a text."""
+    message: Any = dialect.mavlink_map[frame.msg_id]
+    named: dict[str, Any] = {}
+    at = 0
+    for name, length in zip(message.ordered_fieldnames, message.lengths, strict=True):
+        value = frame.fields[at] if length == 1 else list(frame.fields[at : at + length])
+        named[name] = value.rstrip(b"\0").decode(errors="replace") if isinstance(value, bytes) else value
+        at += length
+    return named
+
+
 def _target_places() -> dict[int, int]:
     """Position of target_system among the fields of each message that has one."""
     messages: dict[int, Any] = dialect.mavlink_map

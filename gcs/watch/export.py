@@ -1,0 +1,124 @@
+"""A run or a telemetry log for other tools: MCAP (Foxglove, PlotJuggler) and CSV.
+
+A run gives the topics `/vehicle/ID/tick`, with the columns of ticks.parquet, and `/events`. A telemetry log gives one
+topic for each sender and kind of message, `/mavlink/ID/LOCAL_POSITION_NED` for example. Times of a run count from its
+first tick, those of a log since 1970.
+"""
+
+import csv
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gcs.errors import InputError
+from gcs.link import mavlink
+from gcs.runs.files import RunTail, read_ticks
+from gcs.watch.tlog import read_tlog
+from scenarios.schema import NS_PER_S
+
+_TYPES = {bool: "boolean", int: "integer", float: "number", str: "string", dict: "object", list: "array"}
+
+
+class Message(NamedTuple):
+    """One message of a topic."""
+
+    topic: str
+    table: str
+    """The CSV file that it is a row of, without the ending."""
+    time_ns: int
+    fields: dict[str, Any]
+    """What is known: a value that is not known is left out."""
+
+
+def messages_of(source: Path) -> list[Message]:
+    """The messages of a run's folder or of a telemetry log, in the order of their times.
+
+    Raises InputError if `source` is neither.
+    """
+    if source.is_dir():
+        return sorted(_of_run(source), key=lambda message: message.time_ns)
+    return list(_of_log(source))
+
+
+def _of_run(folder: Path) -> Iterator[Message]:
+    ticks = read_ticks(folder)
+    names = ticks.dtype.names or ()
+    began_s = float(ticks["time_s"].min(initial=0.0))
+
+    def since_ns(time_s: float) -> int:
+        return max(0, round((time_s - began_s) * NS_PER_S))
+
+    for row in ticks.tolist():
+        fields = _known(dict(zip(names, row, strict=True)))
+        yield Message(f"/vehicle/{fields['system_id']}/tick", "ticks", since_ns(fields["time_s"]), fields)
+    for event in RunTail(folder).events():
+        yield Message("/events", "events", since_ns(event.time_s), _known(asdict(event)))
+
+
+def _of_log(file: Path) -> Iterator[Message]:
+    for time_ns, frame in read_tlog(file).frames:
+        name = mavlink.message_name(frame.msg_id)
+        sender = {"system_id": frame.system_id, "component_id": frame.component_id}
+        yield Message(f"/mavlink/{frame.system_id}/{name}", name, time_ns, sender | _known(mavlink.named_fields(frame)))
+
+
+def _known(fields: dict[str, Any]) -> dict[str, Any]:
+    """The fields without those that are None, NaN or infinite, for which JSON has no value."""
+    return {
+        name: value
+        for name, value in fields.items()
+        if value is not None and not (isinstance(value, float) and not math.isfinite(value))
+    }
+
+
+def write_mcap(file: Path, messages: Sequence[Message]) -> None:
+    """Write messages as JSON with a schema for each topic.
+
+    Raises InputError if the package mcap is not installed.
+    """
+    try:
+        from mcap.writer import Writer
+    except ModuleNotFoundError:
+        raise InputError("--mcap: the package mcap is not installed; wanted pip install formation-gcs[mcap]") from None
+
+    properties: dict[str, dict[str, dict[str, str]]] = defaultdict(dict)
+    for message in messages:
+        own = properties[message.table]
+        own.update({name: {"type": _TYPES[type(value)]} for name, value in message.fields.items() if name not in own})
+    with file.open("wb") as out:
+        writer = Writer(out)
+        writer.start(library="formation-gcs")
+        schemas = {
+            table: writer.register_schema(
+                table, "jsonschema", json.dumps({"title": table, "type": "object", "properties": own}).encode()
+            )
+            for table, own in properties.items()
+        }
+        channels = {
+            topic: writer.register_channel(topic, "json", schemas[table])
+            for topic, table in dict.fromkeys((message.topic, message.table) for message in messages)
+        }
+        for message in messages:
+            data = json.dumps(message.fields).encode()
+            writer.add_message(channels[message.topic], message.time_ns, data, message.time_ns)
+        writer.finish()
+
+
+def write_csv(folder: Path, messages: Iterable[Message]) -> list[Path]:
+    """Write one file for each table, with the columns of all its messages; returns the files."""
+    tables: dict[str, list[dict[str, Any]]] = {}
+    for message in messages:
+        row = {"time_ns": message.time_ns} | message.fields
+        tables.setdefault(message.table, []).append(row)
+    files = [folder / f"{name}.csv" for name in tables]
+    for file, rows in zip(files, tables.values(), strict=True):
+        columns = dict.fromkeys(name for row in rows for name in row)
+        with file.open("w", newline="", encoding="utf-8") as out:
+            writer = csv.DictWriter(out, list(columns))
+            writer.writeheader()
+            writer.writerows(rows)
+    return files
