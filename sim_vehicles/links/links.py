@@ -8,22 +8,10 @@ import heapq
 from collections import Counter
 
 from scenarios import link_schema, schema
+from sim_vehicles.links import truth
 from sim_vehicles.links.channel import Channel
 from sim_vehicles.links.fate import Stream, behaviour_of, constant, flipped, outcome
-from sim_vehicles.links.truth import (
-    CORRUPTED,
-    DUPLICATE,
-    FATES,
-    LINK_DOWN,
-    LINK_FULL,
-    LINK_UP,
-    LOST,
-    OUTAGE,
-    PASSED,
-    QUEUE_FULL,
-    Record,
-    Row,
-)
+from sim_vehicles.links.truth import DUPLICATE, FATES, LINK_DOWN, LINK_FULL, LINK_UP, PASSED, Record, Row
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.mavlink import message_id
 
@@ -85,7 +73,7 @@ class Link:
     @property
     def dropped(self) -> int:
         """How many datagrams never come out."""
-        return sum(self.counts[FATES[fate]] for fate in (LOST, OUTAGE, QUEUE_FULL, LINK_FULL))
+        return sum(self.counts[FATES[fate]] for fate in (truth.LOST, truth.OUTAGE, truth.QUEUE_FULL, LINK_FULL))
 
     def send(self, data: bytes, time_ns: int) -> None:
         """Take in a datagram that enters the link at a time."""
@@ -116,19 +104,19 @@ class Link:
         found = outcome(self.behaviour, bad=self._bad, time_ns=time_ns - self.zero_ns, draws=stream.next())
         self._bad = found.bad
         begin_ns = end_ns = time_ns
-        if found.fate & OUTAGE:
-            return self._drop(data, time_ns, OUTAGE)
+        if found.fate & truth.OUTAGE:
+            return self._drop(data, time_ns, truth.OUTAGE)
         if len(self._queue) >= self._capacity:
             return self._drop(data, time_ns, LINK_FULL)
         if self._channel is not None:
             sending_ns = self._channel.send(len(data), time_ns)
             if sending_ns is None:
-                return self._drop(data, time_ns, QUEUE_FULL)
+                return self._drop(data, time_ns, truth.QUEUE_FULL)
             begin_ns, end_ns = sending_ns
-        if found.fate & LOST:
-            return self._drop(data, time_ns, LOST, begin_ns - time_ns)
-        if found.fate & CORRUPTED:
-            self.counts[FATES[CORRUPTED]] += 1
+        if found.fate & truth.LOST:
+            return self._drop(data, time_ns, truth.LOST, begin_ns - time_ns)
+        if found.fate & truth.CORRUPTED:
+            self.counts[FATES[truth.CORRUPTED]] += 1
             data = flipped(data, found.flips)
         self._push(end_ns + found.delay_ns, time_ns, data, found.fate, begin_ns - time_ns)
         if found.duplicate_delay_ns >= 0:

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from scenarios.schema import Safety
 from sim_vehicles.services import messages
 from sim_vehicles.services.mavlink import Encoder
 from sim_vehicles.services.messages import ParameterList, ParameterRead, ParameterSet
@@ -115,15 +114,6 @@ class Parameters:
 
 def _kind(whole: bool) -> int:
     return messages.INT32 if whole else messages.REAL32
-
-
-def of_vehicle(system_id: int, safety: Safety) -> list[Parameter]:
-    """The parameters of every double integrator, by ArduPilot's names."""
-    return [
-        fixed("SYSID_THISMAV", system_id),
-        timeout("GUID_TIMEOUT", safety.setpoint_timeout_s),
-        timeout("FS_GCS_TIMEOUT", safety.heartbeat_timeout_s),
-    ]
 
 
 def timeout(name: str, value_s: float) -> Parameter:
