@@ -145,10 +145,7 @@ class Fleet:
     def step(self, received: Iterable[Datagram], now_ns: int) -> list[Datagram]:
         """The datagrams that leave the up links by now, with their exact instants, in order of time.
 
-        Parameters
-        ----------
-        received
-            Datagrams of the station with the instants at which each enters its vehicle's down link.
+        `received` are datagrams of the station, with the instants at which each enters its vehicle's down link.
         """
         if self._links.zero_ns == NEVER_NS:
             received = list(received)

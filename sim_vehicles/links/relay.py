@@ -63,7 +63,6 @@ class Relay:
 
     @property
     def counters(self) -> Counter[str]:
-        """What happened on all links."""
         return self._links.counters()
 
     @property

@@ -110,10 +110,7 @@ class TruthLog:
 def read_truth(path: Path) -> npt.NDArray[np.void]:
     """The complete records of a truth log, in the order written, as an array of DTYPE.
 
-    Raises
-    ------
-    ValueError
-        If the file is not a truth log, or holds a record of an unknown kind.
+    Raises ValueError if the file is not a truth log, or holds a record of an unknown kind.
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC):

@@ -147,7 +147,6 @@ class Copter:
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
-        """Read the time-outs from the parameters."""
         before = self._setpoint_timeout_ns, self._ground_disarm_ns
         self._read_timeouts()
         if (self._setpoint_timeout_ns, self._ground_disarm_ns) != before:

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 
 from scenarios import schema
 from scenarios.schema import NS_PER_S
-from sim_vehicles.services import mavlink, messages, setup_parameters
+from sim_vehicles.services import mavlink, messages
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
-from sim_vehicles.services.parameters import Parameters, fixed, timeout
+from sim_vehicles.services.parameters import ARDUPILOT_SETUP, Parameters, fixed, timeout
 from sim_vehicles.services.services import whole
 from sim_vehicles.vehicles.dynamics import (
     COAST,
@@ -55,9 +55,7 @@ class DoubleIntegrator:
             timeout("FS_GCS_TIMEOUT", safety.heartbeat_timeout_s),
         )
         formation = [] if onboard is None else formation_parameters()
-        self.parameters = Parameters(
-            [fixed("SYSID_THISMAV", own.system_id), *timeouts, *setup_parameters.ARDUPILOT, *formation]
-        )
+        self.parameters = Parameters([fixed("SYSID_THISMAV", own.system_id), *timeouts, *ARDUPILOT_SETUP, *formation])
         self.reports_from_ns = radio.start_ns
         self._radio = radio
         self._onboard = onboard

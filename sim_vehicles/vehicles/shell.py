@@ -64,7 +64,6 @@ class Radio:
         self.out.append((frame, time_ns))
 
     def say(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
-        """Send a STATUSTEXT."""
         self.send(self.encoder.statustext(severity, text), time_ns)
 
     def tell(self, time_ns: int, text: str) -> None:
@@ -76,7 +75,6 @@ class Radio:
             self.record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
 
     def set_clock(self, clock: BootClock, time_ns: int) -> None:
-        """Continue with another clock."""
         self.clock = clock
         self.schedule.set_clock(clock, time_ns)
 
