@@ -171,7 +171,10 @@ def _least_rank(component: _Component, mode: complex) -> tuple[int, frozenset[in
         return kept + _rank(np.vstack([above, below]), _size(shifted))
 
     size = len(component.inputs)
-    return _least_exhaustive(rank, size) if size <= LARGEST_EXHAUSTIVE else _least_submodular(rank, size)
+    if size > LARGEST_EXHAUSTIVE:
+        return _least_submodular(rank, size)
+    subsets = [frozenset(k for k in range(size) if code >> k & 1) for code in range(2**size)]
+    return min(((rank(subset), subset) for subset in subsets), key=lambda item: item[0])
 
 
 def _candidates(A: FloatArray) -> list[complex]:
@@ -270,12 +273,6 @@ def _advice(remedies: tuple[tuple[Link, ...], ...]) -> str:
 
 def _number(mode: complex) -> str:
     return f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode.real:.6g} ± {abs(mode.imag):.6g}j"
-
-
-def _least_exhaustive(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
-    """The least value of a function of subsets of range(size), and a set with that value, by trying all 2^size."""
-    subsets = [frozenset(k for k in range(size) if code >> k & 1) for code in range(2**size)]
-    return min(((value_of(subset), subset) for subset in subsets), key=lambda item: item[0])
 
 
 def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
