@@ -284,6 +284,8 @@ def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[
     closes; a rank that rounding decides need not be submodular. (S. Fujishige, Submodular Functions and Optimization,
     2nd ed. 2005, section 7.1.)
     """
+    from scipy.optimize import nnls  # takes longer to import than small patterns to analyse
+
     empty = value_of(frozenset())
     best = (empty, frozenset[int]())
 
@@ -304,28 +306,11 @@ def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[
         x = weights @ points
         if empty + np.minimum(x, 0.0).sum() > best[0] - 1 + 1e-6:
             return best
-        points, weights = _nearest_to_origin(np.vstack([points, vertex(x)]), np.append(weights, 0.0))
+        points = np.vstack([points, vertex(x)])
+        # the point of least norm in the hull of the points, as a problem of nonnegative least squares
+        weights = nnls(np.vstack([points.T, np.ones(len(points))]), np.append(np.zeros(size), 1.0))[0]
+        points, weights = points[weights > 0.0], weights[weights > 0.0] / weights.sum()
     raise DisagreementError(
         f"the least rank is between {empty + np.minimum(weights @ points, 0.0).sum():.3f} and {best[0]}; the ranks are "
         "decided by rounding: scale the plant so that its entries are of like size"
     )
-
-
-def _nearest_to_origin(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Wolfe's minor cycle: the points whose hull holds the point of least norm, and the weights of that point."""
-    while True:
-        count = len(points)
-        # least norm in the affine hull, by Lagrange's conditions; least squares because points may be dependent
-        system = np.block([[points @ points.T, np.ones((count, 1))], [np.ones((1, count)), np.zeros((1, 1))]])
-        affine = np.linalg.lstsq(system, np.append(np.zeros(count), 1.0), rcond=None)[0][:count]
-        if affine.min() > -1e-10:
-            kept = affine > 1e-10
-            return points[kept], affine[kept] / affine[kept].sum()
-        outward = affine < weights - 1e-14
-        outward &= affine < 1e-10
-        step = float((weights[outward] / (weights[outward] - affine[outward])).min()) if outward.any() else 0.0
-        weights = weights + min(step, 1.0) * (affine - weights)
-        kept = weights > 1e-12
-        if kept.all():
-            kept[np.argmin(weights)] = False
-        points, weights = points[kept], weights[kept] / weights[kept].sum()
