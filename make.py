@@ -23,7 +23,7 @@ COMPILED = (
     "gcs/control/loops.py gcs/control/phases.py gcs/drive/guard.py gcs/drive/lockstep.py gcs/link/clocks.py "
     "gcs/link/mavlink.py gcs/link/sequence.py gcs/link/vehicle.py gcs/station/monitor.py gcs/station/station.py "
     "gcs/station/tick_rows.py scenarios/signing/link.py scenarios/signing/stamps.py sim_vehicles/drive/fleet.py "
-    "sim_vehicles/links/channel.py sim_vehicles/links/links.py sim_vehicles/services/clock.py "
+    "sim_vehicles/links/links.py sim_vehicles/services/clock.py "
     "sim_vehicles/services/mavlink.py sim_vehicles/services/schedule.py "
     "sim_vehicles/vehicles/double_integrator.py sim_vehicles/vehicles/dynamics.py "
     "sim_vehicles/vehicles/flight_mode.py sim_vehicles/vehicles/setpoints.py sim_vehicles/vehicles/shell.py"

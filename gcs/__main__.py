@@ -10,7 +10,6 @@ from gcs.output import open_what_is_closed
 
 
 def main() -> None:
-    """Entry point."""
     for number in ending_signals():
         signal.signal(number, _end_at_once)
     open_what_is_closed()

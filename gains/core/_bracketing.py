@@ -75,22 +75,15 @@ def bracketed_roots(
         tolerance = 2.0 * _EPS * np.abs(best)
         if bool(np.all((width <= 2.0 * tolerance) | (fa == 0.0))):
             break
-        fraction = _next_fraction(a, b, c, fa, fb, fc)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
+            safe = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
+            quadratic = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
+        fraction = np.where(safe & np.isfinite(quadratic), quadratic, 0.5)
         least = np.minimum(tolerance / np.maximum(width, tolerance), 0.5)
         fraction = np.clip(fraction, least, 1.0 - least)
         fraction = np.where(fa == 0.0, 0.0, fraction)
     return np.where(np.abs(fa) <= np.abs(fb), a, b)
-
-
-def _next_fraction(
-    a: FloatArray, b: FloatArray, c: FloatArray, fa: FloatArray, fb: FloatArray, fc: FloatArray
-) -> FloatArray:
-    """Chandrupatla's choice of the next abscissa, as a fraction of the way from a to b."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        xi, phi = (a - b) / (c - b), (fa - fb) / (fc - fb)
-        interpolate = (phi**2 < xi) & ((1.0 - phi) ** 2 < 1.0 - xi)
-        quadratic = fa / (fb - fa) * fc / (fb - fc) + (c - a) / (b - a) * fa / (fc - fa) * fb / (fc - fb)
-        return np.where(interpolate & np.isfinite(quadratic), quadratic, 0.5)
 
 
 def met_end(

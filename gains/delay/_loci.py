@@ -140,16 +140,12 @@ def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: f
     frequency to zero, and its modulus differs from one by less than rounding; no finite delay belongs to it. The locus
     of a slow motion that does cross, beside fast ones, still changes with the frequency.
     """
-    return [
-        crossing
-        for crossing in crossings
-        if crossing.omega > _SLOW * highest or not _is_flat(loci, crossing.omega, crossing.locus)
-    ]
 
+    def is_flat(crossing: UnitCrossing) -> bool:
+        rows = loci(np.array([crossing.omega / 2.0, 2.0 * crossing.omega]))
+        return bool(np.all(np.min(np.abs(rows - crossing.locus), axis=1) < _FLAT))
 
-def _is_flat(loci: Loci, omega: float, locus: complex) -> bool:
-    rows = loci(np.array([omega / 2.0, 2.0 * omega]))
-    return bool(np.all(np.min(np.abs(rows - locus), axis=1) < _FLAT))
+    return [crossing for crossing in crossings if crossing.omega > _SLOW * highest or not is_flat(crossing)]
 
 
 def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:

@@ -158,27 +158,26 @@ def _images(matrices: tuple[FloatArray, ...], curve: FloatArray, longest_s: tupl
     last = np.floor(((np.array(longest_s) * omega - angles) / (2.0 * pi)).max(axis=0)).astype(int)
     for p in range(first[0], last[0] + 1):
         for q in range(first[1], last[1] + 1):
-            line = Polyline((angles + 2.0 * pi * np.array([p, q])) / omega, curve[:, 0])
-            yield from _inside(matrices, curve, line, (p, q), longest_s)
+            delays_s = (angles + 2.0 * pi * np.array([p, q])) / omega
+            yield from _inside(matrices, curve, delays_s, (p, q), longest_s)
 
 
 def _inside(
     matrices: tuple[FloatArray, ...],
     curve: FloatArray,
-    line: Polyline,
+    delays_s: FloatArray,
     turns: tuple[int, int],
     longest_s: tuple[float, float],
 ) -> Iterator[Polyline]:
     """The stretches of a polyline in the box, each up to the points where the curve enters and leaves it."""
-    delays_s = line.delays_s
     inside = np.all((delays_s >= 0.0) & (delays_s <= np.array(longest_s)), axis=1)
     for begin, end in _runs(inside):
-        points, omega = delays_s[begin:end], line.omega_rad_s[begin:end]
-        for last, beyond, at in ((begin, begin - 1, 0), (end - 1, end, end - begin)):
+        points, omega = delays_s[begin:end], curve[begin:end, 0]
+        for last, beyond in ((begin, begin - 1), (end - 1, end)):
             if 0 <= beyond < len(delays_s):
                 edge = _edge_point(matrices, curve, delays_s, (last, beyond), turns, longest_s)
                 if edge is not None:
-                    place = 0 if at == 0 else len(points)
+                    place = 0 if beyond < begin else len(points)
                     points, omega = np.insert(points, place, edge[0], axis=0), np.insert(omega, place, edge[1])
         if len(points) >= _LEAST_POINTS:
             yield Polyline(points, omega)

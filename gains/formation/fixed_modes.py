@@ -171,7 +171,10 @@ def _least_rank(component: _Component, mode: complex) -> tuple[int, frozenset[in
         return kept + _rank(np.vstack([above, below]), _size(shifted))
 
     size = len(component.inputs)
-    return _least_exhaustive(rank, size) if size <= LARGEST_EXHAUSTIVE else _least_submodular(rank, size)
+    if size > LARGEST_EXHAUSTIVE:
+        return _least_submodular(rank, size)
+    subsets = [frozenset(k for k in range(size) if code >> k & 1) for code in range(2**size)]
+    return min(((rank(subset), subset) for subset in subsets), key=lambda item: item[0])
 
 
 def _candidates(A: FloatArray) -> list[complex]:
@@ -272,12 +275,6 @@ def _number(mode: complex) -> str:
     return f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode.real:.6g} ± {abs(mode.imag):.6g}j"
 
 
-def _least_exhaustive(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
-    """The least value of a function of subsets of range(size), and a set with that value, by trying all 2^size."""
-    subsets = [frozenset(k for k in range(size) if code >> k & 1) for code in range(2**size)]
-    return min(((value_of(subset), subset) for subset in subsets), key=lambda item: item[0])
-
-
 def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[int]]:
     """The least value of an integer submodular function of subsets of range(size), and a set with that value.
 
@@ -287,6 +284,8 @@ def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[
     closes; a rank that rounding decides need not be submodular. (S. Fujishige, Submodular Functions and Optimization,
     2nd ed. 2005, section 7.1.)
     """
+    from scipy.optimize import nnls  # takes longer to import than small patterns to analyse
+
     empty = value_of(frozenset())
     best = (empty, frozenset[int]())
 
@@ -307,28 +306,11 @@ def _least_submodular(value_of: SetFunction, size: int) -> tuple[int, frozenset[
         x = weights @ points
         if empty + np.minimum(x, 0.0).sum() > best[0] - 1 + 1e-6:
             return best
-        points, weights = _nearest_to_origin(np.vstack([points, vertex(x)]), np.append(weights, 0.0))
+        points = np.vstack([points, vertex(x)])
+        # the point of least norm in the hull of the points, as a problem of nonnegative least squares
+        weights = nnls(np.vstack([points.T, np.ones(len(points))]), np.append(np.zeros(size), 1.0))[0]
+        points, weights = points[weights > 0.0], weights[weights > 0.0] / weights.sum()
     raise DisagreementError(
         f"the least rank is between {empty + np.minimum(weights @ points, 0.0).sum():.3f} and {best[0]}; the ranks are "
         "decided by rounding: scale the plant so that its entries are of like size"
     )
-
-
-def _nearest_to_origin(points: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Wolfe's minor cycle: the points whose hull holds the point of least norm, and the weights of that point."""
-    while True:
-        count = len(points)
-        # least norm in the affine hull, by Lagrange's conditions; least squares because points may be dependent
-        system = np.block([[points @ points.T, np.ones((count, 1))], [np.ones((1, count)), np.zeros((1, 1))]])
-        affine = np.linalg.lstsq(system, np.append(np.zeros(count), 1.0), rcond=None)[0][:count]
-        if affine.min() > -1e-10:
-            kept = affine > 1e-10
-            return points[kept], affine[kept] / affine[kept].sum()
-        outward = affine < weights - 1e-14
-        outward &= affine < 1e-10
-        step = float((weights[outward] / (weights[outward] - affine[outward])).min()) if outward.any() else 0.0
-        weights = weights + min(step, 1.0) * (affine - weights)
-        kept = weights > 1e-12
-        if kept.all():
-            kept[np.argmin(weights)] = False
-        points, weights = points[kept], weights[kept] / weights[kept].sum()

@@ -144,15 +144,24 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
         analysis = analyse_mixed(terms, leave_out_zero=True)
     else:
         analysis = analyse_commensurate(by_multiple(terms), leave_out_zero=True)
-    opinions = second_opinions(analysis, terms)
+    checked_by, margin_error_s = second_opinions(analysis, terms)
     scale = 1.0 / float(unit)
     fixed = taken_out + analysis.roots_fixed_at_zero
-    at_zero = () if analysis.stable_intervals_s or fixed else _singular_note(matrices)
+    if fixed:
+        stay = "1 root stays" if fixed == 1 else f"{fixed} roots stay"
+        why = "an equilibrium, as the common value of a consensus"
+        notes = (f"{stay} at 0 at every delay ({why}); all else is said of the others",)
+    elif not analysis.stable_intervals_s and any(
+        is_singular_for_any_delay(balanced(*block.matrices)) for block in distinct_blocks(*matrices)
+    ):
+        notes = ("a root stays at 0 at every delay, so the loop is asymptotically stable at none",)
+    else:
+        notes = ()
     return LoopMargin(
         unknown=model.unknown,
         stable_intervals_s=tuple((start_s * scale, end_s * scale) for start_s, end_s in analysis.stable_intervals_s),
         delay_margin_s=analysis.delay_margin_s * scale,
-        delay_margin_error_s=opinions.margin_error_s * scale,
+        delay_margin_error_s=margin_error_s * scale,
         crossings=tuple(
             _scaled(c, crossing_error(terms, c.omega_rad_s, c.delay_s)[1] if i < _ERRORS_OF else np.nan, scale)
             for i, c in enumerate(analysis.crossings)
@@ -160,8 +169,8 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
         unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_delay,
         roots_fixed_at_zero=fixed,
         complete_to_s=analysis.complete_to_s * scale,
-        checked_by=opinions.checked_by,
-        notes=(_fixed_note(fixed),) if fixed else at_zero,
+        checked_by=checked_by,
+        notes=notes,
     )
 
 
@@ -262,16 +271,3 @@ def _common_divisor(multiples: list[Fraction]) -> Fraction:
         return Fraction(1)
     denominator = np.lcm.reduce([multiple.denominator for multiple in present], dtype=object)
     return Fraction(gcd(*(int(multiple * denominator) for multiple in present)), int(denominator))
-
-
-def _fixed_note(count: int) -> str:
-    what = "1 root stays" if count == 1 else f"{count} roots stay"
-    why = "an equilibrium, as the common value of a consensus"
-    return f"{what} at 0 at every delay ({why}); all else is said of the others"
-
-
-def _singular_note(matrices: tuple[FloatArray, ...]) -> tuple[str, ...]:
-    for block in distinct_blocks(*matrices):
-        if is_singular_for_any_delay(balanced(*block.matrices)):
-            return ("a root stays at 0 at every delay, so the loop is asymptotically stable at none",)
-    return ()

@@ -6,7 +6,6 @@ analysis. A difference that rounding does not explain is an error.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from math import isfinite, nan
 
 import numpy as np
@@ -37,14 +36,6 @@ _UNDECIDED = 1e-9
 _TOUCH = 1e-7
 
 
-@dataclass(frozen=True)
-class Opinions:
-    """The methods that confirmed an analysis, and the estimated error (s) of its margin (0 if that is 0 or `inf`)."""
-
-    checked_by: tuple[str, ...]
-    margin_error_s: float
-
-
 def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     """`gains.delay.constant.delay_margin`, confirmed by the sweep and by the rightmost root below and above it.
 
@@ -62,30 +53,27 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     return analysis.delay_margin_s
 
 
-def second_opinions(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], *, thorough: bool = False) -> Opinions:
-    """Confirm an analysis of x'(t) = sum of the terms by the methods that take no more than a fraction of a second.
+def second_opinions(
+    analysis: DelayAnalysis, terms: Sequence[DelayedTerm], *, thorough: bool = False
+) -> tuple[tuple[str, ...], float]:
+    """The methods that confirm an analysis of x'(t) = sum of the terms, and the estimated error (s) of its margin.
 
-    If `thorough`, more delays are checked, and by every method. DisagreementError if a method contradicts the analysis.
+    Only methods that take no more than a fraction of a second; if `thorough`, every method, at more delays.
+    DisagreementError if a method contradicts the analysis. The error of a margin of 0 or `inf` is 0.
     """
-    error_s = _margin_error_s(analysis, terms)
+    margin_s, error_s = analysis.delay_margin_s, 0.0
+    if margin_s != 0.0 and isfinite(margin_s):
+        ends = [crossing for crossing in analysis.crossings if crossing.delay_s == margin_s]
+        error_s = max((crossing_error(terms, c.omega_rad_s, c.delay_s)[1] for c in ends), default=0.0)
     checks: list[str] = []
     swept_s = _swept_margin(analysis, terms, thorough)
     if swept_s is not None and _agrees(analysis, swept_s, error_s, terms):
         checks.append("sweep")
         if isfinite(swept_s):
-            error_s = max(error_s, abs(analysis.delay_margin_s - swept_s))
+            error_s = max(error_s, abs(margin_s - swept_s))
     if _confirmed_beside_windows(analysis, terms, error_s, thorough):
         checks.append("root count" if analysis.roots_fixed_at_zero else "rightmost root")
-    return Opinions(tuple(checks), error_s)
-
-
-def _margin_error_s(analysis: DelayAnalysis, terms: Sequence[DelayedTerm]) -> float:
-    """The estimated error (s) of the margin, which is that of the crossing at its end."""
-    margin_s = analysis.delay_margin_s
-    if margin_s == 0.0 or not isfinite(margin_s):
-        return 0.0
-    ends = [crossing for crossing in analysis.crossings if crossing.delay_s == margin_s]
-    return max((crossing_error(terms, c.omega_rad_s, c.delay_s)[1] for c in ends), default=0.0)
+    return tuple(checks), error_s
 
 
 def _swept_margin(analysis: DelayAnalysis, terms: Sequence[DelayedTerm], thorough: bool) -> float | None:

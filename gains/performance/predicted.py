@@ -125,8 +125,8 @@ class PredictedLoop:
         """
         if not self.is_stable(delay_s):
             return 0.0
-        _, B, _ = self._matrices
-        K = self._whole_gain
+        _, B, alone = self._matrices
+        K = fed_forward(FormationModel((-1, 0), axes=1), alone, self.feed_forward)
 
         def gain(omega: FloatArray) -> FloatArray:
             s, resolvent = self._resolvents(omega)
@@ -150,10 +150,6 @@ class PredictedLoop:
         if self.response is None:
             return model.A, model.B, K
         return formation_loop(model, K, (self.response, self.response))
-
-    @cached_property
-    def _whole_gain(self) -> FloatArray:
-        return fed_forward(FormationModel((-1, 0), axes=1), self._matrices[2], self.feed_forward)
 
     @cached_property
     def _plant(self) -> HeldPlant:

@@ -68,12 +68,8 @@ def identify(
 ) -> Identified | None:
     """The least-squares fit of a response to sampled velocities; None if there are too few.
 
-    Parameters
-    ----------
-    acted_s, change_m_s2
-        (m,) when the commanded acceleration changed at the vehicle, and by how much.
-    sample_s, velocity_m_s
-        (n,) velocities in the direction of the manoeuvre. Their mean, such as a drift, is ignored.
+    `acted_s` and `change_m_s2` (m,) say when the commanded acceleration changed at the vehicle, and by how much.
+    `velocity_m_s` (n,) is in the direction of the manoeuvre. Its mean, such as a drift, is ignored.
     """
     if sample_s.size < _FEWEST_SAMPLES or acted_s.size < len(PROFILE):
         return None

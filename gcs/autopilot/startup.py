@@ -128,7 +128,9 @@ class AutopilotStartup:
         due = next(((m, us) for m, us in self._rates.items() if m not in self._accepted), None)
         patience_ns = (_TAKE_OFF_S + self.altitude_m / _SLOWEST_CLIMB_M_S) * 1e9
         took_off = self._took_off_ns is not None and now_ns - self._took_off_ns < patience_ns
-        self._see_altitude(armed=armed, taking_off=took_off)
+        # A vehicle found in the air takes set-points at once; during a take-off they would end the climb too early.
+        enough_m = _TAKEN_OFF_FRACTION * self.altitude_m if took_off else _LEFT_GROUND_M
+        self.airborne = armed and (self.airborne or (self.relative_altitude_m or 0.0) > enough_m)
         seen = Seen(
             interval_due=due,
             clock_known=clock_known,
@@ -143,11 +145,6 @@ class AutopilotStartup:
             sea_level_m=self._sea_level_m,
         )
         return next_step(self.kind, seen, altitude_m=self.altitude_m)
-
-    def _see_altitude(self, *, armed: bool, taking_off: bool) -> None:
-        """A vehicle found in the air takes set-points at once; during a take-off they would end the climb too early."""
-        enough_m = _TAKEN_OFF_FRACTION * self.altitude_m if taking_off else _LEFT_GROUND_M
-        self.airborne = armed and (self.airborne or (self.relative_altitude_m or 0.0) > enough_m)
 
 
 def shifted(place: Degrees, north_m: float, east_m: float) -> Degrees:

@@ -1,9 +1,10 @@
 """`gcs fly` and `gcs key`: what a flight is asked for, and what its exit code says."""
 
 import contextlib
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated
 
 import typer
 
@@ -29,12 +30,6 @@ from gcs.cli.options import (
 )
 from gcs.errors import InputError
 from gcs.output import outlive_readers
-
-if TYPE_CHECKING:
-    from gcs.plan.design import Design
-    from gcs.plan.flight_plan import FlightPlan
-    from gcs.runs.summary_record import Summary
-    from scenarios.schema import Scenario
 
 LISTEN = "127.0.0.1:14550"
 
@@ -71,118 +66,74 @@ def fly(
 
     Exit code 1 if the flight is not stable, or its log is incomplete.
     """
+    from gcs.drive import fly as flying
     from gcs.drive import preflight
-    from gcs.views.report import print_summary
+    from gcs.drive.takeover import CONNECTED, TAKEN_OVER, Presence
+    from gcs.plan.planner import flight_plan, with_trade_off
+    from gcs.views.report import print_design, print_summary
 
     outlive_readers()
-    sockets = Sockets(connect, listen, mirror, mirror_commands, key)
-    _refuse_contradictions(sockets, speed, virtual=virtual)
+    sockets = {"--connect": connect, "--listen": listen, "--mirror": mirror, "--key": key}
+    _refuse_contradictions(sockets, speed, virtual=virtual, mirror_commands=mirror_commands)
     scenario = load_scenario(scenario_file, loop)
     if link_delay is not None:
         within("--link-delay", link_delay, 0, 60, "seconds")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
     if connect is None:
         refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
-    flight = Asked(scenario_file, scenario, allow_unstable, out, as_json)
-    folder, summary = _fly_virtually(flight, speed) if virtual else _fly_in_real_time(flight, sockets)
-    answer(summary, partial(print_summary, folder=folder), as_json=as_json)
-    raise typer.Exit(_exit_code(summary))
-
-
-class Sockets(NamedTuple):
-    """The options of a flight in real time."""
-
-    connect: str | None
-    listen: str | None
-    mirror: str | None
-    mirror_commands: bool
-    key: Path | None
-
-
-class Asked(NamedTuple):
-    """What is to be flown, and what is to be shown of it."""
-
-    file: Path
-    scenario: "Scenario"
-    allow_unstable: bool
-    out: Path | None
-    as_json: bool
-
-    def designed(self) -> "tuple[Design, FlightPlan]":
-        from gcs.drive import preflight
-        from gcs.plan.planner import flight_plan, with_trade_off
-
-        design, plan = flight_plan(self.scenario)
+    with contextlib.ExitStack() as opened:
+        link = to = there = None
+        at = ("--listen", LISTEN if listen is None else listen) if connect is None else ("--connect", connect)
+        if not virtual:
+            link = opened.enter_context(listening(*at, opened_guard(key, role="station")))
+            warn_if_open(link)
+            to = None if mirror is None else opened.enter_context(mirroring(mirror, link, commands=mirror_commands))
+        design, plan = flight_plan(scenario)
         if (unstable := preflight.unstable_loop(plan)) is not None:
-            refuse_or_warn(self.file, unstable, allow=self.allow_unstable)
+            refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
             plan = preflight.without_actions(plan)
-        return with_trade_off(design), plan
-
-    def begun(self, design: "Design") -> Path:
-        """Show the design; returns the run's folder."""
-        from gcs.views.report import print_design
-
-        if not self.as_json:
+        design = with_trade_off(design)
+        if link is not None and connect is None:
+            there = Presence(link, plan.scenario)
+        taken_over = there is not None and bool(there.taken_over())
+        if not as_json:
             print_design(design)
-        return run_folder(self.out, self.scenario.name)
+        folder = run_folder(out, scenario.name)
+        if link is None:
+            summary = flying.fly_in_virtual_time(plan, design, folder, show_table=not as_json, speed=speed)
+        else:
+            summary = flying.fly(
+                plan,
+                design,
+                link,
+                folder,
+                show_table=not as_json,
+                fleet=CONNECTED if connect is not None else TAKEN_OVER if taken_over else "",
+                outlive_station=address(*at)[1] != 0,  # nobody listens again at a port that the system chose
+                key_file=key,
+                mirror=to,
+            )
+        if there is not None and taken_over:
+            there.shut_down()
+    answer(summary, partial(print_summary, folder=folder), as_json=as_json)
+    if summary.reason.startswith("interrupted"):
+        raise typer.Exit(INTERRUPTED)
+    raise typer.Exit(0 if summary.verdict == "stable" and not summary.not_logged else FAILED)
 
 
-def _refuse_contradictions(sockets: Sockets, speed: float | None, *, virtual: bool) -> None:
-    connect, listen, mirror, mirror_commands, key = sockets
-    if mirror_commands and mirror is None:
+def _refuse_contradictions(
+    sockets: Mapping[str, str | Path | None], speed: float | None, *, virtual: bool, mirror_commands: bool
+) -> None:
+    if mirror_commands and sockets["--mirror"] is None:
         raise InputError("read --mirror-commands without --mirror, wanted both")
-    if connect is not None and listen is not None:
+    if sockets["--connect"] is not None and sockets["--listen"] is not None:
         raise InputError("read --connect and --listen, wanted one of them")
     if speed is not None:
         within("--speed", speed, 0.01, 1e6, "a multiple of real time")
         if not virtual:
             raise InputError("read --speed without --virtual, wanted both")
-    given = {"--connect": connect, "--listen": listen, "--mirror": mirror, "--key": key}
-    if virtual and (read := [option for option, value in given.items() if value is not None]):
+    if virtual and (read := [option for option, value in sockets.items() if value is not None]):
         raise InputError(f"read --virtual and {read[0]}, wanted one of them: a flight in virtual time has no sockets")
-
-
-def _fly_virtually(flight: Asked, speed: float | None) -> "tuple[Path, Summary]":
-    from gcs.drive.fly import fly_in_virtual_time
-
-    design, plan = flight.designed()
-    folder = flight.begun(design)
-    return folder, fly_in_virtual_time(plan, design, folder, show_table=not flight.as_json, speed=speed)
-
-
-def _fly_in_real_time(flight: Asked, sockets: Sockets) -> "tuple[Path, Summary]":
-    from gcs.drive.fly import FlyOptions
-    from gcs.drive.fly import fly as fly_now
-    from gcs.drive.takeover import CONNECTED, TAKEN_OVER, Presence
-
-    connect, listen, mirror, mirror_commands, key = sockets
-    at = ("--connect", connect) if connect is not None else ("--listen", LISTEN if listen is None else listen)
-    with contextlib.ExitStack() as opened:
-        guard = opened_guard(key, role="station")
-        link = opened.enter_context(listening(*at, guard))
-        warn_if_open(link)
-        to = None if mirror is None else opened.enter_context(mirroring(mirror, link, commands=mirror_commands))
-        design, plan = flight.designed()
-        there = Presence(link, plan.scenario)
-        taken_over = there.taken_over() if connect is None else []
-        folder = flight.begun(design)
-        options = FlyOptions(
-            folder=folder,
-            show_table=not flight.as_json,
-            fleet=CONNECTED if connect is not None else TAKEN_OVER if taken_over else "",
-            outlive_station=address(*at)[1] != 0,  # nobody listens again at a port that the system chose
-            key_file=key,
-        )
-        summary = fly_now(plan, design, link, options, to)
-        if taken_over:
-            there.shut_down()
-    return folder, summary
-
-
-def _exit_code(summary: "Summary") -> int:
-    if summary.reason.startswith("interrupted"):
-        return INTERRUPTED
-    return 0 if summary.verdict == "stable" and not summary.not_logged else FAILED
 
 
 def key(file: Annotated[Path, typer.Argument(metavar="FILE", help="a new file")]) -> None:

@@ -10,10 +10,9 @@ from typing import Annotated
 import typer
 
 from gcs.cli import BAD_INPUT, FAILED, INTERRUPTED
-from gcs.cli.design import design, margin
 from gcs.cli.fly import fly, key
 from gcs.cli.runs import export, grade, recover, view
-from gcs.cli.scenarios import check, new, scenarios
+from gcs.cli.scenarios import check, design, margin, new, scenarios
 from gcs.cli.stress import stress
 from gcs.cli.studies import bench, capacity, compare, thesis
 from gcs.cli.watch import monitor, replay

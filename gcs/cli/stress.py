@@ -103,6 +103,7 @@ def stress(
     from gcs.cli.stress_output import print_reflown, print_result, write_junit
     from gcs.drive.preflight import endless_link
     from gcs.stress.axes import parse_axis
+    from gcs.stress.campaign import dask_workers, local_workers
     from gcs.stress.refly import refly
 
     study, design = _study(scenario_file, loop, real_time=real_time)
@@ -118,7 +119,7 @@ def stress(
         design,
         axes,
         # flights in real time disturb each other: one at a time unless the user knows better
-        _workers(dask, workers or (1 if real_time else len(os.sched_getaffinity(0)))),
+        dask_workers(dask) if dask else local_workers(workers or (1 if real_time else len(os.sched_getaffinity(0)))),
         out,
         resume=resume,
         seeds=seeds,
@@ -148,12 +149,6 @@ def _study(file: Path, loop: Loop | None, *, real_time: bool) -> "tuple[Study, D
     return Study(plan, real_time=real_time), design
 
 
-def _workers(dask: str, count: int) -> "contextlib.AbstractContextManager[Fly]":
-    from gcs.stress.campaign import dask_workers, local_workers
-
-    return dask_workers(dask) if dask else local_workers(count)
-
-
 def _campaign(
     study: "Study",
     design: "Design",
@@ -170,7 +165,7 @@ def _campaign(
     """Fly the sweep over the axes and, with a tolerance, search for the onset; the result, and its folder."""
     from gcs.drive.fly import new_folder
     from gcs.runs.record import SCENARIO_FILE, write_whole
-    from gcs.stress.campaign import Store, check_campaign, run_campaign, write_parquet
+    from gcs.stress.campaign import Store, check_campaign, run_campaign, write_table
     from gcs.stress.report import result_of, write_report
     from gcs.stress.study import NoOnset, find_onset
     from scenarios.files import dump
@@ -203,7 +198,7 @@ def _campaign(
             typer.echo(store.resume, err=True)
             raise
     outcomes = list(store.outcomes.values())
-    write_parquet(outcomes, folder)
+    write_table(outcomes, folder)
     result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, allowed=allowed)
     write_report(folder, result, study=study, axes=axes)
     return result, folder

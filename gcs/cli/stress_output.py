@@ -66,7 +66,6 @@ def print_result(result: CampaignResult, folder: Path) -> None:
 
 
 def _print_noise(console: Console, noise: Noise | None) -> None:
-    """Print how much the machine disturbed flights in real time."""
     if noise is None or not (noise.lateness_s_p50 and noise.lateness_s_p99 and noise.steal_share and noise.busy_share):
         return
     latest = noise.lateness_s_p99

@@ -114,7 +114,6 @@ def capacity(
 
 
 def _rates(text: str) -> list[float]:
-    """Rates in Hz from a list with commas."""
     try:
         rates = [float(part) for part in text.split(",")]
     except ValueError:

@@ -61,19 +61,21 @@ def monitor(
         # Imported after the socket is open: datagrams that come meanwhile keep their receive stamps.
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
-        from gcs.watch.live import WatchOptions, watch_links
+        from gcs.watch.live import watch_links
 
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
-        options = WatchOptions(
-            margin_s=None if given is None else given.delay_margin_s,
-            margin_of=margin_of,
-            timesync_hz=0.0 if silent else asked_hz,
-            seconds=seconds,
-            shown=not as_json,
-        )
         watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
         with stop_signals() as stop_reason:
-            report = watch_links(link, watch, options, stop_reason)
+            report = watch_links(
+                link,
+                watch,
+                stop_reason,
+                margin_s=None if given is None else given.delay_margin_s,
+                margin_of=margin_of,
+                timesync_hz=0.0 if silent else asked_hz,
+                seconds=seconds,
+                shown=not as_json,
+            )
             interrupted = bool(stop_reason())
     if as_json:
         print_json(report)

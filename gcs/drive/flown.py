@@ -16,12 +16,10 @@ from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
-from gcs.runs.effective_delay import truth_of
-from gcs.runs.files import RunTail, read_ticks, write_design
-from gcs.runs.grade import Truth, read_truth
-from gcs.runs.record import END, EVENTS_FILE, SCENARIO_FILE, TICKS_FILE, TRUTH_FILE, RunWriter
+from gcs.runs.files import RunTail, read_ticks, write_experiment
+from gcs.runs.grade import Truth, read_truth, truth_of
+from gcs.runs.record import END, EVENTS_FILE, TICKS_FILE, TRUTH_FILE, RunWriter
 from gcs.station.station import Station
-from scenarios import files as scenario_files
 
 _IDLE, _WAITING, _STEAL = 3, 4, 7
 """Fields of the cpu line of /proc/stat: idle, waiting for a disk, and time taken by the host."""
@@ -55,7 +53,11 @@ def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, w
 
 def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:
     station, records = Station(plan, start_ns=START_NS), list[tuple[int, ...]]()
-    writer = prepared_folder(plan, folder) if folder is not None else None
+    writer = None
+    if folder is not None:
+        folder.mkdir(parents=True)
+        write_experiment(folder, plan.scenario, margins_of(plan))
+        writer = RunWriter(folder)
     rows: list[TickArray] = []
     vehicles = vehicles_of(plan, record=records.append if with_truth else None)
     for tick in fly_lockstep(plan, station=station, vehicles=vehicles):
@@ -73,7 +75,7 @@ def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: boo
 
 def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flight:
     """Fly a plan in real time. With a folder, which is created, the run is left there; otherwise it is deleted."""
-    from gcs.drive.fly import FlyOptions, fly  # processes and sockets: not for flights in virtual time
+    from gcs.drive.fly import fly  # processes and sockets: not for flights in virtual time
     from gcs.drive.udp import StationSocket
 
     kept = folder is not None
@@ -82,7 +84,7 @@ def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flig
     try:
         before = _processor_times()
         with StationSocket("127.0.0.1", 0) as link:
-            summary = fly(plan, design, link, FlyOptions(folder=folder, show_table=False))
+            summary = fly(plan, design, link, folder, show_table=False)
         needed = (TICKS_FILE, EVENTS_FILE, TRUTH_FILE)
         if lost := [text for text in summary.not_logged if text.startswith(needed)]:
             raise OSError(errno.ENOSPC, "; ".join(lost), str(folder))
@@ -109,14 +111,6 @@ def _processor_times() -> IntArray:
 def margins_of(plan: FlightPlan) -> Design:
     """The part of a design that a run's files need; the campaign's report has the margins of the continuous model."""
     return Design(delay_margin_s=plan.delay_margin_s, delay_margin_continuous_s=None)
-
-
-def prepared_folder(plan: FlightPlan, folder: Path) -> RunWriter:
-    """A new run folder with its scenario and margins, and the writer of its logs."""
-    folder.mkdir(parents=True)
-    (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
-    write_design(folder, margins_of(plan))
-    return RunWriter(folder)
 
 
 def median_delays_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, float]:

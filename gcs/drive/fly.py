@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time  # noqa: TID251 - names the run's folder; the flight's own clock is in the driver
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from gcs.interrupts import held_back, stop_signals
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import described, identified
-from gcs.runs.files import write_design
+from gcs.runs.files import write_design, write_experiment
 from gcs.runs.record import (
     DESIGN_FILE,
     END,
@@ -34,40 +33,66 @@ from gcs.runs.refusals import REFUSED, Refusals, in_words
 from gcs.runs.summary import finish
 from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
-from scenarios import files as scenario_files
 from scenarios.schema import NS_PER_S
 
 _OBSERVER_PATIENCE_S = 60.0
 _START_DELAY_NS = NS_PER_S // 5
 
 
-@dataclass(frozen=True)
-class FlyOptions:
-    """Options of one flight that are not part of the experiment, which the scenario describes."""
-
-    folder: Path
-    show_table: bool
-    """Whether to show the live table, or its plain lines without a terminal."""
-    fleet: str = ""
-    """Who provides the vehicles, in words; empty if this flight starts simulated ones."""
-    outlive_station: bool = False
-    """Whether the simulated vehicles wait to be taken over if this process is killed."""
-    key_file: Path | None = None
-    """The guard's key file, passed to the simulated vehicles."""
-
-
 def fly(
     plan: FlightPlan,
     design: Design,
     link: StationSocket,
-    options: FlyOptions,
+    folder: Path,
+    *,
+    show_table: bool,
+    fleet: str = "",
+    outlive_station: bool = False,
+    key_file: Path | None = None,
     mirror: Mirror | None = None,
 ) -> Summary:
-    """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder."""
-    folder = options.folder
+    """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder.
+
+    `show_table`: with the live table, or its plain lines without a terminal. `fleet` says who provides the vehicles,
+    empty if this flight starts simulated ones. Those sign with `key_file`, and with `outlive_station` they wait to be
+    taken over if this process is killed.
+    """
     with stop_signals() as asked_to_stop:
-        _describe(folder, plan, design)
-        unwritten = _flown(plan, design, link, options, mirror, asked_to_stop)
+        write_experiment(folder, plan.scenario, design)
+        # Contexts end in reverse: first the vehicles, then the observer finishes the recording.
+        with _observer(folder, show_table=show_table) as observer, contextlib.ExitStack() as started:
+            vehicles: VehicleProcess | None = None
+            if not fleet:
+                vehicles = VehicleProcess(
+                    folder / SCENARIO_FILE,
+                    station=link.address,
+                    folder=folder,
+                    key_file=key_file,
+                    outlive_station=outlive_station,
+                )
+                started.enter_context(vehicles)
+            writer = RunWriter(folder)
+            _wait_until_ready(observer, folder, asked_to_stop)
+            prepare_real_time()
+            station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS)
+            if fleet:
+                writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=FLEET, text=fleet))
+
+            def new_plan(found: FlightPlan) -> None:
+                _note_design(writer, folder, design, found, station.scenario_time_s(clock_ns()))
+
+            def stop() -> str:
+                return asked_to_stop() or ("" if vehicles is None else vehicles.complaint())
+
+            try:
+                drive(station, link, writer, stop, new_plan, mirror)
+                if station.plan is not plan:  # with the figures that take too long to compute in flight
+                    _write_design(writer, folder, described(design, station.plan))
+                writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=END, text=station.end_reason))
+            finally:
+                unwritten = writer.close()
+            if unwritten:  # including the last event, for which the observer waits
+                observer.terminate()
         return finish(folder, unwritten=unwritten)
 
 
@@ -76,56 +101,42 @@ def fly_in_virtual_time(
 ) -> Summary:
     """Fly on one virtual clock, with the same files as in real time; returns the summary.
 
-    Parameters
-    ----------
-    speed
-        Most virtual seconds per second of real time; None for as many as can be computed.
+    `speed` is the most virtual seconds per second of real time, None for as many as can be computed.
     """
     with stop_signals() as asked_to_stop:
-        _describe(folder, plan, design)
+        write_experiment(folder, plan.scenario, design)
         with _observer(folder, show_table=show_table) as observer:
             if speed is not None:  # otherwise the observer catches up with the flight
                 _wait_until_ready(observer, folder, asked_to_stop)
-            unwritten = _flown_virtually(plan, design, folder, asked_to_stop, speed)
+            station = Station(plan, start_ns=START_NS)
+            writer, vehicles = RunWriter(folder), RecordedVehicles(plan, folder / TRUTH_FILE)
+            began_s, time_s, flown = time.monotonic(), 0.0, plan
+            for rows in fly_lockstep(plan, station=station, vehicles=vehicles):
+                writer.tick(rows)
+                frames = sorted(station.frames + vehicles.take_sent(), key=itemgetter(1))
+                writer.frames((frame, EPOCH_NS + time_ns) for frame, time_ns in frames)
+                for event in station.events:
+                    writer.event(event)
+                station.events.clear()
+                time_s = float(rows["time_s"][0])
+                if station.plan is not flown:
+                    flown = station.plan
+                    _note_design(writer, folder, design, flown, time_s)
+                if reason := asked_to_stop():
+                    station.request_stop(reason)
+                if speed is not None:
+                    due_s = began_s + (int(rows["due_ns"][0]) - START_NS) / NS_PER_S / speed
+                    time.sleep(max(0.0, due_s - time.monotonic()))
+            if flown is not plan:
+                _write_design(writer, folder, described(design, flown))
+            if counts := Refusals().news(station.counters, last=True):
+                writer.event(Event(time_s=time_s, kind=REFUSED, text=in_words(counts), counts=counts))
+            writer.event(Event(time_s=time_s, kind=END, text=station.end_reason))
+            vehicles.close()
+            unwritten = writer.close()
             if unwritten:
                 observer.terminate()
         return finish(folder, unwritten=unwritten)
-
-
-def _describe(folder: Path, plan: FlightPlan, design: Design) -> None:
-    """Write what is to be flown into the run's folder."""
-    (folder / SCENARIO_FILE).write_text(scenario_files.dump(plan.scenario), encoding="utf-8")
-    write_design(folder, design)
-
-
-def _flown_virtually(
-    plan: FlightPlan, design: Design, folder: Path, asked_to_stop: Callable[[], str], speed: float | None
-) -> list[Event]:
-    """Fly in virtual time and leave the logs in the folder; returns the events that could not be written."""
-    station = Station(plan, start_ns=START_NS)
-    writer, vehicles = RunWriter(folder), RecordedVehicles(plan, folder / TRUTH_FILE)
-    began_s, time_s, flown = time.monotonic(), 0.0, plan
-    for rows in fly_lockstep(plan, station=station, vehicles=vehicles):
-        writer.tick(rows)
-        frames = sorted(station.frames + vehicles.take_sent(), key=itemgetter(1))
-        writer.frames((frame, EPOCH_NS + time_ns) for frame, time_ns in frames)
-        for event in station.events:
-            writer.event(event)
-        station.events.clear()
-        time_s = float(rows["time_s"][0])
-        if station.plan is not flown:
-            flown = station.plan
-            _note_design(writer, folder, design, flown, time_s)
-        if reason := asked_to_stop():
-            station.request_stop(reason)
-        if speed is not None:
-            time.sleep(max(0.0, began_s + (int(rows["due_ns"][0]) - START_NS) / NS_PER_S / speed - time.monotonic()))
-    _complete_design(writer, folder, design, plan, flown)
-    if counts := Refusals().news(station.counters, last=True):
-        writer.event(Event(time_s=time_s, kind=REFUSED, text=in_words(counts), counts=counts))
-    writer.event(Event(time_s=time_s, kind=END, text=station.end_reason))
-    vehicles.close()
-    return writer.close()
 
 
 def _note_design(writer: RunWriter, folder: Path, design: Design, found: FlightPlan, time_s: float) -> None:
@@ -135,64 +146,11 @@ def _note_design(writer: RunWriter, folder: Path, design: Design, found: FlightP
     writer.event(Event(time_s=time_s, kind=NEW_DESIGN, text=text))
 
 
-def _complete_design(writer: RunWriter, folder: Path, design: Design, plan: FlightPlan, flown: FlightPlan) -> None:
-    """Add to the design the figures that take too long to compute in flight."""
-    if flown is not plan:
-        _write_design(writer, folder, described(design, flown))
-
-
 def _write_design(writer: RunWriter, folder: Path, design: Design) -> None:
     try:
         write_design(folder, design)
     except OSError as error:
         writer.ended(DESIGN_FILE, error)
-
-
-def _flown(
-    plan: FlightPlan,
-    design: Design,
-    link: StationSocket,
-    options: FlyOptions,
-    mirror: Mirror | None,
-    asked_to_stop: Callable[[], str],
-) -> list[Event]:
-    """Fly and leave the logs in the folder; returns the events that could not be written."""
-    folder = options.folder
-    with contextlib.ExitStack() as stack:
-        # The stack unwinds in reverse: first the vehicles end, then the observer finishes the recording.
-        vehicles: VehicleProcess | None = None
-        observer = stack.enter_context(_observer(folder, show_table=options.show_table))
-        if not options.fleet:
-            vehicles = VehicleProcess(
-                folder / SCENARIO_FILE,
-                station=link.address,
-                folder=folder,
-                key_file=options.key_file,
-                outlive_station=options.outlive_station,
-            )
-            stack.enter_context(vehicles)
-        writer = RunWriter(folder)
-        _wait_until_ready(observer, folder, asked_to_stop)
-        prepare_real_time()
-        station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS)
-        if options.fleet:
-            writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=FLEET, text=options.fleet))
-
-        def new_plan(found: FlightPlan) -> None:
-            _note_design(writer, folder, design, found, station.scenario_time_s(clock_ns()))
-
-        def stop() -> str:
-            return asked_to_stop() or ("" if vehicles is None else vehicles.complaint())
-
-        try:
-            drive(station, link, writer, stop, new_plan, mirror)
-            _complete_design(writer, folder, design, plan, station.plan)
-            writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=END, text=station.end_reason))
-        finally:
-            unwritten = writer.close()
-        if unwritten:  # including the last event, for which the observer waits
-            observer.terminate()
-    return unwritten
 
 
 def new_folder(scenario_name: str) -> Path:

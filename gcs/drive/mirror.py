@@ -26,9 +26,8 @@ _DATAGRAMS_A_STEP = 64
 class Mirror:
     """A socket connected to another ground station; with `commands`, its frames are passed on to the vehicles.
 
-    On a signed link, frames to the other station are signed and its own are accepted only if signed.
-
-    Raises OSError if the address cannot be used.
+    On a signed link, frames to the other station are signed and its own are accepted only if signed. Raises OSError if
+    the address cannot be used.
     """
 
     def __init__(self, host: str, port: int, *, commands: bool, signed: SignedLink | None = None) -> None:

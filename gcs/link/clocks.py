@@ -149,14 +149,7 @@ class VehicleClock:
     def sampled_ns(self, boot_ms: int, received_ns: int, *, newest: bool) -> int | None:
         """The station's time at which a state was sampled; None if it is unknown or impossible.
 
-        Parameters
-        ----------
-        boot_ms
-            The state's time_boot_ms.
-        received_ns
-            When it was received, on the station's clock.
-        newest
-            Whether its sequence number shows that it was sent after all states received before.
+        `newest` says that its sequence number shows that it was sent after all states received before.
         """
         known = self.estimate
         if known.samples == 0:

@@ -49,18 +49,18 @@ class _Layout(NamedTuple):
 
 SETUP_SIGNING = 256
 """Carries a key, so it is neither sent nor accepted, and never logged."""
-
-
-def _layouts() -> dict[int, _Layout]:
-    messages: dict[int, Any] = dialect.mavlink_map
-    return {
-        msg_id: _Layout(message.unpacker, message.unpacker.size, bytes([message.crc_extra]))
-        for msg_id, message in messages.items()
-        if msg_id != SETUP_SIGNING
-    }
-
-
-_LAYOUTS = _layouts()
+_MESSAGES: dict[int, Any] = dialect.mavlink_map
+_LAYOUTS = {
+    msg_id: _Layout(message.unpacker, message.unpacker.size, bytes([message.crc_extra]))
+    for msg_id, message in _MESSAGES.items()
+    if msg_id != SETUP_SIGNING
+}
+_TARGET_PLACES = {
+    msg_id: sum(message.lengths[: message.ordered_fieldnames.index("target_system")])
+    for msg_id, message in _MESSAGES.items()
+    if "target_system" in message.ordered_fieldnames
+}
+"""Position of target_system among the fields of each message that has one."""
 CRC_EXTRA = {msg_id: layout.crc_extra for msg_id, layout in _LAYOUTS.items()}
 
 
@@ -77,13 +77,12 @@ class Frame(NamedTuple):
 
 def field_names(msg_id: int) -> list[str]:
     """Names of a message's fields in wire order; an array has one name but several fields."""
-    messages: dict[int, Any] = dialect.mavlink_map
-    return list(messages[msg_id].ordered_fieldnames)
+    return list(_MESSAGES[msg_id].ordered_fieldnames)
 
 
 def named_fields(frame: Frame) -> dict[str, Any]:
     """The fields by their names: an array as a list, characters as a text."""
-    message: Any = dialect.mavlink_map[frame.msg_id]
+    message = _MESSAGES[frame.msg_id]
     named: dict[str, Any] = {}
     at = 0
     for name, length in zip(message.ordered_fieldnames, message.lengths, strict=True):
@@ -91,19 +90,6 @@ def named_fields(frame: Frame) -> dict[str, Any]:
         named[name] = value.rstrip(b"\0").decode(errors="replace") if isinstance(value, bytes) else value
         at += length
     return named
-
-
-def _target_places() -> dict[int, int]:
-    """Position of target_system among the fields of each message that has one."""
-    messages: dict[int, Any] = dialect.mavlink_map
-    return {
-        msg_id: sum(message.lengths[: message.ordered_fieldnames.index("target_system")])
-        for msg_id, message in messages.items()
-        if "target_system" in message.ordered_fieldnames
-    }
-
-
-_TARGET_PLACES = _target_places()
 
 
 def target_system(frame: Frame) -> int:
@@ -114,8 +100,7 @@ def target_system(frame: Frame) -> int:
 
 def message_name(msg_id: int) -> str:
     """The name of a message that `decode` knows."""
-    messages: dict[int, Any] = dialect.mavlink_map
-    return messages[msg_id].msgname
+    return _MESSAGES[msg_id].msgname
 
 
 def decode(datagram: bytes, refused: Counter[str]) -> list[Frame]:

@@ -34,7 +34,6 @@ class Startup(Protocol):
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         """Take in a message from the vehicle; only some concern the start-up."""
-        ...
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
         """The next step towards a vehicle that takes set-points."""
@@ -44,17 +43,9 @@ class Startup(Protocol):
         """Message id and fields of the parameter message that is due, if one is."""
         ...
 
-    def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:
-        """Note that the vehicle accepted a command."""
-        ...
-
-    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
-        """Note that the vehicle refused a command, which may have been sent before."""
-        ...
-
-    def begin_anew(self) -> None:
-        """Forget what the vehicle was told: it seems to have restarted."""
-        ...
+    def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None: ...
+    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None: ...
+    def begin_anew(self) -> None: ...  # the vehicle seems to have restarted
 
 
 class LaunchedStartup:

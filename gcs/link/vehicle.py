@@ -256,7 +256,6 @@ class RemoteVehicle:
         return frame
 
     def _next_command(self, now_ns: int) -> bytes | None:
-        """The next COMMAND_LONG, if one is due."""
         if now_ns < self._not_before_ns:
             return None
         waiting = self._command

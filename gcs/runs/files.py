@@ -40,8 +40,13 @@ def write_design(folder: Path, design: Design) -> None:
     write_whole(folder / DESIGN_FILE, design.to_json().encode())
 
 
+def write_experiment(folder: Path, scenario: Scenario, design: Design) -> None:
+    """Write what is to be flown into a run's folder."""
+    (folder / SCENARIO_FILE).write_text(scenario_files.dump(scenario), encoding="utf-8")
+    write_design(folder, design)
+
+
 def read_summary(file: Path) -> Summary:
-    """A summary.json."""
     return _checked(file, Summary, "the summary of a run")
 
 

@@ -1,4 +1,4 @@
-"""`gcs grade`: the latencies that a flight measured, against the truth that vehicles and emulated links recorded.
+"""Latencies by the truth that vehicles and emulated links recorded: `gcs grade`, and what varying delays amount to.
 
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
 loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
@@ -7,6 +7,7 @@ acts; both are found in the truth by the time_boot_ms of the messages.
 
 import itertools
 from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from sim_vehicles.links.truth import ACTED, DROPPED, LINK_DOWN, LINK_UP, SAMPLED
 Truth = NDArray[np.void]
 """Records as sim_vehicles.links.truth.DTYPE lays them out."""
 
+_RECORD = np.dtype([("kind", "u1"), ("system_id", "u1"), ("key", "<u4"), ("time_ns", "<i8")])
 _TIMESYNC = 111
 
 
@@ -159,3 +161,44 @@ def graded(measured_s: FloatArray, true_s: FloatArray) -> Graded:
     p50, p99 = np.percentile(error_s, [50, 99]).tolist()
     largest = float(error_s.max())
     return Graded(status="measured", samples=error_s.size, error_p50_s=p50, error_p99_s=p99, error_max_s=largest)
+
+
+def truth_of(records: Iterable[Sequence[int]]) -> Truth:
+    """Those records of simulated vehicles that say when states were sampled and set-points acted."""
+    return np.array([tuple(record[:4]) for record in records if record[0] in (SAMPLED, ACTED)], _RECORD)
+
+
+def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
+    """(k, 2) instants in ns at which a vehicle's commands acted and at which the states used were sampled, in order."""
+    sampled, acted = (instants(truth[truth["system_id"] == system_id], kind) for kind in (SAMPLED, ACTED))
+    rows = ticks[(ticks["system_id"] == system_id) & ticks["commanded"]]
+    known = [((system_id, key), (system_id, boot)) for key, boot in rows[["key_ms", "sample_boot_ms"]].tolist()]
+    pairs = [(acted[key], sampled[boot]) for key, boot in known if key in acted and boot in sampled]
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+
+
+def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
+    """The same with loops on board: what was streamed, and when the oldest state that it needed was sampled.
+
+    `ticks` are whole: a row for every vehicle.
+    """
+    acted, delays_s = instants(truth, ACTED), true_loop_delays_s(ticks, truth)
+    own = (ticks["system_id"] == system_id) & np.isfinite(delays_s)
+    acted_ns = [acted[system_id, key] for key in ticks["key_ms"][own].tolist()]
+    pairs = [(at, at - round(1e9 * late_s)) for at, late_s in zip(acted_ns, delays_s[own].tolist(), strict=True)]
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
+
+
+def effective_delay_s(commands: NDArray[np.int64], *, held_s: float) -> float:
+    """The constant loop delay equivalent to these commands: the mean age of the state behind them, less T / 2.
+
+    T = `held_s` is the slower of the periods of telemetry and control. The command in action ages until one from a
+    newer state acts, T / 2 on average when all arrive (`gains.sampled.multirate`). Unlike the median of the loop
+    delays, this accounts for commands that never arrived. Where delays change fast compared with the loop's motion,
+    only the mean age matters, to first order.
+    """
+    if len(commands) < 2:
+        return 0.0
+    acted_ns, sampled_ns = commands[:, 0], commands[:-1, 1]
+    acting_s, late_s = np.diff(acted_ns) * 1e-9, (acted_ns[:-1] - sampled_ns) * 1e-9
+    return float((acting_s * (late_s + acting_s / 2.0)).sum() / acting_s.sum()) - held_s / 2.0

@@ -9,7 +9,7 @@ import contextlib
 import json
 import os
 import struct
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,6 @@ class RunWriter:
         """Of the newest tick."""
 
     def tick(self, rows: TickArray) -> None:
-        """Log the rows of a tick."""
         self._time_s = float(rows["time_s"][0])
         self._add(TICKS_FILE, rows.tobytes())
 
@@ -135,6 +134,15 @@ def write_whole(file: Path, data: bytes) -> None:
     """Replace a file in one step: nobody reads half of it, and the old one stays if writing fails."""
     with replacing(file) as part:
         part.write_bytes(data)
+
+
+def write_parquet(file: Path, columns: Mapping[str, Any]) -> None:
+    """Replace a Parquet file in one step."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with replacing(file) as part:
+        pq.write_table(pa.table(columns), part, compression="zstd")
 
 
 @contextlib.contextmanager

@@ -29,10 +29,8 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     """Write ticks.parquet and summary.json of a run that has ended, and return the summary.
 
     `unwritten` is given at the end of a flight: its events that could not be written. What cannot be written now is
-    then named in the summary, as `not_logged`, and the log of ticks stays as it is.
-
-    Raises InputError if the folder is not a run, or a file of it is damaged, and OSError if a file cannot be written,
-    unless `unwritten` is given.
+    then named in the summary, as `not_logged`, and the log of ticks stays as it is. Raises InputError if the folder is
+    not a run, or a file of it is damaged, and OSError if a file cannot be written, unless `unwritten` is given.
     """
     scenario = read_scenario(folder)
     design = read_design(folder / record.DESIGN_FILE)
@@ -64,21 +62,15 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     def there() -> set[str]:
         return {file.name for file in folder.iterdir() if not file.name.startswith(".")}
 
-    write(record.PARQUET_FILE, lambda: _write_parquet(folder, ticks))
+    def columns() -> None:  # the growing log goes only when the Parquet file is whole
+        names = TICK.names or ()
+        record.write_parquet(folder / record.PARQUET_FILE, {name: np.ascontiguousarray(ticks[name]) for name in names})
+        (folder / record.TICKS_FILE).unlink(missing_ok=True)
+
+    write(record.PARQUET_FILE, columns)
     text = whole(there() | {record.SUMMARY_FILE}).to_json().encode()
     write(record.SUMMARY_FILE, lambda: record.write_whole(folder / record.SUMMARY_FILE, text))
     return whole(there())
-
-
-def _write_parquet(folder: Path, ticks: TickArray) -> None:
-    """Turn the growing log into Parquet; the log goes only when the Parquet file is whole."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    table = pa.table({name: np.ascontiguousarray(ticks[name]) for name in TICK.names or ()})
-    with record.replacing(folder / record.PARQUET_FILE) as part:
-        pq.write_table(table, part, compression="zstd")
-    (folder / record.TICKS_FILE).unlink(missing_ok=True)
 
 
 def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> Summary:
@@ -101,7 +93,9 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
     for event in events:
         if event.text == CLOCK_JUMPED:
             jumps[event.system_id].append(event.time_s)
-    headroom_end, logged = _headroom_end(flown), not any(text.startswith(record.TICKS_FILE) for text in not_logged)
+    late = sent[sent["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0)]
+    headroom_end = min(_medians(late, "headroom"), default=None)  # of the vehicles, in the last quarter of the flight
+    logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
     slowest_s = max(_medians(sent, "loop_delay_s"), default=None)
     return Summary(
         scenario=scenario.name,
@@ -161,12 +155,6 @@ def verdict(
     return "unstable" if settling_time_s is None or (headroom_end or 0.0) < 0.0 else "stable"
 
 
-def _headroom_end(flown: TickArray) -> float | None:
-    """The least of the vehicles' median headrooms in the last quarter of the flight; None where unknown."""
-    late = flown[flown["commanded"] & (flown["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0))]
-    return min(_medians(late, "headroom"), default=None)
-
-
 def _error(flown: TickArray, system_id: int, column: str) -> Errors:
     """The norm over north and east of an error of a vehicle, where it is known."""
     rows = flown[flown["system_id"] == system_id]
@@ -203,7 +191,9 @@ def _vehicle(
     sent = own[own["commanded"]]
     error_m = error[1] if error is not None and error[1].size else None
     counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
-    margins_s, rtt = sent["delay_margin_s"], estimate(rows["rtt_s"])
+    margins_s, rtt, modes = sent["delay_margin_s"], estimate(rows["rtt_s"]), rows["mode"]
+    if (modes != Mode.WAITING).any():  # in which every vehicle is once it is told to hold at the end
+        modes = modes[modes != Mode.WAITING]
     return VehicleSummary(
         system_id=system_id,
         spacing_error_final_m=None if error_m is None else error_m[-1],
@@ -216,15 +206,9 @@ def _vehicle(
         telemetry_age_s=estimate(sent["telemetry_age_s"]),
         station_queue_s=estimate(sent["queue_s"]),
         clock=_clock(own, rtt.samples, jumps_s),
-        mode_final=_mode_final(rows),
+        mode_final=Mode(int(modes[-1])).name if modes.size else None,
         **counted,
     )
-
-
-def _mode_final(rows: TickArray) -> str | None:
-    """The last mode that was not WAITING, in which every vehicle is once it is told to hold at the end."""
-    flown = rows[rows["mode"] != Mode.WAITING]
-    return Mode(int((flown if flown.size else rows)["mode"][-1])).name if rows.size else None
 
 
 def estimate(values: FloatArray) -> Estimate:

@@ -49,9 +49,8 @@ _RANGES = {"delay": (0.0, 60.0), "jitter": (0.0, 10.0), "loss": (0.0, 1.0), "rat
 def parse_axis(option: str, text: str, system_ids: tuple[int, ...] = ()) -> Axis:
     """The axis that an option's text describes: FROM:TO:N, or values separated by commas.
 
-    The text of --delay-of begins with the system id of a vehicle in `system_ids`: ID=FROM:TO:N.
-
-    Raises InputError if the text has neither form, or a value is out of range.
+    The text of --delay-of begins with the system id of a vehicle in `system_ids`: ID=FROM:TO:N. Raises InputError if
+    the text has neither form, or a value is out of range.
     """
     name = option.removeprefix("--")
     low, high = _RANGES[name.split("-", maxsplit=1)[0]]

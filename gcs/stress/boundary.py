@@ -17,9 +17,10 @@ from gains.sampled.coupled_block import unlike_blocks
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
 from gcs.stress.axes import Axis, at_coordinates, every_link
-from gcs.stress.figures import MEASURED, figure_of, saved
+from gcs.stress.figures import MEASURED
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, plan_loops
+from gcs.views.page import figure_of, saved
 
 _PREDICTED, _GUARANTEED, _SEVERAL, _BLANK = "black", "#1b7837", "#7b3294", "#c8c8c8"
 _POINTS = 60

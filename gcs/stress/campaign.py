@@ -7,6 +7,7 @@ finished trial. A later campaign resumes it: a trial whose id is stored is not f
 import contextlib
 import ctypes
 import fcntl
+import json
 import os
 import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -20,7 +21,7 @@ from pathlib import Path
 from gcs.errors import InputError
 from gcs.interrupts import FROM_TERMINAL, held_back
 from gcs.output import DISK_FULL
-from gcs.runs.record import SCENARIO_FILE, RecordLog, replacing
+from gcs.runs.record import SCENARIO_FILE, RecordLog, write_parquet
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
 
@@ -52,16 +53,13 @@ class Store:
         text = self.file.read_bytes()
         for line in text.splitlines():
             with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; its trial is flown again
-                outcome = Outcome.from_json(line.decode())
+                outcome = Outcome(**json.loads(line))
                 self.outcomes[outcome.id] = outcome
         if text and not text.endswith(b"\n"):
             self._log.add(b"\n")
 
     def add(self, outcome: Outcome) -> None:
-        """Store an outcome; it is in the file when this returns.
-
-        Raises InputError if it cannot be written.
-        """
+        """Store an outcome; it is in the file when this returns. Raises InputError if it cannot be written."""
         try:
             self._log.add((outcome.to_json() + "\n").encode())
         except OSError as error:
@@ -95,9 +93,8 @@ def run_campaign(
 ) -> list[Outcome]:
     """Return the outcomes of trials in the given order; those not stored are flown, each once.
 
-    `ended` is called with each outcome and the number of trials still to come.
-
-    Raises KeyboardInterrupt also if Ctrl-C ended a flight in real time; that flight does not count as flown.
+    `ended` is called with each outcome and the number of trials still to come. Raises KeyboardInterrupt also if Ctrl-C
+    ended a flight in real time; that flight does not count as flown.
     """
     missing = {trial.id: trial for trial in trials if trial.id not in store.outcomes}
     left = len(missing)
@@ -172,17 +169,11 @@ def dask_workers(address: str) -> Generator[Fly]:
         yield fly
 
 
-def write_parquet(outcomes: Iterable[Outcome], folder: Path) -> Path:
+def write_table(outcomes: Iterable[Outcome], folder: Path) -> None:
     """Write all outcomes as one table: a column for each field, and `at_<axis>` for each axis."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     rows = [vars(o) | {f"at_{name}": value for name, value in o.coordinates.items()} for o in outcomes]
     names = dict.fromkeys(name for row in rows for name in row if name != "coordinates")
-    table = pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
-    with replacing(folder / PARQUET_FILE) as part:
-        pq.write_table(table, part, compression="zstd")
-    return folder / PARQUET_FILE
+    write_parquet(folder / PARQUET_FILE, {name: [row.get(name) for row in rows] for name in names})
 
 
 def _leave_to_parent(*_: object) -> None: ...

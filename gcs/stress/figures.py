@@ -12,10 +12,10 @@ from gains.sampled.coupled_block import unlike_blocks
 from gcs.stress.axes import Axis, place_text
 from gcs.stress.study import Onset, Study
 from gcs.stress.trial import Outcome, plan_loops
+from gcs.views.page import figure_of, saved
 
 SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
 _RATES = "growth_1_s", "predicted_growth_1_s", "growth_error_1_s"
-_DPI = 130
 _WORST = 6
 
 
@@ -121,23 +121,6 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
     return list(apart.values())[:_WORST]
 
 
-def figure_of(
-    rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
-) -> tuple[Any, Any]:
-    """A figure that needs no screen, and its plots from the top: a list, or rows of columns."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    plots = figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
-    for plot in plots.flat:
-        plot.grid(visible=True, color="#dddddd", linewidth=0.6)
-        plot.spines[["top", "right"]].set_visible(False)
-        plot.set_axisbelow(True)
-    return figure, plots if columns > 1 else plots[:, 0]
-
-
 def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
     """Mark the verdicts of own-state flights at their loop delays, along the lower edge."""
     for verdict, marker, color in (("stable", "o", SAMPLED), ("unstable", "x", MEASURED)):
@@ -146,8 +129,3 @@ def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
             label = f"own initial states: {verdict}"
             edge = {"transform": plot.get_xaxis_transform(), "clip_on": False}
             plot.plot(at, [0.02] * len(at), marker, color=color, markersize=5, fillstyle="none", label=label, **edge)
-
-
-def saved(figure: Any, file: Path) -> Path:
-    figure.savefig(file, dpi=_DPI)
-    return file

@@ -41,7 +41,7 @@ from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import TickArray
 from gcs.drive.flown import Flight, fly_plan, fly_virtual, median_delays_s
 from gcs.plan.flight_plan import FlightPlan
-from gcs.runs.effective_delay import commands_of, commands_on_board, effective_delay_s
+from gcs.runs.grade import commands_of, commands_on_board, effective_delay_s
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
 from scenarios.link_schema import Link
@@ -146,13 +146,6 @@ def _alike(rows: TickArray, others: TickArray) -> int:
     return count if same.all() else int(np.argmin(same))
 
 
-def probe_duration_s(plan: FlightPlan) -> float:
-    """How long a probe is flown: on random links for a number of loop delays at the margin, where that is longer."""
-    if has_constant_links(plan.scenario) or not isfinite(plan.delay_margin_s):
-        return PROBE_S
-    return max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
-
-
 def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float) -> Scenario:
     """The plan's scenario with all vehicles in place at nominal velocity, except for an error of the given ones.
 
@@ -160,7 +153,9 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     of the leader (m/s), whose position is not controlled. It points in `_DIRECTION_NE` and differs from vehicle to
     vehicle.
     """
-    scenario, place, duration_s = plan.scenario, plan.formation.place_ne_m(), probe_duration_s(plan)
+    scenario, place, duration_s = plan.scenario, plan.formation.place_ne_m(), PROBE_S
+    if not has_constant_links(scenario) and isfinite(plan.delay_margin_s):
+        duration_s = max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
     row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
     [leader] = [vehicle for vehicle in scenario.vehicles if vehicle.follows is None]
     vehicles: list[Vehicle] = []

@@ -46,20 +46,12 @@ CHANNELS = (
 
 @dataclass(frozen=True)
 class Motion:
-    """Errors at equally spaced instants.
-
-    Attributes
-    ----------
-    time_s
-        (n,) instants on the vehicle's clock, from the first sample used.
-    values
-        (n, channels) spacing errors in m and velocity errors in m/s.
-    period_s
-        Time between two instants.
-    """
+    """Errors at equally spaced instants, on the vehicle's clock from the first sample used."""
 
     time_s: FloatArray
+    """(n,)"""
     values: FloatArray
+    """(n, channels) spacing errors in m and velocity errors in m/s."""
     period_s: float
 
 

@@ -29,9 +29,8 @@ def refly(study: Study, folder: Path, wanted: str) -> Reflown:
     """Fly again the one trial in a campaign's folder whose id begins with `wanted`.
 
     Its runs are left in `flights` beside the campaign's table. A study in real time flies it over UDP, even if it was
-    first flown in virtual time.
-
-    Raises InputError if not exactly one id begins so, or the trial was flown with another scenario.
+    first flown in virtual time. Raises InputError if not exactly one id begins so, or the trial was flown with another
+    scenario.
     """
     check_campaign(folder, "--trial")
     with contextlib.closing(Store(folder)) as store:
@@ -46,21 +45,13 @@ def refly(study: Study, folder: Path, wanted: str) -> Reflown:
             f"--trial: {stored.id} was flown with another scenario or design; wanted {folder / SCENARIO_FILE}"
         )
     again = replace(trial, real_time=trial.real_time or study.real_time)
-    run = _free(folder / "flights", f"{stored.id}{'-real-time' if again.real_time else ''}")
+    flights, stem = folder / "flights", f"{stored.id}{'-real-time' if again.real_time else ''}"
+    flights.mkdir(parents=True, exist_ok=True)
+    names = (stem if count == 1 else f"{stem}-{count}" for count in range(1, 1000))
+    run = next(flights / name for name in names if not (flights / name).exists())  # `fly_trial` creates it
     outcome = fly_trial(again, run)
     runs = [run] if (run / SCENARIO_FILE).exists() else sorted(run.iterdir()) if run.is_dir() else []
     for flight in runs:
         recover_run(flight)
-    return Reflown(outcome, runs, [] if again.real_time else _differences(outcome, stored))
-
-
-def _differences(outcome: Outcome, stored: Outcome) -> list[str]:
     was, now = (vars(replace(one, elapsed_s=0.0, coordinates={}, error=None)) for one in (stored, outcome))
-    return [name for name in was if was[name] != now[name]]
-
-
-def _free(parent: Path, stem: str) -> Path:
-    """A path that is not taken yet; the caller creates it."""
-    parent.mkdir(parents=True, exist_ok=True)
-    names = (stem if count == 1 else f"{stem}-{count}" for count in range(1, 1000))
-    return next(parent / name for name in names if not (parent / name).exists())
+    return Reflown(outcome, runs, [name for name in was if was[name] != now[name] and not again.real_time])

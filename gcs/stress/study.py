@@ -107,9 +107,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
 
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
     and those of later rounds over a fraction of one if no smooth curve fits. The search follows the measured growth;
-    the prediction is only its start.
-
-    Raises NoOnset with the reason.
+    the prediction is only its start. Raises NoOnset with the reason.
     """
     predicted_s = study.plan.delay_margin_s
     if predicted_s == np.inf:
@@ -208,7 +206,6 @@ def _waiting_s(outcomes: Sequence[Outcome]) -> float:
 def _found(
     study: Study, run: Run, zero: Zero, near: Sequence[Outcome], flights: tuple[Outcome, ...], *, rounds: int
 ) -> Onset:
-    """The onset with its predictions and the flights that check it."""
     loops = plan_loops(study.plan)
     nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.loop_delay_s))
     assert nearest.probed is not None

@@ -1,6 +1,6 @@
 """Questions answered by designing and flying, one command each; `gcs.cli.studies` has their options.
 
-`compare` sets the design routes side by side, with `compare_cost` as formations grow. `thesis` reproduces the source:
-its flights, figures and errata are in the modules of that name. `capacity` finds how many vehicles a scenario's links
-carry, and `benchmark` how fast flights are computed.
+`compare` sets the design routes side by side, with `compare_cost` as formations grow. `thesis` reproduces the source,
+with the flights and figures of `thesis_flights`. `capacity` finds how many vehicles a scenario's links carry, and
+`benchmark` how fast flights are computed.
 """

@@ -82,10 +82,8 @@ def capacity(
     """The capacity at each rate, up to `most` vehicles: the size doubles until one fails, then bisection.
 
     Each formation flies with the scenario's seed and those that follow it. Flights last `seconds`, long because errors
-    decay slowly near the margin.
-
-    Raises InputError if the scenario gives gains as blocks of its own formation, its vehicles take off first, or it
-    cannot fly.
+    decay slowly near the margin. Raises InputError if the scenario gives gains as blocks of its own formation, its
+    vehicles take off first, or it cannot fly.
     """
     if blocks := len(scenario.control.blocks):
         wanted = "gains for any number of vehicles"

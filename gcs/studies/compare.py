@@ -6,7 +6,7 @@ from the same initial states. Robustness and string peak are computed for all ro
 
 import json
 import time  # noqa: TID251 - design time is one of the figures; nothing flown depends on it
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
@@ -28,12 +28,16 @@ from gcs.runs.record import SCENARIO_FILE
 from gcs.runs.summary import summarise
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
 from gcs.views.console import UNKNOWN, ms_text, number_text
+from gcs.views.page import data_uri, figure_of, rendered, saved
 from scenarios.files import dump
 from scenarios.schema import Control, Scenario
 
 Method = Literal["inclusion", "graph-lqr", "graph-dk"]
 METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr", "graph-dk")
 REPORT_FILE, RESULT_FILE = "compare.html", "compare.json"
+_COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#777777", "#b8860b")
+_FLOOR_M = 1e-3
+"""Smaller values are rounding of the telemetry."""
 
 
 @dataclass(frozen=True)
@@ -168,9 +172,6 @@ def write_comparison(
     folder: Path, scenario: Scenario, routes: list[Route], flights: Flights, grown: list[DesignCost]
 ) -> None:
     """Write compare.json, the figures, and the page compare.html."""
-    from gcs.studies.compare_figures import errors_figure, sizes_figure
-    from gcs.views.page import data_uri, rendered
-
     (folder / SCENARIO_FILE).write_text(dump(scenario), encoding="utf-8")
     result = {"scenario": scenario.name, "routes": routes, "sizes": grown}
     (folder / RESULT_FILE).write_text(json.dumps(result, indent=2, default=vars), encoding="utf-8")
@@ -214,3 +215,36 @@ def rows(routes: list[Route]) -> list[tuple[str, list[str]]]:
         "design time, s": lambda route: number_text(route.design_s, ".2f"),
     }
     return [(title, [text(route) for route in routes]) for title, text in texts.items()]
+
+
+def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
+    """A figure of the largest spacing error and the largest command of all vehicles over time, for each route."""
+    figure, (above, below) = figure_of(2, (9.0, 6.0), heights=(1.4, 1.0))
+    for (method, ticks), colour in zip(flights, _COLOURS, strict=False):
+        flown = ticks[(ticks["time_s"] >= 0.0) & ticks["commanded"]]
+        time_s, place = np.unique(flown["time_s"], return_inverse=True)
+        error, command = np.zeros(time_s.size), np.zeros(time_s.size)
+        spacing = np.hypot(flown["spacing_error_north_m"], flown["spacing_error_east_m"])
+        np.fmax.at(error, place, spacing)
+        np.fmax.at(command, place, np.hypot(flown["command_north_m_s2"], flown["command_east_m_s2"]))
+        above.semilogy(time_s, np.maximum(error, _FLOOR_M), color=colour, linewidth=1.4, label=method)
+        below.semilogy(time_s, np.maximum(command, _FLOOR_M), color=colour, linewidth=1.4)
+    above.set(ylabel="largest spacing error [m]")
+    below.set(xlabel="time of flight [s]", ylabel="largest command [m/s²]")
+    above.legend(frameon=False)
+    return saved(figure, file)
+
+
+def sizes_figure(file: Path, grown: list[DesignCost]) -> Path:
+    """Design time against the number of vehicles in a chain."""
+    figure, (plot,) = figure_of(1, (9.0, 3.8))
+    labels = list(dict.fromkeys(size.method for size in grown))
+    for label, colour in zip(labels, _COLOURS, strict=False):
+        own = [size for size in grown if size.method == label]
+        plot.loglog([s.vehicles for s in own], [s.design_s for s in own], "o-", color=colour, label=label)
+    ticks = sorted({size.vehicles for size in grown})
+    plot.set_xticks(ticks, [str(tick) for tick in ticks])
+    plot.minorticks_off()
+    plot.set(xlabel="vehicles in the chain", ylabel="time of the design [s]")
+    plot.legend(frameon=False)
+    return saved(figure, file)

@@ -4,9 +4,9 @@ Source: P. R. Sahoo, "Decentralized Control Design Approaches for Formation Cont
 thesis, NIT Rourkela, 2012. Each number that contradicts it is found by two independent methods.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import compress, product
+from itertools import compress, islice, product
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +20,12 @@ from gains.design.design import design
 from gains.design.dk_iteration import abscissa, dk_iteration
 from gains.design.robust_lmi import robust_lmi
 from gains.formation.bipartite import expanded_gain, partition_by_input, verify_expansion
-from gains.formation.inclusion import contracted_gain, expand, modified_gain, verify_inclusion
+from gains.formation.inclusion import Restriction, contracted_gain, expand, modified_gain, verify_inclusion
 from gains.formation.inclusion import expanded_gain as inclusion_gain
+from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, bidirectional, checked_pattern_gain, formation_plant, leader_follower
 from gains.margin.opinions import checked_delay_margin
 from gains.sampled.onboard import own_part
-from gcs.studies import thesis_errata as errata
 from gcs.studies.thesis_flights import (
     ALPHA,
     CHAIN,
@@ -35,12 +35,16 @@ from gcs.studies.thesis_flights import (
     SPEED_M_S,
     flown,
     fly_with_late_neighbours,
+    formation_figure,
     nonlinear_response,
     printed_gains,
+    responses_figure,
 )
 from gcs.views.page import rendered
 
 PAGE_FILE = "thesis.md"
+PUBLISHED_S = (0.185, 0.195)
+"""The values that round to the published 0.19 s."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +107,11 @@ def _inclusion() -> Iterator[Claim]:
         "(3.5)-(3.19)", "conditions of the inclusion, types (a) and (b), and the contracted gain", "hold",
         f"largest residual {worst:.1e}", "contracted gain against the pattern (3.19)", "agrees",
     )  # fmt: skip
+    # block (2, 2) of A Y + Y A' + B L + L'B' is zero: the spacing error does not drive itself and has no input
+    middle = float(np.abs(CHAIN.A[2:4, 2:4]).max() + np.abs(CHAIN.B[2:4]).max())
     yield Claim(
         "(3.29)", "the LMI with Y = diag(Y1, Y2, Y1)", "α = 0.93",
-        f"infeasible: its block (2, 2) is {_middle_block():.0f} for every Y and L, so it is never negative definite",
+        f"infeasible: its block (2, 2) is {middle:.0f} for every Y and L, so it is never negative definite",
         f"{_least_eigenvalue():.1e} is the least largest eigenvalue of AY + YA' + BL + L'B' over 2,000 random Y, L",
         "erratum",
     )  # fmt: skip
@@ -128,13 +134,13 @@ def _inclusion() -> Iterator[Claim]:
 
 
 def _expansion() -> Iterator[Claim]:
-    (rank_a, hautus_a), (rank_b, hautus_b) = (errata.controllable_dimensions(kind) for kind in ("a", "b"))
+    (rank_a, hautus_a), (rank_b, hautus_b) = (controllable_dimensions(kind) for kind in ("a", "b"))
     yield Claim(
         "4.5, 6.1", "“the expanded system is uncontrollable”", "uncontrollable",
         f"of (3.13), type (a), {rank_a} of 7 dimensions an axis are controllable: all; only of type (b) they are "
         f"{rank_b}", f"rank of [A, B] at the one eigenvalue, 0: {hautus_a} and {hautus_b} of 7", "erratum",
     )  # fmt: skip
-    _, minus, plus = errata.s_procedure_counterexample()
+    _, minus, plus = s_procedure_counterexample()
     yield Claim(
         "3.3", "S-procedure: F > 0 wherever G ≤ 0 follows from F + τG ≻ 0", "without that sign",
         f"F = G = −1: F > 0 nowhere, yet F − τG ≻ 0 {'for some' if minus else 'for no'} τ ≥ 0",
@@ -143,7 +149,7 @@ def _expansion() -> Iterator[Claim]:
 
 
 def _sweep_algorithm() -> Iterator[Claim]:
-    (least, _), (least_late, most_late) = errata.pencil_moduli(-2.0, 1.0), errata.pencil_moduli(-1.0, -2.0)
+    (least, _), (least_late, most_late) = pencil_moduli(-2.0, 1.0), pencil_moduli(-1.0, -2.0)
     yield Claim(
         "(5.7)", "no delay destabilises if ρ(jωI − A0, A1) < 1", "ρ < 1",
         f"the least modulus above 1 is wanted: x' = −2x + x(t − τ) has it at {least:.1f} and margin "
@@ -151,7 +157,7 @@ def _sweep_algorithm() -> Iterator[Claim]:
         f"x' = −x − 2x(t − τ): least {least_late:.1f}, margin {delay_margin([[-1.0]], [[-2.0]]):.4f} s; moduli pass 1 "
         f"on the way to {most_late:.0f} at 100 rad/s", "erratum",
     )  # fmt: skip
-    right, wrong = (errata.first_crossing(-1.0, -2.0, sign) for sign in (-1.0, 1.0))
+    right, wrong = (first_crossing(-1.0, -2.0, sign) for sign in (-1.0, 1.0))
     yield Claim(
         "(5.7), steps 2, 3", "crossings from ρ ≠ 0, and θ without e^{−jθ}", "ρ ≠ 0, λ = e^{jθ}",
         f"|λ| = 1 is to be looked for, and λ = e^{{−jθ}}: θ/ω = {right:.4f} s for x' = −x − 2x(t − τ); with e^{{jθ}} "
@@ -160,21 +166,15 @@ def _sweep_algorithm() -> Iterator[Claim]:
 
 
 def _subsets() -> Iterator[Claim]:
-    margins = errata.subset_margins()
-    low, high = errata.PUBLISHED_S
+    margins = subset_margins()
+    low, high = PUBLISHED_S
     inside = int(((margins >= low) & (margins <= high)).sum())
     nearest = int(np.argmin(np.abs(margins - 0.19)))
     yield Claim(
         "5.3", "any choice of which of the twelve scalar gains are late that gives 0.19 s", "0.19 s",
         f"{inside or 'none'} of all {len(margins):,} gives {low} to {high} s; the nearest is {margins[nearest]:.4f} s",
-        f"{errata.subset_margin_by_sweep(nearest):.4f} s by the sweep", "erratum",
+        f"{subset_margin_by_sweep(nearest):.4f} s by the sweep", "erratum",
     )  # fmt: skip
-
-
-def _middle_block() -> float:
-    """Block (2, 2) of A Y + Y A' + B L + L'B': zero, as the spacing error does not drive itself and has no input."""
-    A, B = CHAIN.A[2:6, 2:6], CHAIN.B[2:6]
-    return float(np.abs(A[:2, :2]).max() + np.abs(B[:2]).max())
 
 
 def _least_eigenvalue() -> float:
@@ -201,11 +201,13 @@ def _graph() -> Iterator[Claim]:
         f"{len(partition.subgraphs)} subgraphs; K̄ {rows}×{columns}, φ2 {columns}×{expanded.phi2.shape[1]}",
         f"closed-loop modes differ by {verify_expansion(plant, expanded, K):.0e} from those of K", "agrees",
     )  # fmt: skip
+    # of PA + A'P + αI at P = I, K = 0
+    printed = float(np.linalg.eigvalsh(CHAIN.A + CHAIN.A.T - 1e6 * np.eye(CHAIN.states))[-1])
     steps = dk_iteration(formation_plant(SINGLE), Pattern(pattern.blocks, (1, 1, 1), (1, 2, 2)))
     yield Claim(
         "4.4", "“… + αI ⪯ 0, minimise α”", "converges",
         "unbounded below: α = −10⁶ satisfies it with P = I, K = 0 (largest eigenvalue "
-        f"{_printed_inequality(-1e6):.0f}), and every smaller α does",
+        f"{printed:.0f}), and every smaller α does",
         f"with αP and I ⪯ P ⪯ κI the iteration ends after {len(steps.iterates) - 1} steps at "
         f"α = {steps.proof.alpha:.3f}, abscissa {abscissa(SINGLE.A + SINGLE.B @ steps.K):.3f} 1/s", "erratum",
     )  # fmt: skip
@@ -218,11 +220,6 @@ def _graph() -> Iterator[Claim]:
         "5.2.2", "gains within [[k̄, K], [K', I]] ≻ 0, k̄ < 100", "‖K‖ < 10",
         f"‖K‖ = {norm:.2f}", f"largest block norm {largest:.2f}", "erratum",
     )  # fmt: skip
-
-
-def _printed_inequality(alpha: float) -> float:
-    """Largest eigenvalue of PA + A'P + αI at P = I, K = 0."""
-    return float(np.linalg.eigvalsh(CHAIN.A + CHAIN.A.T + alpha * np.eye(CHAIN.states))[-1])
 
 
 def _delay() -> Iterator[Claim]:
@@ -247,7 +244,7 @@ def _delay() -> Iterator[Claim]:
         f"{frequency_sweep_margin(CHAIN.A, CHAIN.B @ K):.6f} s by the sweep", "not checkable",
     )  # fmt: skip
     names, parts = zip(*_parts(K), strict=True)
-    splits = [(chosen, delay_margin(*loop)) for chosen, loop in errata.late_choices(CHAIN, K, parts)]
+    splits = [(chosen, delay_margin(*loop)) for chosen, loop in late_choices(CHAIN, K, parts)]
     chosen, margin_s = min(splits, key=lambda split: abs(split[1] - 0.19))
     yield Claim(
         "5.3", "any split into late and immediate feedback that gives 0.19 s", "0.19 s",
@@ -302,10 +299,75 @@ def _comparison() -> Iterator[Claim]:
     )  # fmt: skip
 
 
+def controllable_dimensions(restriction: Restriction) -> tuple[int, int]:
+    """Rank of [B, AB, A²B, ...] of the expanded chain of three, one axis, and that of [A, B].
+
+    All eigenvalues are zero, so that by Hautus' test the system is controllable if and only if the second is full.
+    """
+    expansion = expand(SINGLE, restriction)
+    A, B = expansion.A.toarray(), expansion.B.toarray()
+    powers = [np.linalg.matrix_power(A, k) @ B for k in range(len(A))]
+    return int(np.linalg.matrix_rank(np.hstack(powers))), int(np.linalg.matrix_rank(np.hstack([A, B])))
+
+
+def s_procedure_counterexample() -> tuple[bool, bool, bool]:
+    """For F = G = −1: whether F > 0 wherever G ≤ 0, whether F − τG > 0 for some τ ≥ 0, and whether F + τG > 0."""
+    F = G = -1.0
+    some = np.linspace(0.0, 100.0, 1001)
+    return not (G <= 0.0) or F > 0.0, bool((F - some * G > 0.0).any()), bool((F + some * G > 0.0).any())
+
+
+def pencil_moduli(own: float, late: float) -> tuple[float, float]:
+    """Least and largest |λ(jωI − A0, A1)| over frequencies up to 100 rad/s, of x' = own x + late x(t − τ)."""
+    moduli = np.abs((1j * np.linspace(0.0, 100.0, 100_001) - own) / late)
+    return float(moduli.min()), float(moduli.max())
+
+
+def first_crossing(own: float, late: float, sign: float) -> float:
+    """θ / ω at which λ(jω − A0, A1) = e^{sign jθ}, θ in [0, 2π), of x' = own x + late x(t − τ)."""
+    omega = float(np.sqrt(late**2 - own**2))
+    return float(np.mod(sign * np.angle((1j * omega - own) / late), 2.0 * np.pi)) / omega
+
+
+def late_choices(
+    model: FormationModel, K: FloatArray, parts: Sequence[FloatArray]
+) -> Iterator[tuple[tuple[bool, ...], tuple[FloatArray, FloatArray]]]:
+    """Each choice of which parts of K are late, at least one, with (A0, A1) of the loop that has them late."""
+    for chosen in islice(product((False, True), repeat=len(parts)), 1, None):
+        late = np.sum(list(compress(parts, chosen)), axis=0)
+        yield chosen, (model.A + model.B @ (K - late), model.B @ late)
+
+
+def _late_entries() -> list[tuple[FloatArray, FloatArray]]:
+    """(A0, A1) for each of the 4,095 choices of which of the twelve printed scalar gains are late.
+
+    One axis: the blocks are multiples of the identity, except for entries of at most 0.0053.
+    """
+    K = printed_gains()[::2, ::2]
+    places = np.flatnonzero(np.abs(K) > 0.1)
+    assert len(places) == 12
+    entries = [K * place.reshape(K.shape) for place in np.eye(K.size)[places]]
+    return [loop for _, loop in late_choices(SINGLE, K, entries)]
+
+
+def subset_margins() -> FloatArray:
+    """The delay margin for each choice of which of the twelve printed scalar gains are late."""
+    margins: list[float] = []
+    for now, late in _late_entries():
+        try:
+            margins.append(delay_margin(now, late))
+        except np.linalg.LinAlgError:  # the resolvent is singular on the axis
+            margins.append(frequency_sweep_margin(now, late))
+    return np.array(margins)
+
+
+def subset_margin_by_sweep(number: int) -> float:
+    """The margin of one of the subsets of `subset_margins` by the frequency sweep."""
+    return frequency_sweep_margin(*_late_entries()[number])
+
+
 def write_page(folder: Path, found: list[Claim]) -> Path:
     """Write thesis.md, with all claims, and the figures to a folder."""
-    from gcs.studies.thesis_figures import formation_figure, responses_figure
-
     formation_figure(folder / "inclusion.png", "inclusion")
     formation_figure(folder / "graph.png", "graph-dk")
     responses_figure(folder / "responses.png")

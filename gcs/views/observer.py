@@ -44,7 +44,6 @@ class Parent:
     stop: bool = False
 
     def gone(self) -> bool:
-        """Whether it has died."""
         return os.getppid() != self.pid
 
 

@@ -1,4 +1,4 @@
-"""HTML pages that need nothing else: templates of this package, figures inside."""
+"""HTML pages that need nothing else: templates of this package, with their figures inside, which matplotlib draws."""
 
 import base64
 from functools import partial
@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from gcs.views.console import ms_text, number_text
+
+_DPI = 130
 
 
 def rendered(template: str, **values: Any) -> str:
@@ -30,3 +32,25 @@ def percent_text(value: float | None, form: str = "+.3%") -> str:
 def data_uri(png: Path) -> str:
     """A picture as an address that holds it."""
     return "data:image/png;base64," + base64.b64encode(png.read_bytes()).decode("ascii")
+
+
+def figure_of(
+    rows: int, size: tuple[float, float], heights: tuple[float, ...] = (1.0,), *, columns: int = 1
+) -> tuple[Any, Any]:
+    """A figure that needs no screen, and its plots from the top: a list, or rows of columns."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    plots = figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
+    for plot in plots.flat:
+        plot.grid(visible=True, color="#dddddd", linewidth=0.6)
+        plot.spines[["top", "right"]].set_visible(False)
+        plot.set_axisbelow(True)
+    return figure, plots if columns > 1 else plots[:, 0]
+
+
+def saved(figure: Any, file: Path) -> Path:
+    figure.savefig(file, dpi=_DPI)
+    return file

@@ -122,7 +122,6 @@ def print_summary(summary: Summary, folder: Path, console: Console | None = None
 
 
 def print_flight(summary: Summary, console: Console) -> None:
-    """The verdict with its figures."""
     style = {"stable": "bold green", "unstable": "bold red"}.get(summary.verdict, "bold yellow")
     flown = "" if summary.fleet == STARTED else f"; vehicles {summary.fleet}"
     console.print(Text.assemble("verdict  ", (summary.verdict, style), f": {_reason(summary)}{flown}"))

@@ -1,9 +1,10 @@
-"""The formation as a picture: from tick rows to points and lines in space. Arrays only; `recording` draws them."""
+"""The formation as a picture: from tick rows to points and lines in space. Arrays and text; `recording` draws them."""
 
 import colorsys
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ Color = tuple[int, int, int]
 PICTURE_S = 0.04
 """Least time between two pictures: 25 a second look smooth."""
 TRAIL_STEP_S = 0.2
+WIDTH, HEIGHT = 64, 16
+_ASPECT = 2.0
+"""Of the plan view; a character is about twice as high as wide."""
 
 # Ten colours that are easy to tell apart on a dark ground; more vehicles take hues around the circle.
 PALETTE: tuple[Color, ...] = (
@@ -117,3 +121,20 @@ def positions_m(ticks: TickArray) -> Floats:
     axes = ("velocity_north_m_s", "velocity_east_m_s", "velocity_down_m_s")
     velocity_m_s = np.stack([ticks[axis] for axis in axes], axis=2)
     return sampled_m + np.nan_to_num(velocity_m_s * ticks["telemetry_age_s"][..., np.newaxis])
+
+
+def plan_view(place_ne_m: Mapping[int, tuple[float, float]]) -> str:
+    """The formation from above, in characters: system ids, north up; of vehicles in one cell the first is shown."""
+    north = [n for n, _ in place_ne_m.values()]
+    east = [e for _, e in place_ne_m.values()]
+    apart_m = min((math.hypot(a[0] - b[0], a[1] - b[1]) for a, b in combinations(place_ne_m.values(), 2)), default=1.0)
+    cell_m = max((max(north) - min(north)) / (HEIGHT - 1), (max(east) - min(east)) / (WIDTH - 5) * _ASPECT)
+    cell_m = max(cell_m, apart_m / 2.0)  # a few vehicles need no large picture
+    rows = [[" "] * WIDTH for _ in range(round((max(north) - min(north)) / cell_m) + 1)]
+    for system_id, (n, e) in place_ne_m.items():
+        row, column = rows[round((max(north) - n) / cell_m)], round((e - min(east)) / cell_m * _ASPECT)
+        text = str(system_id)
+        if all(character == " " for character in row[column : column + len(text)]):
+            row[column : column + len(text)] = text
+    lines = ["".join(row).rstrip() for row in rows]
+    return "\n".join(["north", *(f"  {line}" for line in lines), f"  ({cell_m:.3g} m a line)"])

@@ -204,8 +204,6 @@ def _progress(state: FlightState, width: int) -> RenderableType:
 
 
 def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
-    """One row for each vehicle in `order`."""
-
     vehicles, headroom, error_m = state.scenario.vehicles, figures.headroom, figures.spacing_error_m
     columns: list[FittedColumn[int]] = [
         ("id", 3, 0, lambda k: str(vehicles[k].system_id)),

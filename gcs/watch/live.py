@@ -6,7 +6,6 @@ station is gone has to notice.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 from gcs.drive.udp import StationSocket, clock_ns
@@ -22,44 +21,42 @@ _WINDOW_LOOKS = 50
 """Looks in the live figures: those of the last five seconds."""
 
 
-@dataclass(frozen=True)
-class WatchOptions:
-    """How links are watched."""
-
-    margin_s: float | None
-    margin_of: str
-    """Where the margin is from."""
-    timesync_hz: float
-    """Requests a second to each address; 0 to send nothing at all."""
-    seconds: float
-    shown: bool
-
-
 def watch_links(
-    link: StationSocket, watch: Watch, options: WatchOptions, stop_reason: Callable[[], str]
+    link: StationSocket,
+    watch: Watch,
+    stop_reason: Callable[[], str],
+    *,
+    margin_s: float | None,
+    margin_of: str,
+    timesync_hz: float,
+    seconds: float,
+    shown: bool,
 ) -> WatchReport:
-    """Watch for the time asked or until there is a reason to stop; returns the figures of the whole time."""
-    requests = Requests(options.timesync_hz)
+    """Watch for the time asked or until there is a reason to stop; returns the figures of the whole time.
+
+    `margin_of` says where the margin is from. `timesync_hz` is the rate of requests to each address, 0 to send nothing.
+    """
+    requests = Requests(timesync_hz)
     start_ns = now_ns = clock_ns()
-    end_ns = start_ns + round(options.seconds * NS_PER_S) if math.isfinite(options.seconds) else 1 << 62
+    end_ns = start_ns + round(seconds * NS_PER_S) if math.isfinite(seconds) else 1 << 62
 
     def report(last: int = 0) -> WatchReport:
         return WatchReport(
             listening="{}:{}".format(*link.address),
             duration_s=round((now_ns - start_ns) / NS_PER_S, 3),
-            delay_margin_s=options.margin_s,
-            margin_of=options.margin_of,
-            silent=options.timesync_hz == 0,
+            delay_margin_s=margin_s,
+            margin_of=margin_of,
+            silent=timesync_hz == 0,
             sent={"TIMESYNC": requests.sent},
             send_errors=link.send_errors,
             stations=tuple(sorted(watch.stations)),
             refused=dict(watch.counters),
-            vehicles=tuple(watch.figures(now_ns, options.margin_s, last)),
+            vehicles=tuple(watch.figures(now_ns, margin_s, last)),
         )
 
-    with live_display(shown=options.shown, transient=True) as live:
+    with live_display(shown=shown, transient=True) as live:
         period_ns = _PLAIN_NS if live is None else _SHOW_NS
-        look_ns, show_ns = start_ns, start_ns + period_ns if options.shown else 1 << 62
+        look_ns, show_ns = start_ns, start_ns + period_ns if shown else 1 << 62
         while now_ns < end_ns and not stop_reason():
             link.wait(min(look_ns, end_ns, requests.next_ns))  # not long: a signal does not end the wait
             for datagram in link.receive(watch.counters):
@@ -70,9 +67,9 @@ def watch_links(
             link.send(requests.due(watch, now_ns))
             if now_ns >= show_ns:
                 show_ns = now_ns + period_ns
-                shown = report(_WINDOW_LOOKS)
+                figures = report(_WINDOW_LOOKS)
                 if live is None:
-                    print(plain_line(shown), flush=True)
+                    print(plain_line(figures), flush=True)
                 else:
-                    draw(live, partial(render, shown))
+                    draw(live, partial(render, figures))
     return report()

@@ -162,7 +162,6 @@ class _Rebuilding:
         self._events: list[Event] = []
 
     def take(self, time_ns: int, frame: mavlink.Frame) -> None:
-        """Take in the next frame of the log."""
         self._newest_ns = time_ns
         station = frame.system_id not in self._row
         if station and frame.msg_id == mavlink.SET_POSITION_TARGET_LOCAL_NED and self._outline.keys:

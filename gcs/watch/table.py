@@ -55,8 +55,6 @@ def _headline(report: WatchReport) -> Text:
 
 
 def links_table(vehicles: Sequence[LinkFigures], width: int) -> Table:
-    """One row for each vehicle."""
-
     def headroom(v: LinkFigures) -> Text:
         return headroom_text(v.headroom, "≤ " if _bound(v) and v.headroom is not None else "")
 

@@ -30,10 +30,7 @@ class TelemetryLog:
 
 
 def read_tlog(file: Path) -> TelemetryLog:
-    """Read what can be read of a log.
-
-    Raises InputError if the file cannot be read or there is no frame in it.
-    """
+    """Read what can be read of a log. Raises InputError if the file cannot be read or there is no frame in it."""
     try:
         data = file.read_bytes()
     except OSError as error:

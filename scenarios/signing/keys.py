@@ -38,9 +38,8 @@ def read_key(file: Path) -> Key:
     """The key in a file, in one of the three common forms.
 
     32 raw bytes, as pymavlink takes them; 64 hexadecimal digits, as `make_key` writes them; or one line of text, a
-    passphrase whose SHA-256 is the key, as in MAVProxy, Mission Planner and QGroundControl.
-
-    Raises KeyFileError if it cannot be read, holds none of these, belongs to another user, or others have access.
+    passphrase whose SHA-256 is the key, as in MAVProxy, Mission Planner and QGroundControl. Raises KeyFileError if it
+    cannot be read, holds none of these, belongs to another user, or others have access.
     """
     try:
         with file.open("rb") as opened:

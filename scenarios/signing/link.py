@@ -48,14 +48,9 @@ _FLAG_IN_CHECKSUM = tuple(mcrf4xx(b"\0\1" + bytes(8 + n)) ^ mcrf4xx(bytes(10 + n
 class SignedLink:
     """One system's end of one link.
 
-    Parameters
-    ----------
-    crc_extra
-        The byte that ends the checksummed data of each message id.
-    epoch_ns
-        The time, in ns since 1970, at which the clock of `now_ns` is 0.
-    owner
-        System id of this end, where several ends share one memory of timestamps.
+    `crc_extra` is the byte that ends the checksummed data of each message id, and `epoch_ns` the time, in ns since
+    1970, at which the clock of `now_ns` is 0. Where several ends share one memory of timestamps, `owner` is the system
+    id of this end.
     """
 
     def __init__(

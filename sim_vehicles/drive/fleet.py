@@ -17,11 +17,11 @@ from sim_vehicles.links.links import Link, LinkSet
 from sim_vehicles.links.truth import Record
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.services import LONGEST_TEXT
-from sim_vehicles.vehicles.copter import Copter, multicopter
-from sim_vehicles.vehicles.double_integrator import DoubleIntegrator, launched
+from sim_vehicles.vehicles.copter import Copter
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from sim_vehicles.vehicles.dynamics import State
 from sim_vehicles.vehicles.onboard import OnboardLoop
-from sim_vehicles.vehicles.shell import Change, Shell
+from sim_vehicles.vehicles.shell import Change, Radio, Shell
 
 Datagram = tuple[int, bytes, int]
 """(system id of the vehicle, bytes, host time in ns)"""
@@ -31,7 +31,7 @@ _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 @dataclass(slots=True)
 class _Member:
-    vehicle: Shell[DoubleIntegrator] | Shell[Copter]
+    vehicle: Shell[DoubleIntegrator | Copter]
     up: Link
     down: Link
     signed: SignedLink | None = None
@@ -78,13 +78,14 @@ class Fleet:
         experiment = f"{fingerprint(scenario)} {scenario.name}"[:LONGEST_TEXT]
         self._in_order = sensors or self._links.have_channels
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
+            radio = Radio(scenario, own, start_ns, record)
+            craft: DoubleIntegrator | Copter
             if scenario.dynamics == "autopilot":
-                vehicle = multicopter(
-                    scenario, own, start_ns, record=record, signed=bool(signed), experiment=experiment
-                )
+                craft = Copter(scenario, own, radio)
             else:
                 onboard = OnboardLoop(scenario, own.system_id, self._seen) if sensors else None
-                vehicle = launched(scenario, own, start_ns, record=record, onboard=onboard, experiment=experiment)
+                craft = DoubleIntegrator(scenario, own, radio, onboard)
+            vehicle = Shell(scenario, radio, craft, signed=bool(signed), experiment=experiment)
             self._members[own.system_id] = _Member(
                 vehicle, *self._links.of(own.system_id), signed[own.system_id] if signed else None
             )
@@ -128,7 +129,7 @@ class Fleet:
             total.update(member.vehicle.counters)
         return total
 
-    def vehicle(self, system_id: int) -> Shell[DoubleIntegrator] | Shell[Copter]:
+    def vehicle(self, system_id: int) -> Shell[DoubleIntegrator | Copter]:
         """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
         return self._members[system_id].vehicle
 
@@ -144,10 +145,7 @@ class Fleet:
     def step(self, received: Iterable[Datagram], now_ns: int) -> list[Datagram]:
         """The datagrams that leave the up links by now, with their exact instants, in order of time.
 
-        Parameters
-        ----------
-        received
-            Datagrams of the station with the instants at which each enters its vehicle's down link.
+        `received` are datagrams of the station, with the instants at which each enters its vehicle's down link.
         """
         if self._links.zero_ns == NEVER_NS:
             received = list(received)
@@ -236,10 +234,6 @@ class Fleet:
         if leaves_ns != member.leaves_ns:
             member.leaves_ns = leaves_ns
             heapq.heappush(self._heap, (leaves_ns, member.vehicle.system_id))
-        if self._in_order:
-            self._plan_act(member, min(acts_ns, arrives_ns))
-
-    def _plan_act(self, member: _Member, acts_ns: int) -> None:
-        if acts_ns != member.acts_ns:
-            member.acts_ns = acts_ns
-            heapq.heappush(self._acts, (acts_ns, member.vehicle.system_id))
+        if self._in_order and member.acts_ns != min(acts_ns, arrives_ns):
+            member.acts_ns = min(acts_ns, arrives_ns)
+            heapq.heappush(self._acts, (member.acts_ns, member.vehicle.system_id))

@@ -17,13 +17,7 @@ SILENCE_NS = 3 * NS_PER_S // 2
 
 
 class Peers:
-    """The vehicles' addresses and the sockets on both sides.
-
-    Raises
-    ------
-    OSError
-        If a vehicle port cannot be bound.
-    """
+    """The vehicles' addresses and the sockets on both sides. Raises OSError if a vehicle port cannot be bound."""
 
     def __init__(
         self, vehicle_ports: list[tuple[str, int]], station: tuple[str, int], *, silence_ns: int = SILENCE_NS

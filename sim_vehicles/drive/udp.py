@@ -61,10 +61,7 @@ class Sockets:
     def add(self, *, bind: tuple[str, int] | None = None, connect: tuple[str, int] | None = None) -> int:
         """Open a socket, bound or connected, and return its file number; a connected one hears only its peer.
 
-        Raises
-        ------
-        OSError
-            If the address cannot be used.
+        Raises OSError if the address cannot be used.
         """
         own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         number = own.fileno()
@@ -148,10 +145,7 @@ class Sockets:
 class Ports:
     """The vehicles' sockets, each connected to the station, so that datagrams of others are not accepted.
 
-    Raises
-    ------
-    OSError
-        If the station's address cannot be used.
+    Raises OSError if the station's address cannot be used.
     """
 
     def __init__(self, system_ids: tuple[int, ...], station: tuple[str, int]) -> None:

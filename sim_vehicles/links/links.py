@@ -1,29 +1,17 @@
 """An emulated one-way radio link: a queue ordered by the time each datagram comes out.
 
-A datagram's fate is decided once, when it enters (`Link.send`): `fate` says what happens to it, `channel` how long it
+A datagram's fate is decided once, when it enters (`Link.send`): `fate` says what happens to it, `Channel` how long it
 waits for bandwidth. A link that only delays by a constant draws no random numbers.
 """
 
 import heapq
-from collections import Counter
+from collections import Counter, deque
 
 from scenarios import link_schema, schema
-from sim_vehicles.links.channel import Channel
+from scenarios.schema import NS_PER_S
+from sim_vehicles.links import truth
 from sim_vehicles.links.fate import Stream, behaviour_of, constant, flipped, outcome
-from sim_vehicles.links.truth import (
-    CORRUPTED,
-    DUPLICATE,
-    FATES,
-    LINK_DOWN,
-    LINK_FULL,
-    LINK_UP,
-    LOST,
-    OUTAGE,
-    PASSED,
-    QUEUE_FULL,
-    Record,
-    Row,
-)
+from sim_vehicles.links.truth import DUPLICATE, FATES, LINK_DOWN, LINK_FULL, LINK_UP, PASSED, Record, Row
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.mavlink import message_id
 
@@ -37,6 +25,42 @@ SETPOINT_IDS = (82, 84, 86)
 
 Entry = tuple[int, int, int, bytes, int, int]
 """(due_ns, number, entered_ns, data, fate, queued_ns). A duplicate has the number of its original."""
+
+
+class Channel:
+    """Limited bandwidth, of one link or shared by several: a drop-tail queue with one sender.
+
+    Sends one datagram at a time, in order of arrival; those of one instant in order of `send`.
+    """
+
+    def __init__(self, channel: link_schema.Channel) -> None:
+        self._ns_per_byte = channel.bits_per_byte * NS_PER_S / channel.bandwidth_bit_s
+        self._most_bytes = channel.queue_bytes
+        self._most_datagrams = channel.queue_datagrams
+        self._free_ns = 0
+        """When everything accepted so far has been sent."""
+        self._waiting: deque[tuple[int, int]] = deque()
+        """(when its sending begins, bytes) of each datagram that was waiting at the last call, in order."""
+        self._waiting_bytes = 0
+
+    def send(self, size_bytes: int, time_ns: int) -> tuple[int, int] | None:
+        """When the sending of a datagram begins and ends, or None if the queue is full.
+
+        Successive calls must be in order of time.
+        """
+        waiting = self._waiting
+        while waiting and waiting[0][0] <= time_ns:
+            self._waiting_bytes -= waiting.popleft()[1]
+        begin_ns = max(time_ns, self._free_ns)
+        if begin_ns > time_ns:
+            if self._most_bytes is not None and self._waiting_bytes + size_bytes > self._most_bytes:
+                return None
+            if self._most_datagrams is not None and len(waiting) >= self._most_datagrams:
+                return None
+            waiting.append((begin_ns, size_bytes))
+            self._waiting_bytes += size_bytes
+        self._free_ns = begin_ns + round(size_bytes * self._ns_per_byte)
+        return begin_ns, self._free_ns
 
 
 class Link:
@@ -85,7 +109,7 @@ class Link:
     @property
     def dropped(self) -> int:
         """How many datagrams never come out."""
-        return sum(self.counts[FATES[fate]] for fate in (LOST, OUTAGE, QUEUE_FULL, LINK_FULL))
+        return sum(self.counts[FATES[fate]] for fate in (truth.LOST, truth.OUTAGE, truth.QUEUE_FULL, LINK_FULL))
 
     def send(self, data: bytes, time_ns: int) -> None:
         """Take in a datagram that enters the link at a time."""
@@ -116,19 +140,19 @@ class Link:
         found = outcome(self.behaviour, bad=self._bad, time_ns=time_ns - self.zero_ns, draws=stream.next())
         self._bad = found.bad
         begin_ns = end_ns = time_ns
-        if found.fate & OUTAGE:
-            return self._drop(data, time_ns, OUTAGE)
+        if found.fate & truth.OUTAGE:
+            return self._drop(data, time_ns, truth.OUTAGE)
         if len(self._queue) >= self._capacity:
             return self._drop(data, time_ns, LINK_FULL)
         if self._channel is not None:
             sending_ns = self._channel.send(len(data), time_ns)
             if sending_ns is None:
-                return self._drop(data, time_ns, QUEUE_FULL)
+                return self._drop(data, time_ns, truth.QUEUE_FULL)
             begin_ns, end_ns = sending_ns
-        if found.fate & LOST:
-            return self._drop(data, time_ns, LOST, begin_ns - time_ns)
-        if found.fate & CORRUPTED:
-            self.counts[FATES[CORRUPTED]] += 1
+        if found.fate & truth.LOST:
+            return self._drop(data, time_ns, truth.LOST, begin_ns - time_ns)
+        if found.fate & truth.CORRUPTED:
+            self.counts[FATES[truth.CORRUPTED]] += 1
             data = flipped(data, found.flips)
         self._push(end_ns + found.delay_ns, time_ns, data, found.fate, begin_ns - time_ns)
         if found.duplicate_delay_ns >= 0:

@@ -7,6 +7,7 @@ streams and truth log that it would have in a Fleet.
 import heapq
 from collections import Counter
 from collections.abc import Iterable
+from operator import itemgetter
 from typing import NamedTuple
 
 from scenarios import schema
@@ -62,7 +63,6 @@ class Relay:
 
     @property
     def counters(self) -> Counter[str]:
-        """What happened on all links."""
         return self._links.counters()
 
     @property
@@ -103,13 +103,9 @@ class Relay:
                     self._record(link.row(entry, now_ns))
             if link.next_due_ns != NEVER_NS:
                 heapq.heappush(heap, (link.next_due_ns, kind, system_id))
-        out.sort(key=_order)
+        out.sort(key=itemgetter(0, 1, 2))
         return out
 
     def _link(self, kind: int, system_id: int) -> Link:
         up, down = self._links.of(system_id)
         return up if kind == LINK_UP else down
-
-
-def _order(passing: Passing) -> tuple[int, int, int]:
-    return passing[:3]

@@ -113,10 +113,7 @@ def read_truth(path: Path) -> npt.NDArray[np.void]:
 
     A log that a full disk cut off at its beginning holds none.
 
-    Raises
-    ------
-    ValueError
-        If the file is not a truth log, or holds a record of an unknown kind.
+    Raises ValueError if the file is not a truth log, or holds a record of an unknown kind.
     """
     data = path.read_bytes()
     if not data.startswith(_MAGIC[: len(data)]):

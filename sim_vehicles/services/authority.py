@@ -3,19 +3,13 @@
 from collections import Counter
 
 from scenarios.schema import NS_PER_S
-from sim_vehicles.services.mavlink import (
-    COMMAND_CAPABILITIES,
-    COMMAND_GET_HOME,
-    COMMAND_GET_INTERVAL,
-    COMMAND_INTERVAL,
-    COMMAND_REQUEST,
-    Command,
-    Read,
-    Setpoint,
-)
+from sim_vehicles.services import mavlink
+from sim_vehicles.services.mavlink import Command, Read, Setpoint
 from sim_vehicles.services.messages import DataStream, ParameterSet, SetMode
 
-_QUESTIONS = frozenset((COMMAND_CAPABILITIES, COMMAND_GET_HOME, COMMAND_GET_INTERVAL, COMMAND_REQUEST))
+_QUESTIONS = frozenset(
+    (mavlink.COMMAND_CAPABILITIES, mavlink.COMMAND_GET_HOME, mavlink.COMMAND_GET_INTERVAL, mavlink.COMMAND_REQUEST)
+)
 
 
 class Authority:
@@ -43,7 +37,7 @@ class Authority:
             return True
         if not self.hears(source, time_ns):
             return False
-        if command == COMMAND_INTERVAL or isinstance(message, DataStream):
+        if command == mavlink.COMMAND_INTERVAL or isinstance(message, DataStream):
             return True
         self.station, self._heard_ns, self.commanded_ns = source, time_ns, time_ns
         return True

@@ -32,7 +32,6 @@ class BootClock:
         return cls(start_ns, offset_ns, round((2.0 * drift - 1.0) * clocks.drift_max_ppm * 1000.0))
 
     def boot_ns(self, host_ns: int) -> int:
-        """The boot time at a host time."""
         return self.offset_ns + (host_ns - self.start_ns) * (PARTS + self.drift_ppb) // PARTS
 
     def host_ns(self, boot_ns: int) -> int:

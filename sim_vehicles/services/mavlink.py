@@ -24,10 +24,6 @@ TYPE_GCS = dialect.MAV_TYPE_GCS
 MODE_STABILIZE, MODE_GUIDED, MODE_LOITER, MODE_BRAKE = 0, 4, 5, 17
 MODE_RETURN, MODE_LAND = 6, 9
 BASE_MODE_CUSTOM = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-BASE_MODE_ARMED = dialect.MAV_MODE_FLAG_SAFETY_ARMED
-BASE_MODE_GUIDED = dialect.MAV_MODE_FLAG_GUIDED_ENABLED
-STATUS_STANDBY, STATUS_ACTIVE = dialect.MAV_STATE_STANDBY, dialect.MAV_STATE_ACTIVE
-STATUS_CRITICAL = dialect.MAV_STATE_CRITICAL
 SEVERITY_CRITICAL, SEVERITY_WARNING = dialect.MAV_SEVERITY_CRITICAL, dialect.MAV_SEVERITY_WARNING
 FRAME_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
 
@@ -225,11 +221,22 @@ class Encoder:
         return self.frame(LOCAL_POSITION, payload)
 
     def heartbeat(
-        self, base_mode: int, custom_mode: int, system_status: int, autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+        self,
+        mode: int,
+        *,
+        armed: bool,
+        flying: bool,
+        critical: bool,
+        guided: bool = False,
+        autopilot: int = dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
     ) -> bytes:
         """HEARTBEAT of a quadrotor, by default an ArduCopter."""
+        base_mode = BASE_MODE_CUSTOM | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
+        base_mode |= dialect.MAV_MODE_FLAG_GUIDED_ENABLED if guided else 0
+        status = dialect.MAV_STATE_ACTIVE if flying else dialect.MAV_STATE_STANDBY
+        status = dialect.MAV_STATE_CRITICAL if critical else status
         kind = dialect.MAV_TYPE_QUADROTOR, autopilot
-        return self.pack(dialect.MAVLink_heartbeat_message(*kind, base_mode, custom_mode, system_status, 3))
+        return self.pack(dialect.MAVLink_heartbeat_message(*kind, base_mode, mode, status, 3))
 
     def timesync(self, tc1: int, ts1: int) -> bytes:
         """TIMESYNC, a request if tc1 is 0."""

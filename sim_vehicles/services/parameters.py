@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from scenarios.schema import Safety
 from sim_vehicles.services import messages
 from sim_vehicles.services.mavlink import Encoder
 from sim_vehicles.services.messages import ParameterList, ParameterRead, ParameterSet
@@ -117,15 +116,6 @@ def _kind(whole: bool) -> int:
     return messages.INT32 if whole else messages.REAL32
 
 
-def of_vehicle(system_id: int, safety: Safety) -> list[Parameter]:
-    """The parameters of every double integrator, by ArduPilot's names."""
-    return [
-        fixed("SYSID_THISMAV", system_id),
-        timeout("GUID_TIMEOUT", safety.setpoint_timeout_s),
-        timeout("FS_GCS_TIMEOUT", safety.heartbeat_timeout_s),
-    ]
-
-
 def timeout(name: str, value_s: float) -> Parameter:
     """A parameter that says how long a stream may be silent, in s."""
     low, high = TIMEOUT_S
@@ -135,3 +125,39 @@ def timeout(name: str, value_s: float) -> Parameter:
 def fixed(name: str, value: int) -> Parameter:
     """A whole number that cannot be changed in flight."""
     return Parameter(name, value, value, value, whole=True)
+
+
+_ARDUPILOT_VALUES: dict[str, float] = {
+    "ARMING_CHECK": 1,
+    "FRAME_CLASS": 1,
+    "FRAME_TYPE": 1,
+    "BATT_MONITOR": 4,
+    "BATT_CAPACITY": 3300,
+    **{f"COMPASS_DEV_ID{number}": 0 for number in ("", "2", "3")},
+    **{f"COMPASS_USE{number}": 0 for number in ("", "2", "3")},
+    **{f"COMPASS_OFS{number}_{axis}": 0.0 for number in ("", "2", "3") for axis in "XYZ"},
+    **{f"INS_ACCOFFS_{axis}": 0.01 for axis in "XYZ"},
+    **{f"RCMAP_{stick}": channel for channel, stick in enumerate(("ROLL", "PITCH", "THROTTLE", "YAW"), 1)},
+    **{
+        f"RC{channel}_{end}": pulse
+        for channel in (1, 2, 3, 4)
+        for end, pulse in (("MIN", 1000), ("TRIM", 1500), ("MAX", 2000))
+    },
+}
+_PX4_VALUES: dict[str, float] = {
+    "SYS_AUTOSTART": 4001,
+    "SYS_HAS_MAG": 1,
+    "CAL_ACC0_ID": 1,
+    "CAL_GYRO0_ID": 1,
+    "CAL_MAG0_ID": 1,
+    "BAT1_N_CELLS": 3,
+    "BAT1_V_CHARGED": 4.05,
+    "BAT1_V_EMPTY": 3.5,
+    "COM_RC_IN_MODE": 1,
+    **{f"RC_MAP_{stick}": channel for channel, stick in enumerate(("ROLL", "PITCH", "THROTTLE", "YAW"), 1)},
+}
+ARDUPILOT_SETUP, PX4_SETUP = (
+    [Parameter(name, value, whole=isinstance(value, int)) for name, value in values.items()]
+    for values in (_ARDUPILOT_VALUES, _PX4_VALUES)
+)
+"""Without effect, but QGroundControl warns of a vehicle without a frame, calibrated sensors, a radio and a battery."""

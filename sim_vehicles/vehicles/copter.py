@@ -13,7 +13,6 @@ import numpy as np
 
 from scenarios import schema
 from scenarios.schema import NS_PER_S
-from sim_vehicles.links.truth import Record
 from sim_vehicles.services import mavlink, messages
 from sim_vehicles.services.clock import NEVER_NS, BootClock
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
@@ -29,7 +28,7 @@ from sim_vehicles.vehicles.copter_rules import (
 )
 from sim_vehicles.vehicles.dynamics import State, state_from
 from sim_vehicles.vehicles.setpoints import ABSURD
-from sim_vehicles.vehicles.shell import Answer, Radio, Shell
+from sim_vehicles.vehicles.shell import Answer, Radio
 
 ORIGIN_STREAM = 7
 """Last word of the spawn key of the random stream of a vehicle's local origin."""
@@ -44,23 +43,6 @@ READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
 _ACCEPTED: Answer = mavlink.ACCEPTED, ""
 
 
-def multicopter(
-    scenario: schema.Scenario,
-    own: schema.Vehicle,
-    start_ns: int,
-    *,
-    record: Record | None = None,
-    signed: bool = False,
-    experiment: str = "",
-) -> "Shell[Copter]":
-    """A multicopter on the ground."""
-    radio = Radio(scenario, own, start_ns, record)
-    craft = Copter(scenario, own, radio)
-    # MAVLink 1 cannot be signed.
-    version_1_first = craft.rules.version_1_first and not signed
-    return Shell(scenario, radio, craft, version_1_first=version_1_first, experiment=experiment)
-
-
 class Copter:
     """The craft in the shell: its motion and the autopilot's modes."""
 
@@ -68,7 +50,7 @@ class Copter:
         start_ns = radio.start_ns
         self.settings = scenario.autopilot
         self.rules = RULES[own.flavour or scenario.autopilot.flavour]
-        self.version = self.rules.version
+        self.version, self.version_1_first = self.rules.version, self.rules.version_1_first
         self.parameters = parameters(self.rules, own.system_id)
         self.intervals_us: Mapping[int, int] = dict.fromkeys((*REPORTED, self.rules.estimator_message), 0)
         self.reports_from_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
@@ -144,8 +126,7 @@ class Copter:
         self._advance(time_ns)
         return self._motion_ns
 
-    def hear_heartbeat(self, time_ns: int) -> None:
-        """Heartbeats of a station have no effect."""
+    def hear_heartbeat(self, time_ns: int) -> None: ...  # without effect
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
         """Fly a set-point from now on, if in guided mode and off the ground."""
@@ -166,7 +147,6 @@ class Copter:
         return "setpoints"
 
     def parameters_set(self, time_ns: int) -> None:
-        """Read the time-outs from the parameters."""
         before = self._setpoint_timeout_ns, self._ground_disarm_ns
         self._read_timeouts()
         if (self._setpoint_timeout_ns, self._ground_disarm_ns) != before:
@@ -188,10 +168,9 @@ class Copter:
                 return self.change_mode(commanded_mode(command, self.rules), time_ns)
             case mavlink.COMMAND_TAKEOFF:
                 return self._take_off(command, time_ns), ""
-            case mavlink.COMMAND_LAND:
-                return self.change_mode(self.rules.land_mode, time_ns)
-            case mavlink.COMMAND_RETURN:
-                return self.change_mode(self.rules.return_mode, time_ns)
+            case mavlink.COMMAND_LAND | mavlink.COMMAND_RETURN as asked:
+                land = asked == mavlink.COMMAND_LAND
+                return self.change_mode(self.rules.land_mode if land else self.rules.return_mode, time_ns)
             case _:
                 return None
 
@@ -260,10 +239,8 @@ class Copter:
         origin_north_m, origin_east_m, origin_up_m = self.origin_neu_m
         boot_ms &= mavlink.UINT32
         if message_id == mavlink.HEARTBEAT:
-            base_mode = mavlink.BASE_MODE_CUSTOM | (mavlink.BASE_MODE_ARMED if self.armed else 0)
-            status = mavlink.STATUS_STANDBY if self.landed else mavlink.STATUS_ACTIVE
-            status = mavlink.STATUS_CRITICAL if self.failsafe else status
-            return encoder.heartbeat(base_mode, self.mode, status, self.rules.autopilot)
+            kind, flying = self.rules.autopilot, not self.landed
+            return encoder.heartbeat(self.mode, armed=self.armed, flying=flying, critical=self.failsafe, autopilot=kind)
         if message_id == mavlink.LOCAL_POSITION and ready:
             down_m = origin_up_m - motion.altitude_m
             position = motion.north_m - origin_north_m, motion.east_m - origin_east_m, down_m

@@ -58,8 +58,10 @@ def advance(motion: Motion, target: Target, limits: schema.Autopilot, duration_s
     steps = max(1, math.ceil(duration_s / LONGEST_STEP_S))
     h = duration_s / steps
     for _ in range(steps):
-        if target.place_ne_m is not None:
-            target = _towards(motion, target, target.place_ne_m, limits.speed_max_m_s)
+        if target.place_ne_m is not None:  # the velocity that leads there
+            north, east = target.place_ne_m[0] - motion.north_m, target.place_ne_m[1] - motion.east_m
+            gain = min(PLACE_GAIN_1_S, limits.speed_max_m_s / max(math.hypot(north, east), 1e-9))
+            target = target._replace(velocity_north_m_s=gain * north, velocity_east_m_s=gain * east)
         motion = _step(motion, target, limits, h)
         grown = target.growth * h
         target = target._replace(
@@ -118,13 +120,6 @@ def _climbed(altitude: float, climb: float, target: Target, limits: schema.Autop
     wanted = max(-limits.climb_max_m_s, min(limits.climb_max_m_s, wanted))
     left = math.exp(-h / CLIMB_LAG_S)
     return altitude + wanted * h + (climb - wanted) * CLIMB_LAG_S * (1.0 - left), wanted + (climb - wanted) * left
-
-
-def _towards(motion: Motion, target: Target, place_ne_m: tuple[float, float], speed_max_m_s: float) -> Target:
-    """The target, with the velocity that leads to a place."""
-    north, east = place_ne_m[0] - motion.north_m, place_ne_m[1] - motion.east_m
-    gain = min(PLACE_GAIN_1_S, speed_max_m_s / max(math.hypot(north, east), 1e-9))
-    return target._replace(velocity_north_m_s=gain * north, velocity_east_m_s=gain * east)
 
 
 def _turned(yaw_rad: float, target: Target, h: float) -> float:

@@ -7,9 +7,9 @@ offboardCheck.cpp.
 import math
 from dataclasses import dataclass
 
-from sim_vehicles.services import mavlink, setup_parameters
+from sim_vehicles.services import mavlink
 from sim_vehicles.services.mavlink import Command, Setpoint
-from sim_vehicles.services.parameters import Parameter, Parameters, fixed, timeout
+from sim_vehicles.services.parameters import ARDUPILOT_SETUP, PX4_SETUP, Parameter, Parameters, fixed, timeout
 from sim_vehicles.vehicles.copter_dynamics import Target
 from sim_vehicles.vehicles.setpoints import (
     ABSURD,
@@ -125,9 +125,9 @@ def parameters(rules: Rules, system_id: int) -> Parameters:
         timeout(rules.ground_disarm_parameter, GROUND_DISARM_S),
     ]
     if rules is PX4:
-        known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *setup_parameters.PX4]
+        known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *PX4_SETUP]
     else:
-        known += setup_parameters.ARDUPILOT
+        known += ARDUPILOT_SETUP
     return Parameters(known, bytewise=rules.parameters_bytewise)
 
 

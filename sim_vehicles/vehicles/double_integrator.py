@@ -9,10 +9,9 @@ from collections.abc import Mapping
 
 from scenarios import schema
 from scenarios.schema import NS_PER_S
-from sim_vehicles.links.truth import Record
-from sim_vehicles.services import mavlink, messages, setup_parameters
+from sim_vehicles.services import mavlink, messages
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
-from sim_vehicles.services.parameters import Parameters, of_vehicle
+from sim_vehicles.services.parameters import ARDUPILOT_SETUP, Parameters, fixed, timeout
 from sim_vehicles.services.services import whole
 from sim_vehicles.vehicles.dynamics import (
     COAST,
@@ -27,31 +26,18 @@ from sim_vehicles.vehicles.dynamics import (
 from sim_vehicles.vehicles.flight_mode import MODE_NAMES, FlightMode
 from sim_vehicles.vehicles.onboard import STEP, OnboardLoop, formation_parameters
 from sim_vehicles.vehicles.setpoints import ACCELERATION, AXES, VELOCITY, VELOCITY_ACCELERATION, fault, to_local
-from sim_vehicles.vehicles.shell import Answer, Radio, Shell
+from sim_vehicles.vehicles.shell import Answer, Radio
 
 CANNOT_LAND: Answer = mavlink.DENIED, "cannot land or return, LOITER holds the course"
 """Also sent as STATUSTEXT: a person who asks for this may not see the result code."""
 
 
-def launched(
-    scenario: schema.Scenario,
-    own: schema.Vehicle,
-    start_ns: int,
-    *,
-    record: Record | None = None,
-    onboard: OnboardLoop | None = None,
-    experiment: str = "",
-) -> "Shell[DoubleIntegrator]":
-    """A double integrator on its launcher; `onboard` is its own loop, if it has one."""
-    radio = Radio(scenario, own, start_ns, record)
-    return Shell(scenario, radio, DoubleIntegrator(scenario, own, radio, onboard), experiment=experiment)
-
-
 class DoubleIntegrator:
-    """The craft in the shell: its motion, modes and loop on board."""
+    """The craft in the shell: its motion and modes, and its loop on board if it has one."""
 
     version: tuple[int, int, int] = (4, 6, 0)
     """The version of ArduCopter whose messages and modes it has."""
+    version_1_first: bool = False
     intervals_us: Mapping[int, int] = {
         mavlink.LOCAL_POSITION: 250_000,
         mavlink.GLOBAL_POSITION: 1_000_000,
@@ -60,13 +46,16 @@ class DoubleIntegrator:
     """Slow defaults, as on an autopilot's telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes them."""
 
     def __init__(
-        self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio, onboard: OnboardLoop | None
+        self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio, onboard: OnboardLoop | None = None
     ) -> None:
-        self.flight = FlightMode(scenario.safety)
-        formation = [] if onboard is None else formation_parameters()
-        self.parameters = Parameters(
-            [*of_vehicle(own.system_id, scenario.safety), *setup_parameters.ARDUPILOT, *formation]
+        safety = scenario.safety
+        self.flight = FlightMode(safety)
+        timeouts = (
+            timeout("GUID_TIMEOUT", safety.setpoint_timeout_s),
+            timeout("FS_GCS_TIMEOUT", safety.heartbeat_timeout_s),
         )
+        formation = [] if onboard is None else formation_parameters()
+        self.parameters = Parameters([fixed("SYSID_THISMAV", own.system_id), *timeouts, *ARDUPILOT_SETUP, *formation])
         self.reports_from_ns = radio.start_ns
         self._radio = radio
         self._onboard = onboard
@@ -219,8 +208,11 @@ class DoubleIntegrator:
         boot_ms &= mavlink.UINT32
         encoder = self._radio.encoder
         if message_id == mavlink.HEARTBEAT:
-            flight = self.flight
-            return encoder.heartbeat(flight.base_mode, flight.mode, flight.system_status)
+            flight, critical = self.flight, self.flight.failsafe != ""
+            guided = flight.mode == mavlink.MODE_GUIDED
+            return encoder.heartbeat(
+                flight.mode, armed=flight.armed, flying=flight.flying, critical=critical, guided=guided
+            )
         if message_id == mavlink.HOME_POSITION:
             return encoder.pack(messages.home_position())
         self._advance(time_ns)

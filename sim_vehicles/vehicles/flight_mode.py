@@ -11,20 +11,7 @@ LOITER and BRAKE both hold the course: ground stations send either for "hold".
 
 from scenarios.schema import NS_PER_S, Safety
 from sim_vehicles.services.clock import NEVER_NS
-from sim_vehicles.services.mavlink import (
-    ACCEPTED,
-    BASE_MODE_ARMED,
-    BASE_MODE_CUSTOM,
-    BASE_MODE_GUIDED,
-    DENIED,
-    MODE_BRAKE,
-    MODE_GUIDED,
-    MODE_LOITER,
-    MODE_STABILIZE,
-    STATUS_ACTIVE,
-    STATUS_CRITICAL,
-    STATUS_STANDBY,
-)
+from sim_vehicles.services.mavlink import ACCEPTED, DENIED, MODE_BRAKE, MODE_GUIDED, MODE_LOITER, MODE_STABILIZE
 
 MODE_NAMES = {MODE_STABILIZE: "STABILIZE", MODE_GUIDED: "GUIDED", MODE_LOITER: "LOITER", MODE_BRAKE: "BRAKE"}
 
@@ -45,19 +32,6 @@ class FlightMode:
         self._setpoint_ns = 0
         self._heartbeat_ns = 0
 
-    @property
-    def base_mode(self) -> int:
-        """HEARTBEAT.base_mode."""
-        guided = BASE_MODE_GUIDED if self.mode == MODE_GUIDED else 0
-        return BASE_MODE_CUSTOM | guided | (BASE_MODE_ARMED if self.armed else 0)
-
-    @property
-    def system_status(self) -> int:
-        """HEARTBEAT.system_status: STANDBY on the launcher, CRITICAL in failsafe."""
-        if not self.flying:
-            return STATUS_STANDBY
-        return STATUS_CRITICAL if self.failsafe else STATUS_ACTIVE
-
     def set_timeouts(self, setpoint_s: float, heartbeat_s: float, now_ns: int) -> None:
         """Set how long the station may be silent; both timers restart if that changes."""
         timeouts_ns = round(setpoint_s * NS_PER_S), round(heartbeat_s * NS_PER_S)
@@ -67,7 +41,6 @@ class FlightMode:
             self._set_deadline()
 
     def hear_heartbeat(self, now_ns: int) -> None:
-        """Note a heartbeat of the station."""
         self._heartbeat_ns = max(self._heartbeat_ns, now_ns)
         self._set_deadline()
 

@@ -64,7 +64,6 @@ class Radio:
         self.out.append((frame, time_ns))
 
     def say(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
-        """Send a STATUSTEXT."""
         self.send(self.encoder.statustext(severity, text), time_ns)
 
     def tell(self, time_ns: int, text: str) -> None:
@@ -76,7 +75,6 @@ class Radio:
             self.record((ACTED, self.system_id, setpoint.time_boot_ms, time_ns, time_ns, time_ns))
 
     def set_clock(self, clock: BootClock, time_ns: int) -> None:
-        """Continue with another clock."""
         self.clock = clock
         self.schedule.set_clock(clock, time_ns)
 
@@ -87,6 +85,8 @@ class Craft(Protocol):
     parameters: Parameters
     version: tuple[int, int, int]
     """The version that AUTOPILOT_VERSION reports."""
+    version_1_first: bool
+    """Whether it speaks MAVLink 1 until it hears MAVLink 2, as PX4 does."""
     intervals_us: Mapping[int, int]
     """The messages it can report besides heartbeats, each with its default interval, 0 for none."""
     reports_from_ns: int
@@ -111,27 +111,17 @@ Flown = TypeVar("Flown", bound=Craft, covariant=True)  # noqa: PLC0105 - the typ
 
 
 class Shell(Generic[Flown]):
-    """A vehicle as its link sees it.
-
-    With `version_1_first` it speaks MAVLink 1 until it hears MAVLink 2, as PX4 does. `experiment` is the text of its
-    parameter SCENARIO.
-    """
+    """A vehicle as its link sees it. `experiment` is the text of its parameter SCENARIO."""
 
     def __init__(
-        self,
-        scenario: schema.Scenario,
-        radio: Radio,
-        craft: Flown,
-        *,
-        version_1_first: bool = False,
-        experiment: str = "",
+        self, scenario: schema.Scenario, radio: Radio, craft: Flown, *, signed: bool = False, experiment: str = ""
     ) -> None:
         self.system_id = radio.system_id
         self.craft = craft
         self.radio = radio
         self.counters, self.changes = radio.counters, radio.changes
         self.authority = Authority(scenario.safety.heartbeat_timeout_s)
-        self._speaks_version_1 = version_1_first
+        self._speaks_version_1 = craft.version_1_first and not signed  # MAVLink 1 cannot be signed
         self._timesync_ts1 = -1
         from_ns = craft.reports_from_ns
         self._schedule = schedule = radio.schedule

@@ -33,7 +33,6 @@ from scenarios.link_schema import Link, Outage, VehicleLinks
 from scenarios.schema import FixedGains, Limits, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import ACTED, DTYPE, SAMPLED
-from sim_vehicles.services.mavlink import STATUS_CRITICAL
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
@@ -148,7 +147,7 @@ def test_without_set_points_vehicles_keep_their_places_by_their_own_sensors_and_
         ahead, own = states[k - 1], states[k]
         error = (own.north_m - ahead.north_m - offsets[k, 0], own.east_m - ahead.east_m - offsets[k, 1])
         assert np.hypot(*error) < 0.1  # noise of the sensor: 0.05 m, filtered
-        assert vehicle(fleet, k + 1).flight.system_status == STATUS_CRITICAL
+        assert vehicle(fleet, k + 1).flight.failsafe
 
 
 @pytest.mark.parametrize("act", [False, True])

@@ -20,7 +20,9 @@ from sim_vehicles.services import mavlink as vehicles_mavlink
 
 KEY = Key(bytes(range(32)))
 HEARTBEAT_2 = mavlink.encode(mavlink.HEARTBEAT, mavlink.heartbeat(), sequence=7)
-HEARTBEAT_1 = vehicles_mavlink.in_version_1(vehicles_mavlink.Encoder(3).heartbeat(81, 4, 4))
+HEARTBEAT_1 = vehicles_mavlink.in_version_1(
+    vehicles_mavlink.Encoder(3).heartbeat(4, armed=False, flying=True, critical=False)
+)
 """Shorter than most, with a checksum that is right: what follows it is read as well."""
 SIGNED = SignedLink(KEY, link_id=0, crc_extra=mavlink.CRC_EXTRA, epoch_ns=0, stamps=Stamps()).sign(HEARTBEAT_2, 0)
 FRAMES = (HEARTBEAT_1, HEARTBEAT_2, SIGNED)

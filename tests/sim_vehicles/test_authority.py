@@ -13,7 +13,7 @@ from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains
 from sim_vehicles.drive.fleet import Fleet
-from sim_vehicles.vehicles.copter import Copter, multicopter
+from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.support.paths import SCENARIOS
 from tests.support.sim_client import (
@@ -26,6 +26,7 @@ from tests.support.sim_client import (
     parse,
     scenario,
     setpoint,
+    shell_of,
     take_off,
 )
 
@@ -42,8 +43,7 @@ def command_from_another(number: int, *parameters: float) -> bytes:
 
 
 def a_copter() -> Shell[Copter]:
-    flown = scenario()
-    return multicopter(flown, flown.vehicles[0], START)
+    return shell_of(scenario(), Copter)
 
 
 COMMANDS = {

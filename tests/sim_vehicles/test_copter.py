@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 
 from scenarios.part import Flavour
 from scenarios.schema import Autopilot, ClockJump, Scenario
-from sim_vehicles.vehicles.copter import Copter, multicopter
+from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.shell import Shell
-from tests.support.sim_client import MS, SECOND, START, arm, command, mode, parse_all, scenario, setpoint
+from tests.support.sim_client import MS, SECOND, START, arm, command, mode, parse_all, scenario, setpoint, shell_of
 
 VELOCITY_ACCELERATION, VELOCITY, ACCELERATION = 0x0C07, 0x0DC7, 0x0C3F
 PX4_OFFBOARD, PX4_HOLD, PX4_TAKEOFF = 6 << 16, 4 << 16 | 3 << 24, 4 << 16 | 2 << 24
@@ -29,8 +29,7 @@ def of_copters(flavour: Flavour = "ardupilot", **settings: Any) -> Scenario:
 
 
 def copter(flavour: Flavour = "ardupilot", **settings: Any) -> Shell[Copter]:
-    flown = of_copters(flavour, **settings)
-    return multicopter(flown, flown.vehicles[0], START)
+    return shell_of(of_copters(flavour, **settings), Copter)
 
 
 def tell(vehicle: Shell[Copter], data: bytes, at_s: float, kind: str = "COMMAND_ACK") -> list[Any]:
@@ -237,8 +236,8 @@ def test_acceleration_and_speed_limits_hold_in_every_direction() -> None:
 
 def test_each_copter_reports_its_own_local_origin() -> None:
     flown = of_copters()
-    for own in flown.vehicles:
-        vehicle = multicopter(flown, own, START)
+    for k, own in enumerate(flown.vehicles):
+        vehicle = shell_of(flown, Copter, k)
         for number in (32, 49):
             vehicle.step(
                 [(command(511, number, 1_000_000, system=own.system_id), START + 3 * SECOND)], START + 3 * SECOND

@@ -8,8 +8,19 @@ from hypothesis import strategies as st
 
 from scenarios.schema import Clocks
 from sim_vehicles.services.clock import BootClock
-from sim_vehicles.vehicles.double_integrator import launched
-from tests.support.sim_client import MS, SECOND, START, a_vehicle, command, guided, parse_all, scenario, take_off
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
+from tests.support.sim_client import (
+    MS,
+    SECOND,
+    START,
+    a_vehicle,
+    command,
+    guided,
+    parse_all,
+    scenario,
+    shell_of,
+    take_off,
+)
 
 times = st.integers(0, 10**15)
 clocks = st.builds(BootClock, times, times, st.integers(-(10**7), 10**7))
@@ -79,8 +90,7 @@ def test_asking_for_the_same_rate_again_moves_no_sample() -> None:
 
 
 def test_two_vehicles_do_not_share_a_clock() -> None:
-    flown = scenario(2)
-    first, second = (launched(flown, own, START) for own in flown.vehicles)
+    first, second = (shell_of(scenario(2), DoubleIntegrator, k) for k in (0, 1))
     assert first.radio.clock.boot_ns(START) != second.radio.clock.boot_ns(START)
     assert first.radio.clock.drift_ppb != second.radio.clock.drift_ppb
 

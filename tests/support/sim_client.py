@@ -1,18 +1,20 @@
 """A ground station's side of MAVLink for the tests of the vehicles: plain pymavlink, and nothing of theirs."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.link_schema import Link, Links
 from scenarios.schema import Clocks, Limits, NominalVelocity, Safety, Scenario, Vehicle
-from sim_vehicles.vehicles.double_integrator import DoubleIntegrator, launched
-from sim_vehicles.vehicles.shell import Shell
+from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
+from sim_vehicles.vehicles.shell import Craft, Radio, Shell
 
 SECOND = 1_000_000_000
 MS = 1_000_000
 START = 5 * SECOND
 
+Flown = TypeVar("Flown", bound=Craft)
 _MAV = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
 
 
@@ -53,8 +55,13 @@ def scenario(
 
 def a_vehicle(**settings: Any) -> Shell[DoubleIntegrator]:
     """The first vehicle of such a scenario, on the launcher at START."""
-    flown = scenario(**settings)
-    return launched(flown, flown.vehicles[0], START)
+    return shell_of(scenario(**settings), DoubleIntegrator)
+
+
+def shell_of(flown: Scenario, craft: Callable[[Scenario, Vehicle, Radio], Flown], k: int = 0) -> Shell[Flown]:
+    """The vehicle in place `k` of a scenario, with such a craft, at START."""
+    radio = Radio(flown, flown.vehicles[k], START)
+    return Shell(flown, radio, craft(flown, flown.vehicles[k], radio))
 
 
 def pack(message: dialect.MAVLink_message) -> bytes:

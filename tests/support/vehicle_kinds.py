@@ -4,15 +4,15 @@ from collections.abc import Callable
 
 from scenarios.part import Flavour
 from scenarios.schema import Autopilot
-from sim_vehicles.vehicles.copter import Copter, multicopter
+from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.shell import Craft, Shell
-from tests.support.sim_client import START, a_vehicle, scenario
+from tests.support.sim_client import a_vehicle, scenario, shell_of
 
 
 def copter(flavour: Flavour) -> Shell[Copter]:
     """A multicopter on the ground at START."""
     flown = scenario().model_copy(update={"dynamics": "autopilot", "autopilot": Autopilot(flavour=flavour)})
-    return multicopter(flown, flown.vehicles[0], START)
+    return shell_of(flown, Copter)
 
 
 VEHICLES: dict[str, Callable[[], Shell[Craft]]] = {

@@ -14,12 +14,13 @@ import pytest
 
 from gcs.errors import InputError
 from gcs.stress.campaign import (
+    PARQUET_FILE,
     TRIALS_FILE,
     Store,
     dask_workers,
     local_workers,
     run_campaign,
-    write_parquet,
+    write_table,
 )
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
@@ -114,7 +115,8 @@ def test_a_trial_that_raises_is_recorded_and_the_others_fly(tmp_path: Path) -> N
 
 def test_the_table_has_trials_as_rows_axes_as_columns(tmp_path: Path) -> None:
     outcomes = [fly_trial(trial) for trial in trials(2, bad=1)]
-    table = pq.read_table(write_parquet(outcomes, tmp_path)).to_pydict()
+    write_table(outcomes, tmp_path)
+    table = pq.read_table(tmp_path / PARQUET_FILE).to_pydict()
     assert table["id"] == [outcome.id for outcome in outcomes]
     assert table["at_delay"] == [0.0, 0.01]
     assert table["verdict"] == [outcomes[0].verdict, None]

@@ -11,8 +11,7 @@ from scipy.linalg import expm
 from gains.core.arrays import FloatArray
 from gains.sampled.coupled_block import CoupledBlock
 from gcs.plan.flight_plan import FlightPlan
-from gcs.runs.effective_delay import commands_of, effective_delay_s
-from gcs.runs.grade import ACTED, SAMPLED, instants
+from gcs.runs.grade import ACTED, SAMPLED, commands_of, effective_delay_s, instants
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import FreeResponse, fly_calm, in_place, response_paired
 from gcs.stress.growth import CHANNELS

@@ -14,7 +14,7 @@ from gains.delay.rightmost import rightmost_root
 from gains.formation.inclusion import expand
 from gains.formation.pattern import bidirectional
 from gcs.cli.main import app
-from gcs.studies import thesis_errata as errata
+from gcs.studies import thesis as errata
 from gcs.studies.thesis import late_neighbours
 from gcs.studies.thesis_flights import CHAIN, nonlinear_response, printed_gains
 from tests.support.paths import ROOT
