@@ -1,10 +1,11 @@
 """`gcs fly` and `gcs key`: what a flight is asked for, and what its exit code says."""
 
 import contextlib
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -22,6 +23,7 @@ from gcs.cli.options import (
     load_scenario,
     mirroring,
     opened_guard,
+    out_file,
     refuse,
     refuse_or_warn,
     run_folder,
@@ -30,6 +32,10 @@ from gcs.cli.options import (
 )
 from gcs.errors import InputError
 from gcs.output import outlive_readers
+
+if TYPE_CHECKING:
+    from gcs.runs.summary_record import Summary
+    from gcs.views.junit import Check
 
 LISTEN = "127.0.0.1:14550"
 
@@ -59,12 +65,19 @@ def fly(
     speed: Annotated[
         float | None, typer.Option(metavar="N", help="with --virtual: at most N times as fast as real time")
     ] = None,
+    assert_headroom: Annotated[
+        float | None, typer.Option(metavar="FRACTION", help="exit with code 1 if the headroom was ever less")
+    ] = None,
+    assert_settled: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="exit with code 1 if errors had not settled by then")
+    ] = None,
+    junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
     out: OutFolder = None,
     as_json: AsJson = False,
 ) -> None:
     """Design the control, start the vehicles, fly and record.
 
-    Exit code 1 if the flight is not stable, or its log is incomplete.
+    Exit code 1 if the flight is not stable, its log is incomplete, or an assertion does not hold.
     """
     from gcs.drive import fly as flying
     from gcs.drive import preflight
@@ -73,6 +86,8 @@ def fly(
     from gcs.views.report import print_design, print_summary
 
     outlive_readers()
+    gate = Gate(assert_headroom, assert_settled, junit)
+    gate.refuse_unusable()
     sockets = {"--connect": connect, "--listen": listen, "--mirror": mirror, "--key": key}
     _refuse_contradictions(sockets, speed, virtual=virtual, mirror_commands=mirror_commands)
     scenario = load_scenario(scenario_file, loop)
@@ -116,9 +131,56 @@ def fly(
         if there is not None and taken_over:
             there.shut_down()
     answer(summary, partial(print_summary, folder=folder), as_json=as_json)
+    passed = gate.passed(summary)
     if summary.reason.startswith("interrupted"):
         raise typer.Exit(INTERRUPTED)
-    raise typer.Exit(0 if summary.verdict == "stable" and not summary.not_logged else FAILED)
+    raise typer.Exit(0 if passed else FAILED)
+
+
+class Gate(NamedTuple):
+    """What a flight has to show for exit code 0, besides being stable and logged."""
+
+    least_headroom: float | None
+    settled_s: float | None
+    junit: Path | None
+
+    def refuse_unusable(self) -> None:
+        if self.least_headroom is not None:
+            within("--assert-headroom", self.least_headroom, -1e3, 1.0)
+        if self.settled_s is not None:
+            within("--assert-settled", self.settled_s, 0.0, 1e6, "seconds")
+        if self.junit is not None:
+            out_file("--junit", self.junit)
+
+    def passed(self, summary: "Summary") -> bool:
+        """Check the flight; what fails is one line each."""
+        from gcs.views.junit import write_junit
+
+        checks = list(self._checks(summary))
+        if self.junit is not None:
+            write_junit(self.junit, f"gcs fly {summary.scenario}", checks, time_s=summary.duration_s)
+        failed = [check for check in checks if check.failure]
+        for check in failed:
+            print(f"failed: {check.name}: {check.failure}", file=sys.stderr)
+        return not failed
+
+    def _checks(self, summary: "Summary") -> "Iterator[Check]":
+        from gcs.views.console import number_text
+        from gcs.views.junit import Check
+
+        least, after_s = summary.headroom_min, summary.settling_time_s
+        yield Check(
+            "the flight is stable", "" if summary.verdict == "stable" else f"{summary.verdict}: {summary.reason}"
+        )
+        yield Check("the log is whole", "; ".join(summary.not_logged))
+        if self.least_headroom is not None:
+            met = least is not None and least >= self.least_headroom
+            name = f"the headroom is at least {self.least_headroom:.1%}"
+            yield Check(name, "" if met else f"read {number_text(least, '.1%')}")
+        if self.settled_s is not None:
+            met = after_s is not None and after_s <= self.settled_s
+            name = f"the errors settle within {self.settled_s:g} s"
+            yield Check(name, "" if met else f"read {number_text(after_s, '.2f')} s")
 
 
 def _refuse_contradictions(

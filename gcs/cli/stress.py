@@ -100,11 +100,12 @@ def stress(
     outlive_readers()
     if junit is not None:
         out_file("--junit", junit)
-    from gcs.cli.stress_output import print_reflown, print_result, write_junit
+    from gcs.cli.stress_output import checks_of, print_reflown, print_result
     from gcs.drive.preflight import endless_link
     from gcs.stress.axes import parse_axis
     from gcs.stress.campaign import dask_workers, local_workers
     from gcs.stress.refly import refly
+    from gcs.views.junit import write_junit
 
     study, design = _study(scenario_file, loop, real_time=real_time)
     if trial:
@@ -128,7 +129,7 @@ def stress(
         shown=not as_json,
     )
     if junit is not None:
-        write_junit(result, junit)
+        write_junit(junit, f"gcs stress {result.scenario}", checks_of(result), time_s=result.flight_time_s)
     answer(result, partial(print_result, folder=folder), as_json=as_json)
     raise typer.Exit(0 if result.passed else FAILED)
 

@@ -1,9 +1,8 @@
-"""What `gcs stress` prints, and the JUnit XML it writes for CI."""
+"""What `gcs stress` prints, and what it checks for CI."""
 
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from xml.etree import ElementTree
 
 from rich.console import Console
 from rich.text import Text
@@ -14,6 +13,7 @@ from gcs.stress.report import MOST_ROWS, REPORT_FILE, RESULT_FILE, CampaignResul
 from gcs.stress.trial import Outcome
 from gcs.views.console import UNKNOWN, ms_text, plain_console, table_of
 from gcs.views.console import number_text as _number
+from gcs.views.junit import Check
 
 _ms = partial(ms_text, form=".2f")
 _FILE_WIDTH = 120
@@ -111,28 +111,11 @@ def print_reflown(reflown: Reflown) -> None:
         console.print(outcome.error)
 
 
-def write_junit(result: CampaignResult, file: Path) -> None:
-    """Write one test case that onset and margin agree, and one for every trial that could not be flown."""
-    failed, name = result.trials_failed, f"gcs stress {result.scenario}"
-    skipped = not result.failure and result.assert_onset is None
-    suite = ElementTree.Element(
-        "testsuite",
-        name=name,
-        tests=str(1 + len(failed)),
-        failures=str(int(bool(result.failure))),
-        errors=str(len(failed)),
-        skipped=str(int(skipped)),
-        time=str(result.flight_time_s),
-    )
-    case = ElementTree.SubElement(suite, "testcase", classname=name, name="the onset is where the margin says")
-    if result.failure:
-        ElementTree.SubElement(case, "failure", message=result.failure)
-    elif skipped:
-        ElementTree.SubElement(case, "skipped", message="--assert-onset was not given")
-    for outcome in failed:
-        case = ElementTree.SubElement(suite, "testcase", classname=name, name=f"trial {outcome.id}")
-        ElementTree.SubElement(case, "error", message=_fault(outcome)).text = outcome.error
-    ElementTree.ElementTree(suite).write(file, encoding="utf-8", xml_declaration=True)
+def checks_of(result: CampaignResult) -> list[Check]:
+    """One check that onset and margin agree, and one for every trial that could not be flown."""
+    skipped = "" if result.failure or result.assert_onset is not None else "--assert-onset was not given"
+    agrees = Check("the onset is where the margin says", failure=result.failure or "", skipped=skipped)
+    return [agrees, *(Check(f"trial {outcome.id}", error=outcome.error or "") for outcome in result.trials_failed)]
 
 
 def _fault(outcome: Outcome) -> str:

@@ -13,7 +13,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it comes
 from typer.testing import CliRunner
 
 from gcs.cli.stress import stress
-from gcs.cli.stress_output import write_junit
+from gcs.cli.stress_output import checks_of
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.record import SUMMARY_FILE
@@ -21,6 +21,7 @@ from gcs.stress.campaign import TRIALS_FILE, Store, local_workers, run_campaign
 from gcs.stress.report import CampaignResult
 from gcs.stress.study import Onset, Study, find_onset
 from gcs.stress.trial import Outcome
+from gcs.views.junit import write_junit
 from scenarios.files import dump
 from tests.support.paths import DATA
 from tests.support.stress_pair import SCENARIO, pair_plan
@@ -231,7 +232,7 @@ def test_failed_trials_are_errors_in_junit(tmp_path: Path) -> None:
     result = CampaignResult.model_construct(
         scenario="pair", flight_time_s=1.0, failure="", assert_onset=None, trials_failed=(failed,)
     )
-    write_junit(result, tmp_path / "junit.xml")
+    write_junit(tmp_path / "junit.xml", "gcs stress pair", checks_of(result), time_s=1.0)
     suite = ElementTree.parse(tmp_path / "junit.xml").getroot()
     assert junit_counts(tmp_path / "junit.xml") == {"tests": 2, "failures": 0, "errors": 1, "skipped": 1}
     error = suite.findall("testcase")[1].find("error")

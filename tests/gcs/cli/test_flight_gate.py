@@ -1,0 +1,68 @@
+"""A flight as a gate in CI: assertions, exit codes and JUnit XML."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from gcs.cli.main import main
+from scenarios.files import dump, load
+from tests.support.paths import SCENARIOS
+
+pytestmark = pytest.mark.xdist_group("processes")  # the observer
+
+
+def fly(folder: Path, monkeypatch: pytest.MonkeyPatch, *options: str | Path) -> int | str | None:
+    file = folder / "chain3.toml"
+    file.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 4.0})))
+    arguments = [file, "--virtual", "--json", "--out", folder / "run", *options]
+    monkeypatch.setattr("sys.argv", ["gcs", "fly", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code
+
+
+def test_assertions_that_hold_pass(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    junit = tmp_path / "f.xml"
+    options = ["--assert-headroom", "0.8", "--assert-settled", "2", "--junit", junit]
+    assert fly(tmp_path, monkeypatch, *options) == 0
+    suite = ElementTree.parse(junit).getroot()
+    assert [suite.get(count) for count in ("tests", "failures", "errors", "skipped")] == ["4", "0", "0", "0"]
+    assert capfd.readouterr().err == ""
+
+
+def test_each_assertion_that_fails_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    junit = tmp_path / "f.xml"
+    options = ["--assert-headroom", "0.9", "--assert-settled", "0.1", "--junit", junit, "--link-delay", "0.1"]
+    assert fly(tmp_path, monkeypatch, *options) == 1
+    suite = ElementTree.parse(junit).getroot()
+    failed = [case.get("name") for case in suite if case.find("failure") is not None]
+    assert failed == ["the headroom is at least 90.0%", "the errors settle within 0.1 s"]
+    assert [line.split(":")[1].strip() for line in capfd.readouterr().err.splitlines()] == failed
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "wanted"),
+    [
+        ("--assert-headroom", "1.5", "--assert-headroom: read 1.5, wanted a number from -1000 to 1"),
+        ("--assert-settled", "-1", "--assert-settled: read -1, wanted seconds from 0"),
+        ("--junit", "/", "--junit: /: Is a directory"),
+    ],
+)
+def test_what_no_flight_can_show_is_refused_before_it(
+    option: str,
+    value: str,
+    wanted: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert fly(tmp_path, monkeypatch, option, value) == 2
+    err = capfd.readouterr().err
+    assert wanted in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "run").exists()
