@@ -158,7 +158,7 @@ class Gate(NamedTuple):
 
         checks = list(self._checks(summary))
         if self.junit is not None:
-            write_junit(self.junit, f"gcs fly {summary.scenario}", checks, time_s=summary.duration_s)
+            write_junit(self.junit, f"gcs fly {summary.scenario}", checks, time_s=summary.duration_s or 0.0)
         failed = [check for check in checks if check.failure]
         for check in failed:
             print(f"failed: {check.name}: {check.failure}", file=sys.stderr)

@@ -59,6 +59,8 @@ def grade(folder: Path) -> Grade:
         raise InputError(f"{folder}: read no {TRUTH_FILE}, wanted {wanted}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{error}, wanted the truth log of a run's vehicles") from None
+    if not truth.size:
+        raise InputError(f"{folder / TRUTH_FILE}: read no record, wanted the truth log of a run's vehicles")
     ticks = read_ticks(folder)
     flown = ticks[ticks["time_s"] >= 0.0]
     system_ids = np.unique(ticks["system_id"]).tolist()
