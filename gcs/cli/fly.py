@@ -20,6 +20,7 @@ from gcs.cli.options import (
     address,
     answer,
     listening,
+    live_viewer,
     load_scenario,
     mirroring,
     opened_guard,
@@ -64,6 +65,9 @@ def fly(
     virtual: Annotated[bool, typer.Option("--virtual", help="fly in virtual time, faster than real time")] = False,
     speed: Annotated[
         float | None, typer.Option(metavar="N", help="with --virtual: at most N times as fast as real time")
+    ] = None,
+    live: Annotated[
+        str | None, typer.Option(metavar="new|HOST:PORT", help="show the flight in a new Rerun viewer, or in this one")
     ] = None,
     assert_headroom: Annotated[
         float | None, typer.Option(metavar="FRACTION", help="exit with code 1 if the headroom was ever less")
@@ -113,9 +117,12 @@ def fly(
         taken_over = there is not None and bool(there.taken_over())
         if not as_json:
             print_design(design)
+        viewer = None if live is None else live_viewer(live)
         folder = run_folder(out, scenario.name)
         if link is None:
-            summary = flying.fly_in_virtual_time(plan, design, folder, show_table=not as_json, speed=speed)
+            summary = flying.fly_in_virtual_time(
+                plan, design, folder, show_table=not as_json, speed=speed, viewer=viewer
+            )
         else:
             summary = flying.fly(
                 plan,
@@ -127,6 +134,7 @@ def fly(
                 outlive_station=address(*at)[1] != 0,  # nobody listens again at a port that the system chose
                 key_file=key,
                 mirror=to,
+                viewer=viewer,
             )
         if there is not None and taken_over:
             there.shut_down()

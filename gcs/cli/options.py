@@ -58,6 +58,13 @@ def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> 
         show(result)
 
 
+def live_viewer(text: str) -> str:
+    """The URL of the viewer that --live names, or of a new one."""
+    from gcs.views.viewer import new_viewer, viewer_url
+
+    return new_viewer() if text == "new" else viewer_url(*address("--live", text))
+
+
 def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":
     """The scenario in a file, or the shipped one of that name; with `loop`, its loop is closed there instead.
 

@@ -40,16 +40,17 @@ def view(
     picture: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="write a picture instead of opening a window")
     ] = None,
+    web: Annotated[bool, typer.Option("--web", help="serve it to a browser of this machine, until Ctrl-C")] = False,
     at: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", help="scenario time of the picture; default 10, or the end if sooner"),
     ] = None,
 ) -> None:
-    """Open a recording in Rerun, or write a picture of it, which needs no screen.
+    """Open a recording in Rerun or a browser, or write a picture of it, which needs no screen.
 
     Exit code 1 if the viewer reports a fault in the picture.
     """
-    from gcs.views.viewer import find_recording, picture_time_s, screenshot
+    from gcs.views.viewer import find_recording, picture_time_s, screenshot, serve
     from gcs.views.viewer import view as open_viewer
 
     if at is not None:
@@ -59,6 +60,10 @@ def view(
         if picture.suffix.lower() != ".png":
             raise InputError(f"--picture: read {picture}, wanted a name that ends in .png, as what is written is PNG")
     recording = find_recording(run)
+    if web:
+        if picture is not None:
+            raise InputError("read --web and --picture, wanted one of them")
+        raise typer.Exit(serve(recording))
     if picture is None:
         raise typer.Exit(open_viewer(recording))
     time_s = picture_time_s(recording, at)

@@ -50,17 +50,18 @@ def fly(
     outlive_station: bool = False,
     key_file: Path | None = None,
     mirror: Mirror | None = None,
+    viewer: str | None = None,
 ) -> Summary:
     """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder.
 
     `show_table`: with the live table, or its plain lines without a terminal. `fleet` says who provides the vehicles,
     empty if this flight starts simulated ones. Those sign with `key_file`, and with `outlive_station` they wait to be
-    taken over if this process is killed.
+    taken over if this process is killed. `viewer` is the URL of a Rerun viewer that is shown the flight.
     """
     with stop_signals() as asked_to_stop:
         write_experiment(folder, plan.scenario, design)
         # Contexts end in reverse: first the vehicles, then the observer finishes the recording.
-        with _observer(folder, show_table=show_table) as observer, contextlib.ExitStack() as started:
+        with _observer(folder, viewer, show_table=show_table) as observer, contextlib.ExitStack() as started:
             vehicles: VehicleProcess | None = None
             if not fleet:
                 vehicles = VehicleProcess(
@@ -97,15 +98,22 @@ def fly(
 
 
 def fly_in_virtual_time(
-    plan: FlightPlan, design: Design, folder: Path, *, show_table: bool, speed: float | None = None
+    plan: FlightPlan,
+    design: Design,
+    folder: Path,
+    *,
+    show_table: bool,
+    speed: float | None = None,
+    viewer: str | None = None,
 ) -> Summary:
     """Fly on one virtual clock, with the same files as in real time; returns the summary.
 
-    `speed` is the most virtual seconds per second of real time, None for as many as can be computed.
+    `speed` is the most virtual seconds per second of real time, None for as many as can be computed. `viewer` is
+    as of `fly`.
     """
     with stop_signals() as asked_to_stop:
         write_experiment(folder, plan.scenario, design)
-        with _observer(folder, show_table=show_table) as observer:
+        with _observer(folder, viewer, show_table=show_table) as observer:
             if speed is not None:  # otherwise the observer catches up with the flight
                 _wait_until_ready(observer, folder, asked_to_stop)
             station = Station(plan, start_ns=START_NS)
@@ -164,11 +172,13 @@ def new_folder(scenario_name: str) -> Path:
 
 
 @contextlib.contextmanager
-def _observer(folder: Path, *, show_table: bool) -> Generator["subprocess.Popen[bytes]"]:
+def _observer(folder: Path, viewer: str | None, *, show_table: bool) -> Generator["subprocess.Popen[bytes]"]:
     """The process that shows and records the flight; it has ended when the context is left."""
     command = [sys.executable, "-m", "gcs.views.observer", str(folder), "--parent", str(os.getpid())]
+    command += [] if show_table else ["--no-table"]
+    command += [] if viewer is None else ["--viewer", viewer]
     with held_back():  # once started, it ignores Ctrl-C by itself
-        process = subprocess.Popen(command + ([] if show_table else ["--no-table"]), stdin=subprocess.DEVNULL)
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     try:
         yield process
     except BaseException:

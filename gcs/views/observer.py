@@ -2,7 +2,7 @@
 
 It draws the live table and writes the Rerun recording, so that the control process does neither and never waits.
 
-    python -m gcs.views.observer FOLDER --parent PID [--no-table]
+    python -m gcs.views.observer FOLDER --parent PID [--no-table] [--viewer URL]
 
 The file FOLDER/.observer-ready exists from the end of all slow imports until the observer ends. The observer ends
 after the run's "end" event, on SIGTERM, or when its parent has died and nothing new is written; in each case the
@@ -52,6 +52,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("folder", type=Path, help="the run's folder")
     parser.add_argument("--parent", type=int, required=True, metavar="PID", help="process id of the ground station")
     parser.add_argument("--no-table", action="store_true", help="write the recording and print nothing")
+    parser.add_argument("--viewer", metavar="URL", help="send the recording to this Rerun viewer, too")
     arguments = parser.parse_args(argv)
     parent = Parent(arguments.parent)
 
@@ -71,7 +72,9 @@ def main(argv: list[str] | None = None) -> int:
         ready.touch()
         inputs = _inputs(arguments.folder, parent)
         if inputs is not None:
-            observe(arguments.folder, *inputs, parent=parent, show_table=not arguments.no_table)
+            observe(
+                arguments.folder, *inputs, parent=parent, show_table=not arguments.no_table, viewer=arguments.viewer
+            )
         if inputs is not None and parent.gone():
             finish(arguments.folder)  # the station was killed: its run is summed up here
     except OSError as error:  # a full disk; the flight goes on
@@ -82,14 +85,16 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def observe(folder: Path, scenario: Scenario, design: Design, *, parent: Parent, show_table: bool) -> None:
+def observe(
+    folder: Path, scenario: Scenario, design: Design, *, parent: Parent, show_table: bool, viewer: str | None = None
+) -> None:
     """Follow the run in `folder` until it ends or is left alone."""
     from gcs.views.recording import Recording  # Rerun is slow to import
 
     system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
     tail = RunTail(folder, len(system_ids))
     state = FlightState(scenario, design)
-    with Recording(folder, scenario, design) as recording, live_display(shown=show_table) as live:
+    with Recording(folder, scenario, design, viewer) as recording, live_display(shown=show_table) as live:
         display = Display(state, live, shown=show_table)
         news = table_due = send_due = time.monotonic()
         ended = False

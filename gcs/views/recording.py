@@ -88,10 +88,11 @@ class Level(NamedTuple):
 class Recording:
     """Writes flight.rrd of one run folder while entered: `add` as often as wanted, `send` about once a second.
 
-    Until the end the file has another name, so a flight.rrd is always whole.
+    Until the end the file has another name, so a flight.rrd is always whole. A viewer, given by its URL, is sent the
+    same; if it is closed, the file goes on.
     """
 
-    def __init__(self, folder: Path, scenario: Scenario, design: Design) -> None:
+    def __init__(self, folder: Path, scenario: Scenario, design: Design, viewer: str | None = None) -> None:
         count = len(scenario.vehicles)
         self._folder = folder
         self._scenario = scenario
@@ -108,7 +109,8 @@ class Recording:
         self._trail_times = PictureTimes(TRAIL_STEP_S)
         self._trail_ends_m: dict[str, Floats] = {}
         self._stream = rr.RecordingStream("formation-gcs")
-        self._stream.save(folder / UNFINISHED_FILE, default_blueprint=_blueprint(scenario, design))
+        sinks = [rr.FileSink(folder / UNFINISHED_FILE), *([] if viewer is None else [rr.GrpcSink(viewer)])]
+        self._stream.set_sinks(*sinks, default_blueprint=_blueprint(scenario, design))
         self._stream.send_recording_name(scenario.name)
         self._log_scene_styles()
         self._log_plot_styles()
@@ -144,7 +146,8 @@ class Recording:
         try:
             self._stream.flush()
         except RuntimeError as error:
-            raise OSError(errno.EIO, f"the recording is not whole ({error})") from None
+            if "gRPC" not in str(error):  # the viewer was closed
+                raise OSError(errno.EIO, f"the recording is not whole ({error})") from None
         self._stream.disconnect()
         os.replace(self._folder / UNFINISHED_FILE, self._folder / RECORDING_FILE)
 

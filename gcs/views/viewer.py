@@ -1,22 +1,24 @@
-"""Show a recording: the Rerun viewer on the screen, or a picture made without one."""
+"""Show a recording, or a flight while it flies: the Rerun viewer, a browser, or a picture made without a screen."""
 
 import importlib.util
 import os
 import re
+import socket
 import subprocess
 import sys
 import tempfile
 import time  # noqa: TID251 (waits for another program)
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from math import floor
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from gcs.errors import InputError
 from gcs.interrupts import raised
 from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 
+T = TypeVar("T")
 START_S = 20.0
 SETTLE_S = 20.0
 DEFAULT_PICTURE_S = 10.0
@@ -28,10 +30,64 @@ _WANTED = "wanted a recording of a run (.rrd)"
 def view(folder_or_rrd: Path) -> int:
     """Open the Rerun viewer on a recording; returns when it is closed, with its exit code."""
     recording = find_recording(folder_or_rrd)
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; a picture can be made without")
+    _refuse_without_screen("--picture and --web need none")
     print(f"viewer   {recording}: until its window is closed", flush=True)
     return subprocess.run([_program(), str(recording)], check=False).returncode
+
+
+def serve(folder_or_rrd: Path) -> int:
+    """Serve a recording to the browsers of this machine until Ctrl-C; returns the server's exit code."""
+    recording = find_recording(folder_or_rrd)
+    page, data = _free_port(), _free_port()
+    command = [_program(), str(recording), "--serve-web", "--bind", "127.0.0.1"]
+    with raised(), tempfile.TemporaryFile() as log:
+        process = _started([*command, "--port", str(data), "--web-viewer-port", str(page)], log)
+        try:
+            _wait_for(lambda: _listens("127.0.0.1", page) and _listens("127.0.0.1", data), process, log)
+            at = f"http://127.0.0.1:{page}?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A{data}%2Fproxy"
+            print(f"web      {at}\n         until Ctrl-C", flush=True)
+            return process.wait()
+        except KeyboardInterrupt:
+            return 0
+        finally:
+            process.terminate()
+            process.wait()
+
+
+def new_viewer() -> str:
+    """Open a viewer that waits for a flight; returns its URL. It stays open when the flight has ended."""
+    _refuse_without_screen("wanted --live HOST:PORT of a viewer elsewhere")
+    port = _free_port()
+    with tempfile.TemporaryFile() as log:
+        process = _started([_program(), "--port", str(port)], log)
+        _wait_for(lambda: _listens("127.0.0.1", port), process, log)
+    return viewer_url("127.0.0.1", port)
+
+
+def viewer_url(host: str, port: int) -> str:
+    """The URL of the viewer that listens at an address; raises InputError if none does."""
+    if not _listens(host, port):
+        raise InputError(f"--live: nothing listens at {host}:{port}, wanted an open Rerun viewer (rerun --port {port})")
+    return f"rerun+http://{host}:{port}/proxy"
+
+
+def _refuse_without_screen(way_on: str) -> None:
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise InputError(f"no screen here: neither DISPLAY nor WAYLAND_DISPLAY is set; {way_on}")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _listens(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), timeout=2.0).close()
+    except OSError:
+        return False
+    return True
 
 
 def picture_time_s(recording: Path, wanted_s: float | None) -> float:
@@ -108,8 +164,7 @@ def _headless(width: int, height: int) -> Generator[Any]:
     from gcs.views.recording import viewer_client
 
     with raised(), tempfile.TemporaryFile() as log:
-        environment = os.environ | {"RERUN_APP_ONLY": "true"}  # as the package sets it when it starts a viewer
-        process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+        process = _started(command, log)
         try:
             yield viewer_client(_address(process, log))
         finally:
@@ -126,18 +181,35 @@ def _settled_picture(viewer: Any) -> bytes:
     return pictures[-1]
 
 
+def _started(command: list[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+    environment = os.environ | {"RERUN_APP_ONLY": "true"}  # as the package sets it when it starts a viewer
+    return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment, start_new_session=True)
+
+
+def _wait_for(ready: Callable[[], T], process: subprocess.Popen[bytes], log: IO[bytes]) -> T:
+    """What `ready` returns once it is true; raises InputError with the viewer's last line if it does not start."""
+    give_up = time.monotonic() + START_S
+    while not (found := ready()):
+        if process.poll() is not None or time.monotonic() > give_up:
+            last = (_text(log).strip().splitlines() or ["it said nothing"])[-1]
+            raise InputError(f"the Rerun viewer does not start: {last}")
+        time.sleep(0.02)
+    return found
+
+
+def _text(log: IO[bytes]) -> str:
+    return os.pread(log.fileno(), 1 << 20, 0).decode(errors="replace")
+
+
 def _address(process: subprocess.Popen[bytes], log: IO[bytes]) -> str:
     """The address of a starting viewer, once its log says that it listens there and that it draws."""
-    give_up = time.monotonic() + START_S
-    while True:
-        text = os.pread(log.fileno(), 1 << 20, 0).decode(errors="replace")
+
+    def said() -> str:
+        text = _text(log)
         address = re.search(r"rerun\+http://[0-9.:]+/proxy", text)
-        if address and "Headless viewer running" in text:
-            return address.group()
-        if process.poll() is not None or time.monotonic() > give_up:
-            last = (text.strip().splitlines() or ["it said nothing"])[-1]
-            raise InputError(f"the Rerun viewer does not start without a screen: {last}")
-        time.sleep(0.02)
+        return address.group() if address and "Headless viewer running" in text else ""
+
+    return _wait_for(said, process, log)
 
 
 def _program() -> str:
