@@ -87,7 +87,7 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
 
 def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
     """The formations flown, empty where no α is defined, and the loops of followers in a leader-follower tree."""
-    if design.vehicles < 2:
+    if design.vehicles < 2 or design.prediction is not None:  # these figures are those of the newest states fed back
         return [], []
     entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
     if design.inclusion_gains is not None:

@@ -109,6 +109,8 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     load["two way"] = files.load(ROOT / "scenarios" / "chain3_bidirectional.toml")
     load["onboard"] = files.with_loop(load["chain3"], "onboard", Path("chain3.toml"))
     load["copters5"] = load["copters5"].model_copy(update={"response": Response(lag_s=0.15)})
+    predicted = load["chain3"].control.model_copy(update={"prediction": 0.6})
+    load["predicted"] = load["chain3"].model_copy(update={"control": predicted})
     designs = (with_trade_off(flight_plan(scenario)[0]) for scenario in load.values())
     found = [found_fields(design.to_dict(), known) for design in designs]
     assert set[str]().union(*found) == known.keys()
