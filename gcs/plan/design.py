@@ -163,6 +163,7 @@ class Design(Published):
     K1_1_s: Matrix | None = None
     K2_1_s: Matrix | None = None
     K3_1_s2: Matrix | None = None
+    feed_forward: float = 0.0
     K: Matrix | None = None
     links: tuple[tuple[int, int], ...] = ()
     alpha: float | None = None

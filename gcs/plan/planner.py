@@ -16,6 +16,7 @@ from gains.design.required import requirement_with
 from gains.design.time_scale import time_scaled
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, leader_follower, with_links, without_links
+from gains.performance.predicted import fed_forward
 from gains.performance.response import Response, continuous_margin, sampled_margin
 from gains.performance.robust import robustness
 from gains.performance.string_stability import string_peak
@@ -64,13 +65,22 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     plan = FlightPlan(
         scenario=scenario,
         formation=formation,
-        gain=model.overlapping_gain(found.K1, found.K2, found.K3),
+        gain=_flown(scenario, model, model.overlapping_gain(found.K1, found.K2, found.K3)),
         delay_margin_s=found.delay_margin_s,
-        slower=tuple((K, inf if own.delay_margin_s is None else own.delay_margin_s) for K, own in slower),
+        slower=tuple(
+            (_flown(scenario, model, K), inf if own.delay_margin_s is None else own.delay_margin_s) for K, own in slower
+        ),
     )
     entries = (_entry(1.0, found), *(own for _, own in slower))
-    whole = Design.model_validate(found.to_dict() | {"schedule": entries})
+    more = {"feed_forward": scenario.control.feed_forward} if scenario.control.feed_forward else {}
+    whole = Design.model_validate(found.to_dict() | {"schedule": entries} | more)
     return _flown_loop(*_with_responses(whole, plan, responses))
+
+
+def _flown(scenario: Scenario, model: FormationModel, K: FloatArray) -> FloatArray:
+    """The gain with the share of the command in front that the scenario adds; margins stay the same."""
+    share = scenario.control.feed_forward
+    return fed_forward(model, K, share) if share else K
 
 
 def with_trade_off(design: Design) -> Design:

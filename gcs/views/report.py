@@ -20,7 +20,8 @@ def print_design(design: Design, console: Console | None = None) -> None:
     if design.inclusion_gains is not None and design.behaviour is not None:
         own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
         console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
-        law = "u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike"
+        fed = f" + {design.feed_forward:g} u_(i-1)" if design.feed_forward else ""
+        law = f"u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p{fed}, the leader u_1 = K1 e_1^v, north and east alike"
         console.print(f"         {law}")
         _print_margins(design, console)
         console.print(_response(design.response), end="")

@@ -11,9 +11,10 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.stress.axes import at_coordinates
 from gcs.stress.measure import fly_trial
-from gcs.stress.study import Study, curve_error, find_onset
+from gcs.stress.study import Study
 from scenarios.files import load
-from scenarios.schema import Control, FixedGains, Scenario
+from scenarios.link_schema import DelayPoint, Jitter, Link, Links
+from scenarios.schema import Control, FixedGains, Limits, NominalVelocity, Scenario
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
@@ -92,22 +93,30 @@ def test_the_measured_delay_is_followed() -> None:
     assert errors_m(ticks, from_s=10.0) < 1e-3 * 172.4
 
 
-def test_both_ends_of_the_window_are_where_growth_passes_zero() -> None:
-    plan = flight_plan(chain3(0.6).with_calm_monitor())[1]
-    study = Study(plan)
-    least_s, most_s = study.window_s
-    assert (0.6 - least_s, most_s - 0.6) == pytest.approx((0.149, 0.156), abs=1.5e-3)
-    for end_s, shorter in ((least_s, True), (most_s, False)):
-        onset = find_onset(
-            study, lambda trials: [fly_trial(trial) for trial in trials], tolerance=0.01, shorter=shorter
-        )
-        assert onset.predicted_s == pytest.approx(end_s, rel=1e-9)
-        assert abs(onset.difference) < 5e-4  # as without prediction
-        assert {flight.verdict for flight in onset.own} == {"stable", "unstable"}
-        assert known(curve_error(onset.flights)) < 5e-3
+def test_a_delay_that_drifts_to_ten_times_the_margin_is_followed_through_jitter_and_losses() -> None:
+    """20 ms to 1.5 s each way within a minute, +-30 ms of jitter, 5 % of all datagrams lost.
+
+    The formation flies 15 m/s: errors of the clocks, 5 ms here, are errors of position in proportion to the speed.
+    """
+    drift = (DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=60.0, delay_s=1.5))
+    jitter = Jitter(distribution="uniform", scale_s=0.03)
+    link = Link(delay_points=drift, jitter=jitter, loss_probability=0.05)
+    flown = chain3("measured")
+    slow = tuple(vehicle.model_copy(update={"velocity_ne_m_s": (15.0, 0.0)}) for vehicle in flown.vehicles)
+    changes = {
+        "links": Links(up=link, down=link),
+        "vehicles": slow,
+        "nominal_velocity": (NominalVelocity(from_s=0.0, velocity_ne_m_s=(15.0, 0.0)),),
+        "limits": Limits(speed_min_m_s=0.1),
+        "duration_s": 70.0,
+    }
+    plan = flight_plan(flown.model_copy(update=changes))[1]
+    ticks = fly_virtual(plan).ticks
+    assert ticks["loop_delay_s"][-3:].min() > 2.9
+    assert errors_m(ticks, from_s=12.0) < 0.01 * 172.4
 
 
-def chain3(prediction: float) -> Scenario:
+def chain3(prediction: float | str) -> Scenario:
     loaded = load(SCENARIOS / "chain3.toml")
     control = Control.model_validate({"gains": GAINS, "prediction": prediction})
     return loaded.model_copy(update={"control": control})

@@ -109,6 +109,12 @@ BAD = {
         "control.prediction",
         "off, with loop onboard",
     ),
+    "feed-forward of a design": (
+        'loop = "ground"',
+        'loop = "ground"\nfeed_forward = 0.5',
+        "control.feed_forward",
+        "0, unless gains are given",
+    ),
     "alpha of one": ("delay_margin_s = 0.3", "alpha = 1.0", "control.alpha", "less than 1"),
     "gains and requirement": (
         "delay_margin_s = 0.3",
