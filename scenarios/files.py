@@ -166,6 +166,14 @@ def _control_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield "control.method", control.method, wanted
     if control.gains is not None and control.method != "inclusion":
         yield "control.method", control.method, "inclusion, with gains given; a graph's gains are given as blocks"
+    if control.feed_forward and (control.gains is None or control.loop == "onboard"):
+        wanted = "0, unless gains are given and loop is ground: no design provides for it"
+        yield "control.feed_forward", control.feed_forward, wanted
+    if control.prediction != "off" and control.loop == "onboard":
+        yield "control.prediction", control.prediction, "off, with loop onboard: vehicles feed back their own errors"
+    if control.prediction != "off" and scenario.dynamics == "autopilot":
+        wanted = "off, with dynamics autopilot: only double integrators are predicted"
+        yield "control.prediction", control.prediction, wanted
 
 
 def _hearing_contradictions(scenario: Scenario) -> Iterator[_Fault]:

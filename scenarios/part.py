@@ -5,7 +5,8 @@ Numbers are bounded where the messages (single precision) and the clocks (nanose
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic_core import PydanticCustomError
 
 MOST = 1e6
 Number = Annotated[float, Field(ge=-MOST, le=MOST)]
@@ -20,6 +21,21 @@ Headroom = Annotated[float, Field(ge=-1000, lt=1)]
 Rate = Annotated[float, Field(ge=1, le=500)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Flavour = Literal["ardupilot", "px4"]
+PREDICTION_MAX_S = 10.0
+"""Longest loop delay that the station predicts over."""
+
+
+def _one_fault(value: object, validate: ValidatorFunctionWrapHandler) -> object:
+    """One fault for a key of two types; pydantic reports one for each of them."""
+    try:
+        return validate(value)
+    except ValidationError as error:
+        raise PydanticCustomError("prediction", "prediction", {"most": PREDICTION_MAX_S}) from error
+
+
+Prediction = Annotated[
+    Literal["off", "measured"] | Annotated[float, Field(gt=0, le=PREDICTION_MAX_S)], WrapValidator(_one_fault)
+]
 
 
 class Part(BaseModel):

@@ -22,6 +22,7 @@ from scenarios.part import (
     Part,
     Position,
     Positive,
+    Prediction,
     Rate,
     SystemId,
     Velocity,
@@ -138,6 +139,15 @@ class Control(Part):
     """Fly these gains instead of designing any."""
     blocks: tuple[GainBlock, ...] = ()
     """Fly this gain matrix, given block by block, instead of designing one. Omitted blocks are zero."""
+    feed_forward: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the command of the vehicle in front that is added to each follower's command, computed in the same tick.
+    Only with `gains`, and with `loop = "ground"`. With 1 and K2 = -K1 a follower does what the vehicle in front
+    does."""
+    prediction: Prediction = "off"
+    """The loop delay over which the station predicts each vehicle from its newest state and the set-points that act
+    after it. A number: that many seconds. `measured`: the delay measured for each vehicle, smoothed; what is assumed
+    changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. Only with `loop = "ground"`
+    and `dynamics = "double_integrator"`."""
 
 
 class Onboard(Part):

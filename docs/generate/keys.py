@@ -110,6 +110,8 @@ def _unit(key: str) -> str:
 
 
 def _values(node: Node, what: str) -> str:
+    if "anyOf" in node:
+        return " or ".join(_values(choice, what) for choice in node["anyOf"])
     if "enum" in node:
         return ", ".join(f"`{choice}`" for choice in node["enum"])
     if "properties" in node:
@@ -136,7 +138,7 @@ def _bounds(node: Node, what: str) -> str:
     if node.get("type") == "array":
         inner = node.get("items") or node["prefixItems"][0]
         return _bounds(inner, "one")
-    found: list[str] = []
+    found = [bounds for choice in node.get("anyOf", ()) if (bounds := _bounds(choice, what))]
     for name, sign in (("exclusiveMinimum", ">"), ("minimum", "≥"), ("exclusiveMaximum", "<"), ("maximum", "≤")):
         if name in node:
             found.append(f"{sign} {_number(node[name])}")

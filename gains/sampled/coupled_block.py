@@ -14,8 +14,10 @@ from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.delay.several import late_by_vehicle
 from gains.formation.model import FormationModel
+from gains.sampled._loop import matrix_exponentials
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
 from gains.sampled.onboard import OnboardLoop, OnboardTiming, onboard_loop
+from gains.sampled.prediction import mismatch_window, mismatch_window_continuous, predicted_growth_rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +25,7 @@ class CoupledBlock:
     """Vehicles that act on each other, with their part of e' = A e + B u, u = K e; the same axes for all.
 
     `system_ids` names the vehicles. `onboard` is their part of the onboard loop; without it all feedback is late.
+    `assumed_s` is the loop delay over which the station predicts (`gains.sampled.prediction`); None without prediction.
     """
 
     system_ids: tuple[int, ...]
@@ -31,6 +34,7 @@ class CoupledBlock:
     K: FloatArray
     timing: Timing
     onboard: OnboardLoop | None = None
+    assumed_s: float | None = None
 
     @property
     def has_late_terms(self) -> bool:
@@ -38,20 +42,33 @@ class CoupledBlock:
         return self.onboard is None or bool(self.onboard.late.any())
 
     def margin_s(self) -> float:
-        """The least loop delay (s) at which the sampled and held loop loses stability."""
-        if self.onboard is not None:
-            return self.onboard.sampled_margin_s()
-        return float(multirate_delay_margin(self.A, self.B, self.K, self.timing))
+        """The loop delay (s) at which the sampled and held loop loses stability: the longer end of its window."""
+        return self.window_s()[1]
 
-    def margin_continuous_s(self) -> float:
-        """The least loop delay (s) at which the continuous model loses stability; the hold counts as half a period."""
+    def window_s(self) -> tuple[float, float]:
+        """The loop delays (s) between which the sampled and held loop is stable; from 0 on without prediction."""
+        if self.assumed_s is not None:
+            return mismatch_window(self.A, self.B, self.K, self.timing, assumed_s=self.assumed_s)
+        if self.onboard is not None:
+            return 0.0, self.onboard.sampled_margin_s()
+        return 0.0, float(multirate_delay_margin(self.A, self.B, self.K, self.timing))
+
+    def window_continuous_s(self) -> tuple[float, float]:
+        """The same of the continuous model; the hold counts as half a period."""
+        half_s = self.timing.held_s / 2.0
+        if self.assumed_s is not None:
+            least_s, most_s = mismatch_window_continuous(self.A, self.B, self.K, assumed_s=self.assumed_s + half_s)
+            return max(0.0, least_s - half_s), most_s - half_s
         whole_s = delay_margin(self.A, self.B @ self.K) if self.onboard is None else self.onboard.continuous_margin_s()
-        return whole_s - self.timing.held_s / 2.0
+        return 0.0, whole_s - half_s
 
     def growth_1_s(self, delay_s: float) -> float:
         """Growth rate (1/s) of the sampled and held loop at a loop delay."""
         if self.onboard is not None:
             return self.onboard.growth_1_s(delay_s)
+        if self.assumed_s is not None:
+            arguments = self.A, self.B, self.K, self.timing
+            return predicted_growth_rate(*arguments, assumed_s=self.assumed_s, delay_s=delay_s)
         return multirate_growth_rate(self.A, self.B, self.K, self.timing, delay_s=delay_s)
 
     def growth_continuous_1_s(self, delay_s: float) -> float:
@@ -60,8 +77,19 @@ class CoupledBlock:
 
     def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
         """The same where each vehicle's command has a loop delay of its own (`gains.delay.several`)."""
+        if self.assumed_s is not None:
+            assumed_s = self.assumed_s + self.timing.held_s / 2.0
+            ahead = self.K @ matrix_exponentials(self.A[np.newaxis] * assumed_s)[0]
+            at_once = [(self.A + self.B @ self.K, 0.0), (-self.B @ ahead, assumed_s)]
+            return self._rightmost(at_once, ahead, loop_delay_s)
         late_gain = self.K if self.onboard is None else self.B.T @ self.onboard.late
         at_once = [(self.A, 0.0)] if self.onboard is None else self.onboard.continuous_at_once()
+        return self._rightmost(at_once, late_gain, loop_delay_s)
+
+    def _rightmost(
+        self, at_once: list[tuple[FloatArray, float]], late_gain: FloatArray, loop_delay_s: Mapping[int, float]
+    ) -> float:
+        """Real part (1/s) of the rightmost root of terms with known delays and of those that are late by vehicle."""
         axes = self.B.shape[1] // len(self.system_ids)
         late = late_by_vehicle(
             self.B, late_gain, [slice(axes * k, axes * (k + 1)) for k in range(len(self.system_ids))]
@@ -89,7 +117,7 @@ class CoupledBlock:
     @property
     def kind(self) -> Hashable:
         """Equal for blocks that are the same system."""
-        return self.timing, *((part.shape, (part + 0.0).tobytes()) for part in (self.A, self.B, self.K))
+        return self.timing, self.assumed_s, *((part.shape, (part + 0.0).tobytes()) for part in (self.A, self.B, self.K))
 
 
 def coupled_blocks(
@@ -99,11 +127,12 @@ def coupled_blocks(
     *,
     timing: Timing,
     onboard: OnboardTiming | None = None,
+    assumed_s: float | None = None,
 ) -> list[CoupledBlock]:
     """The blocks of a formation flown with the gain K (inputs, states) of u = K e, those ahead first.
 
     `system_ids` has one for each vehicle, in the order of `model`. Without `onboard`, the timing of the onboard loop,
-    the station closes every loop.
+    the station closes every loop, and predicts over `assumed_s` if that is given.
 
     A chain of three: each vehicle is a block, and the two followers are alike. Sampling at 50 Hz costs half a period:
 
@@ -129,6 +158,7 @@ def coupled_blocks(
                 K=K[np.ix_(inputs, own)],
                 timing=timing,
                 onboard=None if whole is None else whole.part(own),
+                assumed_s=assumed_s,
             )
         )
     return blocks

@@ -143,6 +143,9 @@ def _study(file: Path, loop: Loop | None, *, real_time: bool) -> "tuple[Study, D
     if scenario.dynamics == "autopilot":
         wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
         raise InputError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
+    if scenario.control.prediction == "measured":
+        wanted = "off, or a number of seconds: gcs stress shows what a wrong assumption does"
+        raise InputError(f"{file}: control.prediction: read 'measured', wanted {wanted}")
     # a campaign does not fly the slower gains of the schedule, so they need not be designed
     refuse(file, bad_start(scenario))
     design, plan = flight_plan(scenario.with_calm_monitor())
@@ -177,6 +180,7 @@ def _campaign(
         check_campaign(out, "--resume", scenario)
     sweep: list[Outcome] = []
     onset: Onset | NoOnset | None = None
+    onset_shorter: Onset | None = None
     with raised(), contextlib.ExitStack() as stack:
         fly = stack.enter_context(workers)
         if out is None:
@@ -193,6 +197,8 @@ def _campaign(
             if tolerance is not None:
                 run = partial(run_campaign, store=store, fly=fly, ended=progress("onset", None))
                 onset = find_onset(study, run, tolerance=tolerance)
+                if study.window_s[0] > 0.0:
+                    onset_shorter = find_onset(study, run, tolerance=tolerance, shorter=True)
         except NoOnset as reason:
             onset = reason
         except KeyboardInterrupt:
@@ -200,7 +206,9 @@ def _campaign(
             raise
     outcomes = list(store.outcomes.values())
     write_table(outcomes, folder)
-    result = result_of(study, design, outcomes, axes=axes, sweep=sweep, onset=onset, allowed=allowed)
+    result = result_of(
+        study, design, outcomes, axes=axes, sweep=sweep, onset=onset, onset_shorter=onset_shorter, allowed=allowed
+    )
     write_report(folder, result, study=study, axes=axes)
     return result, folder
 

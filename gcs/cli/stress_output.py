@@ -27,15 +27,15 @@ def print_result(result: CampaignResult, folder: Path) -> None:
     console = plain_console()
     if not console.is_terminal:
         console.width = _FILE_WIDTH
-    onset, margin_s, points = result.onset, result.delay_margin_s, result.points
+    margin_s, points = result.delay_margin_s, result.points
     console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
     kinds = ", ".join(f"{count} {_KINDS[kind]}" for kind, count in sorted(result.trials_of_kind.items(), reverse=True))
     console.print(f"trials   {result.trials}: {kinds}")
-    if onset is not None:
+    for onset in (found for found in (result.onset, result.onset_shorter) if found is not None):
         breaks = "" if onset.frequency_rad_s is None else f"; breaks at {onset.frequency_rad_s:.2f} rad/s"
         console.print(
             f"onset    {_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms in flight, "
-            f"{onset.difference:+.3%} from the sampled margin of this loop, {_ms(onset.predicted_s)}; "
+            f"{onset.difference:+.3%} from the {_limit(result)} of this loop, {_ms(onset.predicted_s)}; "
             f"the continuous model's less half a period for the hold, {_ms(onset.predicted_continuous_s)}"
         )
         console.print(
@@ -63,6 +63,11 @@ def print_result(result: CampaignResult, folder: Path) -> None:
         console.print(f"again    {refly_command(folder, result.worst[0])}")
     if result.failure:
         console.print(Text.assemble(("failed", "bold red"), f"   {result.failure}"))
+
+
+def _limit(result: CampaignResult) -> str:
+    """What the onset is compared with."""
+    return "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
 
 
 def _print_noise(console: Console, noise: Noise | None) -> None:

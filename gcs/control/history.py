@@ -4,6 +4,7 @@ Scalars and plain tuples: for single reports numpy would be ten times slower.
 """
 
 from collections import deque
+from typing import Protocol
 
 State = tuple[float, float, float, float]
 """Position north and east in m, velocity north and east in m/s."""
@@ -12,6 +13,14 @@ Report = tuple[int, State]
 
 HISTORY = 128
 """Reports kept for each vehicle: 2.6 s at 50 Hz, enough for links whose delays differ by that much."""
+
+
+class States(Protocol):
+    """Where vehicles are at any instant."""
+
+    def at(self, vehicle: int, time_ns: int) -> State | None:
+        """The state of a vehicle at an instant; None if it has reported nothing."""
+        ...
 
 
 class StateHistory:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gcs.control.history import Report, State, StateHistory
+from gcs.control.history import Report, State, StateHistory, States
 from gcs.plan.formation import Formation
 
 Gain = tuple[float, float, float, float, float, float, float, float]
@@ -117,6 +117,8 @@ class VehicleControl(NamedTuple):
     command_m_s2: tuple[float, float]
     used_ns: int
     """Instant of the errors from which the command was computed: `sample_ns` with the loop on the ground."""
+    assumed_s: float = 0.0
+    """The loop delay over which the errors were predicted; 0 without prediction."""
 
 
 _UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan, nan), 0)
@@ -151,7 +153,7 @@ def formation_control(
 
 
 def command_at(
-    history: StateHistory,
+    history: States,
     law: VehicleLaw,
     row: int,
     instant_ns: int,
@@ -166,7 +168,7 @@ def command_at(
 
 
 def _followed(
-    history: StateHistory,
+    history: States,
     law: VehicleLaw,
     newest: Report,
     blend: Blend,

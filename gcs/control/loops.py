@@ -12,9 +12,11 @@ from typing import Any, NamedTuple, Protocol
 from gains.sampled.onboard import own_part
 from gcs.control.history import StateHistory
 from gcs.control.law import Blend, FeedbackLaw, VehicleControl, VehicleLaw, command_at, feedback_law, formation_control
+from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates
 from gcs.link import mavlink
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.onboard import own_parameters
+from scenarios.schema import NS_PER_S
 
 Vector = tuple[float, float]
 
@@ -44,10 +46,18 @@ class Loop(Protocol):
         law: FeedbackLaw,
         blends: Sequence[Blend],
         *,
+        due_ns: int,
         nominal_velocity_m_s: Vector,
         opening: float = 1.0,
     ) -> list[VehicleControl]:
-        """Errors of every vehicle, and the acceleration it is sent; as `gcs.control.law.formation_control`."""
+        """Errors of every vehicle at the tick that is due, and the acceleration it is sent.
+
+        As `gcs.control.law.formation_control`.
+        """
+        ...
+
+    def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
+        """Take in the one-way delay that was measured for a vehicle, of a message sent at `sent_ns`."""
         ...
 
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
@@ -61,7 +71,10 @@ class Loop(Protocol):
 
 def loop_of(plan: FlightPlan) -> Loop:
     """The loop that a plan is made for."""
-    return OnboardLoop(plan) if plan.scenario.control.loop == "onboard" else GroundLoop(plan)
+    control = plan.scenario.control
+    if control.loop == "onboard":
+        return OnboardLoop(plan)
+    return GroundLoop(plan) if control.prediction == "off" else PredictedLoop(plan)
 
 
 class GroundLoop:
@@ -69,10 +82,25 @@ class GroundLoop:
 
     def __init__(self, plan: FlightPlan) -> None:
         self._plan = plan
-        self.control = formation_control
 
     def law(self, lost: Sequence[bool]) -> FeedbackLaw:
         return feedback_law(self._plan.formation, _gains(self._plan, lost), lost)
+
+    def control(
+        self,
+        history: StateHistory,
+        law: FeedbackLaw,
+        blends: Sequence[Blend],
+        *,
+        due_ns: int,
+        nominal_velocity_m_s: Vector,
+        opening: float = 1.0,
+    ) -> list[VehicleControl]:
+        del due_ns
+        return formation_control(history, law, blends, nominal_velocity_m_s=nominal_velocity_m_s, opening=opening)
+
+    def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
+        """Nothing to do: the newest states are fed back as they are."""
 
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
         north, east = order.control.command_m_s2
@@ -83,6 +111,46 @@ class GroundLoop:
     def parameters(self, system_id: int) -> dict[str, float]:
         del system_id
         return {}
+
+
+class PredictedLoop:
+    """The ground loop, fed with the errors at the instant at which each set-point acts (`gcs.control.prediction`)."""
+
+    def __init__(self, plan: FlightPlan) -> None:
+        self._ground, self._row = GroundLoop(plan), plan.formation.row
+        self.law, self.parameters = self._ground.law, self._ground.parameters
+        prediction, vehicles = plan.scenario.control.prediction, range(plan.model.vehicles)
+        held_ns = round(plan.scenario.safety.setpoint_timeout_s * NS_PER_S)
+        self._sent = [CommandHistory(held_ns) for _ in vehicles]
+        self._deliveries: list[Delivery] = [
+            MeasuredDelivery() if isinstance(prediction, str) else FixedDelivery(prediction) for _ in vehicles
+        ]
+        self._states = PredictedStates(self._sent, self._deliveries, plan.timing.commands)
+
+    def control(
+        self,
+        history: StateHistory,
+        law: FeedbackLaw,
+        blends: Sequence[Blend],
+        *,
+        due_ns: int,
+        nominal_velocity_m_s: Vector,
+        opening: float = 1.0,
+    ) -> list[VehicleControl]:
+        controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_velocity_m_s, opening=opening)
+        for row, (acts_ns, assumed_s) in enumerate(self._states.look(history, due_ns)):
+            own = law[row]
+            if own is not None and acts_ns > 0:
+                command = command_at(self._states, own, row, acts_ns, blends[row], nominal_velocity_m_s, opening)
+                controls[row] = controls[row]._replace(command_m_s2=command, assumed_s=assumed_s)
+        return controls
+
+    def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
+        self._deliveries[row].measured(down_ns, sent_ns)
+
+    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
+        self._sent[self._row(system_id)].add(order.due_ns, order.control.command_m_s2)
+        return self._ground.set_point(system_id, order)
 
 
 class OnboardLoop:
@@ -108,9 +176,11 @@ class OnboardLoop:
         law: FeedbackLaw,
         blends: Sequence[Blend],
         *,
+        due_ns: int,
         nominal_velocity_m_s: Vector,
         opening: float = 1.0,
     ) -> list[VehicleControl]:
+        del due_ns
         controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_velocity_m_s, opening=opening)
         for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
             control = controls[row]
@@ -123,6 +193,9 @@ class OnboardLoop:
             command = north + (opening - 1.0) * more_north, east + (opening - 1.0) * more_east
             controls[row] = control._replace(command_m_s2=command)
         return controls
+
+    def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
+        """Nothing to do: nothing is predicted."""
 
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
         return mavlink.velocity_set_point(

@@ -91,8 +91,9 @@ TICK = np.dtype(
         ("down_bound_s", "<f8"),  # most that it can be wrong
         ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s - repeated_s; ground loop: of the newest
         ("repeated_s", "<f8"),  # how long the set-point has repeated an earlier one, as far as telemetry is slower
-        ("delay_margin_s", "<f8"),  # of the gains flown, as known at the time; infinite if no delay is too long
-        ("headroom", "<f8"),  # 1 - loop delay / margin
+        ("assumed_delay_s", "<f8"),  # loop delay over which the vehicle was predicted; 0 without prediction
+        ("delay_margin_s", "<f8"),  # longest delay that the gains flown take, as known at the time; infinite: any
+        ("headroom", "<f8"),  # 1 - loop delay / margin; with prediction 1 - mismatch / distance to the window's end
         ("rtt_s", "<f8"),  # a TIMESYNC round trip that has ended and is in no earlier row; NaN if there is none
         ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock, at sent_ns
         ("clock_offset_bound_s", "<f8"),  # most that it can be wrong

@@ -31,9 +31,9 @@ class Check(Published):
 
     expected_loop_delay_s: float
     delay_margin_s: float | None
-    """None if no delay makes the loop unstable."""
+    """None if no delay makes the loop unstable; with prediction the longer end of the mismatch window."""
     headroom: float
-    """1 - expected loop delay / margin."""
+    """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window."""
     closest_m: float | None
     """Least distance between two vehicles in their places; None for a single vehicle."""
     vehicles: tuple[VehicleCheck, ...]
@@ -69,11 +69,15 @@ def check(plan: FlightPlan) -> Check:
                 command_max_m_s2=most if most < inf else None,
             )
         )
-    delay_s, margin_s = expected_loop_delay_s(scenario), plan.delay_margin_s
+    delay_s = expected_loop_delay_s(scenario)
+    known_s = {"off": 0.0, "measured": delay_s}
+    assumed_s = plan.assumed_s or known_s[str(scenario.control.prediction)]
+    tolerated = plan.tolerance.at(assumed_s)
+    margin_s = tolerated.longer_s[0]
     return Check(
         expected_loop_delay_s=delay_s,
-        delay_margin_s=margin_s if margin_s < inf else None,
-        headroom=headroom(delay_s, margin_s),
+        delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
+        headroom=headroom(tolerated.used_s(0, delay_s - assumed_s), margin_s),
         closest_m=min((float(hypot(*(a - b))) for a, b in combinations(place, 2)), default=None),
         vehicles=tuple(vehicles),
     )

@@ -12,6 +12,7 @@ import numpy as np
 from gains.core.requirement import plain
 from gains.design.time_scale import time_scaled
 from gains.performance.flown import ALPHA_KEPT, FlownFormation, FlownLoop, FlownTiming
+from gains.performance.predicted import PredictedLoop
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.onboard import own_part
@@ -74,6 +75,8 @@ def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
 
 def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
     """α and the string peak of a design's gain set at a loop delay (s)."""
+    if delay_s is not None and design.vehicles > 1 and _is_predicted(design):
+        return _predicted_at(design, delay_s, gain_set)
     flown, chains = _flown(design, scenario, gain_set) if delay_s is not None else ([], [])
     if delay_s is None or not flown:
         return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
@@ -85,9 +88,34 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
     )
 
 
+def _is_predicted(design: Design) -> bool:
+    """Whether the loop is that of `gains.performance.predicted`, and not only its newest states are fed back."""
+    return design.prediction is not None or design.feed_forward > 0.0
+
+
+def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDelay:
+    """The figures of a loop that is predicted, or whose commands are fed forward; known of inclusion gains."""
+    assumed_s = 0.0
+    if design.prediction is not None:
+        fixed_s = design.prediction.assumed_delay_s
+        assumed_s = delay_s if fixed_s is None else fixed_s
+    entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
+    loops = [
+        PredictedLoop(chain.gains, design.period_s, assumed_s, chain.response, design.feed_forward)
+        for chain in (_follower_loops(design, entry) if design.inclusion_gains is not None else [])
+    ]
+    if not loops:
+        return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
+    return FiguresAtDelay(
+        loop_delay_s=delay_s,
+        alpha=min(loop.alpha(delay_s) for loop in loops),
+        string_peak=plain(max(loop.string_peak(delay_s) for loop in loops)),
+    )
+
+
 def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
     """The formations flown, empty where no α is defined, and the loops of followers in a leader-follower tree."""
-    if design.vehicles < 2:
+    if design.vehicles < 2 or _is_predicted(design):
         return [], []
     entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
     if design.inclusion_gains is not None:

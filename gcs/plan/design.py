@@ -115,6 +115,24 @@ class OnboardPart(Published):
     ground_delay_margin_continuous_s: Margin
 
 
+class WindowAt(Published):
+    """The loop delays (s) between which a predicted loop is stable; None where no longer delay is too long."""
+
+    assumed_delay_s: float
+    mismatch_window_s: tuple[float, Margin]
+    mismatch_window_continuous_s: tuple[float, Margin]
+
+
+class PredictionPart(Published):
+    """The mismatch window of the fastest gains, and the same at other assumed delays."""
+
+    assumed_delay_s: float | None = None
+    """None where the measured delay is assumed; then there is no one window."""
+    mismatch_window_s: tuple[float, Margin] | None = None
+    mismatch_window_continuous_s: tuple[float, Margin] | None = None
+    windows: tuple[WindowAt, ...] = ()
+
+
 class FiguresAtDelay(Published):
     """α and the growth of spacing errors at a loop delay; None where unknown or without bound."""
 
@@ -145,6 +163,7 @@ class Design(Published):
     K1_1_s: Matrix | None = None
     K2_1_s: Matrix | None = None
     K3_1_s2: Matrix | None = None
+    feed_forward: float = 0.0
     K: Matrix | None = None
     links: tuple[tuple[int, int], ...] = ()
     alpha: float | None = None
@@ -170,6 +189,7 @@ class Design(Published):
     schedule: tuple[GainSet, ...] = ()
     response: ResponsePart | None = None
     onboard: OnboardPart | None = None
+    prediction: PredictionPart | None = None
     at_loop_delay: FiguresAtExpectedDelay | None = None
 
     @property

@@ -7,6 +7,7 @@ from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gains.sampled.multirate import Timing
 from gcs.plan.formation import Formation
+from gcs.plan.mismatch import Tolerance, tolerance
 from gcs.plan.responses import Responses
 from scenarios.schema import Scenario
 
@@ -40,6 +41,17 @@ class FlightPlan:
     def margins_s(self) -> tuple[float, ...]:
         """The delay margins of the gain schedule."""
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
+
+    @cached_property
+    def tolerance(self) -> Tolerance:
+        """By how much the loop delay may miss the one that the station assumes."""
+        return tolerance(self.scenario.control.prediction, self.model, self.gains, self.margins_s, self.timing)
+
+    @property
+    def assumed_s(self) -> float | None:
+        """The given loop delay over which the station predicts; None without prediction, or if it is measured."""
+        prediction = self.scenario.control.prediction
+        return None if isinstance(prediction, str) else prediction
 
     @property
     def model(self) -> FormationModel:

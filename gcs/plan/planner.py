@@ -16,14 +16,26 @@ from gains.design.required import requirement_with
 from gains.design.time_scale import time_scaled
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, leader_follower, with_links, without_links
+from gains.performance.predicted import fed_forward
 from gains.performance.response import Response, continuous_margin, sampled_margin
 from gains.performance.robust import robustness
 from gains.performance.string_stability import string_peak
 from gains.sampled.constant import sampled_delay_margin
+from gains.sampled.prediction import mismatch_window_continuous
 from gcs.plan.at_delay import with_figures_at_delay
-from gcs.plan.design import Block, Design, GainSet, ResponsePart, TradeOffPoint, VehicleResponse
+from gcs.plan.design import (
+    Block,
+    Design,
+    GainSet,
+    PredictionPart,
+    ResponsePart,
+    TradeOffPoint,
+    VehicleResponse,
+    WindowAt,
+)
 from gcs.plan.flight_plan import FlightPlan, loop_timing
 from gcs.plan.formation import Formation, plan_formation
+from gcs.plan.mismatch import window
 from gcs.plan.onboard import onboard_plan, timing_of
 from gcs.plan.responses import Responses, given_responses
 from scenarios.schema import Scenario
@@ -32,6 +44,8 @@ NOT_YET_KNOWN = "not yet known"
 _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
 
+_SHOWN_S = (0.1, 0.3, 0.6, 1.0, 1.5, 3.0)
+"""Assumed delays whose windows a design shows."""
 _MORE = 1.1
 """A design whose margin falls short at these rates is repeated for a margin larger by this times the shortfall."""
 
@@ -51,13 +65,22 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     plan = FlightPlan(
         scenario=scenario,
         formation=formation,
-        gain=model.overlapping_gain(found.K1, found.K2, found.K3),
+        gain=_flown(scenario, model, model.overlapping_gain(found.K1, found.K2, found.K3)),
         delay_margin_s=found.delay_margin_s,
-        slower=tuple((K, inf if own.delay_margin_s is None else own.delay_margin_s) for K, own in slower),
+        slower=tuple(
+            (_flown(scenario, model, K), inf if own.delay_margin_s is None else own.delay_margin_s) for K, own in slower
+        ),
     )
     entries = (_entry(1.0, found), *(own for _, own in slower))
-    whole = Design.model_validate(found.to_dict() | {"schedule": entries})
+    more = {"feed_forward": scenario.control.feed_forward} if scenario.control.feed_forward else {}
+    whole = Design.model_validate(found.to_dict() | {"schedule": entries} | more)
     return _flown_loop(*_with_responses(whole, plan, responses))
+
+
+def _flown(scenario: Scenario, model: FormationModel, K: FloatArray) -> FloatArray:
+    """The gain with the share of the command in front that the scenario adds; margins stay the same."""
+    share = scenario.control.feed_forward
+    return fed_forward(model, K, share) if share else K
 
 
 def with_trade_off(design: Design) -> Design:
@@ -76,7 +99,28 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     """Design and plan of the scenario's loop, from those of its ground loop, with the figures at its delay."""
     if plan.scenario.control.loop == "onboard":
         design, plan = onboard_plan(design, plan)
+    if plan.scenario.control.prediction != "off":
+        design = design.model_copy(update={"prediction": _prediction(plan)})
     return with_figures_at_delay(design, plan.scenario), plan
+
+
+def _prediction(plan: FlightPlan) -> PredictionPart:
+    """The mismatch windows of the fastest gains; computes the tolerance of the plan, which no tick can wait for."""
+    assumed_s = plan.assumed_s
+    plan.tolerance.at(assumed_s or 0.0)
+    found = {at_s: _window_at(plan, at_s) for at_s in sorted({assumed_s or _SHOWN_S[0], *_SHOWN_S})}
+    own = dict.fromkeys(WindowAt.model_fields) if assumed_s is None else found[assumed_s].model_dump()
+    return PredictionPart.model_validate(own | {"windows": tuple(found.values())})
+
+
+def _window_at(plan: FlightPlan, assumed_s: float) -> WindowAt:
+    model, half_s = plan.model, plan.timing.held_s / 2.0
+    least_s, most_s = mismatch_window_continuous(model.A, model.B, plan.gain, assumed_s=assumed_s + half_s)
+    return WindowAt(
+        assumed_delay_s=assumed_s,
+        mismatch_window_s=window(model, plan.gain, plan.timing, assumed_s),
+        mismatch_window_continuous_s=(max(0.0, least_s - half_s), most_s - half_s),
+    )
 
 
 def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None) -> tuple[Design, FlightPlan]:

@@ -61,7 +61,7 @@ def read_ticks(folder: Path) -> TickArray:
     return ticks
 
 
-_ADDED = {"delay_margin_s": np.nan, "repeated_s": 0.0}
+_ADDED = {"delay_margin_s": np.nan, "repeated_s": 0.0, "assumed_delay_s": 0.0}
 """Columns that older runs lack, and the values read instead."""
 
 

@@ -43,7 +43,11 @@ class VehicleState:
 
 
 class Observation(NamedTuple):
-    """What is known of one vehicle at a tick. `loop_delay_s` may be NaN (unknown)."""
+    """What is known of one vehicle at a tick.
+
+    `loop_delay_s` may be NaN (unknown). With prediction it is the part of the delay that counts against the margin,
+    see `gcs.plan.mismatch.Tolerated.used_s`.
+    """
 
     time_s: float
     flying: bool
@@ -182,7 +186,8 @@ class FormationMonitor:
         self, vehicles: int, margins_s: tuple[float, ...], policy: Monitor, *, separable: bool, period_s: float
     ) -> None:
         self.states = [VehicleState() for _ in range(vehicles)]
-        self.margins_s = margins_s
+        self.margins_s = [margins_s] * vehicles
+        """For each vehicle, how much of its loop delay each gain set tolerates."""
         self.opening = 1.0
         """Factor on the formation's spacing."""
         self._policy = policy
@@ -206,7 +211,7 @@ class FormationMonitor:
         states: list[VehicleState] = []
         for row, (before, seen, delay_s) in enumerate(zip(self.states, fleet, delays_s, strict=True)):
             # the same observation with the loop delay that is judged, not that of this tick
-            after = monitored(before, Observation(*seen[:5], delay_s), self.margins_s, self._policy)
+            after = monitored(before, Observation(*seen[:5], delay_s), self.margins_s[row], self._policy)
             if after is not before:
                 if after.released and not before.released and row != self._next_to_release():
                     after = replace(after, mode=Mode.CRITICAL, released=False)  # a vehicle behind goes first
@@ -248,7 +253,7 @@ class FormationMonitor:
 
     def _open(self, time_s: float, *, flying: bool) -> None:
         """Open the formation gradually while a vehicle on the slowest gains is CRITICAL or absent, else close it."""
-        slowest, troubled = len(self.margins_s) - 1, (Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST)
+        slowest, troubled = len(self.margins_s[0]) - 1, (Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST)
         settled_s = time_s - self._policy.blend_s  # gives the slowest gains time to take effect
         wide = self._policy.act and any(
             s.gain_set == slowest and s.mode in troubled and s.changed_s < settled_s for s in self.states

@@ -78,7 +78,7 @@ class Station:
         self._repetitions = Repetitions(rates, n)
         self._telemetry_ns = [0] * n
         self._fresh_rtt_s = [deque[float]() for _ in range(n)]
-        self._loop_delay_s = [nan] * n
+        self._used_s = [nan] * n
         self._absent = [""] * n
 
     @property
@@ -115,7 +115,7 @@ class Station:
 
     def complete(self, tick: Tick, sent_ns: int) -> TickArray:
         """The rows of a tick whose set-points have been sent, with ages, loop delays and headroom."""
-        rows, self._loop_delay_s = tick_rows(tick, sent_ns)
+        rows, self._used_s = tick_rows(tick, sent_ns)
         return rows
 
     def scenario_time_s(self, now_ns: int) -> float:
@@ -209,6 +209,7 @@ class Station:
         rtt_ns = vehicle.clock.reply(tc1_ns=tc1_ns, ts1_ns=ts1_ns, received_ns=received_ns)
         if rtt_ns is not None:
             self._fresh_rtt_s[row].append(rtt_ns * 1e-9)
+            self._fleet.loop.delivered(row, vehicle.clock.down_ns or 0, ts1_ns)
         if vehicle.clock.jumps != jumps:
             self._history.forget(row)
             vehicle.begin_anew()
@@ -230,6 +231,7 @@ class Station:
             self._history,
             self._law,
             self._monitor.blends(time_s),
+            due_ns=due_ns,
             nominal_velocity_m_s=nominal_m_s,
             opening=self._monitor.opening,
         )
@@ -251,12 +253,13 @@ class Station:
             if fields is not None:
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
-            margin_s = self.plan.margins_s[monitored.gain_set]
+            tolerated = self.plan.tolerance.at(control.assumed_s)
+            self._monitor.margins_s[row] = tolerated.longer_s
             fresh_s = self._fresh_rtt_s[row]
             reported, rtt_s = self._reported[row], fresh_s.popleft() if fresh_s else nan
             repeated_s = self._repetitions.repeated_s(row, control.used_ns, due_ns)
             seen.append(
-                VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, margin_s, repeated_s)
+                VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, tolerated, repeated_s)
             )
         for vehicle in self.vehicles:
             frame = vehicle.next_frame(self._now_ns)
@@ -280,8 +283,8 @@ class Station:
             self._law = self._fleet.loop.law([why != "" for why in absent])
         time_s = self.scenario_time_s(due_ns)
         fleet = [
-            Observation(time_s, flying, gone, vehicle.guided, vehicle.critical, delay_s)
-            for vehicle, gone, delay_s in zip(self.vehicles, silent, self._loop_delay_s, strict=True)
+            Observation(time_s, flying, gone, vehicle.guided, vehicle.critical, used_s)
+            for vehicle, gone, used_s in zip(self.vehicles, silent, self._used_s, strict=True)
         ]
         for row, before, after in self._monitor.update(fleet):
             vehicle = self.vehicles[row]
@@ -294,7 +297,7 @@ class Station:
                 text = "is released to its failsafe" if after.released else "is called back"
                 self._report("vehicle", text, vehicle.system_id)
             if after.gain_set != before.gain_set and flying:
-                margin_s = self.plan.margins_s[after.gain_set]
+                margin_s = self._monitor.margins_s[row][after.gain_set]
                 self._report("gains", f"gain set {after.gain_set}, delay margin {margin_s:.3f} s", vehicle.system_id)
                 self._tell(vehicle, after.mode, f"{GAIN_SET}{after.gain_set}", outgoing)
         self._next_phase(due_ns)
@@ -306,7 +309,6 @@ class Station:
         if self.phase is Phase.IDENTIFYING:
             self.request_stop(self._fleet.identify(due_ns, self._history))
             self.plan = self._fleet.plan
-            self._monitor.margins_s = self.plan.margins_s
         if self.phase is Phase.FLYING and (waited_s >= self.plan.scenario.duration_s or all(self._absent)):
             self.request_stop(end_reason(self.vehicles, self._absent))
         phase = next_phase(

@@ -10,6 +10,7 @@ from gcs.control.law import VehicleControl
 from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.control.tick import TICK, TickArray
 from gcs.link.vehicle import RemoteVehicle
+from gcs.plan.mismatch import Tolerated
 from gcs.station.monitor import VehicleState
 
 _CODES = {"<i8": "q", "<u4": "I", "<f8": "d", "|u1": "B", "|b1": "?"}
@@ -41,8 +42,8 @@ class VehicleTick(NamedTuple):
     nearest_m: float
     """NaN while unknown."""
     commanded: bool
-    margin_s: float
-    """Delay margin of the gains flown."""
+    tolerated: Tolerated
+    """By how much the loop delay may miss the assumed one."""
     repeated_s: float
     """See `gcs.control.loop_delay.Repetitions`."""
 
@@ -58,11 +59,14 @@ class Tick(NamedTuple):
 
 
 def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
-    """The rows of a tick whose set-points were handed over at `sent_ns`, and each vehicle's loop delay in s."""
+    """The rows of a tick whose set-points were handed over at `sent_ns`, and how much of its margin each vehicle uses.
+
+    The latter in s as of `gcs.plan.mismatch.Tolerated.used_s`: without prediction the loop delay.
+    """
     packed: list[bytes] = []
-    delays_s: list[float] = []
+    every_used_s: list[float] = []
     for seen in tick.vehicles:
-        vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, margin_s, repeated_s = seen
+        vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, tolerated, repeated_s = seen
         clock, frames = vehicle.clock, vehicle.frames
         estimate = clock.estimate
         age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
@@ -74,7 +78,9 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
         if estimate.samples > 0:
             offset_s, bound_s = estimate.offset_at_ns(sent_ns) * 1e-9, estimate.bound_at_ns(sent_ns) * 1e-9
         loop_s = loop_delay_s(control.used_ns, sent_ns, down_s, repeated_s)
-        delays_s.append(loop_s)
+        margin_s = tolerated.longer_s[monitored.gain_set]
+        used_s = tolerated.used_s(monitored.gain_set, loop_s - control.assumed_s)
+        every_used_s.append(used_s)
         packed.append(
             _ROW.pack(
                 tick.number, tick.time_s, tick.due_ns, sent_ns, tick.key_ms, vehicle.system_id,
@@ -84,9 +90,10 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
                 *control.spacing_error_m, *control.velocity_error_m_s,
                 *(control.command_m_s2 if commanded else (nan, nan)),
                 nearest_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
-                loop_s, repeated_s, margin_s, headroom(loop_s, margin_s) if margin_s > 0.0 else nan, rtt_s,
+                loop_s, repeated_s, control.assumed_s, control.assumed_s + margin_s,
+                headroom(used_s, margin_s) if margin_s > 0.0 else nan, rtt_s,
                 offset_s, bound_s,
                 frames.received, frames.lost, frames.late, frames.duplicate,
             )
         )  # fmt: skip
-    return np.frombuffer(bytearray().join(packed), TICK), delays_s
+    return np.frombuffer(bytearray().join(packed), TICK), every_used_s

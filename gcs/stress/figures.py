@@ -44,7 +44,7 @@ def growth_figure(
     style: dict[str, Any] = {"fmt": "o", "color": MEASURED, "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0}
     above.errorbar(delay_s, measured, yerr=error, label="flights", zorder=3, **style)
     _mark_own(above, own)
-    margin_s = study.plan.delay_margin_s
+    margin_s = study.window_s[1]
     if grid_s[0] <= margin_s <= grid_s[-1]:
         above.axvline(margin_s, color=SAMPLED, linestyle="--", linewidth=1.0)
         at = (margin_s, float(measured.min()))

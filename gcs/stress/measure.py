@@ -36,8 +36,9 @@ from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, p
 AMPLITUDES = (1.0, 0.03, 0.001)
 """Initial errors of a probe in m (m/s for the leader); the next is flown if errors leave the linear range too soon."""
 _PILOT_S, _PILOT_PERIODS = 1.0, 6.0
-_SETTLED_LOOP_DELAYS = 4.0
-"""After this many loop delays, modes other than the slowest are gone, or small enough to be fitted with it."""
+_SETTLED_LOOP_DELAYS, _PREDICTED_LOOP_DELAYS = 4.0, 2.0
+"""After this many loop delays, modes other than the slowest are gone, or small enough to be fitted with it. A predicted
+loop may be at rest after four."""
 _FLYING_LOOP_DELAYS = 1.0
 """For this many loop delays the station uses states of vehicles on the launcher. Without late feedback, this wait is
 enough."""
@@ -189,7 +190,9 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
         return outcome
     since_s = own["time_s"] - own["time_s"][0]
     delay_s = max(response.loop_delays_s(own, loop.system_ids).values())
-    settled = _SETTLED_LOOP_DELAYS if loop.has_late_terms else _FLYING_LOOP_DELAYS
+    settled = _FLYING_LOOP_DELAYS
+    if loop.has_late_terms:
+        settled = _SETTLED_LOOP_DELAYS if loop.assumed_s is None else _PREDICTED_LOOP_DELAYS
     start_s = settled * delay_s + 2.0 * loop.timing.held_s
     # one for each state and one for each late state; given gains may differ north and east, or couple them
     modes = 2 * max(FOLLOWER_MODES, len(loop.A))

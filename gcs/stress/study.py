@@ -1,7 +1,8 @@
 """Which trials a campaign flies: over its axes, and in search of the onset."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Annotated
 
@@ -10,6 +11,7 @@ from pydantic import PlainSerializer
 
 from gains.sampled.coupled_block import unlike_blocks
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.mismatch import Window
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
 from gcs.stress.campaign import Run
 from gcs.stress.onset import GrowthPoint, Zero, locate_zero
@@ -31,6 +33,12 @@ class Study:
 
     plan: FlightPlan
     real_time: bool = False
+
+    @cached_property
+    def window_s(self) -> Window:
+        """The loop delays between which the plan is predicted to be stable: from 0 on, except with prediction."""
+        assumed_s, tolerated = self.plan.assumed_s or 0.0, self.plan.tolerance.at(0.0)
+        return max(0.0, assumed_s - tolerated.shorter_s[0]), assumed_s + tolerated.longer_s[0]
 
     def trial(self, kind: Kind, coordinates: dict[str, float], *, seed: int, probe: int = CRITICAL) -> Trial:
         """The trial at one point. `seed` is the scenario's, from which clocks, jitter and loss are drawn."""
@@ -68,8 +76,8 @@ class Onset:
 
     All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
     down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
-    `difference` is measured / predicted − 1. `predicted_continuous_s` is the continuous model's margin less half a
-    period for the hold.
+    or with prediction the end of its mismatch window, `difference` is measured / predicted − 1.
+    `predicted_continuous_s` is that of the continuous model less half a period for the hold.
     """
 
     loop_delay_s: float
@@ -88,7 +96,7 @@ class Onset:
     checks: _Flights
     """Probes of the other kinds of loops and of the last vehicle, at the onset."""
     own: _Flights
-    """Own trials at 0.9 and 1.1 times the onset's link delay."""
+    """Own trials at 0.9 and 1.1 times the onset's link delay; with prediction half the mismatch to either side."""
 
 
 class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
@@ -102,14 +110,15 @@ class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a f
         self.as_predicted = as_predicted
 
 
-def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
+def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = False) -> Onset:
     """Fly probes ever closer around the predicted onset, until the zero of their growth rates is located.
 
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
     and those of later rounds over a fraction of one if no smooth curve fits. The search follows the measured growth;
-    the prediction is only its start. Raises NoOnset with the reason.
+    the prediction is only its start. `shorter` looks for the onset below the assumed delay of a station that predicts,
+    where growth falls as the delay rises. Raises NoOnset with the reason.
     """
-    predicted_s = study.plan.delay_margin_s
+    predicted_s, way = study.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
     if predicted_s == np.inf:
         raise _no_limit(study, run, tolerance=tolerance)
     if predicted_s <= 0.0:
@@ -132,21 +141,22 @@ def find_onset(study: Study, run: Run, *, tolerance: float) -> Onset:
         flights |= {outcome.id: outcome for outcome in flown}
         near = [o for o in flights.values() if abs((o.link_delay_s or 0.0) - centre_s) <= 1.001 * width_s]
         grown = (
-            GrowthPoint(o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
+            GrowthPoint(way * o.loop_delay_s, o.growth_1_s, o.growth_error_1_s or 0.0)
             for o in near
             if o.loop_delay_s is not None and o.growth_1_s is not None
         )
         zero = locate_zero(list(grown))
         if zero is None:
             all_grow = min((o.growth_1_s for o in near if o.growth_1_s is not None), default=0.0) > 0.0
-            centre_s, width_s = centre_s + (-width_s if all_grow else width_s), 2.0 * width_s
+            centre_s, width_s = centre_s + way * (-width_s if all_grow else width_s), 2.0 * width_s
             continue
+        zero = replace(zero, loop_delay_s=way * zero.loop_delay_s)
         waiting_s = _waiting_s(near)
         ahead_s = max(0.0, zero.loop_delay_s - waiting_s) - centre_s
         wanted_s = tolerance * predicted_s
         close = noisy or zero.misfit <= _SMOOTH_MISFIT or width_s <= 1.001 * _FINEST_WIDTH * wanted_s
         if zero.inside and close and width_s <= 1.001 * wanted_s:
-            return _found(study, run, zero, near, tuple(flights.values()), rounds=round_number)
+            return _found(study, run, zero, near, tuple(flights.values()), rounds=round_number, shorter=shorter)
         if centre_s <= 0.0 and ahead_s <= 0.0:
             break
         # at most twice the width at once: extrapolating farther would be a guess
@@ -204,16 +214,25 @@ def _waiting_s(outcomes: Sequence[Outcome]) -> float:
 
 
 def _found(
-    study: Study, run: Run, zero: Zero, near: Sequence[Outcome], flights: tuple[Outcome, ...], *, rounds: int
+    study: Study,
+    run: Run,
+    zero: Zero,
+    near: Sequence[Outcome],
+    flights: tuple[Outcome, ...],
+    *,
+    rounds: int,
+    shorter: bool,
 ) -> Onset:
     loops = plan_loops(study.plan)
     nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.loop_delay_s))
     assert nearest.probed is not None
     assert nearest.critical is not None
     loop = next(loop for loop in loops if nearest.probed in loop.system_ids)
-    margins_s = [kind.margin_s() for kind in unlike_blocks(loops)]
-    # for the loop of least margin, test the design's own figure, which the station flies by
-    predicted_s = study.plan.delay_margin_s if loop.margin_s() == min(margins_s) else loop.margin_s()
+    end, way = (0, -1.0) if shorter else (1, 1.0)
+    ends_s = [way * kind.window_s()[end] for kind in unlike_blocks(loops)]
+    # for the loop that breaks first, test the design's own figure, which the station flies by
+    own_s = loop.window_s()[end]
+    predicted_s = study.window_s[end] if way * own_s == min(ends_s) else own_s
     waiting_s = _waiting_s(near)
     link_s = max(0.0, zero.loop_delay_s - waiting_s)
     seed = study.plan.scenario.seed
@@ -221,12 +240,15 @@ def _found(
     others = [kind.system_ids[0] for kind in unlike_blocks(loops) if not kind.same_as(loop)]
     others = dict.fromkeys([*others, loops[-1].system_ids[-1]])
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
-    own = run([study.trial("own", {"delay": round(part * link_s, 6)}, seed=seed) for part in (0.9, 1.1)])
+    # with prediction not so far that the other end of the window is near
+    aside_s = 0.1 * link_s if study.plan.assumed_s is None else 0.5 * abs(predicted_s - study.plan.assumed_s)
+    beside_s = [round(max(0.0, link_s + part * aside_s), 6) for part in (-1.0, 1.0)]
+    own = run([study.trial("own", {"delay": delay_s}, seed=seed) for delay_s in beside_s])
     return Onset(
         loop_delay_s=zero.loop_delay_s,
         error_s=zero.error_s,
         predicted_s=predicted_s,
-        predicted_continuous_s=loop.margin_continuous_s(),
+        predicted_continuous_s=loop.window_continuous_s()[end],
         difference=zero.loop_delay_s / predicted_s - 1.0,
         link_delay_s=link_s,
         waiting_s=waiting_s,

@@ -126,7 +126,14 @@ def plan_of(trial: Trial) -> FlightPlan:
 def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
     """The coupled blocks of a plan."""
     onboard = timing_of(plan.scenario)
-    return coupled_blocks(plan.model, plan.gain, plan.formation.system_ids, timing=plan.timing, onboard=onboard)
+    return coupled_blocks(
+        plan.model,
+        plan.gain,
+        plan.formation.system_ids,
+        timing=plan.timing,
+        onboard=onboard,
+        assumed_s=plan.assumed_s,
+    )
 
 
 def with_summary(plan: FlightPlan, flight: Flight, outcome: Outcome) -> Outcome:

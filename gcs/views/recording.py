@@ -99,6 +99,7 @@ class Recording:
         self._tree = tree_of(scenario)
         self._labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
         self._levels = _levels(scenario)
+        self._predicts = scenario.control.prediction != "off"
         self._before_s = patience_s(scenario)
         self._ticks: list[TickArray] = []
         self._events: list[Event] = []
@@ -167,6 +168,8 @@ class Recording:
         margins_ms = 1e3 * ticks["delay_margin_s"]
         if np.isfinite(margins_ms).any():
             self._scalars("delay/margin_ms", times_s, np.where(np.isfinite(margins_ms), margins_ms, np.nan))
+        if self._predicts:
+            self._scalars("delay/assumed_ms", times_s, 1e3 * ticks["assumed_delay_s"])
         # Round trips end at some ticks only: each is shown until the next.
         self._scalars("delay/rtt_ms", times_s, self._newest_rtt_ms.fill(1e3 * ticks["rtt_s"]))
         for level in self._levels:
@@ -268,6 +271,8 @@ class Recording:
         for path in _CURVES:
             lines(path, labels, colors)
         lines("delay/rtt_ms", [f"{label} RTT" for label in labels], [dimmed(color) for color in colors], 0.8)
+        if self._predicts:
+            lines("delay/assumed_ms", [f"{label} assumed" for label in labels], colors)
         lines("delay/margin_ms", [f"{label} margin" for label in labels], [LIMIT_COLOR] * len(labels), 3.5)
         for level in self._levels:
             lines(level.path, [level.name], [LIMIT_COLOR if level.limit else PALE], 3.5 if level.limit else 1.0)

@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from gcs.plan.design import Block, Design, FiguresAtDelay, FiguresAtExpectedDelay, ResponsePart, TradeOffPoint
+from gcs.plan.design import Block, Design, FiguresAtDelay, FiguresAtExpectedDelay, ResponsePart, TradeOffPoint, WindowAt
 from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
 from gcs.runs.summary_record import Summary, VehicleSummary
@@ -20,7 +20,8 @@ def print_design(design: Design, console: Console | None = None) -> None:
     if design.inclusion_gains is not None and design.behaviour is not None:
         own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
         console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
-        law = "u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p, the leader u_1 = K1 e_1^v, north and east alike"
+        fed = f" + {design.feed_forward:g} u_(i-1)" if design.feed_forward else ""
+        law = f"u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p{fed}, the leader u_1 = K1 e_1^v, north and east alike"
         console.print(f"         {law}")
         _print_margins(design, console)
         console.print(_response(design.response), end="")
@@ -48,11 +49,29 @@ def _print_margins(design: Design, console: Console) -> None:
             f"margin   {ms_text(sampled_s)} of loop delay in the sampled loop, {ms_text(continuous_s)} in the "
             "continuous model"
         )
+    if design.prediction is not None:
+        assumed_s = design.prediction.assumed_delay_s
+        over = "the measured loop delay" if assumed_s is None else f"{ms_text(assumed_s)} of loop delay"
+        console.print(f"         without prediction; the station predicts over {over}")
+        console.print(table_of(design.prediction.windows, _WINDOW_COLUMNS, title="stable between, with prediction"))
     if design.vehicles == 1:
         console.print("         of the one vehicle's own velocity loop, as nobody follows it")
     if design.onboard is not None:
         ground_s = design.onboard.ground_delay_margin_s
         console.print(f"         {ms_text(ground_s)} if the station closed every loop with the same gains")
+
+
+def _end(end_s: float | None) -> str:
+    return "no limit" if end_s is None else ms_text(end_s, unit="")
+
+
+_WINDOW_COLUMNS: dict[str, Callable[[WindowAt], str]] = {
+    "assumed delay, ms": lambda at: ms_text(at.assumed_delay_s, ".0f", unit=""),
+    "from, ms": lambda at: _end(at.mismatch_window_s[0]),
+    "to, ms": lambda at: _end(at.mismatch_window_s[1]),
+    "continuous, from": lambda at: _end(at.mismatch_window_continuous_s[0]),
+    "to": lambda at: _end(at.mismatch_window_continuous_s[1]),
+}
 
 
 def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> None:

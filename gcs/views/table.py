@@ -205,6 +205,12 @@ def _progress(state: FlightState, width: int) -> RenderableType:
 
 def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int) -> Table:
     vehicles, headroom, error_m = state.scenario.vehicles, figures.headroom, figures.spacing_error_m
+    assumed: FittedColumn[int] = (
+        "assumed\nms",
+        7,
+        101,
+        lambda k: ms_text(state.newest["assumed_delay_s"][k], ".0f", unit=""),
+    )
     columns: list[FittedColumn[int]] = [
         ("id", 3, 0, lambda k: str(vehicles[k].system_id)),
         ("follows", 7, 101, lambda k: number_text(vehicles[k].follows, "d")),
@@ -213,6 +219,7 @@ def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int
         ("RTT\nms", 6, 76, lambda k: ms_text(figures.rtt_s[k], unit="")),
         ("delay p50\nms", 9, 76, lambda k: ms_text(figures.loop_delay_s_p50[k], unit="")),
         ("delay p99\nms", 9, 0, lambda k: ms_text(figures.loop_delay_s_p99[k], unit="")),
+        *([assumed] if state.scenario.control.prediction != "off" else []),
         ("margin\nms", 6, 101, lambda k: ms_text(state.newest["delay_margin_s"][k], ".0f", unit="")),
         ("headroom\n%", 8, 0, lambda k: headroom_text(headroom[k])),
         ("", 10, 113, lambda k: Text(_bar(headroom[k]), headroom_style(headroom[k]))),

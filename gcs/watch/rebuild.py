@@ -121,20 +121,22 @@ def _told(frame: mavlink.Frame) -> tuple[int, str] | None:
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 
-def _plan(scenario: Scenario) -> FlightPlan:
-    """The plan that defines the errors; it has gains only where the age of the errors depends on them."""
-    if timing_of(scenario) is not None:  # the states that a streamed command needs depend on the gains
+def _plan(scenario: Scenario, margins_s: tuple[float, ...]) -> FlightPlan:
+    """The plan that defines the errors; it has gains only where the latencies depend on them."""
+    # the states that a streamed command needs depend on the gains, and so does the window of a predicted loop
+    if timing_of(scenario) is not None or scenario.control.prediction != "off":
         return flight_plan(scenario)[1]
     formation = plan_formation(scenario)
-    return FlightPlan(scenario, formation, np.zeros((formation.model.inputs, formation.model.states)), nan)
+    K = np.zeros((formation.model.inputs, formation.model.states))
+    return FlightPlan(scenario, formation, K, margins_s[0], tuple((K, margin_s) for margin_s in margins_s[1:]))
 
 
 class _Rebuilding:
     """Rebuilds, frame by frame, what the station knew of the vehicles."""
 
     def __init__(self, scenario: Scenario, margins_s: tuple[float, ...], outline: _Outline) -> None:
-        self._scenario, self._margins_s, self._outline = scenario, margins_s, outline
-        self._fleet = fleet_of(_plan(scenario), ignored)
+        self._scenario, self._outline = scenario, outline
+        self._fleet = fleet_of(_plan(scenario, margins_s), ignored)
         ids = self._fleet.plan.formation.system_ids
         self._repetitions = Repetitions(scenario.rates, len(ids))
         self.watch = Watch(ids)
@@ -221,7 +223,7 @@ class _Rebuilding:
             return
         state = self._states[row]
         if told.isdecimal():
-            gain_set = min(int(told), len(self._margins_s) - 1)
+            gain_set = min(int(told), len(self._fleet.plan.margins_s) - 1)
             self._states[row] = VehicleState(mode=state.mode, gain_set=gain_set)
         elif told in Mode.__members__:
             self._states[row] = VehicleState(mode=Mode[told], gain_set=state.gain_set)
@@ -234,6 +236,8 @@ class _Rebuilding:
             self._jumps[row] = clock.jumps
             self._history.forget(row)
             self._event(time_ns, "vehicle", CLOCK_JUMPED, vehicle.remote.system_id)
+        if frame.msg_id == mavlink.TIMESYNC and frame.fields[0] != 0 and clock.down_ns is not None and vehicle.rtt_s:
+            self._fleet.loop.delivered(row, clock.down_ns, time_ns - round(vehicle.rtt_s[-1] * NS_PER_S))
         if frame.msg_id != mavlink.LOCAL_POSITION_NED:
             return
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
@@ -265,6 +269,7 @@ class _Rebuilding:
             self._history,
             self._law,
             [_NO_BLEND] * len(lost),
+            due_ns=due_ns,
             nominal_velocity_m_s=self._scenario.nominal_velocity_at(time_s),
         )
         nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns), axis=1).tolist()
@@ -274,8 +279,8 @@ class _Rebuilding:
             sent = control._replace(command_m_s2=command or (nan, nan))
             repeated_s = self._repetitions.repeated_s(row, control.used_ns, due_ns)
             figures = self._fresh_rtt_s(row, vehicle), nearest_m[row], command is not None
-            margin_s = self._margins_s[state.gain_set]
-            seen.append(VehicleTick(vehicle.remote, state, sent, self._reported[row], *figures, margin_s, repeated_s))
+            tolerated = self._fleet.plan.tolerance.at(control.assumed_s)
+            seen.append(VehicleTick(vehicle.remote, state, sent, self._reported[row], *figures, tolerated, repeated_s))
         number = round((due_ns - self._start_ns) / self._period_ns)
         rows, _ = tick_rows(Tick(number, time_s, due_ns, key_ms, seen), sent_ns)
         self._rows.append(rows)

@@ -28,7 +28,7 @@ from gcs.runs.summary import finish
 from gcs.station.station import Station
 from gcs.stress.trial import Outcome
 from scenarios import files
-from scenarios.schema import Response
+from scenarios.schema import FixedGains, Response
 
 ROOT = blocks.ROOT
 PAGES = {str(page.relative_to(ROOT)): page for page in blocks.pages()}
@@ -109,6 +109,10 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     load["two way"] = files.load(ROOT / "scenarios" / "chain3_bidirectional.toml")
     load["onboard"] = files.with_loop(load["chain3"], "onboard", Path("chain3.toml"))
     load["copters5"] = load["copters5"].model_copy(update={"response": Response(lag_s=0.15)})
+    predicted = load["chain3"].control.model_copy(update={"prediction": 0.6})
+    load["predicted"] = load["chain3"].model_copy(update={"control": predicted})
+    fed = {"gains": FixedGains(K1=-3.4, K2=3.1, K3=5.6), "delay_margin_s": None, "feed_forward": 0.9}
+    load["fed forward"] = load["chain3"].model_copy(update={"control": load["chain3"].control.model_copy(update=fed)})
     designs = (with_trade_off(flight_plan(scenario)[0]) for scenario in load.values())
     found = [found_fields(design.to_dict(), known) for design in designs]
     assert set[str]().union(*found) == known.keys()

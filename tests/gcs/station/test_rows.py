@@ -1,5 +1,7 @@
 """Each value of the tick record is in the column of its name."""
 
+from math import inf
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from gcs.control.tick import TICK, Mode
 from gcs.link.clocks import ClockEstimate
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
+from gcs.plan.mismatch import Tolerated
 from gcs.station.monitor import VehicleState
 from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
 
@@ -27,12 +30,15 @@ def test_every_column_holds_what_its_name_says() -> None:
         velocity_error_m_s=(7.0, 8.0),
         command_m_s2=(9.0, 10.0),
         used_ns=10 * S - 10_000_000,
+        assumed_s=0.1,
     )
     monitored = VehicleState(mode=Mode.CAUTION, gain_set=1)
     reported = Reported(13_000, -100.0, 0.5, queue_s=0.001, received_ns=10 * S + 25_000_000, bound_s=3e-6)
-    seen = VehicleTick(vehicle, monitored, control, reported, 0.07, 121.5, True, 0.4, 0.01)
+    seen = VehicleTick(
+        vehicle, monitored, control, reported, 0.07, 121.5, True, Tolerated((inf, 0.2), (0.2, 0.3)), 0.01
+    )
     tick = Tick(number=11, time_s=0.22, due_ns=10 * S + 40_000_000, key_ms=220, vehicles=[seen, seen])
-    rows, delays_s = tick_rows(tick, 10 * S + 50_000_000)
+    rows, used_s = tick_rows(tick, 10 * S + 50_000_000)
     expected = {
         "tick": 11, "time_s": 0.22, "due_ns": 10 * S + 40_000_000, "sent_ns": 10 * S + 50_000_000, "key_ms": 220,
         "system_id": 7, "mode": 2, "gain_set": 1, "commanded": True,
@@ -43,7 +49,8 @@ def test_every_column_holds_what_its_name_says() -> None:
         "velocity_error_north_m_s": 7.0, "velocity_error_east_m_s": 8.0,
         "command_north_m_s2": 9.0, "command_east_m_s2": 10.0,
         "nearest_m": 121.5, "queue_s": 0.001, "up_delay_s": 0.025, "sample_bound_s": 3e-6, "down_delay_s": 0.03,
-        "down_bound_s": 4e-6, "loop_delay_s": 0.08, "repeated_s": 0.01, "delay_margin_s": 0.4, "headroom": 0.8,
+        "down_bound_s": 4e-6, "loop_delay_s": 0.08, "repeated_s": 0.01, "assumed_delay_s": 0.1,
+        "delay_margin_s": 0.4, "headroom": 0.9,
         "rtt_s": 0.07, "clock_offset_s": 3.0, "clock_offset_bound_s": 55e-6,  # 5 µs, and 0.1 % of 50 ms
         "received": 5, "lost": 1, "late": 1, "duplicate": 1,
     }  # fmt: skip
@@ -51,16 +58,16 @@ def test_every_column_holds_what_its_name_says() -> None:
     for row in rows:
         found = {name: row[name].item() for name in expected}
         assert all(np.isclose(found[name], expected[name], rtol=1e-12) for name in expected), found
-    assert delays_s == pytest.approx([0.08, 0.08])
+    assert used_s == pytest.approx([0.03, 0.03])  # 0.02 s too short, where 0.2 s are tolerated
 
 
 def test_what_is_not_known_is_not_a_number() -> None:
     vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0))
     nan, pair = np.nan, (np.nan, np.nan)
     nothing = VehicleControl(0, (nan, nan, nan, nan), pair, pair, pair, 0)
-    seen = VehicleTick(vehicle, VehicleState(), nothing, Reported(), nan, nan, False, 0.4, 0.0)
-    rows, delays_s = tick_rows(Tick(0, -1.0, S, 0, [seen]), S)
+    seen = VehicleTick(vehicle, VehicleState(), nothing, Reported(), nan, nan, False, Tolerated((inf,), (0.4,)), 0.0)
+    rows, used_s = tick_rows(Tick(0, -1.0, S, 0, [seen]), S)
     unknown = {name for name in TICK.names or () if rows[name].dtype.kind == "f" and np.isnan(rows[name][0])}
     floats = {name for name in TICK.names or () if TICK[name].kind == "f"}
-    assert unknown == floats - {"time_s", "repeated_s", "delay_margin_s"}
-    assert np.isnan(delays_s).all()
+    assert unknown == floats - {"time_s", "repeated_s", "assumed_delay_s", "delay_margin_s"}
+    assert np.isnan(used_s).all()

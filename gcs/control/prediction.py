@@ -1,0 +1,199 @@
+"""The state of each vehicle at the instant at which its next set-point acts, from the set-points already sent.
+
+A set-point that is due at the tick t_k acts at t_k + D. The *delivery* D of a vehicle is computing + down
+(`gcs.control.loop_delay`), as far as it is known. The newest state (x, v), sampled at s, is carried on to that instant
+with the accelerations u that act in between:
+
+    h = t_k + D - s,   v^ = v + V(t_k) - V(s - D),   x^ = x + v h + P(t_k) - P(s - D) - V(s - D) h,
+
+where V' = u and P' = V over the times at which set-points were due, each held until the next. This is
+x^ = Phi(h) x + sum_j Gamma_j u_{k-j} of `gains.sampled.prediction`, with parts of a period where s lies between ticks.
+The sums are kept, so the cost does not grow with the delay.
+
+The loop delay assumed is the age of a state when it is first used, plus D.
+"""
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Sequence
+from math import exp
+from typing import NamedTuple, Protocol
+
+from gcs.control.history import State, StateHistory
+from scenarios.part import PREDICTION_MAX_S
+from scenarios.schema import NS_PER_S
+
+KEPT_S = 3.0 * PREDICTION_MAX_S
+"""How long set-points are remembered: the assumed delay, and as much again for states that are older than assumed."""
+FASTEST = 0.1
+"""Most that an assumed delay changes, in s per s."""
+_SMOOTHED_S = 2.0
+"""Time constant of the filter of measured deliveries."""
+_AHEAD_S = 5.0
+"""How long the trend of the measured deliveries is continued without a new one."""
+
+
+class _Sent(NamedTuple):
+    """A set-point, and the sums over those before it; north + 1j * east."""
+
+    due_ns: int
+    u: complex
+    V: complex
+    P: complex
+
+
+class CommandHistory:
+    """The accelerations that one vehicle was sent, each held until the next, but at most `held_ns`.
+
+    Without set-points for that long a vehicle enters its failsafe, in which it holds its velocity.
+    """
+
+    def __init__(self, held_ns: int) -> None:
+        self._held_ns = held_ns
+        self._sent: list[_Sent] = [_Sent(0, 0j, 0j, 0j)]
+        self._due_ns = [0]
+
+    def add(self, due_ns: int, acceleration_m_s2: tuple[float, float]) -> None:
+        """Remember the set-point of a tick; ticks come in order."""
+        velocity, position = self.sums(due_ns)
+        self._sent.append(_Sent(due_ns, complex(*acceleration_m_s2), velocity, position))
+        self._due_ns.append(due_ns)
+        long_ago = bisect_right(self._due_ns, due_ns - round(KEPT_S * NS_PER_S)) - 1
+        if 2 * long_ago > len(self._sent):  # half of them at once: deleting from the front moves the rest
+            del self._sent[:long_ago], self._due_ns[:long_ago]
+
+    def sums(self, time_ns: int) -> tuple[complex, complex]:
+        """V (m/s) and P (m) at a time."""
+        last = self._sent[max(0, bisect_right(self._due_ns, time_ns) - 1)]
+        since_ns = max(0, time_ns - last.due_ns)
+        flown_s = min(since_ns, self._held_ns) * 1e-9
+        velocity = last.V + last.u * flown_s
+        position = last.P + (last.V + 0.5 * last.u * flown_s) * flown_s
+        return velocity, position + velocity * (max(0, since_ns - self._held_ns) * 1e-9)
+
+    def carried(self, state: State, from_ns: int, to_ns: int) -> State:
+        """A state carried on under the set-points due between two times."""
+        (velocity, position), (later_velocity, later_position) = self.sums(from_ns), self.sums(to_ns)
+        north, east, v_north, v_east = state
+        for_s = (to_ns - from_ns) * 1e-9
+        gained, moved = later_velocity - velocity, later_position - position - velocity * for_s
+        return (
+            north + v_north * for_s + moved.real,
+            east + v_east * for_s + moved.imag,
+            v_north + gained.real,
+            v_east + gained.imag,
+        )
+
+
+class Delivery(Protocol):
+    """The delivery of one vehicle's set-points as the prediction assumes it."""
+
+    def measured(self, down_ns: int, sent_ns: int) -> None:
+        """Take in the one-way delay of a request that left at `sent_ns`."""
+        ...
+
+    def assumed_ns(self, due_ns: int, age_ns: int) -> int | None:
+        """D of the set-point due now; `age_ns` is the mean age of states at their first use. None while unknown."""
+        ...
+
+
+class FixedDelivery:
+    """What is left of a loop delay that is given."""
+
+    def __init__(self, assumed_s: float) -> None:
+        self._assumed_ns = round(assumed_s * NS_PER_S)
+
+    def measured(self, down_ns: int, sent_ns: int) -> None:
+        """Nothing to do: the delay is given."""
+
+    def assumed_ns(self, due_ns: int, age_ns: int) -> int | None:
+        del due_ns
+        return self._assumed_ns - age_ns
+
+
+class MeasuredDelivery:
+    """The measured one-way delays, smoothed along their trend; what is assumed moves there by `FASTEST` at most.
+
+    A fading-memory filter of second order: it follows a delay that grows evenly without falling behind, although a
+    measurement is known only a round trip after its request has left. R. Morrison, "Introduction to sequential
+    smoothing and prediction" (1969), ch. 9.
+    """
+
+    def __init__(self) -> None:
+        self._level_ns = self._trend = 0.0
+        self._at_ns = 0
+        self._assumed: tuple[int, float] | None = None
+        """The tick at which D was asked for last, and that D."""
+
+    def measured(self, down_ns: int, sent_ns: int) -> None:
+        since_ns = sent_ns - self._at_ns
+        if self._at_ns == 0:
+            self._level_ns, self._at_ns = float(down_ns), sent_ns
+        elif since_ns > 0:
+            fading = exp(-since_ns * 1e-9 / _SMOOTHED_S)
+            level_ns = self._level_ns + self._trend * since_ns
+            off_ns = down_ns - level_ns
+            self._level_ns, self._at_ns = level_ns + (1.0 - fading**2) * off_ns, sent_ns
+            trend = self._trend + (1.0 - fading) ** 2 * off_ns / since_ns
+            self._trend = min(FASTEST, max(-FASTEST, trend))
+
+    def assumed_ns(self, due_ns: int, age_ns: int) -> int | None:
+        del age_ns
+        if self._at_ns == 0:
+            return None
+        ahead_ns = min(due_ns - self._at_ns, _AHEAD_S * NS_PER_S)
+        aim_ns = max(0.0, self._level_ns + self._trend * ahead_ns)
+        if self._assumed is not None:
+            before_ns, assumed_ns = self._assumed
+            most_ns = FASTEST * (due_ns - before_ns)
+            aim_ns = min(assumed_ns + most_ns, max(assumed_ns - most_ns, aim_ns))
+        self._assumed = due_ns, aim_ns
+        return round(aim_ns)
+
+
+class FirstUses:
+    """The mean age of one vehicle's states at the ticks that first use them, over as many as repeat themselves."""
+
+    def __init__(self, commands: int) -> None:
+        self._ages_ns = deque[int](maxlen=commands)
+        self._sample_ns = 0
+
+    def age_ns(self, sample_ns: int, due_ns: int) -> int:
+        """That mean, with the state used at the tick due now."""
+        if sample_ns != self._sample_ns:
+            self._sample_ns = sample_ns
+            self._ages_ns.append(due_ns - sample_ns)
+        return round(sum(self._ages_ns) / len(self._ages_ns))
+
+
+class PredictedStates:
+    """Where vehicles are at any instant after their newest states; `gcs.control.history.States` at one tick."""
+
+    def __init__(self, sent: Sequence[CommandHistory], deliveries: Sequence[Delivery], commands: int) -> None:
+        self.deliveries, self._sent = deliveries, sent
+        self._first_uses = [FirstUses(commands) for _ in sent]
+        self._delivery_ns: list[int | None] = [None] * len(sent)
+        self._history = StateHistory(len(sent))
+
+    def look(self, history: StateHistory, due_ns: int) -> list[tuple[int, float]]:
+        """Take in the newest states; for each vehicle when its set-point acts (ns), and the loop delay assumed (s).
+
+        Both are 0 while no state, or no delivery, is known.
+        """
+        self._history = history
+        found: list[tuple[int, float]] = []
+        for row, delivery in enumerate(self.deliveries):
+            newest = history.newest(row)
+            age_ns = 0 if newest is None else self._first_uses[row].age_ns(newest[0], due_ns)
+            delivery_ns = None if newest is None else delivery.assumed_ns(due_ns, age_ns)
+            self._delivery_ns[row] = delivery_ns
+            found.append((0, 0.0) if delivery_ns is None else (due_ns + delivery_ns, (age_ns + delivery_ns) * 1e-9))
+        return found
+
+    def at(self, vehicle: int, time_ns: int) -> State | None:
+        """The state of a vehicle at an instant; None if it has reported nothing."""
+        newest, delivery_ns = self._history.newest(vehicle), self._delivery_ns[vehicle]
+        if newest is None or delivery_ns is None or time_ns <= newest[0]:
+            return self._history.at(vehicle, time_ns)
+        sample_ns, state = newest
+        return self._sent[vehicle].carried(state, sample_ns - delivery_ns, time_ns - delivery_ns)

@@ -1,0 +1,124 @@
+"""By how much the loop delay may miss the assumed one, for each set of the gain schedule.
+
+Without prediction the assumed delay is 0, and it may be exceeded by the delay margin. With prediction it may be missed
+by its distances from the ends of the mismatch window (`gains.sampled.prediction`).
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from math import inf
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
+from gains.sampled.multirate import Timing
+from gains.sampled.prediction import mismatch_window
+from scenarios.part import PREDICTION_MAX_S
+
+Window = tuple[float, float]
+"""The least and the largest loop delay (s) between which a loop is stable."""
+_TABULATED_S = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0, 7.0, PREDICTION_MAX_S)
+"""Assumed delays at which the windows are computed if the delay is measured."""
+
+
+class Tolerated(NamedTuple):
+    """How much shorter and longer (s) than assumed the loop delay may be, for each set of the gain schedule.
+
+    `shorter_s` is infinite where no delay is too short.
+    """
+
+    shorter_s: tuple[float, ...]
+    longer_s: tuple[float, ...]
+
+    def used_s(self, gain_set: int, mismatch_s: float) -> float:
+        """The loop delay minus the assumed one, to be compared with `longer_s`: one that is too short is scaled to it.
+
+        >>> half = Tolerated((0.1,), (0.2,))
+        >>> half.used_s(0, 0.05), half.used_s(0, -0.05)
+        (0.05, 0.1)
+        """
+        if mismatch_s < 0.0 and self.shorter_s[gain_set] < inf:
+            return -mismatch_s * self.longer_s[gain_set] / self.shorter_s[gain_set]
+        return mismatch_s
+
+
+class Tolerance(Protocol):
+    """What is tolerated at an assumed loop delay."""
+
+    def at(self, assumed_s: float) -> Tolerated: ...
+
+
+class Steady:
+    """The same at every assumed delay, of which there is one."""
+
+    def __init__(self, tolerated: Tolerated) -> None:
+        self._tolerated = tolerated
+
+    def at(self, assumed_s: float) -> Tolerated:
+        del assumed_s
+        return self._tolerated
+
+
+class Tabulated:
+    """The windows at several assumed delays, interpolated to the millisecond.
+
+    The reciprocals of the distances are interpolated, which are about k1 + k3 tau^. Where a window begins to have a
+    lower end, the nearest delay that has one decides.
+    """
+
+    def __init__(self, windows: Sequence[Sequence[Window]]) -> None:
+        """`windows` has those of each gain set at each of the assumed delays in `_TABULATED_S`."""
+        self._known: dict[int, Tolerated] = {}
+        with np.errstate(divide="ignore"):
+            self._reciprocal = 1.0 / np.array(
+                [[distances(at, s) for at, s in zip(own, _TABULATED_S, strict=True)] for own in windows]
+            )
+
+    def at(self, assumed_s: float) -> Tolerated:
+        key = round(1e3 * assumed_s)
+        if key not in self._known:
+            place = float(np.interp(1e-3 * key, _TABULATED_S, np.arange(len(_TABULATED_S))))
+            before, after = self._reciprocal[:, int(place)], self._reciprocal[:, -(-int(1e9 * place) // 10**9)]
+            share = place - int(place)
+            mixed = np.where((before == 0.0) | (after == 0.0), np.maximum(before, after), 0.0)
+            mixed = np.where(mixed > 0.0, mixed, (1.0 - share) * before + share * after)
+            with np.errstate(divide="ignore"):
+                shorter_s, longer_s = (tuple(side) for side in (1.0 / mixed).T.tolist())
+            self._known[key] = Tolerated(shorter_s, longer_s)
+        return self._known[key]
+
+
+def distances(window: Window, assumed_s: float) -> tuple[float, float]:
+    """How much shorter and longer (s) than assumed a loop delay in this window may be."""
+    least_s, most_s = window
+    return assumed_s - least_s if least_s > 0.0 else inf, most_s - assumed_s
+
+
+def tolerance(
+    prediction: float | str,
+    model: FormationModel,
+    gains: Sequence[FloatArray],
+    margins_s: tuple[float, ...],
+    timing: Timing,
+) -> Tolerance:
+    """What a gain schedule tolerates; `prediction` is that of the scenario, `margins_s` are those without it."""
+    if prediction == "off":
+        return Steady(Tolerated((inf,) * len(margins_s), margins_s))
+    if isinstance(prediction, str):
+        return Tabulated([[window(model, K, timing, at_s) for at_s in _TABULATED_S] for K in gains])
+    found = [distances(window(model, K, timing, prediction), prediction) for K in gains]
+    return Steady(Tolerated(tuple(shorter for shorter, _ in found), tuple(longer for _, longer in found)))
+
+
+def window(model: FormationModel, K: FloatArray, timing: Timing, assumed_s: float) -> Window:
+    """The mismatch window of a formation that is predicted over `assumed_s`, as sampled and held."""
+    return _window(model, K.tobytes(), timing, assumed_s)
+
+
+@lru_cache(maxsize=1024)
+def _window(model: FormationModel, gain: bytes, timing: Timing, assumed_s: float) -> Window:
+    """Once for all flights of a campaign."""
+    K = np.frombuffer(gain).reshape(model.inputs, model.states)
+    return mismatch_window(model.A, model.B, K, timing, assumed_s=assumed_s)

@@ -1,0 +1,122 @@
+"""Flights of a station that predicts: they decay or grow as the certificate says, and settle where others break."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from gcs.control.tick import TickArray
+from gcs.drive.flown import fly_virtual
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.planner import flight_plan
+from gcs.stress.axes import at_coordinates
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import Study
+from scenarios.files import load
+from scenarios.link_schema import DelayPoint, Jitter, Link, Links
+from scenarios.schema import Control, FixedGains, Limits, NominalVelocity, Scenario
+from tests.support.known import known
+from tests.support.paths import SCENARIOS
+
+TRIANGLE = load(SCENARIOS / "triangle5.toml")
+GAINS = FixedGains(K1=-3.408, K2=0.631, K3=5.608)
+DECAY_1_S = 1.735
+"""Of these gains without delay, which prediction keeps at every delay: docs/explanation/prediction.md."""
+
+
+def scenario(prediction: float | str, *, link_s: float, **changes: object) -> Scenario:
+    control = Control.model_validate({"gains": GAINS, "prediction": prediction})
+    return at_coordinates(TRIANGLE.model_copy(update={"control": control, **changes}), {"delay": link_s})
+
+
+@cache
+def planned(prediction: float | str) -> FlightPlan:
+    return flight_plan(scenario(prediction, link_s=0.0).with_calm_monitor())[1]
+
+
+def errors_m(ticks: TickArray, *, from_s: float) -> float:
+    """The largest spacing error from a time on."""
+    rows = ticks[ticks["time_s"] >= from_s]
+    return float(np.nanmax(np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])))
+
+
+@pytest.mark.parametrize(
+    ("assumed_s", "loop_s"),
+    [
+        (0.3, 0.35),
+        (0.6, 0.4569),  # beside the lower end of its window, with parts of a period in both delays
+        (0.6, 0.64),
+        (0.6131, 0.7513),
+        (1.5, 1.45),
+        (1.5, 1.5817),
+        (1.5, 1.6),  # beyond the window: errors grow
+    ],
+)
+def test_errors_change_at_the_rate_of_the_certificate(assumed_s: float, loop_s: float) -> None:
+    """The flown arithmetic is that of `predicted_map`: any other would have other roots."""
+    trial = Study(planned(assumed_s)).trial("probe", {"delay": loop_s - 0.01}, seed=1)
+    outcome = fly_trial(trial)
+    growth, predicted = known(outcome.growth_1_s), known(outcome.predicted_growth_1_s)
+    # telemetry is rounded to float32: 0.1 mm, to which an error of a metre decays in a few seconds
+    assert growth == pytest.approx(predicted, abs=0.01 + 0.01 * abs(predicted))
+    tolerated = planned(assumed_s).tolerance.at(assumed_s)
+    mismatch_s = known(outcome.loop_delay_s) - assumed_s
+    assert (growth < 0.0) == (-tolerated.shorter_s[0] < mismatch_s < tolerated.longer_s[0])
+
+
+def test_without_mismatch_errors_decay_as_without_delay() -> None:
+    """At 1.5 s of loop delay, five times the margin of these gains."""
+    beside = fly_trial(Study(planned(1.5)).trial("probe", {"delay": 1.49}, seed=1, probe=2))
+    link_s = 1.49 + 1.5 - known(beside.loop_delay_s)
+    outcome = fly_trial(Study(planned(1.5)).trial("probe", {"delay": link_s}, seed=1, probe=2))
+    assert outcome.loop_delay_s == pytest.approx(1.5, abs=1e-4)
+    assert known(outcome.growth_1_s) == pytest.approx(-DECAY_1_S, rel=0.02)
+
+
+def test_a_predicted_formation_settles_at_five_times_the_margin() -> None:
+    ticks = fly_virtual(flight_plan(scenario(1.5, link_s=1.49, duration_s=16.0))[1]).ticks
+    assert errors_m(ticks, from_s=12.0) < 1e-3 * 172.4
+    assert ticks["headroom"][ticks["time_s"] > 2.0].min() > 0.8
+    assert set(ticks["assumed_delay_s"][ticks["time_s"] > 0.0]) == {1.5}
+
+
+def test_without_prediction_the_same_formation_breaks() -> None:
+    flight = fly_virtual(flight_plan(scenario("off", link_s=1.49, duration_s=16.0))[1])
+    assert "broken" in flight.events[-1].text
+
+
+def test_the_measured_delay_is_followed() -> None:
+    """Links that differ from vehicle to vehicle need no configuration."""
+    ticks = fly_virtual(flight_plan(scenario("measured", link_s=0.9, duration_s=12.0))[1]).ticks
+    flown = ticks[ticks["time_s"] > 3.0]
+    assert np.abs(flown["loop_delay_s"] - flown["assumed_delay_s"]).max() < 0.002  # the rounding of time_boot_ms
+    assert errors_m(ticks, from_s=10.0) < 1e-3 * 172.4
+
+
+def test_a_delay_that_drifts_to_ten_times_the_margin_is_followed_through_jitter_and_losses() -> None:
+    """20 ms to 1.5 s each way within a minute, +-30 ms of jitter, 5 % of all datagrams lost.
+
+    The formation flies 15 m/s: errors of the clocks, 5 ms here, are errors of position in proportion to the speed.
+    """
+    drift = (DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=60.0, delay_s=1.5))
+    jitter = Jitter(distribution="uniform", scale_s=0.03)
+    link = Link(delay_points=drift, jitter=jitter, loss_probability=0.05)
+    flown = chain3("measured")
+    slow = tuple(vehicle.model_copy(update={"velocity_ne_m_s": (15.0, 0.0)}) for vehicle in flown.vehicles)
+    changes = {
+        "links": Links(up=link, down=link),
+        "vehicles": slow,
+        "nominal_velocity": (NominalVelocity(from_s=0.0, velocity_ne_m_s=(15.0, 0.0)),),
+        "limits": Limits(speed_min_m_s=0.1),
+        "duration_s": 70.0,
+    }
+    plan = flight_plan(flown.model_copy(update=changes))[1]
+    ticks = fly_virtual(plan).ticks
+    assert ticks["loop_delay_s"][-3:].min() > 2.9
+    assert errors_m(ticks, from_s=12.0) < 0.01 * 172.4
+
+
+def chain3(prediction: float | str) -> Scenario:
+    loaded = load(SCENARIOS / "chain3.toml")
+    control = Control.model_validate({"gains": GAINS, "prediction": prediction})
+    return loaded.model_copy(update={"control": control})
