@@ -4,7 +4,7 @@ import os
 import re
 import subprocess
 import sys
-import time
+import time  # noqa: TID251 - waits for another program
 import urllib.request
 from collections.abc import Generator
 from contextlib import contextmanager
