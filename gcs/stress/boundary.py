@@ -59,7 +59,7 @@ def map_figure(
     if line is not None:
         label = "guaranteed to the left, however the delay varies"
         plot.plot(*line.T, color=_GUARANTEED, linestyle="dashdot", linewidth=2.0, label=label)
-    _mark(plot, axes, verdicts, np.abs(measured) > 0.6 * reach)
+    _mark(plot, axes, verdicts, dark=np.abs(measured) > 0.6 * reach, decays=measured < 0.0)
     if np.isnan(measured).any():
         plot.plot([], [], "s", color=_BLANK, markersize=9, label="no growth rate could be measured")
     plot.set(xlabel=axes[0].label, ylabel=axes[1].label, xlim=cell_edges(across)[[0, -1]], ylim=cell_edges(up)[[0, -1]])
@@ -125,18 +125,37 @@ def _waiting_s(outcomes: Sequence[Outcome], system_id: int) -> float:
     return float(np.median(waits)) if waits else 0.0
 
 
-def _mark(plot: Any, axes: Sequence[Axis], verdicts: Sequence[Outcome], dark: NDArray[np.bool_]) -> None:
-    """Mark the verdict of each cell's own-state flights; light marks on dark cells."""
+def _mark(
+    plot: Any,
+    axes: Sequence[Axis],
+    verdicts: Sequence[Outcome],
+    *,
+    dark: NDArray[np.bool_],
+    decays: NDArray[np.bool_],
+) -> None:
+    """Mark the verdict of each cell's own-state flights; light marks on dark cells.
+
+    An error that stays where small errors decay is no instability of the loop: large initial errors met a limit, or
+    random links keep pushing.
+    """
     across, up = (np.array(axis.values) for axis in axes)
     found = _verdicts(axes, verdicts)
-    for verdict, marker, size in (("unstable", "x", 22), ("stable", "o", 8), ("aborted", "+", 22)):
-        at = np.argwhere(found == verdict)
+    for cells, marker, size, filled, meaning in (
+        ((found == "unstable") & ~decays, "x", 22, True, "unstable"),
+        ((found == "unstable") & decays, "o", 22, False, "an error stays, though small ones die away"),
+        (found == "stable", "o", 8, True, "stable"),
+        (found == "aborted", "+", 22, True, "aborted"),
+    ):
+        at = np.argwhere(cells)
         if not at.size:
             continue
         ink = np.where(dark[at[:, 0], at[:, 1]], "white", "#222222")
-        plot.scatter(across[at[:, 0]], up[at[:, 1]], marker=marker, s=size, c=ink, linewidths=0.9)
-        label = f"own initial states: {verdict}"
-        plot.scatter([], [], marker=marker, s=size, c="#222222", linewidths=0.9, label=label)
+        for place, color in ((at, ink), (at[:0], np.array(["#222222"]))):  # the second for the legend
+            inside = {"color": color} if filled else {"facecolors": "none", "edgecolors": color}
+            label = None if len(place) else f"own initial states: {meaning}"
+            plot.scatter(
+                across[place[:, 0]], up[place[:, 1]], marker=marker, s=size, linewidths=0.9, label=label, **inside
+            )
 
 
 def cell_edges(values: FloatArray) -> FloatArray:
