@@ -104,6 +104,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         fleet=(said[record.FLEET] or [record.STARTED])[-1],
         not_logged=not_logged,
         loop=scenario.control.loop,
+        prediction=scenario.control.prediction,
         delay_margin_s=design.delay_margin_s,
         delay_margin_continuous_s=design.delay_margin_continuous_s,
         response=design.response,

@@ -108,6 +108,7 @@ class Summary(Published):
     fleet: str = STARTED
     not_logged: tuple[str, ...] = ()
     loop: Literal["ground", "onboard"]
+    prediction: float | str = "off"
     delay_margin_s: Number
     delay_margin_continuous_s: Number = None
     response: ResponsePart | None = None

@@ -181,7 +181,8 @@ def delay_text(summary: Summary) -> str:
     margin = "no limit" if summary.loop == "onboard" and margin_s is None else f"margin {ms_text(margin_s)}"
     slowest_s = max((vehicle.delay_margin_s.max or 0.0 for vehicle in summary.vehicles), default=0.0)
     if margin_s is not None and slowest_s > margin_s:
-        margin += f", up to {ms_text(slowest_s)} with slower gains"
+        way = "slower gains" if summary.prediction == "off" else "prediction"
+        margin += f", up to {ms_text(slowest_s)} with {way}"
     return (
         f"loop {ms_text(delay.p50)} p50, {ms_text(delay.p99)} p99, {ms_text(delay.max)} max; "
         f"{margin}; least headroom {number_text(summary.headroom_min, '.0%')}"
