@@ -41,13 +41,14 @@ def may_reach_zero(points: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
     """Where a local maximum below zero of samples (k, r) of r functions may hide a zero, shape (k - 2, r).
 
     A smooth peak exceeds its highest sample by an eighth of its height above the neighbours; a kink by as much as the
-    line through one neighbour rises over the other step.
+    line through one neighbour rises over the other step. A neighbour at the same point says nothing.
     """
     inner, left, right = values[1:-1], values[:-2], values[2:]
     before, after = np.diff(points)[:-1, np.newaxis], np.diff(points)[1:, np.newaxis]
-    rise = np.maximum(
-        (inner - left) * np.maximum(1.0, after / before), (inner - right) * np.maximum(1.0, before / after)
-    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rise = np.fmax(
+            (inner - left) * np.maximum(1.0, after / before), (inner - right) * np.maximum(1.0, before / after)
+        )
     return (inner >= left) & (inner >= right) & (inner <= 0.0) & (inner + _REACH * rise >= 0.0)
 
 
