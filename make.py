@@ -16,7 +16,6 @@ VENV = ROOT / ".venv"
 STAMP = VENV / "installed.sha256"
 LOCK = ROOT / "requirements.lock"
 
-# name: (what it is for, the commands; further arguments go to the last one)
 # The hot path of a flight in virtual time, and of the station: these modules can be compiled.
 COMPILED = (
     "gcs/control/history.py gcs/control/law.py gcs/control/limits.py gcs/control/loop_delay.py "
@@ -29,6 +28,7 @@ COMPILED = (
     "sim_vehicles/vehicles/flight_mode.py sim_vehicles/vehicles/setpoints.py sim_vehicles/vehicles/shell.py"
 )
 
+# name: (what it is for, the commands; further arguments go to the last one)
 JOBS: dict[str, tuple[str, list[str]]] = {
     "setup": ("make .venv with everything in requirements.lock", ["python --version"]),
     "fly": ("fly scenarios/triangle5.toml", ["gcs fly scenarios/triangle5.toml"]),

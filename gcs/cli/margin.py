@@ -73,6 +73,8 @@ def margin_of_scenario(file: Path) -> ScenarioMargin:
     what = "own errors at once, those of others late" if loop == "onboard" else "all feedback late"
     flown = "no limit" if sampled_s is None else f"margin {sampled_s:.6g} s"
     note = f"as flown, sampled and held every {design.period_s * 1e3:g} ms: {flown}"
+    if design.prediction is not None:
+        note = note.replace("as flown", "without prediction") + "; gcs design tells where the loop is stable with it"
     return ScenarioMargin(replace(found, notes=(f"loop {loop}: {what}", note, *found.notes)), loop, sampled_s)
 
 

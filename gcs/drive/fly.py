@@ -4,7 +4,7 @@ import contextlib
 import os
 import subprocess
 import sys
-import time  # noqa: TID251 - names the run's folder; the flight's own clock is in the driver
+import time  # noqa: TID251 - names the run's folder, paces virtual time and waits for the observer
 from collections.abc import Callable, Generator
 from operator import itemgetter
 from pathlib import Path

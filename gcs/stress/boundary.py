@@ -77,11 +77,11 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     With jitter of at most j each way and periods T of telemetry and control, the state behind the command in action is
     between d - 2 j and d + 2 j + 2 T old. Two bounds cover that: one for deviations from the middle
     (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies), one for any variation between 0 and a
-    maximum (`gains.varying.bounds.varying_delay_bound`). None for other axes, for unbounded jitter, and for the onboard
-    loop, where not all feedback is late.
+    maximum (`gains.varying.bounds.varying_delay_bound`). None for other axes, for unbounded jitter, and for loops
+    in which not all feedback is late: the onboard loop, and that of a station that predicts.
     """
     scenario, names = study.plan.scenario, [axis.name for axis in axes]
-    if names != ["delay", "jitter"] or len(axes[0].values) < 2 or scenario.control.loop != "ground":
+    if names != ["delay", "jitter"] or len(axes[0].values) < 2 or not _all_late(study):
         return None
     jittery = every_link(at_coordinates(scenario, {"jitter": 1.0}))
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in jittery):
@@ -102,10 +102,11 @@ def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
 def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[FloatArray]:
     """The edge of stability over the link delays of two vehicles, from the continuous model of the whole formation.
 
-    Empty for other axes, for the onboard loop, and for vehicles in a loop with others, whose delays matter too.
+    Empty for other axes, for loops in which not all feedback is late, and for vehicles in a loop with others, whose
+    delays matter too.
     """
     plan = study.plan
-    if not all(axis.name.startswith("delay_") for axis in axes) or plan.scenario.control.loop != "ground":
+    if not all(axis.name.startswith("delay_") for axis in axes) or not _all_late(study):
         return []
     ids = [int(axis.name.removeprefix("delay_")) for axis in axes]
     if any(system_id in loop.system_ids and len(loop.system_ids) > 1 for loop in plan_loops(plan) for system_id in ids):
@@ -118,6 +119,12 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     longest_s = (axes[0].values[-1] + float(less_s[0]), axes[1].values[-1] + float(less_s[1]))
     lines = boundary_of_two_delays(others, late[places[0]], late[places[1]], longest_s=longest_s)
     return [line.delays_s - less_s for line in lines]
+
+
+def _all_late(study: Study) -> bool:
+    """Whether the loop flown is x' = A x + B K x(t - tau), with all feedback as late as the links make it."""
+    control = study.plan.scenario.control
+    return control.loop == "ground" and control.prediction == "off"
 
 
 def _waiting_s(outcomes: Sequence[Outcome], system_id: int) -> float:

@@ -39,6 +39,13 @@ def test_nothing_is_guaranteed_where_no_delay_is_the_longest(axes: tuple[Axis, A
     assert guaranteed_line(Study(plan), axes) is None
 
 
+def test_a_station_that_predicts_guarantees_nothing_by_the_loop_without_it() -> None:
+    control = SCENARIO.control.model_copy(update={"prediction": 0.6})
+    study = Study(replace(pair_plan(), scenario=SCENARIO.model_copy(update={"control": control})))
+    assert guaranteed_line(study, DELAY_JITTER) is None
+    assert two_delays_lines(study, (Axis("delay_1", (0.1, 0.5)), Axis("delay_2", (0.1, 0.5))), []) == []
+
+
 def test_two_loops_of_a_tree_break_along_a_rectangle() -> None:
     """The sides are the sampled margins less the waiting, as near as half a period for the hold is."""
     study = Study(pair_plan())
