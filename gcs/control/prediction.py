@@ -115,8 +115,8 @@ class MeasuredDelivery:
     """D from the measured one-way delays, smoothed along their trend; it changes at the rate `FASTEST` at most.
 
     A fading-memory filter of second order: it follows a steadily growing delay without lag, although a measurement is
-    known only one round trip after its request was sent. R. Morrison, "Introduction to sequential
-    smoothing and prediction" (1969), ch. 9.
+    known only one round trip after its request was sent. R. Morrison, "Introduction to sequential smoothing and
+    prediction" (1969), ch. 9.
     """
 
     def __init__(self) -> None:

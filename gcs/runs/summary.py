@@ -22,7 +22,7 @@ from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0
 """A clock's skew is not estimated over a shorter time than this."""
-SILENT_END = "interrupted: the station ended without a word"
+SILENT_END = "interrupted: the station ended without recording why"
 
 
 def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary:

@@ -30,7 +30,7 @@ def print_design(design: Design, console: Console | None = None) -> None:
         console.print(table_of(design.blocks, _BLOCK_COLUMNS))
         _print_margins(design, console)
         bound, decay_1_s = "robustness bound of the whole formation", design.decay_rate_1_s
-    loss = "" if design.cost_loss is None else f"; costs {design.cost_loss:.1%} more than with all information"
+    loss = "" if design.cost_loss is None else f"; LQR cost {design.cost_loss:.1%} above the centralised optimum"
     console.print(f"alpha    {design.alpha:.4f} ({bound}), decay {decay_1_s:.2f} 1/s without delay{loss}")
     if design.at_loop_delay is not None:
         _print_figures_at_delay(design.at_loop_delay, console)
@@ -154,7 +154,7 @@ def print_flight(summary: Summary, console: Console) -> None:
         settled_s = summary.settling_time_s
         console.print(
             f"control  {control.ticks} ticks at {control.rate_hz:g} Hz, {control.deadline_misses} deadline misses; "
-            f"settled {'not at all' if settled_s is None else f'after {settled_s:.1f} s'}"
+            f"{'not settled' if settled_s is None else f'settled after {settled_s:.1f} s'}"
         )
     for who, counts in (("station", summary.refused), ("vehicles", summary.refused_by_vehicles)):
         if counts:
