@@ -25,7 +25,7 @@ from scenarios.places import line_of, location_of, named, wanted_of
 from scenarios.schema import Scenario
 
 TRACE_DELAYS = 100_000
-"""Most delays of a trace."""
+"""Largest number of delays in a trace."""
 TRACE_COLUMN = "delay_s"
 _A_VEHICLE = "the system_id of a vehicle of this scenario"
 _Fault = tuple[str, object, str]
@@ -162,12 +162,12 @@ def _control_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     if control.blocks and (required or control.gains is not None):
         yield "control.blocks", f"{len(control.blocks)} blocks", f"either blocks, or gains, or a requirement ({wanted})"
     if scenario.dynamics == "autopilot" and (control.method != "inclusion" or control.blocks):
-        wanted = "inclusion without blocks, with dynamics autopilot: only for its gains are margins computed with a lag"
+        wanted = "inclusion without blocks, with dynamics autopilot: margins with a lag are computed only for its gains"
         yield "control.method", control.method, wanted
     if control.gains is not None and control.method != "inclusion":
         yield "control.method", control.method, "inclusion, with gains given; a graph's gains are given as blocks"
     if control.feed_forward and (control.gains is None or control.loop == "onboard"):
-        wanted = "0, unless gains are given and loop is ground: no design provides for it"
+        wanted = "0, unless gains are given and loop is ground: no design method provides for it"
         yield "control.feed_forward", control.feed_forward, wanted
     if control.prediction != "off" and control.loop == "onboard":
         yield "control.prediction", control.prediction, "off, with loop onboard: vehicles feed back their own errors"
@@ -259,9 +259,9 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         return
     for k, vehicle in enumerate(scenario.vehicles):
         if vehicle.flavour is not None:
-            yield f"vehicles[{k}].flavour", vehicle.flavour, "nothing, without dynamics autopilot"
+            yield f"vehicles[{k}].flavour", vehicle.flavour, "no such key without dynamics autopilot"
     if scenario.response is not None:
-        yield "response", scenario.response.model_dump(), "nothing, without dynamics autopilot"
+        yield "response", scenario.response.model_dump(), "no such key without dynamics autopilot"
 
 
 def _velocity_contradictions(scenario: Scenario) -> Iterator[_Fault]:
@@ -324,7 +324,7 @@ def _link_contradictions(key: str, link: Link) -> Iterator[_Fault]:
         if k and time_s < times_s[k - 1]:
             yield f"{key}.delay_points[{k}].at_s", time_s, "times that do not decrease"
         if times_s[max(k - 2, 0) : k] == [time_s, time_s]:
-            yield f"{key}.delay_points[{k}].at_s", time_s, "at most two points at one time, which make a step"
+            yield f"{key}.delay_points[{k}].at_s", time_s, "at most two points at the same time, which make a step"
     if link.loss_bursts is not None and link.loss_probability:
         yield f"{key}.loss_probability", link.loss_probability, "either loss_probability or loss_bursts"
     before_s = 0.0
@@ -354,7 +354,7 @@ def _jitter_contradictions(key: str, jitter: Jitter) -> Iterator[_Fault]:
 
 
 def _with_traces(scenario: Scenario, file: Path) -> Scenario:
-    """The scenario with delays in place of the names of trace files, so that it is complete without them."""
+    """The scenario with the delays in place of the names of trace files, so that it is complete without the files."""
     traces: dict[str, tuple[float, ...]] = {}
     for key, link in _places(scenario.links):
         if link.jitter is not None and (name := link.jitter.trace_file) is not None:

@@ -1,4 +1,4 @@
-"""The emulated radio links of a scenario, as the file describes them; `sim_vehicles.links` does what they say."""
+"""The emulated radio links of a scenario, as the file describes them; `sim_vehicles.links` implements them."""
 
 from typing import Annotated, Literal
 
@@ -14,7 +14,7 @@ class Jitter(Part):
     normal       mean 0, standard deviation scale_s
     exponential  from 0 up: mean and standard deviation scale_s
     gamma        from 0 up: mean shape * scale_s, standard deviation sqrt(shape) * scale_s
-    trace        measured delays in their order, starting at a place drawn for each link and wrapping around
+    trace        measured delays in order, from a starting point drawn for each link, wrapping around
     """
 
     distribution: Literal["uniform", "normal", "exponential", "gamma", "trace"]
@@ -25,7 +25,7 @@ class Jitter(Part):
     """Shape of the gamma distribution; needed by `gamma` only."""
     trace_file: str | None = None
     """File of measured delays, relative to the scenario file: one delay in s per line, or CSV with a column `delay_s`.
-    It is read with the scenario, which from then on holds the delays themselves in `trace_s`."""
+    It is read once, with the scenario, which then holds the delays themselves in `trace_s`."""
     trace_s: tuple[NotNegative, ...] | None = None
     """The measured delays, in place of `trace_file`."""
 
@@ -74,8 +74,7 @@ class Link(Part):
     delay_s: NotNegative = 0.0
     """Constant one-way delay."""
     delay_points: tuple[DelayPoint, ...] = ()
-    """A delay that changes over time, in place of `delay_s`. A datagram gets the delay of the time at which it
-    enters."""
+    """A delay that changes over time, in place of `delay_s`. Each datagram gets the delay at the time it enters."""
     jitter: Jitter | None = None
     """Random delay on top of the constant one."""
     reordering: bool = False
@@ -140,8 +139,9 @@ class Links(Part):
     channels: tuple[Channel, ...] = ()
     """Channels of limited bandwidth that links may use."""
     times_from: Literal["flight", "start"] = "flight"
-    """What link time, which outages and delay points refer to, counts from. `flight`: the station's first set-point
-    enters a link; before that the first delay point applies and there is no outage. `start`: the vehicles start."""
+    """Zero of the link time, to which outages and delay points refer. `flight`: when the station's first set-point
+    enters a link; before that, the first delay point applies and there is no outage. `start`: when the vehicles
+    start."""
 
     def of(self, system_id: int) -> tuple[Link, Link]:
         """The (up, down) links of one vehicle."""

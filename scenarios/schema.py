@@ -30,7 +30,7 @@ from scenarios.part import (
 
 NS_PER_S = 1_000_000_000
 DRIFT_MAX_PPM = 1000.0
-"""Most that a vehicle's clock may drift. What the station says of clocks, and the bounds it gives, hold up to this."""
+"""Largest drift of a vehicle's clock. The station's clock estimates and their bounds hold up to this drift."""
 
 
 class Vehicle(Part):
@@ -98,7 +98,7 @@ class FixedGains(Part):
 
 
 class GainBlock(Part):
-    """One block of the gain matrix K of u = K e: what the errors of one vehicle add to the command of one vehicle."""
+    """One block of the gain matrix K of u = K e: the part of one vehicle's command due to one vehicle's errors."""
 
     vehicle: SystemId
     """The vehicle whose command this is."""
@@ -124,7 +124,7 @@ class Control(Part):
     loop: Literal["ground", "onboard"] = "ground"
     """`ground`: the station closes every loop, so all feedback is late. `onboard`: every vehicle feeds back its own
     errors at once, and the station streams only what depends on other vehicles (thesis eq. 5.1). On board,
-    `string_peak_max` holds at every delay, and `delay_margin_s` bounds the vehicles' own gains as if the station closed
+    `string_peak_max` holds at every delay, and `delay_margin_s` limits the vehicles' own gains as if the station closed
     their loop."""
     delay_margin_s: Positive | None = None
     """Requirement: least delay margin of the sampled loop."""
@@ -145,7 +145,7 @@ class Control(Part):
     does."""
     prediction: Prediction = "off"
     """The loop delay over which the station predicts each vehicle from its newest state and the set-points that act
-    after it. A number: that many seconds. `measured`: the delay measured for each vehicle, smoothed; what is assumed
+    after it. A number: that many seconds. `measured`: the delay measured for each vehicle, smoothed; the assumed delay
     changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. Only with `loop = "ground"`
     and `dynamics = "double_integrator"`."""
 
@@ -200,9 +200,9 @@ class Monitor(Part):
     critical_headroom: Headroom = 0.15
     """A vehicle with less headroom is in CRITICAL, and the station acts."""
     hysteresis: NotNegative = 0.05
-    """A mode is left again when headroom exceeds its threshold by this much."""
+    """A mode is left again when the headroom exceeds its threshold by this much."""
     window_s: Annotated[float, Field(gt=0, le=60)] = 1.0
-    """The monitor judges the loop delay that 90 % of the ticks in this window stay below."""
+    """The monitor judges the 90th percentile of the loop delay over the ticks in this window."""
     hold_s: NotNegative = 0.3
     """How long a condition must last before the monitor changes to slower gains."""
     ease_s: NotNegative = 3.0
@@ -235,7 +235,7 @@ class Autopilot(Part):
     """
 
     flavour: Flavour = "ardupilot"
-    """Whose modes, messages and rules it follows: ArduCopter's or PX4's."""
+    """Whether it has the modes, messages and rules of ArduCopter or of PX4."""
     lag_s: Positive = 0.15
     """Time constant of that lag."""
     velocity_gain_1_s: Positive = 2.0
@@ -251,7 +251,7 @@ class Autopilot(Part):
     ready_after_s: NotNegative = 2.0
     """Time after start-up during which its estimator has no position and it refuses to arm."""
     arming_refusals: Annotated[int, Field(ge=0, le=1000)] = 0
-    """How many more arming requests it refuses after that."""
+    """How many arming requests it refuses after `ready_after_s`."""
     origin_spread_m: NotNegative = 20.0
     """The origin of each vehicle's local frame is drawn within this distance of the common one, north and east."""
     clock_jumps: tuple[ClockJump, ...] = ()

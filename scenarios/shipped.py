@@ -38,8 +38,8 @@ def copied(name: str, new_name: str) -> str:
 def columns(new_name: str, count: int, length: int) -> str:
     """The text of a scenario with `count` columns of `length` vehicles, side by side.
 
-    Each vehicle follows the one in front of it; the head of a column follows the head of the column to its left. One
-    column alone is staggered: each vehicle flies behind and to the right of the one in front.
+    Each vehicle follows the one in front of it; the head of a column follows the head of the column to its left. A
+    single column is staggered: each vehicle flies behind and to the right of the one in front.
     """
     vehicles = "\n".join(_vehicle(k, length, alone=count == 1) for k in range(count * length))
     return f"""\
@@ -50,18 +50,18 @@ name = "{new_name}"
 seed = 1           # of everything random: links, clocks, starting phases
 duration_s = 30.0  # of the flight
 
-# The course, north and east. More entries make turns; each is one step of the wanted velocity.
+# The course, north and east. More entries make turns; each is a step of the wanted velocity.
 nominal_velocity = [{{ from_s = 0.0, velocity_ne_m_s = [{_SPEED_M_S}, 0.0] }}]
 
-# Who follows whom, at which distance (m, north and east of the vehicle in front), and where each vehicle starts.
+# Who follows whom, at which offset (m, north and east of the vehicle in front), and where each vehicle starts.
 vehicles = [
 {vehicles}
 ]
 
 [control]
-delay_margin_s = 0.3  # the loop delay that the gains must take; `gcs design` shows what it costs
+delay_margin_s = 0.3  # the loop delay that the gains must tolerate; `gcs design` shows what it costs
 
-[links]  # the same for every vehicle; [[links.vehicles]] differ
+[links]  # the same for every vehicle; [[links.vehicles]] makes exceptions
 up = {{ delay_s = 0.02 }}    # telemetry, one way
 down = {{ delay_s = 0.02 }}  # set-points, one way
 

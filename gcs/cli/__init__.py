@@ -1,6 +1,6 @@
-"""Every command: options, one-line errors and what a terminal prints. The only room that knows Typer.
+"""Every command: options, one-line errors and what a terminal prints. The only package that imports Typer.
 
-What the exit code of a command says is here; 0 is success.
+The exit codes are defined here; 0 is success.
 """
 
 FAILED = 1

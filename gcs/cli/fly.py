@@ -1,4 +1,4 @@
-"""`gcs fly` and `gcs key`: what a flight is asked for, and what its exit code says."""
+"""`gcs fly` and `gcs key`: the options of a flight and its exit code."""
 
 import contextlib
 import sys
@@ -52,7 +52,7 @@ def fly(
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(metavar="HOST:PORT", help=f"listen here for the vehicles it starts; default {LISTEN}"),
+        typer.Option(metavar="HOST:PORT", help=f"listen here for the vehicles that gcs fly starts; default {LISTEN}"),
     ] = None,
     mirror: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="forward all frames to another ground station, read-only")
@@ -67,10 +67,11 @@ def fly(
         float | None, typer.Option(metavar="N", help="with --virtual: at most N times as fast as real time")
     ] = None,
     live: Annotated[
-        str | None, typer.Option(metavar="new|HOST:PORT", help="show the flight in a new Rerun viewer, or in this one")
+        str | None,
+        typer.Option(metavar="new|HOST:PORT", help="show the flight in a new Rerun viewer, or in the one at HOST:PORT"),
     ] = None,
     assert_headroom: Annotated[
-        float | None, typer.Option(metavar="FRACTION", help="exit with code 1 if the headroom was ever less")
+        float | None, typer.Option(metavar="FRACTION", help="exit with code 1 if the headroom was ever lower")
     ] = None,
     assert_settled: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="exit with code 1 if errors had not settled by then")
@@ -146,7 +147,7 @@ def fly(
 
 
 class Gate(NamedTuple):
-    """What a flight has to show for exit code 0, besides being stable and logged."""
+    """What a flight must meet for exit code 0, besides being stable and completely logged."""
 
     least_headroom: float | None
     settled_s: float | None
@@ -161,7 +162,7 @@ class Gate(NamedTuple):
             out_file("--junit", self.junit)
 
     def passed(self, summary: "Summary") -> bool:
-        """Check the flight; what fails is one line each."""
+        """Check the flight, and print one line for each check that fails."""
         from gcs.views.junit import write_junit
 
         checks = list(self._checks(summary))

@@ -1,4 +1,4 @@
-"""The `gcs` command: its subcommands, and what each kind of error becomes on the terminal and as exit code.
+"""The `gcs` command: its subcommands, and the line and exit code that each kind of error becomes.
 
 Each command imports what it needs when it runs: cvxpy, rerun and matplotlib are slow, and --help must be quick.
 """
@@ -23,7 +23,7 @@ app = typer.Typer(
     add_completion=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Fly UAV formations over MAVLink and see how much link delay they can take.",
+    help="Fly UAV formations over MAVLink and see how much link delay they tolerate.",
 )
 
 
@@ -72,7 +72,7 @@ for _command in _COMMANDS:
 
 
 def main() -> None:
-    """Entry point: bad input is one line and exit code 2."""
+    """Entry point: bad input becomes one line and exit code 2."""
     from gains.core.errors import GainsError
     from scenarios.errors import ScenarioError
     from scenarios.signing.keys import KeyFileError
@@ -86,7 +86,7 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted", file=sys.stderr)
         code = INTERRUPTED
-    except BrokenPipeError:  # whoever read our output, as `head`, has enough
+    except BrokenPipeError:  # the reader of our output, such as `head`, has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = FAILED
     except OSError as error:

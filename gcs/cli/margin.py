@@ -27,7 +27,7 @@ class ModelFileError(BadModelError):
 
 @dataclass(frozen=True)
 class ScenarioMargin:
-    """The margin of the loop that a scenario flies: by the continuous model, and as flown, sampled and held."""
+    """The margin of the loop that a scenario flies: by the continuous model, and as flown (sampled and held)."""
 
     margin: LoopMargin
     loop: str
@@ -61,7 +61,7 @@ def margin_of_scenario(file: Path) -> ScenarioMargin:
 
     scenario = load(file)
     if scenario.dynamics == "autopilot":
-        wanted = "double_integrator: gcs design and gcs fly tell the margin with an autopilot's response"
+        wanted = "double_integrator: gcs design and gcs fly give the margin with an autopilot's response"
         raise ModelFileError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
     design, plan = flight_plan(scenario)
     model, loop = plan.model, plan.scenario.control.loop

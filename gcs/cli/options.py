@@ -37,7 +37,8 @@ LoopOption = Annotated[
     typer.Option("--loop", help="who closes the loop on a vehicle's own errors; default as in the scenario"),
 ]
 KeyFile = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="sign, and accept only what is signed, with this key (gcs key)")
+    Path | None,
+    typer.Option(metavar="FILE", help="sign with this key, and accept only frames signed with it (see gcs key)"),
 ]
 
 
@@ -66,7 +67,7 @@ def live_viewer(text: str) -> str:
 
 
 def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":
-    """The scenario in a file, or the shipped one of that name; with `loop`, its loop is closed there instead.
+    """The scenario in a file, or the shipped one of that name; `loop` overrides where its loop is closed.
 
     Raises scenarios.errors.ScenarioError if the file cannot be used, or not with this loop.
     """
@@ -120,7 +121,7 @@ def run_folder(out: Path | None, name: str) -> Path:
 
 
 def out_file(option: str, file: Path) -> None:
-    """Refuse a file that cannot be written, before the work whose result goes there; creates its folder."""
+    """Refuse a file that cannot be written before any work is done for it; creates its folder."""
     try:
         new = not file.exists()
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -139,7 +140,7 @@ def address(option: str, text: str) -> tuple[str, int]:
     except UnicodeError:
         known = False
     if not known:
-        raise InputError(f"{option}: read {text!r}, wanted HOST:PORT, as 127.0.0.1:14550")
+        raise InputError(f"{option}: read {text!r}, wanted HOST:PORT, such as 127.0.0.1:14550")
     return host, int(port)
 
 
@@ -158,7 +159,7 @@ def warn_if_open(link: "StationSocket") -> None:
     """Warn of a socket that other machines can reach while nothing is signed."""
     host, port = link.address
     if link.guard is None and not ip_address(host).is_loopback:
-        text = "others can reach it and nothing is signed; gcs key FILE makes a key for --key"
+        text = "other machines can reach it and nothing is signed; gcs key FILE makes a key for --key"
         typer.echo(f"warning: {host}:{port} is open: {text}", err=True)
 
 

@@ -1,4 +1,4 @@
-"""`gcs grade`, `view`, `export` and `recover`: what is done with the folder of a run."""
+"""`gcs grade`, `view`, `export` and `recover`: what can be done with the folder of a run."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -28,7 +28,7 @@ def print_grade(result: "Grade") -> None:
     from gcs.views.console import ms_text
 
     print(f"errors against the truth, {result.vehicles} vehicles, ms")
-    titles = "loop delay, measured", "round trip, measured", "link delay, applied upwards"
+    titles = "loop delay, measured", "round trip, measured", "link delay, applied up"
     for title, own in zip(titles, (result.loop_delay, result.rtt, result.link_delay), strict=True):
         errors_s = own.error_p50_s, own.error_p99_s, own.error_max_s
         p50, p99, largest = (ms_text(error_s, ".3f", unit="") for error_s in errors_s)
@@ -40,7 +40,7 @@ def view(
     picture: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="write a picture instead of opening a window")
     ] = None,
-    web: Annotated[bool, typer.Option("--web", help="serve it to a browser of this machine, until Ctrl-C")] = False,
+    web: Annotated[bool, typer.Option("--web", help="serve it to browsers on this machine until Ctrl-C")] = False,
     at: Annotated[
         float | None,
         typer.Option(metavar="SECONDS", help="scenario time of the picture; default 10, or the end if sooner"),
@@ -58,7 +58,7 @@ def view(
     if picture is not None:
         out_file("--picture", picture)
         if picture.suffix.lower() != ".png":
-            raise InputError(f"--picture: read {picture}, wanted a name that ends in .png, as what is written is PNG")
+            raise InputError(f"--picture: read {picture}, wanted a name that ends in .png")
     recording = find_recording(run)
     if web:
         if picture is not None:
@@ -75,13 +75,15 @@ def view(
 
 
 def export(
-    source: Annotated[Path, typer.Argument(metavar="RUN|FILE.tlog", help="run folder, or a telemetry log of any tool")],
+    source: Annotated[
+        Path, typer.Argument(metavar="RUN|FILE.tlog", help="run folder, or a telemetry log from any tool")
+    ],
     mcap: Annotated[
         Path | None, typer.Option(metavar="FILE.mcap", help="write MCAP, which Foxglove and PlotJuggler read")
     ] = None,
-    csv: Annotated[Path | None, typer.Option(metavar="DIR", help="write a CSV file for each table here")] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="DIR", help="write one CSV file per table to this folder")] = None,
 ) -> None:
-    """Write a run or a telemetry log for other tools."""
+    """Export a run or a telemetry log to other tools."""
     from gcs.watch.export import messages_of, write_csv, write_mcap
 
     if mcap is None and csv is None:

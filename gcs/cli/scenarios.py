@@ -1,4 +1,4 @@
-"""`gcs scenarios`, `new`, `check`, `design` and `margin`: from a scenario to its gains and how much delay they take."""
+"""`gcs scenarios`, `new`, `check`, `design` and `margin`: from a scenario to its gains and the delay they tolerate."""
 
 from functools import partial
 from pathlib import Path
@@ -86,7 +86,7 @@ def _shape(text: str) -> tuple[int, int]:
     across, _, length = text.partition("x")
     known = across.isdecimal() and length.isdecimal() and len(across) < 4 and len(length) < 4
     if not known or not 1 <= int(across) * int(length) <= MOST_VEHICLES:
-        wanted = f"columns and vehicles in each, as 3x4, of at most {MOST_VEHICLES} vehicles"
+        wanted = f"columns and vehicles in each, such as 3x4, of at most {MOST_VEHICLES} vehicles"
         raise InputError(f"--columns: read {text!r}, wanted {wanted}")
     return int(across), int(length)
 
@@ -97,7 +97,7 @@ def check(
     allow_unstable: AllowUnstable = False,
     as_json: AsJson = False,
 ) -> None:
-    """Validate and design a scenario and show its start, without flying.
+    """Validate a scenario, design its gains and show its start, without flying.
 
     Exit code 2 if `gcs fly` would refuse it.
     """
@@ -122,7 +122,7 @@ def _print_check(design: "Design", found: "Check") -> None:
     print_design(design, console)
     margin = "no limit" if found.delay_margin_s is None else ms_text(found.delay_margin_s)
     console.print(
-        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected of the links, margin {margin}: "
+        f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links, margin {margin}: "
         f"headroom {found.headroom:.0%}"
     )
     if found.closest_m is not None:
@@ -140,8 +140,8 @@ def _print_check(design: "Design", found: "Check") -> None:
     console.print(table_of(found.vehicles, columns))
     if beyond := [v.system_id for v in found.vehicles if v.command_m_s2 > (v.command_max_m_s2 or float("inf"))]:
         console.print(
-            f"limits   vehicle{'s' * (len(beyond) > 1)} {' '.join(map(str, beyond))} cannot fly the first command: the "
-            "flight is not that of the linear analysis until the errors are smaller"
+            f"limits   vehicle{'s' * (len(beyond) > 1)} {' '.join(map(str, beyond))} cannot fly the first command: "
+            "until errors are smaller, the flight differs from the linear analysis"
         )
 
 
@@ -183,7 +183,7 @@ def margin(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Find how much delay a linear loop or a scenario takes.
+    """Find how much delay a linear loop or a scenario tolerates.
 
     Shows the delays at which it is stable, the margin, and where roots cross the stability boundary.
     """

@@ -1,4 +1,4 @@
-"""`gcs stress`: fly the formation at many link delays, and see whether it breaks where the margin says.
+"""`gcs stress`: fly the formation at many link delays, and see whether it breaks where the margin predicts.
 
 The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
 """
@@ -60,7 +60,9 @@ def stress(
     seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights at each point, each with its own seed")] = 1,
     workers: Annotated[
         int,
-        typer.Option(metavar="N", min=0, show_default=False, help="processes; default one per processor, real time 1"),
+        typer.Option(
+            metavar="N", min=0, show_default=False, help="processes; default one per processor, one in real time"
+        ),
     ] = 0,
     dask: Annotated[str, typer.Option(metavar="ADDRESS", help="fly on the workers of this Dask scheduler")] = "",
     resume: Annotated[bool, typer.Option("--resume", help="resume the campaign in --out")] = False,
@@ -70,7 +72,7 @@ def stress(
     real_time: Annotated[bool, typer.Option("--real-time", help="fly over UDP on the real clock")] = False,
     assert_onset: Annotated[
         float | None,
-        typer.Option(metavar="FRACTION", help="exit with 1 if onset and margin differ by more; implies --onset"),
+        typer.Option(metavar="FRACTION", help="exit with code 1 if onset and margin differ by more; implies --onset"),
     ] = None,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
     out: OutFolder = None,
@@ -89,14 +91,14 @@ def stress(
     onset = onset or assert_onset is not None
     if (trial or resume) and (out is None or not out.is_dir()):
         flag = "--trial" if trial else "--resume"
-        raise InputError(f"--out: read {out}, wanted the folder of a campaign, as {flag} is given")
+        raise InputError(f"--out: read {out}, wanted the folder of a campaign, which {flag} needs")
     if not (trial or onset or given):
-        raise InputError("nothing to fly; wanted --onset, or an axis as --delay 0:0.6:13")
+        raise InputError("nothing to fly; wanted --onset, or an axis such as --delay 0:0.6:13")
     if len(given) > 2:
         raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
     for name, value in (("--tolerance", tolerance), ("--assert-onset", assert_onset)):
         if value is not None and not 0.0 < value < 1.0:
-            raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, as 0.02")
+            raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, such as 0.02")
     outlive_readers()
     if junit is not None:
         out_file("--junit", junit)
@@ -141,10 +143,10 @@ def _study(file: Path, loop: Loop | None, *, real_time: bool) -> "tuple[Study, D
 
     scenario = load_scenario(file, loop)
     if scenario.dynamics == "autopilot":
-        wanted = "double_integrator: gcs stress does not fly vehicles that take off first"
+        wanted = "double_integrator: gcs stress flies no vehicles that have to take off"
         raise InputError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
     if scenario.control.prediction == "measured":
-        wanted = "off, or a number of seconds: gcs stress shows what a wrong assumption does"
+        wanted = "off, or a number of seconds: gcs stress tests an assumed delay that is fixed"
         raise InputError(f"{file}: control.prediction: read 'measured', wanted {wanted}")
     # a campaign does not fly the slower gains of the schedule, so they need not be designed
     refuse(file, bad_start(scenario))
@@ -166,7 +168,7 @@ def _campaign(
     allowed: float | None,
     shown: bool,
 ) -> "tuple[CampaignResult, Path]":
-    """Fly the sweep over the axes and, with a tolerance, search for the onset; the result, and its folder."""
+    """Fly the sweep over the axes and, with a tolerance, search for the onset; returns the result and its folder."""
     from gcs.drive.fly import new_folder
     from gcs.runs.record import SCENARIO_FILE, write_whole
     from gcs.stress.campaign import Store, check_campaign, run_campaign, write_table

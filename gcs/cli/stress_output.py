@@ -36,7 +36,7 @@ def print_result(result: CampaignResult, folder: Path) -> None:
         console.print(
             f"onset    {_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms in flight, "
             f"{onset.difference:+.3%} from the {_limit(result)} of this loop, {_ms(onset.predicted_s)}; "
-            f"the continuous model's less half a period for the hold, {_ms(onset.predicted_continuous_s)}"
+            f"continuous model less half a period for the hold: {_ms(onset.predicted_continuous_s)}"
         )
         console.print(
             f"         {_ms(onset.link_delay_s)} of link delay, up + down: vehicle {onset.critical} waits "
@@ -50,7 +50,7 @@ def print_result(result: CampaignResult, folder: Path) -> None:
     if result.past_limits:
         console.print(
             f"limits   the links alone push vehicles past [limits] in {result.past_limits} probes, which fly without "
-            "limits; where limits bind, errors persist that the loop alone would bring down",
+            "limits; where limits bind, errors persist that would otherwise decay",
             markup=False,
         )
     _print_noise(console, result.noise)
@@ -77,7 +77,7 @@ def _print_noise(console: Console, noise: Noise | None) -> None:
     console.print(
         f"noise    set-points {_ms(noise.lateness_s_p50.median)} late at the median, {_ms(latest.median)} at the 99th "
         f"percentile (at worst {_ms(latest.max)}); the host took {noise.steal_share.median:.1%} of the processors, "
-        f"others and flights used {noise.busy_share.median:.0%}"
+        f"all processes together used {noise.busy_share.median:.0%}"
     )
 
 
@@ -94,7 +94,7 @@ def _columns(axes: list[str]) -> dict[str, Callable[[Outcome], str]]:
 
 
 def print_reflown(reflown: Reflown) -> None:
-    """Print the outcome of a trial that was flown again, and whether it is the same."""
+    """Print the outcome of a trial that was flown again, and whether it is identical."""
     console, outcome = plain_console(), reflown.outcome
     console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {place_text(outcome.coordinates)}")
     console.print(f"verdict  {outcome.verdict}: {outcome.reason}")
@@ -107,9 +107,9 @@ def print_reflown(reflown: Reflown) -> None:
     if outcome.real_time:
         console.print("again    in real time, where no two flights are the same")
     elif reflown.differs:
-        console.print(f"again    not as it was flown first: {', '.join(reflown.differs)}")
+        console.print(f"again    differs from the first flight in: {', '.join(reflown.differs)}")
     else:
-        console.print(f"again    the same to the last bit, tick log {outcome.ticks_sha256}")
+        console.print(f"again    identical to the last bit, tick log {outcome.ticks_sha256}")
     for run in reflown.runs:
         console.print(f"look     gcs view {run}")
     if outcome.error is not None:

@@ -13,7 +13,7 @@ from gcs.output import outlive_readers
 def compare(
     scenario_file: ScenarioFile,
     out: OutFolder = None,
-    sizes: Annotated[bool, typer.Option(help="also time designs of growing chains")] = True,
+    sizes: Annotated[bool, typer.Option(help="also time the designs of longer and longer chains")] = True,
     as_json: AsJson = False,
 ) -> None:
     """Design and fly a scenario by every method, side by side.
@@ -44,7 +44,7 @@ def thesis(
     out: OutFolder = None,
     as_json: AsJson = False,
 ) -> None:
-    """Reproduce the source: published and computed figures side by side."""
+    """Reproduce the thesis: published and computed figures side by side."""
     from gcs.studies import thesis as source
 
     folder = run_folder(out, "thesis")
@@ -64,10 +64,11 @@ def bench(
     vehicles: Annotated[
         int, typer.Option(metavar="N", min=0, max=250, help="number of vehicles, in columns behind a leader")
     ] = 0,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, max=86400, help="flight time of each flight")] = 8.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, max=86400, help="duration of each flight")] = 8.0,
     repeat: Annotated[int, typer.Option(metavar="N", min=1, help="number of flights; the fastest counts")] = 10,
     real_time: Annotated[
-        bool, typer.Option("--real-time", help="fly once over UDP: punctuality, and errors of the measured latencies")
+        bool,
+        typer.Option("--real-time", help="fly once over UDP; shows punctuality and the errors of measured latencies"),
     ] = False,
     signed: Annotated[bool, typer.Option("--signed", help="also measure what signing costs")] = False,
     as_json: AsJson = False,
@@ -95,7 +96,9 @@ def capacity(
     scenario_file: ScenarioFile,
     rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
     most: Annotated[int, typer.Option(metavar="N", min=2, max=250, help="largest formation tried")] = 100,
-    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="flights of each formation; all must hold")] = 3,
+    seeds: Annotated[
+        int, typer.Option(metavar="N", min=1, help="flights of each formation, all of which must succeed")
+    ] = 3,
     as_json: AsJson = False,
 ) -> None:
     """Find how many vehicles the links carry at each rate.
@@ -119,5 +122,5 @@ def _rates(text: str) -> list[float]:
     except ValueError:
         rates = []
     if not rates or not all(0.1 <= rate <= 1000.0 for rate in rates):
-        raise InputError(f"--rates: {text}, wanted numbers from 0.1 to 1000 with commas, for example 2,5,10")
+        raise InputError(f"--rates: {text}, wanted numbers from 0.1 to 1000 separated by commas, such as 2,5,10")
     return rates

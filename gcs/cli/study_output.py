@@ -17,11 +17,11 @@ _WHOLE_CORE = 0.95
 
 
 def print_comparison(scenario: Scenario, routes: list[Route], grown: list[DesignCost]) -> None:
-    """Print each route's figures side by side, and what designs cost as the formation grows."""
+    """Print the figures of all routes side by side, and how long designs take as the formation grows."""
     console = plain_console()
     columns: dict[str, Callable[[tuple[str, list[str]]], str]] = {"": lambda row: row[0]}
     columns |= {route.method: lambda row, k=k: row[1][k] for k, route in enumerate(routes)}
-    title = f"{scenario.name}: designed for what it asks for, flown over its links"
+    title = f"{scenario.name}: designed for its requirement, flown over its links"
     console.print(table_of(rows(routes), columns, title=title))
     for route in routes:
         if route.failed:
@@ -40,7 +40,7 @@ def print_comparison(scenario: Scenario, routes: list[Route], grown: list[Design
 
 
 def print_capacity(scenario: Scenario, found: list[Capacity]) -> None:
-    """Print, for each rate, the largest formation that is carried and the next, which is not."""
+    """Print, for each rate, the largest formation that the links carry and the next one, which they do not."""
     console = plain_console()
     loads = [load for capacity in found for load in (capacity.most, capacity.next) if load is not None]
     title = f"{scenario.name}: what its links carry"

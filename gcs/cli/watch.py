@@ -1,4 +1,4 @@
-"""`gcs monitor` and `gcs replay`: what links and telemetry logs show, without commanding anything."""
+"""`gcs monitor` and `gcs replay`: latencies of live links and telemetry logs, without commanding anything."""
 
 import sys
 from dataclasses import replace
@@ -50,7 +50,9 @@ def monitor(
     Exit code 1 if an expected vehicle was never heard, if none was heard, or if a loop delay (p99) exceeded the margin.
     """
     given, margin_of = _given(margin, design)
-    if sys.stdout.isatty():  # a closed terminal ends the command by a signal, a reader that has enough by EPIPE
+    if (
+        sys.stdout.isatty()
+    ):  # a closed terminal sends a signal; a reader that closes its pipe must still end the command
         outlive_readers()
     with listening("--listen", listen, opened_guard(key, role="monitor")) as link:
         scenario = None if scenario_file is None else load_scenario(scenario_file)
@@ -58,7 +60,7 @@ def monitor(
             from gcs.plan.planner import flight_plan
 
             given, margin_of = flight_plan(scenario)[0], f"of {scenario.name}'s gains"
-        # Imported after the socket is open: datagrams that come meanwhile keep their receive stamps.
+        # Imported after the socket is open: datagrams that arrive during the imports keep their receive stamps.
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
         from gcs.watch.live import watch_links
@@ -90,7 +92,7 @@ def monitor(
 
 
 def replay(
-    run: Annotated[Path, typer.Argument(metavar="RUN|FILE.tlog", help="run folder, or the telemetry log of any tool")],
+    run: Annotated[Path, typer.Argument(metavar="RUN|FILE.tlog", help="run folder, or a telemetry log from any tool")],
     scenario_file: Annotated[
         Path | None, typer.Argument(metavar="[SCENARIO]", help="the formation, if it is not in the run")
     ] = None,
@@ -124,7 +126,7 @@ def replay(
 
 
 def _print_rebuilt(report: "RebuildReport") -> None:
-    """Print what was read of the log, its links, and the flight if the formation is known."""
+    """Print what the log holds, its links, and the flight if the formation is known."""
     from gcs.views.console import plain_console
     from gcs.views.report import delay_text, print_flight
     from gcs.watch.table import links_table
@@ -143,7 +145,7 @@ def _print_rebuilt(report: "RebuildReport") -> None:
 
 
 def _given(margin: float | None, design: Path | None) -> "tuple[Design | None, str]":
-    """The design that --margin or --design gives, if only by its margin, and the source of the margin in words."""
+    """The design of --design, or one that has only the margin of --margin; and the source of the margin in words."""
     if margin is not None and design is not None:
         raise InputError("read --margin and --design, wanted one of them")
     if margin is None and design is None:

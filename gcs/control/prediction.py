@@ -1,16 +1,16 @@
-"""The state of each vehicle at the instant at which its next set-point acts, from the set-points already sent.
+"""Prediction of each vehicle's state at the instant when its next set-point acts, from the set-points already sent.
 
-A set-point that is due at the tick t_k acts at t_k + D. The *delivery* D of a vehicle is computing + down
-(`gcs.control.loop_delay`), as far as it is known. The newest state (x, v), sampled at s, is carried on to that instant
-with the accelerations u that act in between:
+A set-point that is due at tick t_k acts at t_k + D. The *delivery delay* D of a vehicle is computing + down
+(`gcs.control.loop_delay`), as far as it is known. The newest state (x, v), sampled at s, is propagated to that instant
+under the accelerations u that act in between:
 
     h = t_k + D - s,   v^ = v + V(t_k) - V(s - D),   x^ = x + v h + P(t_k) - P(s - D) - V(s - D) h,
 
 where V' = u and P' = V over the times at which set-points were due, each held until the next. This is
-x^ = Phi(h) x + sum_j Gamma_j u_{k-j} of `gains.sampled.prediction`, with parts of a period where s lies between ticks.
-The sums are kept, so the cost does not grow with the delay.
+x^ = Phi(h) x + sum_j Gamma_j u_{k-j} of `gains.sampled.prediction`, with fractions of a period where s lies between
+ticks. V and P are kept as running sums, so the cost does not grow with the delay.
 
-The loop delay assumed is the age of a state when it is first used, plus D.
+The assumed loop delay is the age of a state when it is first used, plus D.
 """
 
 from bisect import bisect_right
@@ -24,17 +24,17 @@ from scenarios.part import PREDICTION_MAX_S
 from scenarios.schema import NS_PER_S
 
 KEPT_S = 3.0 * PREDICTION_MAX_S
-"""How long set-points are remembered: the assumed delay, and as much again for states that are older than assumed."""
+"""How long set-points are remembered: longer than any assumed delay, for states that are older than assumed."""
 FASTEST = 0.1
-"""Most that an assumed delay changes, in s per s."""
+"""Fastest change of an assumed delay, in s per s."""
 _SMOOTHED_S = 2.0
-"""Time constant of the filter of measured deliveries."""
+"""Time constant of the filter for measured delivery delays."""
 _AHEAD_S = 5.0
-"""How long the trend of the measured deliveries is continued without a new one."""
+"""How long the trend of the measured delivery delays is extrapolated without a new measurement."""
 
 
 class _Sent(NamedTuple):
-    """A set-point, and the sums over those before it; north + 1j * east."""
+    """A set-point, with V and P at the time it is due; vectors are north + 1j * east."""
 
     due_ns: int
     u: complex
@@ -43,7 +43,7 @@ class _Sent(NamedTuple):
 
 
 class CommandHistory:
-    """The accelerations that one vehicle was sent, each held until the next, but at most `held_ns`.
+    """The accelerations sent to one vehicle, each held until the next, but for `held_ns` at most.
 
     Without set-points for that long a vehicle enters its failsafe, in which it holds its velocity.
     """
@@ -59,7 +59,7 @@ class CommandHistory:
         self._sent.append(_Sent(due_ns, complex(*acceleration_m_s2), velocity, position))
         self._due_ns.append(due_ns)
         long_ago = bisect_right(self._due_ns, due_ns - round(KEPT_S * NS_PER_S)) - 1
-        if 2 * long_ago > len(self._sent):  # half of them at once: deleting from the front moves the rest
+        if 2 * long_ago > len(self._sent):  # in bulk: deleting from the front moves all the rest
             del self._sent[:long_ago], self._due_ns[:long_ago]
 
     def sums(self, time_ns: int) -> tuple[complex, complex]:
@@ -72,7 +72,7 @@ class CommandHistory:
         return velocity, position + velocity * (max(0, since_ns - self._held_ns) * 1e-9)
 
     def carried(self, state: State, from_ns: int, to_ns: int) -> State:
-        """A state carried on under the set-points due between two times."""
+        """The state propagated under the set-points due between two times."""
         (velocity, position), (later_velocity, later_position) = self.sums(from_ns), self.sums(to_ns)
         north, east, v_north, v_east = state
         for_s = (to_ns - from_ns) * 1e-9
@@ -86,7 +86,7 @@ class CommandHistory:
 
 
 class Delivery(Protocol):
-    """The delivery of one vehicle's set-points as the prediction assumes it."""
+    """The delivery delay D that the prediction assumes for one vehicle."""
 
     def measured(self, down_ns: int, sent_ns: int) -> None:
         """Take in the one-way delay of a request that left at `sent_ns`."""
@@ -98,7 +98,7 @@ class Delivery(Protocol):
 
 
 class FixedDelivery:
-    """What is left of a loop delay that is given."""
+    """D for a given loop delay: that delay minus the mean age of the states."""
 
     def __init__(self, assumed_s: float) -> None:
         self._assumed_ns = round(assumed_s * NS_PER_S)
@@ -112,18 +112,18 @@ class FixedDelivery:
 
 
 class MeasuredDelivery:
-    """The measured one-way delays, smoothed along their trend; what is assumed moves there by `FASTEST` at most.
+    """D from the measured one-way delays, smoothed along their trend; it changes at the rate `FASTEST` at most.
 
-    A fading-memory filter of second order: it follows a delay that grows evenly without falling behind, although a
-    measurement is known only a round trip after its request has left. R. Morrison, "Introduction to sequential
-    smoothing and prediction" (1969), ch. 9.
+    A fading-memory filter of second order: it follows a steadily growing delay without lag, although a measurement is
+    known only one round trip after its request was sent. R. Morrison, "Introduction to sequential smoothing and
+    prediction" (1969), ch. 9.
     """
 
     def __init__(self) -> None:
         self._level_ns = self._trend = 0.0
         self._at_ns = 0
         self._assumed: tuple[int, float] | None = None
-        """The tick at which D was asked for last, and that D."""
+        """The last tick for which D was asked, and that D."""
 
     def measured(self, down_ns: int, sent_ns: int) -> None:
         since_ns = sent_ns - self._at_ns
@@ -152,14 +152,14 @@ class MeasuredDelivery:
 
 
 class FirstUses:
-    """The mean age of one vehicle's states at the ticks that first use them, over as many as repeat themselves."""
+    """The mean age of one vehicle's states at the ticks that first use them, over the last `commands` of them."""
 
     def __init__(self, commands: int) -> None:
         self._ages_ns = deque[int](maxlen=commands)
         self._sample_ns = 0
 
     def age_ns(self, sample_ns: int, due_ns: int) -> int:
-        """That mean, with the state used at the tick due now."""
+        """The mean age, including the state used at the tick due now."""
         if sample_ns != self._sample_ns:
             self._sample_ns = sample_ns
             self._ages_ns.append(due_ns - sample_ns)
@@ -167,7 +167,7 @@ class FirstUses:
 
 
 class PredictedStates:
-    """Where vehicles are at any instant after their newest states; `gcs.control.history.States` at one tick."""
+    """States predicted beyond the newest reports: `gcs.control.history.States` as of the last `look`."""
 
     def __init__(self, sent: Sequence[CommandHistory], deliveries: Sequence[Delivery], commands: int) -> None:
         self.deliveries, self._sent = deliveries, sent
@@ -176,9 +176,9 @@ class PredictedStates:
         self._history = StateHistory(len(sent))
 
     def look(self, history: StateHistory, due_ns: int) -> list[tuple[int, float]]:
-        """Take in the newest states; for each vehicle when its set-point acts (ns), and the loop delay assumed (s).
+        """Take in the newest states. Returns when each vehicle's set-point acts (ns) and the assumed loop delay (s).
 
-        Both are 0 while no state, or no delivery, is known.
+        Both are 0 while its state or D is unknown.
         """
         self._history = history
         found: list[tuple[int, float]] = []

@@ -1,4 +1,4 @@
-"""What a scenario would fly, before it flies: places, errors and commands at the start, expected loop delay."""
+"""A scenario before its flight: places, errors and commands at the start, and the expected loop delay."""
 
 from itertools import combinations
 from math import hypot, inf
@@ -31,7 +31,7 @@ class Check(Published):
 
     expected_loop_delay_s: float
     delay_margin_s: float | None
-    """None if no delay makes the loop unstable; with prediction the longer end of the mismatch window."""
+    """None if no delay makes the loop unstable; with prediction the upper end of the mismatch window."""
     headroom: float
     """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window."""
     closest_m: float | None

@@ -52,11 +52,11 @@ def fly(
     mirror: Mirror | None = None,
     viewer: str | None = None,
 ) -> Summary:
-    """Fly a designed scenario in real time; returns the summary of the run, which is left in the folder.
+    """Fly a designed scenario in real time, write the run to the folder, and return its summary.
 
-    `show_table`: with the live table, or its plain lines without a terminal. `fleet` says who provides the vehicles,
-    empty if this flight starts simulated ones. Those sign with `key_file`, and with `outlive_station` they wait to be
-    taken over if this process is killed. `viewer` is the URL of a Rerun viewer that is shown the flight.
+    `show_table` shows the live table, or plain lines without a terminal. `fleet` says who provides the vehicles; if it
+    is empty, this flight starts simulated ones. Those sign with `key_file`; with `outlive_station` they wait to be
+    taken over if this process is killed. `viewer` is the URL of a Rerun viewer that shows the flight.
     """
     with stop_signals() as asked_to_stop:
         write_experiment(folder, plan.scenario, design)
@@ -87,12 +87,12 @@ def fly(
 
             try:
                 drive(station, link, writer, stop, new_plan, mirror)
-                if station.plan is not plan:  # with the figures that take too long to compute in flight
+                if station.plan is not plan:  # now with the figures that take too long to compute in flight
                     _write_design(writer, folder, described(design, station.plan))
                 writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=END, text=station.end_reason))
             finally:
                 unwritten = writer.close()
-            if unwritten:  # including the last event, for which the observer waits
+            if unwritten:  # the observer would wait for the last event, which is among them
                 observer.terminate()
         return finish(folder, unwritten=unwritten)
 
@@ -108,8 +108,8 @@ def fly_in_virtual_time(
 ) -> Summary:
     """Fly on one virtual clock, with the same files as in real time; returns the summary.
 
-    `speed` is the most virtual seconds per second of real time, None for as many as can be computed. `viewer` is
-    as of `fly`.
+    `speed` is the largest number of virtual seconds per second of real time; None sets no limit. `viewer` is as for
+    `fly`.
     """
     with stop_signals() as asked_to_stop:
         write_experiment(folder, plan.scenario, design)

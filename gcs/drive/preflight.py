@@ -1,6 +1,6 @@
 """Checks before take-off: whether a scenario or its plan can fly at all.
 
-A fault is one line: the scenario's key, what was read and what was wanted. None if there is no fault.
+Each check returns a fault in one line (the scenario's key, what was read, what was wanted), or None.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from scenarios.schema import NS_PER_S, Scenario
 def unstable_loop(plan: FlightPlan) -> str | None:
     """The root of the loop that grows even without delay; None if the loop has a delay margin.
 
-    It is a root of the continuous loop, or, where only sampling destabilises it, the growth rate of the sampled one.
+    A root of the continuous loop; if only sampling destabilises it, the growth rate of the sampled loop instead.
     """
     if plan.delay_margin_s > 0.0:
         return None
@@ -37,11 +37,11 @@ def unstable_loop(plan: FlightPlan) -> str | None:
     else:
         rate_1_s = _sampled_growth_1_s(plan)
         read = f"a loop that only sampling makes unstable: it grows at {rate_1_s:+.4g} 1/s without any delay"
-    return f"{key}: read {read}; wanted a stable loop (--allow-unstable of gcs design and gcs fly)"
+    return f"{key}: read {read}; wanted a stable loop (gcs check, design and fly accept it with --allow-unstable)"
 
 
 def without_actions(plan: FlightPlan) -> FlightPlan:
-    """The plan with a monitor that does not act: there is no margin that it could keep."""
+    """The plan with a monitor that does not act: there is no margin to keep."""
     monitor = plan.scenario.monitor.model_copy(update={"act": False})
     return replace(plan, scenario=plan.scenario.model_copy(update={"monitor": monitor}))
 
@@ -109,7 +109,7 @@ def endless_link(scenario: Scenario) -> str | None:
         least_s = sum(min((point.delay_s for point in link.delay_points), default=link.delay_s) for link in links)
         read = f"links: read a round trip of {{:g}} s to vehicle {vehicle.system_id}, wanted less than"
         if first_s >= lifetime_s:
-            return f"{read.format(first_s)} the {lifetime_s:g} s for which an answer is waited for"
+            return f"{read.format(first_s)} the {lifetime_s:g} s that the station waits for an answer"
         if least_s >= scenario.duration_s:
             return f"{read.format(least_s)} duration_s = {scenario.duration_s:g} s"
     return None

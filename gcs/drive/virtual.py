@@ -45,7 +45,7 @@ class VirtualFlight:
 
     @property
     def time_s(self) -> FloatArray:
-        """Scenario time, shape (ticks,); below 0 before the formation is flown."""
+        """Scenario time, shape (ticks,); negative before the formation flight begins."""
         return self.ticks["time_s"][:, 0]
 
     @property
@@ -81,7 +81,7 @@ class VirtualFlight:
     def table(self) -> Any:
         """The record as a pyarrow.Table, one row for each tick and vehicle.
 
-        `flight.table().to_pandas()` and `polars.from_arrow(flight.table())` make frames of it.
+        `flight.table().to_pandas()` and `polars.from_arrow(flight.table())` make data frames of it.
         """
         import pyarrow as pa
 
@@ -100,7 +100,7 @@ def fly_virtual(scenario: Scenario | Path | str, *, allow_unstable: bool = False
     scenario
         A scenario, its file, or the name of one that ships (`gcs scenarios`).
     allow_unstable
-        Whether to fly gains whose loop is unstable without any delay.
+        Whether to fly gains whose loop is unstable even without delay.
 
     Raises
     ------

@@ -10,8 +10,8 @@ _NO_DOUBT = 100.0 * _NS_PER_S
 _STEADY_NS = _NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""
 _RATE_NS = _NS_PER_S
-"""The rate is measured over intervals of this length, of which each weighs less than the next by the factor below: an
-outage of a minute is counted right only if the rate is known to about half a per cent, whatever the jitter."""
+"""The rate is measured over intervals of this length, each weighted less than the next by the factor below. To count
+the losses of a minute's outage correctly, the rate must be known to about half a per cent, whatever the jitter."""
 _OLDER = 0.9
 _AHEAD, _LEAST_AHEAD = 127, 32
 """A frame may be this much newer than its time suggests, because the newest one may itself have been late. The farther
@@ -20,15 +20,15 @@ _MOST = 0xFFFFFFFF
 """The largest count that the tick record holds: a log whose clock jumps by centuries seems to have lost more."""
 _FORGET = 1.0 / 512
 _RUN, _RUN_STEP = 8, 4
-"""This many late frames in a row, each newer than the last by at most the second figure, are new after all: a very late
-frame was taken for a new one."""
+"""This many late frames in a row, each newer than the last by at most the second figure, are new after all: an
+earlier, very late frame was taken for a new one."""
 
 
 class SequenceCounter:
     """Counts the frames of one sender: received, lost, late (received after a newer one) and duplicate.
 
-    A sequence number holds 8 bits of the count; time gives the rest. A frame is at most a little newer than the rate of
-    frames suggests since the newest one, otherwise it is older. So a swapped pair is one late frame, not 254 lost ones,
+    A sequence number holds 8 bits of the count; time gives the rest. A frame can be only slightly newer than the frame
+    rate suggests; one that seems newer than that is an old one. So a swapped pair is one late frame, not 254 lost ones,
     and the losses of an outage of a minute are counted in full. A frame overtaken by more than 223 others is
     miscounted. A late frame no longer counts as lost.
     """
@@ -68,7 +68,7 @@ class SequenceCounter:
         since_ns = max(0, time_ns - self._newest_ns)  # in a log the clock may have been set back
         expected = self._rate_hz * since_ns
         if step == 1 and (sequence - self._newest) & 0xFF == 1 and self._run == 0 and expected < _NO_DOUBT:
-            # Most frames are simply the next one; the general case below would give the same.
+            # A short cut: most frames are simply the next one. The general case below gives the same.
             self._lag *= 1.0 - _FORGET
             self._seen = (self._seen << 1 | 1) & _SEEN
             self._newest += 1

@@ -1,7 +1,7 @@
-"""By how much the loop delay may miss the assumed one, for each set of the gain schedule.
+"""How far the loop delay may be from the assumed one, for each set of the gain schedule.
 
-Without prediction the assumed delay is 0, and it may be exceeded by the delay margin. With prediction it may be missed
-by its distances from the ends of the mismatch window (`gains.sampled.prediction`).
+Without prediction the assumed delay is 0, and the loop delay may exceed it by the delay margin. With prediction the
+loop delay may be anywhere in the mismatch window (`gains.sampled.prediction`).
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from gains.sampled.prediction import mismatch_window
 from scenarios.part import PREDICTION_MAX_S
 
 Window = tuple[float, float]
-"""The least and the largest loop delay (s) between which a loop is stable."""
+"""The shortest and the longest loop delay (s) between which a loop is stable."""
 _TABULATED_S = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0, 7.0, PREDICTION_MAX_S)
 """Assumed delays at which the windows are computed if the delay is measured."""
 
@@ -33,7 +33,7 @@ class Tolerated(NamedTuple):
     longer_s: tuple[float, ...]
 
     def used_s(self, gain_set: int, mismatch_s: float) -> float:
-        """The loop delay minus the assumed one, to be compared with `longer_s`: one that is too short is scaled to it.
+        """The mismatch (loop delay minus assumed) on the scale of `longer_s`: at -`shorter_s` it is `longer_s`.
 
         >>> half = Tolerated((0.1,), (0.2,))
         >>> half.used_s(0, 0.05), half.used_s(0, -0.05)
@@ -45,13 +45,13 @@ class Tolerated(NamedTuple):
 
 
 class Tolerance(Protocol):
-    """What is tolerated at an assumed loop delay."""
+    """The tolerated mismatch at an assumed loop delay."""
 
     def at(self, assumed_s: float) -> Tolerated: ...
 
 
 class Steady:
-    """The same at every assumed delay, of which there is one."""
+    """One tolerance, for an assumed delay that is fixed."""
 
     def __init__(self, tolerated: Tolerated) -> None:
         self._tolerated = tolerated
@@ -62,14 +62,14 @@ class Steady:
 
 
 class Tabulated:
-    """The windows at several assumed delays, interpolated to the millisecond.
+    """Tolerances at any assumed delay, rounded to the millisecond, interpolated between computed windows.
 
-    The reciprocals of the distances are interpolated, which are about k1 + k3 tau^. Where a window begins to have a
-    lower end, the nearest delay that has one decides.
+    The reciprocals of the distances are interpolated, because they are nearly linear: about k1 + k3 tau^. If only one
+    of two neighbouring windows has a lower end, its distance is used.
     """
 
     def __init__(self, windows: Sequence[Sequence[Window]]) -> None:
-        """`windows` has those of each gain set at each of the assumed delays in `_TABULATED_S`."""
+        """`windows`: for each gain set, the window at each assumed delay in `_TABULATED_S`."""
         self._known: dict[int, Tolerated] = {}
         with np.errstate(divide="ignore"):
             self._reciprocal = 1.0 / np.array(
@@ -103,7 +103,7 @@ def tolerance(
     margins_s: tuple[float, ...],
     timing: Timing,
 ) -> Tolerance:
-    """What a gain schedule tolerates; `prediction` is that of the scenario, `margins_s` are those without it."""
+    """What a gain schedule tolerates; `prediction` is the scenario's key, `margins_s` are those without prediction."""
     if prediction == "off":
         return Steady(Tolerated((inf,) * len(margins_s), margins_s))
     if isinstance(prediction, str):
@@ -113,12 +113,12 @@ def tolerance(
 
 
 def window(model: FormationModel, K: FloatArray, timing: Timing, assumed_s: float) -> Window:
-    """The mismatch window of a formation that is predicted over `assumed_s`, as sampled and held."""
+    """The mismatch window of a sampled formation that is predicted over `assumed_s`."""
     return _window(model, K.tobytes(), timing, assumed_s)
 
 
 @lru_cache(maxsize=1024)
 def _window(model: FormationModel, gain: bytes, timing: Timing, assumed_s: float) -> Window:
-    """Once for all flights of a campaign."""
+    """Cached: all flights of a campaign use the same windows."""
     K = np.frombuffer(gain).reshape(model.inputs, model.states)
     return mismatch_window(model.A, model.B, K, timing, assumed_s=assumed_s)

@@ -21,15 +21,15 @@ from gcs.runs.summary_record import Clock, Control, Estimate, MarginRange, OneWa
 from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0
-"""A clock's rate is not estimated over less than this."""
-SILENT_END = "interrupted: the station ended without a word"
+"""A clock's skew is not estimated over a shorter time than this."""
+SILENT_END = "interrupted: the station ended without recording why"
 
 
 def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary:
     """Write ticks.parquet and summary.json of a run that has ended, and return the summary.
 
-    `unwritten` is given at the end of a flight: its events that could not be written. What cannot be written now is
-    then named in the summary, as `not_logged`, and the log of ticks stays as it is. Raises InputError if the folder is
+    `unwritten` is given only at the end of a flight: the events that could not be written. The summary then names in
+    `not_logged` whatever cannot be written now, and the log of ticks is kept. Raises InputError if the folder is
     not a run, or a file of it is damaged, and OSError if a file cannot be written, unless `unwritten` is given.
     """
     scenario = read_scenario(folder)
@@ -62,7 +62,7 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     def there() -> set[str]:
         return {file.name for file in folder.iterdir() if not file.name.startswith(".")}
 
-    def columns() -> None:  # the growing log goes only when the Parquet file is whole
+    def columns() -> None:  # the log of ticks is deleted only once the Parquet file is complete
         names = TICK.names or ()
         record.write_parquet(folder / record.PARQUET_FILE, {name: np.ascontiguousarray(ticks[name]) for name in names})
         (folder / record.TICKS_FILE).unlink(missing_ok=True)
@@ -127,7 +127,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
 
 
 def _medians(rows: TickArray, name: str) -> list[float]:
-    """The median of a column for each vehicle that has a known value there."""
+    """The median of a column for each vehicle that has known values in it."""
     columns = (rows[name][rows["system_id"] == system_id] for system_id in np.unique(rows["system_id"]))
     return [float(np.median(known)) for own in columns if (known := own[np.isfinite(own)]).size]
 
@@ -193,7 +193,7 @@ def _vehicle(
     error_m = error[1] if error is not None and error[1].size else None
     counted = {name: int(rows[name][-1]) if rows.size else None for name in ("received", "lost", "late", "duplicate")}
     margins_s, rtt, modes = sent["delay_margin_s"], estimate(rows["rtt_s"]), rows["mode"]
-    if (modes != Mode.WAITING).any():  # in which every vehicle is once it is told to hold at the end
+    if (modes != Mode.WAITING).any():  # every vehicle is WAITING again once it is told to hold at the end
         modes = modes[modes != Mode.WAITING]
     return VehicleSummary(
         system_id=system_id,
@@ -226,7 +226,7 @@ def _one_way(delay_s: FloatArray, bound_s: FloatArray) -> OneWayDelay:
 def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> Clock:
     """The clock's offset as last estimated, its skew since the last jump, and their bounds.
 
-    The skew is that of the straight line between the first and the last offset, each wrong by its bound at most.
+    The skew is the slope between the first and the last offset, each of which is wrong by its bound at most.
     """
     known = own[np.isfinite(own["clock_offset_s"])]
     if not known.size:

@@ -1,4 +1,4 @@
-"""The map of a campaign with two axes: where the formation breaks in flight and by prediction, and where it cannot."""
+"""The map of a campaign with two axes: where the formation breaks in flight, by prediction, and where it cannot."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -32,7 +32,7 @@ def map_figure(
 ) -> Path | None:
     """Measured growth over two axes, averaged over the seeds, with the measured and the predicted boundaries.
 
-    The marks show the flights `verdicts`, each cell that of its worst seed.
+    The mark of each cell shows the worst verdict of its flights in `verdicts`.
     """
     axes = [replace(axis, values=tuple(sorted(axis.values))) for axis in axes]
     measured = _cells(axes, outcomes, "growth_1_s")
@@ -142,8 +142,8 @@ def _mark(
 ) -> None:
     """Mark the verdict of each cell's own-state flights; light marks on dark cells.
 
-    An error that stays where small errors decay is no instability of the loop: large initial errors met a limit, or
-    random links keep pushing.
+    An error that persists where small errors decay is not an instability of the loop: large initial errors met a limit,
+    or random links keep pushing the vehicles.
     """
     across, up = (np.array(axis.values) for axis in axes)
     found = _verdicts(axes, verdicts)

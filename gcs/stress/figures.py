@@ -34,7 +34,7 @@ def growth_figure(
     figure, (above, below) = figure_of(2, (9.0, 6.4), heights=(3.2, 1.0))
     room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 240)
-    # of the formation: the largest over its loops
+    # the formation's growth rate is the largest of its loops'
     kinds = unlike_blocks(plan_loops(study.plan))
     sampled = np.max([[kind.growth_1_s(at) for at in grid_s.tolist()] for kind in kinds], axis=0)
     continuous = np.max([[kind.growth_continuous_1_s(at) for at in grid_s.tolist()] for kind in kinds], axis=0)
@@ -114,7 +114,7 @@ def worst_of(outcomes: Sequence[Outcome]) -> list[Outcome]:
         return broke, -float(len(outcome.trace_m)) if broke else 0.0, outcome.spacing_error_max_m or 0.0
 
     ordered = sorted(own or flown, key=badness, reverse=True)
-    # the varied quantity may not matter: of identical flights only the first is listed
+    # the varied quantity may have no effect: of identical flights only the first is listed
     apart: dict[tuple[float, ...], Outcome] = {}
     for outcome in ordered:
         apart.setdefault(tuple(outcome.trace_m), outcome)

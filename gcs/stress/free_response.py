@@ -5,7 +5,7 @@ of the vehicles of one loop. Nothing acts on the vehicles ahead, so the flight s
 alone. Where every vehicle has errors, identical loops along the chain drive each other at resonance (t^k e^{st}), and
 growth can be read only after a long time.
 
-A probe removes everything that would hide the loop:
+A probe removes everything that would mask this response:
 
 * Clock drift moves the sampling instants, and with them the loop delay while it is being measured.
 * Vehicles on the launcher report a velocity but do not move. The station extrapolates their states to one instant, so
@@ -13,9 +13,9 @@ A probe removes everything that would hide the loop:
   the same clock: they sample at the same instant, and this error is absent. The probed loop's wait for the control tick
   then no longer follows from its clock; it is restored by moving less than one period of delay between the up and down
   links.
-* Links that differ start the vehicles at different instants. They also leave each clock wrong by half the asymmetry of
-  its links, which the station sees as errors. So all vehicles have the links of the probed one. Its loop is unchanged:
-  the station extrapolates the others' states to the instant of its own.
+* Links that differ start the vehicles at different instants. They also leave each clock estimate wrong by half
+  the asymmetry of its links, which the station sees as errors. So all vehicles have the links of the probed one. Its
+  loop is unchanged: the station extrapolates the others' states to the instant of its own.
 * Changes of the nominal velocity, and the noise of the vehicles' sensors.
 * The vehicles' failsafe, which lossy links would trigger now and then: it opens the loop.
 * The scenario's limit on the spacing error: a growing error must be seen for long enough to be measured.
@@ -48,25 +48,25 @@ from scenarios.link_schema import Link
 from scenarios.schema import Limits, Safety, Scenario, Vehicle
 
 PROBE_S = 20.0
-"""How long a probe is flown, if that is enough."""
+"""How long a probe is flown on constant links."""
 _RANDOM_LOOP_DELAYS, _LONGEST_S = 66.0, 120.0
-"""On links that lose or delay at random a probe shows a mean growth rate, whose error falls with the number of loop
-delays that the probe lasts: this many, for at most this long."""
+"""On links that lose or delay at random, a probe shows a mean growth rate, whose error falls with the number of loop
+delays flown. It lasts this many loop delays, but at most this long."""
 _SPEED_MIN_M_S = 1e-3
 """The kinematics are singular at speed 0."""
 _DIRECTION_NE = np.array([1.0, -0.8])
 """Direction of a probe's error: not a diagonal, where the modes of gains that couple north and east lie, but near one,
 because two nearly equal modes are hard to separate where both are large."""
 _LINEAR_SHARE = 0.8
-"""Share of the nominal speed that an error may reach: the vehicles' linearisation is exact except at speed zero."""
+"""Share of the nominal speed that a velocity error may reach: the linearisation is exact at any speed but zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class FreeResponse:
     """The errors of one loop's vehicles as rows of ticks, in order of time, and their flight.
 
-    No limit and no singularity was near until `until_s` after the first row; `calm_until_s` is the same for the calm
-    flight of a pair, which bounds it for every disturbance. `varying` says that the delays vary.
+    Until `until_s` after the first row, no limit and no singularity was near. `calm_until_s` is the same for the calm
+    flight of a pair; no disturbed flight can exceed it. `varying` says that the delays vary.
     """
 
     plan: FlightPlan
@@ -88,7 +88,7 @@ def response_alone(
 ) -> FreeResponse:
     """Fly a probe's scenario, see `probe_scenario`."""
     probe = replace(plan, scenario=scenario)
-    # where loop delays differ from command to command their mean counts, which only the truth has exactly
+    # where loop delays differ from command to command, their mean counts: only the truth has it exactly
     flight = fly_plan(probe, real_time=real_time, folder=folder, with_truth=plan.timing.commands > 1)
     errors = _rows_of(flight.ticks, system_ids)
     return FreeResponse(probe, flight, errors, linear_until_s(scenario, errors, share=_LINEAR_SHARE))
@@ -138,7 +138,7 @@ def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
 
 
 def _alike(rows: TickArray, others: TickArray) -> int:
-    """The number of first rows with the same ticks and the same states used, before one of the flights broke."""
+    """The number of leading rows with the same ticks and the same states used: until one of the flights broke."""
     count = min(len(rows), len(others))
     same = np.ones(count, dtype=bool)
     for name in ("tick", "system_id", "sample_boot_ms"):
@@ -207,8 +207,8 @@ def probe_scenario(
 def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> tuple[Link, Link]:
     """The links with delay moved between them, so that telemetry sampled at whole periods waits `waiting_s`.
 
-    The up link then takes a whole number of periods less the waiting, and the sum of both delays is unchanged. Links
-    too short for that keep the loop delay instead: the down link takes the time that telemetry does not wait.
+    The up link then takes a whole number of periods less the waiting, and the sum of both delays is unchanged. On
+    links too short for that, the wait stays as it is, and the down link makes up the difference from `waiting_s`.
     """
     if up.delay_points or down.delay_points:
         return up, down
@@ -225,7 +225,7 @@ def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> 
 
 
 def linear_until_s(scenario: Scenario, own: TickArray, *, share: float) -> float:
-    """Time from the first row to the first error near the singularity at speed zero; infinity if there is none.
+    """Time from the first row until the singularity at speed zero or the largest command is near; infinity if neither.
 
     `own` are rows of the probed vehicles, in order of time. `share` is the share of the nominal speed that a velocity
     error may reach.

@@ -32,7 +32,7 @@ _FEWEST_SIGNS = 3
 """Fewest changes of sign that give a frequency: one full cycle."""
 _LONGEST_HANKEL = 120
 FOLLOWER_MODES = 4
-"""Two states and two late states: enough for a vehicle on which none behind it acts."""
+"""Two states and two late states: enough for a vehicle that does not react to those behind it."""
 _RANK_FLOOR = 1e-9
 _LEAST_SHARE = 0.1
 """A mode counts if it carries this share of the motion; modes from rounding and clock noise carry less."""
@@ -59,9 +59,9 @@ class Motion:
 class Growth:
     """Rate of the slowest mode found, ln|z| / T: above zero the loop is unstable.
 
-    `error_1_s` is the standard error. Of a fitted mode it is the larger of that from the misfit and half the difference
-    between the first and the second half of the window. The window is `start_s` to `end_s` of the motion's time. The
-    frequency is None if the motion does not oscillate.
+    `error_1_s` is the standard error. For a fitted mode it is the larger of two: the error from the misfit, and half
+    the difference between the rates of the window's two halves. The window is `start_s` to `end_s` of the motion's
+    time. The frequency is None if the motion does not oscillate.
     """
 
     growth_1_s: float
@@ -76,8 +76,8 @@ def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -
     """The errors of some vehicles at the sampling instants of the states used to command them.
 
     A state that two ticks used (telemetry late or slower than control) counts once. `sample_boot_ms` is exact, so
-    the samples of regular telemetry are equally spaced to the last digit; otherwise a cubic spline interpolates them
-    at equally spaced instants.
+    the samples of regular telemetry are equally spaced to the last digit. Otherwise a cubic spline interpolates them at
+    equally spaced instants.
     """
     columns: list[FloatArray] = []
     for system_id in system_ids:
@@ -95,7 +95,7 @@ def motion_of(ticks: TickArray, system_ids: Sequence[int], *, period_s: float) -
 def fit_growth(motion: Motion, *, start_s: float, end_s: float = np.inf, modes: int = FOLLOWER_MODES) -> Growth | None:
     """The growth rate of a motion from `start_s` on, when faster modes have died away.
 
-    The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. `modes` is the most to look for: a loop
+    The window ends at `end_s`, or when the motion has shrunk to `DECAY_KEPT`. At most `modes` modes are fitted: a loop
     of several vehicles has more slow ones. None if fewer than `FEWEST_SAMPLES` are left or nothing moves.
     """
     time_s, values = _window(motion, start_s, end_s)
@@ -159,7 +159,7 @@ def envelope_growth(size: FloatArray, *, period_s: float, start_s: float) -> Gro
 
 
 def _slope(time_s: FloatArray, level: FloatArray) -> Growth:
-    """The slope of a logarithm over time; its standard error is that of the mean slope of `_PARTS` parts.
+    """The slope of a logarithm over time, with the standard error of the mean slope of `_PARTS` parts.
 
     Random delays make the logarithm a random walk with drift. The slopes of its parts are then independent.
     """
@@ -205,7 +205,7 @@ def _equally_spaced(time_s: FloatArray, values: FloatArray, period_s: float) -> 
 
 
 def _count_before_rest(values: FloatArray) -> int:
-    """Number of samples before all that follow stay below `DECAY_KEPT` of the largest, averaged over the channels."""
+    """Number of samples until the motion stays below `DECAY_KEPT` of its largest, averaged over the channels."""
     if not values.size:
         return 0
     size = (np.abs(values) / np.maximum(np.abs(values).max(axis=0), np.finfo(float).tiny)).mean(axis=1)
@@ -228,7 +228,7 @@ def _slowest_mode(values: FloatArray, period_s: float, modes: int) -> tuple[comp
     z = _modes(flattened, modes)
     if z is None:
         return None
-    # The mode has turned to one that stays. Where others outweigh it now, the motion as it was shows it better.
+    # Flattened, the mode has constant amplitude. If another mode now outweighs it, the first fit is the better one.
     flat = _slowest(z, flattened)
     same = z[np.abs(z - slowest / abs(slowest)).argmin()]
     if not np.isclose(abs(flat), abs(same), rtol=1e-9, atol=0.0):
@@ -270,7 +270,7 @@ def _slowest(z: ComplexArray, values: FloatArray) -> complex:
 def _rate_error(z: ComplexArray, mode: complex, values: FloatArray, period_s: float) -> float:
     """The standard error (1/s) of the rate of one of the modes, from the misfit.
 
-    A change of the rate adds t e^{st}; the part of it that the amplitudes cannot reproduce determines the rate.
+    A change of the rate adds a motion t e^{st}; only the part that no change of the amplitudes explains tells the rate.
     """
     powers, amplitudes = _amplitudes(z, values)
     misfit = values - (powers @ amplitudes).real

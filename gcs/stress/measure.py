@@ -49,7 +49,7 @@ _CALM_SHARE = 0.8
 _WANTED_LOOP_DELAYS = 8.0
 _WANTED_SAMPLES = 60
 _WANTED_ERROR = 0.01
-"""Wanted standard error as a share of the growth rate: in loops of several vehicles the other modes decay slowly."""
+"""Wanted standard error as a share of the growth rate: the other modes of loops of several vehicles decay slowly."""
 
 
 def fly_trial(trial: Trial, folder: Path | None = None) -> Outcome:
@@ -142,9 +142,9 @@ def _folder_of(folder: Path | None, amplitude: float) -> Path | None:
 def _with_response(
     loop: CoupledBlock, critical: CoupledBlock, respond: Callable[[float], FreeResponse], outcome: Outcome
 ) -> Outcome:
-    """The outcome with the growth rate of a loop, which stands for the critical one.
+    """The outcome with the growth rate of a loop, which represents the critical one.
 
-    The initial error is a metre, or less if that grows too fast.
+    The initial error is a metre, or less if a metre leaves the linear range too soon.
     """
     outcome = replace(outcome, probed=loop.system_ids[0], critical=critical.system_ids[0])
     for amplitude in AMPLITUDES:
@@ -222,7 +222,7 @@ def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
 
 
 def _left_linear_range_too_soon(outcome: Outcome) -> bool:
-    """Whether a smaller error would show more: the errors grew, and the window is too short."""
+    """Whether a smaller initial error would give a better fit: the errors grew, and the window is too short."""
     if outcome.fit_start_s is None or outcome.fit_end_s is None:
         return False
     growth_1_s, early = outcome.growth_1_s, outcome.fit_end_s < PROBE_S / 2.0

@@ -44,7 +44,7 @@ def _only(*names: str) -> PlainSerializer:
 
 
 class Typical(Published):
-    """A figure over the flights of a campaign."""
+    """Median and maximum of a figure over the flights of a campaign."""
 
     median: float
     max: float
@@ -53,9 +53,9 @@ class Typical(Published):
 class Noise(Published):
     """How much the machine disturbed flights in real time.
 
-    `lateness` is how much later than due set-points were handed over. `loop_delay_spread_s` is the 90th percentile of
-    the loop delay minus its median. Of the processor time, the host took away `steal_share`, and all processes together
-    used `busy_share`.
+    `lateness` is the time from when a set-point was due until it was handed over. `loop_delay_spread_s` is the 90th
+    percentile of the loop delay minus its median. Of the processor time, the host took away `steal_share`, and all
+    processes together used `busy_share`.
     """
 
     flights: int
@@ -76,7 +76,7 @@ class Provenance(Published):
 
 
 class CampaignResult(Published):
-    """The result of a campaign. `points` are the outcomes of its sweep, `failure` says in one line why it failed."""
+    """The result of a campaign. `points` are the outcomes of its sweep; `failure` says in one line why it failed."""
 
     scenario: str
     delay_margin_s: float | None
@@ -87,7 +87,7 @@ class CampaignResult(Published):
     axes: dict[str, tuple[float, ...]]
     onset: Onset | None
     onset_shorter: Onset | None = None
-    """Where a loop that is predicted over a fixed delay breaks as the delay becomes too short."""
+    """Where a loop that is predicted over a fixed delay breaks because the true delay is too short."""
     onset_missing: str
     onset_missing_as_predicted: bool
     curve_error: float | None

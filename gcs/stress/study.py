@@ -36,7 +36,7 @@ class Study:
 
     @cached_property
     def window_s(self) -> Window:
-        """The loop delays between which the plan is predicted to be stable: from 0 on, except with prediction."""
+        """The loop delays between which the plan is predicted to be stable; without prediction the first is 0."""
         assumed_s, tolerated = self.plan.assumed_s or 0.0, self.plan.tolerance.at(0.0)
         return max(0.0, assumed_s - tolerated.shorter_s[0]), assumed_s + tolerated.longer_s[0]
 
@@ -76,8 +76,8 @@ class Onset:
 
     All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
     down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
-    or with prediction the end of its mismatch window, `difference` is measured / predicted − 1.
-    `predicted_continuous_s` is that of the continuous model less half a period for the hold.
+    or with prediction the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
+    `predicted_continuous_s` is the same for the continuous model, less half a period for the hold.
     """
 
     loop_delay_s: float
@@ -96,7 +96,7 @@ class Onset:
     checks: _Flights
     """Probes of the other kinds of loops and of the last vehicle, at the onset."""
     own: _Flights
-    """Own trials at 0.9 and 1.1 times the onset's link delay; with prediction half the mismatch to either side."""
+    """Own trials at 0.9 and 1.1 times the onset's link delay; with prediction, at ± half the mismatch there."""
 
 
 class NoOnset(Exception):  # noqa: N818 - a finding about the formation, not a fault
@@ -115,8 +115,8 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
 
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
     and those of later rounds over a fraction of one if no smooth curve fits. The search follows the measured growth;
-    the prediction is only its start. `shorter` looks for the onset below the assumed delay of a station that predicts,
-    where growth falls as the delay rises. Raises NoOnset with the reason.
+    the prediction only tells it where to start. `shorter` looks for the onset below the assumed delay of a station that
+    predicts, where growth falls as the delay rises. Raises NoOnset with the reason.
     """
     predicted_s, way = study.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
     if predicted_s == np.inf:
@@ -230,7 +230,7 @@ def _found(
     loop = next(loop for loop in loops if nearest.probed in loop.system_ids)
     end, way = (0, -1.0) if shorter else (1, 1.0)
     ends_s = [way * kind.window_s()[end] for kind in unlike_blocks(loops)]
-    # for the loop that breaks first, test the design's own figure, which the station flies by
+    # for the loop that breaks first, test the figure that the station flies by
     own_s = loop.window_s()[end]
     predicted_s = study.window_s[end] if way * own_s == min(ends_s) else own_s
     waiting_s = _waiting_s(near)
@@ -240,7 +240,7 @@ def _found(
     others = [kind.system_ids[0] for kind in unlike_blocks(loops) if not kind.same_as(loop)]
     others = dict.fromkeys([*others, loops[-1].system_ids[-1]])
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
-    # with prediction not so far that the other end of the window is near
+    # with prediction, stay away from the other end of the window
     aside_s = 0.1 * link_s if study.plan.assumed_s is None else 0.5 * abs(predicted_s - study.plan.assumed_s)
     beside_s = [round(max(0.0, link_s + part * aside_s), 6) for part in (-1.0, 1.0)]
     own = run([study.trial("own", {"delay": delay_s}, seed=seed) for delay_s in beside_s])

@@ -49,7 +49,7 @@ PUBLISHED_S = (0.185, 0.195)
 
 @dataclass(frozen=True)
 class Claim:
-    """One number or statement: its place, what is printed, what is computed, and a second, independent way to it."""
+    """One number or statement: its place, what is printed, what is computed, and a second, independent check."""
 
     place: str
     subject: str
@@ -112,7 +112,8 @@ def _inclusion() -> Iterator[Claim]:
     yield Claim(
         "(3.29)", "the LMI with Y = diag(Y1, Y2, Y1)", "α = 0.93",
         f"infeasible: its block (2, 2) is {middle:.0f} for every Y and L, so it is never negative definite",
-        f"{_least_eigenvalue():.1e} is the least largest eigenvalue of AY + YA' + BL + L'B' over 2,000 random Y, L",
+        f"{_least_eigenvalue():.1e} is the smallest value of the largest eigenvalue of AY + YA' + BL + L'B' over 2,000 "
+        "random Y, L",
         "erratum",
     )  # fmt: skip
     shears = (-1.0, -2.0, -3.0)
@@ -152,16 +153,17 @@ def _sweep_algorithm() -> Iterator[Claim]:
     (least, _), (least_late, most_late) = pencil_moduli(-2.0, 1.0), pencil_moduli(-1.0, -2.0)
     yield Claim(
         "(5.7)", "no delay destabilises if ρ(jωI − A0, A1) < 1", "ρ < 1",
-        f"the least modulus above 1 is wanted: x' = −2x + x(t − τ) has it at {least:.1f} and margin "
-        f"{delay_margin([[-2.0]], [[1.0]])}; a largest one below 1 has no loop, as |λ| grows with ω",
+        f"the condition must be on the least modulus, above 1: x' = −2x + x(t − τ) has it at {least:.1f} and margin "
+        f"{delay_margin([[-2.0]], [[1.0]])}; no loop has a largest one below 1, as |λ| grows with ω",
         f"x' = −x − 2x(t − τ): least {least_late:.1f}, margin {delay_margin([[-1.0]], [[-2.0]]):.4f} s; moduli pass 1 "
         f"on the way to {most_late:.0f} at 100 rad/s", "erratum",
     )  # fmt: skip
     right, wrong = (first_crossing(-1.0, -2.0, sign) for sign in (-1.0, 1.0))
     yield Claim(
         "(5.7), steps 2, 3", "crossings from ρ ≠ 0, and θ without e^{−jθ}", "ρ ≠ 0, λ = e^{jθ}",
-        f"|λ| = 1 is to be looked for, and λ = e^{{−jθ}}: θ/ω = {right:.4f} s for x' = −x − 2x(t − τ); with e^{{jθ}} "
-        f"{wrong:.4f} s", f"exact margin {delay_margin([[-1.0]], [[-2.0]]):.4f} s = 2π / (3√3)", "erratum",
+        f"the condition to search for is |λ| = 1, with λ = e^{{−jθ}}: θ/ω = {right:.4f} s for x' = −x − 2x(t − τ); "
+        f"with e^{{jθ}} {wrong:.4f} s",
+        f"exact margin {delay_margin([[-1.0]], [[-2.0]]):.4f} s = 2π / (3√3)", "erratum",
     )  # fmt: skip
 
 
@@ -171,14 +173,14 @@ def _subsets() -> Iterator[Claim]:
     inside = int(((margins >= low) & (margins <= high)).sum())
     nearest = int(np.argmin(np.abs(margins - 0.19)))
     yield Claim(
-        "5.3", "any choice of which of the twelve scalar gains are late that gives 0.19 s", "0.19 s",
+        "5.3", "any choice of late gains, of the twelve scalar ones, that gives 0.19 s", "0.19 s",
         f"{inside or 'none'} of all {len(margins):,} gives {low} to {high} s; the nearest is {margins[nearest]:.4f} s",
         f"{subset_margin_by_sweep(nearest):.4f} s by the sweep", "erratum",
     )  # fmt: skip
 
 
 def _least_eigenvalue() -> float:
-    """The minimum over random Y, L of the largest eigenvalue of the drift of one subsystem (3.25), per axis."""
+    """The smallest value, over random Y, L, of the largest eigenvalue of AY + YA' + BL + L'B' of (3.25), per axis."""
     A = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
     B = np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
     rng = np.random.default_rng(2012)
@@ -207,7 +209,7 @@ def _graph() -> Iterator[Claim]:
     yield Claim(
         "4.4", "“… + αI ⪯ 0, minimise α”", "converges",
         "unbounded below: α = −10⁶ satisfies it with P = I, K = 0 (largest eigenvalue "
-        f"{printed:.0f}), and every smaller α does",
+        f"{printed:.0f}), and so does every smaller α",
         f"with αP and I ⪯ P ⪯ κI the iteration ends after {len(steps.iterates) - 1} steps at "
         f"α = {steps.proof.alpha:.3f}, abscissa {abscissa(SINGLE.A + SINGLE.B @ steps.K):.3f} 1/s", "erratum",
     )  # fmt: skip
@@ -300,9 +302,9 @@ def _comparison() -> Iterator[Claim]:
 
 
 def controllable_dimensions(restriction: Restriction) -> tuple[int, int]:
-    """Rank of [B, AB, A²B, ...] of the expanded chain of three, one axis, and that of [A, B].
+    """Ranks of [B, AB, A²B, ...] and of [A, B], for the expanded chain of three on one axis.
 
-    All eigenvalues are zero, so that by Hautus' test the system is controllable if and only if the second is full.
+    All eigenvalues are zero, so by Hautus' test the system is controllable if and only if [A, B] has full rank.
     """
     expansion = expand(SINGLE, restriction)
     A, B = expansion.A.toarray(), expansion.B.toarray()

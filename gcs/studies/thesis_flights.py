@@ -1,4 +1,4 @@
-"""The source's figures, and the flights behind them: with our station, for chapter 5 with the nonlinear model."""
+"""The source's figures and the flights behind them: flown by our station; those of chapter 5 by the nonlinear model."""
 
 from functools import cache
 from pathlib import Path
@@ -58,7 +58,7 @@ def nonlinear_response(delay_s: float) -> tuple[float, float]:
     size = np.linalg.norm(errors, axis=1)
     outside = np.flatnonzero(size > 0.02 * size.max())
     settled_s = float(time_s[min(outside[-1] + 1, len(time_s) - 1)])
-    # the largest of each second, as long as it is above rounding
+    # the largest error of each second, while it is above rounding
     whole = int(time_s[-1])
     envelope = size[: whole * 1000].reshape(whole, 1000).max(axis=1)
     kept = (envelope > 1e-9 * envelope.max()) & (np.arange(whole) >= whole // 4)
@@ -67,7 +67,7 @@ def nonlinear_response(delay_s: float) -> tuple[float, float]:
 
 
 def flown(name: str, method: str) -> tuple[TickArray, float | None]:
-    """Fly one of the triangle's scenarios without link delay: its ticks and settling time.
+    """Fly one of the triangle scenarios without link delay; returns its ticks and settling time.
 
     The gains are those of inclusion at α = 0.93, or of a graph method at the same delay margin.
     """

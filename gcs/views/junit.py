@@ -1,4 +1,4 @@
-"""JUnit XML for CI: what a command checked."""
+"""What a command checked, as JUnit XML for CI."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,13 +8,13 @@ from xml.etree import ElementTree
 
 @dataclass(frozen=True)
 class Check:
-    """One test case: passed, unless one of the texts says why not."""
+    """One test case. It has passed unless one of the texts says why not."""
 
     name: str
     failure: str = ""
     skipped: str = ""
     error: str = ""
-    """The traceback of what could not be checked."""
+    """The traceback, if the check could not be made."""
 
 
 def write_junit(file: Path, suite_name: str, checks: Sequence[Check], *, time_s: float) -> None:

@@ -1,4 +1,4 @@
-"""What the terminal shows before and after a flight: the design, and the summary."""
+"""What the terminal shows before and after a flight: the design and the summary."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ def print_design(design: Design, console: Console | None = None) -> None:
         console.print(table_of(design.blocks, _BLOCK_COLUMNS))
         _print_margins(design, console)
         bound, decay_1_s = "robustness bound of the whole formation", design.decay_rate_1_s
-    loss = "" if design.cost_loss is None else f"; costs {design.cost_loss:.1%} more than with all information"
+    loss = "" if design.cost_loss is None else f"; LQR cost {design.cost_loss:.1%} above the centralised optimum"
     console.print(f"alpha    {design.alpha:.4f} ({bound}), decay {decay_1_s:.2f} 1/s without delay{loss}")
     if design.at_loop_delay is not None:
         _print_figures_at_delay(design.at_loop_delay, console)
@@ -79,14 +79,14 @@ def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> 
     kept = f"at least {flown.alpha_kept:.4f} {_up_to(flown.alpha_kept_to_s)}"
     if flown.string_peak_kept is None:
         console.print(f"         {kept}")
-        console.print("string   no verdict: with gains on a general pattern errors do not run down a chain")
+        console.print("string   no verdict: with gains on a general pattern errors do not propagate along a chain")
         return
     growth = f"growth at most {flown.string_peak_kept:.2f} times {_up_to(flown.string_peak_kept_to_s)}"
     console.print(f"         {kept}; {growth}")
 
 
 def figures_text(flown: FiguresAtDelay) -> str:
-    """α and, where they run down a chain, the growth of spacing errors at a loop delay, in words."""
+    """α at a loop delay and, where spacing errors propagate along a chain, their growth there, in words."""
     alpha = f"{flown.alpha:.4f} at {ms_text(flown.loop_delay_s)} of loop delay"
     if not flown.has_string_verdict:
         return f"{alpha}, of the whole formation"
@@ -97,7 +97,7 @@ def figures_text(flown: FiguresAtDelay) -> str:
 def _up_to(delay_s: float | None) -> str:
     if delay_s is None:
         return "at every loop delay"
-    return "at no loop delay" if delay_s == 0.0 else f"up to {ms_text(delay_s)} of it"
+    return "at no loop delay" if delay_s == 0.0 else f"up to {ms_text(delay_s)}"
 
 
 def _matrix(columns: Sequence[Sequence[float]]) -> str:
@@ -118,7 +118,7 @@ _BLOCK_COLUMNS: dict[str, Callable[[Block], str]] = {
     "spacing error, 1/s²": lambda block: _matrix(list(zip(*block.gain, strict=True))[:-2]),
     "velocity error, 1/s": lambda block: _matrix(list(zip(*block.gain, strict=True))[-2:]),
 }
-"""The gain matrix by blocks: who uses whose errors, and how."""
+"""The gain matrix by blocks: which vehicle uses whose errors, with which gain."""
 _VEHICLE_COLUMNS: dict[str, Callable[[VehicleSummary], str]] = {
     "vehicle": lambda own: str(own.system_id),
     "final error, m": lambda own: number_text(own.spacing_error_final_m, ".2f"),
@@ -154,7 +154,7 @@ def print_flight(summary: Summary, console: Console) -> None:
         settled_s = summary.settling_time_s
         console.print(
             f"control  {control.ticks} ticks at {control.rate_hz:g} Hz, {control.deadline_misses} deadline misses; "
-            f"settled {'not at all' if settled_s is None else f'after {settled_s:.1f} s'}"
+            f"{'not settled' if settled_s is None else f'settled after {settled_s:.1f} s'}"
         )
     for who, counts in (("station", summary.refused), ("vehicles", summary.refused_by_vehicles)):
         if counts:
@@ -165,14 +165,14 @@ def print_flight(summary: Summary, console: Console) -> None:
 
 
 def _reason(summary: Summary) -> str:
-    """How the flight ended; for a completed flight that is unstable, why."""
+    """How the flight ended; for a completed but unstable flight, why it is unstable."""
     final_m, most_m = summary.spacing_error_final_m, summary.spacing_error_max_m
     completed = summary.reason.startswith("completed")
     if summary.verdict != "unstable" or not completed or final_m is None or most_m is None:
         return summary.reason
     if summary.settling_time_s is not None:
         return f"errors are small after {summary.duration_s:.1f} s, but the loop delay is past the margin"
-    return f"not settled in {summary.duration_s:.1f} s; {final_m:.2f} m left of errors of up to {most_m:.2f} m"
+    return f"not settled in {summary.duration_s:.1f} s; final spacing error {final_m:.2f} m, largest {most_m:.2f} m"
 
 
 def delay_text(summary: Summary) -> str:
@@ -194,16 +194,16 @@ def _response(response: ResponsePart | None) -> str:
     if response is None:
         return ""
     if not response.vehicles:
-        text = "this margin is of vehicles that answer at once; theirs is found before the formation flight"
+        text = "this margin assumes vehicles that respond at once; theirs is computed before the formation flight"
         return f"response {response.source}: {text}\n"
     lags, gains = (
         sorted(texts)
         for texts in zip(*((f"{v.lag_s:.3f}", f"{v.velocity_gain_1_s:.2f}") for v in response.vehicles), strict=True)
     )
     peak = response.string_peak
-    grows = "" if peak is None else f"; spacing errors grow by {peak:.2f} at most from vehicle to vehicle with it"
+    grows = "" if peak is None else f"; spacing errors grow {peak:.2f} times at most from vehicle to vehicle with it"
     lag, gain = (" to ".join(dict.fromkeys((each[0], each[-1]))) for each in (lags, gains))
     return (
-        f"response {response.source}: lag {lag} s, velocity gain {gain} 1/s; in the margin, which would be "
+        f"response {response.source}: lag {lag} s, velocity gain {gain} 1/s; included in the margin, which would be "
         f"{ms_text(response.delay_margin_at_once_s)} without it{grows}\n"
     )

@@ -124,7 +124,7 @@ def screenshot(folder_or_rrd: Path, png: Path, *, time_s: float, width: int = 16
         viewer.open(str(recording.resolve()))
         try:
             viewer.set_time(TIMELINE, duration=time_s, play_state="paused")
-        except ConnectionError:  # it has loaded nothing with times
+        except ConnectionError:  # it has loaded nothing that has times
             raise InputError(f"{recording}: the viewer reads no flight in it; {_WANTED}") from None
         viewer.run_command("ui.toggle_top_panel")  # of no use on a picture
         png.write_bytes(_settled_picture(viewer))
@@ -173,7 +173,7 @@ def _headless(width: int, height: int) -> Generator[Any]:
 
 
 def _settled_picture(viewer: Any) -> bytes:
-    """A picture once three in a row are equal: the viewer has loaded everything and removed its starting notes."""
+    """The picture, once three in a row are equal: the viewer has loaded everything and removed its notices."""
     pictures = [viewer.take_screenshot()]
     give_up = time.monotonic() + SETTLE_S
     while pictures[-3:] != 3 * pictures[-1:] and time.monotonic() < give_up:
@@ -191,7 +191,7 @@ def _wait_for(ready: Callable[[], T], process: subprocess.Popen[bytes], log: IO[
     give_up = time.monotonic() + START_S
     while not (found := ready()):
         if process.poll() is not None or time.monotonic() > give_up:
-            last = (_text(log).strip().splitlines() or ["it said nothing"])[-1]
+            last = (_text(log).strip().splitlines() or ["it printed nothing"])[-1]
             raise InputError(f"the Rerun viewer does not start: {last}")
         time.sleep(0.02)
     return found

@@ -28,10 +28,10 @@ class Message(NamedTuple):
 
     topic: str
     table: str
-    """The CSV file that it is a row of, without the ending."""
+    """Its CSV file, without the extension."""
     time_ns: int
     fields: dict[str, Any]
-    """What is known: a value that is not known is left out."""
+    """The known values; unknown ones are left out."""
 
 
 def messages_of(source: Path) -> list[Message]:

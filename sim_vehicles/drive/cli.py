@@ -267,7 +267,7 @@ def _parser() -> argparse.ArgumentParser:
     parent = "the parent process; with --stop-after-silence: silence counts only after it has ended"
     for name, kind, default, metavar, text in (
         ("--station", _address, ("127.0.0.1", 14550), "HOST:PORT", "where the station listens (127.0.0.1:14550)"),
-        ("--key", Path, None, "FILE", "sign, and accept only what is signed with this key"),
+        ("--key", Path, None, "FILE", "sign with this key, and accept only frames signed with it"),
         ("--truth", Path, None, "FILE", "write the truth log, or continue one"),
         ("--counters", Path, None, "FILE", "write the counters as JSON at the end"),
         ("--stop-after-silence", _seconds, math.inf, "SECONDS", silence),

@@ -85,7 +85,8 @@ def test_a_flight_too_short_to_settle_says_what_is_left_of_its_errors() -> None:
     [verdict] = [line for line in output.getvalue().splitlines() if line.startswith("verdict")]
     most_m = max(known(vehicle.spacing_error_max_m) for vehicle in summary.vehicles[1:])
     left_m = max(known(vehicle.spacing_error_final_m) for vehicle in summary.vehicles[1:])
-    assert verdict == f"verdict  unstable: not settled in 0.4 s; {left_m:.2f} m left of errors of up to {most_m:.2f} m"
+    reason = f"not settled in 0.4 s; final spacing error {left_m:.2f} m, largest {most_m:.2f} m"
+    assert verdict == f"verdict  unstable: {reason}"
 
 
 def test_formation_follows_the_turns() -> None:

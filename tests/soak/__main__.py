@@ -1,14 +1,14 @@
 """Fly random experiments in virtual time and check that invariants hold: `python3 make.py soak --flights 1000`.
 
 Each flight is drawn from the seed and its number (`soak_experiments.py`), flown through the product's own driver with
-real bytes (`soak_flight.py`) and checked (`soak_checks.py`). What breaks an invariant is written to a folder, and flown
-again with `--only NUMBER` or `--fly FILE`. Exit code 1 if one is broken.
+real bytes (`soak_flight.py`) and checked (`soak_checks.py`). A flight that breaks an invariant is written to a
+folder; `--only NUMBER` or `--fly FILE` flies it again. Exit code 1 if any invariant is broken.
 """
 
 import argparse
 import os
 import sys
-import time  # noqa: TID251 - it tells how long it will take
+import time  # noqa: TID251 - only to report how long the soak will take
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -21,11 +21,11 @@ from tests.soak.soak_judge import Result, fly_numbers, judge
 
 warnings.simplefilter("error")
 BATCH = 8
-"""Flights that a process takes at a time."""
+"""How many flights a process takes at a time."""
 
 
 def fly_all(seed: int, numbers: range, workers: int) -> Iterator[tuple[int, Result]]:
-    """All flights, in any order, in so many processes."""
+    """All flights, in any order, flown in `workers` processes."""
     if workers == 1:
         for number in numbers:
             yield from fly_numbers(seed, [number])
@@ -37,7 +37,7 @@ def fly_all(seed: int, numbers: range, workers: int) -> Iterator[tuple[int, Resu
 
 
 def soak(results: Iterable[tuple[int, Result]], count: int, seed: int, folder: Path) -> int:
-    """Take the results in, show how far it is, and tell at the end; returns how many flights broke something new."""
+    """Collect the results, show progress and print a summary; returns how many flights broke an invariant."""
     began_s = time.monotonic()
     counts: Counter[str] = Counter()
     failed: list[int] = []
@@ -60,7 +60,7 @@ def soak(results: Iterable[tuple[int, Result]], count: int, seed: int, folder: P
 
 
 def tell(number: int, seed: int, result: Result, folder: Path) -> None:
-    """What was broken, and the files that show it."""
+    """Save the experiment, and print what it broke and how to fly it again."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"soak-{seed}-{number}.toml"
     experiment(seed, number).save(file)
@@ -74,10 +74,10 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=200, metavar="N")
     parser.add_argument("--seed", type=int, default=1, metavar="S")
     parser.add_argument("--first", type=int, default=0, metavar="K", help="number of the first flight")
-    parser.add_argument("--only", type=int, metavar="K", help="this flight alone, in this process")
-    parser.add_argument("--fly", type=Path, metavar="FILE", help="fly what a broken invariant left")
+    parser.add_argument("--only", type=int, metavar="K", help="fly this flight alone, in this process")
+    parser.add_argument("--fly", type=Path, metavar="FILE", help="fly a failed experiment again")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, metavar="W", help="default: all processors")
-    parser.add_argument("--out", type=Path, default=Path("runs/soak"), metavar="DIR", help="where broken ones are left")
+    parser.add_argument("--out", type=Path, default=Path("runs/soak"), metavar="DIR", help="for failed experiments")
     asked = parser.parse_args()
     if asked.fly is not None:
         result = judge(Experiment.load(asked.fly))

@@ -1,7 +1,7 @@
-"""What has to hold in every flight of the soak, whatever is flown and whatever goes wrong.
+"""What must hold in every flight of the soak, whatever is flown and whatever goes wrong.
 
-Each check gives what it found broken, in words. Where a check has a tolerance, theory gives it, and the comment says
-how; where theory promises nothing (a clock that was set, a link that is random), nothing is checked.
+Each check yields, in words, what it found broken. A tolerance follows from theory, and a comment says how. Where theory
+promises nothing (a clock that was set, a random link), nothing is checked.
 """
 
 import math
@@ -27,11 +27,11 @@ WHEN_COMMANDED = (
     "velocity_error_east_m_s", "command_north_m_s2", "command_east_m_s2", "up_delay_s", "sample_bound_s",
 )  # fmt: skip
 OF_CLOCKS = ("clock_offset_s", "clock_offset_bound_s")
-"""Known of a vehicle that is commanded unless its clock was set: then from the next exchange on."""
+"""Known of every commanded vehicle; after its clock was set, only from the next exchange on."""
 COUNTS = ("received", "late", "duplicate")
-"""These never go back; what was lost does when it comes late."""
+"""These never decrease; `lost` does when a frame arrives late."""
 LEAST_CHANGE = 1e-6
-"""Part by which a limit may be exceeded: float32 on the wire has 6e-8."""
+"""Fraction by which a limit may be exceeded: float32 on the wire rounds by 6e-8."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def checked(flown: Flown) -> Iterator[Broken]:
 
 
 def _rows_complete(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
-    """Every tick there, with a row for each vehicle, and in each row what has to be known."""
+    """No tick is missing, each has a row for every vehicle, and each row has the values that are always known."""
 
     def incomplete(text: str) -> Broken:
         return Broken("rows complete", text)
@@ -77,7 +77,7 @@ def _rows_complete(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
         yield incomplete(f"the rows of a tick are not those of vehicles {ids.tolist()}")
         return
     if (np.diff(ticks["tick"][:, 0]) != 1).any() or (np.diff(ticks["due_ns"][:, 0]) != period_ns).any():
-        yield incomplete("ticks are left out")
+        yield incomplete("ticks are missing")
     for name in ("tick", *ALWAYS):
         if (ticks[name] != ticks[name][:, :1]).any():
             yield incomplete(f"{name} differs between the rows of a tick")
@@ -86,13 +86,13 @@ def _rows_complete(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
             yield incomplete(f"{name} is not finite")
     for name in COUNTS:
         if (np.diff(ticks[name].astype(np.int64), axis=0) < 0).any():
-            yield incomplete(f"{name} goes back")
+            yield incomplete(f"{name} decreases")
     if not np.isin(ticks["mode"], [int(mode) for mode in Mode]).all():
-        yield incomplete("a mode that there is none of")
+        yield incomplete("a mode that does not exist")
 
 
 def _commands_explained(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
-    """Whoever is commanded is known, and nobody else has a command."""
+    """The state of every commanded vehicle is known, and no other vehicle has a command."""
 
     def incomplete(text: str) -> Broken:
         return Broken("rows complete", text)
@@ -102,20 +102,20 @@ def _commands_explained(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
     for name in WHEN_COMMANDED:
         if not np.isfinite(commanded[name]).all():
             k = int(np.flatnonzero(~np.isfinite(commanded[name]))[0])
-            yield incomplete(f"{name} = {commanded[name][k]} at {commanded['time_s'][k]:.3f} s, where it is commanded")
+            yield incomplete(f"{name} = {commanded[name][k]} at {commanded['time_s'][k]:.3f} s, while commanded")
     never_set = commanded[~np.isin(commanded["system_id"], list(flown.steps_ns))]
     for name in OF_CLOCKS:
         if not np.isfinite(never_set[name]).all():
-            yield incomplete(f"{name} is unknown of a vehicle that is commanded and whose clock nobody has set")
+            yield incomplete(f"{name} is unknown for a commanded vehicle whose clock was never set")
     if np.isfinite(ticks["command_north_m_s2"][~ticks["commanded"]]).any():
         yield incomplete("a command where none was sent")
 
 
 def _repetitions_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
-    """A set-point repeats itself only while no newer state has come, for less than a period of telemetry."""
+    """A set-point is repeated only until a newer state arrives, for less than a telemetry period."""
     rates, ticks = flown.plan.scenario.rates, stretch.ticks
     repeated_s = ticks["repeated_s"]
-    # by a rounded period in ns at most
+    # the period is rounded to a whole ns
     if not ((repeated_s >= 0.0) & (repeated_s < 1.0 / rates.telemetry_hz + 1e-9)).all():
         yield Broken("repetitions", f"{repeated_s.min():g} to {repeated_s.max():g} s of {1.0 / rates.telemetry_hz:g} s")
     elif rates.telemetry_hz >= rates.control_hz and repeated_s.any():
@@ -126,9 +126,9 @@ def _repetitions_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
 
 
 def _clocks_bounded(flown: Flown, stretch: Stretch, sampled: dict[tuple[int, int], int]) -> Iterator[Broken]:
-    """Offsets and instants of samples are within their bounds of the truth, of clocks that nobody has set.
+    """Clock offsets and sampling instants are within their bounds of the truth, for clocks that were never set.
 
-    No tolerance but a microsecond for the rounding of stamps: the bounds follow from each exchange alone.
+    The only tolerance is a microsecond for the rounding of stamps: the bounds follow from each exchange alone.
     """
     for row, system_id in enumerate(flown.plan.formation.system_ids):
         rows = stretch.ticks[:, row]
@@ -137,7 +137,7 @@ def _clocks_bounded(flown: Flown, stretch: Stretch, sampled: dict[tuple[int, int
         clock = flown.clocks[system_id]
         true_s = np.array([(clock.boot_ns(t) - t) * 1e-9 for t in known["sent_ns"].tolist()])
         beyond_s = np.abs(known["clock_offset_s"] - true_s) - known["clock_offset_bound_s"]
-        # float64 seconds of 1e6 s have 1e-10
+        # float64 resolves 1e-10 s in 1e6 s
         if beyond_s.size and beyond_s.max() > 1e-6:
             k = int(beyond_s.argmax())
             text = (
@@ -159,9 +159,9 @@ def _clocks_bounded(flown: Flown, stretch: Stretch, sampled: dict[tuple[int, int
 def _loop_delay_true(flown: Flown, stretch: Stretch, *, until_ns: int) -> Iterator[Broken]:
     """Where no delay varies, the measured loop delay is the true one.
 
-    What the offset of the clock is wrong by cancels. What remains is its drift between the exchange and the sample,
-    until the line through the exchanges has the slope: a second, and as long as five exchanges take. With loops on
-    board the state used may be another vehicle's, whose clock is wrong by something else: then the bounds hold.
+    The error of the clock offset cancels. What remains is the drift between exchange and sample, until the line fitted
+    to the exchanges has found the drift: a second, and as long as five exchanges take. With loops on board the state
+    used may be another vehicle's, whose clock has a different error: then the bounds hold.
     """
     scenario = flown.plan.scenario
     if not _constant_delays(scenario):
@@ -169,7 +169,7 @@ def _loop_delay_true(flown: Flown, stretch: Stretch, *, until_ns: int) -> Iterat
     ticks = stretch.ticks.ravel()
     truth = flown.truth
     known = (truth["time_ns"] >= stretch.start_ns) & (truth["time_ns"] < until_ns)
-    # a set-point's key is its time since its station's start: what acts before that was sent by the station before
+    # a set-point's key is its time since its station's start: one that acts earlier is from the previous station
     known &= (truth["kind"] != ACTED) | (truth["time_ns"] >= stretch.start_ns + truth["key"].astype(np.int64) * 10**6)
     age_s = ticks["loop_delay_s"] + ticks["repeated_s"]
     error_s = np.abs(age_s - true_loop_delays_s(ticks, truth[known]))
@@ -207,7 +207,7 @@ def _longest_round_trip_s(scenario: Scenario) -> float:
 
 
 def _jumps_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
-    """No clock is said to have jumped that nobody has set, where no delay varies."""
+    """Where no delay varies, no clock is reported to have jumped that was not set."""
     if not _constant_delays(flown.plan.scenario) or flown.plan.scenario.clocks.drift_max_ppm > 400.0:
         return
     for event in stretch.station.events:
@@ -216,7 +216,7 @@ def _jumps_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
 
 
 def _ends_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
-    """What is said of the end is so in truth: collisions, settled or not, and a summary that is JSON."""
+    """The reported end is true: collisions, and settled or not. The summary can be written as JSON."""
     scenario = flown.plan.scenario
     log = stretch.flight()
     design = margins_of(stretch.station.plan)
@@ -261,10 +261,10 @@ def _ends_true(flown: Flown, stretch: Stretch) -> Iterator[Broken]:
 def _true_errors_m(
     stretch: Stretch, scenario: Scenario, place: dict[int, Any], away_m: dict[int, float], at_end: np.ndarray[Any, Any]
 ) -> Iterator[tuple[int, tuple[float, float]]]:
-    """Spacing errors of the followers when the end was decided, and how far from them measured ones may be.
+    """True spacing errors of the followers when the end was decided, and how far from them measured ones may be.
 
-    The measured error is of the instant of the newest state: what both can be off at that, and their relative velocity
-    since.
+    The measured error refers to the instant of the newest state. It may differ by the position errors of both vehicles
+    and by their relative motion since.
     """
     age_s = {int(row["system_id"]): float(row["telemetry_age_s"]) for row in at_end}
     for v in scenario.vehicles:
@@ -277,16 +277,16 @@ def _true_errors_m(
 
 
 def _was_opened(stretch: Stretch) -> bool:
-    """Whether somebody was in trouble: the wanted spacing may have been another one."""
+    """Whether a vehicle was in trouble: the station may then have opened the formation to a larger spacing."""
     flown = stretch.ticks[stretch.ticks["time_s"] >= 0.0]
     return bool(np.isin(flown["mode"], [Mode.CRITICAL, Mode.FAILSAFE, Mode.LOST]).any())
 
 
 def _extrapolated_m(flown: Flown, stretch: Stretch, at_end: np.ndarray[Any, Any]) -> dict[int, float]:
-    """How far each vehicle can be from where its newest state, carried on with its velocity, puts it.
+    """How far each vehicle can be from its newest state extrapolated with its velocity.
 
-    With no acceleration beyond A since a state that is T old: A T² / 2, and its speed times what T can be wrong by.
-    A is the most that was commanded, and what a vehicle does by itself: its own loop, and the way to a velocity.
+    With accelerations of at most A since a state of age T: A T² / 2, plus the speed times the error of T. A covers the
+    largest command, and what a vehicle does by itself: its own loop, and reaching a velocity.
     """
     scenario, ticks = flown.plan.scenario, stretch.ticks
     sent = np.hypot(ticks["command_north_m_s2"], ticks["command_east_m_s2"])

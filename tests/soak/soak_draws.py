@@ -12,7 +12,7 @@ Part = dict[str, Any]
 
 
 def whole(model: type[BaseModel], **keys: Any) -> Part:
-    """One part of a scenario: every key of the schema has to be drawn, None leaves it out."""
+    """One part of a scenario. Every key of the schema must be drawn; None leaves it out."""
     unknown = model.model_fields.keys() ^ keys.keys()
     assert not unknown, f"the soak and the schema's {model.__name__} differ in the keys {sorted(unknown)}"
     return {name: value for name, value in keys.items() if value is not None}
@@ -37,12 +37,12 @@ def one_of(rng: Rng, *values: Any) -> Any:
 
 
 def some(rng: Rng, probability: float, value: Any) -> Any:
-    """The value or nothing; it is drawn in any case."""
+    """The value or None. The value has been drawn in either case."""
     return value if chance(rng, probability) else None
 
 
 def most_of(model: type[BaseModel], key: str) -> float:
-    """The largest number that the schema takes for a key."""
+    """The largest number that the schema accepts for a key."""
     [most] = [bound.le for bound in model.model_fields[key].metadata if isinstance(bound, annotated_types.Le)]
     assert isinstance(most, int | float)
     return float(most)

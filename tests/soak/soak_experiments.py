@@ -1,4 +1,4 @@
-"""Random experiments for `soak.py`: a valid scenario, and what goes wrong in flight."""
+"""Random experiments for the soak: a valid scenario, and what goes wrong in flight."""
 
 import json
 import math
@@ -34,7 +34,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Experiment:
-    """One flight of the soak: all that it depends on."""
+    """One flight of the soak: everything that it depends on."""
 
     scenario: Scenario
     faults: tuple[Fault, ...] = ()
@@ -72,10 +72,10 @@ def experiment(seed: int, number: int) -> Experiment:
 
 
 def valid(drawn: Part) -> Scenario:
-    """The scenario as its own TOML text gives it back."""
+    """The drawn scenario, written as TOML and read back."""
     scenario = Scenario.model_validate_json(json.dumps(drawn))
     read = files.parse(files.dump(scenario), Path(f"{scenario.name}.toml"))
-    assert read == scenario, "a scenario is not read back as it was written"
+    assert read == scenario, "a scenario that was written is read back different"
     return read
 
 
@@ -100,7 +100,7 @@ def _faults(rng: Rng, scenario: Scenario) -> tuple[Fault, ...]:
 
 
 def _margin_experiment(rng: Rng, name: str) -> Experiment:
-    """Given or designed gains on constant links and free of limits: what the plan's margin claims to hold for."""
+    """An experiment for which the plan's margin must hold: given or designed gains, constant links, no limits."""
     onboard = chance(rng, 0.25)
     drawn = random_scenario(rng, name)
     count = min(len(drawn["vehicles"]), 6)

@@ -1,7 +1,7 @@
-"""One experiment of `soak.py`: flown in virtual time with its faults; `soak_checks.py` says what must hold.
+"""One experiment of the soak, flown in virtual time with its faults; `soak_checks.py` says what must hold.
 
-The flight is the product's own `fly_lockstep`; between station and vehicles stands a `World` that makes the faults and
-hashes every byte. What is true comes from the vehicles and links themselves.
+The flight is the product's own `fly_lockstep`. A `World` between station and vehicles makes the faults and hashes every
+byte. The truth comes from the vehicles and links themselves.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ from tests.soak.soak_experiments import Experiment, Fault
 from tests.soak.soak_scenarios import AUTOPILOT_START_S
 
 CONNECT_S = 25.0
-"""Longest start of double integrators. A flight that has not ended in its time is told to."""
+"""Longest start of double integrators. A flight that takes longer than its start and duration is told to end."""
 GARBAGE_A_STEP = 10
 KEY = Key(bytes(range(32)))
 _HEARTBEAT, _SET_POINT = 0, 84
@@ -42,7 +42,7 @@ _SET_POINT_FIELDS = struct.Struct("<I11fHBBB")
 
 @dataclass(frozen=True)
 class SetPoint:
-    """What a SET_POSITION_TARGET_LOCAL_NED on the wire asks for; NaN where its mask says that nothing is."""
+    """What a SET_POSITION_TARGET_LOCAL_NED on the wire asks for; NaN for what its mask leaves out."""
 
     time_ns: int
     velocity_m_s: float
@@ -51,7 +51,7 @@ class SetPoint:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """What one station saw and did: a flight has several where the station was replaced."""
+    """What one station saw and did. A flight has several stretches if the station was replaced."""
 
     station: Station
     ticks: TickArray
@@ -60,10 +60,10 @@ class Stretch:
     states_at_end: dict[int, tuple[float, float, float, float]] = field(default_factory=dict)
     """True position and velocity (north, east) of each vehicle when the station decided to end the flight."""
     ended_ns: int = 0
-    """That instant."""
+    """The instant of that decision."""
 
     def flight(self) -> Flight:
-        """As `summarise` wants it."""
+        """The stretch as a flight for `summarise`."""
         end = Event(time_s=float(self.ticks["time_s"][-1, 0]), kind="end", text=self.station.end_reason)
         return Flight(self.ticks.ravel(), [*self.station.events, end])
 
@@ -77,11 +77,11 @@ class Flown:
     truth: np.ndarray[Any, Any]
     """Records of sim_vehicles.truth.DTYPE."""
     clocks: dict[int, BootClock]
-    """Of the vehicles, at the start."""
+    """Clocks of the vehicles at the start, by system id."""
     steps_ns: dict[int, int]
-    """When the clock of a vehicle was first set."""
+    """When the clock of each vehicle was first set."""
     silences_s: list[float]
-    """How long vehicles or the station were not heard, each time."""
+    """Length of each time during which vehicles or the station were not heard."""
     set_points: list[SetPoint]
     sha256: str
 
@@ -94,7 +94,7 @@ class World:
         self.digest = hashlib.sha256()
         self.set_points: list[SetPoint] = []
         self.flying = False
-        """Whether a formation is flown: before that nobody knows who is who, and garbage may be taken for anything."""
+        """Whether a formation is flown. Before that, garbage could pass for a vehicle that is not yet known."""
         self._faults = experiment.faults
         self._steps = deque(fault for fault in experiment.faults if fault.kind == "clock step")
         self._rng = np.random.default_rng(experiment.scenario.seed)
@@ -102,7 +102,7 @@ class World:
         self._down: deque[bytes] = deque(maxlen=100)
 
     def step(self, received: Sent, now_ns: int) -> Sent:
-        """As Fleet.step, with the faults."""
+        """Like `Fleet.step`, with the faults."""
         for _, data, time_ns in received:
             self._note(data, time_ns)
         received = self._passed(received)
@@ -116,13 +116,13 @@ class World:
             self.digest.update(b"%d %d " % (system_id, time_ns) + data)
         for system_id in under_fire:
             arrived += [(system_id, data, now_ns) for data in self._garbage(self._up, None)]
-        # last: setting a clock brings its vehicle up to now, past what was received meanwhile
+        # last: setting a clock advances its vehicle to now, past what was received meanwhile
         while self._steps and _ns(self._steps[0].from_s) <= now_ns:
             self._set_clocks(self._steps.popleft(), now_ns)
         return arrived
 
     def strangers(self, now_ns: int) -> list[Datagram]:
-        """What the station gets from an address that no vehicle has: any message of any vehicle, but no heartbeat."""
+        """Datagrams from an address that no vehicle has: any message from any vehicle, except heartbeats."""
         if not self._under_fire(now_ns):
             return []
         ids = [*self.fleet.system_ids, *range(1, 256)]
@@ -136,7 +136,7 @@ class World:
         return hit[0] if hit else ()
 
     def _garbage(self, real: deque[bytes], left_out: set[int] | None) -> list[bytes]:
-        """Nothing that is valid and new under the name of one who may say it."""
+        """Hostile datagrams, none of which is a valid new message from a sender that may send it."""
         rng, count = self._rng, GARBAGE_A_STEP
         data = changed(rng, count, list(real)) + noise(rng, count)
         if left_out is not None:
@@ -151,11 +151,11 @@ class World:
 
     def _set_clocks(self, fault: Fault, now_ns: int) -> None:
         for system_id in fault.system_ids:
-            self.fleet.state(system_id, now_ns)  # brings it up to now
+            self.fleet.state(system_id, now_ns)  # advances the vehicle to now
             vehicle = self.fleet.vehicle(system_id)
             clock = vehicle.radio.clock
             shown_ns = clock.boot_ns(now_ns)
-            to_ns = max(1_000_000, shown_ns + round(fault.by_s * NS_PER_S))  # no clock shows less than its boot
+            to_ns = max(1_000_000, shown_ns + round(fault.by_s * NS_PER_S))  # no clock shows a time before its boot
             vehicle.radio.set_clock(BootClock(now_ns, to_ns, clock.drift_ppb), now_ns)
             self.fleet.state(system_id, now_ns)
 
@@ -227,11 +227,11 @@ def _stretch(plan: FlightPlan, world: World, guard: Guard | None, start_ns: int,
                 state = world.fleet.state(system_id, now_ns)
                 states[system_id] = (state.north_m, state.east_m, *state.velocity_ne_m_s())
         if now_ns >= until_ns:
-            assert now_ns < until_ns + 20 * NS_PER_S, "the station does not end when it is told to"
+            assert now_ns < until_ns + 20 * NS_PER_S, "the station does not end although it was told to"
             station.request_stop("soak: time is up")
         if guard is None:
             answers, _ = station.step(world.strangers(now_ns), now_ns)
-            assert not answers, f"the station answers to a stranger: {answers}"
+            assert not answers, f"the station answers a stranger: {answers}"
     replaced = station.phase is not Phase.ENDED
     return Stretch(station, np.stack(ticks), start_ns, replaced, states, ended_ns)
 

@@ -1,4 +1,4 @@
-"""One experiment of the soak flown and judged: refused, or flown and checked by `soak_checks.py`."""
+"""Fly and judge one experiment of the soak: refused, or flown and checked by `soak_checks.py`."""
 
 import re
 import traceback
@@ -21,13 +21,13 @@ class Result:
 
     broken: tuple[Broken, ...] = ()
     refused: str = ""
-    """Why the scenario was not flown, without its numbers."""
+    """Why the scenario was not flown; numbers are left out."""
     ended: str = ""
-    """How the flight ended: the kind of its end, or what was judged of its margin."""
+    """The kind of the flight's end, or the finding on its margin."""
 
 
 class RefusalError(Exception):
-    """A scenario that is refused before take-off, as it has to be."""
+    """The scenario is refused before take-off, as it should be."""
 
 
 def judge(experiment: Experiment) -> Result:
@@ -41,7 +41,7 @@ def judge(experiment: Experiment) -> Result:
         return Result(refused=str(refused))
     except DisagreementError as error:
         return Result((Broken("independent methods agree", str(error)),))
-    except Exception:  # noqa: BLE001 - whatever it is, it is what the soak looks for
+    except Exception:  # noqa: BLE001 - any exception is what the soak looks for
         return Result((Broken("no exception", traceback.format_exc()),))
 
 
@@ -79,12 +79,12 @@ def _flown(experiment: Experiment, plan: FlightPlan) -> Result:
 
 
 def _margin_kept(plan: FlightPlan, ratio: float) -> Result:
-    """Errors die away below nine tenths of the plan's margin, and grow above eleven tenths, and where there is none.
+    """Errors decay below 0.9 of the plan's margin; they grow above 1.1 of it, and if there is no margin.
 
-    Judged by the growth rate that a campaign's probe fits to a flight in virtual time, at the loop delay it had.
+    The growth rate is the one that a campaign's probe fits to a flight in virtual time, at the flight's loop delay.
     """
     margin_s, timing = plan.delay_margin_s, plan.timing
-    # what a state waits for the next tick, in the mean
+    # less the mean time that a state waits for the next tick
     wanted_s = ratio * min(margin_s, 2.0) - 0.5 * min(timing.control_s, timing.telemetry_s)
     if margin_s == 0.0:
         wanted_s = 0.0
@@ -99,8 +99,8 @@ def _margin_kept(plan: FlightPlan, ratio: float) -> Result:
     share = found.loop_delay_s / margin_s if margin_s > 0.0 else 2.0
     growth, error = found.growth_1_s, found.growth_error_1_s
     text = f"grows by {growth:.4f} 1/s (± {error}) at {share:.3f} of the margin of {margin_s:.4f} s"
-    # An integrator left to itself has no margin either, and its errors stay what they are, but for rounding: float32
-    # rounds positions of 2 km by 1e-4 m, of errors of a metre within 20 s.
+    # A free integrator has no margin either, and its errors stay constant except for rounding: float32 rounds positions
+    # of 2 km by 1e-4 m, for errors of a metre within 20 s.
     stays = -3.0 * (error or 0.0) - 2e-5 if margin_s == 0.0 else 0.0
     if (share < 0.9 and growth > 0.0) or (share > 1.1 and growth < stays):
         return Result((Broken("margin", text),))
@@ -109,5 +109,5 @@ def _margin_kept(plan: FlightPlan, ratio: float) -> Result:
 
 
 def fly_numbers(seed: int, numbers: list[int]) -> list[tuple[int, Result]]:
-    """Some flights of a seed; here, as worker processes do not import a `__main__`."""
+    """Some flights of a seed. Defined here because worker processes do not import a `__main__`."""
     return [(number, judge(experiment(seed, number))) for number in numbers]

@@ -1,7 +1,7 @@
-"""Random scenarios for `soak.py`.
+"""Random scenarios for the soak.
 
-Every part of the schema is drawn by one function here, through `whole`, which fails when a key of the schema is not
-drawn: who adds a key adds it here. Bounds that matter are read from the schema.
+One function here draws each part of the schema, through `whole`, which fails if a key of the schema is not drawn: a new
+key must be added here too. Bounds that matter are read from the schema.
 """
 
 import math
@@ -13,7 +13,7 @@ from scenarios.schema import Scenario
 from tests.soak.soak_draws import Part, Rng, between, chance, most_of, one_of, some, spread, whole
 
 VEHICLE_TICKS = 6_000
-"""Most control and telemetry ticks of all vehicles of a flight, apart from what the shortest flight needs."""
+"""Largest number of control and telemetry ticks of all vehicles of a flight, unless the shortest flight needs more."""
 SHORTEST_S, LONGEST_S = 4.0, 12.0
 MOST_VEHICLES = 12
 AUTOPILOT_START_S = 25.0
@@ -60,7 +60,7 @@ def random_scenario(rng: Rng, name: str) -> Part:
 
 
 def random_vehicles(rng: Rng, count: int, pitch_m: float, speed_m_s: float, *, autopilot: bool) -> list[Part]:
-    """A tree of any shape whose places are on a grid, so that no two are in one place."""
+    """A tree of any shape. Its places are on a grid, so that no two coincide."""
     ids = rng.choice(np.arange(1, 251), size=count, replace=False).tolist() if chance(rng, 0.5) else range(1, count + 1)
     side = max(2, math.ceil(1.5 * math.sqrt(count)))
     cells = rng.choice(side * side, size=count, replace=False)
@@ -111,7 +111,7 @@ def _limits(rng: Rng, speed_m_s: float) -> Part:
 
 def _rates(rng: Rng, *, onboard: bool, autopilot: bool) -> Part:
     control_hz = one_of(rng, 50.0, 50.0, 50.0, 10.0, 20.0, 25.0, spread(rng, 1.0, 500.0), float(rng.integers(1, 100)))
-    if onboard:  # sensor and own loop are whole multiples of it
+    if onboard:  # the rates of the sensor and the onboard loop are whole multiples of it
         control_hz = one_of(rng, 5.0, 10.0, 20.0, 25.0, 50.0, 100.0)
     if autopilot:
         control_hz = one_of(rng, 10.0, 25.0, 50.0, between(rng, 5.0, 60.0))
@@ -137,7 +137,7 @@ def _onboard(rng: Rng, control_hz: float) -> Part:
 
 
 def fixed_gains(rng: Rng, *, stable: bool, own_1_s: float) -> Part:
-    """Gains that are stable without delay, or any."""
+    """Gains that are stable without delay, or arbitrary ones."""
     front_1_s, spacing_1_s2 = own_1_s * rng.uniform(0.0, 0.5), own_1_s**2 * spread(rng, 0.02, 0.6)
     any_gains = [one_of(rng, -1.0, 1.0) * spread(rng, 1e-3, 1e5) for _ in range(3)]
     if not stable:
@@ -201,7 +201,7 @@ def _jitter(rng: Rng) -> Part:
         distribution=kind,
         scale_s=scale_s if kind != "trace" else None,
         shape=spread(rng, 0.3, 5.0) if kind == "gamma" else None,
-        trace_file=None,  # what it holds is in trace_s once it is read
+        trace_file=None,  # reading it moves its delays to trace_s
         trace_s=trace if kind == "trace" else None,
     )
 

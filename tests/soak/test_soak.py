@@ -1,4 +1,4 @@
-"""Some flights of the soak break no invariant, and it sees one that is broken.
+"""Some flights of the soak break no invariant, and the soak notices a broken one.
 
 `python3 make.py soak --flights 10000 --seed 1` flies more. Each test flies a part, so that they share the processors.
 """
@@ -96,7 +96,7 @@ def test_an_unstable_loop_is_refused_or_flown_where_that_is_allowed() -> None:
     "reason", ["broken: vehicles 1 and 2 have collided, 0.3 m apart", "completed: duration reached"]
 )
 def test_an_end_that_is_not_so_in_truth_is_seen(reason: str) -> None:
-    """Vehicles on their places have not collided, and vehicles far off them have not settled."""
+    """Vehicles in their places have not collided, and vehicles far from their places have not settled."""
     flown = calm_flight()
     [stretch] = flown.stretches
     states = dict(stretch.states_at_end)
@@ -119,7 +119,7 @@ def test_a_key_that_the_soak_does_not_draw_is_named() -> None:
 
 
 def test_every_part_of_the_schema_is_drawn() -> None:
-    """A part that no flight has would be one whose keys nobody checks."""
+    """The keys of a part that no flight has would never be checked."""
 
     def parts(value: object) -> set[str]:
         if isinstance(value, BaseModel):

@@ -102,7 +102,7 @@ def test_gains_on_a_general_pattern_have_the_alpha_of_the_whole_formation_and_no
     print_design(design, console)
     text = cast("io.StringIO", console.file).getvalue()
     assert f"{told.alpha:.4f} at 210.0 ms of loop delay, of the whole formation" in text
-    assert "no verdict: with gains on a general pattern errors do not run down a chain" in text
+    assert "no verdict: with gains on a general pattern errors do not propagate along a chain" in text
 
 
 @pytest.mark.parametrize("loop", ["ground", "onboard"])

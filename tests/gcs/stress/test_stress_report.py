@@ -156,7 +156,7 @@ def test_the_printed_command_reflies_a_trial_to_the_last_bit(tmp_path: Path) -> 
     result = CliRunner().invoke(app, [scenario, *options])
     assert result.exit_code == 0, result.output
     assert "verdict  unstable" in result.output
-    assert "the same to the last bit" in result.output
+    assert "identical to the last bit" in result.output
     [recording] = (out / "flights").rglob("flight.rrd")
     assert recording.stat().st_size > 0
     summary = json.loads((recording.parent / SUMMARY_FILE).read_text(encoding="utf-8"))
@@ -173,7 +173,8 @@ def test_both_flights_of_a_pair_are_kept_and_differences_reported(tmp_path: Path
     table.write_text(
         re.sub(r'"ticks_sha256": "\w{8}', '"ticks_sha256": "00000000', table.read_text()), encoding="utf-8"
     )
-    assert "not as it was flown first: ticks_sha256" in run(tmp_path, "--trial", probe, "--out", str(out), code=1)
+    reflown = run(tmp_path, "--trial", probe, "--out", str(out), code=1)
+    assert "differs from the first flight in: ticks_sha256" in reflown
 
 
 def test_a_sweep_over_two_vehicles_links_names_both_axes(tmp_path: Path) -> None:
