@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-Loop = Literal["ground", "onboard"]
+LoopPlace = Literal["ground", "onboard"]
 """Where the loop is closed, as `control.loop` of a scenario."""
 ScenarioFile = Annotated[
     Path, typer.Argument(metavar="SCENARIO", help="scenario file, or the name of one that ships (see gcs scenarios)")
@@ -33,7 +33,7 @@ AllowUnstable = Annotated[
     bool, typer.Option("--allow-unstable", help="accept gains whose loop is unstable without any delay")
 ]
 LoopOption = Annotated[
-    Loop | None,
+    LoopPlace | None,
     typer.Option("--loop", help="who closes the loop on a vehicle's own errors; default as in the scenario"),
 ]
 KeyFile = Annotated[
@@ -66,7 +66,7 @@ def live_viewer(text: str) -> str:
     return new_viewer() if text == "new" else viewer_url(*address("--live", text))
 
 
-def load_scenario(file: Path, loop: Loop | None = None) -> "Scenario":
+def load_scenario(file: Path, loop: LoopPlace | None = None) -> "Scenario":
     """The scenario in a file, or the shipped one of that name; `loop` overrides where its loop is closed.
 
     Raises scenarios.errors.ScenarioError if the file cannot be used, or not with this loop.

@@ -22,7 +22,7 @@ from gcs.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from gcs.drive.check import Check, VehicleCheck
+    from gcs.drive.check import ScenarioCheck, VehicleCheck
     from gcs.plan.design import Design
 
 MOST_VEHICLES = 254
@@ -113,7 +113,7 @@ def check(
     answer(checked(plan), partial(_print_check, design), as_json=as_json)
 
 
-def _print_check(design: "Design", found: "Check") -> None:
+def _print_check(design: "Design", found: "ScenarioCheck") -> None:
     from gcs.views.console import UNKNOWN, ms_text, number_text, plain_console, table_of
     from gcs.views.report import print_design
     from gcs.views.scene import plan_view

@@ -16,8 +16,8 @@ import typer
 from gcs.cli import FAILED
 from gcs.cli.options import (
     AsJson,
-    Loop,
     LoopOption,
+    LoopPlace,
     OutFolder,
     ScenarioFile,
     answer,
@@ -136,7 +136,7 @@ def stress(
     raise typer.Exit(0 if result.passed else FAILED)
 
 
-def _study(file: Path, loop: Loop | None, *, real_time: bool) -> "tuple[Study, Design]":
+def _study(file: Path, loop: LoopPlace | None, *, real_time: bool) -> "tuple[Study, Design]":
     from gcs.drive.preflight import bad_start, unstable_loop
     from gcs.plan.planner import flight_plan
     from gcs.stress.study import Study

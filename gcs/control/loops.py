@@ -73,8 +73,8 @@ def loop_of(plan: FlightPlan) -> Loop:
     """The loop that a plan is made for."""
     control = plan.scenario.control
     if control.loop == "onboard":
-        return OnboardLoop(plan)
-    return GroundLoop(plan) if control.prediction == "off" else PredictedLoop(plan)
+        return StreamedLoop(plan)
+    return GroundLoop(plan) if control.prediction == "off" else PredictingGroundLoop(plan)
 
 
 class GroundLoop:
@@ -113,7 +113,7 @@ class GroundLoop:
         return {}
 
 
-class PredictedLoop:
+class PredictingGroundLoop:
     """The ground loop, fed with the errors at the instant at which each set-point acts (`gcs.control.prediction`)."""
 
     def __init__(self, plan: FlightPlan) -> None:
@@ -153,7 +153,7 @@ class PredictedLoop:
         return self._ground.set_point(system_id, order)
 
 
-class OnboardLoop:
+class StreamedLoop:
     """Vehicles close loops of their own: the station uploads their gains and streams what they cannot know."""
 
     def __init__(self, plan: FlightPlan) -> None:

@@ -26,7 +26,7 @@ class VehicleCheck(Published):
     """The acceleration that the vehicle can fly at its initial speed; None without a limit."""
 
 
-class Check(Published):
+class ScenarioCheck(Published):
     """A scenario before its flight."""
 
     expected_loop_delay_s: float
@@ -39,7 +39,7 @@ class Check(Published):
     vehicles: tuple[VehicleCheck, ...]
 
 
-def check(plan: FlightPlan) -> Check:
+def check(plan: FlightPlan) -> ScenarioCheck:
     """The vehicles of a plan at the start, and the headroom that the scenario's links leave."""
     scenario, formation, model = plan.scenario, plan.formation, plan.model
     ordered = scenario.leader_first()
@@ -74,7 +74,7 @@ def check(plan: FlightPlan) -> Check:
     assumed_s = plan.assumed_s or known_s[str(scenario.control.prediction)]
     tolerated = plan.tolerance.at(assumed_s)
     margin_s = tolerated.longer_s[0]
-    return Check(
+    return ScenarioCheck(
         expected_loop_delay_s=delay_s,
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
         headroom=headroom(tolerated.used_s(0, delay_s - assumed_s), margin_s),

@@ -34,7 +34,7 @@ from scenarios.schema import NS_PER_S, Scenario
 
 Frames = list[tuple[int, mavlink.Frame]]
 
-_TOLD = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
+_ANNOUNCED = re.compile(rf"vehicle (\d+): (?:{GAIN_SET}(\d+)|(\w+))")
 _LONGEST_GAP_NS = 10 * NS_PER_S
 """Gaps of a log that are longer than this get no ticks."""
 _LEAST_TICKS = 3
@@ -102,8 +102,8 @@ def _outline(frames: Frames, scenario: Scenario) -> _Outline:
         if frame.msg_id == mavlink.SET_POSITION_TARGET_LOCAL_NED:
             sent_ns.setdefault(frame.fields[0], time_ns)
         elif frame.msg_id == mavlink.STATUSTEXT and start_key is None and sent_ns:
-            told = _told(frame)
-            if told is not None and told[1] == Mode.NOMINAL.name:
+            announced = _announced(frame)
+            if announced is not None and announced[1] == Mode.NOMINAL.name:
                 start_key = list(sent_ns)[-1]  # the station announces it at the next tick
         exchanges = exchanges or (frame.msg_id == mavlink.TIMESYNC and frame.fields[0] == 0)
     keys = list(sent_ns)
@@ -115,9 +115,9 @@ def _outline(frames: Frames, scenario: Scenario) -> _Outline:
     return _Outline(base_ns, keys, keys[0] if start_key is None else start_key, exchanges)
 
 
-def _told(frame: mavlink.Frame) -> tuple[int, str] | None:
+def _announced(frame: mavlink.Frame) -> tuple[int, str] | None:
     """What a STATUSTEXT of the station says about a vehicle: its mode, or the number of its gain set."""
-    found = _TOLD.match(frame.fields[1].split(b"\0")[0].decode(errors="replace"))
+    found = _ANNOUNCED.match(frame.fields[1].split(b"\0")[0].decode(errors="replace"))
     return None if found is None else (int(found[1]), found[2] or found[3])
 
 
@@ -217,17 +217,17 @@ class _Rebuilding:
 
     def _take_told(self, time_ns: int, frame: mavlink.Frame) -> None:
         """Take in a mode or a gain set that the station announced."""
-        system_id, told = _told(frame) or (0, "")
+        system_id, announced = _announced(frame) or (0, "")
         row = self._row.get(system_id)
         if row is None:
             return
         state = self._states[row]
-        if told.isdecimal():
-            gain_set = min(int(told), len(self._fleet.plan.margins_s) - 1)
+        if announced.isdecimal():
+            gain_set = min(int(announced), len(self._fleet.plan.margins_s) - 1)
             self._states[row] = VehicleState(mode=state.mode, gain_set=gain_set)
-        elif told in Mode.__members__:
-            self._states[row] = VehicleState(mode=Mode[told], gain_set=state.gain_set)
-            self._event(time_ns, "mode", f"{state.mode.name} -> {told}", system_id)
+        elif announced in Mode.__members__:
+            self._states[row] = VehicleState(mode=Mode[announced], gain_set=state.gain_set)
+            self._event(time_ns, "mode", f"{state.mode.name} -> {announced}", system_id)
 
     def _take_telemetry(self, row: int, vehicle: WatchedVehicle, time_ns: int, frame: mavlink.Frame) -> None:
         clock = vehicle.remote.clock

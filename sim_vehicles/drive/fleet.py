@@ -20,7 +20,7 @@ from sim_vehicles.services.services import LONGEST_TEXT
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from sim_vehicles.vehicles.dynamics import State
-from sim_vehicles.vehicles.onboard import OnboardLoop
+from sim_vehicles.vehicles.onboard import VehicleLoop
 from sim_vehicles.vehicles.shell import Change, Radio, Shell
 
 Datagram = tuple[int, bytes, int]
@@ -83,7 +83,7 @@ class Fleet:
             if scenario.dynamics == "autopilot":
                 craft = Copter(scenario, own, radio)
             else:
-                onboard = OnboardLoop(scenario, own.system_id, self._seen) if sensors else None
+                onboard = VehicleLoop(scenario, own.system_id, self._seen) if sensors else None
                 craft = DoubleIntegrator(scenario, own, radio, onboard)
             vehicle = Shell(scenario, radio, craft, signed=bool(signed), experiment=experiment)
             self._members[own.system_id] = _Member(

@@ -1,8 +1,8 @@
 """What happens to one datagram on a link: a pure function of the link, the time and the random draws.
 
-A link's schema is converted once into a frozen `Behaviour`, with all times in ns. Each link has two random streams: one
-decides loss, duplication and corruption, the other the jitter. Every datagram takes the same number of draws from both,
-used or not. So more loss leaves the delays unchanged, and one link's traffic does not shift the draws of another.
+A link's schema is converted once into a frozen `LinkBehaviour`, with all times in ns. Each link has two random streams:
+one decides loss, duplication and corruption, the other the jitter. Every datagram takes the same number of draws from
+both, used or not. So more loss leaves the delays unchanged, and one link's traffic does not shift the draws of another.
 """
 
 from bisect import bisect_right
@@ -34,7 +34,7 @@ class Draws(NamedTuple):
     duplicate_jitter_ns: int
 
 
-class Outcome(NamedTuple):
+class Fate(NamedTuple):
     """What happens to a datagram."""
 
     fate: int
@@ -47,7 +47,7 @@ class Outcome(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Behaviour:
+class LinkBehaviour:
     """A link's schema with its times as integers of ns."""
 
     points_ns: tuple[tuple[int, int], ...]
@@ -69,11 +69,11 @@ class Behaviour:
         return len(self.points_ns) > 1 or bool(self.outages_ns)
 
 
-def behaviour_of(link: link_schema.Link) -> Behaviour:
+def behaviour_of(link: link_schema.Link) -> LinkBehaviour:
     points = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
     points_ns = tuple((_ns(time_s), _ns(delay_s)) for time_s, delay_s in points)
     bursts = link.loss_bursts
-    return Behaviour(
+    return LinkBehaviour(
         points_ns=points_ns,
         least_delay_ns=max(0, min(delay_ns for _, delay_ns in points_ns) + _least_jitter_ns(link.jitter)),
         outages_ns=tuple((_ns(outage.from_s), _ns(outage.until_s)) for outage in link.outages),
@@ -93,7 +93,7 @@ def constant(link: link_schema.Link) -> bool:
     return link == plain and link.channel is None
 
 
-def outcome(link: Behaviour, *, bad: bool, time_ns: int, draws: Draws) -> Outcome:
+def outcome(link: LinkBehaviour, *, bad: bool, time_ns: int, draws: Draws) -> Fate:
     """The fate of a datagram that enters at a link time, before any channel or full link drops it."""
     bad = draws.burst >= link.to_good if bad else draws.burst < link.to_bad
     fate = PASSED
@@ -110,10 +110,10 @@ def outcome(link: Behaviour, *, bad: bool, time_ns: int, draws: Draws) -> Outcom
     delay_ns = delay_at(link, time_ns)
     twice = draws.duplicate < link.duplicate
     duplicate_ns = max(0, delay_ns + draws.duplicate_jitter_ns) if twice else -1
-    return Outcome(fate, bad, max(0, delay_ns + draws.jitter_ns), duplicate_ns, flips)
+    return Fate(fate, bad, max(0, delay_ns + draws.jitter_ns), duplicate_ns, flips)
 
 
-def delay_at(link: Behaviour, time_ns: int) -> int:
+def delay_at(link: LinkBehaviour, time_ns: int) -> int:
     """The delay without jitter at a link time: linear between points; at a step, that after it."""
     points = link.points_ns
     if len(points) == 1:
@@ -164,7 +164,7 @@ def _delays_of(jitter: link_schema.Jitter | None, rng: np.random.Generator) -> _
     if jitter is None:
         return lambda count: [(0.0, 0.0)] * count
     if jitter.distribution == "trace":
-        return _replayed(jitter.trace_s or (0.0,), rng)
+        return _in_trace_order(jitter.trace_s or (0.0,), rng)
     scale_s, shape = jitter.scale_s or 0.0, jitter.shape or 1.0
 
     def drawn(count: int) -> list[tuple[float, float]]:
@@ -183,7 +183,7 @@ def _delays_of(jitter: link_schema.Jitter | None, rng: np.random.Generator) -> _
     return drawn
 
 
-def _replayed(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:
+def _in_trace_order(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:
     """A trace in its own order, which keeps the correlation of neighbours; a duplicate takes the next delay."""
     at = int(rng.integers(len(trace_s)))
 

@@ -24,7 +24,7 @@ from sim_vehicles.vehicles.dynamics import (
     state_from,
 )
 from sim_vehicles.vehicles.flight_mode import MODE_NAMES, FlightMode
-from sim_vehicles.vehicles.onboard import STEP, OnboardLoop, formation_parameters
+from sim_vehicles.vehicles.onboard import STEP, VehicleLoop, formation_parameters
 from sim_vehicles.vehicles.setpoints import ACCELERATION, AXES, VELOCITY, VELOCITY_ACCELERATION, fault, to_local
 from sim_vehicles.vehicles.shell import Answer, Radio
 
@@ -46,7 +46,7 @@ class DoubleIntegrator:
     """Slow defaults, as on an autopilot's telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes them."""
 
     def __init__(
-        self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio, onboard: OnboardLoop | None = None
+        self, scenario: schema.Scenario, own: schema.Vehicle, radio: Radio, onboard: VehicleLoop | None = None
     ) -> None:
         safety = scenario.safety
         self.flight = FlightMode(safety)
@@ -187,7 +187,7 @@ class DoubleIntegrator:
         onboard.drop_stream()
         return onboard.command() if self._own_loop_flies(onboard) else COAST
 
-    def _own_loop_flies(self, onboard: OnboardLoop) -> bool:
+    def _own_loop_flies(self, onboard: VehicleLoop) -> bool:
         flight = self.flight
         return onboard.on and flight.flying and (flight.mode == mavlink.MODE_GUIDED or flight.failsafe != "")
 

@@ -41,7 +41,7 @@ def formation_parameters() -> list[Parameter]:
     return [*gains, *offsets, ahead, Parameter("FORM_LOOP", 0.0, 0.0, 1.0, whole=True)]
 
 
-class OnboardLoop:
+class VehicleLoop:
     """The loop of one vehicle. `state_of` gives the true state of another vehicle at an instant, for the sensor."""
 
     def __init__(self, scenario: schema.Scenario, system_id: int, state_of: Callable[[int, int], State | None]) -> None:
