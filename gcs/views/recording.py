@@ -330,9 +330,13 @@ def _margins_text(design: Design) -> str:
 def _blueprint(scenario: Scenario, design: Design) -> Any:
     """The screen: the scene on the left, with modes and events; plots on the right; time below."""
 
+    # all plots show the whole flight on the same axis, wherever the cursor is; at the right a little room for a label
+    start, end = (rrb.TimeRangeBoundary.absolute(seconds=at_s) for at_s in (0.0, 1.03 * scenario.duration_s))
+    whole = rrb.TimeAxis(view_range=rrb.TimeRange(start=start, end=end))
+
     def plot(name: str, *contents: str, legend: bool = False) -> Any:
         corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend)
-        return rrb.TimeSeriesView(name=name, origin="/", contents=list(contents), plot_legend=corner)
+        return rrb.TimeSeriesView(name=name, origin="/", contents=list(contents), plot_legend=corner, axis_x=whole)
 
     few = len(scenario.vehicles) <= LEGEND_MAX
     events = rrb.TextLogColumns(

@@ -61,6 +61,8 @@ def first_time_s(station: Station, mode: Mode) -> float:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_with_the_monitor_the_formation_survives_three_times_its_first_margin(seed: int) -> None:
+    shipped = load(SCENARIOS / "delay_ramp.toml")
+    assert (shipped.duration_s, shipped.links) == (75.0, ramp(0.44))
     ticks, station = flown(seed=seed, duration_s=75.0, links=ramp(0.44))
     assert station.end_reason == "completed: duration reached"
     assert np.nanmax(ticks["loop_delay_s"]) > 2.9 * planned().delay_margin_s
