@@ -14,13 +14,18 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gains.sampled.multirate import Timing
-from gains.sampled.prediction import mismatch_window
+from gains.sampled.prediction import mismatch_window, mismatch_window_continuous
 from scenarios.part import PREDICTION_MAX_S
 
 Window = tuple[float, float]
 """The shortest and the longest loop delay (s) between which a loop is stable."""
 _TABULATED_S = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0, 7.0, PREDICTION_MAX_S)
 """Assumed delays at which the windows are computed if the delay is measured."""
+
+
+_MOST_ON_THE_WAY, _MOST_AT_TWO_RATES = 600, 60
+"""Most commands on their way for which the sampled window is computed; the second if telemetry has another rate, for
+which it takes a march over delays."""
 
 
 class Tolerated(NamedTuple):
@@ -35,13 +40,16 @@ class Tolerated(NamedTuple):
     def used_s(self, gain_set: int, mismatch_s: float) -> float:
         """The mismatch (loop delay minus assumed) on the scale of `longer_s`: at -`shorter_s` it is `longer_s`.
 
+        Infinite if the loop delay is shorter than assumed and none that is shorter is tolerated.
+
         >>> half = Tolerated((0.1,), (0.2,))
         >>> half.used_s(0, 0.05), half.used_s(0, -0.05)
         (0.05, 0.1)
         """
-        if mismatch_s < 0.0 and self.shorter_s[gain_set] < inf:
-            return -mismatch_s * self.longer_s[gain_set] / self.shorter_s[gain_set]
-        return mismatch_s
+        shorter_s = self.shorter_s[gain_set]
+        if mismatch_s >= 0.0 or shorter_s == inf:
+            return mismatch_s
+        return -mismatch_s * self.longer_s[gain_set] / shorter_s if shorter_s > 0.0 else inf
 
 
 class Tolerance(Protocol):
@@ -83,7 +91,9 @@ class Tabulated:
             before, after = self._reciprocal[:, int(place)], self._reciprocal[:, -(-int(1e9 * place) // 10**9)]
             share = place - int(place)
             mixed = np.where((before == 0.0) | (after == 0.0), np.maximum(before, after), 0.0)
-            mixed = np.where(mixed > 0.0, mixed, (1.0 - share) * before + share * after)
+            # infinite where nothing is tolerated, also at the place itself, where its neighbour has no share
+            between = before if share == 0.0 else (1.0 - share) * before + share * after
+            mixed = np.where(mixed > 0.0, mixed, between)
             with np.errstate(divide="ignore"):
                 shorter_s, longer_s = (tuple(side) for side in (1.0 / mixed).T.tolist())
             self._known[key] = Tolerated(shorter_s, longer_s)
@@ -113,8 +123,23 @@ def tolerance(
 
 
 def window(model: FormationModel, K: FloatArray, timing: Timing, assumed_s: float) -> Window:
-    """The mismatch window of a sampled formation that is predicted over `assumed_s`."""
-    return _window(model, K.tobytes(), timing, assumed_s)
+    """The mismatch window of a sampled formation that is predicted over `assumed_s`.
+
+    The map of one period has a state for each command on its way. Where these are too many, the window is that of the
+    continuous model, which differs by less than a period of both rates at either end, less such a period at both.
+    """
+    most = _MOST_ON_THE_WAY if timing.commands == 1 else _MOST_AT_TWO_RATES
+    if assumed_s <= most * timing.faster_s:
+        return _window(model, K.tobytes(), timing, assumed_s)
+    least_s, most_s = continuous_window(model, K, timing, assumed_s)
+    return min(assumed_s, least_s + timing.common_s), max(assumed_s, most_s - timing.common_s)
+
+
+def continuous_window(model: FormationModel, K: FloatArray, timing: Timing, assumed_s: float) -> Window:
+    """The mismatch window of the continuous model, in which the hold counts as half a period of delay."""
+    half_s = timing.held_s / 2.0
+    least_s, most_s = mismatch_window_continuous(model.A, model.B, K, assumed_s=assumed_s + half_s)
+    return max(0.0, least_s - half_s), most_s - half_s
 
 
 @lru_cache(maxsize=1024)

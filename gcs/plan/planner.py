@@ -21,7 +21,6 @@ from gains.performance.response import Response, continuous_margin, sampled_marg
 from gains.performance.robust import robustness
 from gains.performance.string_stability import string_peak
 from gains.sampled.constant import sampled_delay_margin
-from gains.sampled.prediction import mismatch_window_continuous
 from gcs.plan.at_delay import with_figures_at_delay
 from gcs.plan.design import (
     Block,
@@ -35,7 +34,7 @@ from gcs.plan.design import (
 )
 from gcs.plan.flight_plan import FlightPlan, loop_timing
 from gcs.plan.formation import Formation, plan_formation
-from gcs.plan.mismatch import window
+from gcs.plan.mismatch import continuous_window, window
 from gcs.plan.onboard import onboard_plan, timing_of
 from gcs.plan.responses import Responses, given_responses
 from scenarios.schema import Scenario
@@ -114,12 +113,11 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
 
 
 def _window_at(plan: FlightPlan, assumed_s: float) -> WindowAt:
-    model, half_s = plan.model, plan.timing.held_s / 2.0
-    least_s, most_s = mismatch_window_continuous(model.A, model.B, plan.gain, assumed_s=assumed_s + half_s)
+    flown = plan.model, plan.gain, plan.timing, assumed_s
     return WindowAt(
         assumed_delay_s=assumed_s,
-        mismatch_window_s=window(model, plan.gain, plan.timing, assumed_s),
-        mismatch_window_continuous_s=(max(0.0, least_s - half_s), most_s - half_s),
+        mismatch_window_s=window(*flown),
+        mismatch_window_continuous_s=continuous_window(*flown),
     )
 
 

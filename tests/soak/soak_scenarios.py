@@ -36,7 +36,7 @@ def random_scenario(rng: Rng, name: str) -> Part:
     if control.get("method", "inclusion") == "inclusion" or control.get("blocks"):
         for vehicle in vehicles:
             vehicle.pop("hears", None)
-    return whole(
+    drawn = whole(
         Scenario,
         name=name,
         seed=int(rng.integers(2**31)),
@@ -57,6 +57,18 @@ def random_scenario(rng: Rng, name: str) -> Part:
         response=_response(rng) if autopilot and chance(rng, 0.6) else None,
         at_end=one_of(rng, "hold", "land"),
     )
+    if not autopilot and not onboard:
+        one_rate = rates["control_hz"] == rates["telemetry_hz"] <= 50.0  # else the windows take minutes
+        _predict(np.random.default_rng(drawn["seed"]), control, often=0.15 if one_rate else 0.0)
+    return drawn
+
+
+def _predict(rng: Rng, control: Part, *, often: float) -> None:
+    """Prediction and feed-forward, with random numbers of their own: all else is as without them."""
+    if chance(rng, often):
+        control["prediction"] = one_of(rng, "measured", spread(rng, 0.02, 1.0))
+    if "gains" in control and chance(rng, 0.2):
+        control["feed_forward"] = between(rng, 0.0, 1.0)
 
 
 def random_vehicles(rng: Rng, count: int, pitch_m: float, speed_m_s: float, *, autopilot: bool) -> list[Part]:
@@ -166,6 +178,8 @@ def _control(rng: Rng, vehicles: list[Part], rates: Part, *, onboard: bool, auto
         alpha=some(rng, 0.2, spread(rng, 0.01, 0.9)) if required else None,
         decay_rate_1_s=some(rng, 0.2, spread(rng, 0.01, 2.0)) if required else None,
         string_peak_max=one_of(rng, 1.0, 1.0, between(rng, 1.0, 2.0)),
+        feed_forward=None,  # these two: see _predict
+        prediction=None,
         gains=fixed_gains(rng, stable=chance(rng, 0.93), own_1_s=spread(rng, 0.2, 6.0)) if way == "gains" else None,
         blocks=_blocks(rng, vehicles) if way == "blocks" else None,
     )
