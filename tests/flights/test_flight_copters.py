@@ -99,7 +99,7 @@ def test_copters_start_on_the_ground_fly_the_formation_and_hold(flavour: str) ->
         assert copter.motion.altitude_m == pytest.approx(20.0, abs=0.3)
 
 
-def test_the_distances_flown_are_true_although_each_vehicle_has_its_own_origin() -> None:
+def test_distances_are_true_though_each_vehicle_has_its_own_origin() -> None:
     flight = fly(planned("ardupilot"))
     # the last positions in the scenario's frame, braking by then in the same way
     place = {k: np.array(flight.copter(k).motion[:2]) for k in (1, 2, 3)}
@@ -110,7 +110,7 @@ def test_the_distances_flown_are_true_although_each_vehicle_has_its_own_origin()
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_identified_response_is_the_truth_and_its_margin_is_flown_with(flavour: str) -> None:
+def test_the_identified_response_is_true_and_its_margin_is_used(flavour: str) -> None:
     flight = fly(planned(flavour))
     responses = flight.station.plan.responses
     assert responses is not None
@@ -123,7 +123,7 @@ def test_identified_response_is_the_truth_and_its_margin_is_flown_with(flavour: 
     assert given.delay_margin_s == pytest.approx(0.6, abs=1e-6)  # what the scenario asks for, with the response
 
 
-def test_a_given_response_leaves_the_manoeuvre_out_and_the_design_says_so() -> None:
+def test_a_given_response_skips_the_manoeuvre_as_the_design_says() -> None:
     design, plan = flight_plan(three().model_copy(update={"response": TRUTH}))
     flight = fly(plan)
     assert "identifying" not in flight.texts("phase")
@@ -145,7 +145,7 @@ def test_design_of_a_flight_names_what_was_identified() -> None:
     assert [vehicle.system_id for vehicle in known.response.vehicles] == [1, 2, 3]
 
 
-def test_gains_on_a_graph_get_the_margin_with_the_response_too() -> None:
+def test_graph_gains_get_the_margin_with_the_response_too() -> None:
     control = COPTERS5.control.model_copy(update={"method": "graph-lqr", "delay_margin_s": 0.5})
     design, plan = flight_plan(three().model_copy(update={"control": control}))
     flight = fly(plan)
@@ -170,7 +170,7 @@ def at_loop_delay(plan: FlightPlan, delay_s: float) -> Flight:
     return fly(replace(plan, scenario=scenario.model_copy(update={"monitor": watching, "duration_s": 60.0})))
 
 
-def test_the_flight_breaks_at_the_margin_with_the_response_and_not_at_that_without() -> None:
+def test_the_flight_breaks_only_at_the_margin_with_the_response() -> None:
     without_s = planned("ardupilot").delay_margin_s
     with_s = fly(planned("ardupilot")).station.plan.delay_margin_s
     assert with_s < 0.8 * without_s
@@ -202,7 +202,7 @@ def test_telemetry_that_begins_40_s_after_boot_is_waited_for(flavour: str) -> No
     assert began_ns > START_NS + 55e9
 
 
-def test_a_vehicle_that_never_gets_a_position_ends_the_start_in_its_own_time_and_is_named() -> None:
+def test_a_vehicle_without_position_ends_the_start_and_is_named() -> None:
     scenario = three(duration_s=1.0, ready_after_s=1e6)
     flight = fly(plan_for(scenario))
     reason = flight.station.end_reason
@@ -212,7 +212,7 @@ def test_a_vehicle_that_never_gets_a_position_ends_the_start_in_its_own_time_and
     assert all(not flight.copter(k).armed for k in (1, 2, 3))
 
 
-def test_vehicles_already_in_the_air_are_held_when_another_never_starts() -> None:
+def test_airborne_vehicles_are_held_when_another_never_starts() -> None:
     dead = VehicleLinks(system_id=3, up=Link(loss_probability=1.0), down=Link())
     scenario = three()
     scenario = scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (dead,)})})
@@ -222,7 +222,7 @@ def test_vehicles_already_in_the_air_are_held_when_another_never_starts() -> Non
         assert flight.copter(system_id).mode == flight.copter(system_id).rules.hold_mode
 
 
-def test_no_flight_begins_without_a_vehicle_that_has_fallen_silent_while_it_climbed() -> None:
+def test_no_flight_begins_without_a_vehicle_that_fell_silent_climbing() -> None:
     gone = Link(delay_s=0.02, outages=(Outage(from_s=6.0, until_s=1e6),))
     vehicles = (VehicleLinks(system_id=3, up=gone, down=gone),)
     scenario = three().model_copy(update={"response": TRUTH})
@@ -236,7 +236,7 @@ def test_no_flight_begins_without_a_vehicle_that_has_fallen_silent_while_it_clim
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("by_s", [-0.2, 0.2, 5.0])
-def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str, by_s: float) -> None:
+def test_a_clock_jump_in_flight_is_noticed_and_flown_through(flavour: str, by_s: float) -> None:
     scenario = three(flavour=flavour, clock_jumps=(ClockJump(at_s=25.0, by_s=by_s),))
     flight = fly(plan_for(scenario))
     assert flight.station.end_reason == "completed: duration reached"
@@ -256,7 +256,7 @@ def test_a_pilot_who_takes_over_in_the_manoeuvre_ends_it(flavour: str, mode: int
 
 
 @pytest.mark.parametrize("by_s", [-0.2, 5.0])
-def test_a_clock_that_jumps_in_the_manoeuvre_leaves_the_same_response(by_s: float) -> None:
+def test_a_clock_jump_in_the_manoeuvre_leaves_the_same_response(by_s: float) -> None:
     flight = fly(plan_for(three(duration_s=1.0, clock_jumps=(ClockJump(at_s=13.0, by_s=by_s),))))
     times = [event.time_s for event in flight.events if event.text in ("identifying", "its clock jumped")]
     assert 0.5 < times[-1] - times[0] < 4.0  # while the vehicles were being moved
@@ -275,7 +275,7 @@ def test_clocks_that_drift_by_500_ppm_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_after_an_outage_longer_than_the_time_outs_the_vehicle_is_called_back(flavour: str) -> None:
+def test_after_an_outage_past_the_timeouts_the_vehicle_is_recalled(flavour: str) -> None:
     gone = Link(delay_s=0.02, outages=(Outage(from_s=28.0, until_s=32.0),))
     links = COPTERS5.links.model_copy(
         update={"vehicles": (VehicleLinks(system_id=3, up=gone, down=gone),), "times_from": "start"}
@@ -288,7 +288,7 @@ def test_after_an_outage_longer_than_the_time_outs_the_vehicle_is_called_back(fl
 
 
 @pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 6), ("px4", 4 << 16 | 5 << 24)])
-def test_a_vehicle_whose_pilot_sends_it_home_is_left_alone_and_flown_around(flavour: str, mode: int) -> None:
+def test_a_vehicle_piloted_home_is_left_alone_and_flown_around(flavour: str, mode: int) -> None:
     flight = fly_with_a_pilot(flavour, {5.0: mode})
     assert flight.station.end_reason == "taken over: vehicles 3"
     flight.fleet.step([], int(flight.ticks["due_ns"][-1]) + 60_000_000_000)
@@ -300,7 +300,7 @@ def test_a_vehicle_whose_pilot_sends_it_home_is_left_alone_and_flown_around(flav
 
 
 @pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 5), ("px4", 3 << 16)])
-def test_a_vehicle_that_its_pilot_gives_back_flies_in_the_formation_again(flavour: str, mode: int) -> None:
+def test_a_vehicle_given_back_by_its_pilot_rejoins_the_formation(flavour: str, mode: int) -> None:
     flight = fly_with_a_pilot(flavour, {5.0: mode, 8.0: RULES[flavour].guided_mode})
     assert flight.station.end_reason == "completed: duration reached"
     assert flight.texts("vehicle")[-1] == "is given back"
@@ -322,7 +322,7 @@ def fly_with_a_pilot(flavour: str, modes: dict[float, int]) -> Flight:
     return Flight(station, fleet, np.concatenate(ticks), station.events)
 
 
-def test_a_second_station_takes_over_vehicles_that_are_in_the_air() -> None:
+def test_a_second_station_takes_over_airborne_vehicles() -> None:
     first = fly(planned("ardupilot"))
     took_off = sum(change.text == "takes off" for change in first.fleet.take_changes())
     second = fly(planned("ardupilot"), first.fleet, int(first.ticks["due_ns"][-1]) + 100_000_000)
@@ -347,7 +347,7 @@ def test_an_arduplane_is_refused_at_once_and_by_name() -> None:
     assert not any(messages(outgoing, "COMMAND_LONG") for outgoing in told)  # whoever flies it is not disturbed
 
 
-def test_a_px4_that_speaks_mavlink_1_at_first_is_heard_and_answered_in_mavlink_2() -> None:
+def test_px4_starting_in_mavlink_1_is_answered_in_mavlink_2() -> None:
     first = dialect.MAVLink(None, srcSystem=2, srcComponent=1)
     heartbeat = bytes(first.heartbeat_encode(2, 12, 1, 4 << 16 | 3 << 24, 3).pack(first, force_mavlink1=True))
     assert heartbeat[0] == 0xFE
@@ -365,7 +365,7 @@ def test_a_px4_that_speaks_mavlink_1_at_first_is_heard_and_answered_in_mavlink_2
     assert messages(outgoing, "HEARTBEAT")
 
 
-def test_a_gimbal_with_the_vehicles_system_id_is_not_taken_for_the_vehicle() -> None:
+def test_a_gimbal_with_the_same_system_id_is_no_vehicle() -> None:
     station, peer = Station(planned("ardupilot"), start_ns=START_NS), Peer(2)
     gimbal: Any = dialect.MAVLink(None, srcSystem=2, srcComponent=154)
     station.step([peer.heartbeat(START_NS)], START_NS)

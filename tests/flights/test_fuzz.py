@@ -258,7 +258,7 @@ def test_a_watched_link_under_fire_is_still_watched(timesync_hz: float, version:
 
 
 @pytest.mark.parametrize("hurt", ["frames", "stamps", "bits", "stamps of no time"])
-def test_a_log_of_hostile_frames_and_stamps_is_read_to_its_end(hurt: str) -> None:
+def test_a_log_of_hostile_frames_and_stamps_is_read_through(hurt: str) -> None:
     scenario = scenario_of("plain", 2.0)
     design, _, _, entries = logged(scenario)
     for seed in range(4):

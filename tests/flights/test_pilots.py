@@ -124,7 +124,7 @@ def flight_s(flavour: str) -> float:
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("by_s", [-0.2, 3.0, -1000.0])
-def test_a_clock_that_jumps_does_not_take_a_vehicle_from_its_pilot(flavour: str, by_s: float) -> None:
+def test_a_clock_jump_takes_no_vehicle_from_its_pilot(flavour: str, by_s: float) -> None:
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour, clock_jumps=(ClockJump(at_s=began_s + 8.0, by_s=by_s),))
     station, pilots = fly(scenario, flavour, {began_s + 5.0: mode})
@@ -134,7 +134,7 @@ def test_a_clock_that_jumps_does_not_take_a_vehicle_from_its_pilot(flavour: str,
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_silence_and_being_heard_again_do_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+def test_a_silence_that_ends_takes_no_vehicle_from_its_pilot(flavour: str) -> None:
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     gone = Link(delay_s=0.02, outages=(Outage(from_s=began_s + 7.0, until_s=began_s + 12.0),))
     own = (VehicleLinks(system_id=3, up=gone, down=gone),)
@@ -148,7 +148,7 @@ def test_silence_and_being_heard_again_do_not_take_a_vehicle_from_its_pilot(flav
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_an_old_heartbeat_after_a_silence_does_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+def test_an_old_heartbeat_after_a_silence_overrides_no_pilot(flavour: str) -> None:
     """What a link held back, or somebody recorded: guided, from before the pilot took over."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     kept: list[bytes] = []
@@ -186,7 +186,7 @@ def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("after_the_end_s", [-1.5, 0.5, 2.0])
-def test_a_pilot_who_takes_over_while_the_flight_ends_is_not_told_to_hold(flavour: str, after_the_end_s: float) -> None:
+def test_no_hold_is_sent_to_pilots_intervening_at_the_end(flavour: str, after_the_end_s: float) -> None:
     began_s = flight_s(flavour)
     mode, end_s = PILOTS_MODE[flavour], began_s + 20.0
     lossy = VehicleLinks(system_id=2, up=Link(delay_s=0.02, outages=(Outage(from_s=end_s - 1.0, until_s=1e6),)))
@@ -199,7 +199,7 @@ def test_a_pilot_who_takes_over_while_the_flight_ends_is_not_told_to_hold(flavou
 
 @pytest.mark.parametrize("mode", [POSCTL, 4 << 16 | 5 << 24, 4 << 16 | 6 << 24, 4 << 16 | 3 << 24])
 @pytest.mark.parametrize("at_s", [5.0, 6.0])
-def test_a_px4_pilot_who_intervenes_before_the_first_offboard_is_left_alone(mode: int, at_s: float) -> None:
+def test_a_px4_pilot_intervening_before_first_offboard_is_left_alone(mode: int, at_s: float) -> None:
     """While it climbs; what the pilot chooses may also be the hold that a take-off ends in."""
     station, pilots = fly(flown("px4"), "px4", {at_s: mode}, until_s=30.0)
     assert station.vehicles[2].missing == "is armed and not in OFFBOARD: flown by its pilot or its autopilot"
@@ -207,7 +207,7 @@ def test_a_px4_pilot_who_intervenes_before_the_first_offboard_is_left_alone(mode
     assert pilots.copter.mode != RULES["px4"].guided_mode  # a pilot's return ends in a landing
 
 
-def test_a_take_off_that_was_not_answered_is_not_told_again_to_a_px4_whose_pilot_has_intervened() -> None:
+def test_unanswered_takeoffs_are_not_repeated_once_a_px4_pilot_intervenes() -> None:
     def change(data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
         message = parse(data)
         lost = message.get_type() == "COMMAND_ACK" and message.command == 22
@@ -218,7 +218,7 @@ def test_a_take_off_that_was_not_answered_is_not_told_again_to_a_px4_whose_pilot
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_a_pilot_who_intervenes_after_the_station_has_released_a_vehicle_is_left_alone(flavour: str) -> None:
+def test_a_pilot_intervening_after_release_is_left_alone(flavour: str) -> None:
     """A released PX4 leaves OFFBOARD by itself: it is called back from that failsafe, not from its pilot's mode."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
@@ -235,7 +235,7 @@ def test_a_pilot_who_intervenes_after_the_station_has_released_a_vehicle_is_left
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_the_next_station_does_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+def test_the_next_station_takes_no_vehicle_from_its_pilot(flavour: str) -> None:
     """The first was killed; the second knows nothing of what was before."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
@@ -256,7 +256,7 @@ def test_the_next_station_does_not_take_a_vehicle_from_its_pilot(flavour: str) -
     assert station.phase == "flying"
 
 
-def test_a_pilot_within_a_second_of_an_answer_is_seen_by_the_next_heartbeat() -> None:
+def test_the_next_heartbeat_shows_a_pilot_soon_after_an_answer() -> None:
     """What the station was told by an ACK holds against heartbeats from before, not against a mode that is new."""
     scenario = flown("ardupilot")
     station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
@@ -271,7 +271,7 @@ def test_a_pilot_within_a_second_of_an_answer_is_seen_by_the_next_heartbeat() ->
     raise AssertionError("the pilot was never seen")
 
 
-def test_a_heartbeat_from_before_a_command_does_not_undo_what_its_answer_said() -> None:
+def test_a_heartbeat_before_a_command_does_not_undo_its_answer() -> None:
     vehicle = RemoteVehicle(3, startup=LaunchedStartup(50.0))
     vehicle.address = ("127.0.0.1", 3)
 

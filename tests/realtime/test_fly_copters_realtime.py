@@ -38,7 +38,7 @@ def vehicles_of(scenario_file: Path, port: int) -> Generator[None]:
         process.wait(10.0)
 
 
-def test_three_arducopters_and_two_px4_that_were_not_started_here_are_identified_and_flown(tmp_path: Path) -> None:
+def test_arducopters_and_px4_started_elsewhere_are_identified_and_flown(tmp_path: Path) -> None:
     scenario = files.load(COPTERS5)
     mixed = (v.model_copy(update={"flavour": "px4" if v.system_id > 3 else None}) for v in scenario.vehicles)
     scenario = scenario.model_copy(update={"vehicles": tuple(mixed), "duration_s": 10.0, "altitude_m": 5.0})

@@ -101,7 +101,7 @@ def true_loop_delay_s(folder: Path, ticks: TickArray) -> np.ndarray[Any, np.dtyp
 
 
 @pytest.mark.parametrize("delay_s", [0.02, 0.06])
-def test_flight_over_udp_settles_and_reports_the_loop_delay_that_the_links_had(tmp_path: Path, delay_s: float) -> None:
+def test_a_udp_flight_settles_and_reports_its_links_loop_delay(tmp_path: Path, delay_s: float) -> None:
     folder = tmp_path / "run"
     scenario = short(tmp_path, "triangle5", 8.0)
     process = fly(scenario, "--listen", "127.0.0.1:0", "--link-delay", str(delay_s), "--out", folder, "--json")
@@ -165,7 +165,7 @@ def test_too_late_a_link_is_unstable_and_exit_code_1(tmp_path: Path) -> None:
         (False, signal.SIGHUP),
     ],
 )
-def test_ctrl_c_sigterm_and_a_closed_terminal_leave_whole_files_and_no_traceback(
+def test_ctrl_c_sigterm_and_hangup_leave_whole_files_without_traceback(
     tmp_path: Path, early: bool, number: signal.Signals
 ) -> None:
     folder = tmp_path / "run"
@@ -181,7 +181,7 @@ def test_ctrl_c_sigterm_and_a_closed_terminal_leave_whole_files_and_no_traceback
     assert not children_named(str(folder))
 
 
-def test_killed_station_leaves_readable_logs_and_a_new_one_takes_the_vehicles_back(tmp_path: Path) -> None:
+def test_after_a_kill_logs_are_readable_and_vehicles_taken_back(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     scenario, port = short(tmp_path, "triangle5", 10.0), free_port()
     listen = f"127.0.0.1:{port}"
@@ -215,7 +215,7 @@ def test_killed_station_leaves_readable_logs_and_a_new_one_takes_the_vehicles_ba
             os.kill(pid, signal.SIGTERM)
 
 
-def test_vehicles_at_a_port_that_nobody_listens_at_again_end_with_their_station(tmp_path: Path) -> None:
+def test_vehicles_nobody_listens_to_again_end_with_their_station(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     process = fly(short(tmp_path, "chain3", 60.0), "--listen", "127.0.0.1:0", "--out", folder)
     until(lambda: flying(folder))
@@ -272,7 +272,7 @@ def test_a_full_disk_ends_the_logs_and_not_the_flight(tmp_path: Path) -> None:
     assert not children_named(str(folder))
 
 
-def test_vehicles_with_loops_of_their_own_keep_their_places_without_a_station_and_are_taken_back(
+def test_onboard_loops_keep_vehicles_in_place_until_a_station_returns(
     tmp_path: Path,
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"

@@ -48,7 +48,7 @@ def commands(outgoing: list[Outgoing]) -> list[tuple[int, int]]:
     return [(message.command, message.confirmation) for message in messages(outgoing, "COMMAND_LONG")]
 
 
-def test_a_vehicle_is_set_up_step_by_step_one_command_at_a_time() -> None:
+def test_a_vehicle_is_set_up_one_command_at_a_time() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     outgoing, _ = station.step([peer.heartbeat(S)], S)
     (interval,) = messages(outgoing, "COMMAND_LONG")
@@ -70,7 +70,7 @@ def test_a_command_without_answer_is_repeated_with_its_confirmation_raised() -> 
     assert sent == [(511, 0), (511, 1), (511, 2), (511, 3)]
 
 
-def test_a_refused_command_is_reported_and_tried_again_a_second_later() -> None:
+def test_refused_commands_are_reported_and_tried_again_a_second_later() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     station.step([peer.heartbeat(S)], S)
     station.step([peer.datagram(peer.link.command_ack_encode(511, 2), S)], S + 20 * MS)
@@ -87,7 +87,7 @@ def test_an_acknowledgement_of_another_command_is_not_taken_for_ours() -> None:
     assert station.vehicles[1].missing == "does not accept the telemetry rate"
 
 
-def test_timesync_request_of_a_vehicle_is_answered_with_the_receive_time() -> None:
+def test_a_vehicles_timesync_request_is_answered_with_the_receive_time() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     request = peer.datagram(peer.link.timesync_encode(0, 777), S + 3 * MS)
     outgoing, _ = station.step([peer.heartbeat(S), request], S + 5 * MS)
@@ -104,7 +104,7 @@ def test_a_heartbeat_that_is_replayed_or_overtaken_undoes_nothing() -> None:
     assert (vehicle.frames.duplicate, vehicle.frames.late) == (1, 1)
 
 
-def test_what_a_link_reorders_or_repeats_is_no_refusal_and_is_told_once_of_each_vehicle() -> None:
+def test_reordered_or_repeated_frames_are_no_refusals_and_told_once() -> None:
     station, peers = Station(PLAN, start_ns=S), [Peer(2), Peer(3)]
     for second in range(1, 5):
         for peer in peers:
@@ -116,7 +116,7 @@ def test_what_a_link_reorders_or_repeats_is_no_refusal_and_is_told_once_of_each_
     assert told == [(system_id, text) for system_id in (2, 3) for text in texts]
 
 
-def test_a_vehicle_that_begins_anew_to_count_its_frames_is_heard() -> None:
+def test_a_vehicle_that_counts_its_frames_anew_is_heard() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
     peer.link.seq = 100
@@ -135,7 +135,7 @@ def test_unknown_system_id_is_counted_and_not_answered() -> None:
     assert station.counters == {"unknown system id": 1}
 
 
-def test_a_second_source_of_a_known_id_is_refused_until_the_first_is_silent() -> None:
+def test_a_second_source_is_refused_until_the_first_is_silent() -> None:
     station, peer, thief = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666))
     station.step([peer.heartbeat(S)], S)
     station.step([thief.heartbeat(S + 100 * MS)], S + 100 * MS)
