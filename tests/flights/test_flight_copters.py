@@ -1,8 +1,7 @@
 """Flights of vehicles with autopilots in virtual time, from boot to hold, and what the start-up has to cope with."""
 
 from collections import deque
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.control.phases import START_PATIENCE_S
-from gcs.control.tick import Event, TickArray
+from gcs.control.tick import TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.link.datagram import Datagram
 from gcs.plan.flight_plan import FlightPlan
@@ -18,71 +17,15 @@ from gcs.plan.planner import described, flight_plan
 from gcs.runs.summary import verdict
 from gcs.station.absence import TAKEN_OVER
 from gcs.station.station import Station
-from scenarios.files import load
-from scenarios.link_schema import Link, Links, Outage, VehicleLinks
-from scenarios.schema import ClockJump, Response, Scenario
+from scenarios.link_schema import Link, Outage, VehicleLinks
+from scenarios.schema import ClockJump
 from sim_vehicles.drive.fleet import Fleet
-from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.copter_rules import RULES
-from tests.gcs.station.test_station import HOME, Peer, messages
-from tests.support.paths import SCENARIOS
+from tests.support.flown_copters import COPTERS5, TRUTH, Flight, fly, plan_for, planned, three
 from tests.support.sim_client import command
+from tests.support.station_peer import HOME, Peer, messages
 
-COPTERS5 = load(SCENARIOS / "copters5.toml")
 PERIOD_S = 0.02
-TRUTH = Response(lag_s=COPTERS5.autopilot.lag_s, velocity_gain_1_s=COPTERS5.autopilot.velocity_gain_1_s)
-
-
-def three(*, duration_s: float = 15.0, up_down: Link | None = None, **changes: Any) -> Scenario:
-    """The leader and one platoon of copters5, with an autopilot changed."""
-    kept: dict[str, Any] = {"vehicles": COPTERS5.vehicles[:3], "duration_s": duration_s}
-    links = Links(up=up_down, down=up_down) if up_down else COPTERS5.links
-    autopilot = COPTERS5.autopilot.model_copy(update=changes)
-    return COPTERS5.model_copy(update=kept | {"links": links, "autopilot": autopilot})
-
-
-@dataclass(frozen=True)
-class Flight:
-    """A flight that has ended: its ticks, events and vehicles."""
-
-    station: Station
-    fleet: Fleet
-    ticks: TickArray
-    events: list[Event]
-
-    @property
-    def flown(self) -> TickArray:
-        """Ticks of the formation flight, without those in which the vehicles are told to hold."""
-        last = self.ticks["tick"][self.ticks["commanded"]][-1]
-        return self.ticks[(self.ticks["time_s"] >= 0.0) & (self.ticks["tick"] <= last)]
-
-    def error_m(self, system_id: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-        rows = self.flown[self.flown["system_id"] == system_id]
-        return np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
-
-    def texts(self, kind: str) -> list[str]:
-        return [event.text for event in self.events if event.kind == kind]
-
-    def copter(self, system_id: int) -> Copter:
-        craft = self.fleet.vehicle(system_id).craft
-        assert isinstance(craft, Copter)
-        return craft
-
-
-def fly(plan: FlightPlan, fleet: Fleet | None = None, start_ns: int = START_NS) -> Flight:
-    station, fleet = Station(plan, start_ns=start_ns), fleet or Fleet(plan.scenario, start_ns)
-    ticks = list(fly_lockstep(plan, station=station, vehicles=fleet))
-    return Flight(station, fleet, np.concatenate(ticks), station.events)
-
-
-@cache
-def planned(flavour: str) -> FlightPlan:
-    return flight_plan(three(flavour=flavour))[1]
-
-
-def plan_for(scenario: Scenario) -> FlightPlan:
-    """The gains of copters5 with another scenario of the same formation: designing takes longer than flying."""
-    return replace(planned("ardupilot"), scenario=scenario)
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])

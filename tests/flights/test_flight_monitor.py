@@ -21,8 +21,9 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.station.station import Station
 from scenarios.files import load
-from scenarios.link_schema import DelayPoint, Jitter, Link, Links
+from scenarios.link_schema import Jitter, Link, Links
 from scenarios.schema import Monitor, Safety
+from tests.support.delay_ramp import ramp
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
@@ -30,13 +31,6 @@ TRIANGLE = load(SCENARIOS / "triangle5.toml")
 SEEDS = range(int(os.environ.get("MONITOR_SEEDS", "3")))
 QUIET_S = 8.0
 """The formation has settled by then."""
-
-
-def ramp(highest_s: float) -> Links:
-    """From 20 ms each way at 10 s to a highest delay at 40 s, held for 10 s, and back within 8 s."""
-    points = ((10.0, 0.02), (40.0, highest_s), (50.0, highest_s), (58.0, 0.02))
-    link = Link(delay_points=tuple(DelayPoint(at_s=at_s, delay_s=delay_s) for at_s, delay_s in points))
-    return Links(up=link, down=link)
 
 
 @cache

@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Generator
@@ -14,17 +13,12 @@ import pytest
 
 from scenarios import files
 from tests.support.paths import SCENARIOS
+from tests.support.processes import free_port
 
 COPTERS5 = SCENARIOS / "copters5.toml"
 RUN_S = 80.0
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @contextmanager

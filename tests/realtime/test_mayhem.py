@@ -28,8 +28,8 @@ from gcs.watch.tlog import parse_tlog
 from scenarios.files import dump, load
 from scenarios.schema import FixedGains
 from sim_vehicles.links.truth import read_truth
-from tests.realtime.test_fly_realtime import free_port, until
 from tests.support.paths import SCENARIOS
+from tests.support.processes import free_port, until
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes"), pytest.mark.timeout(400)]
 

@@ -20,8 +20,8 @@ import pytest
 
 from gcs.control.tick import Event
 from gcs.runs.record import READY_FILE, RECORDING_FILE, TICKS_FILE, UNFINISHED_FILE
-from tests.gcs.views.test_recording import read_back
 from tests.support.flown_run import line, prepare, ticks_of
+from tests.support.recordings import read_back
 
 pytestmark = pytest.mark.realtime
 FIVE = line(5)

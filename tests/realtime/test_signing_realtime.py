@@ -24,7 +24,8 @@ from scenarios.files import load
 from scenarios.schema import FixedGains
 from scenarios.signing.keys import Key, make_key, read_key
 from scenarios.signing.stamps import Stamps, open_stamps
-from tests.realtime.test_fly_realtime import PATIENCE_S, SCENARIOS, children_named, fly, flying, free_port, short, until
+from tests.support.paths import SCENARIOS
+from tests.support.processes import PATIENCE_S, children_named, fly, flying, free_port, short, until
 from tests.support.signed_peer import KEY, OTHER_KEY, position
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]

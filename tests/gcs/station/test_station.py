@@ -1,47 +1,21 @@
 """The station's conversation with vehicles, frame by frame, with pymavlink as the other side."""
 
-from typing import Any
-
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.datagram import Outgoing
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
 from gcs.station.station import Station
 from scenarios.files import load
 from tests.support.paths import SCENARIOS
+from tests.support.station_peer import HOME, Peer, messages
 
 S, MS = 1_000_000_000, 1_000_000
 SCENARIO = load(SCENARIOS / "chain3.toml")
 FORMATION = plan_formation(SCENARIO)
 GAIN = FORMATION.model.overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
 PLAN = FlightPlan(SCENARIO, FORMATION, GAIN, 0.3)
-HOME = ("127.0.0.1", 5001)
-
-
-class Peer:
-    """One vehicle played by pymavlink: what it says and what it was told."""
-
-    def __init__(self, system_id: int, address: tuple[str, int] = HOME) -> None:
-        self.link: Any = dialect.MAVLink(None, srcSystem=system_id, srcComponent=1)
-        self.address = address
-
-    def datagram(self, message: Any, time_ns: int) -> Datagram:
-        data = bytes(message.pack(self.link))
-        self.link.seq = (self.link.seq + 1) % 256  # pymavlink counts only what it sends itself
-        return Datagram(data, self.address, time_ns)
-
-    def heartbeat(self, time_ns: int, *, base_mode: int = 1, custom_mode: int = 0, status: int = 3) -> Datagram:
-        return self.datagram(self.link.heartbeat_encode(2, 3, base_mode, custom_mode, status), time_ns)
-
-
-def messages(outgoing: list[Outgoing], kind: str, to: tuple[str, int] = HOME) -> list[Any]:
-    """The messages of one kind sent to an address, as pymavlink reads them."""
-    parser: Any = dialect.MAVLink(None)
-    read = [parser.parse_char(data) for data, address in outgoing if address == to]
-    return [message for message in read if message.get_type() == kind]
 
 
 def commands(outgoing: list[Outgoing]) -> list[tuple[int, int]]:

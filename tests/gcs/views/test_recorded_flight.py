@@ -22,8 +22,8 @@ from gcs.views.viewer import screenshot, vulkan_missing
 from scenarios.files import dump, load
 from scenarios.link_schema import DelayPoint, Link, VehicleLinks
 from scenarios.schema import Scenario
-from tests.gcs.views.test_recording import read_back
 from tests.support.paths import SCENARIOS
+from tests.support.recordings import read_back
 
 pytestmark = pytest.mark.xdist_group("recorded flight")
 

@@ -19,20 +19,9 @@ from gcs.views.recording import Recording
 from gcs.views.scene import vehicle_colors
 from gcs.views.viewer import find_recording, view
 from tests.support.flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
+from tests.support.recordings import read_back
 
 FIVE = line(5)
-
-
-def read_back(recording: Path, entity: str, component: str) -> tuple[Any, Any]:
-    """Times in s and values, shape (times, vehicles, ...), of one entity in the order of time."""
-    times: list[float] = []
-    values: list[Any] = []
-    for chunk in RrdReader(recording).stream().filter(content=entity, is_static=False, components=component):
-        batch = chunk.to_record_batch()
-        times += [time / 1e9 for time in batch.column("sim_time").cast(pa.int64()).to_pylist()]
-        values += batch.column(component).to_pylist()
-    order = np.argsort(times, kind="stable")
-    return np.array(times)[order], np.array(values, dtype=float)[order]
 
 
 def spacing_errors_m(ticks: TickArray) -> Any:

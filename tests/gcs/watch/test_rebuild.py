@@ -17,7 +17,7 @@ from gcs.watch.rebuild_report import LogSource, rebuild_report
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
 from scenarios.schema import Scenario
-from tests.flights.test_flight_monitor import ramp
+from tests.support.delay_ramp import ramp
 from tests.support.known import known
 from tests.support.logged_flight import EPOCH_NS, flown, log_bytes
 from tests.support.paths import SCENARIOS
