@@ -106,7 +106,7 @@ def test_it_arms_changes_the_mode_and_disarms(client: Client) -> None:
     until(lambda: not told.armed(), "disarmed")
 
 
-def test_its_velocities_are_flown_in_both_frames_then_it_holds_and_returns(client: Client) -> None:
+def test_velocities_are_flown_in_both_frames_before_hold_and_return(client: Client) -> None:
     numbers = (1, 4)
     for number in numbers:
         action = Action(client.systems[number])

@@ -1,0 +1,1 @@
+"""The documentation: it says what the code does, and its examples run."""

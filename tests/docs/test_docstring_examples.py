@@ -106,7 +106,7 @@ def test_the_examples_of_internal_modules_run_in_their_namespace(name: str) -> N
 
 
 @pytest.mark.parametrize("name", PUBLIC_MODULES)
-def test_the_examples_on_the_reference_page_run_in_an_empty_session(name: str) -> None:
+def test_reference_page_examples_run_in_an_empty_session(name: str) -> None:
     texts = documented(import_module(name))
     for full, text in texts.items():
         assert failures(doctest.DocTestParser().get_doctest(text, {}, f"{name}.{full}", None, None)) == []
@@ -114,7 +114,7 @@ def test_the_examples_on_the_reference_page_run_in_an_empty_session(name: str) -
     assert {test.name.removeprefix(f"{name}.") for test in found if test.examples} <= texts.keys()
 
 
-def test_every_function_that_is_called_and_every_class_it_takes_has_an_example() -> None:
+def test_functions_called_and_the_classes_they_take_have_examples() -> None:
     functions = called_functions()
     classes = classes_taken(functions)
     called = {"gains.delay.constant.analyse_delay", "gains.design.design.design"}

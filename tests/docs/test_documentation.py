@@ -56,7 +56,7 @@ def test_a_figure_that_was_changed_by_hand_is_noticed() -> None:
     assert blocks.differing("margin-held", text.replace("1.72941", "1.72942")) == [page]
 
 
-def test_every_generated_block_has_a_maker_and_every_figure_a_page() -> None:
+def test_generated_blocks_have_a_maker_and_figures_a_page() -> None:
     known = {*reference.MAKERS, *figures.FIGURES, *(f"{name}-bare" for name in figures.FIGURES)}
     assert {name for page in PAGES.values() for name in blocks.blocks_of(page)} <= known
     assert measurements.unused() == []

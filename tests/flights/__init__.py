@@ -1,0 +1,1 @@
+"""Whole flights in virtual time: station, links and vehicles together."""

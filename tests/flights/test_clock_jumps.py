@@ -15,7 +15,7 @@ from gcs.station.station import Station
 from scenarios.link_schema import Link, Links
 from scenarios.schema import ClockJump, Rates, Scenario, Vehicle
 from sim_vehicles.drive.fleet import Fleet
-from tests.flights.test_flight_copters import COPTERS5, TRUTH, Flight, fly
+from tests.support.flown_copters import COPTERS5, TRUTH, Flight, fly
 from tests.support.sim_client import parse
 
 SECOND = 1_000_000_000
@@ -49,7 +49,7 @@ def flown(**changes: Any) -> Flight:
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("timesync_hz", [10.0, 0.2])
 @pytest.mark.parametrize("by_s", [3.0, -3.0, -1000.0, 700.0])
-def test_no_clock_jump_ends_a_flight_or_shows_in_its_figures(by_s: float, timesync_hz: float, flavour: str) -> None:
+def test_clock_jumps_neither_end_a_flight_nor_show_in_figures(by_s: float, timesync_hz: float, flavour: str) -> None:
     """-1000 s sets a clock to before its boot, so that time_boot_ms wraps."""
     at_s = 22.0 if timesync_hz > 1.0 else 45.0  # at 0.2 Hz the clocks are known after 25 s
     flight = flown(clock_jumps=(ClockJump(at_s=at_s, by_s=by_s),), timesync_hz=timesync_hz, flavour=flavour)
@@ -71,7 +71,7 @@ def test_no_clock_jump_ends_a_flight_or_shows_in_its_figures(by_s: float, timesy
     assert np.nanmax(commands[rows["time_s"] > max(jumped_s, 5.0)]) < 1.0
 
 
-def test_the_reported_offset_is_within_its_bound_of_the_truth_at_every_tick_on_which_it_is_known() -> None:
+def test_known_offsets_are_within_their_bound_at_every_tick() -> None:
     """But for the round trip in which only the vehicle knows that its clock has been set back."""
     flight = flown(clock_jumps=(ClockJump(at_s=45.0, by_s=3.0),), timesync_hz=0.2)
     rows = flight.ticks[flight.ticks["system_id"] == 2]

@@ -69,14 +69,14 @@ def sizes_m(ticks: TickArray) -> list[float]:
     return [float(np.sqrt((error[flown["system_id"] == v.system_id] ** 2).mean())) for v in CHAIN.leader_first()[1:]]
 
 
-def test_a_follower_that_does_what_the_one_in_front_does_keeps_its_distance_at_any_delay() -> None:
+def test_copying_the_vehicle_in_front_keeps_distance_at_any_delay() -> None:
     alike = peaks_m(stepped(1.0, K1, link_s=0.25))
     apart = peaks_m(stepped(0.0, K1, link_s=0.25))
     assert max(alike) < 2.0 * 2.0 * 0.04  # a step of 2 m/s, at which each of two vehicles may be two ticks apart
     assert min(apart) > 3.0 * max(alike)
 
 
-def test_errors_behind_a_disturbed_leader_do_not_grow_down_the_chain() -> None:
+def test_behind_a_disturbed_leader_errors_never_grow_down_the_chain() -> None:
     """With k_ff = 0.9 and k2 = 3.13 the peak is 1.00 up to 0.25 s: docs/explanation/prediction.md."""
     first, second = sizes_m(stepped(0.9, 3.13, link_s=0.23, leader_m_s=2.0))
     assert second < first
@@ -84,7 +84,7 @@ def test_errors_behind_a_disturbed_leader_do_not_grow_down_the_chain() -> None:
     assert second > 1.2 * first
 
 
-def test_feed_forward_changes_neither_the_margin_nor_the_growth_of_a_loop() -> None:
+def test_feed_forward_changes_neither_margin_nor_growth_of_a_loop() -> None:
     plan, bare = planned(0.9, 3.13), planned(0.0, 3.13)
     assert plan.delay_margin_s == bare.delay_margin_s
     assert np.abs(plan.gain - bare.gain).max() > 1.0
@@ -93,7 +93,7 @@ def test_feed_forward_changes_neither_the_margin_nor_the_growth_of_a_loop() -> N
     assert fed.predicted_growth_1_s == without.predicted_growth_1_s
 
 
-def test_the_figures_at_a_delay_are_those_of_the_fed_forward_loop() -> None:
+def test_figures_at_a_delay_are_the_fed_forward_loops() -> None:
     flown = scenario(0.9, 3.13)
     found = figures_at(flight_plan(flown)[0], flown, 0.25)
     loop = PredictedLoop(ScalarGains(K1, 3.13, K3, 0.0), 1.0 / flown.rates.control_hz, 0.0, feed_forward=0.9)

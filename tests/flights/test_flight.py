@@ -76,7 +76,7 @@ def test_formation_settles_below_one_percent_of_the_spacing(name: str) -> None:
     assert {vehicle.mode_final for vehicle in summary.vehicles} == {"NOMINAL"}
 
 
-def test_a_flight_too_short_to_settle_says_what_is_left_of_its_errors() -> None:
+def test_a_flight_too_short_to_settle_reports_its_remaining_errors() -> None:
     plan, design = planned("triangle5", duration_s=0.4)
     _, summary = flown(plan, design)
     assert (summary.verdict, summary.reason) == ("unstable", "completed: duration reached")
@@ -100,7 +100,7 @@ def test_formation_follows_the_turns() -> None:
         assert heading == pytest.approx(np.full(5, heading_deg), abs=0.1)
 
 
-def test_above_the_margin_the_formation_breaks_and_vehicles_are_left_in_failsafe() -> None:
+def test_above_the_margin_the_formation_breaks_leaving_vehicles_in_failsafe() -> None:
     plan, design = planned("triangle5")
     scenario = plan.scenario.with_link_delay(up_s=0.4, down_s=0.4)
     plan = replace(plan, scenario=scenario)
@@ -269,7 +269,7 @@ def test_given_gains_without_margin_are_flown_and_break() -> None:
     assert "but the loop delay is past the margin" in output.getvalue()
 
 
-def test_errors_that_still_grow_slowly_past_the_margin_are_not_stable() -> None:
+def test_slow_error_growth_past_the_margin_is_not_stable() -> None:
     links = load(SCENARIOS / "thesis_delay.toml").with_link_delay(up_s=0.55, down_s=0.55).links
     _, summary = flown(*planned("thesis_delay", links=links))
     assert known(summary.headroom_end) < 0.0
@@ -291,7 +291,7 @@ FIXED_WING = (
 
 
 @pytest.mark.parametrize("name", FIXED_WING)
-def test_shipped_scenarios_ask_nothing_of_their_aircraft_that_they_cannot_do(name: str) -> None:
+def test_shipped_scenarios_ask_nothing_beyond_what_their_aircraft_can_do(name: str) -> None:
     """Commands stay below 3 g from the first tick on, and turns below the turn rate; so limits change nothing."""
     plan, design = planned(name)
     scenario = plan.scenario
@@ -313,7 +313,7 @@ def test_shipped_scenarios_ask_nothing_of_their_aircraft_that_they_cannot_do(nam
         assert np.nanmax(np.abs(ticks[error] - without[error])) < 1e-2
 
 
-def test_a_wide_start_is_flown_at_three_g_and_comes_together() -> None:
+def test_a_wide_start_flown_at_three_g_comes_together() -> None:
     """Without limits the gains ask for 93 g."""
     plan, design = planned("triangle5_scattered")
     ticks, summary = flown(plan, design)
@@ -334,7 +334,7 @@ def test_a_wide_start_is_flown_at_three_g_and_comes_together() -> None:
         (300.0, False, "broken: spacing error of vehicle 5 is 301 m, limit 300 m"),
     ],
 )
-def test_what_breaks_triangle5_far_above_its_margin_is_its_tolerance_or_a_station_that_may_not_act(
+def test_tolerance_or_a_passive_station_breaks_triangle5_far_above_margin(
     limit_m: float, acts: bool, reason: str
 ) -> None:
     """With time to change to slower gains the monitor saves it: what scenarios/triangle5.toml says of its limit."""

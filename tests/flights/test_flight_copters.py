@@ -1,8 +1,7 @@
 """Flights of vehicles with autopilots in virtual time, from boot to hold, and what the start-up has to cope with."""
 
 from collections import deque
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.control.phases import START_PATIENCE_S
-from gcs.control.tick import Event, TickArray
+from gcs.control.tick import TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.link.datagram import Datagram
 from gcs.plan.flight_plan import FlightPlan
@@ -18,71 +17,15 @@ from gcs.plan.planner import described, flight_plan
 from gcs.runs.summary import verdict
 from gcs.station.absence import TAKEN_OVER
 from gcs.station.station import Station
-from scenarios.files import load
-from scenarios.link_schema import Link, Links, Outage, VehicleLinks
-from scenarios.schema import ClockJump, Response, Scenario
+from scenarios.link_schema import Link, Outage, VehicleLinks
+from scenarios.schema import ClockJump
 from sim_vehicles.drive.fleet import Fleet
-from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.copter_rules import RULES
-from tests.gcs.station.test_station import HOME, Peer, messages
-from tests.support.paths import SCENARIOS
+from tests.support.flown_copters import COPTERS5, TRUTH, Flight, fly, plan_for, planned, three
 from tests.support.sim_client import command
+from tests.support.station_peer import HOME, Peer, messages
 
-COPTERS5 = load(SCENARIOS / "copters5.toml")
 PERIOD_S = 0.02
-TRUTH = Response(lag_s=COPTERS5.autopilot.lag_s, velocity_gain_1_s=COPTERS5.autopilot.velocity_gain_1_s)
-
-
-def three(*, duration_s: float = 15.0, up_down: Link | None = None, **changes: Any) -> Scenario:
-    """The leader and one platoon of copters5, with an autopilot changed."""
-    kept: dict[str, Any] = {"vehicles": COPTERS5.vehicles[:3], "duration_s": duration_s}
-    links = Links(up=up_down, down=up_down) if up_down else COPTERS5.links
-    autopilot = COPTERS5.autopilot.model_copy(update=changes)
-    return COPTERS5.model_copy(update=kept | {"links": links, "autopilot": autopilot})
-
-
-@dataclass(frozen=True)
-class Flight:
-    """A flight that has ended: its ticks, events and vehicles."""
-
-    station: Station
-    fleet: Fleet
-    ticks: TickArray
-    events: list[Event]
-
-    @property
-    def flown(self) -> TickArray:
-        """Ticks of the formation flight, without those in which the vehicles are told to hold."""
-        last = self.ticks["tick"][self.ticks["commanded"]][-1]
-        return self.ticks[(self.ticks["time_s"] >= 0.0) & (self.ticks["tick"] <= last)]
-
-    def error_m(self, system_id: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-        rows = self.flown[self.flown["system_id"] == system_id]
-        return np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
-
-    def texts(self, kind: str) -> list[str]:
-        return [event.text for event in self.events if event.kind == kind]
-
-    def copter(self, system_id: int) -> Copter:
-        craft = self.fleet.vehicle(system_id).craft
-        assert isinstance(craft, Copter)
-        return craft
-
-
-def fly(plan: FlightPlan, fleet: Fleet | None = None, start_ns: int = START_NS) -> Flight:
-    station, fleet = Station(plan, start_ns=start_ns), fleet or Fleet(plan.scenario, start_ns)
-    ticks = list(fly_lockstep(plan, station=station, vehicles=fleet))
-    return Flight(station, fleet, np.concatenate(ticks), station.events)
-
-
-@cache
-def planned(flavour: str) -> FlightPlan:
-    return flight_plan(three(flavour=flavour))[1]
-
-
-def plan_for(scenario: Scenario) -> FlightPlan:
-    """The gains of copters5 with another scenario of the same formation: designing takes longer than flying."""
-    return replace(planned("ardupilot"), scenario=scenario)
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
@@ -99,7 +42,7 @@ def test_copters_start_on_the_ground_fly_the_formation_and_hold(flavour: str) ->
         assert copter.motion.altitude_m == pytest.approx(20.0, abs=0.3)
 
 
-def test_the_distances_flown_are_true_although_each_vehicle_has_its_own_origin() -> None:
+def test_distances_are_true_though_each_vehicle_has_its_own_origin() -> None:
     flight = fly(planned("ardupilot"))
     # the last positions in the scenario's frame, braking by then in the same way
     place = {k: np.array(flight.copter(k).motion[:2]) for k in (1, 2, 3)}
@@ -110,7 +53,7 @@ def test_the_distances_flown_are_true_although_each_vehicle_has_its_own_origin()
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_identified_response_is_the_truth_and_its_margin_is_flown_with(flavour: str) -> None:
+def test_the_identified_response_is_true_and_its_margin_is_used(flavour: str) -> None:
     flight = fly(planned(flavour))
     responses = flight.station.plan.responses
     assert responses is not None
@@ -123,7 +66,7 @@ def test_identified_response_is_the_truth_and_its_margin_is_flown_with(flavour: 
     assert given.delay_margin_s == pytest.approx(0.6, abs=1e-6)  # what the scenario asks for, with the response
 
 
-def test_a_given_response_leaves_the_manoeuvre_out_and_the_design_says_so() -> None:
+def test_a_given_response_skips_the_manoeuvre_as_the_design_says() -> None:
     design, plan = flight_plan(three().model_copy(update={"response": TRUTH}))
     flight = fly(plan)
     assert "identifying" not in flight.texts("phase")
@@ -145,7 +88,7 @@ def test_design_of_a_flight_names_what_was_identified() -> None:
     assert [vehicle.system_id for vehicle in known.response.vehicles] == [1, 2, 3]
 
 
-def test_gains_on_a_graph_get_the_margin_with_the_response_too() -> None:
+def test_graph_gains_get_the_margin_with_the_response_too() -> None:
     control = COPTERS5.control.model_copy(update={"method": "graph-lqr", "delay_margin_s": 0.5})
     design, plan = flight_plan(three().model_copy(update={"control": control}))
     flight = fly(plan)
@@ -170,7 +113,7 @@ def at_loop_delay(plan: FlightPlan, delay_s: float) -> Flight:
     return fly(replace(plan, scenario=scenario.model_copy(update={"monitor": watching, "duration_s": 60.0})))
 
 
-def test_the_flight_breaks_at_the_margin_with_the_response_and_not_at_that_without() -> None:
+def test_the_flight_breaks_only_at_the_margin_with_the_response() -> None:
     without_s = planned("ardupilot").delay_margin_s
     with_s = fly(planned("ardupilot")).station.plan.delay_margin_s
     assert with_s < 0.8 * without_s
@@ -202,7 +145,7 @@ def test_telemetry_that_begins_40_s_after_boot_is_waited_for(flavour: str) -> No
     assert began_ns > START_NS + 55e9
 
 
-def test_a_vehicle_that_never_gets_a_position_ends_the_start_in_its_own_time_and_is_named() -> None:
+def test_a_vehicle_without_position_ends_the_start_and_is_named() -> None:
     scenario = three(duration_s=1.0, ready_after_s=1e6)
     flight = fly(plan_for(scenario))
     reason = flight.station.end_reason
@@ -212,7 +155,7 @@ def test_a_vehicle_that_never_gets_a_position_ends_the_start_in_its_own_time_and
     assert all(not flight.copter(k).armed for k in (1, 2, 3))
 
 
-def test_vehicles_already_in_the_air_are_held_when_another_never_starts() -> None:
+def test_airborne_vehicles_are_held_when_another_never_starts() -> None:
     dead = VehicleLinks(system_id=3, up=Link(loss_probability=1.0), down=Link())
     scenario = three()
     scenario = scenario.model_copy(update={"links": scenario.links.model_copy(update={"vehicles": (dead,)})})
@@ -222,7 +165,7 @@ def test_vehicles_already_in_the_air_are_held_when_another_never_starts() -> Non
         assert flight.copter(system_id).mode == flight.copter(system_id).rules.hold_mode
 
 
-def test_no_flight_begins_without_a_vehicle_that_has_fallen_silent_while_it_climbed() -> None:
+def test_no_flight_begins_without_a_vehicle_that_fell_silent_climbing() -> None:
     gone = Link(delay_s=0.02, outages=(Outage(from_s=6.0, until_s=1e6),))
     vehicles = (VehicleLinks(system_id=3, up=gone, down=gone),)
     scenario = three().model_copy(update={"response": TRUTH})
@@ -236,7 +179,7 @@ def test_no_flight_begins_without_a_vehicle_that_has_fallen_silent_while_it_clim
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("by_s", [-0.2, 0.2, 5.0])
-def test_a_clock_that_jumps_in_flight_is_noticed_and_flown_through(flavour: str, by_s: float) -> None:
+def test_a_clock_jump_in_flight_is_noticed_and_flown_through(flavour: str, by_s: float) -> None:
     scenario = three(flavour=flavour, clock_jumps=(ClockJump(at_s=25.0, by_s=by_s),))
     flight = fly(plan_for(scenario))
     assert flight.station.end_reason == "completed: duration reached"
@@ -256,7 +199,7 @@ def test_a_pilot_who_takes_over_in_the_manoeuvre_ends_it(flavour: str, mode: int
 
 
 @pytest.mark.parametrize("by_s", [-0.2, 5.0])
-def test_a_clock_that_jumps_in_the_manoeuvre_leaves_the_same_response(by_s: float) -> None:
+def test_a_clock_jump_in_the_manoeuvre_leaves_the_same_response(by_s: float) -> None:
     flight = fly(plan_for(three(duration_s=1.0, clock_jumps=(ClockJump(at_s=13.0, by_s=by_s),))))
     times = [event.time_s for event in flight.events if event.text in ("identifying", "its clock jumped")]
     assert 0.5 < times[-1] - times[0] < 4.0  # while the vehicles were being moved
@@ -275,7 +218,7 @@ def test_clocks_that_drift_by_500_ppm_change_nothing() -> None:
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_after_an_outage_longer_than_the_time_outs_the_vehicle_is_called_back(flavour: str) -> None:
+def test_after_an_outage_past_the_timeouts_the_vehicle_is_recalled(flavour: str) -> None:
     gone = Link(delay_s=0.02, outages=(Outage(from_s=28.0, until_s=32.0),))
     links = COPTERS5.links.model_copy(
         update={"vehicles": (VehicleLinks(system_id=3, up=gone, down=gone),), "times_from": "start"}
@@ -288,7 +231,7 @@ def test_after_an_outage_longer_than_the_time_outs_the_vehicle_is_called_back(fl
 
 
 @pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 6), ("px4", 4 << 16 | 5 << 24)])
-def test_a_vehicle_whose_pilot_sends_it_home_is_left_alone_and_flown_around(flavour: str, mode: int) -> None:
+def test_a_vehicle_piloted_home_is_left_alone_and_flown_around(flavour: str, mode: int) -> None:
     flight = fly_with_a_pilot(flavour, {5.0: mode})
     assert flight.station.end_reason == "taken over: vehicles 3"
     flight.fleet.step([], int(flight.ticks["due_ns"][-1]) + 60_000_000_000)
@@ -300,7 +243,7 @@ def test_a_vehicle_whose_pilot_sends_it_home_is_left_alone_and_flown_around(flav
 
 
 @pytest.mark.parametrize(("flavour", "mode"), [("ardupilot", 5), ("px4", 3 << 16)])
-def test_a_vehicle_that_its_pilot_gives_back_flies_in_the_formation_again(flavour: str, mode: int) -> None:
+def test_a_vehicle_given_back_by_its_pilot_rejoins_the_formation(flavour: str, mode: int) -> None:
     flight = fly_with_a_pilot(flavour, {5.0: mode, 8.0: RULES[flavour].guided_mode})
     assert flight.station.end_reason == "completed: duration reached"
     assert flight.texts("vehicle")[-1] == "is given back"
@@ -322,7 +265,7 @@ def fly_with_a_pilot(flavour: str, modes: dict[float, int]) -> Flight:
     return Flight(station, fleet, np.concatenate(ticks), station.events)
 
 
-def test_a_second_station_takes_over_vehicles_that_are_in_the_air() -> None:
+def test_a_second_station_takes_over_airborne_vehicles() -> None:
     first = fly(planned("ardupilot"))
     took_off = sum(change.text == "takes off" for change in first.fleet.take_changes())
     second = fly(planned("ardupilot"), first.fleet, int(first.ticks["due_ns"][-1]) + 100_000_000)
@@ -347,7 +290,7 @@ def test_an_arduplane_is_refused_at_once_and_by_name() -> None:
     assert not any(messages(outgoing, "COMMAND_LONG") for outgoing in told)  # whoever flies it is not disturbed
 
 
-def test_a_px4_that_speaks_mavlink_1_at_first_is_heard_and_answered_in_mavlink_2() -> None:
+def test_px4_starting_in_mavlink_1_is_answered_in_mavlink_2() -> None:
     first = dialect.MAVLink(None, srcSystem=2, srcComponent=1)
     heartbeat = bytes(first.heartbeat_encode(2, 12, 1, 4 << 16 | 3 << 24, 3).pack(first, force_mavlink1=True))
     assert heartbeat[0] == 0xFE
@@ -365,7 +308,7 @@ def test_a_px4_that_speaks_mavlink_1_at_first_is_heard_and_answered_in_mavlink_2
     assert messages(outgoing, "HEARTBEAT")
 
 
-def test_a_gimbal_with_the_vehicles_system_id_is_not_taken_for_the_vehicle() -> None:
+def test_a_gimbal_with_the_same_system_id_is_no_vehicle() -> None:
     station, peer = Station(planned("ardupilot"), start_ns=START_NS), Peer(2)
     gimbal: Any = dialect.MAVLink(None, srcSystem=2, srcComponent=154)
     station.step([peer.heartbeat(START_NS)], START_NS)

@@ -21,8 +21,9 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.station.station import Station
 from scenarios.files import load
-from scenarios.link_schema import DelayPoint, Jitter, Link, Links
+from scenarios.link_schema import Jitter, Link, Links
 from scenarios.schema import Monitor, Safety
+from tests.support.delay_ramp import ramp
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
@@ -30,13 +31,6 @@ TRIANGLE = load(SCENARIOS / "triangle5.toml")
 SEEDS = range(int(os.environ.get("MONITOR_SEEDS", "3")))
 QUIET_S = 8.0
 """The formation has settled by then."""
-
-
-def ramp(highest_s: float) -> Links:
-    """From 20 ms each way at 10 s to a highest delay at 40 s, held for 10 s, and back within 8 s."""
-    points = ((10.0, 0.02), (40.0, highest_s), (50.0, highest_s), (58.0, 0.02))
-    link = Link(delay_points=tuple(DelayPoint(at_s=at_s, delay_s=delay_s) for at_s, delay_s in points))
-    return Links(up=link, down=link)
 
 
 @cache
@@ -60,7 +54,7 @@ def first_time_s(station: Station, mode: Mode) -> float:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_with_the_monitor_the_formation_survives_three_times_its_first_margin(seed: int) -> None:
+def test_a_monitored_formation_survives_three_times_its_first_margin(seed: int) -> None:
     shipped = load(SCENARIOS / "delay_ramp.toml")
     assert (shipped.duration_s, shipped.links) == (75.0, ramp(0.44))
     ticks, station = flown(seed=seed, duration_s=75.0, links=ramp(0.44))
@@ -73,7 +67,7 @@ def test_with_the_monitor_the_formation_survives_three_times_its_first_margin(se
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_without_its_action_caution_and_critical_come_before_the_error_and_the_formation_breaks(seed: int) -> None:
+def test_without_action_caution_and_critical_precede_error_and_break(seed: int) -> None:
     ticks, station = flown(seed=seed, duration_s=75.0, links=ramp(0.44), monitor=Monitor(act=False))
     assert station.end_reason.startswith("broken")
     out_s = float(ticks["time_s"][error_m(ticks) > 0.01 * 172.4].min())
@@ -102,7 +96,7 @@ def test_gains_change_without_a_jump_in_command() -> None:
             assert step <= 1.5 * float(np.max(np.delete(jump[k - 25 : k + 25], 24))) + 1e-3
 
 
-def test_release_when_even_the_slowest_gains_have_no_headroom_leaves_vehicles_in_failsafe() -> None:
+def test_slowest_gains_without_headroom_release_vehicles_into_failsafe() -> None:
     # Released while the formation opens, vehicles drift apart; on the way back their spacing errors are large.
     safety = Safety(spacing_error_limit_m=2000.0)
     ticks, station = flown(seed=1, duration_s=90.0, links=ramp(0.9), safety=safety)
@@ -126,7 +120,7 @@ class Overheard:
         return self.vehicles.step(received, now_ns)
 
 
-def test_every_change_of_mode_and_gains_is_an_event_and_a_statustext() -> None:
+def test_mode_and_gain_changes_are_events_and_statustexts() -> None:
     plan = replace(planned(), scenario=TRIANGLE.model_copy(update={"duration_s": 45.0, "links": ramp(0.44)}))
     station, vehicles = Station(plan, start_ns=START_NS), Overheard(vehicles_of(plan))
     for _ in fly_lockstep(plan, station=station, vehicles=vehicles):
@@ -147,7 +141,7 @@ def test_every_change_of_mode_and_gains_is_an_event_and_a_statustext() -> None:
     assert {m.severity for m in told if m.text.endswith("CAUTION")} == {dialect.MAV_SEVERITY_WARNING}
 
 
-def test_a_collision_ends_the_flight_as_broken_and_the_least_distance_is_in_the_summary() -> None:
+def test_a_collision_breaks_the_flight_and_least_distance_is_summarised() -> None:
     # Vehicles that stand nearer to each other than is allowed, from the flight's first tick on.
     ticks, station = flown(duration_s=5.0, safety=Safety(collision_distance_m=180.0))
     assert station.end_reason.startswith("broken: vehicles")

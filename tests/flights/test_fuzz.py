@@ -35,10 +35,11 @@ from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.drive.guard import signed_links
-from tests.flights.test_flight_copters import three
+from tests.support.flown_copters import three
 from tests.support.hostile import (
     SAID_BY_STATIONS,
     SAID_BY_VEHICLES,
+    TO_VEHICLES,
     any_message,
     changed,
     extreme,
@@ -54,9 +55,6 @@ COUNT = int(os.environ.get("FUZZ_DATAGRAMS", "20000"))
 BATCH = min(3000, max(100, COUNT // 1800 * 10))
 """To each end at each step: three links hold 10,000 datagrams each, and what is sent in two steps is under way."""
 SECONDS = max(4.0, math.ceil(COUNT / BATCH / 50) + 1.0)
-TO_VEHICLES = {0, 11, 23, 66, 75, 76, 84, 111}
-"""HEARTBEAT, SET_MODE, PARAM_SET, REQUEST_DATA_STREAM, COMMAND_INT and _LONG, set-points, TIMESYNC: a vehicle may take
-these from its station."""
 COUNTERS = ["received", "lost", "late", "duplicate"]
 CHAIN3 = load(SCENARIOS / "chain3.toml")
 GIVEN = CHAIN3.control.model_copy(update={"gains": FixedGains(K1=-3.4, K2=0.6, K3=5.6)})
@@ -258,7 +256,7 @@ def test_a_watched_link_under_fire_is_still_watched(timesync_hz: float, version:
 
 
 @pytest.mark.parametrize("hurt", ["frames", "stamps", "bits", "stamps of no time"])
-def test_a_log_of_hostile_frames_and_stamps_is_read_to_its_end(hurt: str) -> None:
+def test_a_log_of_hostile_frames_and_stamps_is_read_through(hurt: str) -> None:
     scenario = scenario_of("plain", 2.0)
     design, _, _, entries = logged(scenario)
     for seed in range(4):

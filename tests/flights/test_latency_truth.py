@@ -71,7 +71,7 @@ def flown(name: str) -> tuple[TickArray, Truth]:
 
 
 @pytest.mark.parametrize("name", [name for name in GRID if name != "bunches"])
-def test_every_round_trip_is_that_of_the_links_to_the_microsecond(name: str) -> None:
+def test_round_trips_are_those_of_the_links_to_the_microsecond(name: str) -> None:
     ticks, truth = flown(name)
     for system_id in (1, 2, 3):
         measured = ticks["rtt_s"][(ticks["system_id"] == system_id) & np.isfinite(ticks["rtt_s"])]
@@ -94,7 +94,7 @@ def test_every_round_trip_is_in_the_ticks(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CONSTANT)
-def test_loop_delay_is_exact_to_the_microsecond_where_links_are_constant(name: str) -> None:
+def test_loop_delay_over_constant_links_is_exact_to_the_microsecond(name: str) -> None:
     ticks, truth = flown(name)
     grade = graded(ticks["loop_delay_s"], true_loop_delays_s(ticks, truth))
     assert grade.samples > 700
@@ -103,7 +103,7 @@ def test_loop_delay_is_exact_to_the_microsecond_where_links_are_constant(name: s
     assert known(grade.error_max_s) < 1e-4
 
 
-def test_with_jitter_loop_delay_is_off_by_no_more_than_set_points_and_exchanges_differ() -> None:
+def test_with_jitter_loop_delay_errs_at_most_by_the_jitter() -> None:
     """The down delay is that of the newest exchange; the set-point's own is known to nobody when it is sent."""
     ticks, truth = flown("reordering")
     grade = graded(ticks["loop_delay_s"], true_loop_delays_s(ticks, truth))
@@ -143,7 +143,7 @@ def test_clock_offsets_are_never_outside_their_bounds(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["drift 300 ppm", "asymmetric"])
-def test_the_skew_of_a_clock_is_that_of_its_time_stamps(name: str) -> None:
+def test_clock_skew_is_that_of_its_time_stamps(name: str) -> None:
     ticks, truth = flown(name)
     events = [Event(time_s=8.0, kind="end", text="completed: duration reached")]
     summary = summarise(CHAIN, Design(delay_margin_s=1.0), ticks, events)
@@ -155,7 +155,7 @@ def test_the_skew_of_a_clock_is_that_of_its_time_stamps(name: str) -> None:
         assert abs(known(vehicle.clock.skew_ppm) - 1e6 * (slope - 1.0)) < known(vehicle.clock.skew_bound_ppm)
 
 
-def test_loss_and_duplicates_are_those_of_the_links_though_they_reorder() -> None:
+def test_despite_reordering_loss_and_duplicates_are_those_of_the_links() -> None:
     ticks, truth = flown("reordering")
     last = ticks[ticks["tick"] == ticks["tick"].max()]
     up = truth[truth["kind"] == LINK_UP]

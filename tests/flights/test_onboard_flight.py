@@ -68,9 +68,7 @@ def vehicle(fleet: Fleet, system_id: int) -> DoubleIntegrator:
 
 
 @pytest.mark.parametrize(("link_delay_s", "verdict"), [(0.17, "stable"), (0.9, "stable"), (1.1, "unstable")])
-def test_the_source_holds_at_its_own_delay_and_at_five_times_its_margin_and_breaks_beyond_the_computed_one(
-    link_delay_s: float, verdict: str
-) -> None:
+def test_the_source_breaks_beyond_the_computed_margin_not_its_own(link_delay_s: float, verdict: str) -> None:
     scenario = delayed(link_delay_s)
     flight = fly_virtual(flown(scenario))
     summary = summarise(scenario, thesis()[0], flight.ticks, flight.events)
@@ -82,7 +80,7 @@ def test_the_source_holds_at_its_own_delay_and_at_five_times_its_margin_and_brea
     assert 0.0 < waiting_s < 1.0 / 50.0
 
 
-def test_with_the_monitor_acting_less_is_streamed_and_it_holds_beyond_its_margin() -> None:
+def test_the_acting_monitor_streams_less_and_holds_beyond_the_margin() -> None:
     scenario = delayed(1.1)
     acting = scenario.monitor.model_copy(update={"act": True})
     plan = flown(scenario.model_copy(update={"monitor": acting}))
@@ -110,7 +108,7 @@ def test_vehicles_hold_their_gains_as_float32_before_they_are_armed(loss: float)
     assert all(vehicle(fleet, system_id).flight.armed for system_id in (1, 2, 3))
 
 
-def test_a_gain_that_a_vehicle_does_not_take_ends_the_start_in_one_line_and_nothing_is_armed() -> None:
+def test_a_gain_not_taken_ends_the_start_with_nothing_armed() -> None:
     plan = flown(delayed(0.1))
     fleet, broken = Fleet(plan.scenario, START_NS), plan.gain.copy()
     broken[2, 2] = 2e4  # beyond what it takes
@@ -121,7 +119,7 @@ def test_a_gain_that_a_vehicle_does_not_take_ends_the_start_in_one_line_and_noth
     assert fleet.vehicle(2).counters["refused_parameter_value"] > 0
 
 
-def test_flights_are_the_same_to_the_last_bit_and_the_seed_moves_the_sensors() -> None:
+def test_flights_repeat_to_the_last_bit_and_seeds_move_sensors() -> None:
     def ticks(seed: int) -> bytes:
         calm = {"seed": seed, "duration_s": 2.0, "clocks": {"offset_max_s": 0.0, "drift_max_ppm": 0.0}}
         data = delayed(0.1).model_dump() | calm
@@ -130,7 +128,7 @@ def test_flights_are_the_same_to_the_last_bit_and_the_seed_moves_the_sensors() -
     assert ticks(1) == ticks(1) != ticks(2)
 
 
-def test_without_set_points_vehicles_keep_their_places_by_their_own_sensors_and_say_so() -> None:
+def test_without_set_points_vehicles_keep_their_places_by_own_sensors() -> None:
     plan = flown(delayed(0.17, duration_s=3.0))
     fleet = Fleet(plan.scenario, START_NS)
     now_ns = START_NS
@@ -151,7 +149,7 @@ def test_without_set_points_vehicles_keep_their_places_by_their_own_sensors_and_
 
 
 @pytest.mark.parametrize("act", [False, True])
-def test_while_a_vehicle_is_lost_all_keep_their_places_by_their_own_loops(act: bool) -> None:
+def test_when_one_is_lost_all_keep_place_by_own_loops(act: bool) -> None:
     """Vehicle 2, which the others act on and which acts on them, is not heard and hears nothing for six seconds."""
     gone = Link(delay_s=0.085, outages=(Outage(from_s=8.0, until_s=14.0),))
     scenario = delayed(0.17, duration_s=25.0)
@@ -201,7 +199,7 @@ def probed(plan: FlightPlan, link_delay_s: float) -> Any:
     return fly_trial(Trial(scenario, sparse_gain(plan.gain), plan.delay_margin_s, "probe", CRITICAL))
 
 
-def test_growth_in_flight_is_that_of_the_sampled_model_on_both_sides_of_the_margin() -> None:
+def test_growth_either_side_of_the_margin_matches_the_sampled_model() -> None:
     _, plan = thesis()
     outcomes = [probed(plan, part * plan.delay_margin_s) for part in (0.5, 0.95, 1.05)]
     assert [outcome.verdict for outcome in outcomes] == ["stable", "stable", "unstable"]
@@ -210,7 +208,7 @@ def test_growth_in_flight_is_that_of_the_sampled_model_on_both_sides_of_the_marg
         assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=2e-4)
 
 
-def test_clocks_that_are_apart_leave_growth_and_loop_delays_as_they_are() -> None:
+def test_clocks_apart_leave_growth_and_loop_delays_as_they_are() -> None:
     """The model takes the vehicles' steps as in step. By the difference of two flights with clocks at random."""
     still = load(THESIS).clocks.model_copy(update={"drift_max_ppm": 0.0})
     plan = flown(delayed(1.0, clocks=still))
@@ -225,7 +223,7 @@ def test_clocks_that_are_apart_leave_growth_and_loop_delays_as_they_are() -> Non
     assert found.growth_1_s == pytest.approx(loop.growth_at_1_s(delays_s), abs=1e-4)
 
 
-def test_no_delay_breaks_a_leader_follower_formation_and_the_search_for_one_says_so() -> None:
+def test_the_search_says_no_delay_breaks_a_leader_follower_formation() -> None:
     design, plan = flight_plan(onboard("chain3"))
     assert design.delay_margin_s is None
     with pytest.raises(NoOnset, match="the margin has no limit; in 5 flights with 0 to 2 s of link delay") as caught:
@@ -250,7 +248,7 @@ def test_control_rates_are_varied_together_with_those_on_board() -> None:
     assert parse(dump(scenario), THESIS) == scenario
 
 
-def test_ticks_of_the_formation_opened_by_the_station_keep_the_wider_spacing() -> None:
+def test_ticks_of_the_opened_formation_keep_the_wider_spacing() -> None:
     """The vehicles' own spacing stays as it was uploaded; the rest is streamed."""
     _, plan = flight_plan(onboard("chain3", duration_s=25.0, limits=Limits()))
     station = Station(plan, start_ns=START_NS)
@@ -271,7 +269,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("good", BAD)
-def test_what_the_onboard_loop_cannot_be_flown_with_is_refused_in_one_line(good: str) -> None:
+def test_what_onboard_loops_cannot_fly_is_refused_in_one_line(good: str) -> None:
     bad, key, wanted = BAD[good]
     with pytest.raises(ScenarioError) as caught:
         parse(THESIS.read_text().replace(good, bad), Path("x.toml"))

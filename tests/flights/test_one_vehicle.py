@@ -31,7 +31,7 @@ def flown(scenario: Scenario) -> tuple[Design, Summary]:
 
 
 @pytest.mark.parametrize("loop", ["ground", "onboard"])
-def test_one_vehicle_alone_flies_with_the_margin_of_its_own_velocity_loop(loop: Any) -> None:
+def test_one_vehicle_alone_has_the_margin_of_its_velocity_loop(loop: Any) -> None:
     design, summary = flown(LONE.model_copy(update={"control": Control(loop=loop)}))
     assert design.K1_1_s is not None
     own = -design.K1_1_s[0][0]

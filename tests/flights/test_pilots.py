@@ -1,83 +1,28 @@
 """A vehicle that its pilot flies is the pilot's, whatever else happens to it, until it reports that it is guided."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cache
-from typing import Any
 
 import pytest
 
-from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
+from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from gcs.station.station import Station
 from scenarios.link_schema import Link, Outage, VehicleLinks
 from scenarios.schema import ClockJump, Scenario
 from sim_vehicles.drive.fleet import Fleet
-from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.copter_rules import RULES
-from tests.flights.test_flight_copters import COPTERS5, TRUTH, plan_for, three
-from tests.support.sim_client import command, parse
-
-SECOND = 1_000_000_000
-LOITER, RTL, POSCTL = 5, 6, 3 << 16
-PILOTS_MODE = {"ardupilot": LOITER, "px4": POSCTL}
-COMMANDS = {"COMMAND_LONG", "COMMAND_INT", "SET_MODE"}
-SET_POINT = "SET_POSITION_TARGET_LOCAL_NED"
-SET_MESSAGE_INTERVAL = 511
-
-
-@dataclass
-class PilotsVehicle:
-    """A fleet with a pilot who changes the mode of vehicle 3; notes what the station tells it from then on."""
-
-    fleet: Fleet
-    flavour: str
-    modes: dict[float, int]
-    """Mode by time since the start in s."""
-    change: Callable[[bytes, int], list[tuple[bytes, int]]] = lambda data, now_ns: [(data, now_ns)]
-    """What becomes of a datagram that the vehicle sends."""
-    told: list[Any] = field(default_factory=list[Any])
-    """MAVLink messages."""
-    reached_ns: int = 0
-    """When the pilot's first mode must have reached the station; 0 before."""
-
-    @property
-    def copter(self) -> Copter:
-        craft = self.fleet.vehicle(3).craft
-        assert isinstance(craft, Copter)
-        return craft
-
-    def step(self, received: Sent, now_ns: int) -> Sent:
-        for at_s in [at_s for at_s in self.modes if START_NS + at_s * SECOND <= now_ns]:
-            self.fleet.vehicle(3).step([(pilots_switch(self.flavour, self.modes.pop(at_s)), now_ns)], now_ns)
-            self.reached_ns = self.reached_ns or now_ns + 3 * SECOND // 2
-        if 0 < self.reached_ns < now_ns:
-            self.told += [parse(data) for system_id, data, _ in received if system_id == 3]
-        sent: Sent = []
-        for system_id, data, time_ns in self.fleet.step(received, now_ns):
-            kept = self.change(data, time_ns) if system_id == 3 else [(data, time_ns)]
-            sent += [(system_id, each, at_ns) for each, at_ns in kept]
-        return sent
-
-    @property
-    def commanded(self) -> list[str]:
-        """What it was told that is none of the station's business: all but rates, and what keeps a PX4's door open."""
-        found = [
-            str(message)
-            for message in self.told
-            if message.get_type() in COMMANDS and getattr(message, "command", 0) != SET_MESSAGE_INTERVAL
-        ]
-        hovers = [message for message in self.told if message.get_type() == SET_POINT]
-        if self.flavour == "px4":  # enters OFFBOARD, by its pilot's switch, only while set-points come
-            hovers = [m for m in hovers if (m.vx, m.vy, m.afx, m.afy) != (0.0, 0.0, 0.0, 0.0)]
-        return found + [str(message) for message in hovers]
-
-
-def pilots_switch(flavour: str, mode: int) -> bytes:
-    """What a switch of the remote control does is the command, without a link."""
-    packed = (mode >> 16 & 0xFF, mode >> 24) if flavour == "px4" else (mode, 0)
-    return command(176, 1, *packed, system=3)
+from tests.support.flown_copters import COPTERS5, plan_for
+from tests.support.pilots import (
+    PILOTS_MODE,
+    POSCTL,
+    RTL,
+    SET_MESSAGE_INTERVAL,
+    PilotsVehicle,
+    flight_s,
+    flown,
+)
+from tests.support.sim_client import SECOND, parse
 
 
 def fly(
@@ -101,30 +46,15 @@ def fly(
     return station, pilots
 
 
-def flown(flavour: str, **changes: Any) -> Scenario:
-    """Three copters that fly from about 13 s on, for 20 s."""
-    return three(flavour=flavour, duration_s=20.0, **changes).model_copy(update={"response": TRUTH})
-
-
 def assert_left_alone(pilots: PilotsVehicle, mode: int) -> None:
     assert pilots.told, "nothing was sent at all: the test would not see a command"
     assert pilots.commanded == []
     assert pilots.copter.mode == mode
 
 
-@cache
-def flight_s(flavour: str) -> float:
-    """When the formation flight begins, after the start."""
-    station = Station(plan_for(flown(flavour)), start_ns=START_NS)
-    for tick in fly_lockstep(station.plan, station=station, vehicles=Fleet(flown(flavour), START_NS)):
-        if tick["time_s"][0] >= 0.0:
-            return (int(tick["due_ns"][0]) - START_NS) / SECOND
-    raise AssertionError("it never began")
-
-
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("by_s", [-0.2, 3.0, -1000.0])
-def test_a_clock_that_jumps_does_not_take_a_vehicle_from_its_pilot(flavour: str, by_s: float) -> None:
+def test_a_clock_jump_takes_no_vehicle_from_its_pilot(flavour: str, by_s: float) -> None:
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour, clock_jumps=(ClockJump(at_s=began_s + 8.0, by_s=by_s),))
     station, pilots = fly(scenario, flavour, {began_s + 5.0: mode})
@@ -134,7 +64,7 @@ def test_a_clock_that_jumps_does_not_take_a_vehicle_from_its_pilot(flavour: str,
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_silence_and_being_heard_again_do_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+def test_a_silence_that_ends_takes_no_vehicle_from_its_pilot(flavour: str) -> None:
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     gone = Link(delay_s=0.02, outages=(Outage(from_s=began_s + 7.0, until_s=began_s + 12.0),))
     own = (VehicleLinks(system_id=3, up=gone, down=gone),)
@@ -148,7 +78,7 @@ def test_silence_and_being_heard_again_do_not_take_a_vehicle_from_its_pilot(flav
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_an_old_heartbeat_after_a_silence_does_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+def test_an_old_heartbeat_after_a_silence_overrides_no_pilot(flavour: str) -> None:
     """What a link held back, or somebody recorded: guided, from before the pilot took over."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     kept: list[bytes] = []
@@ -186,7 +116,7 @@ def test_a_vehicle_heard_from_another_address_is_still_its_pilots(flavour: str) 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
 @pytest.mark.parametrize("after_the_end_s", [-1.5, 0.5, 2.0])
-def test_a_pilot_who_takes_over_while_the_flight_ends_is_not_told_to_hold(flavour: str, after_the_end_s: float) -> None:
+def test_no_hold_is_sent_to_pilots_intervening_at_the_end(flavour: str, after_the_end_s: float) -> None:
     began_s = flight_s(flavour)
     mode, end_s = PILOTS_MODE[flavour], began_s + 20.0
     lossy = VehicleLinks(system_id=2, up=Link(delay_s=0.02, outages=(Outage(from_s=end_s - 1.0, until_s=1e6),)))
@@ -199,7 +129,7 @@ def test_a_pilot_who_takes_over_while_the_flight_ends_is_not_told_to_hold(flavou
 
 @pytest.mark.parametrize("mode", [POSCTL, 4 << 16 | 5 << 24, 4 << 16 | 6 << 24, 4 << 16 | 3 << 24])
 @pytest.mark.parametrize("at_s", [5.0, 6.0])
-def test_a_px4_pilot_who_intervenes_before_the_first_offboard_is_left_alone(mode: int, at_s: float) -> None:
+def test_a_px4_pilot_intervening_before_first_offboard_is_left_alone(mode: int, at_s: float) -> None:
     """While it climbs; what the pilot chooses may also be the hold that a take-off ends in."""
     station, pilots = fly(flown("px4"), "px4", {at_s: mode}, until_s=30.0)
     assert station.vehicles[2].missing == "is armed and not in OFFBOARD: flown by its pilot or its autopilot"
@@ -207,7 +137,7 @@ def test_a_px4_pilot_who_intervenes_before_the_first_offboard_is_left_alone(mode
     assert pilots.copter.mode != RULES["px4"].guided_mode  # a pilot's return ends in a landing
 
 
-def test_a_take_off_that_was_not_answered_is_not_told_again_to_a_px4_whose_pilot_has_intervened() -> None:
+def test_unanswered_takeoffs_are_not_repeated_once_a_px4_pilot_intervenes() -> None:
     def change(data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
         message = parse(data)
         lost = message.get_type() == "COMMAND_ACK" and message.command == 22
@@ -218,7 +148,7 @@ def test_a_take_off_that_was_not_answered_is_not_told_again_to_a_px4_whose_pilot
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_a_pilot_who_intervenes_after_the_station_has_released_a_vehicle_is_left_alone(flavour: str) -> None:
+def test_a_pilot_intervening_after_release_is_left_alone(flavour: str) -> None:
     """A released PX4 leaves OFFBOARD by itself: it is called back from that failsafe, not from its pilot's mode."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
@@ -235,7 +165,7 @@ def test_a_pilot_who_intervenes_after_the_station_has_released_a_vehicle_is_left
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_the_next_station_does_not_take_a_vehicle_from_its_pilot(flavour: str) -> None:
+def test_the_next_station_takes_no_vehicle_from_its_pilot(flavour: str) -> None:
     """The first was killed; the second knows nothing of what was before."""
     began_s, mode = flight_s(flavour), PILOTS_MODE[flavour]
     scenario = flown(flavour)
@@ -256,7 +186,7 @@ def test_the_next_station_does_not_take_a_vehicle_from_its_pilot(flavour: str) -
     assert station.phase == "flying"
 
 
-def test_a_pilot_within_a_second_of_an_answer_is_seen_by_the_next_heartbeat() -> None:
+def test_the_next_heartbeat_shows_a_pilot_soon_after_an_answer() -> None:
     """What the station was told by an ACK holds against heartbeats from before, not against a mode that is new."""
     scenario = flown("ardupilot")
     station, pilots = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
@@ -271,7 +201,7 @@ def test_a_pilot_within_a_second_of_an_answer_is_seen_by_the_next_heartbeat() ->
     raise AssertionError("the pilot was never seen")
 
 
-def test_a_heartbeat_from_before_a_command_does_not_undo_what_its_answer_said() -> None:
+def test_a_heartbeat_before_a_command_does_not_undo_its_answer() -> None:
     vehicle = RemoteVehicle(3, startup=LaunchedStartup(50.0))
     vehicle.address = ("127.0.0.1", 3)
 

@@ -93,7 +93,7 @@ def test_the_measured_delay_is_followed() -> None:
     assert errors_m(ticks, from_s=10.0) < 1e-3 * 172.4
 
 
-def test_a_delay_that_drifts_to_ten_times_the_margin_is_followed_through_jitter_and_losses() -> None:
+def test_drift_to_ten_margins_is_followed_through_jitter_and_losses() -> None:
     """20 ms to 1.5 s each way within a minute, +-30 ms of jitter, 5 % of all datagrams lost.
 
     The formation flies 15 m/s: errors of the clocks, 5 ms here, are errors of position in proportion to the speed.

@@ -148,7 +148,7 @@ def test_reference_sees_another_seed_and_another_tick(changes: dict[str, Any]) -
     assert reference_of(fly_virtual(plan).ticks).sha256 != REFERENCES["triangle5, jitter and loss"].sha256
 
 
-def test_reference_sees_gains_that_differ_by_a_part_in_a_thousand() -> None:
+def test_the_reference_sees_gains_that_differ_by_a_thousandth() -> None:
     _, plan = flight_plan(scenario("chain3, above the margin"))
     end = reference_of(fly_virtual(replace(plan, gain=1.001 * plan.gain)).ticks).end
     known = REFERENCES["chain3, above the margin"].end
@@ -160,7 +160,7 @@ OLDER_PROCESSOR = {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "
 
 
 @pytest.mark.parametrize("other", [{"PYTHONHASHSEED": "12345"}, OLDER_PROCESSOR])
-def test_flight_is_the_same_to_the_last_bit_in_another_process(other: dict[str, str]) -> None:
+def test_another_process_flies_the_same_to_the_last_bit(other: dict[str, str]) -> None:
     """Another hash seed changes the order of sets, another processor that of sums; nothing flown may depend on them."""
     name = "triangle5, jitter and loss"
     here = hashlib.sha256(flown(name).tobytes()).hexdigest()

@@ -125,7 +125,7 @@ def test_signed_copters_start_and_fly(flavour: Flavour) -> None:
     assert not any(name.startswith("refused") for name in fleet.counters)
 
 
-def test_under_attack_at_both_ends_a_signed_flight_is_flown_as_without() -> None:
+def test_attacks_at_both_ends_do_not_change_a_signed_flight() -> None:
     plan = a_plan("triangle5", 6.0)
     calm, calm_station = flown(plan, a_fleet(plan), a_guard())
     attacked = Attacked(a_fleet(plan))
@@ -158,7 +158,7 @@ def test_ends_that_do_not_have_one_key_do_not_fly(fleet_key: Any, station_key: A
         assert fleet.counters["refused_unsigned"] > 30
 
 
-def test_links_that_reorder_cost_frames_and_do_not_look_like_an_attack() -> None:
+def test_reordering_links_cost_frames_but_look_like_no_attack() -> None:
     plan = a_plan("wifi_bursts", 10.0)
     fleet = a_fleet(plan)
     _, station = flown(plan, fleet, a_guard())
@@ -187,7 +187,7 @@ def test_a_restarted_station_refuses_what_was_recorded_before() -> None:
     assert a_guard().received(recorded, START_NS + 10**9, Counter())
 
 
-def test_a_copy_from_another_address_that_comes_first_does_not_make_the_frame_a_replay() -> None:
+def test_an_earlier_copy_from_elsewhere_makes_no_frame_a_replay() -> None:
     plan = a_plan("chain3", 2.0)
     calm, _ = flown(plan, a_fleet(plan), a_guard())
     station, guard, fleet = Station(plan, start_ns=START_NS), a_guard(), a_fleet(plan)
@@ -210,7 +210,7 @@ def test_a_copy_from_another_address_that_comes_first_does_not_make_the_frame_a_
     assert station.counters == {"known system id from another address": copies}
 
 
-def test_a_heartbeat_in_mavlink_1_is_an_exception_only_without_signing() -> None:
+def test_a_mavlink_1_heartbeat_is_an_exception_only_without_signing() -> None:
     scenario = load(SCENARIOS / "copters5.toml")
     _, plan = flight_plan(scenario)
     heartbeat = dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3).pack(

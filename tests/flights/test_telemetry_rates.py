@@ -35,7 +35,7 @@ def scenario_at(telemetry_hz: float, control_hz: float = 50.0, *, name: str = "c
     ("telemetry_hz", "margin_s"),
     [(100.0, 0.300000), (50.0, 0.300000), (25.0, 0.290179), (10.0, 0.261117), (5.0, 0.213938)],
 )
-def test_the_margin_of_a_flight_is_that_of_its_telemetry_rate(telemetry_hz: float, margin_s: float) -> None:
+def test_a_flight_has_the_margin_of_its_telemetry_rate(telemetry_hz: float, margin_s: float) -> None:
     """Margins of the same gains from the newest sample, by the march of events in
     `tests/gains/sampled/test_multirate.py`."""
     design, plan = flight_plan(scenario_at(telemetry_hz, control=GAINS))
@@ -80,14 +80,14 @@ def test_flown_growth_is_that_of_the_model_at_these_rates(telemetry_hz: float, c
 
 
 @pytest.mark.parametrize("telemetry_hz", [10.0, 30.0])
-def test_flown_growth_on_board_is_that_of_the_model_at_these_rates(telemetry_hz: float) -> None:
+def test_growth_flown_on_board_matches_the_model_at_these_rates(telemetry_hz: float) -> None:
     scenario = scenario_at(telemetry_hz, name="thesis_delay")
     _, plan = flight_plan(scenario)
     outcome = fly_trial(Study(plan).trial("probe", {"delay": 1.05 * plan.delay_margin_s}, seed=4))
     assert outcome.growth_1_s == pytest.approx(outcome.predicted_growth_1_s, abs=1e-3)
 
 
-def test_the_two_models_of_the_loop_on_board_are_one_where_both_hold() -> None:
+def test_the_two_onboard_loop_models_agree_where_both_hold() -> None:
     """Telemetry at a fifth of the control rate: the map from step to step, and that from event to event."""
     scenario = scenario_at(10.0, name="thesis_delay")
     _, plan = flight_plan(scenario)
@@ -99,7 +99,7 @@ def test_the_two_models_of_the_loop_on_board_are_one_where_both_hold() -> None:
         assert events == pytest.approx(loop.growth_1_s(delay_s), abs=1e-9)
 
 
-def test_a_state_used_again_makes_the_loop_no_later_and_one_that_stays_away_does() -> None:
+def test_missing_states_delay_the_loop_and_reused_ones_do_not() -> None:
     """Telemetry at 10 Hz of a vehicle whose link is gone for half a second: commands from one state, five and more."""
     gone = Link(delay_s=0.02, outages=(Outage(from_s=2.02, until_s=2.52),))
     links = scenario_at(10.0).links.model_copy(update={"up": gone})

@@ -1,0 +1,1 @@
+"""Gains and their delay margins: known answers, brackets and names of the whole package."""

@@ -16,7 +16,7 @@ from gains.performance.scalar_gains import decay_rate_of, least_singular_value
 from gains.performance.string_stability import largest_value
 
 
-def test_a_loop_that_stays_where_it_is_has_a_root_at_zero_at_every_delay() -> None:
+def test_at_every_delay_a_resting_loop_has_a_zero_root() -> None:
     """x'(t) = -x(t) + x(t - tau); a slow decay beside a fast one is no standstill."""
     assert is_singular_for_any_delay([np.array([[-1]]), np.array([[1]])])
     assert not is_singular_for_any_delay([np.diag([-1e9, -1e-9])])
@@ -53,7 +53,7 @@ def test_a_pair_falls_into_the_blocks_of_leader_and_follower() -> None:
     assert [(A0 + A1).tolist() for A0, A1 in blocks] == [[[-1.0]], [[0.0, -1.0], [1.0, -1.0]]]
 
 
-def test_a_block_crosses_the_axis_at_the_frequency_of_the_closed_form() -> None:
+def test_a_block_crosses_the_axis_at_the_closed_form_frequency() -> None:
     """s^2 + (s + 1) e^{-s tau}: omega^2 = (1 + sqrt 5) / 2 and tau = atan(omega) / omega."""
     found, omega = block_margin([[0, -1], [0, 0]], [[0, 0], [1, -1]]), ((1 + 5**0.5) / 2) ** 0.5
     assert (found.delay_margin_s, found.crossing_rad_s) == pytest.approx((np.arctan(omega) / omega, omega), rel=1e-9)

@@ -1,0 +1,1 @@
+"""Real processes, real UDP and the real clock."""

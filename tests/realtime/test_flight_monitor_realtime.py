@@ -45,7 +45,7 @@ def modes(events: list[dict[str, object]], system_id: int) -> set[str]:
     return {text.split("-> ")[1].split()[0] for text in texts}
 
 
-def test_over_udp_the_monitor_comes_to_the_verdicts_and_modes_of_virtual_time(tmp_path: Path) -> None:
+def test_over_udp_verdicts_and_modes_are_those_of_virtual_time(tmp_path: Path) -> None:
     flights: dict[str, subprocess.Popen[str]] = {}
     for name, scenario in FLOWN.items():
         file = tmp_path / f"{name}.toml"

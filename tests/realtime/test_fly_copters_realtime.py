@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Generator
@@ -14,17 +13,12 @@ import pytest
 
 from scenarios import files
 from tests.support.paths import SCENARIOS
+from tests.support.processes import free_port
 
 COPTERS5 = SCENARIOS / "copters5.toml"
 RUN_S = 80.0
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @contextmanager
@@ -38,7 +32,7 @@ def vehicles_of(scenario_file: Path, port: int) -> Generator[None]:
         process.wait(10.0)
 
 
-def test_three_arducopters_and_two_px4_that_were_not_started_here_are_identified_and_flown(tmp_path: Path) -> None:
+def test_arducopters_and_px4_started_elsewhere_are_identified_and_flown(tmp_path: Path) -> None:
     scenario = files.load(COPTERS5)
     mixed = (v.model_copy(update={"flavour": "px4" if v.system_id > 3 else None}) for v in scenario.vehicles)
     scenario = scenario.model_copy(update={"vehicles": tuple(mixed), "duration_s": 10.0, "altitude_m": 5.0})

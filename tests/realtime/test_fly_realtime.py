@@ -4,12 +4,9 @@ import json
 import os
 import resource
 import signal
-import socket
 import struct
 import subprocess
-import sys
 import time  # noqa: TID251 - waits for processes, with time-outs
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,69 +18,15 @@ from gcs.control.tick import TICK, TickArray
 from gcs.drive.sitl import ORPHAN_S
 from gcs.runs.files import read_ticks
 from gcs.runs.record import TRUTH_FILE
-from scenarios.files import dump, load
 from sim_vehicles.links.truth import ACTED, SAMPLED, read_truth
 from tests.support.paths import SCENARIOS
+from tests.support.processes import GCS, PATIENCE_S, children_named, fly, flying, free_port, short, until
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
-
-GCS = [sys.executable, "-m", "gcs"]
-PATIENCE_S = 60.0
-
-
-def short(tmp_path: Path, name: str, duration_s: float) -> Path:
-    """A scenario of the repository, made shorter."""
-    scenario = load(SCENARIOS / f"{name}.toml").model_copy(update={"duration_s": duration_s})
-    file = tmp_path / f"{name}.toml"
-    file.write_text(dump(scenario), encoding="utf-8")
-    return file
-
-
-def fly(*arguments: str | Path, **kwargs: Any) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [*GCS, "fly", *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs
-    )
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.05)
-
-
-def flying(folder: Path, at_least_s: float = 1.0) -> bool:
-    """Whether the run has flown for that long."""
-    file = folder / "ticks.part"
-    if not file.exists():
-        return False
-    whole = file.stat().st_size // TICK.itemsize * TICK.itemsize
-    ticks = np.frombuffer(file.read_bytes()[:whole], TICK)
-    return bool(ticks.size and ticks["time_s"][-1] > at_least_s)
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def vehicles_log(folder: Path) -> str:
     return (folder / "vehicles.log").read_text(encoding="utf-8")
-
-
-def children_named(text: str) -> list[int]:
-    """Process ids whose command line contains a text that only this test uses."""
-    found: list[int] = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                command = (entry / "cmdline").read_bytes().decode(errors="replace")
-            except OSError:
-                continue
-            if text in command and "sim_vehicles.drive.cli" in command:
-                found.append(int(entry.name))
-    return found
 
 
 def true_loop_delay_s(folder: Path, ticks: TickArray) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -101,7 +44,7 @@ def true_loop_delay_s(folder: Path, ticks: TickArray) -> np.ndarray[Any, np.dtyp
 
 
 @pytest.mark.parametrize("delay_s", [0.02, 0.06])
-def test_flight_over_udp_settles_and_reports_the_loop_delay_that_the_links_had(tmp_path: Path, delay_s: float) -> None:
+def test_a_udp_flight_settles_and_reports_its_links_loop_delay(tmp_path: Path, delay_s: float) -> None:
     folder = tmp_path / "run"
     scenario = short(tmp_path, "triangle5", 8.0)
     process = fly(scenario, "--listen", "127.0.0.1:0", "--link-delay", str(delay_s), "--out", folder, "--json")
@@ -165,7 +108,7 @@ def test_too_late_a_link_is_unstable_and_exit_code_1(tmp_path: Path) -> None:
         (False, signal.SIGHUP),
     ],
 )
-def test_ctrl_c_sigterm_and_a_closed_terminal_leave_whole_files_and_no_traceback(
+def test_ctrl_c_sigterm_and_hangup_leave_whole_files_without_traceback(
     tmp_path: Path, early: bool, number: signal.Signals
 ) -> None:
     folder = tmp_path / "run"
@@ -181,7 +124,7 @@ def test_ctrl_c_sigterm_and_a_closed_terminal_leave_whole_files_and_no_traceback
     assert not children_named(str(folder))
 
 
-def test_killed_station_leaves_readable_logs_and_a_new_one_takes_the_vehicles_back(tmp_path: Path) -> None:
+def test_after_a_kill_logs_are_readable_and_vehicles_taken_back(tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     scenario, port = short(tmp_path, "triangle5", 10.0), free_port()
     listen = f"127.0.0.1:{port}"
@@ -215,7 +158,7 @@ def test_killed_station_leaves_readable_logs_and_a_new_one_takes_the_vehicles_ba
             os.kill(pid, signal.SIGTERM)
 
 
-def test_vehicles_at_a_port_that_nobody_listens_at_again_end_with_their_station(tmp_path: Path) -> None:
+def test_vehicles_nobody_listens_to_again_end_with_their_station(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     process = fly(short(tmp_path, "chain3", 60.0), "--listen", "127.0.0.1:0", "--out", folder)
     until(lambda: flying(folder))
@@ -272,7 +215,7 @@ def test_a_full_disk_ends_the_logs_and_not_the_flight(tmp_path: Path) -> None:
     assert not children_named(str(folder))
 
 
-def test_vehicles_with_loops_of_their_own_keep_their_places_without_a_station_and_are_taken_back(
+def test_onboard_loops_keep_vehicles_in_place_until_a_station_returns(
     tmp_path: Path,
 ) -> None:
     first, second = tmp_path / "first", tmp_path / "second"

@@ -12,9 +12,9 @@ from gcs.link.vehicle import RemoteVehicle
 from scenarios.files import load
 from sim_vehicles.drive.relay_udp import Peers
 from sim_vehicles.links.relay import Relay
-from tests.flights.test_fuzz import SCENARIOS
-from tests.sim_vehicles.test_sim_relay import free_port
 from tests.support.hostile import SAID_BY_STATIONS, SAID_BY_VEHICLES, any_message, changed, extreme, in_version_1, noise
+from tests.support.paths import SCENARIOS
+from tests.support.processes import free_port
 
 pytestmark = pytest.mark.realtime
 ROUNDS = 60

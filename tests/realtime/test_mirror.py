@@ -99,7 +99,7 @@ def acknowledged(heard: list[bytes]) -> list[int]:
     return [m.get_srcSystem() for m in messages if m.get_type() == "COMMAND_ACK" and m.command == PROBE]
 
 
-def test_the_other_station_hears_the_whole_flight_and_cannot_touch_it(tmp_path: Path) -> None:
+def test_the_other_station_hears_everything_and_cannot_touch_the_flight(tmp_path: Path) -> None:
     with listening() as other:
         summary, run = fly(tmp_path, "--mirror", other.address)
     logged = [frame.data for _, frame in read_tlog(run / "flight.tlog").frames]
@@ -114,7 +114,7 @@ def test_the_other_station_hears_the_whole_flight_and_cannot_touch_it(tmp_path: 
     assert acknowledged(other.heard) == []
 
 
-def test_commands_of_the_other_station_reach_the_vehicle_they_are_for_where_that_is_asked_for(tmp_path: Path) -> None:
+def test_the_other_stations_commands_reach_their_vehicle_if_asked_for(tmp_path: Path) -> None:
     with listening(mavlink.STATION_SYSTEM_ID) as other:
         summary, _ = fly(tmp_path, "--mirror", other.address, "--mirror-commands")
     assert summary["verdict"] == "stable"
@@ -133,7 +133,7 @@ def test_a_vehicle_obeys_one_station_also_through_a_mirror(tmp_path: Path) -> No
     assert refused > 1
 
 
-def test_a_mirror_where_nobody_listens_is_counted_and_the_flight_goes_on(tmp_path: Path) -> None:
+def test_an_unheard_mirror_is_counted_and_the_flight_goes_on(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -143,7 +143,7 @@ def test_a_mirror_where_nobody_listens_is_counted_and_the_flight_goes_on(tmp_pat
     assert summary["control"]["ticks"] > 100  # of 150; a busy machine takes some away
 
 
-def test_mavsdk_on_a_mirror_finds_all_vehicles_and_where_they_fly(tmp_path: Path) -> None:
+def test_mavsdk_on_a_mirror_finds_every_vehicle_and_its_position(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -165,7 +165,7 @@ def test_mavsdk_on_a_mirror_finds_all_vehicles_and_where_they_fly(tmp_path: Path
     assert summary["mirror"]["refused HEARTBEAT"] >= 1
 
 
-def test_what_is_garbled_or_in_a_vehicles_name_is_not_passed_on() -> None:
+def test_nothing_garbled_or_in_a_vehicles_name_is_passed_on() -> None:
     vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
     vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
     with (
@@ -190,7 +190,7 @@ def test_what_is_garbled_or_in_a_vehicles_name_is_not_passed_on() -> None:
     assert sum(count for name, count in mirror.counters.items() if name.startswith("refused: ")) == 1
 
 
-def test_a_display_that_connects_in_flight_does_not_slow_the_telemetry_that_is_flown_with() -> None:
+def test_a_display_connecting_in_flight_does_not_slow_the_telemetry() -> None:
     vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
     vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
     mav = dialect.MAVLink(None, srcSystem=255)
@@ -214,7 +214,7 @@ def test_a_display_that_connects_in_flight_does_not_slow_the_telemetry_that_is_f
     assert mirror.counters[refused.format("COMMAND_LONG")] == mirror.counters[refused.format("COMMAND_INT")] == 1
 
 
-def test_on_a_signed_link_the_other_station_gets_signed_frames_and_is_heard_only_if_it_signs() -> None:
+def test_a_signed_link_mirrors_and_hears_signed_frames_only() -> None:
     vehicle = RemoteVehicle(1, startup=LaunchedStartup(1.0))
     vehicle.address, vehicle.armed, vehicle.custom_mode = ("127.0.0.1", 9), True, vehicle.kind.guided_mode
     ours, theirs = Guard(Key(KEY), epoch_ns=EPOCH_NS, stamps=Stamps()), a_sender(system=255)

@@ -42,7 +42,7 @@ def vehicles(address: str) -> Generator[None]:
             process.terminate()
 
 
-def test_links_are_watched_for_the_time_asked_and_compared_with_the_margin_of_the_scenario() -> None:
+def test_links_are_watched_and_compared_with_the_scenarios_margin() -> None:
     address = free_address()
     with vehicles(address):
         process = monitor("scenarios/chain3.toml", "--listen", address, "--for", "4", "--json")
@@ -72,7 +72,7 @@ def test_ctrl_c_prints_the_figures_and_what_was_sent() -> None:
 
 
 @pytest.mark.parametrize("option", ["--silent", "--json"])
-def test_a_vehicle_is_sent_timesync_requests_and_nothing_else_or_nothing_at_all(option: str) -> None:
+def test_a_vehicle_is_sent_only_timesync_requests_or_nothing(option: str) -> None:
     address = free_address()
     host, _, port = address.partition(":")
     sender = dialect.MAVLink(None, srcSystem=7, srcComponent=1)

@@ -20,8 +20,8 @@ import pytest
 
 from gcs.control.tick import Event
 from gcs.runs.record import READY_FILE, RECORDING_FILE, TICKS_FILE, UNFINISHED_FILE
-from tests.gcs.views.test_recording import read_back
 from tests.support.flown_run import line, prepare, ticks_of
+from tests.support.recordings import read_back
 
 pytestmark = pytest.mark.realtime
 FIVE = line(5)
@@ -64,7 +64,7 @@ def ticks_so_far(growing: Path) -> int:
     return 0
 
 
-def test_a_growing_run_is_followed_to_its_end_and_ctrl_c_is_left_to_the_parent(tmp_path: Path) -> None:
+def test_growing_runs_are_followed_to_their_end_despite_ctrl_c(tmp_path: Path) -> None:
     writer = prepare(tmp_path, FIVE)
     ticks = ticks_of(FIVE, start_s=-1.0, count=700)
     ready, growing = tmp_path / READY_FILE, tmp_path / UNFINISHED_FILE
@@ -122,7 +122,7 @@ def test_an_orphan_closes_the_recording_and_ends(tmp_path: Path) -> None:
     assert recorded(tmp_path) == 100
 
 
-def test_the_table_is_drawn_on_a_terminal_until_sigterm_closes_the_recording(tmp_path: Path) -> None:
+def test_the_terminal_shows_the_table_until_sigterm_closes_the_recording(tmp_path: Path) -> None:
     writer = prepare(tmp_path, FIVE)
     controller, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 120, 0, 0))

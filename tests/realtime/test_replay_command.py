@@ -40,7 +40,7 @@ def quantiles_ms(figures: dict[str, Any], *names: str) -> list[float]:
     return [1e3 * figures[name] for name in names]
 
 
-def test_the_log_of_a_run_gives_its_summary_within_tenths_of_a_millisecond(tmp_path: Path) -> None:
+def test_a_runs_log_gives_its_summary_to_tenths_of_milliseconds(tmp_path: Path) -> None:
     scenario = load(ROOT / "scenarios" / "chain3.toml").model_copy(update={"duration_s": 5.0})
     (tmp_path / "chain3.toml").write_text(dump(scenario), encoding="utf-8")
     run = tmp_path / "run"
@@ -74,7 +74,7 @@ def test_the_log_of_a_run_gives_its_summary_within_tenths_of_a_millisecond(tmp_p
     assert "1 damaged places" in shown.stdout
 
 
-def test_a_log_written_by_pymavlinks_own_logger_shows_its_links_and_errors(tmp_path: Path) -> None:
+def test_pymavlinks_own_log_shows_its_links_and_errors(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])

@@ -24,7 +24,8 @@ from scenarios.files import load
 from scenarios.schema import FixedGains
 from scenarios.signing.keys import Key, make_key, read_key
 from scenarios.signing.stamps import Stamps, open_stamps
-from tests.realtime.test_fly_realtime import PATIENCE_S, SCENARIOS, children_named, fly, flying, free_port, short, until
+from tests.support.paths import SCENARIOS
+from tests.support.processes import PATIENCE_S, children_named, fly, flying, free_port, short, until
 from tests.support.signed_peer import KEY, OTHER_KEY, position
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
@@ -57,7 +58,7 @@ def holds_key(folder: Path, secret: bytes) -> list[str]:
     return [file.name for file in files if any(form in file.read_bytes() for form in forms)]
 
 
-def test_a_signed_flight_is_stable_under_attack_and_says_what_it_refused(tmp_path: Path) -> None:
+def test_under_attack_a_signed_flight_is_stable_and_reports_refusals(tmp_path: Path) -> None:
     key_file, folder, port = tmp_path / "formation.key", tmp_path / "run", free_port()
     make_key(key_file)
     process = fly(
@@ -87,7 +88,7 @@ def test_a_signed_flight_is_stable_under_attack_and_says_what_it_refused(tmp_pat
     assert holds_key(folder, OTHER_KEY) == []  # nor one that was sent to us
 
 
-def test_after_a_kill_a_new_station_with_the_key_takes_the_vehicles_back(tmp_path: Path) -> None:
+def test_after_a_kill_another_station_with_the_key_takes_over(tmp_path: Path) -> None:
     key_file, first, second = (tmp_path / name for name in ("key", "first", "second"))
     make_key(key_file)
     scenario, listen = short(tmp_path, "chain3", 4.0), f"127.0.0.1:{free_port()}"
@@ -106,7 +107,7 @@ def test_after_a_kill_a_new_station_with_the_key_takes_the_vehicles_back(tmp_pat
             os.kill(pid, signal.SIGTERM)
 
 
-def test_vehicles_that_cannot_start_as_others_have_their_timestamps_end_the_flight_with_what_they_said(
+def test_vehicles_whose_timestamps_are_taken_end_the_flight_saying_so(
     tmp_path: Path,
 ) -> None:
     key_file = tmp_path / "key"
@@ -121,7 +122,7 @@ def test_vehicles_that_cannot_start_as_others_have_their_timestamps_end_the_flig
 
 
 @pytest.mark.parametrize("signed", [False, True])
-def test_a_port_that_others_can_reach_is_warned_of_unless_it_is_signed(tmp_path: Path, signed: bool) -> None:
+def test_an_unsigned_port_that_others_can_reach_is_warned_of(tmp_path: Path, signed: bool) -> None:
     make_key(tmp_path / "key")
     key = ["--key", tmp_path / "key"] if signed else []
     process = fly(short(tmp_path, "chain3", 0.2), "--listen", "0.0.0.0:0", *key, "--out", tmp_path / "run", "--json")
@@ -146,7 +147,7 @@ def signed_vehicles(tmp_path: Path, station_port: int) -> Generator[None]:
         process.wait(PATIENCE_S)
 
 
-def test_a_monitor_with_the_key_is_answered_and_one_without_hears_only(tmp_path: Path) -> None:
+def test_monitors_with_the_key_are_answered_and_others_only_hear(tmp_path: Path) -> None:
     port = free_port()
     with signed_vehicles(tmp_path, port):
         watch = [
@@ -182,7 +183,7 @@ def answers(link: socket.socket, mav: Any, data: bytes, address: Any, wanted: st
     return None
 
 
-def test_a_station_of_pymavlinks_with_the_key_commands_our_vehicles_and_no_other_does(tmp_path: Path) -> None:
+def test_only_a_pymavlink_station_with_the_key_commands_our_vehicles(tmp_path: Path) -> None:
     arm = dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(("127.0.0.1", 0))
@@ -203,7 +204,7 @@ def test_a_station_of_pymavlinks_with_the_key_commands_our_vehicles_and_no_other
             assert station.signing.goodsig_count > 5
 
 
-def test_our_station_flies_with_a_vehicle_of_pymavlinks_that_has_the_key_and_hears_no_other() -> None:
+def test_our_station_flies_a_pymavlink_vehicle_only_with_the_key() -> None:
     """Up to what the station asks of it: the vehicle's clock, its telemetry rate, its mode."""
     scenario = load(SCENARIOS / "chain3.toml")
     gains = scenario.control.model_copy(update={"gains": FixedGains(K1=-3.4, K2=0.6, K3=5.6)})

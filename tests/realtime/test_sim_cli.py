@@ -86,9 +86,7 @@ def take_off(client: Client) -> None:
 
 
 @pytest.mark.realtime
-def test_a_client_arms_a_vehicle_flies_it_and_it_tells_when_it_is_left_alone(
-    client: Client, scenario_file: Path, tmp_path: Path
-) -> None:
+def test_a_vehicle_flown_by_a_client_tells_when_left_alone(client: Client, scenario_file: Path, tmp_path: Path) -> None:
     with vehicles(scenario_file, client, "--truth", str(tmp_path / "truth")) as process:
         take_off(client)
         client.say(heartbeat(), setpoint(10.0))
@@ -116,7 +114,7 @@ def test_a_client_arms_a_vehicle_flies_it_and_it_tells_when_it_is_left_alone(
 
 
 @pytest.mark.realtime
-def test_vehicles_outlive_their_station_and_are_taken_over_by_the_next(client: Client, scenario_file: Path) -> None:
+def test_vehicles_outlive_their_station_and_the_next_takes_over(client: Client, scenario_file: Path) -> None:
     with vehicles(scenario_file, client, "--stop-after-silence", "2") as process:
         take_off(client)
         client.say(setpoint())

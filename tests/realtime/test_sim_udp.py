@@ -29,7 +29,7 @@ def ports(station: socket.socket) -> Generator[Ports]:
     opened.sockets.close()
 
 
-def test_each_vehicle_has_a_port_and_answers_come_back_to_it(station: socket.socket, ports: Ports) -> None:
+def test_each_vehicle_has_a_port_where_answers_come_back(station: socket.socket, ports: Ports) -> None:
     ports.send([(1, b"one", 0), (7, b"seven", 0)])
     addresses = dict((station.recvfrom(100), station.recvfrom(100)))
     assert addresses[b"one"] != addresses[b"seven"]
@@ -43,9 +43,7 @@ def test_each_vehicle_has_a_port_and_answers_come_back_to_it(station: socket.soc
     assert ports.receive() == []
 
 
-def test_datagrams_bear_the_time_of_their_arrival_not_that_of_their_reading(
-    station: socket.socket, ports: Ports
-) -> None:
+def test_datagrams_bear_their_time_of_arrival_not_of_reading(station: socket.socket, ports: Ports) -> None:
     ports.send([(1, b"x", 0)])
     _, address = station.recvfrom(100)
     errors_ns: list[int] = []
@@ -91,7 +89,7 @@ def test_a_datagram_ends_the_wait(station: socket.socket, ports: Ports) -> None:
     assert [data for _, data, _ in ports.receive()] == [b"wake up"]
 
 
-def test_a_dead_station_is_counted_and_a_new_one_on_its_port_is_found(station: socket.socket, ports: Ports) -> None:
+def test_a_dead_station_is_counted_and_its_successor_is_found(station: socket.socket, ports: Ports) -> None:
     address = station.getsockname()
     station.close()
     for _ in range(3):

@@ -16,7 +16,7 @@ def spin(wait_ns: int) -> None:
         pass
 
 
-def test_a_datagram_came_after_it_was_sent_and_before_it_was_read_and_waited_in_between() -> None:
+def test_a_datagram_arrives_between_sending_and_reading_and_waits() -> None:
     with StationSocket("127.0.0.1", 0) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
         # Linux begins to stamp some time after the first socket has asked for it; until then reading stamps.
         for _ in range(1000):

@@ -37,9 +37,7 @@ def start_flight(shown: Terminal, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_table_of_a_flight_shows_rows_headroom_and_modes_and_ctrl_c_gives_the_shell_back(
-    kind: str, tmp_path: Path
-) -> None:
+def test_the_flight_table_stands_until_ctrl_c_restores_the_shell(kind: str, tmp_path: Path) -> None:
     with terminal(kind, 120, 40, tmp_path) as shown:
         start_flight(shown, tmp_path)
         text = shown.lines()
@@ -60,7 +58,7 @@ def test_the_table_of_a_flight_shows_rows_headroom_and_modes_and_ctrl_c_gives_th
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("columns", "lines"), [(60, 24), (40, 20)])
-def test_a_narrow_terminal_shows_who_is_how_close_in_which_mode(
+def test_a_narrow_terminal_shows_each_vehicles_headroom_and_mode(
     kind: str, columns: int, lines: int, tmp_path: Path
 ) -> None:
     with terminal(kind, columns, lines, tmp_path) as shown:
@@ -82,7 +80,7 @@ def test_a_narrow_terminal_shows_who_is_how_close_in_which_mode(
         assert is_restored(shown)
 
 
-def test_the_monitors_table_shows_links_and_ctrl_c_gives_the_shell_back(tmp_path: Path) -> None:
+def test_the_links_table_stands_until_ctrl_c_restores_the_shell(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"

@@ -1,0 +1,1 @@
+"""Scenarios and their keys: what is read, checked and refused."""

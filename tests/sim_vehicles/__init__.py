@@ -1,0 +1,1 @@
+"""The simulated vehicles and their links, room by room."""

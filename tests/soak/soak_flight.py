@@ -28,9 +28,9 @@ from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.drive.guard import signed_links
 from sim_vehicles.links.truth import DTYPE, Row
 from sim_vehicles.services.clock import BootClock
-from tests.flights.test_fuzz import TO_VEHICLES, any_message, changed, noise
 from tests.soak.soak_experiments import Experiment, Fault
 from tests.soak.soak_scenarios import AUTOPILOT_START_S
+from tests.support.hostile import TO_VEHICLES, any_message, changed, noise
 
 CONNECT_S = 25.0
 """Longest start of double integrators. A flight that takes longer than its start and duration is told to end."""

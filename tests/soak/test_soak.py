@@ -83,7 +83,7 @@ def test_a_repetition_that_is_none_is_seen(telemetry_hz: float, wrong_s: float) 
     assert broken == {"repetitions", "loop delay"}
 
 
-def test_an_unstable_loop_is_refused_or_flown_where_that_is_allowed() -> None:
+def test_an_unstable_loop_is_refused_unless_flying_it_is_allowed() -> None:
     scenario = short_scenario(FixedGains(K1=3.0, K2=0.6, K3=5.6))
     refused = judge(Experiment(scenario))
     assert refused.refused.startswith("control.gains: read a loop that is unstable without any delay")

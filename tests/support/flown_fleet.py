@@ -1,7 +1,6 @@
 """Vehicles in a process of their own, for the tests with clients of other people's."""
 
 import contextlib
-import socket
 import subprocess
 import sys
 import time  # noqa: TID251 - the clients have threads and clocks of their own
@@ -12,6 +11,7 @@ from typing import Any
 from scenarios import files
 from scenarios.schema import Scenario
 from tests.support.paths import SCENARIOS
+from tests.support.processes import free_port
 
 PATIENCE_S = 60.0
 
@@ -37,9 +37,7 @@ def fleet(scenario: Scenario, folder: Path, *options: str) -> Generator[int]:
     """The vehicles of a scenario, with further options of their command, and the port they send to."""
     file = folder / "scenario.toml"
     file.write_text(files.dump(scenario), encoding="utf-8")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-m", "sim_vehicles.drive.cli", str(file), "--station", f"127.0.0.1:{port}", *options]
     with subprocess.Popen([*command, "--duration", "90"], stdout=subprocess.DEVNULL) as process:
         try:

@@ -17,6 +17,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 MESSAGES: dict[int, Any] = dict(sorted(dialect.mavlink_map.items()))
 SAID_BY_VEHICLES = [0, 1, 22, 24, 32, 33, 49, 77, 111, 148, 193, 230, 242, 245, 253]
 SAID_BY_STATIONS = [0, 11, 20, 21, 23, 40, 43, 44, 45, 51, 66, 75, 76, 84, 110, 111]
+TO_VEHICLES = {0, 11, 23, 66, 75, 76, 84, 111}
+"""HEARTBEAT, SET_MODE, PARAM_SET, REQUEST_DATA_STREAM, COMMAND_INT and _LONG, set-points, TIMESYNC: a vehicle may take
+these from its station."""
 _COMMANDS = [16, 20, 21, 22, 176, 183, 400, 410, 510, 511, 512, 519, 520]
 _REALS = (math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e-45, 0.0, -0.0, 1.0, -1.0, 4.0, 1e9, 1e10, 20_000.0)
 _Value = TypeVar("_Value")

@@ -1,7 +1,11 @@
 """A leader and a follower with given gains: the cheapest formation, for tests of campaigns."""
 
+from dataclasses import replace
+
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
+from gcs.stress.study import Study
+from gcs.stress.trial import Trial
 from scenarios.schema import Control, FixedGains, Monitor, NominalVelocity, Scenario, Vehicle
 
 SCENARIO = Scenario(
@@ -23,3 +27,11 @@ SCENARIO = Scenario(
 def pair_plan() -> FlightPlan:
     _, plan = flight_plan(SCENARIO)
     return plan
+
+
+def trials(count: int, *, bad: int = -1) -> list[Trial]:
+    """Short own flights at different delays; one of them may have a gain matrix that does not fit."""
+    study = Study(pair_plan())
+    study = replace(study, plan=replace(study.plan, scenario=SCENARIO.model_copy(update={"duration_s": 1.0})))
+    made = [study.trial("own", {"delay": round(0.01 * k, 3)}, seed=7) for k in range(count)]
+    return [replace(trial, gain=((99, 0, 1.0),)) if k == bad else trial for k, trial in enumerate(made)]

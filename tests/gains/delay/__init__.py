@@ -1,0 +1,1 @@
+"""Continuous loops with constant delays: windows of stability, and several delays at once."""

@@ -114,7 +114,7 @@ def own_part(K: Matrix) -> Matrix:
     return own
 
 
-def test_thesis_gains_take_1_00796_s_when_only_the_neighbours_are_late() -> None:
+def test_thesis_gains_take_1_00796_s_from_late_neighbours_only() -> None:
     A, B, K = thesis_loop()
     own = own_part(K)
     # the published 0.19 s does not follow from the published gains: erratum, confirmed by three methods
@@ -133,7 +133,7 @@ def test_thesis_gains_settle_as_published_at_0_17_s() -> None:
     assert rightmost_root([(A + B @ own, 0.0), (B @ (K - own), 0.17)]).real == pytest.approx(-1.106, abs=5e-4)
 
 
-def test_own_feedback_at_once_makes_a_leader_follower_tree_independent_of_delay() -> None:
+def test_immediate_own_feedback_makes_a_leader_follower_tree_delay_independent() -> None:
     A, B, K = chain(4, 1.0, 1.0)
     own = np.zeros_like(K)
     own[0, 0] = K[0, 0]

@@ -149,7 +149,7 @@ def test_a_gain_that_does_not_fit_the_inputs_is_refused() -> None:
         late_by_vehicle(np.ones((3, 2)), np.eye(3), [slice(0, 1), slice(1, 2)])
 
 
-def test_edge_of_two_delays_in_blocks_of_their_own_is_the_rectangle() -> None:
+def test_edge_of_two_delays_in_separate_blocks_is_the_rectangle() -> None:
     """Both sides, whichever matrix is called the first."""
     formation, K = formation_with_k3((1.0, 0.5))
     leader, *late = late_by_vehicle(formation.B, K, [formation.input_slice(i) for i in range(3)])

@@ -37,7 +37,7 @@ def test_default_design_has_just_the_margin_asked_for(default_design: Design) ->
     assert default_design.delay_margin_continuous_s - margin_s == pytest.approx(PERIOD_S / 2, abs=2e-3)
 
 
-def test_sampled_loop_is_stable_just_below_the_margin_and_not_just_above(default_design: Design) -> None:
+def test_sampled_loop_is_stable_just_below_its_margin_not_above(default_design: Design) -> None:
     """By the spectral radius of the one-period map, which no formula of the design uses."""
     K = TRIANGLE.overlapping_gain(default_design.K1, default_design.K2, default_design.K3)
     below, above = (
@@ -145,7 +145,7 @@ def test_decay_rate_is_refused_only_where_no_gains_have_it() -> None:
         {"alpha": 0.805, "delay_margin_s": 0.3, "string_peak_max": 1.0},
     ],
 )
-def test_what_cannot_be_had_is_refused_with_what_each_part_would_have_to_be(wanted: dict[str, Any]) -> None:
+def test_a_refusal_says_what_each_part_would_have_to_be(wanted: dict[str, Any]) -> None:
     with pytest.raises(InfeasibleError) as refused:
         design(TRIANGLE, Requirement(**wanted), period_s=PERIOD_S)
     offers = re.findall(r"lower (\w+) to ([0-9.e-]+)", str(refused.value))
@@ -216,7 +216,7 @@ def test_coupled_axes_are_evaluated() -> None:
     assert found.certificate is not None
 
 
-def test_an_unstable_loop_is_reported_with_no_margin_and_no_proof() -> None:
+def test_an_unstable_loop_is_reported_without_margin_and_proof() -> None:
     found = evaluate_gains(TRIANGLE, (EYE, EYE, EYE), period_s=0.02)
     assert (found.alpha, found.delay_margin_s, found.delay_margin_continuous_s, found.certificate) == (0, 0, 0, None)
 

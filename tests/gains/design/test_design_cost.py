@@ -12,7 +12,7 @@ from gcs.studies.compare_cost import DesignCost, ratios
 CHAIN = formation_plant(FormationModel((-1, 0, 1), axes=1))
 
 
-def test_centralised_lqr_is_stationary_and_its_cost_is_that_of_the_lyapunov_equation() -> None:
+def test_centralised_lqr_is_stationary_at_the_lyapunov_equations_cost() -> None:
     weights = Weights(np.eye(CHAIN.states), np.eye(3))
 
     def cost(K: np.ndarray) -> float:

@@ -42,7 +42,7 @@ def test_formations_have_no_fixed_modes(pattern: Pattern) -> None:
     assert fixed_modes(PLANT, pattern) == ()
 
 
-def test_a_vehicle_that_may_not_use_its_own_output_cannot_be_stabilised_and_the_missing_link_is_named() -> None:
+def test_a_missing_own_output_prevents_stability_and_is_named() -> None:
     pattern = without_links(leader_follower(CHAIN), [(2, 2)])
     with pytest.raises(InfeasibleError, match=r"\(2, 2\)"):
         check_stabilisable(PLANT, pattern)
@@ -54,7 +54,7 @@ def test_with_all_information_the_structured_optimum_is_the_centralised_one() ->
 
 
 @pytest.mark.parametrize("pattern", [leader_follower(CHAIN), bidirectional(CHAIN)], ids=["tree", "bidirectional"])
-def test_structured_optimum_is_stationary_stable_in_the_pattern_and_costs_more(pattern: Pattern) -> None:
+def test_structured_optimum_is_stationary_stable_in_pattern_and_costs_more(pattern: Pattern) -> None:
     result = structured_lqr(PLANT, pattern, WEIGHTS)
     mask = pattern.mask
     assert not result.K[~mask].any()
@@ -69,7 +69,7 @@ def test_structured_optimum_is_stationary_stable_in_the_pattern_and_costs_more(p
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_gradient_of_the_cost_is_its_slope_away_from_the_optimum_with_outputs_that_are_not_the_states(
+def test_cost_gradient_is_its_slope_with_outputs_other_than_states(
     seed: int,
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -118,7 +118,7 @@ def test_a_loop_whose_eigenvalues_add_up_to_zero_is_refused() -> None:
         stabilising_gain(plant, pattern, Weights(np.eye(plant.states), np.eye(3)))
 
 
-def test_dk_iteration_falls_at_each_iterate_and_ends_stable_in_the_pattern() -> None:
+def test_dk_iteration_always_falls_and_ends_stable_in_the_pattern() -> None:
     chain = FormationModel((-1, 0), axes=1)
     pattern, plant = leader_follower(chain), formation_plant(chain)
     design = dk_iteration(plant, pattern)

@@ -29,7 +29,7 @@ def growth(gains: ScalarGains, delay_s: float) -> float:
     return float(np.abs(late / (s**2 + gains.k1 * s + gains.k3)).max())
 
 
-def test_on_board_no_error_grows_at_any_delay_where_the_ground_design_lets_it() -> None:
+def test_onboard_errors_grow_at_no_delay_unlike_the_ground_designs() -> None:
     ground, onboard = (required_gains(Requirement(0.3, None, 1.0, loop=loop), 0.02) for loop in ("ground", "onboard"))
     delays_s = [0.1, 0.5, 1.0, 3.0]
     assert min(growth(ground, delay_s) for delay_s in delays_s) > 1.0005
@@ -41,7 +41,7 @@ def test_on_board_no_error_grows_at_any_delay_where_the_ground_design_lets_it() 
 
 
 @pytest.mark.parametrize("peak", [1.02, 1.2, 2.0])
-def test_a_growth_that_is_allowed_is_reached_at_the_worst_delay_and_not_passed(peak: float) -> None:
+def test_the_worst_delay_reaches_the_allowed_growth_and_no_more(peak: float) -> None:
     found = required_gains(Requirement(0.3, None, peak, loop="onboard"), 0.02)
     most = float(onboard_front_gain_limit(np.array([found.k1]), np.array([found.k3]), peak)[0])
     assert abs(found.k2) <= most * (1.0 + 1e-9)
@@ -64,7 +64,7 @@ def test_the_design_of_a_scenario_is_that_of_its_loop() -> None:
     assert plan.delay_margin_s == np.inf
 
 
-def test_the_certificate_of_an_onboard_design_proves_its_alpha_at_every_delay() -> None:
+def test_an_onboard_designs_certificate_proves_its_alpha_at_every_delay() -> None:
     found = design(FormationModel((-1, 0, 1)), Requirement(0.3, None, 1.0, loop="onboard"), period_s=0.02)
     assert found.certificate is not None
     gains = ScalarGains(-found.K1[0, 0], found.K2[0, 0], found.K3[0, 0], 0.0)
@@ -73,7 +73,7 @@ def test_the_certificate_of_an_onboard_design_proves_its_alpha_at_every_delay() 
 
 
 @pytest.mark.parametrize("method", ["graph-lqr", "graph-dk"])
-def test_graph_gains_on_board_have_the_margin_asked_for_in_the_loop_that_is_flown(method: GraphMethod) -> None:
+def test_onboard_graph_gains_give_the_flown_loop_the_requested_margin(method: GraphMethod) -> None:
     """That of own gains as if the station closed their loops, and that of the onboard loop; not of the ground loop."""
     chain, timing = FormationModel((-1, 0, 1)), OnboardTiming(0.02, steps=2)
     pattern = bidirectional(chain)
@@ -97,7 +97,7 @@ def test_graph_gains_on_board_have_the_margin_asked_for_in_the_loop_that_is_flow
     assert on_board.certificate is not None
 
 
-def test_graph_gains_on_a_tree_are_bounded_on_board_as_those_of_the_ground_loop() -> None:
+def test_graph_gains_on_a_tree_are_bounded_alike_on_board() -> None:
     """There the onboard loop takes every delay, and the ground loop's margin is that of the vehicles' own gains."""
     chain, timing = FormationModel((-1, 0, 1)), OnboardTiming(0.02, steps=2)
     ground, onboard = (
@@ -107,7 +107,7 @@ def test_graph_gains_on_a_tree_are_bounded_on_board_as_those_of_the_ground_loop(
     assert pytest.approx(ground.K, rel=1e-5) == onboard.K
 
 
-def test_a_decay_that_is_asked_for_on_board_is_that_of_the_loop_flown_and_leaves_the_largest_margin() -> None:
+def test_the_flown_loop_has_the_requested_decay_and_largest_margin() -> None:
     chain, timing = FormationModel((-1, 0, 1)), OnboardTiming(0.02, steps=2)
     wanted = Requirement(decay_rate_1_s=1.2)
     found = design(chain, wanted, method="graph-lqr", pattern=bidirectional(chain), period_s=0.02, onboard=timing)

@@ -23,7 +23,7 @@ def test_lmi_reaches_its_supremum_as_the_bounds_get_loose(shear: float, supremum
     assert alphas[-1] == pytest.approx(abs(shear) / np.hypot(1, shear), abs=5e-6)
 
 
-def test_lmi_gains_have_the_pattern_of_the_source_with_the_same_k1_twice() -> None:
+def test_lmi_gains_have_the_sources_pattern_with_k1_twice() -> None:
     found = robust_lmi(shear=-2.0, gain_bound=10.0, lyapunov_bound=10.0)
     (own, none, nothing), (front, spacing, own_again) = found.K.tolist()
     assert (none, nothing) == pytest.approx((0.0, 0.0), abs=1e-12)
@@ -41,7 +41,7 @@ def test_lmi_alpha_is_a_lower_bound_of_the_exact_one() -> None:
         assert robustness(own, front, spacing) > gains.alpha
 
 
-def test_bounds_too_tight_end_in_a_solver_error_that_names_them() -> None:
+def test_a_solver_error_names_bounds_that_are_too_tight() -> None:
     with pytest.raises(SolverError, match=r"'infeasible'.*gain_bound = 2.*lyapunov_bound = 2"):
         robust_lmi(shear=-5.0, gain_bound=2.0, lyapunov_bound=2.0)
 
@@ -63,7 +63,7 @@ def test_arguments_out_of_range_are_refused_by_name(name: str, arguments: dict[s
         )
 
 
-def test_centralised_lmi_withstands_what_it_claims_and_no_single_gain_is_above_its_bound() -> None:
+def test_centralised_lmi_withstands_its_claim_and_keeps_gains_in_bounds() -> None:
     found = centralised_lmi(CHAIN, gain_bound=30.0, lyapunov_bound=30.0)
     exact = disturbance_bound(CHAIN.A + CHAIN.B @ found.K, np.eye(CHAIN.states))
     assert 0.9 < found.alpha <= exact * (1.0 + 1e-6)

@@ -82,13 +82,13 @@ def test_front_gain_limit_is_where_spacing_errors_begin_to_grow(peak: float, del
         assert limit == pytest.approx(np.sqrt(k1**2 - 2 * k3), rel=1e-9)
 
 
-def test_no_front_gain_is_small_enough_when_the_own_loop_itself_amplifies() -> None:
+def test_when_own_loops_amplify_no_front_gain_is_small_enough() -> None:
     """k1² < 2 k3: even without feed-forward the follower overshoots."""
     assert np.isnan(front_gain_limit(np.array([1.0]), np.array([1.0]), np.array([0.0]), 1.0)[0])
 
 
 @pytest.mark.parametrize(("margin_s", "coarse"), [(0.1, 0.94), (0.3, 0.80), (0.5, 0.63)])
-def test_optimum_beats_a_plain_scan_by_no_more_than_its_grid(margin_s: float, coarse: float) -> None:
+def test_optimum_beats_a_plain_scan_at_most_by_its_grid(margin_s: float, coarse: float) -> None:
     """Scan of (k1, k2, k3) at the closed-form margin with α by singular values: the optimum is above and near it."""
     best = largest_alpha(margin_s, 0.0)
     assert best is not None
@@ -116,7 +116,7 @@ def test_no_neighbour_with_the_margin_is_better(angle: float, front: float, peri
     assert robustness(-k1, best.k2 + front * k1, k3) <= best.alpha + 1e-8
 
 
-def test_alpha_falls_as_margin_period_or_string_stability_are_asked_for() -> None:
+def test_asking_for_margin_period_or_string_stability_costs_alpha() -> None:
     def alpha(margin_s: float, period_s: float, peak: float | None) -> float:
         gains = largest_alpha(margin_s, period_s, peak)
         assert gains is not None

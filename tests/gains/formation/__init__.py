@@ -1,0 +1,1 @@
+"""Formation models, information patterns and the structure of the gains on them."""

@@ -47,7 +47,7 @@ def test_chapter_5_pattern_of_three_vehicles_is_the_bidirectional_chain() -> Non
     assert (pattern.input_sizes, pattern.output_sizes) == ((2, 2, 2), (2, 4, 4))
 
 
-def test_printed_gains_take_1_00796_s_with_own_feedback_at_once_and_0_077736_s_with_all_late() -> None:
+def test_printed_gains_have_known_margins_with_prompt_and_late_feedback() -> None:
     # both recomputed for this project by two methods; the source prints 0.19 s for the former, which no split gives
     plant = formation_plant(CHAIN)
     own = own_part(CHAIN, PRINTED)

@@ -1,0 +1,1 @@
+"""The delay margin of any linear loop, against oracles and benchmarks."""

@@ -69,16 +69,14 @@ def test_known_margins(tmp_path: Path, model: dict[str, Any], intervals: list[li
         ("held_late", [0.0, 1.157157060376148]),
     ],
 )
-def test_the_model_files_in_docs_have_the_margins_that_are_known_of_them(
-    tmp_path: Path, name: str, interval: list[float]
-) -> None:
+def test_model_files_in_docs_have_the_margins_known_of_them(tmp_path: Path, name: str, interval: list[float]) -> None:
     text = (ROOT / "docs" / "models" / f"{name}.json").read_text(encoding="utf-8")
     [found] = json.loads(run(tmp_path, text, "--json").stdout)["stable_intervals_s"]
     assert found == pytest.approx(interval, rel=1e-8)
 
 
 @pytest.mark.parametrize("gain", [0, -1])
-def test_an_unstable_plant_with_too_little_gain_is_stable_at_no_period(tmp_path: Path, gain: int) -> None:
+def test_too_little_gain_stabilises_an_unstable_plant_at_no_period(tmp_path: Path, gain: int) -> None:
     done = run(tmp_path, json.dumps({"A": [[2]], "B": [[1]], "K": [[gain]], "hold": True}), "--json")
     assert (done.returncode, done.stderr) == (0, "")
     result = json.loads(done.stdout)

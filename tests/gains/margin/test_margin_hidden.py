@@ -160,7 +160,7 @@ def test_formation_at_constant_velocity_has_two_roots_at_zero() -> None:
     assert result["roots_fixed_at_zero"] == 2
 
 
-def test_root_at_zero_without_an_equilibrium_is_left_out_and_said() -> None:
+def test_a_zero_root_without_equilibrium_is_left_out_and_said() -> None:
     # s + 1 - e^{-s tau}: A0 + A1 = 0 while neither vanishes; |s + 1| > 1 in the right half plane
     result = result_of([[-1.0]], [[1.0]])
     assert (result["stable_intervals_s"], result["roots_fixed_at_zero"]) == ([[0.0, None]], 1)
@@ -170,7 +170,7 @@ def test_root_at_zero_without_an_equilibrium_is_left_out_and_said() -> None:
     assert result["checked_by"] == ["root count"]
 
 
-def test_an_integrator_that_nobody_feeds_back_is_stable_at_no_delay() -> None:
+def test_an_integrator_without_feedback_is_stable_at_no_delay() -> None:
     result = result_of([[0.0, 0.0], [1.0, -1.0]], [[0.0, 0.0], [0.0, -0.5]])
     assert (result["stable_intervals_s"], result["delay_margin_s"]) == ([], 0.0)
     assert result["notes"] == ["a root stays at 0 at every delay, so the loop is asymptotically stable at none"]

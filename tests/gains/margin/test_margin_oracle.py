@@ -160,7 +160,7 @@ def test_no_digit_is_printed_that_is_not_known(group: int) -> None:
         assert abs(float(shown) - margin_s) <= unit, (seed, shown, margin_s)
 
 
-def test_four_followers_in_dense_coordinates_are_known_to_a_few_digits() -> None:
+def test_four_followers_in_dense_coordinates_keep_a_few_digits() -> None:
     # an eigenvalue of multiplicity four is known to eps^(1/4), 1e-4; all methods agree better than that
     rng = np.random.default_rng(0)
     one0, one1 = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0, 0.0], [1.0, -1.0]])
@@ -172,7 +172,7 @@ def test_four_followers_in_dense_coordinates_are_known_to_a_few_digits() -> None
 
 
 @pytest.mark.parametrize("seed", range(SYSTEMS))
-def test_held_loop_with_a_known_period_has_the_margin_of_its_one_period_map(seed: int) -> None:
+def test_a_held_loop_has_its_one_period_maps_margin(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n, inputs, period_s = int(rng.integers(1, 4)), int(rng.integers(1, 3)), float(rng.uniform(0.02, 0.3))
     free, B, K = rng.normal(size=(n, n)), rng.normal(size=(n, inputs)), rng.normal(size=(inputs, n))

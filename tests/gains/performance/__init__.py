@@ -1,0 +1,1 @@
+"""What given gains do: alpha, growth, string stability, and the response of the vehicles."""

@@ -58,9 +58,7 @@ def worst_disturbance(flight: FlownFormation, delay_s: float) -> FloatArray:
 @pytest.mark.parametrize(
     ("loop", "delay_s"), [("ground", 0.1), ("ground", 0.2), ("ground", 0.27), ("onboard", 0.3), ("onboard", 1.2)]
 )
-def test_a_real_disturbance_just_beyond_alpha_destabilises_the_sampled_formation_and_none_of_many_within_does(
-    loop: Loop, delay_s: float
-) -> None:
+def test_only_a_real_disturbance_beyond_alpha_destabilises_the_sampled_formation(loop: Loop, delay_s: float) -> None:
     flight = flown(loop)
     alpha, worst = flight.alpha(delay_s), worst_disturbance(flight, delay_s)
     assert np.linalg.norm(worst, 2) == pytest.approx(1.0)
@@ -74,7 +72,7 @@ def test_a_real_disturbance_just_beyond_alpha_destabilises_the_sampled_formation
 
 
 @pytest.mark.parametrize("loop", ["ground", "onboard"])
-def test_alpha_falls_long_before_the_margin_and_is_kept_up_to_the_limit_that_is_named(loop: Loop) -> None:
+def test_alpha_holds_to_its_limit_and_falls_before_the_margin(loop: Loop) -> None:
     flight = flown(loop)
     at_rest = flight.alpha(0.0)
     assert flight.alpha(0.97 * flight.timing.delay_margin_s) < 0.2 * at_rest
@@ -87,7 +85,7 @@ def test_alpha_falls_long_before_the_margin_and_is_kept_up_to_the_limit_that_is_
     assert flight.alpha_limit_s(1.01 * at_rest) == 0.0
 
 
-def test_a_leader_with_one_follower_is_the_loop_of_a_follower() -> None:
+def test_a_leader_with_one_follower_is_the_followers_loop() -> None:
     pair, gains = FormationModel((-1, 0)), ScalarGains(3.4, 0.6, 5.6, 0.0)
     K = pair.overlapping_gain(-gains.k1 * np.eye(2), gains.k2 * np.eye(2), gains.k3 * np.eye(2))
     answer = Response(0.05, 1.5)
@@ -101,7 +99,7 @@ def test_a_leader_with_one_follower_is_the_loop_of_a_follower() -> None:
                 assert matrix.alpha(delay_s) == pytest.approx(pair_of_one_axis.alpha(delay_s), rel=1e-9)
 
 
-def test_gains_that_couple_north_and_east_are_taken_whole_and_others_by_one_axis() -> None:
+def test_only_gains_that_couple_north_and_east_are_taken_whole() -> None:
     flight = flown("ground")
     omega = np.linspace(0.0, 5.0, 20)
     assert flight.characteristic(omega, 0.1).shape == (20, 5, 5)
@@ -112,7 +110,7 @@ def test_gains_that_couple_north_and_east_are_taken_whole_and_others_by_one_axis
     assert coupled.alpha(0.2) == pytest.approx(flight.alpha(0.2), rel=1e-7)
 
 
-def test_vehicles_that_answer_each_in_their_own_way_are_in_the_matrix_row_by_row() -> None:
+def test_each_vehicles_response_is_in_its_row_of_the_matrix() -> None:
     """σ_min of the formation is that of the Schur complement of the formation with its vehicles' states."""
     flight = flown("ground")
     answers = tuple(Response(lag_s, gain) for lag_s, gain in ((0.05, 0.0), (0.2, 1.0), (0.1, 2.0)))

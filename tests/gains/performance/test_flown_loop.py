@@ -55,7 +55,7 @@ def smallest_singular_value(A0: NDArray[np.float64], A1: NDArray[np.float64], de
     ("delay_s", "alpha", "peak"),
     [(0.0, 0.817, 1.0), (0.15, 0.815, 1.0), (0.2, 0.666, 1.19), (0.25, 0.312, 2.49), (0.29, 0.055, 13.8)],
 )
-def test_alpha_and_growth_of_triangle5_fall_apart_long_before_the_margin(
+def test_alpha_and_growth_of_triangle5_degrade_well_before_the_margin(
     delay_s: float, alpha: float, peak: float
 ) -> None:
     assert FLOWN.pair.alpha(delay_s) == pytest.approx(alpha, abs=6e-4)
@@ -65,7 +65,7 @@ def test_alpha_and_growth_of_triangle5_fall_apart_long_before_the_margin(
 
 
 @pytest.mark.parametrize("delay_s", [0.1, 0.2, 0.25])
-def test_a_real_disturbance_just_beyond_alpha_destabilises_the_sampled_loop_and_none_of_many_within_does(
+def test_only_a_real_disturbance_beyond_alpha_destabilises_the_sampled_loop(
     delay_s: float,
 ) -> None:
     pair = FormationModel((-1, 0))
@@ -95,7 +95,7 @@ def test_a_real_disturbance_just_beyond_alpha_destabilises_the_sampled_loop_and_
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.2, 0.25, 0.28])
-def test_the_peak_is_the_growth_of_the_sampled_chain_from_vehicle_to_vehicle(delay_s: float) -> None:
+def test_the_peak_is_the_sampled_chains_growth_between_vehicles(delay_s: float) -> None:
     chain = FormationModel((-1, 0, 1), axes=1)
     K = chain.overlapping_gain([[-GAINS.k1]], [[GAINS.k2]], [[GAINS.k3]])
     lifted = period_map(chain.A, chain.B, K, period_s=PERIOD_S, delay_s=delay_s)
@@ -123,7 +123,7 @@ def gains_of_stable_loops() -> st.SearchStrategy[ScalarGains]:
 )
 @example(gains=GAINS, loop="ground", peak=1.0)
 @example(gains=GAINS, loop="onboard", peak=1.05)
-def test_the_limit_in_closed_form_is_where_the_peak_passes_it(gains: ScalarGains, loop: str, peak: float) -> None:
+def test_the_closed_form_limit_is_where_the_peak_passes_it(gains: ScalarGains, loop: str, peak: float) -> None:
     pair = FormationModel((-1, 0), axes=1)
     K = pair.overlapping_gain([[-gains.k1]], [[gains.k2]], [[gains.k3]])
     margin_s = sampled_delay_margin(pair.A, pair.B, K, period_s=PERIOD_S) if loop == "ground" else inf
@@ -165,7 +165,7 @@ def test_alpha_is_kept_up_to_its_limit_and_not_beyond() -> None:
 
 
 @pytest.mark.parametrize(("delay_s", "peak"), [(0.49, 1.039), (0.99, 1.083)])
-def test_on_board_the_late_front_velocity_lets_errors_grow_at_every_delay(delay_s: float, peak: float) -> None:
+def test_late_front_velocity_lets_onboard_errors_grow_at_every_delay(delay_s: float, peak: float) -> None:
     onboard = FlownLoop(GAINS, FlownTiming(inf, PERIOD_S, "onboard"))
     assert onboard.string_peak(delay_s) == pytest.approx(peak, abs=5e-4)
     # Γ = (k3 + k2 s e^{−sτ}) / (s² + k1 s + k3), with half a period for the hold
@@ -181,7 +181,7 @@ def test_on_board_the_late_front_velocity_lets_errors_grow_at_every_delay(delay_
     assert without.pair.alpha_limit_s(0.81) == inf
 
 
-def test_the_motion_of_a_follower_on_board_grows_by_the_peak() -> None:
+def test_a_followers_motion_on_board_grows_by_the_peak() -> None:
     onboard, delay_s, step_s = FlownLoop(GAINS, FlownTiming(inf, 0.0, "onboard")), 1.0, 1e-3
     omega = 2 * pi / 4.0
     # e_p' = v_front − v, v' = −k1 v + k2 v_front(t − τ) + k3 e_p behind a vehicle whose velocity swings
@@ -199,7 +199,7 @@ def test_the_motion_of_a_follower_on_board_grows_by_the_peak() -> None:
     assert most == pytest.approx(gamma, rel=5e-3)
 
 
-def test_a_response_takes_of_alpha_and_of_growth_what_it_takes_of_the_margin() -> None:
+def test_a_response_costs_alpha_growth_and_margin_alike() -> None:
     response, pair = Response(0.15, 2.0), FormationModel((-1, 0), axes=1)
     K = pair.overlapping_gain([[-2.1]], [[0.6]], [[2.0]])
     margin_s = sampled_margin(pair, K, [response] * 2, timing=Timing(PERIOD_S, PERIOD_S))
@@ -212,7 +212,7 @@ def test_a_response_takes_of_alpha_and_of_growth_what_it_takes_of_the_margin() -
     assert flown.string_peak(limit_s * 0.999) <= 1.2 < flown.string_peak(limit_s * 1.001 + 1e-6)
 
 
-def test_on_the_ground_the_growth_is_the_peak_of_its_transfer_function_with_half_a_period_more_delay() -> None:
+def test_ground_growth_is_the_transfer_peak_half_a_period_later() -> None:
     s = 1j * np.linspace(1e-3, 20.0, 100_001)
     late = np.exp(-s * 0.21)
     direct = np.abs((GAINS.k2 * s + GAINS.k3) * late / (s**2 + (GAINS.k1 * s + GAINS.k3) * late))

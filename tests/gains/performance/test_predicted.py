@@ -47,7 +47,7 @@ def test_a_motion_that_no_command_explains_is_seen_late_once() -> None:
     assert peak > 1.3 > loop.string_peak(tau_s)
 
 
-def test_feed_forward_of_the_command_in_front_stops_the_growth_at_delay() -> None:
+def test_feeding_forward_the_command_in_front_stops_growth_at_delay() -> None:
     fed = PredictedLoop(ScalarGains(3.408, 3.13, 5.608, 0.0), PERIOD_S, 0.0, feed_forward=0.9)
     assert [round(fed.string_peak(delay_s), 2) for delay_s in (0.0, 0.1, 0.2, 0.25, 0.29)] == [1.0, 1.0, 1.0, 1.0, 1.01]
     # 1 % above the 13.6 of the source: within 10 ms of the margin the peak changes by 7 % in a millisecond
@@ -57,7 +57,7 @@ def test_feed_forward_of_the_command_in_front_stops_the_growth_at_delay() -> Non
 
 
 @pytest.mark.parametrize(("assumed_s", "delay_s"), [(0.0, 0.21), (0.6, 0.6), (0.6, 0.68)])
-def test_the_matrix_of_a_whole_chain_has_the_ratios_and_signs_of_the_formulas(assumed_s: float, delay_s: float) -> None:
+def test_a_whole_chains_matrix_has_the_formulas_ratios_and_signs(assumed_s: float, delay_s: float) -> None:
     """A chain of four with feed-forward, its commands from one linear system at each z."""
     model, share = FormationModel((-1, 0, 1, 2), axes=1), 0.9
     gains = ScalarGains(3.408, 3.13, 5.608, 0.0)

@@ -37,7 +37,7 @@ def crossing_margin(response: Response) -> float:
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_continuous_margin_is_the_least_phase_over_frequency_of_the_transfer_function(response: Response) -> None:
+def test_continuous_margin_is_the_transfer_functions_least_phase_over_frequency(response: Response) -> None:
     assert continuous_margin(PAIR, K, [response] * 2) == pytest.approx(
         crossing_margin(response), rel=1e-5
     )  # the grid's cell: 3e-6
@@ -77,14 +77,14 @@ def grows(response: Response, delay_s: float, period_s: float) -> bool:
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-def test_a_simulated_follower_diverges_beyond_the_sampled_margin_and_not_below(response: Response) -> None:
+def test_a_simulated_follower_diverges_only_beyond_the_sampled_margin(response: Response) -> None:
     period_s = 0.02
     margin_s = sampled_margin(PAIR, K, [response] * 2, timing=Timing(period_s, period_s))
     assert not grows(response, 0.97 * margin_s, period_s)
     assert grows(response, 1.03 * margin_s, period_s)
 
 
-def test_a_very_short_lag_leaves_the_margin_of_vehicles_that_answer_at_once() -> None:
+def test_a_very_short_lag_leaves_the_margin_of_immediate_answers() -> None:
     at_once = delay_margin(*PAIR.ground_loop(*GAINS))
     assert continuous_margin(PAIR, K, [Response(1e-5, 0.0)] * 2) == pytest.approx(at_once, abs=2e-5)
 
@@ -94,7 +94,7 @@ def test_a_lag_costs_about_its_length() -> None:
     assert without - continuous_margin(PAIR, K, [Response(0.02, 0.0)] * 2) == pytest.approx(0.02, rel=0.05)
 
 
-def test_the_margin_of_a_tree_is_that_of_the_vehicle_with_the_least() -> None:
+def test_a_trees_margin_is_the_least_of_its_vehicles() -> None:
     tree = FormationModel((-1, 0, 1, 0, 3))
     of = [RESPONSES[0], *RESPONSES]
     each = [sampled_margin(PAIR, K, [response] * 2, timing=TIMING) for response in RESPONSES]
@@ -102,7 +102,7 @@ def test_the_margin_of_a_tree_is_that_of_the_vehicle_with_the_least() -> None:
     assert together == pytest.approx(min(each), rel=1e-9)
 
 
-def test_vehicles_that_act_on_each_other_have_a_margin_of_their_own_kind() -> None:
+def test_coupled_vehicles_have_a_margin_of_their_own_kind() -> None:
     # the leader also feels the follower's spacing error, so that no vehicle's loop stands alone
     coupled = K.copy()
     coupled[PAIR.input_slice(0), PAIR.spacing_slice(1)] = -0.4 * np.eye(2)
@@ -135,21 +135,21 @@ def test_a_design_for_a_response_has_the_margin_asked_for(response: Response, ti
     assert found.delay_margin_s > 0.4
 
 
-def test_a_margin_that_no_gains_have_is_refused_with_the_response_named() -> None:
+def test_refusing_a_margin_that_no_gains_have_names_the_response() -> None:
     with pytest.raises(InfeasibleError, match=r"lag_s = 0\.15"):
         requirement_with(Requirement(delay_margin_s=29.9), Response(0.15, 2.0), timing=TIMING)
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.2])
 @pytest.mark.parametrize("front_1_s", [0.6, 1.6])  # errors shrink, errors grow
-def test_string_growth_tends_to_that_of_vehicles_that_answer_at_once(front_1_s: float, delay_s: float) -> None:
+def test_string_growth_tends_to_that_of_immediate_answers(front_1_s: float, delay_s: float) -> None:
     gains = (GAINS[0], front_1_s * np.eye(2), GAINS[2])
     at_once = string_peak(gains, delay_s)
     answer = Response(1e-6, 0.0).transfer
     assert string_peak(gains, delay_s, answer=answer) == pytest.approx(at_once, rel=1e-4)
 
 
-def test_a_lag_makes_spacing_errors_grow_more_as_a_delay_of_its_length_does() -> None:
+def test_lag_makes_spacing_errors_grow_as_an_equal_delay_does() -> None:
     gains = (GAINS[0], 1.6 * np.eye(2), GAINS[2])  # more of the velocity in front: errors grow
     with_lag = string_peak(gains, 0.2, answer=Response(0.05, 0.0).transfer)
     assert with_lag == pytest.approx(string_peak(gains, 0.25), rel=0.02)

@@ -11,7 +11,7 @@ from gains.performance.robust import certify, disturbance_bound, robustness, sub
 EYE = np.eye(2)
 
 
-def test_bound_of_a_normal_matrix_is_the_distance_of_its_spectrum_from_the_axis() -> None:
+def test_normal_matrix_bound_is_its_spectrums_distance_from_the_axis() -> None:
     """For a normal A, σ_min(jωI − A) is the least |jω − λ|, so α is the least |Re λ|: here 0.25 (exact)."""
     A = np.array([[-0.25, 7.0, 0.0], [-7.0, -0.25, 0.0], [0.0, 0.0, -3.0]])
     # The level-set search stops at 1e-10 of the bound, on the safe side.

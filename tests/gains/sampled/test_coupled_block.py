@@ -18,7 +18,7 @@ def tree_blocks(period_s: float = 0.02) -> list[CoupledBlock]:
     return coupled_blocks(FormationModel(TREE), K, (1, 2, 3, 4, 5), timing=Timing(period_s, period_s))
 
 
-def test_every_vehicle_of_a_tree_is_a_block_of_its_own() -> None:
+def test_each_vehicle_of_a_tree_is_its_own_block() -> None:
     blocks = tree_blocks()
     assert sorted(block.system_ids for block in blocks) == [(1,), (2,), (3,), (4,), (5,)]
     leader, follower = unlike_blocks(blocks)
@@ -47,7 +47,7 @@ def test_models_meet_the_closed_formulas_at_a_short_period() -> None:
         assert block.growth_continuous_1_s(at_s) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_critical_block_is_the_one_that_grows_most_at_its_own_delay() -> None:
+def test_the_critical_block_grows_most_at_its_own_delay() -> None:
     blocks = tree_blocks()
     delays = {1: 0.25, 2: 0.25, 3: 0.25, 4: 0.28, 5: 0.27}
     assert critical_block(blocks, delays).system_ids == (4,)

@@ -100,9 +100,7 @@ def test_map_predicts_what_is_flown(loop: Loop, timing: Timing, least_s: float) 
 
 @pytest.mark.parametrize(("phase_s", "up_s"), [(0.004, 0.0), (0.013, 0.31), (0.0, 0.6)])
 @pytest.mark.parametrize("timing", RATES, ids=str)
-def test_the_mean_loop_delay_is_all_that_counts_whatever_phase_and_share(
-    timing: Timing, phase_s: float, up_s: float
-) -> None:
+def test_only_the_mean_loop_delay_counts_whatever_phase_and_share(timing: Timing, phase_s: float, up_s: float) -> None:
     """Growth of a flight of 20 s, against the map at the mean loop delay that it had."""
     states, mean_s = flown(FOLLOWER, timing, np.array([1.0, 0.0]), 20.0, phase_s=phase_s, up_s=up_s, down_s=0.037)
     found = fit_growth(
@@ -149,14 +147,14 @@ def test_growth_is_zero_at_the_margin_and_negative_before(timing: Timing) -> Non
     assert multirate_growth_rate(*FOLLOWER, timing, delay_s=margin_s * (1.0 + 1e-6)) >= 0.0
 
 
-def test_the_mean_loop_delay_hides_next_to_nothing_of_the_rates() -> None:
+def test_the_mean_loop_delay_hides_almost_nothing_of_the_rates() -> None:
     """The margin of uneven rates is that of the slower one to its second order; the least delay would be 4 ms off."""
     for telemetry_s in (0.045, 0.04, 0.03, 0.0333):
         even_s = multirate_delay_margin(*FOLLOWER, Timing(0.05, 0.05))
         assert multirate_delay_margin(*FOLLOWER, Timing(0.05, telemetry_s)) == pytest.approx(even_s, abs=3e-4)
 
 
-def test_a_margin_long_against_the_periods_is_that_of_the_mean_loop_delay() -> None:
+def test_long_margins_are_those_of_the_mean_loop_delay() -> None:
     """A part in 10^4 is left to the order of the loop delays; at 100,000 periods the map of a search has no end."""
     timing = Timing(1.0 / 59.91, 1.0 / 124.5)
     margin_s = multirate_delay_margin(*FOLLOWER, timing)
@@ -172,7 +170,7 @@ def test_slower_telemetry_costs_margin() -> None:
     assert all(faster > slower for faster, slower in pairwise(margins_s))
 
 
-def test_unstable_loop_has_no_margin_and_a_weak_one_no_limit() -> None:
+def test_unstable_loops_have_no_margin_and_weak_ones_no_limit() -> None:
     for timing in (Timing(0.1, 0.05), FIVE_TO_TWO):
         assert multirate_delay_margin([[1.0]], [[1.0]], [[-0.5]], timing) == 0.0
         assert multirate_delay_margin([[-1.0]], [[1.0]], [[-0.5]], timing) == inf

@@ -62,7 +62,7 @@ def marched(loop: OnboardLoop, delay_s: float, *, periods: int) -> FloatArray:
     return np.array(states)
 
 
-def test_continuous_margin_of_the_printed_gains_is_that_of_the_erratum_in_two_ways() -> None:
+def test_printed_gains_have_the_erratums_continuous_margin_in_two_ways() -> None:
     loop = onboard_loop(CHAIN, PRINTED, FINE)
     own = own_part(CHAIN, PRINTED)
     others = PRINTED - own
@@ -94,7 +94,7 @@ def test_growth_changes_sign_at_the_margin(timing: OnboardTiming) -> None:
 
 
 @pytest.mark.parametrize("telemetry_s", [0.025, 0.013])
-def test_a_margin_long_against_uneven_periods_is_where_growth_changes_sign(telemetry_s: float) -> None:
+def test_long_margins_at_uneven_periods_are_where_growth_changes_sign(telemetry_s: float) -> None:
     loop = onboard_loop(CHAIN, PRINTED, OnboardTiming(0.02, 4, 2, telemetry_s))
     margin_s = loop.sampled_margin_s()
     assert margin_s > 30.0 * loop.timing.rates.held_s
@@ -102,7 +102,7 @@ def test_a_margin_long_against_uneven_periods_is_where_growth_changes_sign(telem
     assert loop.growth_1_s(margin_s * (1.0 - 3e-4)) < 0.0 < loop.growth_1_s(margin_s * (1.0 + 3e-4))
 
 
-def test_a_vehicle_whose_own_loop_is_too_fast_for_its_steps_leaves_no_margin_at_uneven_periods() -> None:
+def test_own_loops_too_fast_for_their_steps_leave_no_margin() -> None:
     K = np.zeros((4, 7))
     K[:3, :5] = PRINTED
     K[3, 5:] = 3.0, -300.0  # 1 − 300 T = −5
@@ -116,7 +116,7 @@ def test_sampled_margin_goes_to_the_continuous_one_with_the_period() -> None:
     assert fine.sampled_margin_s() == pytest.approx(fine.continuous_margin_s(), rel=1e-4)
 
 
-def test_steps_of_its_own_make_an_infinitely_fast_vehicle_a_continuous_local_loop() -> None:
+def test_own_steps_make_an_infinitely_fast_vehicle_a_continuous_loop() -> None:
     """With many steps the local loop is the matrix exponential of A + B K_own, and what is late a held command."""
     loop = onboard_loop(CHAIN, PRINTED, OnboardTiming(0.02, steps=400))
     held = growth_rate(loop.A + loop.sensed + loop.known, loop.late, np.eye(5), period_s=0.02, delay_s=0.9)

@@ -163,7 +163,7 @@ def test_half_the_speed_tolerates_268_ms_at_1_5_s() -> None:
     assert int(1e3 * min(1.5 - least_s, most_s - 1.5)) == 268
 
 
-def test_a_lag_in_the_model_leaves_the_published_window_and_decay() -> None:
+def test_a_modelled_lag_leaves_the_published_window_and_decay() -> None:
     loop = follower(lag_s=0.15)
     least_s, most_s = mismatch_window(*loop, RATES, assumed_s=1.5)
     # printed as +50 / -60 ms; the ends are at +51.98 and -60.86 ms, where the map by its definition has radius one
@@ -204,7 +204,7 @@ def test_crossings_and_the_spectrum_of_the_lifted_map_agree(seed: int) -> None:
             assert radius(loop, period_s, end_s + 1e-4 * way * period_s, assumed_s) > 1.0
 
 
-def test_the_continuous_window_ends_where_the_rightmost_root_is_on_the_axis() -> None:
+def test_the_continuous_window_ends_with_a_root_on_the_axis() -> None:
     A, B, K = follower()
     for assumed_s in (0.6, 1.5):
         late = B @ K @ expm(A * assumed_s)
@@ -214,7 +214,7 @@ def test_the_continuous_window_ends_where_the_rightmost_root_is_on_the_axis() ->
 
 
 @pytest.mark.parametrize(("assumed_s", "mismatch_s"), [(0.6, 0.14), (0.6, -0.13), (0.313, 0.22)])
-def test_a_simulated_flight_grows_at_the_rate_of_the_lifted_map(assumed_s: float, mismatch_s: float) -> None:
+def test_a_simulated_flight_grows_as_the_lifted_map_says(assumed_s: float, mismatch_s: float) -> None:
     model = FormationModel((-1, 0), axes=1)
     K = model.overlapping_gain([[-K1]], [[0.63]], [[K3]])
     for beyond in (0.0, 1.2 * mismatch_s):
@@ -227,9 +227,7 @@ def test_a_simulated_flight_grows_at_the_rate_of_the_lifted_map(assumed_s: float
 
 
 @pytest.mark.parametrize(("mismatch_s", "duration_s"), [(0.13, 45.0), (-0.12, 45.0)])
-def test_a_simulated_flight_with_slower_telemetry_grows_as_the_multirate_map_says(
-    mismatch_s: float, duration_s: float
-) -> None:
+def test_flights_with_slower_telemetry_grow_as_the_multirate_map_says(mismatch_s: float, duration_s: float) -> None:
     """Five commands from each sample, each predicted anew."""
     model, assumed_s, delay_s = FormationModel((-1, 0), axes=1), 0.607, 0.607 + mismatch_s
     K = model.overlapping_gain([[-K1]], [[0.63]], [[K3]])
@@ -287,7 +285,7 @@ def test_vehicles_with_delays_of_their_own_stay_block_triangular() -> None:
         assert 0.0 < wanted == pytest.approx(grown, abs=0.03)
 
 
-def test_a_formation_whose_vehicles_lag_has_the_window_of_its_blocks() -> None:
+def test_a_formation_of_lagging_vehicles_has_its_blocks_window() -> None:
     model = FormationModel((-1, 0, 1), axes=2)
     identity = np.eye(2)
     K = model.overlapping_gain(-K1 * identity, 0.63 * identity, K3 * identity)

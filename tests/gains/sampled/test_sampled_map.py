@@ -69,7 +69,7 @@ def test_whole_periods_are_recognised_despite_rounding() -> None:
     assert len(period_map(*FOLLOWER, period_s=0.02, delay_s=0.02 + 0.02 + 0.02)) == 2 + 3
 
 
-def test_spectral_radius_of_a_chain_is_that_of_its_worst_member() -> None:
+def test_a_chains_spectral_radius_is_that_of_its_worst_member() -> None:
     # 12 identical followers: the eigenvalues of the whole map are wrong in the second digit
     n = 12
     A = np.kron(np.eye(n), FOLLOWER[0]) + np.kron(np.eye(n, k=-1), [[0.0, 1.0], [0.0, 0.0]])

@@ -169,7 +169,7 @@ def test_period_limit_of_a_follower_is_the_closed_form() -> None:
     assert analyse_period(FOLLOWER[0], FOLLOWER[1], [[9.0, -1.0]]).limit_s == pytest.approx(2.0 / 9.0, rel=1e-12)
 
 
-def test_period_has_no_limit_where_the_plant_is_stable_and_the_gain_small() -> None:
+def test_a_stable_plant_with_small_gain_has_no_period_limit() -> None:
     assert analyse_period([[-1.0]], [[1.0]], [[-0.5]]).limit_s == inf
 
 

@@ -1,0 +1,1 @@
+"""Bounds for delays that vary in time."""

@@ -186,7 +186,7 @@ def worst_reach(reach: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_integral_over_a_deviation_has_at_most_the_gain_that_the_spread_counts_on(seed: int) -> None:
+def test_a_deviations_integral_has_at_most_the_gain_counted_on(seed: int) -> None:
     rng = np.random.default_rng(seed)
     anyhow = rng.integers(-CELLS, CELLS + 1, 4 * CELLS)
     assert integral_gain(anyhow) ** 2 <= 1.75
@@ -195,7 +195,7 @@ def test_integral_over_a_deviation_has_at_most_the_gain_that_the_spread_counts_o
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_deviation_that_overtakes_nothing_has_a_gain_of_at_most_one(seed: int) -> None:
+def test_deviation_that_overtakes_nothing_has_at_most_unit_gain(seed: int) -> None:
     rng = np.random.default_rng(seed)
     # a sawtooth: rises by a cell a cell at most, and falls anyhow
     reach = [0]

@@ -1,0 +1,1 @@
+"""Start-up of vehicles with autopilots, and the identification of their response."""

@@ -31,7 +31,7 @@ def advised(kind: Kind, seen: Seen) -> tuple[str, tuple[int, tuple[float, ...]] 
     return step.missing, step.command
 
 
-def test_arducopter_goes_guided_arms_takes_off_and_is_ready_in_this_order() -> None:
+def test_arducopter_goes_guided_arms_takes_off_and_then_is_ready() -> None:
     seen = BEFORE
     assert advised(ARDUCOPTER, seen) == ("does not enter GUIDED", (176, (1.0, 4.0)))
     seen = seen._replace(custom_mode=4)
@@ -43,7 +43,7 @@ def test_arducopter_goes_guided_arms_takes_off_and_is_ready_in_this_order() -> N
     assert advised(ARDUCOPTER, seen._replace(airborne=True)) == ("", None)
 
 
-def test_px4_arms_takes_off_to_an_altitude_above_the_sea_and_enters_offboard_in_the_air() -> None:
+def test_px4_arms_takes_off_by_sea_level_then_enters_offboard() -> None:
     seen = BEFORE._replace(custom_mode=4 << 16 | 3 << 24)
     assert advised(PX4_COPTER, seen) == ("does not arm", (400, (1.0,)))
     seen = seen._replace(armed=True)
@@ -91,7 +91,7 @@ def test_a_vehicle_found_flying_is_not_told_to_take_off() -> None:
     assert startup.airborne
 
 
-def test_a_take_off_whose_answer_was_lost_counts_although_the_second_is_refused() -> None:
+def test_a_takeoff_counts_though_unanswered_and_refused_on_repetition() -> None:
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.recognise(3, 2)
     startup.refused(22, (0.0,) * 7, 0, repeated=True)
@@ -110,7 +110,7 @@ def test_what_cannot_be_flown_is_refused_by_name(autopilot: int, vehicle_type: i
     assert words in found
 
 
-def test_a_vehicle_that_does_not_know_its_type_yet_is_waited_for() -> None:
+def test_a_vehicle_still_of_unknown_type_is_waited_for() -> None:
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.recognise(3, 0)
     assert (startup.kind, startup.refusal) == (UNRECOGNISED, "")
@@ -124,7 +124,7 @@ def test_a_mode_command_is_read_back_as_its_mode(kind: Kind) -> None:
         assert commanded_mode(kind, mode_command(kind, mode)[1]) == mode
 
 
-def test_origin_from_a_moving_vehicle_takes_the_time_between_both_positions_into_account() -> None:
+def test_a_moving_vehicles_origin_allows_for_time_between_its_positions() -> None:
     origin = (47.397742, 8.545594)
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.take(32, (10_000, 100.0, -40.0, -5.0, 12.0, -3.0, 0.0))
@@ -134,7 +134,7 @@ def test_origin_from_a_moving_vehicle_takes_the_time_between_both_positions_into
     assert between(origin, startup.origin) == pytest.approx((0.0, 0.0), abs=0.012)  # 1e-7 degrees are 11 mm
 
 
-def test_the_origin_a_vehicle_says_wins_over_home_and_over_one_that_is_computed() -> None:
+def test_a_reported_origin_wins_over_home_and_a_computed_one() -> None:
     startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
     startup.take(242, (470000000, 80000000, 400_000, 3.0, 4.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0))
     assert startup.origin is not None

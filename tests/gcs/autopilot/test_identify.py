@@ -66,7 +66,7 @@ def test_lag_and_gain_are_found_through_noise_and_drift(response: Response) -> N
     assert found.misfit < 0.06
 
 
-def test_a_vehicle_that_answers_without_velocity_feedback_is_one_with_next_to_none() -> None:
+def test_no_velocity_feedback_is_identified_as_next_to_none() -> None:
     sample_s = np.arange(0.0, LONGEST_S, 0.02)
     found = identify(ACTED_S, CHANGE, sample_s, velocity_of(Response(0.2, 0.0), sample_s))
     assert found is not None

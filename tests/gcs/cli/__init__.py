@@ -1,0 +1,1 @@
+"""The commands: options, refusals in one line, and what is printed."""

@@ -31,7 +31,7 @@ def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> int:
 
 
 @pytest.mark.parametrize("name", names())
-def test_a_copy_of_a_shipped_scenario_differs_by_its_name_only(name: str, tmp_path: Path) -> None:
+def test_a_copied_scenario_differs_only_by_its_name(name: str, tmp_path: Path) -> None:
     text = copied(name, "mine")
     assert load_text(text, tmp_path).model_copy(update={"name": name}) == load_text(copied(name, name), tmp_path)
 

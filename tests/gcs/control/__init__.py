@@ -1,0 +1,1 @@
+"""The control tick: commands, limits, loop delay, phases and prediction."""

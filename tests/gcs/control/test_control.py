@@ -95,7 +95,7 @@ def test_command_is_shortened_to_the_limit_and_keeps_its_direction() -> None:
     assert np.array(held) == pytest.approx(5.0 * direction)
 
 
-def test_a_formation_in_place_is_left_alone_though_its_states_are_of_different_instants() -> None:
+def test_states_of_different_instants_leave_a_formation_in_place_alone() -> None:
     v_d = (91.44, 10.0)
     place = TREE.place_ne_m()
     history = StateHistory(5)
@@ -108,7 +108,7 @@ def test_a_formation_in_place_is_left_alone_though_its_states_are_of_different_i
     assert result.command_m_s2 == pytest.approx(np.zeros((5, 2)), abs=1e-9)
 
 
-def test_unknown_vehicle_gives_no_command_to_itself_and_its_follower_only() -> None:
+def test_only_an_unknown_vehicle_and_its_follower_get_no_command() -> None:
     history = StateHistory(5)
     for row in (0, 2, 3, 4):
         history.add(row, 5 * MS, (0.0, 0.0, 1.0, 1.0))
@@ -175,7 +175,7 @@ def test_a_report_older_than_the_newest_changes_nothing() -> None:
     assert history.newest(0) == (100, (1.0, 2.0, 3.0, 4.0))
 
 
-def test_a_clock_that_is_set_right_between_two_reports_makes_no_velocity_of_it() -> None:
+def test_a_clock_correction_between_reports_makes_no_velocity() -> None:
     """0.2 ms at 91 m/s are 18 mm between reports 20 ms apart, which as a slope would be 1.4 m/s."""
     history = StateHistory(1)
     history.add(0, 0, (0.0, 0.0, 91.0, 0.1))

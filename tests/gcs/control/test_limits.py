@@ -12,7 +12,7 @@ from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains, Limits, Vehicle
 from sim_vehicles.drive.fleet import Fleet
-from tests.flights.test_flight_copters import planned, three
+from tests.support.flown_copters import planned, three
 from tests.support.paths import SCENARIOS
 from tests.support.sim_client import parse
 
@@ -48,7 +48,7 @@ def tapped(plan: FlightPlan, *, opening: float | None = None) -> Wiretap:
 
 @pytest.mark.parametrize("limit_m_s2", [1.0, 30.0])
 @pytest.mark.parametrize("loop", ["onboard", "ground"])
-def test_a_formation_that_the_monitor_opens_keeps_the_limit_of_acceleration(loop: str, limit_m_s2: float) -> None:
+def test_a_formation_opened_by_the_monitor_keeps_the_acceleration_limit(loop: str, limit_m_s2: float) -> None:
     flown = load(SCENARIOS / "chain3.toml")
     control = flown.control.model_copy(update={"loop": loop, "gains": FixedGains(K1=-3.4, K2=0.6, K3=5.6)})
     limits = Limits(acceleration_max_m_s2=limit_m_s2)
@@ -59,7 +59,7 @@ def test_a_formation_that_the_monitor_opens_keeps_the_limit_of_acceleration(loop
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_copters_are_asked_for_no_more_speed_or_acceleration_in_the_manoeuvre_and_the_flight(flavour: str) -> None:
+def test_copters_keep_speed_and_acceleration_limits_in_manoeuvre_and_flight(flavour: str) -> None:
     """Speeds are held as the vehicles' targets: they grow with what is wanted, while a vehicle cannot follow."""
     scenario, limits = three(flavour=flavour, duration_s=8.0), Limits(acceleration_max_m_s2=1.5, speed_max_m_s=4.5)
     behind: list[Vehicle] = []

@@ -11,7 +11,7 @@ from scenarios.schema import Rates
 S, MS = 1_000_000_000, 1_000_000
 
 
-def test_it_is_the_age_of_the_state_plus_the_way_down_less_the_repetition() -> None:
+def test_it_is_state_age_plus_the_way_down_less_repetition() -> None:
     assert loop_delay_s(10 * S, 10 * S + 50 * MS, 0.03, 0.01) == pytest.approx(0.07, abs=1e-12)
 
 

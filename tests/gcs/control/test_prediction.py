@@ -53,7 +53,7 @@ ACCELERATIONS = st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0))
     st.integers(-1000, 5000),
     st.integers(0, 10_000),
 )
-def test_a_state_is_carried_on_as_if_each_piece_were_integrated(
+def test_states_are_carried_on_as_if_each_piece_were_integrated(
     steps: list[tuple[int, tuple[float, float]]], from_ms: int, for_ms: int
 ) -> None:
     due_ms = np.cumsum([gap_ms for gap_ms, _ in steps]).tolist()
@@ -64,14 +64,14 @@ def test_a_state_is_carried_on_as_if_each_piece_were_integrated(
     assert np.array(carried) == pytest.approx(integrated(commands, from_ns, to_ns), rel=1e-9, abs=1e-8)
 
 
-def test_a_vehicle_without_set_points_holds_its_velocity_after_the_time_out() -> None:
+def test_without_set_points_a_vehicle_holds_velocity_after_the_timeout() -> None:
     history = history_of([(START, (1.0, 0.0)), (START + 9 * S, (2.0, 0.0))], held_ns=S)
     north, _, v_north, _ = history.carried((0.0, 0.0, 0.0, 0.0), START, START + 10 * S)
     assert v_north == pytest.approx(1.0 + 2.0)
     assert north == pytest.approx(0.5 + 8.0 * 1.0 + 1.0 + 1.0)
 
 
-def test_set_points_older_than_any_prediction_are_forgotten_without_a_change() -> None:
+def test_forgetting_set_points_older_than_any_prediction_changes_nothing() -> None:
     commands: Commands = [(START + 20 * MS * k, (np.sin(0.01 * k), 1.0)) for k in range(6000)]
     history, now_ns = history_of(commands), commands[-1][0]
     remembered = len(history._due_ns)  # pyright: ignore[reportPrivateUsage] - what it forgets shows nowhere else
@@ -85,7 +85,7 @@ def states(sent: list[CommandHistory], assumed_s: float) -> PredictedStates:
     return PredictedStates(sent, [FixedDelivery(assumed_s) for _ in sent], 1)
 
 
-def test_the_newest_set_point_acts_one_assumed_delay_after_the_sample() -> None:
+def test_the_newest_set_point_acts_an_assumed_delay_after_sampling() -> None:
     history = StateHistory(1)
     history.add(0, START, STATE)
     predicted = states([CommandHistory(LONG)], 0.3)

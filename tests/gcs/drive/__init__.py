@@ -1,0 +1,1 @@
+"""Checks before a flight, and flights in virtual time."""

@@ -72,7 +72,7 @@ def test_an_unstable_loop_is_refused_with_its_root(
     assert told in line
 
 
-def test_an_unstable_coupled_loop_on_a_pattern_names_all_of_its_vehicles() -> None:
+def test_an_unstable_coupled_loop_of_a_pattern_names_all_vehicles() -> None:
     scenario = load(ROOT / "scenarios/thesis_gains.toml")
     blocks = tuple(
         block.model_copy(update={"gain": tuple(tuple(-value for value in row) for row in block.gain)})
@@ -105,9 +105,7 @@ def test_an_unstable_loop_flown_all_the_same_shows_no_headroom(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("gains", list(itertools.product((-1e5, 1e5), repeat=3)))
-def test_gains_of_any_size_are_assessed_and_told_as_what_they_are(
-    gains: tuple[float, float, float], tmp_path: Path
-) -> None:
+def test_gains_of_any_size_are_assessed_and_truthfully_told(gains: tuple[float, float, float], tmp_path: Path) -> None:
     file = with_gains(tmp_path, *gains)
     printed = CliRunner().invoke(app, ["design", str(file), "--allow-unstable"])
     assert printed.exit_code == 0, printed.output
@@ -116,7 +114,7 @@ def test_gains_of_any_size_are_assessed_and_told_as_what_they_are(
     assert json.loads(told.stdout)["delay_margin_s"] == 0.0
 
 
-def test_vehicles_that_start_in_collision_or_past_the_limit_are_found_before_take_off(
+def test_starts_in_collision_or_past_the_limit_are_found_beforehand(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     near = chain_file(tmp_path, ("[-242.79, 243.09]", "[-122.82, 125.52]"))
@@ -128,7 +126,7 @@ def test_vehicles_that_start_in_collision_or_past_the_limit_are_found_before_tak
     assert "read vehicle 3 with a spacing error of 1998" in complaint(capsys, monkeypatch, "fly", str(far))
 
 
-def test_a_link_slower_than_the_flight_waits_for_is_found_before_take_off(
+def test_a_link_too_slow_for_the_flight_is_found_beforehand(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = str(ROOT / "scenarios/chain3.toml")

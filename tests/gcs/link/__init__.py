@@ -1,0 +1,1 @@
+"""The conversation with one vehicle: clocks, sequence numbers, codec and uploads."""

@@ -47,7 +47,7 @@ def test_clock_is_known_within_a_microsecond_at_any_symmetric_rtt(one_way_ms: in
 
 
 @pytest.mark.parametrize("up_ms", [0, 5, 80])
-def test_error_of_an_asymmetric_link_is_half_the_asymmetry_and_within_the_bound(up_ms: int) -> None:
+def test_an_asymmetric_link_errs_by_half_its_asymmetry_within_bounds(up_ms: int) -> None:
     truth = Exchange(offset_ns=5 * S, drift=0.0)
     for k in range(20):
         truth.at(k * S // 10, down_ns=20 * MS, up_ns=up_ms * MS)
@@ -132,7 +132,7 @@ def test_the_bound_is_never_violated_whatever_the_links_do(link: tuple[float, ..
 
 @pytest.mark.parametrize("rtt_ms", [2, 40, 400, 5000])
 @pytest.mark.parametrize("by_ms", [-900.0, -20.0, -0.7, 0.7, 20.0, 900.0])
-def test_a_jump_of_less_than_a_round_trip_is_seen_and_keeps_the_bound(rtt_ms: int, by_ms: float) -> None:
+def test_a_jump_under_a_round_trip_is_seen_and_bounded(rtt_ms: int, by_ms: float) -> None:
     truth = Exchange(offset_ns=0, drift=50e-6)
     down_ns, up_ns = rtt_ms * MS // 10, rtt_ms * MS * 9 // 10  # so that half of all jumps leave the old limits
     for k in range(100):
@@ -145,7 +145,7 @@ def test_a_jump_of_less_than_a_round_trip_is_seen_and_keeps_the_bound(rtt_ms: in
     assert truth.error_ns(11 * S) == pytest.approx((up_ns - down_ns) / 2, abs=20_000)
 
 
-def test_a_reply_from_before_a_jump_that_comes_after_it_is_no_second_jump() -> None:
+def test_late_replies_from_before_a_jump_are_no_second_jump() -> None:
     truth = Exchange(offset_ns=0, drift=0.0)
     for k in range(20):
         truth.at(k * S // 10, down_ns=20 * MS, up_ns=20 * MS)
@@ -167,7 +167,7 @@ def test_no_way_of_slowing_down_is_taken_for_a_jump() -> None:
     assert truth.clock.jumps == 0
 
 
-def test_a_scenario_may_have_the_drift_up_to_which_the_bounds_hold_and_no_more() -> None:
+def test_a_scenario_may_drift_only_as_far_as_bounds_hold() -> None:
     assert DRIFT_BOUND == DRIFT_MAX_PPM * 1e-6
     assert Clocks(drift_max_ppm=1e6 * DRIFT_BOUND).drift_max_ppm == 1000.0
     with pytest.raises(ValidationError, match="less than or equal to 1000"):
@@ -191,7 +191,7 @@ def state(truth: Exchange, sampled_ns: int, *, up_ms: int = 20) -> int | None:
 @given(
     st.integers(0, 3000), st.integers(0, 3000), st.integers(0, 3000), st.floats(-DRIFT_BOUND, DRIFT_BOUND)
 )  # fmt: skip
-def test_no_state_of_a_clock_that_has_not_jumped_is_refused(down: int, up: int, state_up: int, drift: float) -> None:
+def test_no_state_of_a_clock_without_jumps_is_refused(down: int, up: int, state_up: int, drift: float) -> None:
     truth = exchanged(down_ms=down, up_ms=up, drift=drift)
     for k in range(250, 1000, 50):
         assert state(truth, k * S // 50 + 10 * S, up_ms=state_up) is not None
@@ -199,7 +199,7 @@ def test_no_state_of_a_clock_that_has_not_jumped_is_refused(down: int, up: int, 
 
 
 @given(st.integers(41, 10**9), st.integers(0, 2000))
-def test_a_state_from_the_future_is_refused_and_the_clock_unknown_until_an_exchange(by_ms: int, way_ms: int) -> None:
+def test_a_future_state_is_refused_and_makes_the_clock_unknown(by_ms: int, way_ms: int) -> None:
     truth = exchanged(down_ms=way_ms, up_ms=way_ms)
     truth.offset_ns += (by_ms + 2 * way_ms) * MS
     assert state(truth, 10 * S, up_ms=way_ms) is None
@@ -213,7 +213,7 @@ def test_a_state_from_the_future_is_refused_and_the_clock_unknown_until_an_excha
 
 
 @given(st.integers(25, 10**9))
-def test_a_state_sampled_before_the_one_sent_before_it_is_refused_and_asks_for_an_exchange(by_ms: int) -> None:
+def test_a_state_older_than_its_predecessor_asks_for_an_exchange(by_ms: int) -> None:
     """Also when the clock is set to before its boot, where time_boot_ms wraps."""
     truth = exchanged()
     assert state(truth, 10 * S - 20 * MS) is not None
@@ -235,7 +235,7 @@ def test_an_overtaken_state_asks_for_no_exchange() -> None:
 
 
 @pytest.mark.parametrize("by_s", [229, -50])
-def test_an_overtaken_state_from_before_a_jump_is_refused_without_doubt(by_s: int) -> None:
+def test_overtaken_states_from_before_a_jump_are_refused_without_doubt(by_s: int) -> None:
     truth = exchanged()
     before_ms = truth.boot_ns(9 * S) // MS
     truth.offset_ns += by_s * S
@@ -254,7 +254,7 @@ def test_time_boot_ms_wraps_after_49_days_in_the_air() -> None:
     assert truth.clock.jumps == 0
 
 
-def test_replies_dated_back_as_by_arducopter_are_no_jumps_and_keep_the_bound() -> None:
+def test_replies_backdated_by_arducopter_are_no_jumps_and_keep_bounds() -> None:
     """Up to 3.5 ms, on a third of the exchanges over links that take next to nothing."""
     rng = np.random.default_rng(5)
     truth = Exchange(offset_ns=7 * S, drift=30e-6)

@@ -49,7 +49,7 @@ def test_random_losses_are_counted_exactly(seed: int, share: float) -> None:
 
 @example(323, 290.9375, 55.265625, 0.0)
 @given(st.integers(0, 2**32), st.floats(20.0, 300.0), st.floats(0.0, 60.0), st.floats(0.0, 0.3))
-def test_what_is_lost_in_an_outage_of_up_to_a_minute_is_counted_whole(
+def test_losses_in_outages_up_to_a_minute_are_counted_whole(
     seed: int, rate_hz: float, outage_s: float, share: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -67,7 +67,7 @@ def test_what_is_lost_in_an_outage_of_up_to_a_minute_is_counted_whole(
     assert counter.duplicate == 0
 
 
-def test_frames_overtaken_by_up_to_two_hundred_are_late_and_not_lost_or_doubled() -> None:
+def test_frames_overtaken_by_two_hundred_are_neither_lost_nor_doubled() -> None:
     """50 frames a second, each up to 3 s late: the signed difference of two numbers would be wrong by 256."""
     rng = np.random.default_rng(4)
     arrival_ms = 20.0 * np.arange(4000) + rng.uniform(0.0, 3000.0, 4000)
@@ -92,13 +92,13 @@ def test_reordering_within_the_window_is_never_loss(seed: int) -> None:
 
 
 @pytest.mark.parametrize("lost_between", [0, 2])
-def test_after_a_very_late_frame_only_eight_good_ones_count_as_late(lost_between: int) -> None:
+def test_a_very_late_frame_makes_only_eight_good_ones_late(lost_between: int) -> None:
     numbers = [*range(300), 150, *range(300, 600, lost_between + 1)]  # 150 is taken for 256 + 150
     counter = counted(numbers, [20.0 * max(n, 299) for n in numbers])
     assert (counter.late, counter.duplicate) == (8, 0)
 
 
-def test_a_burst_that_time_does_not_show_is_counted_once_reordering_has_ended() -> None:
+def test_a_burst_hidden_in_time_counts_once_reordering_has_ended() -> None:
     rng = np.random.default_rng(4)
     arrival_ms = 20.0 * np.arange(1000) + rng.uniform(0.0, 2000.0, 1000)  # overtaken by up to a hundred
     arrival_ms[0] = 0.0
@@ -109,7 +109,7 @@ def test_a_burst_that_time_does_not_show_is_counted_once_reordering_has_ended() 
     assert counted(numbers, times_ms).lost == 100
 
 
-def test_a_pause_of_the_sender_does_not_spoil_the_count_of_the_next_outage() -> None:
+def test_a_senders_pause_does_not_spoil_the_next_outages_count() -> None:
     before, after = np.arange(260), np.arange(1260, 1400)  # 50 frames a second; a pause of 1.9 s after 250
     times_ms = [20.0 * n + 1900.0 * (n >= 250) for n in [*before.tolist(), *after.tolist()]]
     assert counted([*before.tolist(), *after.tolist()], times_ms).lost == 1000

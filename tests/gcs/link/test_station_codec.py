@@ -72,7 +72,7 @@ def test_several_frames_in_one_datagram_are_all_read() -> None:
     assert not refused
 
 
-def test_every_message_of_the_dialect_but_a_key_can_be_read() -> None:
+def test_every_dialect_message_but_a_key_can_be_read() -> None:
     for msg_id, message in dialect.mavlink_map.items():
         if msg_id == dialect.MAVLINK_MSG_ID_SETUP_SIGNING:
             continue

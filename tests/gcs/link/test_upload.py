@@ -28,7 +28,7 @@ class Holder:
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(0, 1500), st.booleans()), max_size=40))
 @settings(max_examples=60, deadline=None)
-def test_done_means_read_back_and_right_whatever_is_lost_late_or_twice(
+def test_done_means_read_back_right_despite_loss_delay_and_repeats(
     fates: list[tuple[bool, bool, int, bool]],
 ) -> None:
     """Each frame's fate: lost on its way there, lost on its way back, ms until the answer is here, and twice."""
@@ -64,7 +64,7 @@ def test_numbers_are_compared_as_they_travel() -> None:
 
 
 @pytest.mark.parametrize("told", [-17.0088, float("nan")])
-def test_a_vehicle_that_reads_otherwise_is_refused_in_one_line_after_some_attempts(told: float) -> None:
+def test_vehicles_that_keep_reading_otherwise_are_refused_in_one_line(told: float) -> None:
     upload = Upload({"FORM_A": -17.0089})
     for attempt in range(ATTEMPTS):
         assert not upload.refusal

@@ -25,7 +25,7 @@ TRIANGLE = load(ROOT / "scenarios/triangle5.toml")
 TWO_WAY = load(ROOT / "scenarios/chain3_bidirectional.toml")
 
 
-def test_a_design_tells_alpha_and_growth_at_the_delay_of_its_links_and_how_far_they_hold() -> None:
+def test_a_design_tells_alpha_and_growth_at_its_links_delay() -> None:
     late = TRIANGLE.with_link_delay(up_s=0.12, down_s=0.12)
     flown = flight_plan(late)[0].at_loop_delay
     assert flown is not None
@@ -41,7 +41,7 @@ def test_a_design_tells_alpha_and_growth_at_the_delay_of_its_links_and_how_far_t
     assert (beyond.alpha, beyond.string_peak) == (0.0, None)
 
 
-def test_a_slower_gain_set_is_judged_as_the_design_slowed_down() -> None:
+def test_a_slower_gain_set_is_judged_as_a_slowed_design() -> None:
     design, _ = flight_plan(TRIANGLE)
     # slowed down by 2 all but the hold does the same in twice the time: 2 (0.2 + 0.01) - 0.01
     fast, slow = figures_at(design, TRIANGLE, 0.2), figures_at(design, TRIANGLE, 0.41, gain_set=1)
@@ -65,7 +65,7 @@ def test_the_expected_loop_delay_is_that_of_the_slowest_links() -> None:
     assert expected_loop_delay_s(slow) == pytest.approx(0.03 + 0.02 + 0.1 + 0.01)
 
 
-def test_table_and_summary_tell_both_at_the_loop_delay_that_was_measured() -> None:
+def test_table_and_summary_tell_both_at_the_measured_loop_delay() -> None:
     late = TRIANGLE.with_link_delay(up_s=0.09, down_s=0.09).model_copy(update={"duration_s": 6.0})
     calm = late.model_copy(update={"monitor": late.monitor.model_copy(update={"act": False})})
     design, plan = flight_plan(calm)
@@ -83,7 +83,7 @@ def test_table_and_summary_tell_both_at_the_loop_delay_that_was_measured() -> No
     assert f"errors grow {told.string_peak:.1f}" in plain_line(state)
 
 
-def test_gains_on_a_general_pattern_have_the_alpha_of_the_whole_formation_and_no_string_verdict() -> None:
+def test_general_pattern_gains_have_formation_alpha_and_no_string_verdict() -> None:
     late = TWO_WAY.with_link_delay(up_s=0.1, down_s=0.1)
     design, plan = flight_plan(late)
     told = design.at_loop_delay
@@ -106,7 +106,7 @@ def test_gains_on_a_general_pattern_have_the_alpha_of_the_whole_formation_and_no
 
 
 @pytest.mark.parametrize("loop", ["ground", "onboard"])
-def test_each_gain_set_on_a_general_pattern_has_the_alpha_of_the_gains_that_are_flown(
+def test_general_pattern_gain_sets_have_the_alpha_of_flown_gains(
     loop: Literal["ground", "onboard"],
 ) -> None:
     scenario = with_loop(TWO_WAY, loop, ROOT)
@@ -118,7 +118,7 @@ def test_each_gain_set_on_a_general_pattern_has_the_alpha_of_the_gains_that_are_
         assert found == pytest.approx(own.alpha(0.15), rel=1e-6)  # own gains are flown as float32
 
 
-def test_table_and_summary_of_a_flight_on_a_general_pattern_tell_its_alpha_at_the_delay_measured() -> None:
+def test_general_pattern_flights_tell_alpha_at_the_measured_delay() -> None:
     short = TWO_WAY.model_copy(update={"duration_s": 4.0})
     design, plan = flight_plan(short)
     flight = fly_virtual(plan)

@@ -24,7 +24,7 @@ DESIGNED = {
 
 
 @pytest.mark.parametrize("scenario", DESIGNED.values(), ids=DESIGNED.keys())
-def test_a_design_read_back_from_its_run_is_the_same_record(scenario: Scenario, tmp_path: Path) -> None:
+def test_a_design_read_back_from_its_run_is_the_same(scenario: Scenario, tmp_path: Path) -> None:
     design, plan = flight_plan(scenario)
     write_design(tmp_path, design)
     assert read_design(tmp_path / DESIGN_FILE) == design
@@ -37,7 +37,7 @@ def test_a_design_cannot_be_changed() -> None:
         Design(delay_margin_s=0.3).alpha = 1.0  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def test_margins_without_an_end_are_none_and_what_a_design_lacks_is_not_written() -> None:
+def test_endless_margins_are_none_and_missing_parts_are_not_written() -> None:
     design = Design(delay_margin_s=np.inf)
     assert design.to_dict() == {"delay_margin_s": None}
     assert design.margins_s == (np.inf,)

@@ -30,7 +30,7 @@ def exact(gain_set: int, assumed_s: float) -> tuple[float, float]:
     return mismatch_window(model.A, model.B, plan.gains[gain_set], plan.timing, assumed_s=assumed_s)
 
 
-def test_without_prediction_the_margin_is_tolerated_and_no_delay_is_too_short() -> None:
+def test_without_prediction_any_delay_up_to_the_margin_is_tolerated() -> None:
     plan = planned("off")
     tolerated = plan.tolerance.at(0.0)
     assert tolerated.longer_s == plan.margins_s
@@ -62,7 +62,7 @@ def test_a_window_that_begins_at_no_delay_ends_at_none() -> None:
     assert tolerated.used_s(0, -0.05) == -0.05
 
 
-def test_a_delay_that_is_too_short_uses_the_same_share_as_one_that_is_too_long() -> None:
+def test_too_short_and_too_long_delays_use_the_same_share() -> None:
     tolerated = planned(1.5).tolerance.at(1.5)
     used_s = tolerated.used_s(0, -tolerated.shorter_s[0])
     assert used_s == pytest.approx(tolerated.longer_s[0])

@@ -30,14 +30,14 @@ def test_a_summary_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert json.loads((tmp_path / SUMMARY_FILE).read_text(encoding="utf-8")) == summary.to_dict()
 
 
-def test_a_summary_of_an_older_run_is_read_without_its_later_fields(tmp_path: Path) -> None:
+def test_an_older_runs_summary_is_read_without_later_fields(tmp_path: Path) -> None:
     (tmp_path / SUMMARY_FILE).write_text(json.dumps(OLDER), encoding="utf-8")
     summary = read_summary(tmp_path / SUMMARY_FILE)
     assert (summary.verdict, summary.loop_delay_s.p95, summary.vehicles) == ("stable", None, ())
 
 
 @pytest.mark.parametrize("missing", [name for name in OLDER if not name.startswith("a ")])
-def test_a_summary_without_verdict_or_figures_is_refused_in_one_line(missing: str, tmp_path: Path) -> None:
+def test_summaries_without_verdict_or_figures_are_refused_in_one_line(missing: str, tmp_path: Path) -> None:
     left = {name: value for name, value in OLDER.items() if name != missing}
     (tmp_path / SUMMARY_FILE).write_text(json.dumps(left), encoding="utf-8")
     with pytest.raises(InputError, match=f"summary.json: {missing}: missing; wanted the summary of a run"):

@@ -1,0 +1,1 @@
+"""The station without sockets: its conversation, its monitor, and when a flight breaks."""

@@ -18,8 +18,8 @@ from gcs.station.station import Station
 from scenarios.schema import Limits, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
-from tests.flights.test_flight_copters import TRUTH, Flight, plan_for, three
-from tests.flights.test_pilots import PILOTS_MODE, PilotsVehicle, flight_s
+from tests.support.flown_copters import TRUTH, Flight, plan_for, three
+from tests.support.pilots import PILOTS_MODE, PilotsVehicle, flight_s
 
 
 def flown(flavour: str, modes: dict[float, int], **changes: object) -> Flight:
@@ -33,7 +33,7 @@ def flown(flavour: str, modes: dict[float, int], **changes: object) -> Flight:
 
 
 @pytest.mark.parametrize("flavour", ["ardupilot", "px4"])
-def test_a_vehicle_given_back_far_behind_comes_back_and_the_flight_is_stable(flavour: str) -> None:
+def test_a_vehicle_given_back_far_behind_returns_to_stable_flight(flavour: str) -> None:
     flight = flown(flavour, {5.0: PILOTS_MODE[flavour], 20.0: RULES[flavour].guided_mode})
     assert flight.station.end_reason == "completed: duration reached"
     assert "is given back" in flight.texts("vehicle")
@@ -43,7 +43,7 @@ def test_a_vehicle_given_back_far_behind_comes_back_and_the_flight_is_stable(fla
     assert verdict(flight.station.end_reason, 1.0) == "stable"
 
 
-def test_one_that_has_not_come_back_in_its_time_ends_the_flight_and_so_do_those_behind_it() -> None:
+def test_vehicles_or_followers_not_back_in_time_end_the_flight() -> None:
     plan = plan_for(three())
     breakage, limit_m = Breakage(plan), plan.scenario.safety.spacing_error_limit_m
 
@@ -95,7 +95,7 @@ def test_a_vehicle_that_keeps_failing_gets_no_new_time() -> None:
     assert end_of(2.0 * limit_m, 2.0 * limit_m, why=TAKEN_OVER) == ""
 
 
-def test_the_time_is_what_the_slowest_gains_need_and_the_limits_more() -> None:
+def test_the_time_suffices_the_slowest_gains_and_allows_for_limits() -> None:
     """Against the loop itself: an error stays within the limit from then on."""
     plan: FlightPlan = replace(plan_for(three()), scenario=three().model_copy(update={"limits": Limits()}))
     decay_1_s = slowest_decay_1_s(plan)

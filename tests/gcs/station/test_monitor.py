@@ -72,7 +72,7 @@ def test_caution_ends_past_the_hysteresis_and_after_the_hold() -> None:
 
 
 @pytest.mark.parametrize("mode", [Mode.NOMINAL, Mode.CAUTION, Mode.RECOVERING, Mode.CRITICAL])
-def test_critical_headroom_changes_to_the_next_slower_gains_after_the_hold(mode: Mode) -> None:
+def test_critical_headroom_brings_the_next_slower_gains_after_the_hold(mode: Mode) -> None:
     state = VehicleState(mode=mode)
     assert after(state, seconds=0.28, loop_delay_s=with_headroom(0.14)).gain_set == 0
     held = after(state, seconds=0.32, loop_delay_s=with_headroom(0.14))
@@ -91,7 +91,7 @@ def test_no_second_change_while_gains_are_blended() -> None:
     assert after(NOMINAL, seconds=1.4, loop_delay_s=with_headroom(-5.0)).gain_set == 2
 
 
-def test_slower_gains_with_enough_headroom_are_caution_until_the_link_returns() -> None:
+def test_slower_gains_with_headroom_are_caution_until_the_link_returns() -> None:
     state = after(NOMINAL, seconds=2.0, loop_delay_s=0.29)
     assert (state.mode, state.gain_set) == (Mode.CAUTION, 1)
     state = replace(state, changed_s=0.0)
@@ -119,7 +119,7 @@ def test_recovery_from_the_slowest_gains_goes_up_set_by_set() -> None:
     ]
 
 
-def test_on_the_slowest_gains_a_vehicle_is_released_only_without_any_headroom() -> None:
+def test_the_slowest_gains_release_a_vehicle_only_without_headroom() -> None:
     slowest = VehicleState(mode=Mode.CRITICAL, gain_set=2, former_set=1, changed_s=0.0)
     assert not after(slowest, seconds=10.0, loop_delay_s=with_headroom(0.05, 2)).released
     released = after(slowest, seconds=0.4, loop_delay_s=with_headroom(-0.05, 2))
@@ -168,7 +168,7 @@ def view(k: int, delays_s: list[float]) -> list[Observation]:
     return [Observation(0.02 * k, True, False, True, False, delay_s) for delay_s in delays_s]
 
 
-def test_one_late_vehicle_changes_its_own_gains_only_in_a_tree() -> None:
+def test_in_a_tree_a_late_vehicle_changes_only_its_gains() -> None:
     monitor = formation(3)
     for k in range(100):
         monitor.update(view(k, [0.05, 0.29, 0.05]))

@@ -1,54 +1,28 @@
 """The station's conversation with vehicles, frame by frame, with pymavlink as the other side."""
 
-from typing import Any
-
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.link.datagram import Datagram, Outgoing
+from gcs.link.datagram import Outgoing
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
 from gcs.station.station import Station
 from scenarios.files import load
 from tests.support.paths import SCENARIOS
+from tests.support.station_peer import HOME, Peer, messages
 
 S, MS = 1_000_000_000, 1_000_000
 SCENARIO = load(SCENARIOS / "chain3.toml")
 FORMATION = plan_formation(SCENARIO)
 GAIN = FORMATION.model.overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
 PLAN = FlightPlan(SCENARIO, FORMATION, GAIN, 0.3)
-HOME = ("127.0.0.1", 5001)
-
-
-class Peer:
-    """One vehicle played by pymavlink: what it says and what it was told."""
-
-    def __init__(self, system_id: int, address: tuple[str, int] = HOME) -> None:
-        self.link: Any = dialect.MAVLink(None, srcSystem=system_id, srcComponent=1)
-        self.address = address
-
-    def datagram(self, message: Any, time_ns: int) -> Datagram:
-        data = bytes(message.pack(self.link))
-        self.link.seq = (self.link.seq + 1) % 256  # pymavlink counts only what it sends itself
-        return Datagram(data, self.address, time_ns)
-
-    def heartbeat(self, time_ns: int, *, base_mode: int = 1, custom_mode: int = 0, status: int = 3) -> Datagram:
-        return self.datagram(self.link.heartbeat_encode(2, 3, base_mode, custom_mode, status), time_ns)
-
-
-def messages(outgoing: list[Outgoing], kind: str, to: tuple[str, int] = HOME) -> list[Any]:
-    """The messages of one kind sent to an address, as pymavlink reads them."""
-    parser: Any = dialect.MAVLink(None)
-    read = [parser.parse_char(data) for data, address in outgoing if address == to]
-    return [message for message in read if message.get_type() == kind]
 
 
 def commands(outgoing: list[Outgoing]) -> list[tuple[int, int]]:
     return [(message.command, message.confirmation) for message in messages(outgoing, "COMMAND_LONG")]
 
 
-def test_a_vehicle_is_set_up_step_by_step_one_command_at_a_time() -> None:
+def test_a_vehicle_is_set_up_one_command_at_a_time() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     outgoing, _ = station.step([peer.heartbeat(S)], S)
     (interval,) = messages(outgoing, "COMMAND_LONG")
@@ -70,7 +44,7 @@ def test_a_command_without_answer_is_repeated_with_its_confirmation_raised() -> 
     assert sent == [(511, 0), (511, 1), (511, 2), (511, 3)]
 
 
-def test_a_refused_command_is_reported_and_tried_again_a_second_later() -> None:
+def test_refused_commands_are_reported_and_tried_again_a_second_later() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     station.step([peer.heartbeat(S)], S)
     station.step([peer.datagram(peer.link.command_ack_encode(511, 2), S)], S + 20 * MS)
@@ -87,7 +61,7 @@ def test_an_acknowledgement_of_another_command_is_not_taken_for_ours() -> None:
     assert station.vehicles[1].missing == "does not accept the telemetry rate"
 
 
-def test_timesync_request_of_a_vehicle_is_answered_with_the_receive_time() -> None:
+def test_a_vehicles_timesync_request_is_answered_with_the_receive_time() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     request = peer.datagram(peer.link.timesync_encode(0, 777), S + 3 * MS)
     outgoing, _ = station.step([peer.heartbeat(S), request], S + 5 * MS)
@@ -104,7 +78,7 @@ def test_a_heartbeat_that_is_replayed_or_overtaken_undoes_nothing() -> None:
     assert (vehicle.frames.duplicate, vehicle.frames.late) == (1, 1)
 
 
-def test_what_a_link_reorders_or_repeats_is_no_refusal_and_is_told_once_of_each_vehicle() -> None:
+def test_reordered_or_repeated_frames_are_no_refusals_and_told_once() -> None:
     station, peers = Station(PLAN, start_ns=S), [Peer(2), Peer(3)]
     for second in range(1, 5):
         for peer in peers:
@@ -116,7 +90,7 @@ def test_what_a_link_reorders_or_repeats_is_no_refusal_and_is_told_once_of_each_
     assert told == [(system_id, text) for system_id in (2, 3) for text in texts]
 
 
-def test_a_vehicle_that_begins_anew_to_count_its_frames_is_heard() -> None:
+def test_a_vehicle_that_counts_its_frames_anew_is_heard() -> None:
     station, peer = Station(PLAN, start_ns=S), Peer(2)
     vehicle = next(vehicle for vehicle in station.vehicles if vehicle.system_id == 2)
     peer.link.seq = 100
@@ -135,7 +109,7 @@ def test_unknown_system_id_is_counted_and_not_answered() -> None:
     assert station.counters == {"unknown system id": 1}
 
 
-def test_a_second_source_of_a_known_id_is_refused_until_the_first_is_silent() -> None:
+def test_a_second_source_is_refused_until_the_first_is_silent() -> None:
     station, peer, thief = Station(PLAN, start_ns=S), Peer(2), Peer(2, ("127.0.0.1", 6666))
     station.step([peer.heartbeat(S)], S)
     station.step([thief.heartbeat(S + 100 * MS)], S + 100 * MS)

@@ -1,0 +1,1 @@
+"""Campaigns, free responses, and the map of where a formation breaks."""

@@ -23,18 +23,9 @@ from gcs.stress.campaign import (
     write_table,
 )
 from gcs.stress.measure import fly_trial
-from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, Trial
 from tests.support.paths import ROOT
-from tests.support.stress_pair import SCENARIO, pair_plan
-
-
-def trials(count: int, *, bad: int = -1) -> list[Trial]:
-    """Short own flights at different delays; one of them may have a gain matrix that does not fit."""
-    study = Study(pair_plan())
-    study = replace(study, plan=replace(study.plan, scenario=SCENARIO.model_copy(update={"duration_s": 1.0})))
-    made = [study.trial("own", {"delay": round(0.01 * k, 3)}, seed=7) for k in range(count)]
-    return [replace(trial, gain=((99, 0, 1.0),)) if k == bad else trial for k, trial in enumerate(made)]
+from tests.support.stress_pair import trials
 
 
 class Here:
@@ -140,7 +131,7 @@ KILLED = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from tests.gcs.stress.test_campaign import trials
+from tests.support.stress_pair import trials
 from gcs.stress.campaign import Store, local_workers, run_campaign
 if __name__ == "__main__":
     store = Store(Path(sys.argv[1]))

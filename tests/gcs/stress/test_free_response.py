@@ -194,7 +194,7 @@ def test_the_effective_delay_predicts_loss_the_median_does_not() -> None:
     assert outcome.growth_1_s - without.growth_1_s > 0.2
 
 
-def test_a_probe_lasts_as_many_loop_delays_whatever_the_margin_if_links_are_random() -> None:
+def test_on_random_links_a_probe_lasts_equally_many_loop_delays() -> None:
     """Its rate is a mean over the delays drawn: 20 s at a margin of 1.5 s left it wrong by the whole curve's range."""
 
     def duration_s(margin_s: float, **coordinates: float) -> float:

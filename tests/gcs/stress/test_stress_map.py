@@ -39,7 +39,7 @@ def test_nothing_is_guaranteed_where_no_delay_is_the_longest(axes: tuple[Axis, A
     assert guaranteed_line(Study(plan), axes) is None
 
 
-def test_a_station_that_predicts_guarantees_nothing_by_the_loop_without_it() -> None:
+def test_a_predicting_station_guarantees_nothing_by_the_unpredicted_loop() -> None:
     control = SCENARIO.control.model_copy(update={"prediction": 0.6})
     study = Study(replace(pair_plan(), scenario=SCENARIO.model_copy(update={"control": control})))
     assert guaranteed_line(study, DELAY_JITTER) is None

@@ -1,0 +1,1 @@
+"""The studies: capacity, comparison, and the source reproduced."""

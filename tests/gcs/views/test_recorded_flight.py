@@ -22,8 +22,8 @@ from gcs.views.viewer import screenshot, vulkan_missing
 from scenarios.files import dump, load
 from scenarios.link_schema import DelayPoint, Link, VehicleLinks
 from scenarios.schema import Scenario
-from tests.gcs.views.test_recording import read_back
 from tests.support.paths import SCENARIOS
+from tests.support.recordings import read_back
 
 pytestmark = pytest.mark.xdist_group("recorded flight")
 
@@ -65,7 +65,7 @@ def test_reruns_own_check_finds_the_recording_whole(run: Path) -> None:
     assert rerun("rrd", "verify", cut).returncode != 0  # the check can fail
 
 
-def test_delays_headroom_and_errors_in_the_recording_are_those_of_the_ticks(run: Path) -> None:
+def test_recorded_delays_headroom_and_errors_are_those_of_the_ticks(run: Path) -> None:
     ticks = read_ticks(run).reshape(-1, len(SCENARIO.vehicles))
     column = {system_id: k for k, system_id in enumerate(ticks[0]["system_id"].tolist())}
     flown = ticks[ticks["time_s"][:, 0] >= 0][:, [column[vehicle.system_id] for vehicle in SCENARIO.vehicles]]
@@ -84,7 +84,7 @@ def test_delays_headroom_and_errors_in_the_recording_are_those_of_the_ticks(run:
     assert np.nanmax(errors_m[0]) > 4 > np.nanmax(errors_m[-1])
 
 
-def test_a_margin_is_drawn_for_the_gains_each_vehicle_is_flown_with(tmp_path: Path) -> None:
+def test_a_margin_is_drawn_for_each_vehicles_flown_gains(tmp_path: Path) -> None:
     """The loop delay of vehicle 2 passes the margin of the fastest gains, and it changes to slower ones."""
     links = SCENARIO.links.model_copy(update={"vehicles": (VehicleLinks(system_id=2, up=SLOW, down=SLOW),)})
     folder = recorded(SCENARIO.model_copy(update={"links": links}), tmp_path)
@@ -111,7 +111,7 @@ def test_a_margin_is_drawn_for_the_gains_each_vehicle_is_flown_with(tmp_path: Pa
 
 
 @pytest.mark.skipif(vulkan_missing(), reason="no Vulkan driver installed (Debian: mesa-vulkan-drivers)")
-def test_the_headless_viewer_opens_a_flight_and_no_view_reports_an_error(run: Path) -> None:
+def test_the_headless_viewer_opens_a_flight_without_view_errors(run: Path) -> None:
     pictures: list[Any] = []
     for time_s in (0.2, 3.5):
         png = run / f"{time_s}.png"
@@ -124,7 +124,7 @@ def test_the_headless_viewer_opens_a_flight_and_no_view_reports_an_error(run: Pa
 
 
 @pytest.mark.skipif(vulkan_missing(), reason="no Vulkan driver installed (Debian: mesa-vulkan-drivers)")
-def test_a_recording_cut_off_before_its_first_tick_is_told_in_one_line(run: Path, tmp_path: Path) -> None:
+def test_a_recording_without_any_tick_is_told_in_one_line(run: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.rrd"
     cut.write_bytes((run / "flight.rrd").read_bytes()[:2000])
     with pytest.raises(InputError, match=r"cut\.rrd: the viewer reads no flight in it; wanted a recording of a run"):

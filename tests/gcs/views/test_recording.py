@@ -19,27 +19,16 @@ from gcs.views.recording import Recording
 from gcs.views.scene import vehicle_colors
 from gcs.views.viewer import find_recording, view
 from tests.support.flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
+from tests.support.recordings import read_back
 
 FIVE = line(5)
-
-
-def read_back(recording: Path, entity: str, component: str) -> tuple[Any, Any]:
-    """Times in s and values, shape (times, vehicles, ...), of one entity in the order of time."""
-    times: list[float] = []
-    values: list[Any] = []
-    for chunk in RrdReader(recording).stream().filter(content=entity, is_static=False, components=component):
-        batch = chunk.to_record_batch()
-        times += [time / 1e9 for time in batch.column("sim_time").cast(pa.int64()).to_pylist()]
-        values += batch.column(component).to_pylist()
-    order = np.argsort(times, kind="stable")
-    return np.array(times)[order], np.array(values, dtype=float)[order]
 
 
 def spacing_errors_m(ticks: TickArray) -> Any:
     return np.hypot(ticks["spacing_error_north_m"], ticks["spacing_error_east_m"])[:, 1:]
 
 
-def test_every_followers_spacing_error_is_recorded_as_it_was_at_every_tick(tmp_path: Path) -> None:
+def test_every_followers_spacing_error_is_recorded_at_every_tick(tmp_path: Path) -> None:
     ticks = ticks_of(FIVE, start_s=0.0, count=120)
     write_run(tmp_path, FIVE, ticks)
     times_s, errors_m = read_back(record_run(tmp_path), "/spacing/error_m", "Scalars:scalars")
@@ -47,7 +36,7 @@ def test_every_followers_spacing_error_is_recorded_as_it_was_at_every_tick(tmp_p
     np.testing.assert_array_equal(errors_m, spacing_errors_m(ticks))
 
 
-def test_a_run_whose_ticks_are_parquet_by_now_is_recorded_alike(tmp_path: Path) -> None:
+def test_a_run_with_ticks_in_parquet_is_recorded_alike(tmp_path: Path) -> None:
     ticks = ticks_of(FIVE, start_s=0.0, count=120)
     write_run(tmp_path, FIVE, ticks)
     rows = ticks.ravel()
@@ -57,7 +46,7 @@ def test_a_run_whose_ticks_are_parquet_by_now_is_recorded_alike(tmp_path: Path) 
     np.testing.assert_array_equal(errors_m, spacing_errors_m(ticks))
 
 
-def test_sending_in_many_pieces_records_the_same_as_sending_at_once(tmp_path: Path) -> None:
+def test_sending_in_pieces_records_the_same_as_sending_at_once(tmp_path: Path) -> None:
     ticks = ticks_of(FIVE, start_s=0.0, count=200)
     found: list[Any] = []
     for pieces in (1, 40):
@@ -92,7 +81,7 @@ def test_trails_join_up_to_the_way_flown(tmp_path: Path) -> None:
     np.testing.assert_allclose(pieces_m[-1, :, 1, 0] - pieces_m[0, :, 0, 0], 2.0 * SPEED_M_S, atol=0.1)
 
 
-def test_the_unknown_stays_unknown_and_round_trips_last_until_the_next(tmp_path: Path) -> None:
+def test_unknowns_stay_unknown_and_round_trips_last_until_the_next(tmp_path: Path) -> None:
     ticks = ticks_of(FIVE, start_s=0.0, count=20)
     ticks["loop_delay_s"][5:10, 2] = np.nan
     write_run(tmp_path, FIVE, ticks)
@@ -103,7 +92,7 @@ def test_the_unknown_stays_unknown_and_round_trips_last_until_the_next(tmp_path:
     np.testing.assert_allclose(rtt_ms, 50.0)
 
 
-def test_the_recording_starts_with_the_flight_and_earlier_events_stand_at_its_start(tmp_path: Path) -> None:
+def test_events_before_the_flight_stand_at_the_recordings_start(tmp_path: Path) -> None:
     write_run(tmp_path, FIVE, ticks_of(FIVE, start_s=-1.0, count=100))
     file = record_run(tmp_path)
     times_s, _ = read_back(file, "/headroom/percent", "Scalars:scalars")
@@ -191,7 +180,7 @@ def test_every_vehicle_has_a_colour_of_its_own(count: int) -> None:
     assert len(set(vehicle_colors(count))) == count
 
 
-def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path: Path) -> None:
+def test_a_missing_recording_is_named_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere: no such run folder or recording"):
         find_recording(tmp_path / "nowhere")
     with pytest.raises(InputError, match=r"no flight\.rrd here"):
@@ -206,7 +195,7 @@ def test_a_recording_that_is_not_there_is_named_in_one_line(tmp_path: Path) -> N
         find_recording(tmp_path)
 
 
-def test_a_half_written_tick_is_left_out_of_a_recovered_recording(tmp_path: Path) -> None:
+def test_a_recovered_recording_leaves_out_a_half_written_tick(tmp_path: Path) -> None:
     ticks = ticks_of(FIVE, start_s=0.0, count=30)
     write_run(tmp_path, FIVE, ticks)
     with (tmp_path / TICKS_FILE).open("r+b") as file:

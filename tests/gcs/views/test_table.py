@@ -33,7 +33,7 @@ def flown(scenario: Scenario, ticks: TickArray | None = None) -> FlightState:
     return state
 
 
-def test_a_row_shows_the_newest_state_and_the_figures_of_the_last_seconds() -> None:
+def test_a_row_shows_the_newest_state_and_recent_figures() -> None:
     ticks = ticks_of(line(5), start_s=10.0, count=50)
     ticks["spacing_error_north_m"][-1, 1], ticks["spacing_error_east_m"][-1, 1] = 3.0, 4.0
     ticks["loop_delay_s"][:, 1] = np.linspace(0.051, 0.100, 50)
@@ -55,7 +55,7 @@ def test_the_figures_forget_what_was_before_the_last_seconds() -> None:
     assert row_of(drawn(state), 1)[8] == "80"
 
 
-def test_what_is_not_known_is_a_dash_and_never_a_zero() -> None:
+def test_what_is_unknown_is_a_dash_and_never_a_zero() -> None:
     lines = drawn(FlightState(line(3), DESIGN))
     for system_id, front in ((3, "–"), (2, "3"), (1, "2")):
         assert row_of(lines, system_id) == [str(system_id), front, *"–––––––", "0", "0", "WAITING"]
@@ -81,14 +81,14 @@ def test_the_table_fits_every_terminal(count: int, width: int, height: int) -> N
     assert "NOMINAL" in "".join(lines)  # the last column is whole
 
 
-def test_twenty_vehicles_are_all_shown_on_forty_rows_in_the_scenarios_order() -> None:
+def test_forty_rows_show_all_twenty_vehicles_in_the_scenarios_order() -> None:
     lines = drawn(flown(line(20)))
     shown = [int(text.split()[0]) for text in lines if text.endswith("NOMINAL")]
     assert shown == list(range(20, 0, -1))
     assert not any("not shown" in text for text in lines)
 
 
-def test_of_many_vehicles_the_worst_are_shown_and_the_others_counted() -> None:
+def test_of_many_vehicles_the_worst_are_shown_and_others_counted() -> None:
     ticks = ticks_of(line(250), start_s=0.0, count=5)
     ticks["mode"][-1, 100] = Mode.LOST  # system id 150
     ticks["headroom"][-1, 200] = -0.2  # system id 50
@@ -101,7 +101,7 @@ def test_of_many_vehicles_the_worst_are_shown_and_the_others_counted() -> None:
     assert len(shown) >= 25
 
 
-def test_header_and_footer_say_phase_time_progress_lateness_and_skipped_ticks() -> None:
+def test_header_and_footer_say_phase_time_progress_lateness_and_skips() -> None:
     scenario = line(3)
     ticks = ticks_of(scenario, start_s=0.0, count=251)
     ticks["sent_ns"] = ticks["due_ns"] + 2_500_000
@@ -121,7 +121,7 @@ def test_header_and_footer_say_phase_time_progress_lateness_and_skipped_ticks() 
         assert wanted in text
 
 
-def test_events_that_say_the_same_of_several_vehicles_share_a_line() -> None:
+def test_events_saying_the_same_of_several_vehicles_share_a_line() -> None:
     state = FlightState(line(20), DESIGN)
     late = [Event(time_s=3.1, kind="mode", system_id=k, text="NOMINAL -> CAUTION") for k in range(1, 21)]
     back = [Event(time_s=9.0, kind="mode", system_id=7, text="CAUTION -> NOMINAL")]
@@ -181,7 +181,7 @@ def test_headroom_is_coloured_on_a_terminal_only(mode: Mode, headroom: float, se
         assert all((sequence in output.getvalue()) == terminal for sequence in sequences)
 
 
-def test_what_was_refused_has_a_line_of_its_own_and_is_no_news() -> None:
+def test_refusals_have_their_own_line_and_are_no_news() -> None:
     state = flown(line(2))
     event = Event(time_s=1.0, kind="refused", text="3 unsigned", counts={"unsigned": 3})
     assert not any("refused" in text for text in drawn(state))

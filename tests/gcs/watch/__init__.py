@@ -1,0 +1,1 @@
+"""Links watched, and telemetry logs read, rebuilt and exported."""

@@ -59,9 +59,7 @@ def test_a_run_as_mcap_holds_every_value_of_every_tick(
         assert np.isnan(values[~finite]).all()
 
 
-def test_a_telemetry_log_as_csv_has_a_file_for_each_kind_of_message(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_as_csv_has_one_file_per_message_kind(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert export(monkeypatch, run / TLOG_FILE, "--csv", tmp_path / "csv", "--mcap", tmp_path / "log.mcap") == 0
     rows = 0
     for file in (tmp_path / "csv").iterdir():

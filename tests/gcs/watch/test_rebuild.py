@@ -17,7 +17,7 @@ from gcs.watch.rebuild_report import LogSource, rebuild_report
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
 from scenarios.schema import Scenario
-from tests.flights.test_flight_monitor import ramp
+from tests.support.delay_ramp import ramp
 from tests.support.known import known
 from tests.support.logged_flight import EPOCH_NS, flown, log_bytes
 from tests.support.paths import SCENARIOS
@@ -58,7 +58,7 @@ def both(flight: str) -> tuple[Summary, Summary]:
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_the_verdict_its_reason_and_the_ticks_are_those_of_the_flight(flight: str) -> None:
+def test_verdict_reason_and_ticks_are_those_of_the_flight(flight: str) -> None:
     summary, rebuilt = both(flight)
     assert rebuilt.verdict == summary.verdict
     assert rebuilt.reason == summary.reason
@@ -101,7 +101,7 @@ def test_errors_and_distances_are_those_of_the_flight(flight: str) -> None:
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
-def test_modes_and_what_was_lost_and_late_are_those_of_the_flight(flight: str) -> None:
+def test_modes_losses_and_lateness_are_those_of_the_flight(flight: str) -> None:
     summary, rebuilt = both(flight)
     period_s = 0.02
 
@@ -138,7 +138,7 @@ def overheard(*, requests: bool) -> tuple[bytes, TickArray]:
 
 
 @pytest.mark.parametrize("requests", [True, False], ids=["with exchanges", "telemetry only"])
-def test_a_log_of_another_tool_gives_links_and_errors_and_no_verdict(requests: bool) -> None:
+def test_another_tools_log_gives_links_and_errors_but_no_verdict(requests: bool) -> None:
     scenario = scenario_of("chain3")
     data, ticks = overheard(requests=requests)
     log = parse_tlog(data)

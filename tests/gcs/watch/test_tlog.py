@@ -51,7 +51,7 @@ def test_both_versions_of_mavlink_are_read_with_the_same_fields(dialect: Any) ->
 
 
 @given(st.integers(1, len(logged(ENTRIES))))
-def test_a_log_cut_short_anywhere_gives_every_whole_frame_before_the_cut(length: int) -> None:
+def test_logs_cut_anywhere_give_all_whole_frames_before_the_cut(length: int) -> None:
     entry_bytes = 8 + len(ENTRIES[0][1])
     sizes = [len(logged(ENTRIES[:k])) for k in range(len(ENTRIES) + 1)]
     whole = sum(size <= length for size in sizes) - 1
@@ -81,7 +81,7 @@ def test_any_bytes_are_taken_without_an_exception(data: bytes) -> None:
     assert len(log.frames) * 8 + log.counters["damaged bytes"] <= len(data)
 
 
-def test_a_frame_with_a_wrong_time_is_left_out_and_counted() -> None:
+def test_frames_with_a_wrong_time_are_left_out_and_counted() -> None:
     entries = list(ENTRIES)
     entries[30] = (entries[30][0] + 3_600_000_000, entries[30][1])
     entries[0] = (5, entries[0][1])

@@ -74,7 +74,7 @@ class Watched:
         return (self.now_ns - sampled[-1]) * 1e-9 if sampled else np.nan
 
 
-def test_round_trips_and_loop_delays_are_those_of_the_links_to_the_microsecond() -> None:
+def test_round_trips_and_loop_delays_match_links_to_the_microsecond() -> None:
     watched = Watched(linked(Link(delay_s=0.07), Link(delay_s=0.03)), timesync_hz=10.0)
     watched.run(8.0)
     vehicle = watched.watch.vehicles[1]
@@ -93,7 +93,7 @@ def test_round_trips_and_loop_delays_are_those_of_the_links_to_the_microsecond()
     assert figures.status == "measured"
 
 
-def test_silence_gives_lower_bounds_that_hold_and_rise_with_the_jitter() -> None:
+def test_silence_gives_lower_bounds_that_hold_and_rise_with_jitter() -> None:
     jitter = Jitter(distribution="uniform", scale_s=0.02)
     watched = Watched(linked(Link(delay_s=0.05, jitter=jitter), Link(delay_s=0.05)), timesync_hz=0.0)
     watched.run(10.0)
@@ -110,7 +110,7 @@ def test_silence_gives_lower_bounds_that_hold_and_rise_with_the_jitter() -> None
     assert watched.watch.figures(watched.now_ns, 0.3)[0].status == "no exchange"
 
 
-def test_the_exchanges_of_a_station_on_the_same_stream_are_used_without_asking() -> None:
+def test_another_stations_exchanges_on_the_stream_are_used_without_asking() -> None:
     watched = Watched(linked(Link(delay_s=0.02), Link(delay_s=0.02)), timesync_hz=0.0)
     asked = [(system_id, START_NS + k * 100 * MS + system_id) for k in range(40) for system_id in (1, 2, 3)]
     station = [
@@ -124,7 +124,7 @@ def test_the_exchanges_of_a_station_on_the_same_stream_are_used_without_asking()
     assert watched.sent == []
 
 
-def test_nothing_but_timesync_requests_is_sent_and_the_rate_is_as_told() -> None:
+def test_only_timesync_requests_are_sent_at_the_rate_asked_for() -> None:
     watched = Watched(CHAIN, timesync_hz=5.0)
     watched.run(10.0)
     frames = [frame for data in watched.sent for frame in mavlink.decode(data, Counter())]
@@ -132,7 +132,7 @@ def test_nothing_but_timesync_requests_is_sent_and_the_rate_is_as_told() -> None
     assert 3 * 5 * 8 < len(frames) <= 3 * 5 * 10 + 3
 
 
-def test_a_vehicle_whose_station_has_gone_goes_to_its_failsafe_though_it_is_watched() -> None:
+def test_without_its_station_a_watched_vehicle_goes_to_failsafe() -> None:
     watched = Watched(CHAIN, timesync_hz=10.0)
     watched.run(1.0)
     start_ns = watched.now_ns
@@ -145,7 +145,7 @@ def test_a_vehicle_whose_station_has_gone_goes_to_its_failsafe_though_it_is_watc
     assert len(watched.watch.vehicles[1].rtt_s) > 40
 
 
-def test_a_vehicle_that_falls_silent_says_so_and_its_delay_does_not_grow() -> None:
+def test_silence_is_shown_and_does_not_make_a_delay_grow() -> None:
     watched = Watched(linked(Link(delay_s=0.01), Link(delay_s=0.01)), timesync_hz=10.0)
     watched.run(5.0)
     before = watched.watch.figures(watched.now_ns, None)[0]
@@ -159,7 +159,7 @@ def test_a_vehicle_that_falls_silent_says_so_and_its_delay_does_not_grow() -> No
     assert after.headroom is None
 
 
-def test_looks_are_uneven_so_that_no_telemetry_rate_is_in_step_with_them() -> None:
+def test_looks_are_uneven_and_in_step_with_no_telemetry_rate() -> None:
     watch = Watch([1])
     times = [0]
     while len(times) < 500:
@@ -183,7 +183,7 @@ def test_looks_are_uneven_so_that_no_telemetry_rate_is_in_step_with_them() -> No
         max_size=40,
     )
 )
-def test_whatever_a_stream_says_is_taken_and_figures_are_plain_numbers(
+def test_any_stream_is_taken_and_figures_are_plain_numbers(
     said: list[tuple[int, int, int, int]],
 ) -> None:
     watch = Watch([1])
@@ -205,7 +205,7 @@ def test_whatever_a_stream_says_is_taken_and_figures_are_plain_numbers(
 
 
 @pytest.mark.parametrize("width", [50, 73, 80, 139, 140, 200])
-def test_the_table_of_links_fits_the_terminal_and_keeps_headroom_and_status(width: int) -> None:
+def test_the_links_table_fits_the_terminal_with_headroom_and_status(width: int) -> None:
     watched = Watched(CHAIN, timesync_hz=10.0)
     watched.run(1.5)
     figures = watched.watch.figures(watched.now_ns, 0.3)

@@ -22,6 +22,7 @@ from sim_vehicles.links.links import CAPACITY, LinkSet
 from sim_vehicles.links.relay import Passing, Relay, holds_key, sender
 from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, LINK_DOWN, LINK_UP, LOST, Row, read_truth
 from sim_vehicles.services.clock import NEVER_NS
+from tests.support.processes import free_port
 from tests.support.sim_client import MS, SECOND, START, heartbeat, scenario, setpoint
 
 WILD = link_schema.Link(
@@ -122,11 +123,6 @@ def a_socket() -> socket.socket:
     own.bind(("127.0.0.1", 0))
     own.settimeout(10.0)
     return own
-
-
-def free_port() -> int:
-    with a_socket() as own:
-        return own.getsockname()[1]
 
 
 @contextmanager

@@ -1,0 +1,1 @@
+"""One emulated link: due times, order, draws, and the truth log."""

@@ -1,0 +1,1 @@
+"""What a vehicle answers: parameters, authority, other stations' questions, and its boot clock."""

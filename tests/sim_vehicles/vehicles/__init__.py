@@ -1,0 +1,1 @@
+"""The vehicles of each kind: motion, commands, failsafe, and hostile datagrams."""
