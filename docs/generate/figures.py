@@ -117,6 +117,46 @@ def margin_thesis(runner: Runner) -> str:
     return _output(runner.run("gcs margin scenarios/thesis_delay.toml"))
 
 
+# --- prediction ---------------------------------------------------------------------------------------------------
+
+
+def prediction_windows(runner: Runner) -> str:
+    """Between which loop delays triangle5 is stable, over several assumed ones."""
+
+    def span(ends_s: tuple[float, float | None]) -> str:
+        return f"{1e3 * ends_s[0]:.1f} to {_ms(ends_s[1])}"
+
+    rows: list[tuple[str, ...]] = []
+    for assumed_s in (0.3, 0.6, 1.5, 3.0):
+        name = _predicting(runner, f"assumed{1e3 * assumed_s:.0f}", f"{assumed_s}")
+        found = runner.json(f"gcs design {name}")["prediction"]
+        windows = found["mismatch_window_s"], found["mismatch_window_continuous_s"]
+        rows.append((_ms(assumed_s, 0), *map(span, windows)))
+    head = ("assumed loop delay", "stable between", "continuous model")
+    return f"Each file is `triangle5.toml` with `prediction` in s:\n\n{table(head, rows)}"
+
+
+def prediction_flights(runner: Runner) -> str:
+    """triangle5 over links that take five times its margin, with and without prediction."""
+    rows: list[tuple[str, ...]] = []
+    for name, prediction in (("predicted", '"measured"'), ("plain", '"off"')):
+        text = (runner.folder / _predicting(runner, name, prediction)).read_text(encoding="utf-8")
+        (runner.folder / f"{name}.toml").write_text(text.replace("delay_s = 0.02", "delay_s = 0.75"), encoding="utf-8")
+        flight = runner.json(f"gcs fly {name}.toml --virtual", wanted=(0, 1))
+        settled_s = flight["settling_time_s"]
+        settled = "not settled" if settled_s is None else f"settled after {settled_s:.1f} s"
+        outcome = (
+            f"{flight['verdict']}, {settled}" if settled_s is not None else f"{flight['verdict']}: {flight['reason']}"
+        )
+        rows.append((f"`{prediction}`", outcome, _ms(flight["loop_delay_s"]["p50"]), f"{flight['headroom_min']:.0%}"))
+    head = ("`prediction`", "flight", "loop delay, median", "least headroom")
+    return f"Both files are `triangle5.toml` with `delay_s = 0.75` each way:\n\n{table(head, rows)}"
+
+
+def _predicting(runner: Runner, name: str, prediction: str) -> str:
+    return _changed(runner, "triangle5", name, r"^\[control\]", f"[control]\nprediction = {prediction}")
+
+
 # --- where formations break ---------------------------------------------------------------------------------------
 
 
@@ -363,7 +403,10 @@ def speed_compiled(runner: Runner) -> str:
     return _speed(runner, compiled=True)
 
 
-_QUICK = (design, string_limit, compare, margin_held, margin_thesis, onset_chain3, readme_onset)
+_QUICK = (
+    *(design, string_limit, compare, prediction_windows, prediction_flights),
+    *(margin_held, margin_thesis, onset_chain3, readme_onset),
+)
 _EXACT = (onsets, thesis_flights, maps, capacity)
 _TIMED = (readme_fly, flights, too_late, punctuality, copters, signing, design_time, speed, onset_real_time)
 _COMPILED = (speed_compiled,)
