@@ -132,8 +132,8 @@ def test_a_link_too_slow_for_the_flight_is_found_beforehand(
     file = str(ROOT / "scenarios/chain3.toml")
     line = complaint(capsys, monkeypatch, "fly", file, "--link-delay", "40")
     assert line == (
-        f"{file}: links: read a round trip of 80 s to vehicle 1, wanted less than the 20 s for which an answer is "
-        "waited for\n"
+        f"{file}: links: read a round trip of 80 s to vehicle 1, wanted less than the 20 s that the station "
+        "waits for an answer\n"
     )
     out = str(tmp_path / "stress")
     line = complaint(capsys, monkeypatch, "stress", file, "--delay", "0.1,30", "--out", out)
