@@ -24,7 +24,7 @@ COMPILED = (
     "gcs/station/tick_rows.py scenarios/signing/link.py scenarios/signing/stamps.py sim_vehicles/drive/fleet.py "
     "sim_vehicles/links/links.py sim_vehicles/services/clock.py "
     "sim_vehicles/services/mavlink.py sim_vehicles/services/schedule.py "
-    "sim_vehicles/vehicles/double_integrator.py sim_vehicles/vehicles/dynamics.py "
+    "sim_vehicles/vehicles/double_integrator.py sim_vehicles/motion/double_integrator.py "
     "sim_vehicles/vehicles/flight_mode.py sim_vehicles/vehicles/setpoints.py sim_vehicles/vehicles/shell.py"
 )
 
@@ -70,7 +70,7 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         "write requirements.lock anew from pyproject.toml",
         [
             "uv pip compile --upgrade --universal --generate-hashes --no-header --no-emit-index-url "
-            "--group dev pyproject.toml -o requirements.lock"
+            "--all-extras --group dev pyproject.toml -o requirements.lock"
         ],
     ),
 }

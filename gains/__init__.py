@@ -10,6 +10,7 @@ more, each room using those below it:
 * `varying`: delays that change: which of them a loop is proved to take.
 * `margin`: the engine of `gcs margin`: any linear loop from one description, confirmed by second opinions.
 * `performance`: what given gains do: robustness, growth down the chain, vehicles that respond with a lag.
+* `criteria`: what a design can be asked for beside margin, robustness and decay, as figures of given gains.
 * `design`: from a requirement to gains.
 
 A module whose name begins with an underscore is internal. Matrices are arrays or nested lists; A, B and K are those of

@@ -1,6 +1,7 @@
 """The ground station: flies formations over MAVLink and compares measured loop delay with the delay margin.
 
-From Python, `fly_virtual` flies a scenario in virtual time; importing the name loads what it needs.
+From Python, `fly_virtual` flies a scenario in virtual time, and `LawFormation` is what a control law of one's own is
+called with; importing a name loads what it needs.
 """
 
 import os
@@ -11,8 +12,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gcs.drive.virtual import VirtualFlight, fly_virtual
+    from gcs.plan.own_law import LawFormation
 
-__all__ = ["VirtualFlight", "fly_virtual"]
+__all__ = ["LawFormation", "VirtualFlight", "fly_virtual"]
 
 
 def __getattr__(name: str) -> object:
@@ -20,4 +22,4 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module("gcs.drive.virtual"), name)
+    return getattr(import_module("gcs.plan.own_law" if name == "LawFormation" else "gcs.drive.virtual"), name)

@@ -1,9 +1,18 @@
 """Records whose fields users read: in JSON files, and in what commands print with --json."""
 
 import json
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
+
+SCHEMA_VERSION = 1
+"""`schema_version` of all JSON: it grows when a field changes its meaning or goes, not when one is added."""
+
+
+def json_text(fields: Mapping[str, Any], default: Callable[[Any], Any] | None = None) -> str:
+    """JSON over several lines, the schema's version first; `default` as of `json.dumps`."""
+    return json.dumps({"schema_version": SCHEMA_VERSION, **fields}, indent=2, allow_nan=False, default=default)
 
 
 class Published(BaseModel):
@@ -17,4 +26,4 @@ class Published(BaseModel):
 
     def to_json(self) -> str:
         """JSON over several lines."""
-        return json.dumps(self.to_dict(), indent=2, allow_nan=False)
+        return json_text(self.to_dict())

@@ -3,8 +3,6 @@
 Every fault is a ScenarioError: one line with file, key, what was read and what was wanted.
 """
 
-import contextlib
-import csv
 import difflib
 import hashlib
 import itertools
@@ -19,14 +17,19 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import to_json
 
 from scenarios.errors import ScenarioError
-from scenarios.link_schema import Jitter, Link, Links
-from scenarios.part import MOST
+from scenarios.for_link import contradictions as for_link_contradictions
+from scenarios.keys.autopilot import response_contradictions
+from scenarios.keys.criteria import criteria_faults
+from scenarios.keys.disturbance import disturbance_contradictions
+from scenarios.keys.link import Jitter, Link, Links
+from scenarios.keys.sitl import sitl_contradictions
+from scenarios.manoeuvres import contradictions as manoeuvre_contradictions
+from scenarios.own_code import as_flown, own_code_faults, with_code
 from scenarios.places import line_of, location_of, named, wanted_of
+from scenarios.profiles import load_profile
 from scenarios.schema import Scenario
+from scenarios.traces import TRACE_DELAYS, each_link, with_traces
 
-TRACE_DELAYS = 100_000
-"""Largest number of delays in a trace."""
-TRACE_COLUMN = "delay_s"
 _A_VEHICLE = "the system_id of a vehicle of this scenario"
 _Fault = tuple[str, object, str]
 """A key, what was read and what was wanted."""
@@ -59,9 +62,23 @@ def parse(text: str, file: Path) -> Scenario:
         scenario = Scenario.model_validate_json(to_json(data))
     except ValidationError as errors:
         raise _at_line(file, text, data, *_first_error(errors, data)) from None
+    if scenario.code:
+        raise _at_line(file, text, data, "code", "tables", "no such key: files of code are named by other keys")
     for key, read, wanted in _contradictions(scenario):
         raise _at_line(file, text, data, key, read, wanted)
-    return _with_traces(scenario, file)
+    if scenario.links.profile is not None:
+        scenario = with_profile(scenario, scenario.links.profile, file)
+    return with_code(with_traces(scenario, file), file)
+
+
+def with_profile(scenario: Scenario, name: str, file: Path, key: str = "links.profile") -> Scenario:
+    """The scenario with the links of a profile for all vehicles; `file` and `key` are named in errors."""
+    profile = load_profile(name, file, key)
+    links = Links(up=profile.up, down=profile.down, channels=profile.channels, times_from=scenario.links.times_from)
+    changed = scenario.model_copy(update={"links": links})
+    for place, read, wanted in _links_contradictions(changed):
+        raise ScenarioError(file, key, f"{name}: {place}: {read}", wanted)
+    return changed
 
 
 def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path) -> Scenario:
@@ -70,22 +87,27 @@ def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path
     Raises ScenarioError if the scenario cannot be flown with this loop.
     """
     control = scenario.control.model_copy(update={"loop": loop})
-    changed = scenario.model_copy(update={"control": control})
-    for key, read, wanted in _contradictions(changed):
+    return checked(scenario.model_copy(update={"control": control}), file)
+
+
+def checked(scenario: Scenario, file: Path) -> Scenario:
+    """A changed scenario, if its keys do not contradict each other; else raises ScenarioError, which names the file."""
+    for key, read, wanted in _contradictions(scenario):
         raise ScenarioError(file, key, read, wanted)
-    return changed
+    return scenario
 
 
 def dump(scenario: Scenario) -> str:
-    """The scenario as TOML text that `parse` reads back to an equal object."""
+    """The scenario as TOML text that `parse` reads back to an equal object, beside `scenarios.own_code.write_code`."""
     import tomlkit
 
-    return tomlkit.dumps(scenario.model_dump(mode="json", exclude_none=True))
+    return tomlkit.dumps(as_flown(scenario).model_dump(mode="json", exclude_none=True, exclude={"code"}))
 
 
 def fingerprint(scenario: Scenario) -> str:
     """Sixteen hexadecimal digits that identify a scenario with all of its keys."""
-    return hashlib.sha256(scenario.model_dump_json(exclude_none=True).encode()).hexdigest()[:16]
+    flown = as_flown(scenario).model_dump_json(exclude_none=True, exclude=None if scenario.code else {"code"})
+    return hashlib.sha256(flown.encode()).hexdigest()[:16]
 
 
 def _at_line(file: Path, text: str, data: dict[str, Any], key: str, read: object, wanted: str) -> ScenarioError:
@@ -140,14 +162,32 @@ def _value_at(data: Any, location: tuple[int | str, ...]) -> object:
 def _contradictions(scenario: Scenario) -> Iterator[_Fault]:
     """Faults that no single key shows."""
     yield from _formation_contradictions(scenario)
+    yield from manoeuvre_contradictions(scenario)
     yield from _velocity_contradictions(scenario)
     yield from _links_contradictions(scenario)
+    yield from own_code_faults(scenario)
     yield from _control_contradictions(scenario)
+    yield from criteria_faults(
+        scenario.control.criteria,
+        scenario.control.overlap,
+        method=scenario.control.method,
+        given=scenario.control.gains is not None or bool(scenario.control.blocks),
+        loop=scenario.control.loop,
+        at_once=scenario.dynamics == "double_integrator" and scenario.control.prediction == "off",
+    )
+    yield from for_link_contradictions(scenario)
     yield from _block_contradictions(scenario)
     yield from _hearing_contradictions(scenario)
     yield from _monitor_contradictions(scenario)
     yield from _onboard_contradictions(scenario)
     yield from _autopilot_contradictions(scenario)
+    yield from sitl_contradictions(scenario.autopilot.sitl, scenario.dynamics)
+    yield from disturbance_contradictions(
+        scenario.disturbance,
+        vehicles=len(scenario.vehicles),
+        steady=len(scenario.nominal_velocity) == 1 and not scenario.manoeuvres,
+        dynamics=scenario.dynamics,
+    )
     limits = scenario.limits
     if limits.speed_max_m_s is not None and limits.speed_max_m_s <= limits.speed_min_m_s:
         yield "limits.speed_max_m_s", limits.speed_max_m_s, f"more than speed_min_m_s = {limits.speed_min_m_s:g}"
@@ -171,8 +211,8 @@ def _control_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield "control.feed_forward", control.feed_forward, wanted
     if control.prediction != "off" and control.loop == "onboard":
         yield "control.prediction", control.prediction, "off, with loop onboard: vehicles feed back their own errors"
-    if control.prediction != "off" and scenario.dynamics == "autopilot":
-        wanted = "off, with dynamics autopilot: only double integrators are predicted"
+    if control.prediction != "off" and scenario.dynamics != "double_integrator" and scenario.response is None:
+        wanted = f"off, with dynamics {scenario.dynamics} and no [response]: a response must be known to be predicted"
         yield "control.prediction", control.prediction, wanted
 
 
@@ -253,6 +293,9 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     times_s = [jump.at_s for jump in scenario.autopilot.clock_jumps]
     if times_s != sorted(times_s):
         yield "autopilot.clock_jumps", times_s, "times that do not decrease"
+    for key, part in (("autopilot", scenario.autopilot), ("response", scenario.response)):
+        if part is not None:
+            yield from response_contradictions(key, part.dead_time_s, part.natural_frequency_rad_s)
     if scenario.dynamics == "autopilot":
         if scenario.altitude_m == 0:
             yield "altitude_m", scenario.altitude_m, "an altitude above 0 to take off to, with dynamics autopilot"
@@ -260,12 +303,15 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     for k, vehicle in enumerate(scenario.vehicles):
         if vehicle.flavour is not None:
             yield f"vehicles[{k}].flavour", vehicle.flavour, "no such key without dynamics autopilot"
-    if scenario.response is not None:
-        yield "response", scenario.response.model_dump(), "no such key without dynamics autopilot"
+    if scenario.response is not None and scenario.dynamics == "double_integrator":
+        wanted = "no such key, unless dynamics is autopilot or of your own"
+        yield "response", scenario.response.model_dump(), wanted
 
 
 def _velocity_contradictions(scenario: Scenario) -> Iterator[_Fault]:
-    lowest, highest = scenario.limits.speed_min_m_s, scenario.limits.speed_max_m_s or math.inf
+    on_ground = scenario.dynamics == "autopilot"
+    lowest = 0.0 if on_ground else scenario.limits.speed_min_m_s  # multicopters can stand
+    highest = scenario.limits.speed_max_m_s or math.inf
     wanted_speed = f"a speed within the limits, {lowest:g} to {highest:g} m/s"
     before_s = -math.inf
     for k, entry in enumerate(scenario.nominal_velocity):
@@ -274,7 +320,6 @@ def _velocity_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         if not lowest <= math.hypot(*entry.velocity_ne_m_s) <= highest:
             yield f"nominal_velocity[{k}].velocity_ne_m_s", entry.velocity_ne_m_s, wanted_speed
         before_s = entry.from_s
-    on_ground = scenario.dynamics == "autopilot"
     for k, vehicle in enumerate(scenario.vehicles):
         speed_m_s = math.hypot(*vehicle.velocity_ne_m_s)
         if not (speed_m_s == 0 if on_ground else lowest <= speed_m_s <= highest):
@@ -284,6 +329,8 @@ def _velocity_contradictions(scenario: Scenario) -> Iterator[_Fault]:
 
 def _links_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     links = scenario.links
+    if links.profile is not None and (given := {"up", "down", "vehicles", "channels"} & links.model_fields_set):
+        yield "links.profile", links.profile, f"either a profile, or {', '.join(sorted(given))}"
     own = [link.system_id for link in links.vehicles]
     for k in (k for k, system_id in enumerate(own) if system_id not in {v.system_id for v in scenario.vehicles}):
         yield f"links.vehicles[{k}].system_id", own[k], _A_VEHICLE
@@ -294,7 +341,7 @@ def _links_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         if (channel.queue_bytes is None) == (channel.queue_datagrams is None):
             read = "neither" if channel.queue_bytes is None else "both"
             yield f"links.channels[{k}]", read, "either queue_bytes or queue_datagrams"
-    for key, link in _places(links):
+    for key, link in each_link(links):
         if link.channel is not None and link.channel not in names:
             yield f"{key}.channel", link.channel, f"the name of one of links.channels: {', '.join(names) or 'none'}"
         yield from _link_contradictions(key, link)
@@ -305,15 +352,6 @@ def _repeated(part: str, name: str, values: Sequence[object], wanted: str) -> It
     for k, value in enumerate(values):
         if value in values[:k]:
             yield f"{part}[{k}].{name}", value, wanted
-
-
-def _places(links: Links) -> Iterator[tuple[str, Link]]:
-    """Each link of the file with its key."""
-    parts = ("links", links), *((f"links.vehicles[{k}]", own) for k, own in enumerate(links.vehicles))
-    for key, part in parts:
-        for name, link in (("up", part.up), ("down", part.down)):
-            if link is not None:
-                yield f"{key}.{name}", link
 
 
 def _link_contradictions(key: str, link: Link) -> Iterator[_Fault]:
@@ -351,45 +389,3 @@ def _jitter_contradictions(key: str, jitter: Jitter) -> Iterator[_Fault]:
     if given != wanted:
         text = f"{' and '.join(wanted)} and nothing else with distribution {jitter.distribution}"
         yield key, ", ".join(given) or "nothing", text
-
-
-def _with_traces(scenario: Scenario, file: Path) -> Scenario:
-    """The scenario with the delays in place of the names of trace files, so that it is complete without the files."""
-    traces: dict[str, tuple[float, ...]] = {}
-    for key, link in _places(scenario.links):
-        if link.jitter is not None and (name := link.jitter.trace_file) is not None:
-            traces[name] = _read_trace(file.parent / name, file, f"{key}.jitter.trace_file")
-
-    def read(link: Link) -> Link:
-        if link.jitter is None or link.jitter.trace_file is None:
-            return link
-        update = {"trace_file": None, "trace_s": traces[link.jitter.trace_file]}
-        return link.model_copy(update={"jitter": link.jitter.model_copy(update=update)})
-
-    return scenario.with_links(read, read) if traces else scenario
-
-
-def _read_trace(path: Path, file: Path, key: str) -> tuple[float, ...]:
-    """The delays of a trace file, in s."""
-    try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ScenarioError(file, key, str(error), "a readable file with a delay in s on each line, or CSV") from None
-    cells = [cell.strip() for cell in rows[0]] if rows else []
-    first = int(TRACE_COLUMN in cells)
-    column = cells.index(TRACE_COLUMN) if first else 0
-    delays: list[float] = []
-    for number, row in enumerate(rows[first:], first + 1):
-        if not row:
-            continue
-        delay_s = math.nan
-        if first or len(row) == 1:
-            with contextlib.suppress(ValueError, IndexError):
-                delay_s = float(row[column])
-        if not 0 <= delay_s <= MOST:
-            wanted = f"a delay from 0 to {MOST:g} s on each line, or CSV with a column {TRACE_COLUMN}"
-            raise ScenarioError(file, key, f"{path.name} line {number}: {','.join(row)}", wanted)
-        delays.append(delay_s)
-    if not 1 <= len(delays) <= TRACE_DELAYS:
-        raise ScenarioError(file, key, f"{path.name}: {len(delays)} delays", f"1 to {TRACE_DELAYS}")
-    return tuple(delays)

@@ -77,6 +77,7 @@ _WANTED = {
     "model_type": "a table of keys",
     "model_attributes_type": "a table of keys",
     "dict_type": "a table of keys",
+    "dynamics": "double_integrator, autopilot, or FILE.py:NAME",
     "prediction": "off, measured, or a number of seconds greater than 0, at most {most:g}",
 }
 """What was wanted, by the type of pydantic's error."""
@@ -84,4 +85,7 @@ _WANTED = {
 
 def wanted_of(error: Mapping[str, Any]) -> str:
     """What was wanted at one of pydantic's errors, in plain words."""
-    return _WANTED[error["type"]].format(**error.get("ctx", {}))
+    context = error.get("ctx", {})
+    if ".py:" in str(context.get("pattern", "")).replace("\\", ""):
+        return "FILE.py:NAME"
+    return _WANTED[error["type"]].format(**context)

@@ -1,19 +1,25 @@
 """The scenario: one typed, frozen object that says everything a flight depends on.
 
 Units are part of each key's name. Positions and velocities are in the horizontal plane of one local NED frame,
-as pairs (north, east). All vehicles fly at one altitude: the formation control is planar.
+as pairs (north, east): the formation control is planar. Each vehicle keeps an altitude of its own.
 
-The docstring below a key is its description in `scenario.schema.json` and in the reference. `scenarios.link_schema` has
-the keys of `[links]`.
+The docstring below a key is its description in `scenario.schema.json` and in the reference. `scenarios.keys.link` has
+the keys of `[links]`, `scenarios.keys.autopilot` those of `[response]`.
 """
 
 from collections.abc import Callable
 from typing import Annotated, Literal, Self
 
 from pydantic import Field
+from pydantic.json_schema import SkipJsonSchema
 
-from scenarios.link_schema import Link, Links
-from scenarios.part import (
+from scenarios.keys.autopilot import DeadTime, Response
+from scenarios.keys.course import Course, FormationChange
+from scenarios.keys.criteria import Criteria, Overlap
+from scenarios.keys.disturbance import Disturbance, Navigation
+from scenarios.keys.link import Link, Links
+from scenarios.keys.own import CodeFile, CodeName, Dynamics
+from scenarios.keys.part import (
     Factor,
     Flavour,
     Headroom,
@@ -27,6 +33,8 @@ from scenarios.part import (
     SystemId,
     Velocity,
 )
+from scenarios.keys.sitl import Sitl
+from scenarios.smooth import Bounds, SmoothCourse, course_by_steps, course_by_waypoints
 
 NS_PER_S = 1_000_000_000
 DRIFT_MAX_PPM = 1000.0
@@ -49,6 +57,8 @@ class Vehicle(Part):
     """Position when the flight begins; with an autopilot, the place on the ground from which it takes off."""
     velocity_ne_m_s: Velocity
     """Velocity when the flight begins."""
+    altitude_m: NotNegative | None = None
+    """Altitude of this vehicle above the origin, if it differs from `altitude_m` of the scenario."""
     flavour: Flavour | None = None
     """Autopilot of this vehicle, if it differs from `autopilot.flavour`. Only with `dynamics = "autopilot"`."""
 
@@ -66,7 +76,7 @@ class Limits(Part):
     """Limits of every vehicle. Omitted ones are off, except the minimum speed: the kinematics are singular at zero."""
 
     speed_min_m_s: Positive = 1.0
-    """Minimum ground speed."""
+    """Minimum ground speed; not with `dynamics = "autopilot"`: multicopters can stand."""
     speed_max_m_s: Positive | None = None
     """Maximum ground speed."""
     acceleration_max_m_s2: Positive | None = None
@@ -117,10 +127,16 @@ class Control(Part):
     cannot be.
     """
 
-    method: Literal["inclusion", "graph-dk", "graph-lqr"] = "inclusion"
+    method: Literal["inclusion", "graph-dk", "graph-lqr", "python"] = "inclusion"
     """`inclusion`: every vehicle uses its own errors and the velocity error of the vehicle in front. `graph-lqr`
     (structured LQR) and `graph-dk` (the D-K type iteration of the thesis): it uses all errors of these two vehicles and
-    of those it `hears`."""
+    of those it `hears`. `python`: the `controller` computes all commands."""
+    controller: CodeName | None = None
+    """With `method = "python"`: the control law, a function in a Python file beside this one, such as
+    `"my_law.py:law"`. Commands run it only with `--allow-code`."""
+    linear: CodeName | None = None
+    """States that the controller is u = K e: a function in a Python file that returns K. The delay margin is then
+    computed."""
     loop: Literal["ground", "onboard"] = "ground"
     """`ground`: the station closes every loop, so all feedback is late. `onboard`: every vehicle feeds back its own
     errors at once, and the station streams only what depends on other vehicles (thesis eq. 5.1). On board,
@@ -135,6 +151,10 @@ class Control(Part):
     string_peak_max: Factor = 1.0
     """Largest factor by which a spacing error may grow from one vehicle to the next at any frequency; 1 allows no
     growth."""
+    criteria: Criteria | None = None
+    """Further requirements, and the loop delay for which gains are to be best."""
+    overlap: Overlap | None = None
+    """Whom every vehicle hears beside the vehicle in front; graph methods only."""
     gains: FixedGains | None = None
     """Fly these gains instead of designing any."""
     blocks: tuple[GainBlock, ...] = ()
@@ -146,8 +166,13 @@ class Control(Part):
     prediction: Prediction = "off"
     """The loop delay over which the station predicts each vehicle from its newest state and the set-points that act
     after it. A number: that many seconds. `measured`: the delay measured for each vehicle, smoothed; the assumed delay
-    changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. Only with `loop = "ground"`
-    and `dynamics = "double_integrator"`."""
+    changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. Only with `loop = "ground"`;
+    with `dynamics = "autopilot"` the file must give the `response`, which is part of the prediction."""
+    for_link: Literal["off", "measured"] = "off"
+    """`measured`: gains of the inclusion principle, and whether to predict, are chosen for links that were measured
+    before (`--links-of`). `criteria` and `string_peak_max` are met at the delays of these links."""
+    link_headroom: Annotated[float, Field(ge=0, lt=1)] = 0.3
+    """With `for_link`: the headroom to keep at the worst delay of the measured links."""
 
 
 class Onboard(Part):
@@ -182,6 +207,9 @@ class Safety(Part):
     heartbeat_timeout_s: Positive = 3.0
     """A vehicle that does not hear its ground station for this long enters its failsafe and may take commands from
     another."""
+    ready_patience_s: Annotated[float, Field(gt=0, le=360)] = 120.0
+    """How long a vehicle with an autopilot may take until it takes set-points in the air, from its first heartbeat or,
+    if it is never heard, from the start. Then the others fly without it."""
     spacing_error_limit_m: Positive = 1000.0
     """A larger spacing error ends the flight; the verdict is then `unstable`."""
     collision_distance_m: NotNegative = 5.0
@@ -240,8 +268,14 @@ class Autopilot(Part):
     """Time constant of that lag."""
     velocity_gain_1_s: Positive = 2.0
     """Gain from velocity error to acceleration."""
+    dead_time_s: DeadTime = 0.0
+    """Dead time before the lag, as in `[response]`."""
+    natural_frequency_rad_s: Positive | None = None
+    """Makes the response one of second order, as in `[response]`."""
     acceleration_max_m_s2: Positive = 5.0
     """Maximum acceleration."""
+    jerk_max_m_s3: Positive | None = None
+    """Maximum rate of change of the acceleration that it aims at; unlimited if omitted."""
     speed_max_m_s: Positive = 12.0
     """Maximum horizontal speed."""
     climb_max_m_s: Positive = 2.5
@@ -256,19 +290,8 @@ class Autopilot(Part):
     """The origin of each vehicle's local frame is drawn within this distance of the common one, north and east."""
     clock_jumps: tuple[ClockJump, ...] = ()
     """Jumps of the boot clock."""
-
-
-class Response(Part):
-    """How every vehicle responds to set-points, with acceleration a and velocity v.
-
-    lag a' = a_set + gain (v_set - v) - a. The control is designed for it. Without it, the response of vehicles with
-    `dynamics = "autopilot"` is identified in a manoeuvre before the formation flight.
-    """
-
-    lag_s: Positive
-    """Time constant from set-point to acceleration."""
-    velocity_gain_1_s: NotNegative = 0.0
-    """Gain from velocity error to acceleration."""
+    sitl: Sitl = Sitl()
+    """Clocks that lie a little, as those of autopilots in SITL."""
 
 
 class Scenario(Part):
@@ -281,11 +304,15 @@ class Scenario(Part):
     duration_s: Annotated[float, Field(gt=0, le=86400)]
     """How long the formation is flown."""
     altitude_m: NotNegative = 1000.0
-    """Altitude of all vehicles above the origin."""
+    """Altitude above the origin of every vehicle that has none of its own."""
     vehicles: Annotated[tuple[Vehicle, ...], Field(min_length=1, max_length=250)]
     """The formation: one tree, whose root is the leader."""
-    nominal_velocity: Annotated[tuple[NominalVelocity, ...], Field(min_length=1)]
-    """The formation's velocity over time, as steps in order of time."""
+    nominal_velocity: tuple[NominalVelocity, ...] = ()
+    """The formation's velocity over time, as steps in order of time; needed without `course.waypoints_ne_m`."""
+    course: Course = Course()
+    """Smooth courses, offsets that turn with the course, and a leader flown by somebody else."""
+    formation_changes: tuple[FormationChange, ...] = ()
+    """Changes of offsets in flight, in order of time."""
     limits: Limits = Limits()
     """What the vehicles can do."""
     rates: Rates = Rates()
@@ -302,15 +329,22 @@ class Scenario(Part):
     """Time-outs and limits."""
     monitor: Monitor = Monitor()
     """When and how the station acts on a shrinking headroom."""
-    dynamics: Literal["double_integrator", "autopilot"] = "double_integrator"
+    dynamics: Dynamics = "double_integrator"
     """`double_integrator`: the UAVs of the thesis, which follow an acceleration at once and are launched in the air.
-    `autopilot`: multicopters with an autopilot, which start on the ground."""
+    `autopilot`: multicopters with an autopilot, which start on the ground. A function in a Python file, such as
+    `"my_model.py:step"`: vehicles launched in the air that move as it says; run only with `--allow-code`."""
     autopilot: Autopilot = Autopilot()
     """The simulated multicopters, with `dynamics = "autopilot"`."""
     response: Response | None = None
     """How the vehicles respond to set-points, if that is known beforehand."""
+    disturbance: Disturbance | None = None
+    """What pushes the vehicles in flight: wind, gusts, or a disturbance that depends on the formation's errors."""
+    navigation: Navigation | None = None
+    """Errors of what the vehicles report."""
     at_end: Literal["hold", "land"] = "hold"
     """What vehicles with an autopilot are commanded to do when the flight ends."""
+    code: SkipJsonSchema[tuple[CodeFile, ...]] = ()
+    """No key: the Python files that other keys name, filled in when the scenario is read."""
 
     def leader_first(self) -> tuple[Vehicle, ...]:
         """Vehicles ordered so that each comes after the one it follows, by system id within a rank."""
@@ -327,12 +361,54 @@ class Scenario(Part):
         return self.links.of(system_id)
 
     def nominal_velocity_at(self, time_s: float) -> Velocity:
-        """v_d at a scenario time; before time zero it is the first entry's."""
+        """v_d at a scenario time; before time zero it is that at time zero."""
+        if self.course.is_smooth:
+            return self.smooth_course().velocity_at(time_s)
         current = self.nominal_velocity[0]
         for entry in self.nominal_velocity:
             if entry.from_s <= time_s:
                 current = entry
         return current.velocity_ne_m_s
+
+    def smooth_course(self) -> SmoothCourse:
+        """The course with bounded accelerations, if `course.acceleration_max_m_s2` is given.
+
+        Raises scenarios.smooth.TooShortError if waypoints are too close to each other for the turns between them.
+        """
+        course = self.course
+        assert course.acceleration_max_m_s2 is not None
+        bounds = Bounds(course.acceleration_max_m_s2, course.jerk_max_m_s3)
+        if course.speed_m_s is not None:
+            return course_by_waypoints(bounds, course.waypoints_ne_m, course.speed_m_s)
+        return course_by_steps(bounds, tuple((entry.from_s, entry.velocity_ne_m_s) for entry in self.nominal_velocity))
+
+    @property
+    def external_id(self) -> int | None:
+        """System id of the leader if somebody else flies it."""
+        return self.leader_first()[0].system_id if self.course.leader == "external" else None
+
+    @property
+    def manoeuvres(self) -> bool:
+        """Whether the motion planned for a vehicle is more than steps of the nominal velocity in one shape."""
+        return self.course.is_smooth or self.course.leader == "external" or bool(self.formation_changes)
+
+    def altitude_of(self, vehicle: Vehicle) -> float:
+        """The altitude at which a vehicle flies, in m above the origin."""
+        return self.altitude_m if vehicle.altitude_m is None else vehicle.altitude_m
+
+    @property
+    def has_altitude_slots(self) -> bool:
+        """Whether vehicles fly at different altitudes."""
+        return len({self.altitude_of(vehicle) for vehicle in self.vehicles}) > 1
+
+    def in_steady_flight(self) -> Self:
+        """The same scenario without manoeuvres: the nominal velocity and the offsets stay as they are at time zero."""
+        heading = self.course.offsets == "heading"
+        steady = NominalVelocity(from_s=0.0, velocity_ne_m_s=self.nominal_velocity_at(0.0))
+        course = (
+            Course(offsets="heading", acceleration_max_m_s2=self.course.acceleration_max_m_s2) if heading else Course()
+        )
+        return self.model_copy(update={"nominal_velocity": (steady,), "course": course, "formation_changes": ()})
 
     def with_calm_monitor(self) -> Self:
         """The same scenario with a monitor that only watches, and without slower gains to switch to."""

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-_SCHEMA_LINE = f"#:schema {FOLDER / 'scenario.schema.json'}"
+SCHEMA = FOLDER / "scenario.schema.json"
+_SCHEMA_LINE = f"#:schema ./{SCHEMA.name}"
 _SPACING_M, _ASIDE_M, _SPEED_M_S = 40.0, 40.0, 25.0
 _ERRORS_M = (3.0, -2.0), (-2.0, 2.0), (1.0, 3.0), (-3.0, -1.0)
 """Initial offsets (north, east) of a new scenario's vehicles from their places, used in turn."""
@@ -20,9 +21,9 @@ def located(text: str) -> Path:
     return named if text in names() and not Path(text).exists() else Path(text)
 
 
-def description(name: str) -> str:
-    """The first sentence of the comment at the top of a shipped scenario."""
-    lines = (FOLDER / f"{name}.toml").read_text(encoding="utf-8").splitlines()
+def description(name: str, folder: Path = FOLDER) -> str:
+    """The first sentence of the comment at the top of a shipped scenario, or of another file of a folder."""
+    lines = (folder / f"{name}.toml").read_text(encoding="utf-8").splitlines()
     comment = " ".join(line.lstrip("# ") for line in lines if line.startswith("# "))
     sentence, dot, _ = comment.partition(". ")
     return sentence + dot.strip()

@@ -25,7 +25,9 @@ def described() -> dict[str, dict[str, str]]:
 
 def json_fields(file: str) -> str:
     """The table of one file's JSON fields."""
-    return table(("field", "meaning"), [(f"`{path}`", text) for path, text in described()[file].items()])
+    fields = described()
+    own = fields[file] if file == "trial" else fields["every"] | fields[file]  # trials are lines of a table
+    return table(("field", "meaning"), [(f"`{path}`", text) for path, text in own.items()])
 
 
 def found_fields(value: Any, known: Iterable[str], path: str = "") -> set[str]:

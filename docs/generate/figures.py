@@ -136,6 +136,28 @@ def prediction_windows(runner: Runner) -> str:
     return f"Each file is `triangle5.toml` with `prediction` in s:\n\n{table(head, rows)}"
 
 
+def prediction_price(runner: Runner) -> str:
+    """The longest loop delay at equal decay and string peak, with and without prediction, and what that costs."""
+    rows: list[tuple[str, ...]] = []
+    for way in runner.json("gcs design scenarios/triangle5.toml --compare-prediction")["ways"]:
+        shorter_s, longer_s = (way["stable_s"][0] - way["loop_delay_s"], way["stable_s"][1] - way["loop_delay_s"])
+        rows.append(
+            (
+                "off" if not way["prediction"] else f"on, ±{way['tolerated']:.0%} wanted",
+                _ms(way["loop_delay_s"]),
+                f"{way['ratio']:.2f}",
+                f"{1e3 * shorter_s:+.0f} / {1e3 * longer_s:+.0f} ms",
+                f"{way['decay_rate_1_s']:.3f} 1/s",
+                f"{way['string_peak']:.2f}",
+                f"{way['alpha']:.3f}",
+                f"{way['spacing_gain_s2']:.2f} s²",
+                f"{way['noise_gain']:.2f}",
+            )
+        )
+    head = ("prediction", "largest loop delay", "ratio", "mismatch tolerated", "decay", "string peak", "alpha")
+    return table((*head, "disturbance gain", "noise gain"), rows)
+
+
 def prediction_flights(runner: Runner) -> str:
     """triangle5 over links that take five times its margin, with and without prediction."""
     rows: list[tuple[str, ...]] = []
@@ -404,7 +426,7 @@ def speed_compiled(runner: Runner) -> str:
 
 
 _QUICK = (
-    *(design, string_limit, compare, prediction_windows, prediction_flights),
+    *(design, string_limit, compare, prediction_windows, prediction_price, prediction_flights),
     *(margin_held, margin_thesis, onset_chain3, readme_onset),
 )
 _EXACT = (onsets, thesis_flights, maps, capacity)

@@ -131,6 +131,14 @@ def _default(given: Node, node: Node, *, required: bool) -> str:
     return f"`{json.dumps(given['default'])}`"
 
 
+_PATTERNS = {
+    r"^[A-Za-z0-9_-]+$": "letters, digits, `_` and `-`",
+    r"^[^:]+\.py:[A-Za-z_][A-Za-z0-9_]*$": "FILE.py:NAME",
+    r"^[0-9a-f]{64}$": "64 hexadecimal digits",
+}
+"""What a pattern of the schema asks for."""
+
+
 def _bounds(node: Node, what: str) -> str:
     if what == "array":
         least, most = node.get("minItems", 0), node.get("maxItems")
@@ -143,7 +151,7 @@ def _bounds(node: Node, what: str) -> str:
         if name in node:
             found.append(f"{sign} {_number(node[name])}")
     if "pattern" in node:
-        found.append("letters, digits, `_` and `-`")
+        found.append(_PATTERNS[node["pattern"]])
     return ", ".join(found)
 
 

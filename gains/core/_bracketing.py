@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import FloatArray, IntArray
 
 Functions = Callable[[FloatArray], FloatArray]
 
@@ -35,6 +35,11 @@ def peaks(function: Functions, a: FloatArray, b: FloatArray) -> FloatArray:
         c, d = np.where(to_left, new, d), np.where(to_left, c, new)
         at_c, at_d = np.where(to_left, at_new, at_d), np.where(to_left, at_c, at_new)
     return (a + b) / 2.0
+
+
+def local_maxima(values: FloatArray) -> IntArray:
+    """Places of the samples (k,) off the ends that no neighbour exceeds."""
+    return np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
 
 
 def may_reach_zero(points: FloatArray, values: FloatArray) -> NDArray[np.bool_]:

@@ -4,6 +4,7 @@
 """
 
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +24,77 @@ class OnboardPeak:
 
 
 PeakLimit = float | OnboardPeak | None
+
+
+Objective = Literal["alpha", "decay_rate_1_s", "alpha_at_delay", "decay_rate_at_delay_1_s", "delay_margin_s"]
+
+
+@dataclass(frozen=True)
+class Criteria:
+    """What a design must reach beside the parts of `Requirement`; what is None is not asked for.
+
+    A figure at a delay is that of the loop as flown (`gains.performance.flown`): late by the delay and half a control
+    period. BadModelError if a number is out of its range, or a figure at a delay is asked for without the delay.
+
+    >>> from gains.core.requirement import Criteria
+    >>> Criteria(at_delay_s=0.3, alpha_at_delay=0.5).objective, Criteria(damping_min=0.7).objective
+    ('alpha_at_delay', None)
+    """
+
+    at_delay_s: float | None = None
+    """Loop delay (s) of the figures at a delay. Gains are then searched for this delay."""
+    maximise: Objective | None = None
+    """What gains are best in, of all that meet the rest; `alpha_at_delay` if there is a delay, and else what
+    `Requirement` says."""
+    alpha_at_delay: float | None = None
+    """Least α (1/s) at the delay."""
+    decay_rate_at_delay_1_s: float | None = None
+    """Least decay rate (1/s) at the delay."""
+    damping_min: float | None = None
+    """Least damping ratio of every root without delay, at most 1."""
+    natural_frequency_max_rad_s: float | None = None
+    """Largest natural frequency |s| of every root without delay."""
+    spacing_gain_max_s2: float | None = None
+    """Largest H∞ gain (s²) from disturbing accelerations to spacing errors, at the delay, without one if none is
+    given."""
+    noise_gain_max: float | None = None
+    """Largest H2 gain from measurement noise to commands: the standard deviation of the noisiest command (m/s²) where
+    every error is measured with white noise of standard deviation 1 (m, m/s), at the delay."""
+    delays_s: tuple[float, float] | None = None
+    """The loop delays (least, largest) among which the loop must be proved stable."""
+    delay_rate: float | None = None
+    """How fast the delay varies among them, s/s: 0 for one that is constant but not known, None for one that jumps."""
+    weight: tuple[float, float] | None = None
+    """Diagonal of W on spacing errors and on velocity errors, with which every α is meant: |w| ≤ α |W E|."""
+
+    def __post_init__(self) -> None:
+        for name in _POSITIVE:
+            wanted = getattr(self, name)
+            if wanted is not None and not (np.isfinite(wanted) and wanted > 0):
+                raise BadModelError(f"{name} = {wanted}; wanted a positive number")
+        if self.damping_min is not None and self.damping_min > 1.0:
+            raise BadModelError(f"damping_min = {self.damping_min}; wanted at most 1")
+        for name in AT_DELAY:
+            if self.at_delay_s is None and (getattr(self, name) is not None or self.maximise == name):
+                raise BadModelError(f"{name} is asked for without a delay; wanted at_delay_s")
+        low, high = self.delays_s or (0.0, 0.0)
+        if not 0.0 <= low <= high < inf:
+            raise BadModelError(f"delays_s = {self.delays_s}; wanted two numbers of seconds, the smaller one first")
+        if self.delay_rate is not None and not 0.0 <= self.delay_rate < inf:
+            raise BadModelError(f"delay_rate = {self.delay_rate}; wanted a number >= 0, none for a delay that jumps")
+        if self.weight is not None and not all(0.0 < entry < inf for entry in self.weight):
+            raise BadModelError(f"weight = {self.weight}; wanted two positive numbers")
+
+    @property
+    def objective(self) -> Objective | None:
+        """What gains are best in; None if that is for the rest of the requirement to say."""
+        return self.maximise or ("alpha_at_delay" if self.at_delay_s is not None else None)
+
+
+AT_DELAY = "alpha_at_delay", "decay_rate_at_delay_1_s"
+_POSITIVE = (
+    "at_delay_s", *AT_DELAY, "damping_min", "natural_frequency_max_rad_s", "spacing_gain_max_s2", "noise_gain_max",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,6 +128,8 @@ class Requirement:
     """The loop that is flown. On board a pattern without cycles takes any delay; `delay_margin_s` then limits each
     vehicle's own gains, as if a ground station closed their loops. On a pattern with cycles the onboard loop must have
     this margin too."""
+    criteria: Criteria | None = None
+    """What else must be reached. Gains are then searched by `gains.design.for_delay`."""
 
     def __post_init__(self) -> None:
         for name in ("delay_margin_s", "alpha", "decay_rate_1_s"):
@@ -68,7 +142,8 @@ class Requirement:
             raise BadModelError(f"alpha = {self.alpha}; wanted at least {ALPHA_MIN}")
         if self.string_peak_max is not None and not 1 <= self.string_peak_max < np.inf:
             raise BadModelError(f"string_peak_max = {self.string_peak_max}; wanted a number of at least 1")
-        if self.delay_margin_s is None and self.alpha is None and self.decay_rate_1_s is None:
+        given = (self.delay_margin_s, self.alpha, self.decay_rate_1_s, self.criteria and self.criteria.at_delay_s)
+        if all(wanted is None for wanted in given):
             object.__setattr__(self, "delay_margin_s", DEFAULT_DELAY_MARGIN_S)
 
     @property

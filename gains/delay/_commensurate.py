@@ -7,7 +7,7 @@ where a modulus is one, and it moves to the right where that modulus falls with 
 The frequencies come from `_crossings` for a single delay (m = 1), else from angles: where an eigenvalue of
 A(theta) = sum_k A_k e^{-j k theta} is j omega, tau = theta / omega is critical. A matrix pencil gives a finite list of
 angles that contains every crossing. Where it is too large or too ill-conditioned, a grid on the unit circle with
-refined extrema and Newton's method finds them.
+refined extrema and Newton's method finds them. Blocks of many states are left to `_tracked`.
 
 See also E. Jarlebring, "Critical delays and polynomial eigenvalue problems", arXiv:0706.1634.
 """
@@ -23,6 +23,7 @@ from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 from gains.delay._crossings import (
+    LARGEST_ALGEBRAIC_BLOCK,
     Crossing,
     DelayedTerm,
     axis_crossings,
@@ -40,6 +41,7 @@ from gains.delay._loci import (
     solved_beside_poles,
     unit_crossings,
 )
+from gains.delay._tracked import UnclearError, tracked_crossings
 from gains.delay._windows import (
     BlockAnalysis,
     DelayAnalysis,
@@ -104,6 +106,13 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
     present = [k for k, matrix in enumerate(terms) if k > 0 and matrix.any()]
     if not present:
         return []
+    used = tuple(terms[: present[-1] + 1])
+    rank = column_space(used[1:]).shape[1]
+    if len(terms[0]) > LARGEST_ALGEBRAIC_BLOCK and rank > 1:
+        try:
+            return [each for each in tracked_crossings(used) if not _is_passage(used, each)]
+        except UnclearError:
+            return _crossings_by_angle(used)
     if len(present) == 1:
         # one delay of k tau: its angle modulo 2 pi belongs to k angles of tau
         [k] = present
@@ -112,9 +121,8 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
             for crossing in axis_crossings(terms[0], terms[k])
             for turn in range(k)
         ]
-    used = tuple(terms[: present[-1] + 1])
     highest = highest_frequency(used)
-    if (len(used) - 1) * column_space(used[1:]).shape[1] > _LARGEST_LOCI:
+    if (len(used) - 1) * rank > _LARGEST_LOCI:
         return _crossings_by_angle(used)
 
     def terms_at(omega: FloatArray) -> ComplexArray:
@@ -124,6 +132,11 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
     found = crossings_of_loci(loci, _candidates(used, highest), highest)
     polished = [polish(used, crossing) for crossing in found if is_root(used, crossing)]
     return sorted(polished, key=lambda crossing: crossing.omega_rad_s)
+
+
+def _is_passage(terms: Sequence[FloatArray], crossing: Crossing) -> bool:
+    omega = crossing.omega_rad_s
+    return omega == 0.0 or passes_zero(terms, omega * crossing.delay_s, omega)
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:

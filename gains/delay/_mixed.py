@@ -32,6 +32,12 @@ _TURN = 0.1
 _POINTS_PER_DECADE, _DECADES = 60, 9
 # more frequencies than this take more than a few seconds
 _MOST_POINTS = 60_000
+# the Hurwitz reference of a count of roots is this far left of the axis, relative to the norm
+_SHIFT = 0.02
+# points around a frequency at which roots are near the axis, relative to it
+_BESIDE = np.logspace(-7.0, -1.0, 25)
+# entries of a stack of matrices: 32 MB
+_LARGEST_STACK = 2_000_000
 # largest turn (rad) of the determinant between neighbouring frequencies, and how often the grid may be halved for it
 _DETERMINANT_TURN, _HALVINGS = 0.5, 40
 # least frequency of that grid if there is a root at zero, as a share of the highest
@@ -65,11 +71,15 @@ def _analyse_block(block: Block, known_s: FloatArray, multiples: IntArray, leave
     return block_analysis(block.copies, delayed, _crossings(parts), unstable, passage, parts.highest())
 
 
-def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_zero: bool = False) -> int:
+def count_unstable_roots(
+    terms: Sequence[tuple[ArrayLike, float]], *, leave_out_zero: bool = False, beside: Sequence[float] = ()
+) -> int:
     """The number of roots of x'(t) = sum A x(t - d) with positive real part, by the argument principle.
 
     `terms` are pairs (A, d): a real matrix (n, n) in 1/s and its delay in s. With `leave_out_zero` the simple root at
-    s = 0 of a block whose matrices have a singular sum is not counted. Exceptions as of `analyse_mixed`.
+    s = 0 of a block whose matrices have a singular sum is not counted. `beside` are frequencies (rad/s) at which roots
+    are known to be near the imaginary axis: two of them at one place turn the phase by a whole turn between two points,
+    which looks like none. Exceptions as of `analyse_mixed`.
     """
     checked = [DelayedTerm(np.asarray(matrix, dtype=np.float64), delay_s, 0) for matrix, delay_s in terms]
     blocks, delays_s = distinct_blocks(*_checked(checked)), np.array([term.known_s for term in checked])
@@ -77,7 +87,7 @@ def count_unstable_roots(terms: Sequence[tuple[ArrayLike, float]], *, leave_out_
     for block in blocks:
         parts = _Parts(np.array(balanced(*block.matrices)), delays_s, np.zeros(len(checked), dtype=np.intp))
         at_zero = leave_out_zero and is_singular_for_any_delay(parts.matrices)
-        count += block.copies * _unstable_roots(parts, at_zero)
+        count += block.copies * _unstable_roots(parts, at_zero, beside)
     return count
 
 
@@ -127,31 +137,41 @@ def _crossings(parts: _Parts) -> list[Crossing]:
     ]
 
 
-def _unstable_roots(parts: _Parts, at_zero: bool) -> int:
-    """Roots with positive real part at tau = 0: turns of det(j omega I - A(j omega)) / (j omega + c)^n.
+def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) -> int:
+    """Roots with positive real part at tau = 0: turns of det(j omega I - A(j omega)) / det(j omega I - H).
 
-    The quotient is analytic in the right half plane and tends to one. As omega goes from infinity to minus infinity, it
-    winds around zero once for each root there. If `at_zero`, a simple root at zero is divided out.
+    H is the loop without delay, shifted to the left until it is Hurwitz, so the quotient is analytic in the right half
+    plane and turns little. Above the bound of all crossings, where the omega of the eigenvalues of A stay below that of
+    the argument, no angle of j omega - s leaves (0, pi): there the phase is known without steps. If `at_zero`, a simple
+    root at zero is divided out.
     """
-    identity, scale = np.eye(parts.size), parts.highest() + float(np.linalg.norm(parts.matrices[0]))
+    identity, highest = np.eye(parts.size), parts.highest()
+    hurwitz = np.linalg.eigvals(parts.matrices.sum(axis=0))
+    hurwitz = hurwitz - max(0.0, float(hurwitz.real.max()) + _SHIFT * (highest + float(np.abs(hurwitz).max())))
+
+    def angles(omega: FloatArray) -> FloatArray:
+        return np.angle(1j * omega[:, np.newaxis] - hurwitz).sum(axis=1)
 
     def phase(omega: FloatArray) -> ComplexArray:
-        matrix = 1j * omega[:, np.newaxis, np.newaxis] * identity - parts.at(omega).sum(axis=1)
-        # s + c in the denominator once for each state, but not for the root s = j omega that is divided out
-        counted = parts.size * np.angle(1j * omega + scale)
-        if at_zero:
-            counted += pi / 2.0 - np.angle(1j * omega + scale)
-        return np.linalg.slogdet(matrix)[0] * np.exp(-1j * counted)
+        shares = np.array_split(omega, max(1, omega.size * parts.size**2 // _LARGEST_STACK))
+        return np.concatenate([phase_of_share(share) for share in shares])
 
-    far = parts.highest() * np.logspace(0.0, 4.0, 100)
-    omega = np.unique(np.concatenate([[0.0], parts.frequencies(parts.highest()), far]))
+    def phase_of_share(omega: FloatArray) -> ComplexArray:
+        matrix = 1j * omega[:, np.newaxis, np.newaxis] * identity - parts.at(omega).sum(axis=1)
+        return np.linalg.slogdet(matrix)[0] * np.exp(-1j * angles(omega))
+
+    omega = np.union1d(0.0, parts.frequencies(highest))
+    near = np.outer(np.array(beside), np.concatenate([1.0 - _BESIDE, [1.0], 1.0 + _BESIDE])).ravel()
+    omega = np.union1d(omega, near[near < omega[-1]])
     if at_zero:
         # nearer to zero the determinant is rounding, and it is real there up to the frequency itself
-        omega = omega[omega > _LEAST_FREQUENCY * parts.highest()]
+        omega = omega[omega > _LEAST_FREQUENCY * highest]
     values = phase(omega)
+    # roots beside the axis turn the phase by half a turn each: the more states, the more of them between two points
+    most_turn = _DETERMINANT_TURN / (1.0 + parts.size / 25.0)
     for _ in range(_HALVINGS):
         turns = np.angle(values[1:] / values[:-1])
-        coarse = np.flatnonzero(np.abs(turns) > _DETERMINANT_TURN)
+        coarse = np.flatnonzero(np.abs(turns) > most_turn)
         if coarse.size == 0:
             break
         between = (omega[coarse] + omega[coarse + 1]) / 2.0
@@ -159,9 +179,10 @@ def _unstable_roots(parts: _Parts, at_zero: bool) -> int:
         values = np.insert(values, coarse + 1, phase(between))
     else:
         raise DisagreementError("a root is too close to the imaginary axis at tau = 0 to count it on either side")
-    # from the far end, where the quotient is one up to a few n / 10^4, to zero, where it is real
-    total = float(np.angle(values[-1])) - float(np.sum(np.angle(values[1:] / values[:-1])))
-    return round(total / pi)
+    turned = float(np.sum(np.angle(values[1:] / values[:-1]))) + float(np.diff(angles(omega[[0, -1]]))[0])
+    last = np.linalg.eigvals(parts.at(omega[-1:])[0].sum(axis=0))
+    beyond = float(np.angle(1j * omega[-1] - last).sum())
+    return round((beyond - turned) / pi - (0.5 if at_zero else 0.0))
 
 
 def _checked(terms: Sequence[DelayedTerm]) -> list[FloatArray]:

@@ -19,6 +19,7 @@ from gains.core.errors import DisagreementError, SolverError
 from gains.core.requirement import ALPHA_MIN, Requirement, plain
 from gains.core.structure import positive_seconds
 from gains.delay.constant import delay_margin
+from gains.design.for_delay import criteria_gains
 from gains.design.graph import GraphDesign, GraphMethod, assess, graph_design
 from gains.design.required import required_gains
 from gains.design.search import largest_alpha
@@ -134,14 +135,14 @@ def design(
         return graph_design(formation, links, requirement, method=method, period_s=period_s, onboard=onboard)
     wanted = Requirement() if requirement is None else requirement
     positive_seconds("period_s", period_s)
-    gains = required_gains(wanted, period_s)
+    gains = required_gains(wanted, period_s) if wanted.criteria is None else criteria_gains(wanted, period_s)
     identity = np.eye(formation.axes)
     matrices = 0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity
     result = _assess(formation, matrices, period_s=period_s, requirement=wanted)
     decay = result.behaviour.decay_rate_1_s
     if (
         result.delay_margin_s < (wanted.delay_margin_s or 0.0)
-        or result.alpha < (wanted.alpha or 0.0)
+        or (wanted.criteria is None and result.alpha < (wanted.alpha or 0.0))
         or decay < (1.0 - _DECAY_ROUNDING) * (wanted.decay_rate_1_s or 0.0)
     ):
         raise DisagreementError(
@@ -198,7 +199,7 @@ def _assess(formation: FormationModel, gains: Gains, *, period_s: float, require
     verify_inclusion(expansion, A, B, K=K, K_expanded=K_expanded)
 
     alpha = robustness(*gains)
-    margin_s = float(sampled_delay_margin(A, B, K, period_s=period_s))
+    margin_s = sampled_delay_margin(A, B, K, period_s=period_s)
     continuous_s = delay_margin(A, B @ K)
     leader, follower = (block_margin(*block) for block in diagonal_blocks(gains))
     blocks_s = [leader.delay_margin_s, follower.delay_margin_s][: formation.vehicles]

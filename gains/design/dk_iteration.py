@@ -25,7 +25,7 @@ from scipy import linalg
 from gains.core._semidefinite import SolverFacts, solved
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError, InfeasibleError, SolverError
-from gains.core.structure import strongly_connected_blocks
+from gains.criteria.poles import roots_of
 from gains.formation.pattern import Pattern, Plant, check_fits
 
 # At 40 states an iteration takes the solver seconds, at 60 a minute. A formation needs its states along one axis only.
@@ -205,8 +205,7 @@ def abscissa(closed_loop: FloatArray) -> float:
     >>> round(abscissa(np.array([[0.0, 1.0], [-2.0, -3.0]])), 6)
     -1.0
     """
-    blocks = strongly_connected_blocks(closed_loop)
-    return max(float(np.linalg.eigvals(closed_loop[np.ix_(block, block)]).real.max()) for block in blocks)
+    return float(roots_of(closed_loop).real.max())
 
 
 def decay_proof(closed_loop: FloatArray, P: FloatArray) -> DecayProof:

@@ -9,7 +9,8 @@ Source: Sahoo 2012 (see `gains.formation.model`), section 4. The scaling to a re
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from math import inf
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from gains.core.errors import BadModelError, InfeasibleError, SolverError
 from gains.core.requirement import Requirement, plain
 from gains.delay.constant import delay_margin
 from gains.design.dk_iteration import DecayProof, abscissa, decay_proof, dk_iteration
+from gains.design.for_delay import PatternGains, searched
 from gains.design.lqr import Weights
 from gains.design.structured_lqr import structured_lqr
 from gains.design.time_scale import BaseGain, BoundedMargins, scaled_to
@@ -28,6 +30,7 @@ from gains.formation.bipartite import partition_by_input, smallest_partition
 from gains.formation.fixed_modes import check_stabilisable
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Link, Pattern, Plant, formation_plant
+from gains.performance.flown import FlownTiming
 from gains.performance.robust import disturbance_bound
 from gains.sampled.constant import sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming
@@ -97,14 +100,7 @@ def graph_design(
     SolverError if the base gain is not found (`gains.design.structured_lqr`, `gains.design.dk_iteration`).
     """
     wanted = requirement or Requirement()
-    single = FormationModel(formation.predecessors, axes=1)
-    if pattern.blocks.shape != (single.vehicles, single.vehicles):
-        raise BadModelError(
-            f"the pattern has {pattern.blocks.shape} blocks; wanted {(single.vehicles, single.vehicles)}"
-        )
-    narrow = Pattern(pattern.blocks, (1,) * single.vehicles, (1, *(2,) * (single.vehicles - 1)))
-    plant = formation_plant(single)
-    check_stabilisable(plant, narrow)
+    single, narrow, plant = _narrowed(formation, pattern)
     margins = BoundedMargins(single, period_s, onboard)
     every = [
         BaseGain(K, margins.continuous_s(K), -abscissa(single.A + single.B @ K), loss, facts)
@@ -115,11 +111,50 @@ def graph_design(
         raise InfeasibleError(
             "no gains on this pattern leave each vehicle stable by its own errors alone, as the onboard loop wants"
         )
+    if wanted.criteria is not None:
+        gain = _searched(single, narrow, bases, wanted, period_s)
+        return assess(formation, narrow, gain, period_s=period_s, requirement=wanted, method=method)
     base, gain = scaled_to(wanted, margins, bases)
     return assess(
         formation, narrow, gain, period_s=period_s, requirement=wanted, method=method, loss=base.cost_loss,
         solver=base.solver,
     )  # fmt: skip
+
+
+def _searched(
+    single: FormationModel, narrow: Pattern, bases: list[BaseGain], wanted: Requirement, period_s: float
+) -> FloatArray:
+    """The gain that meets a requirement with criteria, searched from base gains."""
+    criteria = wanted.criteria
+    assert criteria is not None
+    timing = FlownTiming(inf, period_s)
+    starts = tuple(base.K for base in bases)
+    family = PatternGains(single, narrow.mask, starts, criteria.at_delay_s, timing, criteria.weight)
+    point, _ = searched(family, replace(wanted, string_peak_max=None))
+    return family.gain(point)
+
+
+def lqr_bases(formation: FormationModel, pattern: Pattern) -> tuple[FormationModel, PatternGains]:
+    """Return the formation of one axis, and the gains on its pattern that begin with those of the structured LQR.
+
+    The gains have no delay and no period yet. Raises as `graph_design` does.
+    """
+    single, narrow, plant = _narrowed(formation, pattern)
+    bases = tuple(K for K, _, _ in _base_gains(plant, narrow, single, "graph-lqr"))
+    return single, PatternGains(single, narrow.mask, bases, None, FlownTiming(inf, 0.0))
+
+
+def _narrowed(formation: FormationModel, pattern: Pattern) -> tuple[FormationModel, Pattern, Plant]:
+    """Formation, pattern and plant of one axis, checked."""
+    single = FormationModel(formation.predecessors, axes=1)
+    if pattern.blocks.shape != (single.vehicles, single.vehicles):
+        raise BadModelError(
+            f"the pattern has {pattern.blocks.shape} blocks; wanted {(single.vehicles, single.vehicles)}"
+        )
+    narrow = Pattern(pattern.blocks, (1,) * single.vehicles, (1, *(2,) * (single.vehicles - 1)))
+    plant = formation_plant(single)
+    check_stabilisable(plant, narrow)
+    return single, narrow, plant
 
 
 def _base_gains(
@@ -131,9 +166,7 @@ def _base_gains(
         yield found.K, None, found.solver
         return
     for ratio in _WEIGHT_RATIOS:
-        weight = np.ones(single.states)
-        for i in single.followers:
-            weight[single.spacing_slice(i)] = ratio
+        weight = np.where(single.spacing_mask, ratio, 1.0)
         optimum = structured_lqr(plant, pattern, Weights(np.diag(weight), np.eye(single.inputs)))
         yield optimum.K, optimum.loss, None
 
@@ -161,7 +194,7 @@ def assess(
         links=pattern.links,
         alpha=disturbance_bound(closed_loop, np.eye(model.states)) if stable else 0.0,
         decay_rate_1_s=decay,
-        delay_margin_s=float(sampled_delay_margin(A, B, K, period_s=period_s)),
+        delay_margin_s=sampled_delay_margin(A, B, K, period_s=period_s),
         delay_margin_continuous_s=delay_margin(A, B @ K),
         period_s=period_s,
         vehicles=formation.vehicles,

@@ -5,15 +5,15 @@ made as large as possible.
 """
 
 from dataclasses import replace
-from math import floor, log10
 
 from gains.core._bracketing import met_end
 from gains.core.errors import InfeasibleError
 from gains.core.requirement import DELAY_MARGIN_MAX_S, PeakLimit, Requirement
+from gains.criteria.parts import rounded
 from gains.design.search import fastest_decay, largest_alpha, largest_margin
-from gains.formation.model import FormationModel
+from gains.performance.lone_margin import lone_margin
 from gains.performance.response import Response, sampled_margin
-from gains.performance.scalar_gains import ScalarGains
+from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled.multirate import Timing
 
 # The search aims this much above the wanted margin, so that rounding cannot leave it below.
@@ -70,7 +70,7 @@ def _conflict(wanted: Requirement, period_s: float) -> str:
         for name in ("delay_margin_s", "alpha", "decay_rate_1_s")
         if (value := getattr(wanted, name)) is not None
     }
-    reached = {name: _rounded_down(most) for name in given if (most := _most(name, wanted, period_s)) > 0.0}
+    reached = {name: rounded(most, up=False) for name in given if (most := _most(name, wanted, period_s)) > 0.0}
     lower = [f"lower {name} to {most:g}" for name, most in reached.items()]
     unlimited = replace(wanted, string_peak_max=None)
     if wanted.string_peak_max is not None and _best_gains(unlimited, period_s) is not None:
@@ -101,12 +101,6 @@ def _most(name: str, wanted: Requirement, period_s: float) -> float:
     return low
 
 
-def _rounded_down(value: float) -> float:
-    """Four digits, and no more than the value."""
-    unit = 10.0 ** (floor(log10(value)) - 3)
-    return floor(value / unit) * unit
-
-
 def requirement_with(requirement: Requirement, response: Response | None, *, timing: Timing) -> Requirement:
     """Return the requirement whose design has the wanted margin on vehicles with this response, at these periods.
 
@@ -124,15 +118,18 @@ def requirement_with(requirement: Requirement, response: Response | None, *, tim
     if wanted_s is None or (response is None and timing.commands == 1):
         return requirement
 
-    responses, lag_s = (None, timing.faster_s) if response is None else ([response] * 2, response.lag_s)
-    pair = FormationModel((-1, 0), axes=1)  # a leader-follower tree has the roots of these two, whatever its size
+    responses, lag_s = (None, timing.faster_s)
+    if response is not None:
+        responses, lag_s = [response] * 2, response.lag_s + response.dead_time_s
 
     def excess(without_s: float) -> float:
         found = largest_alpha(without_s, timing.held_s, requirement.peak_limit, requirement.decay_rate_1_s or 0.0)
         if found is None:
             return -wanted_s
-        K = pair.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
-        return sampled_margin(pair, K, responses, timing=timing) - wanted_s
+        if response is not None and response.dead_time_s and timing.commands == 1:  # which takes the other too long
+            alone_s = (lone_margin(found.k1, k3, response, period_s=timing.held_s) for k3 in (0.0, found.k3))
+            return min(alone_s) - wanted_s
+        return sampled_margin(PAIR, found.K, responses, timing=timing) - wanted_s
 
     # the response takes about its lag of the margin
     low, high = wanted_s, wanted_s + lag_s
@@ -141,9 +138,10 @@ def requirement_with(requirement: Requirement, response: Response | None, *, tim
         low, f_low, high = high, f_high, min(high + wanted_s + lag_s, DELAY_MARGIN_MAX_S)
         f_high = excess(high)
     if f_high < 0.0 or high > DELAY_MARGIN_MAX_S:
-        answer = (
-            f" with lag_s = {response.lag_s} and velocity_gain_1_s = {response.velocity_gain_1_s}" if response else ""
-        )
+        answer = ""
+        if response:
+            late = f", dead_time_s = {response.dead_time_s}" if response.dead_time_s else ""
+            answer = f" with lag_s = {response.lag_s}{late} and velocity_gain_1_s = {response.velocity_gain_1_s}"
         raise InfeasibleError(f"no gains have a sampled delay margin of {wanted_s} s{answer}; ask for less")
     if f_low >= 0.0:
         return requirement

@@ -65,9 +65,9 @@ class BoundedMargins:
     def sampled_s(self, K: FloatArray) -> float:
         A, B = self.model.A, self.model.B
         if self.onboard is None:
-            return float(sampled_delay_margin(A, B, K, period_s=self.period_s))
+            return sampled_delay_margin(A, B, K, period_s=self.period_s)
         own_s = sampled_delay_margin(A, B, own_part(self.model, K), period_s=self.period_s)
-        return float(min(own_s, onboard_loop(self.model, K, self.onboard).sampled_margin_s()))
+        return min(own_s, onboard_loop(self.model, K, self.onboard).sampled_margin_s())
 
 
 def time_scaled(formation: FormationModel, K: FloatArray, scale: float) -> FloatArray:
@@ -79,8 +79,7 @@ def time_scaled(formation: FormationModel, K: FloatArray, scale: float) -> Float
     [[-0.5, 0.0, 0.0], [0.0, 0.25, -0.5]]
     """
     scaled = K / scale
-    for i in formation.followers:
-        scaled[:, formation.spacing_slice(i)] /= scale
+    scaled[:, formation.spacing_mask] /= scale
     return scaled
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import real_matrix, strongly_connected_blocks
 
@@ -84,6 +84,14 @@ class FormationModel:
         start = self.axes * (2 * vehicle - 1)
         return slice(start, start + self.axes)
 
+    @property
+    def spacing_mask(self) -> BoolArray:
+        """Which entries of the state are spacing errors, (states,)."""
+        mask = np.zeros(self.states, dtype=np.bool_)
+        for i in self.followers:
+            mask[self.spacing_slice(i)] = True
+        return mask
+
     def output_slice(self, vehicle: int) -> slice:
         """Place of all errors of a vehicle in the state: e_i^p and e_i^v, for the leader e_0^v."""
         start = 0 if self._known(vehicle) == 0 else self.spacing_slice(vehicle).start
@@ -141,6 +149,13 @@ class FormationModel:
         All feedback is late: A0 = A, A1 = B K, both (states, states). Arguments as of `overlapping_gain`.
         """
         return self.A, self.B @ self.overlapping_gain(K1, K2, K3)
+
+    def narrowed(self, K: FloatArray) -> tuple["FormationModel", FloatArray]:
+        """The formation and gain of one axis, if K (inputs, states) acts on every axis alike; else both as they are."""
+        one = K[:: self.axes, :: self.axes]
+        if self.axes == 1 or not np.array_equal(K, np.kron(one, np.eye(self.axes))):
+            return self, K
+        return FormationModel(self.predecessors, axes=1), one
 
     def coupled_vehicles(self, K: FloatArray) -> list[list[int]]:
         """Groups of vehicles that act on each other with the gain K (inputs, states), those ahead first."""

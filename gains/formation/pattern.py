@@ -131,6 +131,28 @@ def bidirectional(formation: FormationModel) -> Pattern:
     return replace(pattern, blocks=pattern.blocks | pattern.blocks.T)
 
 
+def overlapping(formation: FormationModel, *, ahead: int = 1, behind: bool = False, leader: bool = False) -> Pattern:
+    """Every vehicle uses its own output, those of `ahead` vehicles in front and, if wanted, those behind or the leader.
+
+    More overlaps than the source's (4.6). BadModelError if `ahead` is below 1.
+
+    >>> from gains.formation.model import FormationModel
+    >>> overlapping(FormationModel((-1, 0, 1, 2)), ahead=2, leader=True).blocks.astype(int).tolist()
+    [[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1]]
+    """
+    if ahead < 1:
+        raise BadModelError(f"ahead is {ahead}; 1 vehicle in front or more is wanted")
+    pattern = bidirectional(formation) if behind else leader_follower(formation)
+    blocks = pattern.blocks.copy()
+    for i in formation.followers:
+        front = i
+        for _ in range(ahead):
+            front = max(formation.predecessors[front], 0)
+            blocks[i, front] = True
+        blocks[i, 0] |= leader
+    return replace(pattern, blocks=blocks)
+
+
 def all_to_all(formation: FormationModel) -> Pattern:
     """Every vehicle uses all outputs: the centralised controller.
 

@@ -16,6 +16,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
 from gains.delay._crossings import DelayedTerm, by_multiple, crossing_error
+from gains.delay._loci import factor_rank
 from gains.delay.constant import Crossing
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
@@ -68,7 +69,7 @@ class LoopMargin:
     unstable_roots_at_zero_delay: int
     """The number of roots right of the axis with the unknown at zero."""
     roots_fixed_at_zero: int = 0
-    """The number of roots that stay at 0 and are left out of all else."""
+    """The number of roots that stay at 0, or at z = 1 of a held loop, and are left out of all else."""
     complete_to_s: float
     checked_by: tuple[str, ...] = ()
     """The methods that confirmed the windows."""
@@ -148,9 +149,7 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
     scale = 1.0 / float(unit)
     fixed = taken_out + analysis.roots_fixed_at_zero
     if fixed:
-        stay = "1 root stays" if fixed == 1 else f"{fixed} roots stay"
-        why = "an equilibrium, as the common value of a consensus"
-        notes = (f"{stay} at 0 at every delay ({why}); all else is said of the others",)
+        notes = _fixed_note(fixed, "0 at every delay")
     elif not analysis.stable_intervals_s and any(
         is_singular_for_any_delay(balanced(*block.matrices)) for block in distinct_blocks(*matrices)
     ):
@@ -174,6 +173,23 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
     )
 
 
+def _fixed_note(fixed: int, where: str) -> tuple[str, ...]:
+    """What is said of roots that are left out; nothing without one."""
+    stay = "1 root stays" if fixed == 1 else f"{fixed} roots stay"
+    why = "an equilibrium, as the common value of a consensus"
+    return (f"{stay} at {where} ({why}); all else is said of the others",) if fixed else ()
+
+
+def _held_moving(model: HeldModel) -> tuple[tuple[FloatArray, FloatArray, FloatArray], int]:
+    """A, B and K of a held loop without its equilibria, and how many states these were.
+
+    A direction along which neither A nor B K acts keeps an eigenvalue of the one-period map at one, at every delay and
+    period; rounding would put it on either side.
+    """
+    (plant, feedback), fixed = without_equilibria(model.A, model.B @ model.K)
+    return ((plant, *factor_rank(feedback)), fixed) if fixed else ((model.A, model.B, model.K), 0)
+
+
 def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
     omega = crossing.omega_rad_s
     repeats_every_s = 2.0 * pi / omega * scale if omega > 0.0 else None
@@ -185,10 +201,12 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
     from gains.sampled._period import analyse_period
     from gains.sampled.constant import period_map
 
-    def error_s(period_s: float) -> float:
-        return _map_error(lambda at_s: period_map(model.A, model.B, model.K, period_s=at_s, delay_s=0.0), period_s)
+    loop, fixed = _held_moving(model)
 
-    analysis = analyse_period(model.A, model.B, model.K)
+    def error_s(period_s: float) -> float:
+        return _map_error(lambda at_s: period_map(*loop, period_s=at_s, delay_s=0.0), period_s)
+
+    analysis = analyse_period(*loop)
     crossings = tuple(
         MarginCrossing(c.omega_rad_s, c.period_s, c.direction, None, None, error_s(c.period_s) if i < _ERRORS_OF else 0)
         for i, c in enumerate(analysis.crossings)
@@ -200,8 +218,9 @@ def _with_unknown_period(model: HeldModel) -> LoopMargin:
         delay_margin_error_s=max((c.delay_error_s for c in crossings if c.delay_s == analysis.limit_s), default=0.0),
         crossings=crossings,
         unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_period,
+        roots_fixed_at_zero=fixed,
         complete_to_s=analysis.complete_to_s,
-        notes=("the unknown is the sampling period: u = K x, sampled and held",),
+        notes=("the unknown is the sampling period: u = K x, sampled and held", *_fixed_note(fixed, "z = 1")),
     )
 
 
@@ -209,11 +228,11 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
     """The first window of the held loop as it is flown."""
     from gains.sampled.constant import period_map, sampled_delay_margin, spectral_radius
 
-    loop = (model.A, model.B, model.K)
+    loop, fixed = _held_moving(model)
     margin_s = sampled_delay_margin(*loop, period_s=period_s)
     crossings: tuple[MarginCrossing, ...] = ()
     checks: tuple[str, ...] = ()
-    if 0.0 < margin_s < inf and len(model.A) + model.B.shape[1] * (margin_s / period_s + 2.0) <= _LARGEST_MAP:
+    if 0.0 < margin_s < inf and len(loop[0]) + loop[1].shape[1] * (margin_s / period_s + 2.0) <= _LARGEST_MAP:
         delays_s = [(1.0 - _BESIDE) * margin_s, margin_s, (1.0 + _BESIDE) * margin_s]
         before, at, after = (spectral_radius(*loop, period_s=period_s, delay_s=delay_s) for delay_s in delays_s)
         # it may touch one at a whole period and be smaller on both sides
@@ -238,10 +257,11 @@ def _with_known_period(model: HeldModel, period_s: float) -> LoopMargin:
         delay_margin_s=margin_s,
         delay_margin_error_s=max((crossing.delay_error_s for crossing in crossings), default=0.0),
         crossings=crossings,
-        unstable_roots_at_zero_delay=int(np.count_nonzero(np.abs(at_once) > 1.0)),
+        unstable_roots_at_zero_delay=int(np.count_nonzero(np.abs(at_once) > 1.0 + _ROUNDING)),
+        roots_fixed_at_zero=fixed,
         complete_to_s=margin_s,
         checked_by=checks,
-        notes=(f"u = K x, sampled and held every {period_s:g} s, acts tau late{beyond}",),
+        notes=(f"u = K x, sampled and held every {period_s:g} s, acts tau late{beyond}", *_fixed_note(fixed, "z = 1")),
     )
 
 

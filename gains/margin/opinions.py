@@ -1,8 +1,8 @@
 """Second opinions on an analysis of one unknown delay, and how many of its digits are known.
 
 A sweep along the unit circle (`gains.delay.sweep.circle_sweep_margin`), and the rightmost root beside the ends of the
-windows or, where a root at zero is left out, a root count by the argument principle: none shares algebra with the exact
-analysis. A difference that rounding does not explain is an error.
+windows or, for large loops and where a root at zero is left out, a root count by the argument principle: none shares
+algebra with the exact analysis. A difference that rounding does not explain is an error.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,6 +23,10 @@ _SWEEP_BUDGET = 14_000
 _SPECTRUM_BUDGET = 200
 # turns of the longest delay up to the highest frequency, for a count of roots: 0.1 s
 _COUNT_BUDGET = 1000.0
+# frequencies of a count at delay zero; frequencies times n^3 for determinants of n states: 3 s
+_COUNT_POINTS, _DETERMINANT_BUDGET = 840, 1e10
+# rad; a root that crosses within this turn of its frequency may be near the axis
+_NEAR_TURN = 0.2
 # the spectrum is computed this far inside and outside a window, relative to its end
 _BESIDE = 1e-4
 # a thorough check also looks at these fractions of a window
@@ -71,8 +75,7 @@ def second_opinions(
         checks.append("sweep")
         if isfinite(swept_s):
             error_s = max(error_s, abs(margin_s - swept_s))
-    if _confirmed_beside_windows(analysis, terms, error_s, thorough):
-        checks.append("root count" if analysis.roots_fixed_at_zero else "rightmost root")
+    checks += sorted(_confirmed_beside_windows(analysis, terms, error_s, thorough))
     return tuple(checks), error_s
 
 
@@ -113,46 +116,65 @@ def _is_root(terms: Sequence[DelayedTerm], crossing: Crossing) -> bool:
 
 def _confirmed_beside_windows(
     analysis: DelayAnalysis, terms: Sequence[DelayedTerm], error_s: float, thorough: bool
-) -> bool:
-    """Compare the windows with the spectrum inside and beside them; False if no delay could be checked."""
+) -> set[str]:
+    """Compare the windows with the spectrum inside and beside them; the methods by which a delay could be checked."""
     rate = sum(float(np.linalg.norm(term.matrix)) for term in terms)
-    looked_at = 0
+    largest = max(len(block.indices) for block in distinct_blocks(*(term.matrix for term in terms)))
+    methods: set[str] = set()
     for tau_s, stable in _delays_to_look_at(analysis, rate, error_s, thorough):
         pairs = [(term.matrix, term.delay_s(tau_s)) for term in terms]
-        growth = _growth(pairs, rate, thorough, leave_out_zero=analysis.roots_fixed_at_zero > 0)
-        looked_at += 0 if np.isnan(growth) else 1
+        turns = rate * max(delay_s for _, delay_s in pairs)
+        if analysis.roots_fixed_at_zero or (not thorough and largest * (12.0 + turns / 2.0) > _SPECTRUM_BUDGET):
+            method = "root count"
+            beside = [c.omega_rad_s for c in analysis.crossings if _is_near(c, tau_s)]
+            growth = _counted_growth(
+                pairs, rate, turns, largest, beside, leave_out_zero=analysis.roots_fixed_at_zero > 0
+            )
+        else:
+            method, growth = "rightmost root", _growth(pairs)
+        if not np.isnan(growth):
+            methods.add(method)
         if (growth < 0.0) != stable and abs(growth) > _UNDECIDED * rate:
             raise DisagreementError(
                 f"the loop should be {'stable' if stable else 'unstable'} at {tau_s} s, but the real part of its "
                 f"rightmost root there is {growth} 1/s; windows {analysis.stable_intervals_s}"
             )
-    return looked_at > 0
+    return methods
 
 
-def _growth(pairs: Sequence[tuple[FloatArray, float]], rate: float, thorough: bool, *, leave_out_zero: bool) -> float:
-    """Real part (1/s) of the rightmost root or, with a root at zero left out, a number of its sign.
+def _is_near(crossing: Crossing, tau_s: float) -> bool:
+    """Whether one of the delays of a crossing is so near that its root is near the axis."""
+    away = crossing.omega_rad_s * (tau_s - crossing.delay_s)
+    return abs(float(np.angle(np.exp(1j * away)))) < _NEAR_TURN
 
-    nan where it would take long or is too close to tell.
-    """
-    longest_s = max(delay_s for _, delay_s in pairs)
-    if leave_out_zero:
-        from gains.delay._mixed import count_unstable_roots
 
-        if rate * longest_s > _COUNT_BUDGET:
-            return nan
-        try:
-            return rate if count_unstable_roots(pairs, leave_out_zero=True) > 0 else -rate
-        except DisagreementError:
-            return nan
+def _growth(pairs: Sequence[tuple[FloatArray, float]]) -> float:
+    """Real part (1/s) of the rightmost root; nan where the delay is too long for its discretisation."""
     from gains.delay.rightmost import rightmost_root
 
-    largest = max(len(block.indices) for block in distinct_blocks(*(matrix for matrix, _ in pairs)))
-    if not thorough and largest * (12.0 + rate * longest_s / 2.0) > _SPECTRUM_BUDGET:
-        return nan
     try:
         return rightmost_root(pairs).real
     except BadModelError:
-        # the delay is too long for its discretisation
+        return nan
+
+
+def _counted_growth(
+    pairs: Sequence[tuple[FloatArray, float]],
+    rate: float,
+    turns: float,
+    largest: int,
+    beside: Sequence[float],
+    *,
+    leave_out_zero: bool,
+) -> float:
+    """A number of the sign of the growth, from a count of roots; nan where it would take long or is too close."""
+    from gains.delay._mixed import count_unstable_roots
+
+    if turns > _COUNT_BUDGET or (_COUNT_POINTS + 10.0 * turns) * largest**3 > _DETERMINANT_BUDGET:
+        return nan
+    try:
+        return rate if count_unstable_roots(pairs, leave_out_zero=leave_out_zero, beside=beside) > 0 else -rate
+    except DisagreementError:
         return nan
 
 

@@ -24,7 +24,7 @@ from gains.core._bracketing import met_end
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response
-from gains.performance.scalar_gains import ScalarGains
+from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.performance.string_stability import largest_magnitude, largest_value, string_peak
 from gains.sampled.onboard import own_part
 
@@ -130,18 +130,13 @@ class FlownFormation:
     @cached_property
     def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A, B K_own and B K_others."""
-        model = self._model
-        step = self.model.axes // model.axes
-        K = self.K[::step, ::step]
+        model, K = self._narrowed
         own = own_part(model, K)
         return model.A, model.B @ own, model.B @ (K - own)
 
     @cached_property
-    def _model(self) -> FormationModel:
-        """The formation of one axis, if the gains act on every axis alike."""
-        axes = self.model.axes
-        alike = np.array_equal(self.K, np.kron(self.K[::axes, ::axes], np.eye(axes)))
-        return FormationModel(self.model.predecessors, axes=1) if alike and axes > 1 else self.model
+    def _narrowed(self) -> tuple[FormationModel, FloatArray]:
+        return self.model.narrowed(self.K)
 
     @cached_property
     def _slowest(self) -> float:
@@ -151,7 +146,7 @@ class FlownFormation:
 
     def _answers(self, omega: FloatArray) -> NDArray[np.complex128]:
         """From wanted to real accelerations, (k, n, 1): the factor of each row of B K."""
-        model = self._model
+        model, _ = self._narrowed
         factors = np.ones((len(omega), model.states, 1), dtype=np.complex128)
         for vehicle, response in enumerate(self.responses or ()):
             factors[:, model.velocity_slice(vehicle)] = response.transfer(omega)[:, None, None]
@@ -181,10 +176,8 @@ class FlownLoop:
     @cached_property
     def pair(self) -> FlownFormation:
         """The follower and the vehicle in front as a formation of one axis, which has the α of all axes."""
-        model = FormationModel((-1, 0), axes=1)
-        own, front, spacing = self._matrices
         responses = None if self.response is None else (self.response, self.response)
-        return FlownFormation(model, model.overlapping_gain(own, front, spacing), self.timing, responses)
+        return FlownFormation(PAIR, self.gains.K, self.timing, responses)
 
     def string_peak(self, delay_s: float) -> float:
         """Largest growth of a spacing error from one vehicle to the next at a loop delay (s); `inf` past the margin."""

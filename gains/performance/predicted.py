@@ -11,10 +11,13 @@ k_ff = 1 the vehicle in front and its follower do the same, and no spacing error
 
 A motion that its own command explains is known to the station before it happens. Between two samples it propagates as
 
-    U_i / U_j = (k_ff + K_i S_j) / (1 - K_i S_i),   S(z) = (z I - Phi)^{-1} (G + Phi(tau^) (g_tau(z) - g_tau^(z))),
+    U_i / U_j = (k_ff + K_i S_j) / (1 - K_i S_i),
 
-in which g_tau = (G0 z + G1) z^{-q-1} is the entry of a held command that acts tau late: exact, and without mismatch
-free of the delay. Only a motion that no command explains is seen late, by the first vehicle behind it.
+    S(z) = R(z) G + L R(z) (g_tau(z) - g_tau^(z)),   R(z) = (z I - Phi)^{-1},
+
+in which g_tau = (G0 z + G1) z^{-q-1} is the entry of a held command that acts tau late, and L = e^{A tau^} of the
+measured states (`HeldPlant.carry`): exact, and without mismatch free of the delay. Only a motion that no command
+explains is seen late, by the first vehicle behind it.
 """
 
 from dataclasses import dataclass
@@ -27,9 +30,9 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
-from gains.performance.scalar_gains import ScalarGains
+from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.performance.string_stability import largest_value
-from gains.sampled._loop import HeldPlant, split_delay
+from gains.sampled._loop import HeldPlant, held_entry
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window
 
@@ -82,7 +85,8 @@ class PredictedLoop:
     def window_s(self) -> tuple[float, float]:
         """The least and the largest stable true loop delay in s, see `gains.sampled.prediction.mismatch_window`."""
         A, B, K = self._matrices
-        return mismatch_window(A, B, K, Timing(self.period_s, self.period_s), assumed_s=self.assumed_s)
+        timing = Timing(self.period_s, self.period_s)
+        return mismatch_window(A, B, K, timing, assumed_s=self.assumed_s, measured=self._measured)
 
     def string_peak(self, delay_s: float) -> float:
         """Largest ratio of a follower's commanded motion to that in front, over all frequencies that samples have.
@@ -91,32 +95,13 @@ class PredictedLoop:
         """
         if not self.is_stable(delay_s):
             return inf
-        _, _, K = self._matrices
+        frequencies = np.geomspace(_LOWEST * self._slowest, pi / self.period_s, _FREQUENCIES)
+        return max(1.0, largest_value(lambda omega: self.growth(omega, delay_s), frequencies))
 
-        def growth(omega: FloatArray) -> FloatArray:
-            front, own = (K[1] @ self._seen_sampled(omega, delay_s)).T
-            return np.abs((self.feed_forward + front) / (1.0 - own))
-
-        nyquist = pi / self.period_s
-        return max(1.0, largest_value(growth, np.geomspace(_LOWEST * self._slowest, nyquist, _FREQUENCIES)))
-
-    def first_string_peak(self, delay_s: float) -> float:
-        """The same from a motion in front that no command explains: the vehicle behind sees it late.
-
-        The hold counts as half a period, and the rates of samples are not seen.
-        """
-        if not self.is_stable(delay_s):
-            return inf
-        _, B, K = self._matrices
-
-        def growth(omega: FloatArray) -> FloatArray:
-            s, resolvent = self._resolvents(omega)
-            moved, answered = resolvent[:, :, 0] @ (K[1] @ self._ahead), resolvent[:, 2] @ B[:, 1]
-            late = np.exp(-s * (delay_s + self.period_s / 2.0))[:, 0, 0]
-            own = self._seen(s, resolvent, delay_s)[:, :, 1] @ K[1]
-            return np.abs(answered * late * moved / (1.0 - own) / resolvent[:, 0, 0])
-
-        return max(1.0, largest_value(growth, self._frequencies))
+    def growth(self, omega: FloatArray, delay_s: float) -> FloatArray:
+        """|U_i / U_j| (k,) at frequencies omega (k,) in rad/s up to pi / `period_s`, if the loop is stable."""
+        front, own = (self._matrices[2][1] @ self._seen_sampled(omega, delay_s)).T
+        return np.abs((self.feed_forward + front) / (1.0 - own))
 
     def alpha(self, delay_s: float) -> float:
         """Disturbances |w| up to alpha |e| (1/s) are withstood at a true loop delay; 0 outside the window.
@@ -126,7 +111,7 @@ class PredictedLoop:
         if not self.is_stable(delay_s):
             return 0.0
         _, B, alone = self._matrices
-        K = fed_forward(FormationModel((-1, 0), axes=1), alone, self.feed_forward)
+        K = fed_forward(PAIR, alone, self.feed_forward)
 
         def gain(omega: FloatArray) -> FloatArray:
             s, resolvent = self._resolvents(omega)
@@ -145,20 +130,21 @@ class PredictedLoop:
     @cached_property
     def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A, B and K of a vehicle and its follower, of one axis; K without feed-forward."""
-        k, model = self.gains, FormationModel((-1, 0), axes=1)
-        K = model.overlapping_gain([[-k.k1]], [[k.k2]], [[k.k3]])
-        if self.response is None:
-            return model.A, model.B, K
-        return formation_loop(model, K, (self.response, self.response))
+        return formation_loop(PAIR, self.gains.K, None if self.response is None else (self.response, self.response))
 
     @cached_property
     def _plant(self) -> HeldPlant:
-        return HeldPlant(*self._matrices, self.period_s)
+        return HeldPlant(*self._matrices, self.period_s, np.array(self._measured))
+
+    @property
+    def _measured(self) -> list[bool]:
+        """Positions and velocities; a response is computed from the commands."""
+        return [k < 3 for k in range(len(self._matrices[0]))]
 
     @cached_property
     def _ahead(self) -> FloatArray:
-        """e^{A tau^}."""
-        return self._plant.transition(np.array([self.assumed_s]))[0][0]
+        """L = e^{A tau^}, of the measured states."""
+        return self._plant.carry(np.array([self.assumed_s]))[0]
 
     @cached_property
     def _slowest(self) -> float:
@@ -182,17 +168,13 @@ class PredictedLoop:
         """What the predicted state answers to commands, (k, n, 2), in continuous time."""
         B = self._matrices[1]
         mismatch = np.exp(-s * delay_s) - np.exp(-s * self.assumed_s)
-        return resolvent @ (B + self._ahead @ B * mismatch) * np.exp(-s * self.period_s / 2.0)
+        answers = resolvent @ B
+        return (answers + self._ahead @ answers * mismatch) * np.exp(-s * self.period_s / 2.0)
 
     def _seen_sampled(self, omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
         """S(z) at z = e^{j omega T}, shape (k, n, 2)."""
         z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
         Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
-
-        def entry(late_s: float) -> NDArray[np.complex128]:
-            whole, rest_s = split_delay(late_s, self.period_s)
-            newer = self._plant.transition(np.array([self.period_s - rest_s]))[1][0]
-            return (newer * (z - 1.0) + G) * z ** (-whole - 1)
-
-        mismatch = self._ahead @ (entry(delay_s) - entry(self.assumed_s))
-        return np.linalg.solve(z * np.eye(len(Phi)) - Phi, G + mismatch)
+        mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
+        resolvent = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
+        return resolvent @ G + self._ahead @ resolvent @ mismatch

@@ -1,16 +1,21 @@
-"""The formation loop of vehicles that respond to a command with a lag, as an autopilot does, and its delay margin.
+"""The formation loop of vehicles that respond to a command as an autopilot does, and its delay margin.
 
-A vehicle is commanded an acceleration u and the velocity that goes with it, v_s' = u. Its acceleration a follows
+A vehicle is commanded an acceleration u and the velocity that goes with it, v_s' = u. Its acceleration a follows what
+its velocity loop wants, w = u + g (v_s - v), with one of three responses h = a / w:
 
-    lag a' = u + g (v_s - v) - a,   v' = a,
+    lag                  lag a'(t) = w(t) - a(t)                     h = 1 / (lag s + 1)
+    lag with dead time   lag a'(t) = w(t - T) - a(t)                 h = e^{-sT} / (lag s + 1)
+    second order         a'' / omega_n^2 + lag a' = w - a            h = 1 / (s^2 / omega_n^2 + lag s + 1)
 
-so a / u = (s + g) / (lag s² + s + g), which is 1 / (lag s + 1) for g = 0. Instead of v_s the state holds the velocity
-still owed, d = v_s - v, d' = u - a. With these A, B and u = K e, `gains.delay.constant` and
-`gains.sampled.multirate` have the margin: one delay, exact.
+so that v' = a and a / u = h (s + g) / (s + g h), which is h for g = 0. Instead of v_s the state holds the velocity
+still owed, d = v_s - v, d' = u - a. A dead time becomes a rational function of order 4, whose phase is exact to 1e-6
+rad up to an angle of omega T = 1.3; `Response.transfer` has it exactly. With these A, B and u = K e,
+`gains.delay.constant` and `gains.sampled.multirate` have the margin.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,37 +26,108 @@ from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.sampled.multirate import Timing, multirate_delay_margin
 
+_ORDER = 4
+"""Of the rational function that stands for a dead time (Pade)."""
+
 
 @dataclass(frozen=True)
 class Response:
-    """The response of one vehicle: `lag_s` > 0 from wanted to real acceleration, velocity gain g >= 0 in 1/s.
+    """The response of one vehicle: its `lag_s` > 0 from wanted to real acceleration, and its velocity gain g >= 0.
 
-    BadModelError if the lag is below 1e-6 s, the gain negative, or either not finite.
+    BadModelError if the lag is below 1e-6 s, the gain or the dead time negative, the natural frequency not positive,
+    any not finite, or if there are both a dead time and a natural frequency.
     """
 
     lag_s: float
+    """Time constant; of a second order, 2 damping / natural frequency: its phase at low frequencies is the same."""
     velocity_gain_1_s: float
+    dead_time_s: float = 0.0
+    natural_frequency_rad_s: float | None = None
+    """Of a second order; None for the other models."""
 
     def __post_init__(self) -> None:
-        for name, least in (("lag_s", 1e-6), ("velocity_gain_1_s", 0.0)):
+        natural = self.natural_frequency_rad_s
+        least = {"lag_s": 1e-6, "velocity_gain_1_s": 0.0, "dead_time_s": 0.0}
+        for name, bound in (least if natural is None else least | {"natural_frequency_rad_s": 1e-6}).items():
             value = getattr(self, name)
-            if not (np.isfinite(value) and value >= least):
-                raise BadModelError(f"{name} = {value}; wanted a number of at least {least:g}")
+            if not (np.isfinite(value) and value >= bound):
+                raise BadModelError(f"{name} = {value}; wanted a number of at least {bound:g}")
+        if natural is not None and self.dead_time_s:
+            raise BadModelError(f"dead_time_s = {self.dead_time_s}; wanted 0 with a natural frequency")
+
+    @property
+    def model(self) -> str:
+        """The name of the model."""
+        if self.natural_frequency_rad_s is not None:
+            return "second order"
+        return "lag with dead time" if self.dead_time_s else "lag"
+
+    @property
+    def damping(self) -> float | None:
+        """Damping ratio of a second order; None for the other models."""
+        return None if self.natural_frequency_rad_s is None else self.lag_s * self.natural_frequency_rad_s / 2.0
 
     def transfer(self, omega: FloatArray) -> NDArray[np.complex128]:
-        """a / u at jω, from wanted to real acceleration: (s + g) / (lag s² + s + g)."""
+        """a / u at jω, from wanted to real acceleration: h (s + g) / (s + g h)."""
         s, g = 1j * omega, self.velocity_gain_1_s
+        below = self.lag_s * s + 1.0
+        if self.natural_frequency_rad_s is not None:
+            below = below + (s / self.natural_frequency_rad_s) ** 2
+        late = np.exp(-s * self.dead_time_s)
         if g == 0.0:  # a root at 0 cancels
-            return np.reciprocal(self.lag_s * s + 1.0)
-        return (s + g) / (self.lag_s * s**2 + s + g)
+            return late / below
+        return late * (s + g) / (below * s + g * late)
+
+
+def own_dynamics(response: Response) -> tuple[FloatArray, FloatArray]:
+    """Return (A, B) of one vehicle of one axis: the state is its acceleration a, what follows it, and d if g > 0.
+
+    The input is u.
+
+    A lag of 0.5 s and a gain of 2 1/s: 0.5 a' = u + 2 d - a, d' = u - a.
+
+    >>> [matrix.tolist() for matrix in own_dynamics(Response(0.5, 2.0))]
+    [[[-2.0, 4.0], [-1.0, 0.0]], [[2.0], [1.0]]]
+    """
+    lag_s, g, natural = response.lag_s, response.velocity_gain_1_s, response.natural_frequency_rad_s
+    if natural is None:
+        own, entry = np.array([[-1.0 / lag_s]]), np.array([[1.0 / lag_s]])
+    else:
+        own = np.array([[0.0, 1.0], [-(natural**2), -lag_s * natural**2]])
+        entry = np.array([[0.0], [natural**2]])
+    if response.dead_time_s:
+        line, into, out, through = _dead_time(response.dead_time_s)
+        own = np.block([[own, entry @ out], [np.zeros((_ORDER, len(own))), line]])
+        entry = np.vstack([through * entry, into])
+    if g == 0.0:
+        return own, entry
+    n = len(own)
+    A, B = np.zeros((n + 1, n + 1)), np.vstack([entry, [[1.0]]])
+    A[:n, :n], A[:n, n:], A[n, 0] = own, g * entry, -1.0
+    return A, B
+
+
+def _dead_time(dead_time_s: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """A dead time as x' = A x + B w, w_late = C x + D w: the Pade approximation of e^{-sT}, companion form in s T."""
+    n = _ORDER
+    c = [factorial(2 * n - k) / (factorial(k) * factorial(n - k)) for k in range(n + 1)]
+    below = np.array(c) / c[n]
+    above = below * (-1.0) ** np.arange(n + 1)
+    A = np.diag(np.ones(n - 1), 1)
+    A[-1] = -below[:n]
+    B = np.zeros((n, 1))
+    B[-1] = 1.0
+    return A / dead_time_s, B / dead_time_s, (above[:n] - above[n] * below[:n])[np.newaxis], float(above[n])
 
 
 def formation_loop(
-    model: FormationModel, K: FloatArray, responses: Sequence[Response]
+    model: FormationModel, K: FloatArray, responses: Sequence[Response] | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return (A, B, K) of the formation u = K e whose vehicles have these responses, one for each in the model's order.
 
-    The state is e of `gains.formation.model`, followed by a and d of each vehicle; a vehicle with g = 0 has no d.
+    Without responses they respond at once, and these are the model's own.
+
+    The state is e of `gains.formation.model`, followed by that of each vehicle as of `own_dynamics`, axis by axis.
     BadModelError unless K has the shape (inputs, states) of the model and there is one response for each vehicle.
 
     A leader by itself, of one axis: e' = a, 0.5 a' = u − a, u = −e.
@@ -60,28 +136,25 @@ def formation_loop(
     >>> (A + B @ K).tolist()
     [[0.0, 1.0], [-2.0, -2.0]]
     """
+    if responses is None:
+        return model.A, model.B, K
     if len(responses) != model.vehicles:
         raise BadModelError(f"there are {len(responses)} responses; wanted one for each of {model.vehicles} vehicles")
     if K.shape != (model.inputs, model.states):
         raise BadModelError(f"K has shape {K.shape}; wanted {(model.inputs, model.states)}")
     axes = model.axes
-    n = model.states + axes * sum(2 if response.velocity_gain_1_s > 0.0 else 1 for response in responses)
+    identity = np.eye(axes)
+    dynamics = [tuple(np.kron(part, identity) for part in own_dynamics(response)) for response in responses]
+    n = model.states + sum(len(own) for own, _ in dynamics)
     A, B = np.zeros((n, n)), np.zeros((n, model.inputs))
     A[: model.states, : model.states] = model.A
-    identity, at = np.eye(axes), model.states
-    for vehicle, response in enumerate(responses):
-        rate, gain = 1.0 / response.lag_s, response.velocity_gain_1_s
-        own, command = slice(at, at + axes), model.input_slice(vehicle)
-        A[model.velocity_slice(vehicle), own] = identity
-        A[own, own] = -rate * identity
-        B[own, command] = rate * identity
-        at += axes
-        if gain > 0.0:
-            owed = slice(at, at + axes)
-            A[own, owed] = gain * rate * identity
-            A[owed, own] = -identity
-            B[owed, command] = identity
-            at += axes
+    at = model.states
+    for vehicle, (own, entry) in enumerate(dynamics):
+        rows = slice(at, at + len(own))
+        A[model.velocity_slice(vehicle), at : at + axes] = identity
+        A[rows, rows] = own
+        B[rows, model.input_slice(vehicle)] = entry
+        at += len(own)
     return A, B, np.hstack([K, np.zeros((model.inputs, n - model.states))])
 
 
@@ -99,8 +172,7 @@ def sampled_margin(
     >>> round(sampled_margin(leader, K, [Response(1.0, 0.0)], timing=Timing(0.02, 0.02)), 3)
     1.141
     """
-    loop = (model.A, model.B, K) if responses is None else formation_loop(model, K, responses)
-    return float(multirate_delay_margin(*loop, timing))
+    return multirate_delay_margin(*formation_loop(model, K, responses), timing)
 
 
 def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[Response]) -> float:
@@ -114,4 +186,4 @@ def continuous_margin(model: FormationModel, K: FloatArray, responses: Sequence[
     1.1506
     """
     A, B, K_all = formation_loop(model, K, responses)
-    return float(delay_margin(A, B @ K_all))
+    return delay_margin(A, B @ K_all)

@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
 
+PAIR = FormationModel((-1, 0), axes=1)
+"""A leader and its follower, of one axis: with equal gains a tree of any size has the roots of these two."""
 # Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three
 # closer looks, and a parabola through the last, give σ_min to about 1e-10 of itself.
 _FREQUENCIES, _FREQUENCIES_CLOSER, _CLOSER_LOOKS = 40, 9, 3
@@ -25,6 +28,11 @@ class ScalarGains:
     k2: float
     k3: float
     alpha: float
+
+    @property
+    def K(self) -> FloatArray:  # noqa: N802 - the source's letter
+        """K of u = K e for `PAIR`, shape (2, 3)."""
+        return PAIR.overlapping_gain([[-self.k1]], [[self.k2]], [[self.k3]])
 
 
 def gains_of_margin(share: FloatArray, delay_margin_s: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core._bracketing import peaks
+from gains.core._bracketing import local_maxima, peaks
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 
@@ -81,7 +81,7 @@ def largest_magnitude(response: Callable[[FloatArray], NDArray[Any]], *, near_ra
 def largest_value(function: Callable[[FloatArray], FloatArray], grid: FloatArray) -> float:
     """Return the largest value of a function (k,) -> (k,) on a rising grid, with every local maximum refined."""
     values = function(grid)
-    inner = np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    inner = local_maxima(values)
     largest = float(values.max())
     if inner.size:
         largest = max(largest, float(function(peaks(function, grid[inner - 1], grid[inner + 1])).max()))

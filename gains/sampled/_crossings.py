@@ -54,7 +54,7 @@ def block_delay_margin(plant: SampledPlant) -> float:
         margin_s = min(off_axis_s, _least_delay_at_minus_one(plant, refinement))
         contradiction = _contradiction(plant, margin_s)
         if not contradiction:
-            return margin_s
+            return float(margin_s)
     raise DisagreementError(contradiction)
 
 

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from math import inf
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, distinct_blocks
@@ -12,10 +14,13 @@ from gains.delay._loci import factor_rank
 
 # delays this close to a whole number of periods (in periods) count as it: (3 * 0.02) / 0.02 is not exactly 3
 _WHOLE = 1e-12
+# doublings of a stable map until nothing is added: motions that decay in 2^60 periods are as good as unstable
+_DOUBLINGS = 60
+_ROUNDING, _MOST = 1e-15, 1e30
 
 
 class SampledPlant(Protocol):
-    """The plant under a held command: one block, linear, and the same in every period."""
+    """The plant under held commands: one block, linear, and the same in every period."""
 
     @property
     def A(self) -> FloatArray: ...  # noqa: N802 - the source's letter
@@ -33,15 +38,23 @@ class SampledPlant(Protocol):
         """Maps over the last `duration_s` (k,) of a period: of the state (k, n, n), of a held input (k, n, r)."""
         ...
 
+    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """The same from each instant to the next, of a state whose first n entries are those on which K acts."""
+        ...
+
 
 @dataclass(frozen=True)
 class HeldPlant:
-    """One strongly connected block of the loop: A (n, n), B (n, r), K (r, n) of full rank r, and the period."""
+    """One strongly connected block of the loop: A (n, n), B (n, r), K (r, n) of full rank r, and the period.
+
+    A station that predicts computes the states that are not `measured` (n,) from the commands; None: all are measured.
+    """
 
     A: FloatArray
     B: FloatArray
     K: FloatArray
     period_s: float
+    measured: NDArray[np.bool_] | None = None
 
     def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """e^{A t} (k, n, n) and int_0^t e^{A s} ds B (k, n, r) for k durations t."""
@@ -52,8 +65,24 @@ class HeldPlant:
         return exponentials[:, :n, :n], exponentials[:, :n, n:]
 
     def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """The same from each of the instants to the next."""
+        """As of the protocol."""
         return self.transition(np.diff(instants))
+
+    def carry(self, duration_s: FloatArray) -> FloatArray:
+        """By how much a measured difference from the computed state grows over k durations: maps (k, n, n).
+
+        e^{A t} of the measured states; the others do not differ.
+        """
+        return carry(self.A, self.measured, duration_s)
+
+
+def carry(A: FloatArray, measured: NDArray[np.bool_] | None, duration_s: FloatArray) -> FloatArray:
+    """See `HeldPlant.carry`."""
+    seen = np.arange(len(A)) if measured is None else np.flatnonzero(measured)
+    maps = np.zeros((duration_s.size, *A.shape))
+    exponents = duration_s[:, np.newaxis, np.newaxis] * A[np.ix_(seen, seen)]
+    maps[:, seen[:, np.newaxis], seen] = matrix_exponentials(exponents)
+    return maps
 
 
 def matrix_exponentials(exponents: FloatArray) -> FloatArray:
@@ -74,18 +103,52 @@ def matrix_exponentials(exponents: FloatArray) -> FloatArray:
     return result
 
 
-def held_blocks(A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float) -> list[HeldPlant]:
+def held_blocks(
+    A: FloatArray, B: FloatArray, K: FloatArray, *, period_s: float, measured: NDArray[Any] | None = None
+) -> list[HeldPlant]:
     """The distinct strongly connected blocks of the loop, in balanced coordinates, with B K of each in full rank."""
     plants: list[HeldPlant] = []
-    for block in distinct_blocks(A, B @ K):
-        A_block, BK_block = balanced(*block.matrices)
-        plants.append(HeldPlant(A_block, *factor_rank(BK_block), period_s))
+    for block in distinct_blocks(A, B @ K, np.eye(len(A)) if measured is None else np.diag(measured)):
+        A_block, BK_block = balanced(*block.matrices[:2])
+        seen = None if measured is None else np.diag(block.matrices[2]) > 0.0
+        plants.append(HeldPlant(A_block, *factor_rank(BK_block), period_s, seen))
     return plants
+
+
+def radius_of(step: FloatArray) -> float:
+    """Spectral radius of a map."""
+    return float(np.abs(np.linalg.eigvals(step)).max())
 
 
 def block_radius(plant: SampledPlant, delay_s: float) -> float:
     """Spectral radius of the one-period map of one block."""
-    return float(np.abs(np.linalg.eigvals(lifted_map(plant, delay_s))).max())
+    return radius_of(lifted_map(plant, delay_s))
+
+
+def settled_covariance(step: FloatArray, added: FloatArray) -> FloatArray | None:
+    """P = F P F' + Q of a map F and the noise Q of a period, by doubling; None if the map is not stable."""
+    covariance, power = added.copy(), step
+    for _ in range(_DOUBLINGS):
+        more = power @ covariance @ power.T
+        if not np.abs(more).max() <= _MOST * (np.abs(added).max() + 1.0):
+            return None
+        covariance += more
+        if np.abs(more).max() <= _ROUNDING * np.abs(covariance).max():
+            break
+        power = power @ power
+    return covariance
+
+
+def rate_of(radius: float, period_s: float) -> float:
+    """Exponential rate (1/s) of a motion that grows by a factor in every period: negative when it shrinks."""
+    return float(np.log(radius)) / period_s if radius > 0.0 else -inf
+
+
+def held_entry(plant: SampledPlant, z: NDArray[np.complex128], delay_s: float) -> NDArray[np.complex128]:
+    """(G0 z + G1) z^{-q-1}, (k, n, r) at points z (k, 1, 1): what commands that are held and late do to the state."""
+    whole, rest_s = split_delay(delay_s, plant.period_s)
+    G, newer = plant.transition(np.array([plant.period_s, plant.period_s - rest_s]))[1]
+    return (newer * (z - 1.0) + G) * z ** (-whole - 1)
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:

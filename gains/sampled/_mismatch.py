@@ -4,7 +4,9 @@ One command in every period T, sampled and held as in `gains.sampled.constant`, 
 P_tau(z) = (z I - Phi)^{-1} (G0 z + G1) z^{-q-1}, the response of the sampled state to a command that acts tau late, the
 sum of the commands in the predictor telescopes, and the loop has the eigenvalue z exactly if
 
-    det(I - K (z I - Phi)^{-1} G - K e^{A tau^} (P_tau(z) - P_tau^(z))) = 0,   G = int_0^T e^{A s} ds B.
+    det(I - K (z I - Phi)^{-1} G - K e^{A tau^} (P_tau(z) - P_tau^(z))) = 0,   G = int_0^T e^{A s} ds B,
+
+with `HeldPlant.carry` in place of e^{A tau^} if some states are not measured.
 
 Without mismatch this is det(z I - Phi - G K) = 0: the loop without delay. As in `_crossings`, at a given fraction m of
 a period the moduli of the loci do not depend on the whole periods of tau. That gives the angle of each crossing, and
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 from gains.core._bracketing import bracketed_roots, may_reach_zero
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.delay._loci import log_moduli
-from gains.sampled._loop import HeldPlant, split_delay
+from gains.sampled._loop import HeldPlant, held_entry, split_delay
 
 # fractions of a period at which the angles are computed: they hardly depend on them
 _FRACTIONS = 4
@@ -50,7 +52,7 @@ class _PredictedBlock:
     def __init__(self, plant: HeldPlant, assumed_s: float) -> None:
         self.plant, self.assumed_s = plant, assumed_s
         self.Phi, self.G = (maps[0] for maps in plant.transition(np.array([plant.period_s])))
-        self.ahead = plant.transition(np.array([assumed_s]))[0][0]
+        self.ahead = plant.carry(np.array([assumed_s]))[0]
 
     def starts(self, refinement: int) -> tuple[FloatArray, FloatArray]:
         """Angles and delays near the crossings next to the assumed delay."""
@@ -120,10 +122,9 @@ class _PredictedBlock:
         """K e^{A tau^} (z I - Phi)^{-1}, shape (k, r, n), and the part (k, r, r) that does not depend on tau."""
         plant, z = self.plant, np.exp(1j * angle)[:, np.newaxis, np.newaxis]
         resolvent = (z * np.eye(len(self.Phi)) - self.Phi).swapaxes(1, 2)
-        rows = np.linalg.solve(resolvent, plant.K.T.astype(np.complex128)).swapaxes(1, 2)
-        whole, rest_s = split_delay(self.assumed_s, plant.period_s)
-        ahead = rows @ self.ahead
-        assumed = ahead @ self._entered(z, np.array([rest_s])) * z ** (-whole - 1)
+        both = np.hstack([plant.K.T, (plant.K @ self.ahead).T]).astype(np.complex128)
+        rows, ahead = np.split(np.linalg.solve(resolvent, both).swapaxes(1, 2).astype(np.complex128), 2, axis=1)
+        assumed = ahead @ held_entry(plant, z, self.assumed_s)
         return ahead, np.eye(plant.K.shape[0]) - rows @ self.G + assumed
 
     def _entered(self, z: NDArray[np.complex128], rest_s: FloatArray) -> NDArray[np.complex128]:

@@ -18,7 +18,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import positive_seconds, real_matrix, square_matrices
 from gains.sampled._crossings import block_delay_margin
-from gains.sampled._loop import HeldPlant, block_radius, held_blocks, lifted_map
+from gains.sampled._loop import HeldPlant, block_radius, held_blocks, lifted_map, rate_of
 
 
 def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> FloatArray:
@@ -28,7 +28,7 @@ def period_map(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, del
     +K x; T = `period_s` > 0 and tau = `delay_s` >= 0 are in s. BadModelError names an argument that is not.
     """
     plant = HeldPlant(*checked_loop(A, B, K), positive_seconds("period_s", period_s))
-    return lifted_map(plant, _checked_delay(delay_s))
+    return lifted_map(plant, checked_delay(delay_s))
 
 
 def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> float:
@@ -37,7 +37,7 @@ def spectral_radius(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float
     Strongly connected blocks are taken one by one, so that equal followers do not spoil each other's eigenvalues.
     """
     plants = held_blocks(*checked_loop(A, B, K), period_s=positive_seconds("period_s", period_s))
-    return max(block_radius(plant, _checked_delay(delay_s)) for plant in plants)
+    return max(block_radius(plant, checked_delay(delay_s)) for plant in plants)
 
 
 def growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, delay_s: float) -> float:
@@ -51,8 +51,7 @@ def growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float, de
     >>> round(growth_rate([[0]], [[1]], [[-1]], period_s=0.5, delay_s=0.0), 6)
     -1.386294
     """
-    radius = spectral_radius(A, B, K, period_s=period_s, delay_s=delay_s)
-    return float(np.log(radius)) / period_s if radius > 0.0 else -np.inf
+    return rate_of(spectral_radius(A, B, K, period_s=period_s, delay_s=delay_s), period_s)
 
 
 def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: float) -> float:
@@ -70,7 +69,7 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
     [1.0, 1.561]
     """
     plants = held_blocks(*checked_loop(A, B, K), period_s=positive_seconds("period_s", period_s))
-    return float(min(block_delay_margin(plant) for plant in plants))
+    return min(block_delay_margin(plant) for plant in plants)
 
 
 def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -84,7 +83,8 @@ def checked_loop(A: ArrayLike, B: ArrayLike, K: ArrayLike) -> tuple[FloatArray, 
     return plant, entry, feedback
 
 
-def _checked_delay(delay_s: float) -> float:
+def checked_delay(delay_s: float) -> float:
+    """`delay_s`, or BadModelError."""
     if not (np.isfinite(delay_s) and delay_s >= 0.0):
         raise BadModelError(f"delay_s is {delay_s}; a number of seconds >= 0 is wanted")
     return float(delay_s)

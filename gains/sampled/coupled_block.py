@@ -6,6 +6,7 @@ vehicle is a block of its own. The formation is stable exactly when every block 
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -16,16 +17,86 @@ from gains.delay.several import late_by_vehicle
 from gains.formation.model import FormationModel
 from gains.sampled._loop import matrix_exponentials
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
-from gains.sampled.onboard import OnboardLoop, OnboardTiming, onboard_loop
+from gains.sampled.onboard import OnboardTiming, onboard_loop
 from gains.sampled.prediction import mismatch_window, mismatch_window_continuous, predicted_growth_rate
+
+
+class ClosedLoop(Protocol):
+    """The feedback within one block as it is flown: who closes it and what is predicted is chosen when it is made."""
+
+    def window_s(self) -> tuple[float, float]:
+        """The loop delays (s) between which the sampled and held loop is stable; from 0 on without prediction."""
+        ...
+
+    def window_continuous_s(self) -> tuple[float, float]:
+        """The same of the continuous model; the hold counts as half a period."""
+        ...
+
+    def growth_1_s(self, delay_s: float) -> float:
+        """Growth rate (1/s) of the sampled and held loop at a loop delay."""
+        ...
+
+    def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
+        """Of the continuous model: what acts after delays that are known (s), and what acts a loop delay late."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class GroundLoop:
+    """A station closes every loop: all feedback is late."""
+
+    A: FloatArray
+    B: FloatArray
+    K: FloatArray
+    timing: Timing
+
+    def window_s(self) -> tuple[float, float]:
+        return 0.0, multirate_delay_margin(self.A, self.B, self.K, self.timing)
+
+    def window_continuous_s(self) -> tuple[float, float]:
+        return 0.0, delay_margin(self.A, self.B @ self.K) - self.timing.held_s / 2.0
+
+    def growth_1_s(self, delay_s: float) -> float:
+        return multirate_growth_rate(self.A, self.B, self.K, self.timing, delay_s=delay_s)
+
+    def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
+        return [(self.A, 0.0)], self.B @ self.K
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedGroundLoop:
+    """The same by a station that predicts over `assumed_s` (`gains.sampled.prediction`)."""
+
+    A: FloatArray
+    B: FloatArray
+    K: FloatArray
+    timing: Timing
+    assumed_s: float
+
+    def window_s(self) -> tuple[float, float]:
+        return mismatch_window(self.A, self.B, self.K, self.timing, assumed_s=self.assumed_s)
+
+    def window_continuous_s(self) -> tuple[float, float]:
+        half_s = self.timing.held_s / 2.0
+        least_s, most_s = mismatch_window_continuous(self.A, self.B, self.K, assumed_s=self.assumed_s + half_s)
+        return max(0.0, least_s - half_s), most_s - half_s
+
+    def growth_1_s(self, delay_s: float) -> float:
+        loop = self.A, self.B, self.K, self.timing
+        return predicted_growth_rate(*loop, assumed_s=self.assumed_s, delay_s=delay_s)
+
+    def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
+        assumed_s = self.assumed_s + self.timing.held_s / 2.0
+        late = self.B @ (self.K @ matrix_exponentials(self.A[np.newaxis] * assumed_s)[0])
+        return [(self.A + self.B @ self.K, 0.0), (-late, assumed_s)], late
 
 
 @dataclass(frozen=True, eq=False)
 class CoupledBlock:
     """Vehicles that act on each other, with their part of e' = A e + B u, u = K e; the same axes for all.
 
-    `system_ids` names the vehicles. `onboard` is their part of the onboard loop; without it all feedback is late.
-    `assumed_s` is the loop delay over which the station predicts (`gains.sampled.prediction`); None without prediction.
+    `system_ids` names the vehicles and `loop` is their feedback; `assumed_s` is the loop delay over which the station
+    predicts, None without prediction.
     """
 
     system_ids: tuple[int, ...]
@@ -33,43 +104,17 @@ class CoupledBlock:
     B: FloatArray
     K: FloatArray
     timing: Timing
-    onboard: OnboardLoop | None = None
+    loop: ClosedLoop
     assumed_s: float | None = None
 
     @property
     def has_late_terms(self) -> bool:
         """Whether any feedback inside the block is late; in the onboard loop a single vehicle has none."""
-        return self.onboard is None or bool(self.onboard.late.any())
+        return bool(self.loop.continuous_terms()[1].any())
 
     def margin_s(self) -> float:
         """The loop delay (s) at which the sampled and held loop loses stability: the longer end of its window."""
-        return self.window_s()[1]
-
-    def window_s(self) -> tuple[float, float]:
-        """The loop delays (s) between which the sampled and held loop is stable; from 0 on without prediction."""
-        if self.assumed_s is not None:
-            return mismatch_window(self.A, self.B, self.K, self.timing, assumed_s=self.assumed_s)
-        if self.onboard is not None:
-            return 0.0, self.onboard.sampled_margin_s()
-        return 0.0, float(multirate_delay_margin(self.A, self.B, self.K, self.timing))
-
-    def window_continuous_s(self) -> tuple[float, float]:
-        """The same of the continuous model; the hold counts as half a period."""
-        half_s = self.timing.held_s / 2.0
-        if self.assumed_s is not None:
-            least_s, most_s = mismatch_window_continuous(self.A, self.B, self.K, assumed_s=self.assumed_s + half_s)
-            return max(0.0, least_s - half_s), most_s - half_s
-        whole_s = delay_margin(self.A, self.B @ self.K) if self.onboard is None else self.onboard.continuous_margin_s()
-        return 0.0, whole_s - half_s
-
-    def growth_1_s(self, delay_s: float) -> float:
-        """Growth rate (1/s) of the sampled and held loop at a loop delay."""
-        if self.onboard is not None:
-            return self.onboard.growth_1_s(delay_s)
-        if self.assumed_s is not None:
-            arguments = self.A, self.B, self.K, self.timing
-            return predicted_growth_rate(*arguments, assumed_s=self.assumed_s, delay_s=delay_s)
-        return multirate_growth_rate(self.A, self.B, self.K, self.timing, delay_s=delay_s)
+        return self.loop.window_s()[1]
 
     def growth_continuous_1_s(self, delay_s: float) -> float:
         """Real part (1/s) of the rightmost root of the continuous model; the hold counts as half a period of delay."""
@@ -77,25 +122,12 @@ class CoupledBlock:
 
     def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
         """The same where each vehicle's command has a loop delay of its own (`gains.delay.several`)."""
-        if self.assumed_s is not None:
-            assumed_s = self.assumed_s + self.timing.held_s / 2.0
-            ahead = self.K @ matrix_exponentials(self.A[np.newaxis] * assumed_s)[0]
-            at_once = [(self.A + self.B @ self.K, 0.0), (-self.B @ ahead, assumed_s)]
-            return self._rightmost(at_once, ahead, loop_delay_s)
-        late_gain = self.K if self.onboard is None else self.B.T @ self.onboard.late
-        at_once = [(self.A, 0.0)] if self.onboard is None else self.onboard.continuous_at_once()
-        return self._rightmost(at_once, late_gain, loop_delay_s)
-
-    def _rightmost(
-        self, at_once: list[tuple[FloatArray, float]], late_gain: FloatArray, loop_delay_s: Mapping[int, float]
-    ) -> float:
-        """Real part (1/s) of the rightmost root of terms with known delays and of those that are late by vehicle."""
+        known, late = self.loop.continuous_terms()
         axes = self.B.shape[1] // len(self.system_ids)
-        late = late_by_vehicle(
-            self.B, late_gain, [slice(axes * k, axes * (k + 1)) for k in range(len(self.system_ids))]
-        )
+        places = [slice(axes * k, axes * (k + 1)) for k in range(len(self.system_ids))]
         delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
-        return rightmost_root([*at_once, *zip(late, delays_s, strict=True)]).real
+        own = late_by_vehicle(self.B, self.B.T @ late, places)
+        return rightmost_root([*known, *zip(own, delays_s, strict=True)]).real
 
     def growth_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
         """Growth rate (1/s) of the sampled loop where each vehicle has a loop delay of its own.
@@ -105,7 +137,7 @@ class CoupledBlock:
         """
         delays_s = [loop_delay_s[system_id] for system_id in self.system_ids]
         mean_s = sum(delays_s) / len(delays_s)
-        rate_1_s = self.growth_1_s(mean_s)
+        rate_1_s = self.loop.growth_1_s(mean_s)
         if max(delays_s) == min(delays_s):
             return rate_1_s
         return rate_1_s + self.growth_continuous_at_1_s(loop_delay_s) - self.growth_continuous_1_s(mean_s)
@@ -150,17 +182,13 @@ def coupled_blocks(
     for members in model.coupled_vehicles(K):
         own = np.concatenate([np.r_[model.output_slice(i)] for i in members])
         inputs = np.concatenate([np.r_[model.input_slice(i)] for i in members])
-        blocks.append(
-            CoupledBlock(
-                system_ids=tuple(system_ids[i] for i in members),
-                A=A[np.ix_(own, own)],
-                B=B[np.ix_(own, inputs)],
-                K=K[np.ix_(inputs, own)],
-                timing=timing,
-                onboard=None if whole is None else whole.part(own),
-                assumed_s=assumed_s,
-            )
-        )
+        matrices = A[np.ix_(own, own)], B[np.ix_(own, inputs)], K[np.ix_(inputs, own)]
+        loop: ClosedLoop = GroundLoop(*matrices, timing)
+        if whole is not None:
+            loop = whole.part(own)
+        elif assumed_s is not None:
+            loop = PredictedGroundLoop(*matrices, timing, assumed_s)
+        blocks.append(CoupledBlock(tuple(system_ids[i] for i in members), *matrices, timing, loop, assumed_s))
     return blocks
 
 

@@ -14,10 +14,9 @@ n is the number of slower periods in T:
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial
 from math import ceil, floor, inf, isfinite
 
 import numpy as np
@@ -27,9 +26,8 @@ from gains.core._bracketing import met_end, peaks
 from gains.core.arrays import FloatArray
 from gains.core.structure import positive_seconds
 from gains.delay.constant import delay_margin
-from gains.sampled._loop import held_blocks
-from gains.sampled._predictor import LiftedPlant, Predictor
-from gains.sampled.constant import checked_loop, growth_rate, sampled_delay_margin
+from gains.sampled._loop import HeldPlant, SampledPlant, block_radius, held_blocks, radius_of, rate_of
+from gains.sampled.constant import checked_delay, checked_loop, sampled_delay_margin
 
 # instants closer than this (in common periods) are one: sums of periods and delays are known to rounding
 _SAME_INSTANT = 1e-11
@@ -132,10 +130,7 @@ def multirate_growth_rate(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timi
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; BadModelError names one that does not fit. A
     `delay_s` (s) below the least that these rates can have counts as that.
     """
-    if timing.commands == 1:
-        return growth_rate(A, B, K, period_s=timing.held_s, delay_s=delay_s)
-    plants = held_blocks(*checked_loop(A, B, K), period_s=timing.common_s)
-    return lifted_growth(plants, timing, delay_s=delay_s)
+    return lifted_growth(held_blocks(*checked_loop(A, B, K), period_s=timing.common_s), timing, delay_s=delay_s)
 
 
 def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing) -> float:
@@ -162,14 +157,50 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
     return lifted_margin(held_blocks(plant, entry, feedback, period_s=timing.common_s), timing, near_s=continuous_s)
 
 
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """The plant that is believed, and the (mean) loop delay (s) over which it is predicted."""
+
+    believed: HeldPlant
+    assumed_s: float
+
+    @property
+    def computed(self) -> list[int]:
+        """The states that are computed from the commands alone, for want of a measurement."""
+        measured = self.believed.measured
+        return [] if measured is None else np.flatnonzero(~measured).tolist()
+
+    def carried(
+        self,
+        x: FloatArray,
+        given: Mapping[int, FloatArray],
+        acting_s: Sequence[float],
+        *,
+        from_s: float,
+        to_s: float,
+        first: int,
+    ) -> FloatArray:
+        """The state at `to_s`, from its value x at `from_s`.
+
+        Commands act at the instants `acting_s`, ascending. They are `given`, numbered from `first` on.
+        """
+        held = bisect_right(acting_s, from_s) - 1
+        instants = [from_s, *(acts_s for acts_s in acting_s[held + 1 :] if acts_s < to_s), to_s]
+        if to_s > from_s:
+            for number, (Phi, hold) in enumerate(zip(*self.believed.between(instants), strict=True), first + held):
+                x = Phi @ x + hold @ given[number]
+        return x
+
+
 def multirate_map(
-    plant: LiftedPlant, timing: Timing, *, delay_s: float, predictor: Predictor | None = None
+    plant: SampledPlant, timing: Timing, *, delay_s: float, predictor: Predictor | None = None
 ) -> FloatArray:
     """The matrix that takes (x, u(command -1), u(command -2), ...) one common period on.
 
-    u = K x(sample), or with a predictor, at every control tick, K times the state predicted for when it acts.
+    u = K x(sample), or with a predictor, at every control tick, K times the state predicted for when it acts. States
+    that it computes because they are not measured follow the commands.
     """
-    inputs, n = plant.K.shape
+    inputs, on = plant.K.shape
     common_s, count = timing.common_s, timing.commands if predictor is None else timing.ticks
     least_s, least_assumed_s = (
         max(0.0, late_s - timing.spread_s) for late_s in (delay_s, predictor.assumed_s if predictor else 0.0)
@@ -182,27 +213,47 @@ def multirate_map(
     assumed_s = [computed_s + least_assumed_s - close_s for _, computed_s in schedule]
     oldest = max(i for acts_s, i in acting if acts_s <= close_s)
     kept = max(0, -oldest, earlier + 1 - bisect_right(assumed_s, 0.0) if predictor else 0)
-    start = np.eye(n + kept * inputs)
-    x = start[:n]
-    samples = {-age: start[n + (age - 1) * inputs : n + age * inputs] for age in range(1, kept + 1)}
+    computed = predictor.computed if predictor else []
     sampled = [(taken_s, i) for i, (taken_s, _) in known if i >= 0]
     inside = [acts_s for acts_s, i in acting if i > oldest and acts_s < common_s - close_s]
     instants = _merged([0.0, *inside, *(taken_s for taken_s, _ in sampled), common_s], close_s)
-    for instant, Phi, hold in zip(instants, *plant.between(instants), strict=False):
+    flows, holds = plant.between(instants)
+    n = flows.shape[1]
+    start = np.eye(n + kept * inputs + len(computed))
+    x, believed = start[:n], np.zeros((n, len(start)))
+    believed[computed] = start[len(start) - len(computed) :]
+    samples = {-age: start[n + (age - 1) * inputs : n + age * inputs] for age in range(1, kept + 1)}
+    for instant, Phi, hold in zip(instants, flows, holds, strict=False):
         for taken_s, i in sampled:
             if abs(taken_s - instant) <= close_s:
-                acting_s = assumed_s[: i + earlier + 1]
-                state = predictor.predicted(x, samples, acting_s, taken_s=taken_s, first=-earlier) if predictor else x
-                samples[i] = plant.K @ state
+                state, acting_s = x, assumed_s[: i + earlier + 1]
+                if predictor and computed:
+                    state = x.copy()
+                    by_now = predictor.carried(believed, samples, acting_s, from_s=0.0, to_s=taken_s, first=-earlier)
+                    state[computed] = by_now[computed]
+                if predictor:
+                    acts_s = max(taken_s, acting_s[-1])
+                    state = predictor.carried(state, samples, acting_s, from_s=taken_s, to_s=acts_s, first=-earlier)
+                samples[i] = plant.K @ state[:on]
         command = max(i for acts_s, i in acting if acts_s <= instant + close_s)
         x = Phi @ x + hold @ samples[command]
-    return np.vstack([x, *(samples[count - age] for age in range(1, kept + 1))])
+    if predictor and computed:
+        believed = predictor.carried(believed, samples, assumed_s, from_s=0.0, to_s=common_s, first=-earlier)
+    return np.vstack([x, *(samples[count - age] for age in range(1, kept + 1)), believed[computed]])
 
 
-def lifted_growth(plants: Sequence[LiftedPlant], timing: Timing, *, delay_s: float) -> float:
+def lifted_radius(plant: SampledPlant, timing: Timing, *, delay_s: float, predictor: Predictor | None = None) -> float:
+    """Spectral radius of `multirate_map`."""
+    return radius_of(multirate_map(plant, timing, delay_s=delay_s, predictor=predictor))
+
+
+def lifted_growth(plants: Sequence[SampledPlant], timing: Timing, *, delay_s: float) -> float:
     """`multirate_growth_rate` (1/s) at a mean loop delay (s), from the plants of the blocks in a common period."""
-    radius = max(_radius(plant, timing, delay_s) for plant in plants)
-    return float(np.log(radius)) / timing.common_s if radius > 0.0 else -inf
+    if timing.commands == 1:
+        radius = max(block_radius(plant, checked_delay(delay_s)) for plant in plants)
+    else:
+        radius = max(lifted_radius(plant, timing, delay_s=delay_s) for plant in plants)
+    return rate_of(radius, timing.common_s)
 
 
 def hardly_sampled(timing: Timing, *, near_s: float) -> bool:
@@ -210,7 +261,7 @@ def hardly_sampled(timing: Timing, *, near_s: float) -> bool:
     return _MOST_PERIODS * timing.held_s < near_s < inf
 
 
-def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: float) -> float:
+def lifted_margin(plants: Sequence[SampledPlant], timing: Timing, *, near_s: float) -> float:
     """`multirate_delay_margin` from the blocks likewise; `near_s` is the margin of the continuous loop."""
     known_s = near_s if isfinite(near_s) else 0.0
     last_s = _SEARCHED_MARGINS * known_s + _SEARCHED_PERIODS * timing.held_s
@@ -220,12 +271,9 @@ def lifted_margin(plants: Sequence[LiftedPlant], timing: Timing, *, near_s: floa
     for plant in plants:
         # without feedback one look tells; beyond the margin of another plant none does
         seen = [look for look in looks if look < least_s + step_s] if plant.K.any() else looks[:1]
-        least_s = min(least_s, first_unstable(partial(_radius, plant, timing), seen))
+        found_s = first_unstable(lambda delay_s, plant=plant: lifted_radius(plant, timing, delay_s=delay_s), seen)
+        least_s = min(least_s, found_s)
     return least_s
-
-
-def _radius(plant: LiftedPlant, timing: Timing, delay_s: float) -> float:
-    return float(np.abs(np.linalg.eigvals(multirate_map(plant, timing, delay_s=delay_s))).max())
 
 
 def _merged(instants: list[float], close_s: float) -> list[float]:

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from math import ceil, inf
+from math import ceil
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from gains.delay._loci import factor_rank
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gains.sampled._crossings import block_delay_margin
-from gains.sampled._loop import HeldPlant, block_radius, matrix_exponentials
+from gains.sampled._loop import matrix_exponentials
 from gains.sampled.multirate import Timing, hardly_sampled, lifted_growth, lifted_margin
 
 # instants this close to a step (in steps) coincide with it
@@ -107,19 +107,24 @@ class OnboardLoop:
         if hardly_sampled(rates, near_s=continuous_s):  # a command held for T stands for a delay of T / 2
             one_rate = replace(self, timing=replace(self.timing, telemetry_s=None))
             return max(0.0, one_rate.sampled_margin_s() - (rates.held_s - rates.control_s) / 2.0)
-        return lifted_margin([SteppedPlant(plant) for plant in plants], rates, near_s=continuous_s)
+        return lifted_margin(plants, rates, near_s=continuous_s)
 
     def growth_1_s(self, delay_s: float) -> float:
         """Exponential rate of the slowest motion of the loop as flown: negative when stable."""
-        plants, rates = self.plants(), self.timing.rates
-        if rates.commands > 1:
-            return lifted_growth([SteppedPlant(plant) for plant in plants], rates, delay_s=delay_s)
-        radius = max(block_radius(plant, delay_s) for plant in plants)
-        return float(np.log(radius)) / rates.held_s if radius > 0.0 else -inf
+        return lifted_growth(self.plants(), self.timing.rates, delay_s=delay_s)
 
-    def continuous_at_once(self) -> list[tuple[FloatArray, float]]:
-        """The terms of the continuous model that are not late, with their delays (s): a hold counts as half a step."""
-        return [(self.A, 0.0), (self.sensed + self.known, self.timing.control_s / self.timing.steps / 2.0)]
+    def window_s(self) -> tuple[float, float]:
+        """From no loop delay (s) to the sampled margin."""
+        return 0.0, self.sampled_margin_s()
+
+    def window_continuous_s(self) -> tuple[float, float]:
+        """The same of the continuous model; the station's hold counts as half a period."""
+        return 0.0, self.continuous_margin_s() - self.timing.rates.held_s / 2.0
+
+    def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
+        """What acts after known delays (s), where a hold counts as half a step, and what acts a loop delay late."""
+        own_s = self.timing.control_s / self.timing.steps / 2.0
+        return [(self.A, 0.0), (self.sensed + self.known, own_s)], self.late
 
     def plants(self) -> "list[LocalPlant]":
         """The distinct strongly connected blocks, with or without late terms."""
@@ -131,112 +136,83 @@ class OnboardLoop:
 class LocalPlant:
     """One block with its local loop closed, as a `gains.sampled._loop.SampledPlant`; the late part B K is its input.
 
-    A = `free` + `sensed` + `known` is what the sampled local loop approximates.
+    A = `free` + `sensed` + `known` is what the sampled local loop approximates. Between steps the state x is followed
+    by the last sensor measurement of it, and by what the vehicle itself adds to x'.
     """
 
-    A: FloatArray
-    B: FloatArray
-    K: FloatArray
     free: FloatArray
     sensed: FloatArray
     known: FloatArray
+    B: FloatArray
+    K: FloatArray
     timing: OnboardTiming
+
+    @property
+    def A(self) -> FloatArray:  # noqa: N802 - the source's letter
+        return self.free + self.sensed + self.known
 
     @property
     def period_s(self) -> float:
         return self.timing.control_s
 
-    def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Maps to the state at a period's end: from the state `duration_s` earlier, and from an input held since.
+    @property
+    def _step_s(self) -> float:
+        return self.period_s / self.timing.steps
 
-        Shapes (k, n, n) and (k, n, r) for k durations up to the period. Both include the responses of the steps in
-        between. For a whole period the first is the map of the local loop from its first step on, sensor included.
-        """
-        step_s = self.period_s / self.timing.steps
-        begin = (self.period_s - duration_s) / step_s
+    def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As of the protocol; both maps include the responses of the steps in between."""
+        begin, n = (self.period_s - duration_s) / self._step_s, len(self.free)
         following = np.ceil(begin - _SAME_INSTANT).astype(np.int64)
-        rest_s = np.maximum(following - begin, 0.0) * step_s
-        flow, held = HeldPlant(self.free, self.B, self.K, self.period_s).transition(rest_s)
-        from_step, from_input = self._ends
-        return from_step[following] @ flow, from_input[following] + from_step[following] @ held
+        rest_s = np.maximum(following - begin, 0.0) * self._step_s
+        # from the state alone: what the sensor saw at an earlier step does not depend on it
+        whole = self._ends[following] @ matrix_exponentials(rest_s[:, np.newaxis, np.newaxis] * self._generator)
+        return whole[:, :n, :n], whole[:, :n, 3 * n :]
+
+    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+        """As of the protocol."""
+        inside, maps = 3 * len(self.free), list[FloatArray]()
+        for begin_s, end_s in pairwise(instants):
+            first, last = (ceil(instant / self._step_s - _SAME_INSTANT) for instant in (begin_s, end_s))
+            stops = np.array([begin_s, *(self._step_s * k for k in range(first, last)), end_s])
+            whole = np.eye(len(self._generator))
+            for k, flow in enumerate(matrix_exponentials(np.diff(stops)[:, np.newaxis, np.newaxis] * self._generator)):
+                whole = flow @ (whole if k == 0 else self._step(first + k - 1) @ whole)
+            maps.append(whole)
+        every = np.array(maps)
+        return every[:, :inside, :inside], every[:, :inside, inside:]
 
     @cached_property
-    def _ends(self) -> tuple[FloatArray, FloatArray]:
-        """Maps to the state at the period's end: from the state just before each step, and from an input held since.
+    def _ends(self) -> FloatArray:
+        """Maps to the period's end, of the state and the held input: from just before each step, and from the end."""
+        [flow] = matrix_exponentials(self._step_s * self._generator[np.newaxis])
+        maps = [np.eye(len(flow))]
+        for number in reversed(range(self.timing.steps)):
+            maps.append(maps[-1] @ flow @ self._step(number))
+        return np.array(maps[::-1])
 
-        The last entries are those of the end itself. A map needs the state alone: what the sensor saw at an earlier
-        step does not depend on it.
-        """
-        n, steps = len(self.free), self.timing.steps
-        step_s = self.period_s / steps
-        generator = np.zeros((2 * n, 2 * n))
-        generator[:n, :n], generator[:n, n:] = self.free, np.eye(n)
-        [exponential] = matrix_exponentials(step_s * generator[np.newaxis])
-        Phi, Gamma = exponential[:n, :n], exponential[:n, n:]
-        on_state, on_input = [np.eye(n)], [np.zeros_like(self.B)]
-        from_both = np.hstack([np.eye(n), np.zeros((n, n))])  # of the state and of what the sensor saw last
-        for step in reversed(range(steps)):
-            age_s = step % self.timing.steps_per_sample * step_s
-            seen = Gamma @ self.sensed @ (np.eye(n) + age_s * self.free)
-            on_input.append(on_input[-1] + on_state[-1] @ Gamma @ self.B)
-            flown = Phi + Gamma @ self.known
-            none, same = np.zeros((n, n)), np.eye(n)
-            looks = step % self.timing.steps_per_sample == 0
-            one_step = [[flown + seen, none], [same, none]] if looks else [[flown, seen], [none, same]]
-            from_both = from_both @ np.block(one_step)
-            on_state.append(from_both[:, :n])
-        return np.array(on_state[::-1]), np.array(on_input[::-1])
+    @cached_property
+    def _generator(self) -> FloatArray:
+        """Of the flow between two steps."""
+        n, inputs = self.B.shape
+        generator = np.zeros((3 * n + inputs, 3 * n + inputs))
+        generator[:n, :n], generator[:n, 2 * n : 3 * n], generator[:n, 3 * n :] = self.free, np.eye(n), self.B
+        return generator
+
+    def _step(self, number: int) -> FloatArray:
+        """The map of the state and the held input over one step of the vehicle's loop."""
+        n, age_steps = len(self.free), number % self.timing.steps_per_sample
+        look, compute = np.eye(len(self._generator)), np.eye(len(self._generator))
+        if age_steps == 0:
+            look[n : 2 * n, :n], look[n : 2 * n, n : 2 * n] = np.eye(n), 0.0
+        carried = np.eye(n) + age_steps * self._step_s * self.free
+        compute[2 * n : 3 * n, : 3 * n] = np.hstack([self.known, self.sensed @ carried, np.zeros((n, n))])
+        return compute @ look
 
 
 def local_plant(parts: Sequence[FloatArray], timing: OnboardTiming) -> LocalPlant:
     """The plant of A, `sensed`, `known` and `late` (n, n) of an `OnboardLoop`, its input of full rank."""
     free, sensed, known, late = parts
-    return LocalPlant(free + sensed + known, *factor_rank(late), free, sensed, known, timing)
-
-
-@dataclass(frozen=True, eq=False)
-class SteppedPlant:
-    """A local plant between any instants, as a `gains.sampled.multirate.LiftedPlant`.
-
-    Its state is that of the block, the last sensor measurement of it, and what the vehicle itself adds to x'.
-    """
-
-    local: LocalPlant
-
-    @property
-    def K(self) -> FloatArray:  # noqa: N802 - the source's letter
-        K = self.local.K
-        return np.hstack([K, np.zeros((len(K), 2 * K.shape[1]))])
-
-    def between(self, instants: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """As of the protocol."""
-        local, step_s = self.local, self.local.period_s / self.local.timing.steps
-        n, inputs = local.B.shape
-        generator = np.zeros((3 * n + inputs, 3 * n + inputs))
-        generator[:n, :n], generator[:n, 2 * n : 3 * n], generator[:n, 3 * n :] = local.free, np.eye(n), local.B
-        maps: list[FloatArray] = []
-        for begin_s, end_s in pairwise(instants):
-            first, last = (ceil(instant / step_s - _SAME_INSTANT) for instant in (begin_s, end_s))
-            stops = np.array([begin_s, *(step_s * k for k in range(first, last)), end_s])
-            whole = np.eye(3 * n + inputs)
-            for k, flow in enumerate(matrix_exponentials(np.diff(stops)[:, np.newaxis, np.newaxis] * generator)):
-                whole = flow @ (whole if k == 0 else self._step(first + k - 1) @ whole)
-            maps.append(whole)
-        every = np.array(maps)
-        return every[:, : 3 * n, : 3 * n], every[:, : 3 * n, 3 * n :]
-
-    def _step(self, number: int) -> FloatArray:
-        """The map of the state and the held input over one step of the vehicle's loop."""
-        local, timing = self.local, self.local.timing
-        n, inputs = local.B.shape
-        age_steps = number % timing.steps_per_sample
-        look = np.eye(3 * n + inputs)
-        if age_steps == 0:
-            look[n : 2 * n, :n], look[n : 2 * n, n : 2 * n] = np.eye(n), 0.0
-        carried = np.eye(n) + age_steps * local.period_s / timing.steps * local.free
-        compute = np.eye(3 * n + inputs)
-        compute[2 * n : 3 * n, : 3 * n] = np.hstack([local.known, local.sensed @ carried, np.zeros((n, n))])
-        return compute @ look
+    return LocalPlant(free, sensed, known, *factor_rank(late), timing)
 
 
 def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) -> OnboardLoop:
@@ -254,13 +230,10 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
     ([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], inf, inf)
     """
     B, own = model.B, own_part(model, K)
-    spacing = np.zeros(model.states, dtype=bool)
-    for i in model.followers:
-        spacing[model.spacing_slice(i)] = True
     return OnboardLoop(
         A=model.A,
-        sensed=B @ np.where(spacing, own, 0.0),
-        known=B @ np.where(spacing, 0.0, own),
+        sensed=B @ np.where(model.spacing_mask, own, 0.0),
+        known=B @ np.where(model.spacing_mask, 0.0, own),
         late=B @ (K - own),
         timing=timing,
     )

@@ -15,7 +15,9 @@ the roots of
 
     det(s I - A - B K - B K e^{A tau^} (e^{-s tau} - e^{-s tau^})) = 0,
 
-a loop with two delays, one of them known. Robustness and string stability are in `gains.performance.predicted`. Source:
+a loop with two delays, one of them known. An acceleration is not in a vehicle's telemetry: the station computes it from
+its commands alone, and e^{A tau^} then carries on only what is `measured`, see `HeldPlant.carry`. Robustness and string
+stability are in `gains.performance.predicted`. Source:
 Z. Artstein, "Linear systems with delayed controls: a reduction", IEEE Trans. AC 27 (1982).
 """
 
@@ -24,18 +26,17 @@ from functools import partial
 from math import inf, isfinite
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.delay._crossings import DelayedTerm
 from gains.delay._mixed import analyse_mixed
-from gains.sampled._loop import HeldPlant, block_radius, held_blocks, matrix_exponentials
+from gains.sampled._loop import HeldPlant, block_radius, carry, held_blocks, rate_of
 from gains.sampled._mismatch import block_window
-from gains.sampled._predictor import LiftedPlant, Predictor
+from gains.sampled._nyquist import rates_window
 from gains.sampled.constant import checked_loop
-from gains.sampled.multirate import Timing, first_unstable, multirate_map
-from gains.sampled.onboard import OnboardLoop, SteppedPlant
+from gains.sampled.multirate import Predictor, Timing, first_unstable, lifted_radius
 
 # states of the largest lifted map that confirms an end, and how far from the end (s per s of mismatch) it is taken
 _LARGEST_CHECK, _BESIDE = 60, 1e-5
@@ -47,17 +48,25 @@ _LOOKS_WINDOW, _LOOKS_PERIOD, _SEARCHED, _SEARCHED_PERIODS = 20, 3, 3.0, 10.0
 
 
 def mismatch_window(
-    A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing, *, assumed_s: float
+    A: ArrayLike,
+    B: ArrayLike,
+    K: ArrayLike,
+    timing: Timing,
+    *,
+    assumed_s: float,
+    measured: Sequence[bool] | None = None,
 ) -> tuple[float, float]:
     """The least and the largest true loop delay (s) between which the predicted loop is stable.
 
     0 if it is stable down to no delay, `inf` if no longer delay is found to be too long, and `assumed_s` twice if it is
-    unstable without mismatch. With a sample for every command, the ends are crossings of the unit circle to about 1e-9
-    s, confirmed by the spectrum of the lifted map on either side if that is small. Otherwise that spectrum is followed
-    from the assumed delay on: a search, not a proof.
+    unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s, confirmed by the spectrum of
+    the lifted map on either side if that is small. With a sample for every command no crossing in between is missed;
+    otherwise delays in between are looked at, see `gains.sampled._nyquist`.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; a response of the vehicles is part of A and B,
     see `gains.performance.response.formation_loop`. `assumed_s` is tau^, the (mean) loop delay over which is predicted.
+    `measured` says which states are sampled, all if None; the station computes the others from its commands alone, K
+    must not use them, and they must not depend on those that are sampled.
     BadModelError names an argument that does not fit; DisagreementError is raised if the eigenvalues of the lifted map
     contradict the crossings found.
 
@@ -69,9 +78,16 @@ def mismatch_window(
     [1.449, 4.765]
     """
     loop, late_s = checked_loop(A, B, K), checked_assumption(assumed_s)
-    plants = held_blocks(*loop, period_s=timing.common_s)
+    plants = held_blocks(*loop, period_s=timing.common_s, measured=checked_mask(loop, measured))
     if timing.ticks > 1:
-        return _marched(plants, timing, late_s, mismatch_window_continuous(*loop, assumed_s=late_s))
+        ends_s = [rates_window(plant, timing, late_s) for plant in plants]
+        window_s = max(least for least, _ in ends_s), min(most for _, most in ends_s)
+        contradiction = "".join(_contradiction(plants, timing, late_s, end_s) for end_s in window_s)
+        if window_s[0] < window_s[1] and contradiction:  # near the limit of the rates
+            return _marched(
+                plants, timing, late_s, mismatch_window_continuous(*loop, assumed_s=late_s, measured=measured)
+            )
+        return window_s
     # without mismatch the loop has the eigenvalues of that without delay
     if max(block_radius(plant, 0.0) for plant in plants) >= 1.0:
         return late_s, late_s
@@ -85,7 +101,9 @@ def mismatch_window(
     raise DisagreementError(contradiction)
 
 
-def mismatch_window_continuous(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, assumed_s: float) -> tuple[float, float]:
+def mismatch_window_continuous(
+    A: ArrayLike, B: ArrayLike, K: ArrayLike, *, assumed_s: float, measured: Sequence[bool] | None = None
+) -> tuple[float, float]:
     """The same of the continuous loop, from the analysis of its two delays. A hold counts as half a period of both.
 
     Exceptions as of `gains.delay._mixed.analyse_mixed`.
@@ -97,34 +115,22 @@ def mismatch_window_continuous(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, assu
     [1.386, 4.873]
     """
     (plant, entry, feedback), late_s = checked_loop(A, B, K), checked_assumption(assumed_s)
-    late = entry @ feedback @ matrix_exponentials(plant[np.newaxis] * late_s)[0]
+    mask = checked_mask((plant, entry, feedback), measured)
+    late = entry @ feedback @ carry(plant, mask, np.array([late_s]))[0]
     terms = [(plant + entry @ feedback, 0.0, 0), (late, 0.0, 1), (-late, late_s, 0)]
     windows = analyse_mixed([DelayedTerm(*term) for term in terms], horizon_s=late_s or None).stable_intervals_s
     return next((window for window in windows if window[0] <= late_s < window[1]), (late_s, late_s))
 
 
-def onboard_mismatch_window(loop: OnboardLoop, *, assumed_s: float) -> tuple[float, float]:
-    """The same where each vehicle feeds back its own errors, and a station predicts only what comes from others.
-
-    (0, inf) if no vehicle is acted on by those that it acts on itself, as in a leader-follower tree.
-
-    >>> import numpy as np
-    >>> from gains import FormationModel, OnboardTiming, onboard_loop
-    >>> from gains.sampled.prediction import onboard_mismatch_window
-    >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
-    >>> loop = onboard_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
-    >>> onboard_mismatch_window(loop, assumed_s=0.6)
-    (0.0, inf)
-    """
-    late_s = checked_assumption(assumed_s)
-    plants = [SteppedPlant(plant) for plant in loop.plants()]
-    B, K = np.eye(len(loop.A)), loop.late
-    near_s = mismatch_window_continuous(loop.A + loop.sensed + loop.known, B, K, assumed_s=late_s)
-    return _marched(plants, loop.timing.rates, late_s, near_s)
-
-
 def predicted_growth_rate(
-    A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Timing, *, assumed_s: float, delay_s: float
+    A: ArrayLike,
+    B: ArrayLike,
+    K: ArrayLike,
+    timing: Timing,
+    *,
+    assumed_s: float,
+    delay_s: float,
+    measured: Sequence[bool] | None = None,
 ) -> float:
     """Exponential rate (1/s) of the slowest motion at a true loop delay: negative when stable.
 
@@ -137,41 +143,10 @@ def predicted_growth_rate(
     >>> round(predicted_growth_rate([[0]], [[1]], [[-1]], Timing(0.5, 0.5), assumed_s=3.2, delay_s=3.2), 6)
     -1.386294
     """
-    plants = held_blocks(*checked_loop(A, B, K), period_s=timing.common_s)
-    radius = max(_radius(plant, timing, checked_assumption(assumed_s), delay_s) for plant in plants)
-    return float(np.log(radius)) / timing.common_s if radius > 0.0 else -inf
-
-
-def predicted_map(
-    A: ArrayLike,
-    B: ArrayLike,
-    K: ArrayLike,
-    timing: Timing,
-    *,
-    assumed_s: float,
-    delay_s: float,
-    believed: tuple[ArrayLike, ArrayLike] | None = None,
-) -> FloatArray:
-    """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one common period on, of the whole loop at once.
-
-    `believed` are the A and B by which the station predicts, of the shapes of the true ones, which they are if None.
-    Otherwise arguments and exceptions as of `mismatch_window`.
-
-    x' = u, u = -x^ with T = 1 s and both delays 0.25 s: x^ = x_k + 0.25 u_{k-1}, x_{k+1} = x_k + 0.75 u_k + 0.25
-    u_{k-1}.
-
-    >>> from gains.sampled.multirate import Timing
-    >>> from gains.sampled.prediction import predicted_map
-    >>> step = predicted_map([[0]], [[1]], [[-1]], Timing(1.0, 1.0), assumed_s=0.25, delay_s=0.25)
-    >>> step.round(6).tolist()
-    [[0.25, 0.0625], [-1.0, -0.25]]
-    """
     loop = checked_loop(A, B, K)
-    model = loop if believed is None else checked_loop(*believed, K)
-    plant, believed_plant = (HeldPlant(*matrices, timing.common_s) for matrices in (loop, model))
-    return multirate_map(
-        plant, timing, delay_s=delay_s, predictor=Predictor(believed_plant, checked_assumption(assumed_s))
-    )
+    plants = held_blocks(*loop, period_s=timing.common_s, measured=checked_mask(loop, measured))
+    radius = max(_radius(plant, timing, checked_assumption(assumed_s), delay_s) for plant in plants)
+    return rate_of(radius, timing.common_s)
 
 
 def checked_assumption(assumed_s: float) -> float:
@@ -181,15 +156,28 @@ def checked_assumption(assumed_s: float) -> float:
     return float(assumed_s)
 
 
-def _radius(plant: LiftedPlant, timing: Timing, assumed_s: float, delay_s: float) -> float:
-    lifted = multirate_map(plant, timing, delay_s=delay_s, predictor=Predictor(plant, assumed_s))
-    return float(np.abs(np.linalg.eigvals(lifted)).max())
+def checked_mask(
+    loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequence[bool] | None
+) -> NDArray[np.bool_] | None:
+    """Which states are measured (n,), None if all are; BadModelError if that does not fit the loop."""
+    A, _, K = loop
+    mask = None if measured is None else np.array(measured, dtype=np.bool_)
+    if mask is None or mask.all():
+        return None
+    if mask.shape != (len(A),) or K[:, ~mask].any() or A[np.ix_(~mask, mask)].any():
+        wanted = f"{len(A)} flags, with K and the states not measured independent as documented, are wanted"
+        raise BadModelError(f"measured is {mask.tolist()}; {wanted}")
+    return mask
+
+
+def _radius(plant: HeldPlant, timing: Timing, assumed_s: float, delay_s: float) -> float:
+    return lifted_radius(plant, timing, delay_s=delay_s, predictor=Predictor(plant, assumed_s))
 
 
 def _contradiction(plants: Sequence[HeldPlant], timing: Timing, assumed_s: float, end_s: float) -> str:
     """What the lifted map just within the end of a window, and just beyond it, says against it; nothing if empty."""
     known_s = end_s if end_s < inf else 2.0 * assumed_s + 5.0 * timing.held_s
-    periods = max(known_s, assumed_s) / timing.held_s + 2.0
+    periods = timing.ticks * (max(known_s, assumed_s) / timing.common_s + 2.0)
     if max(len(plant.A) + plant.B.shape[1] * periods for plant in plants) > _LARGEST_CHECK:
         return ""
     for share in (1.0 - _BESIDE, 1.0 + _BESIDE):
@@ -205,9 +193,13 @@ def _contradiction(plants: Sequence[HeldPlant], timing: Timing, assumed_s: float
 
 
 def _marched(
-    plants: Sequence[LiftedPlant], timing: Timing, assumed_s: float, near_s: tuple[float, float]
+    plants: Sequence[HeldPlant], timing: Timing, assumed_s: float, near_s: tuple[float, float]
 ) -> tuple[float, float]:
     """The window by a march of the lifted map's radius; `near_s` is that of the continuous loop."""
+
+    def radius_aside(plant: HeldPlant, way: float, aside_s: float) -> float:
+        return _radius(plant, timing, assumed_s, max(0.0, assumed_s + way * aside_s))
+
     period_s, ends_s = timing.common_s / timing.ticks, [0.0, inf]
     for plant in plants:
         for side, way in enumerate((-1.0, 1.0)):
@@ -215,10 +207,6 @@ def _marched(
             step_s = max(period_s / _LOOKS_PERIOD, wide_s / _LOOKS_WINDOW)
             last_s = assumed_s if side == 0 else _SEARCHED * wide_s + _SEARCHED_PERIODS * period_s
             looks = [*np.arange(0.0, last_s, step_s).tolist(), last_s] if plant.K.any() else [0.0]
-            found_s = first_unstable(partial(_radius_aside, plant, timing, assumed_s, way), looks)
+            found_s = first_unstable(partial(radius_aside, plant, way), looks)
             ends_s[side] = max(ends_s[0], assumed_s - found_s) if side == 0 else min(ends_s[1], assumed_s + found_s)
     return ends_s[0], ends_s[1]
-
-
-def _radius_aside(plant: LiftedPlant, timing: Timing, assumed_s: float, way: float, aside_s: float) -> float:
-    return _radius(plant, timing, assumed_s, max(0.0, assumed_s + way * aside_s))

@@ -23,8 +23,8 @@ from gains.varying.bounds import varying_delay_bound
 
 Cover = Literal["constant", "rate", "spread", "any", "none"]
 
-# frequencies at which the scaling is chosen, and at which the gain is then read
-_FREQUENCIES_SCALING, _FREQUENCIES_GAIN = 60, 4000
+# frequencies at which the scaling is chosen, and at which the gain is then read, or read roughly in a search of gains
+_FREQUENCIES_SCALING, _FREQUENCIES_GAIN, _FREQUENCIES_ROUGH = 60, 4000, 600
 # halvings in the bisection of the gain that a scaling reaches; the gain is read again afterwards, so few are enough
 _HALVINGS = 12
 # the gain is read on a grid: its peak may be higher by this share
@@ -102,7 +102,7 @@ def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBoun
     )
 
 
-def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = inf) -> float:
+def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = inf, scaled: bool = True) -> float:
     """The spread (s) that the loop takes on both sides of a constant delay, however the delay varies within it.
 
     A0 and A1 are real matrices (n, n) in 1/s. `rate` is the largest tau'(t), inf if the delay may jump upwards; jumps
@@ -113,8 +113,9 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
     closed by the integral of C x' between t - mean and t - tau(t), whose gain is at most g times the spread: g = 1 if
     tau' <= 1 upwards, else sqrt(7/4) (proof in docs/explanation/delay-margin.md). The loop is stable for a spread below
     1 / (g max over omega of ||D G(j omega) D^{-1}||), for any D. The maximum is read from a fine grid, with a part in a
-    thousand allowed for what lies between: a search, not a proof. At most the mean is returned; 0 if the loop is
-    unstable at the mean delay.
+    thousand allowed for what lies between: a search, not a proof. If `scaled` is False, D = I and the grid is
+    coarse, for searches that need an estimate quickly. At most the mean is returned; 0 if the loop is unstable at the
+    mean delay.
 
     x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
 
@@ -126,7 +127,7 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
     _check(Jitter(mean_s, 0.0, rate))
     if not _is_inside(analyse_delay(A0, A1).stable_intervals_s, mean_s):
         return 0.0
-    return min(_spread_admitted(A0, A1, mean_s, rate), mean_s)
+    return min(_spread_admitted(A0, A1, mean_s, rate, scaled=scaled), mean_s)
 
 
 def _check(jitter: Jitter) -> None:
@@ -156,13 +157,13 @@ def _first(jitter: Jitter, bounds: dict[Cover, float], windows: tuple[tuple[floa
     return "none", float("nan")
 
 
-def _spread_admitted(A0: ArrayLike, A1: ArrayLike, mean_s: float, rate: float) -> float:
+def _spread_admitted(A0: ArrayLike, A1: ArrayLike, mean_s: float, rate: float, *, scaled: bool = True) -> float:
     gain = 1.0 if rate <= 1.0 else sqrt(7.0 / 4.0)
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
-    return min(_spread_of_block(balanced(*block.matrices), mean_s) for block in blocks) / gain
+    return min(_spread_of_block(balanced(*block.matrices), mean_s, scaled=scaled) for block in blocks) / gain
 
 
-def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float) -> float:
+def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float, *, scaled: bool) -> float:
     """The reciprocal of the loop's largest gain about the mean delay."""
     now, late = matrices
     B, C = factor_rank(late)
@@ -171,13 +172,11 @@ def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float) -> float:
         return inf
     highest = highest_frequency((now, late))
     coarse = highest * np.logspace(-3.0, 2.0, _FREQUENCIES_SCALING)
-    D = _scaling(_loop_gains(now, late, B, C, mean_s, coarse)) if r > 1 else np.eye(1)
-    fine = np.concatenate(
-        [highest * np.logspace(-4.0, 3.0, _FREQUENCIES_GAIN), np.linspace(0.0, highest, _FREQUENCIES_GAIN)]
-    )
+    D = _scaling(_loop_gains(now, late, B, C, mean_s, coarse)) if scaled and r > 1 else np.eye(r)
+    count = _FREQUENCIES_GAIN if scaled else _FREQUENCIES_ROUGH
+    fine = np.concatenate([highest * np.logspace(-4.0, 3.0, count), np.linspace(0.0, highest, count)])
     loops = np.concatenate([_loop_gains(now, late, B, C, mean_s, fine), (C @ B)[np.newaxis]])
-    scaled = D @ loops @ np.linalg.inv(D)
-    largest = float(np.linalg.norm(scaled, ord=2, axis=(1, 2)).max())
+    largest = float(np.linalg.norm(D @ loops @ np.linalg.inv(D), ord=2, axis=(1, 2)).max())
     return 1.0 / (largest * (1.0 + _GRID_ERROR))
 
 

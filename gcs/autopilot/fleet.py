@@ -1,21 +1,27 @@
 """Vehicles with autopilots: their start, one common frame, identification, set-points."""
 
+from collections.abc import Sequence
 from math import hypot
 from typing import Any
 
+from gcs.autopilot.identify import LEAST_RATE_HZ
 from gcs.autopilot.manoeuvre import Identification
 from gcs.autopilot.startup import AutopilotStartup, between
+from gcs.autopilot.vehicle_limits import Bounds
 from gcs.autopilot.velocity_targets import VelocityTargets
 from gcs.control.history import StateHistory
-from gcs.control.loops import Order, loop_of
+from gcs.control.law import Blend, VehicleControl
+from gcs.control.loops import Order
+from gcs.control.manoeuvring import loop_of
 from gcs.control.phases import START_PATIENCE_S, Phase
 from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
 from gcs.plan.flight_plan import FlightPlan
 from scenarios.schema import NS_PER_S
 
-PATIENCE_S = 120.0
-"""Longest time from a vehicle's first heartbeat until it takes set-points in the air; longest silence in between."""
 _UNANNOUNCED_S = 3.0
+_LEAD_S = 0.5
+"""The velocity target leads the vehicle's newest velocity by what its largest acceleration gains in this time, the age
+of that velocity and the delay down: more only builds up while the vehicle cannot follow."""
 _FRAME_RESOLUTION_M = 0.005
 """Half of the last digit of a latitude: an origin that seems to move by less has not moved."""
 
@@ -31,16 +37,24 @@ class AutopilotFleet:
         self.plan = plan
         self.loop = loop_of(plan)
         self.starts = [
-            AutopilotStartup(altitude_m=scenario.altitude_m, telemetry_hz=scenario.rates.telemetry_hz) for _ in ids
+            AutopilotStartup(altitude_m=scenario.altitude_of(vehicle), telemetry_hz=scenario.rates.telemetry_hz)
+            for vehicle in scenario.leader_first()
         ]
         self.vehicles = [
-            RemoteVehicle(system_id, startup=startup, report=report, land=scenario.at_end == "land")
+            RemoteVehicle(
+                system_id,
+                startup=startup,
+                report=report,
+                land=scenario.at_end == "land",
+                external=system_id == scenario.external_id,
+            )
             for system_id, startup in zip(ids, self.starts, strict=True)
         ]
         self.frame_ned_m = [(0.0, 0.0, 0.0)] * len(ids)
         self._report = report
         self._lacks = [("", 0)] * len(ids)
         """What each vehicle lacks, and since when; 0 once that has been reported."""
+        self._bounds = Bounds(plan, [startup.limits for startup in self.starts])
         self._targets = VelocityTargets(self.vehicles, self.starts, period_s=1.0 / scenario.rates.control_hz)
         self._identification = Identification(plan, self.vehicles, report) if plan.responses is None else None
 
@@ -48,22 +62,45 @@ class AutopilotFleet:
     def identified(self) -> bool:
         return self._identification is None
 
-    def startup_failure(self, due_ns: int, start_ns: int) -> str:
+    def startup_failure(self, due_ns: int, start_ns: int, history: StateHistory) -> str:
         if failure := refusals(self.vehicles):
             return failure
+        rate_hz = self.plan.scenario.rates.telemetry_hz
+        if not self.identified and rate_hz < LEAST_RATE_HZ:
+            wanted = f"at least {LEAST_RATE_HZ:g}, or a [response] in the scenario"
+            return f"not identified: rates.telemetry_hz is {rate_hz:g}; wanted {wanted}"
         self._report_lacks(due_ns)
         out_of_time = due_ns - start_ns > START_PATIENCE_S * NS_PER_S
+        patience_ns = self.plan.scenario.safety.ready_patience_s * NS_PER_S
 
         def late(vehicle: RemoteVehicle) -> bool:
             first_ns = start_ns if vehicle.first_heard_ns is None else vehicle.first_heard_ns
             heard_ns = vehicle.heard_ns if vehicle.silent else first_ns
-            return not vehicle.ready and (out_of_time or due_ns - heard_ns > PATIENCE_S * NS_PER_S)
+            return not vehicle.ready and (out_of_time or due_ns - heard_ns > patience_ns)
 
-        return in_words("not ready: ", [vehicle for vehicle in self.vehicles if late(vehicle)])
+        too_late = [vehicle for vehicle in self.vehicles if vehicle.left_out or late(vehicle)]
+        if len(too_late) == len(self.vehicles):
+            return in_words("not ready: ", too_late)
+        self._leave_out([vehicle for vehicle in too_late if not vehicle.left_out], history)
+        return ""
+
+    def _leave_out(self, vehicles: list[RemoteVehicle], history: StateHistory) -> None:
+        """Fly without vehicles; from now on they are commanded nothing, until the flight ends."""
+        for vehicle in vehicles:
+            vehicle.left_out, vehicle.goal = True, None
+            history.forget(self.vehicles.index(vehicle))
+            self._report("vehicle", f"is left out: {vehicle.missing}", vehicle.system_id)
+        if vehicles:
+            self.locate(history)  # the first vehicle, whose frame is common to all, may be among them
+        if vehicles and self._identification is not None:
+            present = [vehicle for vehicle in self.vehicles if not vehicle.left_out]
+            self._identification = Identification(self.plan, present, self._report)
 
     def _report_lacks(self, due_ns: int) -> None:
         """Report what a vehicle has lacked for longer than a start-up step usually takes."""
         for row, vehicle in enumerate(self.vehicles):
+            if vehicle.left_out:
+                continue
             lacks, _, _ = vehicle.missing.partition(",")  # without how far it has climbed
             before, since_ns = self._lacks[row]
             if lacks != before:
@@ -72,9 +109,16 @@ class AutopilotFleet:
                 self._lacks[row] = lacks, 0
                 self._report("start", lacks or "is ready", vehicle.system_id)
 
+    def begin(self) -> None:
+        for vehicle, startup in zip(self.vehicles, self.starts, strict=True):
+            self._report("limits", startup.limits.in_words(), vehicle.system_id)
+
+    def end(self) -> None:
+        """Nothing to report."""
+
     def locate(self, history: StateHistory) -> None:
         """States reported in a frame that has moved since are forgotten."""
-        first = self.starts[0]
+        first = next(start for start, vehicle in zip(self.starts, self.vehicles, strict=True) if not vehicle.left_out)
         for row, startup in enumerate(self.starts):
             if first.origin is None or startup.origin is None:
                 continue
@@ -89,18 +133,31 @@ class AutopilotFleet:
     def identify(self, due_ns: int, history: StateHistory) -> str:
         if self._identification is None:
             return ""
-        found = self._identification.next(due_ns, history)
+        present = [row for row, vehicle in enumerate(self.vehicles) if not vehicle.left_out]
+        found = self._identification.next(
+            due_ns, history if len(present) == len(self.vehicles) else history.of(present)
+        )
         if isinstance(found, str):
             return found
         if found is not None:
             self.plan, self._identification = found, None
         return ""
 
+    def bounded(self, controls: list[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
+        return self._bounds.bounded(controls, blends)
+
+    def _rest(self, row: int) -> None:
+        self._targets.rest(row)
+        self._bounds.rest(row)
+
     def set_point(self, row: int, order: Order, phase: Phase) -> tuple[Any, ...] | None:
         vehicle, (control, commanded, _, key_ms, due_ns) = self.vehicles[row], order
         command, known = control.command_m_s2, control.sample_ns > 0
-        if vehicle.taken_over and vehicle.kind.guided_first:
-            self._targets.rest(row)
+        if vehicle.left_out:
+            return None
+        piloted = vehicle.taken_over and vehicle.kind.guided_first
+        if vehicle.external or self.starts[row].has_landed or piloted:
+            self._rest(row)
             return None
         others = vehicle.taken_over and phase in (Phase.IDENTIFYING, Phase.FLYING)
         if (phase is Phase.CONNECTING and self.starts[row].airborne) or others:
@@ -109,8 +166,12 @@ class AutopilotFleet:
             command, commanded = self._identification.command(due_ns), True
             known = known or self._targets.steers(row)  # a clock that jumped does not interrupt the manoeuvre
         if not commanded or not known:
-            self._targets.rest(row)
+            self._rest(row)
             return None
         if not vehicle.guided:
-            self._targets.rest(row)  # set-points show it that a station is there; they start from its own velocity
-        return self._targets.accelerate(row, command, control.state[2:4], key_ms=key_ms, now_ns=due_ns)
+            self._rest(row)  # set-points show it that a station is there; they start from its own velocity
+        self.loop.remember(row, due_ns, command)
+        late_s = (due_ns - control.sample_ns + (vehicle.clock.down_ns or 0)) / NS_PER_S if control.sample_ns else 0.0
+        lead_m_s = self._bounds.acceleration_m_s2(row) * (late_s + _LEAD_S)
+        velocity_m_s = control.state[2:4]
+        return self._targets.accelerate(row, command, velocity_m_s, lead_m_s=lead_m_s, key_ms=key_ms, now_ns=due_ns)

@@ -1,30 +1,39 @@
 """Identifies a vehicle's response to set-points from a short manoeuvre before the formation flight.
 
-All vehicles are commanded the same acceleration at the same time: forwards, backwards for twice as long, and forwards
-again. So they keep their distances and end at their initial velocity. The model of `gains.performance.response` is
-fitted to the velocity they report. A command acts at its sending time plus the measured delay down; the instant of a
-sample comes from the vehicle's clock. So the response found does not include the link's delay.
+All vehicles are commanded the same acceleration at the same time: a sine of three seconds and its third harmonic,
+forwards, and then backwards. So they keep their distances and end where they began, at rest. The jerk stays well below
+what autopilots allow: a square measures their jerk limit instead of their response.
+
+The models of `gains.performance.response` are fitted to the velocity that a vehicle reports, and the Bayesian
+information criterion chooses between them. A command acts at its sending time plus the measured delay down; the instant
+of a sample comes from the vehicle's clock. So the response found does not include the link's delay.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
+from math import inf, pi, sin
 
 import numpy as np
+from scipy.linalg import expm
 
 from gains.core.arrays import FloatArray
-from gains.performance.response import Response
+from gains.performance.response import Response, own_dynamics
 
 LONGEST_S = 6.0
-PROFILE = ((0.0, 1.0), (1.0, -2.0), (3.0, 2.0), (4.0, -1.0))
-"""(time in s, change of the acceleration relative to its amplitude)"""
-_LARGEST_M_S2 = 2.0
+_OMEGA_RAD_S, _HARMONIC, _SHARE = 2.0 * pi / 3.0, 3, 0.15
+"""The sine, and a harmonic with this share of its amplitude, which tells the models apart."""
+_JERK_M_S3 = 2.5
 MISFIT_MAX = 0.1
 """A fit that leaves more than this fraction of the velocity unexplained is refused."""
-_FEWEST_SAMPLES = 30
-_LAGS_S = np.geomspace(0.02, 1.5, 12)
-_GAINS_1_S = np.geomspace(0.05, 8.0, 12)
-_STEPS = 30
-_NUDGE = 1e-4
+LEAST_RATE_HZ = 10.0
+_FEWEST_SAMPLES = 42
+"""Of the sixty at 10 Hz, so that some may be lost."""
+_BOUNDS = np.log([(0.01, 3.0), (0.02, 10.0), (0.002, 0.5), (2.0, 200.0)])
+"""Lag, velocity gain, dead time, natural frequency."""
+_USED = {"lag": [0, 1], "lag with dead time": [0, 1, 2], "second order": [0, 1, 3]}
+_STEPS, _NUDGE, _STEPS_A_TICK = 24, 1e-4, 2
+_RESOLUTION = 1e-3
+"""Misfits that differ by less than this fraction of the velocity do not tell models apart."""
 
 
 @dataclass(frozen=True)
@@ -34,76 +43,143 @@ class Identified:
     response: Response
     misfit: float
     samples: int
+    misfits: Mapping[str, float]
+    """The same of every model, by its name."""
 
 
-def amplitude_m_s2(limit_m_s2: float | None) -> float:
-    """Amplitude of the manoeuvre's acceleration: half the limit, as the velocity loop adds to it."""
-    return min(_LARGEST_M_S2, 0.5 * limit_m_s2) if limit_m_s2 is not None else _LARGEST_M_S2
+def amplitude_m_s2(acceleration_max_m_s2: float | None) -> float:
+    """Amplitude of the manoeuvre's sine: within half of the limit, as the velocity loop adds to it."""
+    return min(_JERK_M_S3 / (_OMEGA_RAD_S * (1.0 + _HARMONIC * _SHARE)), 0.5 * (acceleration_max_m_s2 or inf))
 
 
 def manoeuvre_m_s2(since_s: float, amplitude: float) -> tuple[float, float]:
     """The commanded acceleration north and east, `since_s` after the manoeuvre began."""
-    north = sum(change for at_s, change in PROFILE if at_s <= since_s) * amplitude
-    return (north, 0.0) if since_s < PROFILE[-1][0] else (0.0, 0.0)
+    if not 0.0 <= since_s < LONGEST_S:
+        return 0.0, 0.0
+    angle = _OMEGA_RAD_S * since_s
+    north = amplitude * (sin(angle) + _SHARE * sin(_HARMONIC * angle))
+    return (north if since_s < LONGEST_S / 2.0 else -north), 0.0
 
 
-def step_velocity(response: Response, since_s: FloatArray) -> FloatArray:
-    """Velocity `since_s` after the commanded acceleration stepped to 1 m/s²; 0 before.
+@dataclass(frozen=True)
+class Flown:
+    """What a vehicle was commanded in the manoeuvre, and the velocities it reported."""
 
-    v(s) = (s + g) / (s² (lag s² + s + g)), v(t) = t - e^{-σt} sin(ωt) / ω with σ = 1 / (2 lag), ω² = g / lag - σ²; ω is
-    imaginary for a vehicle that does not overshoot.
+    period_s: float
+    command_m_s2: FloatArray
+    """Acceleration (m,) from one control tick to the next."""
+    sample_s: FloatArray
+    """Instants (n,) of the samples after the first command acted, from 0 to m periods."""
+    velocity_m_s: FloatArray
+    """In the direction of the manoeuvre. Its mean, such as a drift, is ignored."""
+
+    def velocities(self, responses: list[Response]) -> FloatArray:
+        """The velocity at each sample of vehicles with each of these responses of one model, shape (k, n).
+
+        The acceleration and the velocity at the ticks are a convolution with their answers to one tick's command, and a
+        cubic joins them: a recurrence over ticks, whose matrix is squared instead of repeated.
+        """
+        m, h = self.command_m_s2.size, self.period_s
+        dynamics = [own_dynamics(response) for response in responses]
+        n = len(dynamics[0][0])
+        whole = np.zeros((len(responses), n + 2, n + 2))
+        for k, (A, B) in enumerate(dynamics):
+            whole[k, :n, :n], whole[k, :n, n + 1 :], whole[k, n, 0] = A, B, 1.0
+        whole = expm(whole * h)
+        power, answers = whole[:, : n + 1, : n + 1], whole[:, : n + 1, n + 1 :]
+        while answers.shape[2] < m:
+            answers = np.concatenate([answers, power @ answers], axis=2)
+            power = power @ power
+        answers = answers[:, [0, n], :m]
+        size = 1 << (2 * m).bit_length()
+        spectrum = np.fft.rfft(answers, size) * np.fft.rfft(self.command_m_s2, size)
+        at_ticks = np.zeros((len(responses), 2, m + 1))
+        at_ticks[:, :, 1:] = np.fft.irfft(spectrum, size)[:, :, :m]
+        index = np.minimum((self.sample_s / h).astype(np.int64), m - 1)
+        s = self.sample_s / h - index
+        (a0, v0), (a1, v1) = (at_ticks[:, :, index + k].swapaxes(0, 1) for k in (0, 1))
+        return (
+            v0 * (1.0 + 2.0 * s) * (1.0 - s) ** 2
+            + v1 * s**2 * (3.0 - 2.0 * s)
+            + h * s * (1.0 - s) * (a0 * (1.0 - s) - a1 * s)
+        )
+
+
+def identify(flown: Flown) -> Generator[None, None, Identified | None]:
+    """The least-squares fit of the model that explains the velocities best, in steps of some milliseconds.
+
+    None if there are too few samples, or no motion.
     """
-    t = np.maximum(since_s, 0.0)
-    decay = 0.5 / response.lag_s
-    omega = np.sqrt(complex(response.velocity_gain_1_s / response.lag_s - decay**2))
-    if abs(omega) < 1e-9 * decay:
-        return t - t * np.exp(-decay * t)
-    # e^{-σt} sin(ωt) as two exponentials, so that neither factor overflows
-    rising, falling = np.exp((1j * omega - decay) * t), np.exp((-1j * omega - decay) * t)
-    return t - ((rising - falling) / (2j * omega)).real
-
-
-def identify(
-    acted_s: FloatArray, change_m_s2: FloatArray, sample_s: FloatArray, velocity_m_s: FloatArray
-) -> Identified | None:
-    """The least-squares fit of a response to sampled velocities; None if there are too few.
-
-    `acted_s` and `change_m_s2` (m,) say when the commanded acceleration changed at the vehicle, and by how much.
-    `velocity_m_s` (n,) is in the direction of the manoeuvre. Its mean, such as a drift, is ignored.
-    """
-    if sample_s.size < _FEWEST_SAMPLES or acted_s.size < len(PROFILE):
+    if flown.sample_s.size < _FEWEST_SAMPLES or flown.command_m_s2.size < 2:
         return None
-    measured = velocity_m_s - velocity_m_s.mean()
-    size = float(np.sqrt((measured**2).mean()))
-    if size == 0.0:
+    size = float(np.sqrt(np.square(flown.velocity_m_s - flown.velocity_m_s.mean()).mean()))
+    if not size > 0.0:
         return None
-    since_s = sample_s[:, np.newaxis] - acted_s
+    grid = [(lag, gain) for lag in (0.06, 0.15, 0.45) for gain in (0.3, 1.5, 4.0)]
+    misfits = _misfit(flown, "lag", np.log([[lag, gain, 1.0, 1.0] for lag, gain in grid]))
+    first = np.log([*grid[int(np.square(misfits).sum(axis=1).argmin())], 0.03, 15.0])
+    yield
+    found: dict[str, tuple[FloatArray, FloatArray]] = {}
+    for name in _USED:
+        found[name] = yield from _descent(flown, name, first)
+        if name == "lag":
+            lag, gain, _, _ = np.exp(found[name][0]).tolist()
+            first = np.clip(np.log([0.6 * lag, gain, 0.4 * lag, 1.6 / lag]), *_BOUNDS.T)
+    rms = {name: float(np.sqrt(np.square(rest).mean())) / size for name, (_, rest) in found.items()}
+    name = _chosen(rms, found[min(rms, key=rms.__getitem__)][1])
+    return Identified(_response(name, found[name][0]), rms[name], flown.sample_s.size, rms)
 
-    def misfit(logs: Sequence[float] | FloatArray) -> FloatArray:
-        lag_s, gain = np.exp(logs).tolist()
-        velocity = step_velocity(Response(lag_s, gain), since_s) @ change_m_s2
-        return velocity - velocity.mean() - measured
 
-    starts = [(float(np.log(lag)), float(np.log(gain))) for lag in _LAGS_S for gain in _GAINS_1_S]
-    x = np.array(min(starts, key=lambda logs: float((misfit(logs) ** 2).sum())))
-    x = _descended(misfit, x)
-    lag_s, gain = np.exp(x).tolist()
-    return Identified(Response(lag_s, gain), float(np.sqrt((misfit(x) ** 2).mean())) / size, sample_s.size)
+def _chosen(rms: Mapping[str, float], residuals: FloatArray) -> str:
+    """The model with the least information criterion; residuals that resemble their neighbours count as fewer."""
+    n = residuals.size
+    alike = float(residuals[1:] @ residuals[:-1]) / max(float(residuals @ residuals), 1e-300)
+    count = max(10.0, n * (1.0 - alike) / (1.0 + alike)) if alike > 0.0 else float(n)
+
+    def criterion(name: str) -> float:
+        return count * float(np.log(rms[name] ** 2 + _RESOLUTION**2)) + len(_USED[name]) * float(np.log(count))
+
+    return min(rms, key=criterion)
 
 
-def _descended(misfit: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
-    """Levenberg-Marquardt descent from a nearby start."""
-    rest, damping = misfit(x), 1e-3
-    for _ in range(_STEPS):
-        slope = np.stack([(misfit(x + _NUDGE * axis) - rest) / _NUDGE for axis in np.eye(x.size)], axis=1)
-        normal = slope.T @ slope
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -slope.T @ rest)
-        step = np.clip(step, -0.5, 0.5)
-        after = misfit(x + step)
-        if after @ after < rest @ rest:
-            x, rest, damping = x + step, after, damping / 10.0
-            if np.abs(step).max() < 1e-9:
+def _response(name: str, logs: FloatArray) -> Response:
+    lag_s, gain, dead_time_s, natural = np.exp(logs).tolist()
+    match name:
+        case "lag":
+            return Response(lag_s, gain)
+        case "lag with dead time":
+            return Response(lag_s, gain, dead_time_s)
+        case _:
+            return Response(lag_s, gain, 0.0, natural)
+
+
+def _misfit(flown: Flown, name: str, logs: FloatArray) -> FloatArray:
+    """Modelled less measured velocity, both without their means, for each row of parameters."""
+    velocity = flown.velocities([_response(name, row) for row in logs]) - flown.velocity_m_s
+    return velocity - velocity.mean(axis=1, keepdims=True)
+
+
+def _descent(flown: Flown, name: str, start: FloatArray) -> Generator[None, None, tuple[FloatArray, FloatArray]]:
+    """Levenberg-Marquardt descent to parameters and residuals, a few steps at a time."""
+    used, x, damping = _USED[name], start.copy(), 1e-3
+    nudges = _NUDGE * np.eye(x.size)[used]
+    rest = np.empty(0)
+    for step_number in range(_STEPS):
+        rests = _misfit(flown, name, x + np.vstack([np.zeros(x.size), nudges]))
+        rest, slope = rests[0], (rests[1:] - rests[0]).T / _NUDGE
+        if step_number % _STEPS_A_TICK == _STEPS_A_TICK - 1:
+            yield
+        normal, moved = slope.T @ slope, 0.0
+        for _ in range(8):
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -slope.T @ rest)
+            new = x.copy()
+            new[used] = np.clip(x[used] + np.clip(step, -0.5, 0.5), *_BOUNDS[used].T)
+            after = _misfit(flown, name, new[np.newaxis])[0]
+            if after @ after < rest @ rest:
+                moved = float(np.abs(new - x).max())
+                x, rest, damping = new, after, damping / 10.0
                 break
-        else:
             damping *= 10.0
-    return np.clip(x, np.log(1e-3), np.log(20.0))
+        if moved < 1e-5:
+            break
+    return x, rest

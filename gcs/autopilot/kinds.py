@@ -10,6 +10,8 @@ from typing import NamedTuple
 from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, Kind, Step, mode_command, packed
 
+ARM = ARM_DISARM, (1.0,)
+STAYS_DISARMED = "has landed and is not armed again"
 ARDUPILOT, PX4 = 3, 12
 """MAV_AUTOPILOT"""
 _MULTICOPTERS = {2: "quadrotor", 3: "coaxial", 4: "helicopter", 13: "hexarotor", 14: "octorotor", 15: "tricopter"}
@@ -26,7 +28,7 @@ ARDUCOPTER = Kind(
     estimator_message=mavlink.EKF_STATUS_REPORT,
     stays_guided=True,
     velocity_grows=True,
-    timesync_backdated_ns=5_000_000,  # by the bytes' time on a serial port: 3.5 ms at its 57600 baud
+    timesync_error_ns=5_000_000,  # dated back by the bytes' time on a serial port, 3.5 ms at its 57600 baud
 )
 PX4_COPTER = Kind(
     "PX4 multicopter",
@@ -67,6 +69,8 @@ class Seen(NamedTuple):
     origin_known: bool
     custom_mode: int
     armed: bool
+    has_landed: bool
+    """It has been in the air in this flight and is on the ground again."""
     took_off: bool
     airborne: bool
     relative_altitude_m: float | None
@@ -78,7 +82,7 @@ def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
     """The next step of the start-up, from what is seen alone: a vehicle found in the air continues from there.
 
     All need rates, clock and position. ArduCopter then becomes guided, is armed and takes off; PX4 is armed, takes off
-    and becomes guided (OFFBOARD) once set-points arrive.
+    and becomes guided (OFFBOARD) once set-points arrive. A vehicle that has landed is sent neither mode nor arming.
     """
     if seen.interval_due is not None:
         text = f"does not accept the rate of message {seen.interval_due[0]:.0f}"
@@ -89,7 +93,7 @@ def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
     if not guided and (kind.guided_first or seen.airborne):
         return Step(f"does not enter {kind.guided_name}", mode_command(kind, kind.guided_mode))
     if not seen.armed:
-        return Step("does not arm", (ARM_DISARM, (1.0,)))
+        return Step("does not arm", ARM)
     if not seen.took_off and not seen.airborne:
         # PX4 would fly to a latitude, longitude and yaw that are numbers; NaN means where it stands.
         where = (0.0, 0.0, 0.0, nan, nan, nan, altitude_m + seen.sea_level_m)
@@ -101,8 +105,8 @@ def next_step(kind: Kind, seen: Seen, *, altitude_m: float) -> Step:
 def _lacks(kind: Kind, seen: Seen) -> str:
     """What the vehicle lacks that no command can bring."""
     flags = seen.estimator_flags
-    if not seen.clock_known:
-        return "does not answer TIMESYNC"
+    if seen.has_landed or not seen.clock_known:
+        return STAYS_DISARMED if seen.has_landed else "does not answer TIMESYNC"
     if flags is None:
         return f"sends no estimator status (message {kind.estimator_message})"
     if flags & _POSITION_FLAGS != _POSITION_FLAGS or flags & _CONSTANT_POSITION:

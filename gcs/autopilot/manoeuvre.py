@@ -5,12 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gains.performance.response import Response, sampled_margin
-from gcs.autopilot.identify import LONGEST_S, MISFIT_MAX, PROFILE, Identified, amplitude_m_s2, identify, manoeuvre_m_s2
+from gcs.autopilot import identify
+from gcs.autopilot.identify import Flown, Identified
 from gcs.control.history import StateHistory
 from gcs.link.vehicle import RemoteVehicle, Report
-from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.responses import Responses
+from gcs.plan.flight_plan import FlightPlan, Responses, margin_steps
 from scenarios.schema import NS_PER_S
 
 _UNNOTICED_NS = NS_PER_S
@@ -30,59 +29,67 @@ class Identification:
         self._plan = plan
         self._vehicles = vehicles
         self._report = report
-        self._amplitude_m_s2 = amplitude_m_s2(plan.scenario.limits.acceleration_max_m_s2)
+        self._amplitude_m_s2 = identify.amplitude_m_s2(plan.scenario.limits.acceleration_max_m_s2)
         self._begin_ns: int | None = None
-        self._acted_ns: list[list[int]] = [[] for _ in vehicles]
-        """When each change of the acceleration acted."""
+        self._commands: list[tuple[int, float]] = []
+        """When each acceleration was sent, and it."""
+        self._downs_ns: list[list[int]] = [[] for _ in vehicles]
+        """How long commands took to each vehicle."""
         self._samples: list[list[_Sample]] = [[] for _ in vehicles]
         self._jumps = [vehicle.clock.jumps for vehicle in vehicles]
         self._steps = self._result()
 
     def command(self, due_ns: int) -> tuple[float, float]:
-        """The acceleration that all vehicles are commanded at a tick; notes when it changes."""
+        """The acceleration that all vehicles are commanded at a tick, which it notes."""
         if self._begin_ns is None:
             self._begin_ns = due_ns
         since_s = (due_ns - self._begin_ns) / NS_PER_S
-        begun = sum(at_s <= since_s for at_s, _ in PROFILE)
-        for vehicle, acted in zip(self._vehicles, self._acted_ns, strict=True):
-            if len(acted) < begun:
-                acted.append(due_ns + (vehicle.clock.down_ns or 0))
-        return manoeuvre_m_s2(since_s, self._amplitude_m_s2)
+        command = identify.manoeuvre_m_s2(since_s, self._amplitude_m_s2)
+        if not self._commands or self._commands[-1][0] < due_ns:  # once for all vehicles
+            self._commands.append((due_ns, command[0]))
+            for vehicle, downs_ns in zip(self._vehicles, self._downs_ns, strict=True):
+                downs_ns.append(vehicle.clock.down_ns or 0)
+        return command
 
     def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
         """The plan with the margins of the responses found, or why there is none; None while it takes longer."""
-        gone = next((v for v in self._vehicles if v.silent or v.taken_over), None)
+        gone = next((v for v in self._vehicles if v.silent or v.taken_over or v.startup.has_landed), None)
         if gone is not None:
             return f"not identified: vehicle {gone.system_id} {gone.missing}"
-        if self._begin_ns is None or due_ns - self._begin_ns < LONGEST_S * NS_PER_S:
+        if self._begin_ns is None or due_ns - self._begin_ns < identify.LONGEST_S * NS_PER_S:
             self._observe(due_ns, history)
             return None
         return next(self._steps)
 
     def _result(self) -> Iterator[FlightPlan | str | None]:
         """The result, after a None for each step before it."""
-        found: dict[int, Response] = {}
+        found: dict[int, Identified] = {}
         for row, vehicle in enumerate(self._vehicles):
-            seen = self._fit(row)
-            if seen is None:
-                yield f"not identified: vehicle {vehicle.system_id} sent too little telemetry in the manoeuvre"
+            seen = yield from identify.identify(self._flown(row))
+            if seen is None or seen.misfit > identify.MISFIT_MAX:
+                yield f"not identified: vehicle {vehicle.system_id} {self._why_not(row, seen)}"
                 return
-            if seen.misfit > MISFIT_MAX:
-                yield (
-                    f"not identified: vehicle {vehicle.system_id} does not respond with a lag: {seen.misfit:.0%} of "
-                    "its velocity is unexplained; [response] in the scenario replaces the manoeuvre"
-                )
-                return
-            response = found[vehicle.system_id] = seen.response
-            answer = f"lag {response.lag_s:.3f} s, velocity gain {response.velocity_gain_1_s:.2f} 1/s"
-            self._report("response", f"{answer}, misfit {seen.misfit:.1%}", vehicle.system_id)
-            yield None
-        responses = Responses("identified", found)
-        of, margins_s = responses.in_order(self._plan.formation.system_ids), list[float]()
-        for K in self._plan.gains:
-            margins_s.append(sampled_margin(self._plan.model, K, of, timing=self._plan.timing))
-            yield None
+            found[vehicle.system_id] = seen
+            self._report("response", in_words(seen), vehicle.system_id)
+        of = {system_id: seen.response for system_id, seen in found.items()}
+        responses = Responses("identified", of, {system_id: seen.misfit for system_id, seen in found.items()})
+        margins_s = yield from margin_steps(self._plan, responses)
         yield self._plan.with_margins(tuple(margins_s), responses)
+
+    def _why_not(self, row: int, seen: Identified | None) -> str:
+        """Why a vehicle has no response, and what may be done."""
+        way_on = "a [response] in the scenario replaces the manoeuvre"
+        if seen is None:
+            rate_hz, asked_hz = len(self._samples[row]) / identify.LONGEST_S, self._plan.scenario.rates.telemetry_hz
+            return (
+                f"sent too little telemetry: {rate_hz:.1f} states a second in the manoeuvre, wanted "
+                f"{identify.LEAST_RATE_HZ:g}; raise rates.telemetry_hz (now {asked_hz:g}) or what the link carries; "
+                f"{way_on}"
+            )
+        return (
+            f"does not follow a manoeuvre of {self._amplitude_m_s2:.2g} m/s^2: {seen.misfit:.0%} of its velocity is "
+            f"unexplained by the best model ({seen.response.model}); see that no wind or limit disturbs it; {way_on}"
+        )
 
     def _observe(self, due_ns: int, history: StateHistory) -> None:
         for row, vehicle in enumerate(self._vehicles):
@@ -93,10 +100,29 @@ class Identification:
             if newest is not None and (not samples or newest[0] > samples[-1].sampled_ns):
                 samples.append(_Sample(newest[0], due_ns, newest[1][2]))
 
-    def _fit(self, row: int) -> Identified | None:
-        begin_ns = self._begin_ns or 0
-        acted_s = (np.array(self._acted_ns[row], dtype=np.int64) - begin_ns) / NS_PER_S
-        change = self._amplitude_m_s2 * np.array([size for _, size in PROFILE[: acted_s.size]])
-        samples = [s for s in self._samples[row] if s.sampled_ns >= begin_ns]
-        sample_s = (np.array([s.sampled_ns for s in samples], dtype=np.int64) - begin_ns) / NS_PER_S
-        return identify(acted_s, change, sample_s, np.array([s.velocity_north_m_s for s in samples], dtype=np.float64))
+    def _flown(self, row: int) -> Flown:
+        """The manoeuvre as one vehicle saw it, on the grid of control ticks; a missed tick repeats the one before."""
+        begin_ns, period_s = self._begin_ns or 0, 1.0 / self._plan.scenario.rates.control_hz
+        sent_s = (np.array([at_ns for at_ns, _ in self._commands], dtype=np.int64) - begin_ns) / NS_PER_S
+        ticks = np.arange(round(float(sent_s[-1]) / period_s) + 1)
+        newest = np.searchsorted(np.rint(sent_s / period_s), ticks, side="right") - 1
+        command = np.array([north for _, north in self._commands])[newest]
+        acts_ns = begin_ns + round(float(np.median(self._downs_ns[row])))
+        sampled_ns = np.array([s.sampled_ns for s in self._samples[row]], dtype=np.int64)
+        sample_s = (sampled_ns - acts_ns) / NS_PER_S
+        inside = (sample_s >= 0.0) & (sample_s <= ticks.size * period_s)
+        velocity = np.array([s.velocity_north_m_s for s in self._samples[row]], dtype=np.float64)
+        return Flown(period_s, command, sample_s[inside], velocity[inside])
+
+
+def in_words(found: Identified) -> str:
+    """The response of a vehicle, its misfit and that of the other models."""
+    response = found.response
+    late = f", dead time {response.dead_time_s:.3f} s" if response.dead_time_s else ""
+    if response.natural_frequency_rad_s is not None:
+        late = f", natural frequency {response.natural_frequency_rad_s:.1f} rad/s, damping {response.damping:.2f}"
+    others = ", ".join(f"{name} {misfit:.1%}" for name, misfit in found.misfits.items() if name != response.model)
+    return (
+        f"{response.model}: lag {response.lag_s:.3f} s{late}, velocity gain {response.velocity_gain_1_s:.2f} 1/s, "
+        f"misfit {found.misfit:.1%} ({others})"
+    )

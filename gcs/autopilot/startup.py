@@ -7,9 +7,11 @@ or from a GLOBAL_POSITION_INT and the newest LOCAL_POSITION_NED.
 from math import cos, degrees, isfinite, radians
 from typing import Any
 
-from gcs.autopilot.kinds import Seen, kind_of, next_step
+from gcs.autopilot.kinds import ARM, Seen, kind_of, next_step
+from gcs.autopilot.vehicle_limits import ToldLimits
 from gcs.link import mavlink
-from gcs.link.kinds import SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
+from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
+from gcs.link.vehicle import ARMED
 
 EARTH_RADIUS_M = 6_378_137.0
 _SLOW_US = 200_000.0
@@ -19,9 +21,61 @@ _TAKE_OFF_S, _SLOWEST_CLIMB_M_S = 15.0, 0.5
 """A take-off may last this long plus the climb at this rate. Then it is commanded again or, if the vehicle has left the
 ground, set-points lead it to its altitude."""
 _LEFT_GROUND_M = 2.0
+_STANDBY = 3
+"""MAV_STATE of a vehicle on the ground, ArduCopter's also while it is armed."""
+_HAS_FLOWN_M, _FLIES_M = 1.0, 2.0
+"""An armed vehicle above the first has flown; one that has landed flies again above the second, farther from the drift
+of a barometer."""
 
 Degrees = tuple[float, float]
 """Latitude and longitude."""
+
+
+class _Ground:
+    """What heartbeats, altitudes and texts of one vehicle say about take-off and landing, and its refusals to arm.
+
+    The station never arms a vehicle that has been in the air and is on the ground again: people may be beside it.
+    """
+
+    def __init__(self) -> None:
+        self.has_landed = False
+        """It has been in the air in this flight and is on the ground; the pilot may take it off again."""
+        self._armed = self._standby = self._has_flown = False
+        self._altitude_m = 0.0
+        self.arming_refusals = 0
+        """Since it was armed last."""
+        self._text = ""
+
+    def heartbeat(self, fields: tuple[Any, ...]) -> None:
+        _, _, _, base_mode, system_status, _ = fields
+        self._armed, self._standby = bool(base_mode & ARMED), system_status == _STANDBY
+        if self._armed:
+            self.arming_refusals, self._text = 0, ""
+        self._judge()
+
+    def altitude(self, above_home_m: float) -> None:
+        self._altitude_m = above_home_m
+        self._judge()
+
+    def _judge(self) -> None:
+        self._has_flown |= self._armed and self._altitude_m > _HAS_FLOWN_M
+        if not self._armed or self._standby:
+            self.has_landed = self._has_flown
+        elif self._altitude_m > _FLIES_M:
+            self.has_landed = False
+
+    def said(self, text: str) -> bool:
+        """Take in a text from the vehicle; whether it is news. While it is disarmed, it repeats why it does not arm."""
+        known, self._text = not self._armed and text == self._text, text
+        return not known
+
+    @property
+    def does_not_arm(self) -> str:
+        """What a vehicle that is not armed lacks, with the count of its refusals and what it said last."""
+        if not self.arming_refusals:
+            return "does not arm"
+        why = f": {self._text}" if self._text else ""
+        return f"does not arm, refused {self.arming_refusals} times{why}"
 
 
 class AutopilotStartup:
@@ -36,6 +90,8 @@ class AutopilotStartup:
         self.origin: Degrees | None = None
         self.origin_altitude_m = 0.0
         """Above sea level; only with an origin."""
+        self.limits = ToldLimits()
+        self._ground = _Ground()
         self._origin_said = False
         self._sea_level_m = 0.0
         self._flags: int | None = None
@@ -64,6 +120,10 @@ class AutopilotStartup:
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         match msg_id:
+            case mavlink.HEARTBEAT:
+                self._ground.heartbeat(fields)
+            case mavlink.PARAM_VALUE:
+                self.limits.take(fields)
             case mavlink.LOCAL_POSITION_NED:
                 self._local = fields[:6]
             case mavlink.GLOBAL_POSITION_INT:
@@ -85,7 +145,8 @@ class AutopilotStartup:
         boot_ms, latitude, longitude, altitude_mm, relative_mm = fields[:5]
         if latitude == longitude == 0:
             return  # sent before a position is known
-        self.relative_altitude_m = relative_mm * 1e-3
+        above_home_m = self.relative_altitude_m = relative_mm * 1e-3
+        self._ground.altitude(above_home_m)
         self._sea_level_m = (altitude_mm - relative_mm) * 1e-3
         if self._local is not None and not self._origin_said and not self.airborne:
             local_ms, north, east, down, v_north, v_east = self._local
@@ -104,12 +165,26 @@ class AutopilotStartup:
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
         """A message rate for the origin may be refused: other messages show it too.
 
-        A vehicle that refuses a repeated take-off is taking off already, and its first answer was lost.
+        Refusals to arm are counted. A vehicle that refuses a repeated take-off is taking off already, and its first
+        answer was lost.
         """
         if command == SET_MESSAGE_INTERVAL and parameters[0] == mavlink.GPS_GLOBAL_ORIGIN:
             self._accepted.add(parameters[0])
+        elif command == ARM_DISARM:
+            self._ground.arming_refusals += 1
         elif command == TAKE_OFF and repeated:
             self._took_off_ns = now_ns
+
+    def is_news(self, text: str) -> bool:
+        return self._ground.said(text)
+
+    @property
+    def has_landed(self) -> bool:
+        return self._ground.has_landed
+
+    @property
+    def arming_refusals(self) -> int:
+        return self._ground.arming_refusals
 
     @property
     def is_half_way_up(self) -> bool:
@@ -119,8 +194,9 @@ class AutopilotStartup:
         self._accepted.clear()
         self._took_off_ns = None
 
-    def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> None:
-        """None: an autopilot's parameters are its owner's."""
+    def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
+        """The question that is due about its limits; to set them is its owner's."""
+        return self.limits.next(self.kind, now_ns, target_system=target_system, rtt_ns=rtt_ns)
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
         if self.kind is UNRECOGNISED:
@@ -130,7 +206,8 @@ class AutopilotStartup:
         took_off = self._took_off_ns is not None and now_ns - self._took_off_ns < patience_ns
         # A vehicle found in the air takes set-points at once; during a take-off they would end the climb too early.
         enough_m = _TAKEN_OFF_FRACTION * self.altitude_m if took_off else _LEFT_GROUND_M
-        self.airborne = armed and (self.airborne or (self.relative_altitude_m or 0.0) > enough_m)
+        is_up = self.airborne or (self.relative_altitude_m or 0.0) > enough_m
+        self.airborne = armed and is_up and not self.has_landed
         seen = Seen(
             interval_due=due,
             clock_known=clock_known,
@@ -139,12 +216,14 @@ class AutopilotStartup:
             origin_known=self.origin is not None,
             custom_mode=custom_mode,
             armed=armed,
+            has_landed=self.has_landed,
             took_off=took_off,
             airborne=self.airborne,
             relative_altitude_m=self.relative_altitude_m,
             sea_level_m=self._sea_level_m,
         )
-        return next_step(self.kind, seen, altitude_m=self.altitude_m)
+        step = next_step(self.kind, seen, altitude_m=self.altitude_m)
+        return step if step.command != ARM else step._replace(missing=self._ground.does_not_arm)
 
 
 def shifted(place: Degrees, north_m: float, east_m: float) -> Degrees:

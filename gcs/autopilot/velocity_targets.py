@@ -15,8 +15,6 @@ from gcs.link.vehicle import RemoteVehicle
 
 _CLIMB_GAIN_1_S = 0.5
 _CLIMB_MAX_M_S = 1.0
-_RESET_M_S = 5.0
-"""A velocity target this far from the vehicle's velocity is dropped; a new one starts from that velocity."""
 _Vector = tuple[float, float]
 
 
@@ -52,11 +50,12 @@ class VelocityTargets:
         return self._targets[row] is not None
 
     def accelerate(
-        self, row: int, acceleration_m_s2: _Vector, velocity_m_s: _Vector, *, key_ms: int, now_ns: int
+        self, row: int, acceleration_m_s2: _Vector, velocity_m_s: _Vector, *, lead_m_s: float, key_ms: int, now_ns: int
     ) -> tuple[Any, ...]:
         """The set-point of a commanded acceleration.
 
-        `velocity_m_s` is the vehicle's newest; it may be NaN if the vehicle has a velocity target.
+        `velocity_m_s` is the vehicle's newest; it may be NaN if the vehicle has a velocity target, which keeps within
+        `lead_m_s` of it.
         """
         target = self._targets[row]
         if target is None:
@@ -65,8 +64,11 @@ class VelocityTargets:
             since_s = (now_ns - target.since_ns) * 1e-9
             north = target.velocity_m_s[0] + target.acceleration_m_s2[0] * since_s
             east = target.velocity_m_s[1] + target.acceleration_m_s2[1] * since_s
-            if hypot(north - velocity_m_s[0], east - velocity_m_s[1]) > _RESET_M_S:
-                north, east = velocity_m_s
+            own_north, own_east = velocity_m_s
+            ahead_m_s = hypot(north - own_north, east - own_east)
+            if ahead_m_s > lead_m_s:  # it cannot follow: more would only build up
+                share = lead_m_s / ahead_m_s
+                north, east = own_north + share * (north - own_north), own_east + share * (east - own_east)
         self._targets[row] = _Target((north, east), acceleration_m_s2, now_ns)
         # A vehicle that holds the velocity between set-points is sent that of the middle of the period.
         ahead_s = 0.0 if self._vehicles[row].kind.velocity_grows else self._period_s / 2.0

@@ -9,28 +9,8 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from gcs.cli import FAILED, INTERRUPTED
-from gcs.cli.options import (
-    AllowUnstable,
-    AsJson,
-    KeyFile,
-    LoopOption,
-    OutFolder,
-    ScenarioFile,
-    address,
-    answer,
-    listening,
-    live_viewer,
-    load_scenario,
-    mirroring,
-    opened_guard,
-    out_file,
-    refuse,
-    refuse_or_warn,
-    run_folder,
-    warn_if_open,
-    within,
-)
+from gcs.cli import FAILED, INTERRUPTED, options
+from gcs.cli.front import LinksOf, chosen_for, with_link
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
@@ -42,10 +22,16 @@ LISTEN = "127.0.0.1:14550"
 
 
 def fly(
-    scenario_file: ScenarioFile,
-    loop: LoopOption = None,
+    scenario_file: options.ScenarioFile,
+    loop: options.LoopOption = None,
+    links: options.LinksOption = None,
+    links_of: LinksOf = None,
     link_delay: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="constant delay of every link, each way")
+    ] = None,
+    without: Annotated[
+        list[int] | None,
+        typer.Option(metavar="ID", help="leave this vehicle out and fly the formation around it; may be repeated"),
     ] = None,
     connect: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="listen here and fly vehicles that are already running")
@@ -60,8 +46,9 @@ def fly(
     mirror_commands: Annotated[
         bool, typer.Option("--mirror-commands", help="with --mirror: pass that station's frames on to the vehicles")
     ] = False,
-    key: KeyFile = None,
-    allow_unstable: AllowUnstable = False,
+    key: options.KeyFile = None,
+    allow_unstable: options.AllowUnstable = False,
+    allow_code: options.AllowCode = False,
     virtual: Annotated[bool, typer.Option("--virtual", help="fly in virtual time, faster than real time")] = False,
     speed: Annotated[
         float | None, typer.Option(metavar="N", help="with --virtual: at most N times as fast as real time")
@@ -77,8 +64,8 @@ def fly(
         float | None, typer.Option(metavar="SECONDS", help="exit with code 1 if errors had not settled by then")
     ] = None,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
-    out: OutFolder = None,
-    as_json: AsJson = False,
+    out: options.OutFolder = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Design the control, start the vehicles, fly and record.
 
@@ -88,38 +75,44 @@ def fly(
     from gcs.drive import preflight
     from gcs.drive.takeover import CONNECTED, TAKEN_OVER, Presence
     from gcs.plan.planner import flight_plan, with_trade_off
+    from gcs.views.flight_report import leave_report
     from gcs.views.report import print_design, print_summary
 
     outlive_readers()
     gate = Gate(assert_headroom, assert_settled, junit)
     gate.refuse_unusable()
     sockets = {"--connect": connect, "--listen": listen, "--mirror": mirror, "--key": key}
-    _refuse_contradictions(sockets, speed, virtual=virtual, mirror_commands=mirror_commands)
-    scenario = load_scenario(scenario_file, loop)
+    _refuse_contradictions(sockets, speed, live, virtual=virtual, mirror_commands=mirror_commands)
+    scenario = options.load_scenario(scenario_file, loop, without, links=links, allow_code=allow_code)
     if link_delay is not None:
-        within("--link-delay", link_delay, 0, 60, "seconds")
+        options.within("--link-delay", link_delay, 0, 60, "seconds")
         scenario = scenario.with_link_delay(up_s=link_delay, down_s=link_delay)
     if connect is None:
-        refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
+        options.refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
     with contextlib.ExitStack() as opened:
         link = to = there = None
         at = ("--listen", LISTEN if listen is None else listen) if connect is None else ("--connect", connect)
         if not virtual:
-            link = opened.enter_context(listening(*at, opened_guard(key, role="station")))
-            warn_if_open(link)
-            to = None if mirror is None else opened.enter_context(mirroring(mirror, link, commands=mirror_commands))
+            link = opened.enter_context(options.listening(*at, options.opened_guard(key, role="station")))
+            options.warn_if_open(link)
+            to = (
+                None
+                if mirror is None
+                else opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands))
+            )
+        scenario, measured = chosen_for(scenario, links_of)
         design, plan = flight_plan(scenario)
         if (unstable := preflight.unstable_loop(plan)) is not None:
-            refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
+            options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
             plan = preflight.without_actions(plan)
-        design = with_trade_off(design)
+        design = with_trade_off(with_link(design, measured))
         if link is not None and connect is None:
             there = Presence(link, plan.scenario)
         taken_over = there is not None and bool(there.taken_over())
         if not as_json:
             print_design(design)
-        viewer = None if live is None else live_viewer(live)
-        folder = run_folder(out, scenario.name)
+        viewer = None if live is None else options.live_viewer(live)
+        folder = options.run_folder(out, scenario.name)
         if link is None:
             summary = flying.fly_in_virtual_time(
                 plan, design, folder, show_table=not as_json, speed=speed, viewer=viewer
@@ -132,14 +125,15 @@ def fly(
                 folder,
                 show_table=not as_json,
                 fleet=CONNECTED if connect is not None else TAKEN_OVER if taken_over else "",
-                outlive_station=address(*at)[1] != 0,  # nobody listens again at a port that the system chose
+                outlive_station=options.address(*at)[1] != 0,  # nobody listens again at a port that the system chose
                 key_file=key,
                 mirror=to,
                 viewer=viewer,
             )
         if there is not None and taken_over:
             there.shut_down()
-    answer(summary, partial(print_summary, folder=folder), as_json=as_json)
+        summary = leave_report(folder, summary)
+    options.answer(summary, partial(print_summary, folder=folder), as_json=as_json)
     passed = gate.passed(summary)
     if summary.reason.startswith("interrupted"):
         raise typer.Exit(INTERRUPTED)
@@ -155,11 +149,11 @@ class Gate(NamedTuple):
 
     def refuse_unusable(self) -> None:
         if self.least_headroom is not None:
-            within("--assert-headroom", self.least_headroom, -1e3, 1.0)
+            options.within("--assert-headroom", self.least_headroom, -1e3, 1.0)
         if self.settled_s is not None:
-            within("--assert-settled", self.settled_s, 0.0, 1e6, "seconds")
+            options.within("--assert-settled", self.settled_s, 0.0, 1e6, "seconds")
         if self.junit is not None:
-            out_file("--junit", self.junit)
+            options.out_file("--junit", self.junit)
 
     def passed(self, summary: "Summary") -> bool:
         """Check the flight, and print one line for each assertion that fails; the summary tells the rest."""
@@ -191,14 +185,23 @@ class Gate(NamedTuple):
 
 
 def _refuse_contradictions(
-    sockets: Mapping[str, str | Path | None], speed: float | None, *, virtual: bool, mirror_commands: bool
+    sockets: Mapping[str, str | Path | None],
+    speed: float | None,
+    live: str | None,
+    *,
+    virtual: bool,
+    mirror_commands: bool,
 ) -> None:
+    if live is not None:
+        from gcs.views.viewer import refuse_without_viewer
+
+        refuse_without_viewer()
     if mirror_commands and sockets["--mirror"] is None:
         raise InputError("read --mirror-commands without --mirror, wanted both")
     if sockets["--connect"] is not None and sockets["--listen"] is not None:
         raise InputError("read --connect and --listen, wanted one of them")
     if speed is not None:
-        within("--speed", speed, 0.01, 1e6, "a multiple of real time")
+        options.within("--speed", speed, 0.01, 1e6, "a multiple of real time")
         if not virtual:
             raise InputError("read --speed without --virtual, wanted both")
     if virtual and (read := [option for option, value in sockets.items() if value is not None]):

@@ -16,7 +16,7 @@ from gcs.cli.scenarios import check, design, margin, new, scenarios
 from gcs.cli.stress import stress
 from gcs.cli.studies import bench, capacity, compare, thesis
 from gcs.cli.watch import monitor, replay
-from gcs.errors import InputError
+from gcs.errors import InputError, extra_wanted
 from gcs.output import DISK_FULL
 
 app = typer.Typer(
@@ -47,26 +47,9 @@ def help_without_command(
 
 
 _COMMANDS = (
-    *(
-        scenarios,
-        new,
-        check,
-        fly,
-        design,
-        compare,
-        margin,
-        thesis,
-        bench,
-        capacity,
-        grade,
-        view,
-        export,
-        recover,
-        key,
-        stress,
-    ),
-    *(monitor, replay),
-)
+    scenarios, new, check, fly, design, compare, margin, thesis, bench, capacity, grade, view, export, recover, key,
+    stress, monitor, replay,
+)  # fmt: skip
 for _command in _COMMANDS:
     app.command()(_command)
 
@@ -83,6 +66,10 @@ def main() -> None:
         code = _bad_input(str(error))
     except typer.TyperException as error:  # an unknown option, a missing argument
         code = _bad_input(error.format_message() if isinstance(error, typer.BadParameter) else str(error))
+    except ModuleNotFoundError as error:
+        if not extra_wanted(error.name):
+            raise
+        code = _bad_input(extra_wanted(error.name))
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted", file=sys.stderr)
         code = INTERRUPTED

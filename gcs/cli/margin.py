@@ -3,6 +3,7 @@
 The mathematics is in `gains.margin.loop_margin`.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -35,13 +36,14 @@ class ScenarioMargin:
 
 
 def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
-    """The margin of a JSON model.
+    """The margin of a JSON model, or of a MATLAB file whose variables have the names of its keys.
 
     Raises ModelFileError, whose one line names file, key, what was read and what was wanted, or DisagreementError if
     independent methods give different answers.
     """
     try:
-        return loop_margin(parse_model(file.read_text(encoding="utf-8-sig")))
+        text = _mat_as_json(file) if file.suffix == ".mat" else file.read_text(encoding="utf-8-sig")
+        return loop_margin(parse_model(text))
     except OSError as error:
         raise ModelFileError(f"{file}: {error.strerror}; wanted a JSON model") from None
     except UnicodeDecodeError:
@@ -50,20 +52,40 @@ def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
         raise ModelFileError(f"{file}: {error}") from None
 
 
-def margin_of_scenario(file: Path) -> ScenarioMargin:
+def _mat_as_json(file: Path) -> str:
+    """The variables of a MATLAB file (up to version 7.2) as the JSON that `parse_model` reads."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        variables = loadmat(file)
+    except (MatReadError, NotImplementedError, ValueError, TypeError) as error:
+        raise BadModelError(f"read {' '.join(str(error).split())}; wanted a MATLAB file, version 4 to 7.2") from None
+    known = {name: value.tolist() for name, value in variables.items() if not name.startswith("__")}
+    one = {"hold": bool, "period": float}
+    for name in one.keys() & known.keys():
+        if np.shape(known[name]) == (1, 1):
+            known[name] = one[name](known[name][0][0])
+    return json.dumps(known, default=str)
+
+
+def margin_of_scenario(file: Path, *, allow_code: bool = False) -> ScenarioMargin:
     """The margin of the loop that a scenario flies.
 
     Raises ModelFileError, scenarios.errors.ScenarioError, GainsError: one line with what was read and what was wanted.
     """
     from gains.sampled.onboard import own_part
+    from gcs.cli.options import load_scenario
     from gcs.plan.planner import flight_plan
-    from scenarios.files import load
 
-    scenario = load(file)
+    scenario = load_scenario(file, allow_code=allow_code)
     if scenario.dynamics == "autopilot":
         wanted = "double_integrator: gcs design and gcs fly give the margin with an autopilot's response"
         raise ModelFileError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
     design, plan = flight_plan(scenario)
+    if design.margin_unknown or scenario.response is not None:
+        wanted = design.margin_unknown or "gcs design, which gives the margin with a response"
+        raise ModelFileError(f"{file}: read code without a linear model of its loop, wanted {wanted}")
     model, loop = plan.model, plan.scenario.control.loop
     at_once = own_part(model, plan.gain) if loop == "onboard" else np.zeros_like(plan.gain)
     terms = Term(model.A + model.B @ at_once, 0.0, Fraction(0)), Term(model.B @ (plan.gain - at_once), 0.0, Fraction(1))

@@ -1,8 +1,7 @@
 """Options that several commands share, and the one-line error for each bad value."""
 
-import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from ipaddress import ip_address
 from pathlib import Path
@@ -23,8 +22,22 @@ Result = TypeVar("Result")
 
 LoopPlace = Literal["ground", "onboard"]
 """Where the loop is closed, as `control.loop` of a scenario."""
+
+
+def _shipped(incomplete: str) -> list[str]:
+    """The shipped scenarios that a shell offers for the beginning of a name; it offers files besides."""
+    from scenarios.shipped import names
+
+    return [name for name in names() if name.startswith(incomplete)]
+
+
 ScenarioFile = Annotated[
-    Path, typer.Argument(metavar="SCENARIO", help="scenario file, or the name of one that ships (see gcs scenarios)")
+    Path,
+    typer.Argument(
+        metavar="SCENARIO",
+        help="scenario file, or the name of one that ships (see gcs scenarios)",
+        autocompletion=_shipped,
+    ),
 ]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="run folder")]
 AsJson = Annotated[bool, typer.Option("--json", help="print JSON and nothing else")]
@@ -32,9 +45,16 @@ OutFolder = Annotated[Path | None, typer.Option(metavar="DIR", help="new or empt
 AllowUnstable = Annotated[
     bool, typer.Option("--allow-unstable", help="accept gains whose loop is unstable without any delay")
 ]
+AllowCode = Annotated[
+    bool, typer.Option("--allow-code", help="run the Python code that the scenario names: it can do whatever you can")
+]
 LoopOption = Annotated[
     LoopPlace | None,
     typer.Option("--loop", help="who closes the loop on a vehicle's own errors; default as in the scenario"),
+]
+LinksOption = Annotated[
+    str | None,
+    typer.Option("--links", metavar="NAME|FILE", help="fly over this link profile (see gcs scenarios --links)"),
 ]
 KeyFile = Annotated[
     Path | None,
@@ -43,12 +63,13 @@ KeyFile = Annotated[
 
 
 def print_json(result: Any) -> None:
-    """Print a result as JSON, with records as objects of their fields."""
+    """Print a record, or an object of records, as JSON."""
+    from gcs.published import json_text
 
     def fields(record: Any) -> Any:
         return record.to_dict() if hasattr(record, "to_dict") else asdict(record)
 
-    typer.echo(json.dumps(result, indent=2, allow_nan=False, default=fields))
+    typer.echo(json_text(result if isinstance(result, dict) else fields(result), default=fields))
 
 
 def answer(result: Result, show: Callable[[Result], None], *, as_json: bool) -> None:
@@ -66,19 +87,36 @@ def live_viewer(text: str) -> str:
     return new_viewer() if text == "new" else viewer_url(*address("--live", text))
 
 
-def load_scenario(file: Path, loop: LoopPlace | None = None) -> "Scenario":
+def load_scenario(
+    file: Path,
+    loop: LoopPlace | None = None,
+    left_out: Sequence[int] | None = None,
+    *,
+    links: str | None = None,
+    allow_code: bool | str = False,
+) -> "Scenario":
     """The scenario in a file, or the shipped one of that name; `loop` overrides where its loop is closed.
 
-    Raises scenarios.errors.ScenarioError if the file cannot be used, or not with this loop.
+    The vehicles with the system ids `left_out` are left out; `links` names a profile that replaces its links. A
+    scenario that names code is refused unless `allow_code`, which may be what is wanted instead. Raises
+    scenarios.errors.ScenarioError if the file cannot be used, or not with this loop, without these vehicles, or with
+    these links.
     """
-    from scenarios.files import load, with_loop
+    from scenarios.files import load, with_loop, with_profile
+    from scenarios.left_out import without
+    from scenarios.own_code import refusal
     from scenarios.shipped import located
 
     found = located(str(file))
     if not found.exists():
         raise InputError(f"{file}: read no such file, wanted a scenario file or the name of one (see gcs scenarios)")
     scenario = load(found)
-    return scenario if loop is None else with_loop(scenario, loop, file)
+    if allow_code is not True and (refused := refusal(scenario, file, allow_code or "")):
+        raise InputError(refused)
+    if links is not None:
+        scenario = with_profile(scenario, links, Path(links).parent / "--links", "--links")
+    scenario = scenario if loop is None else with_loop(scenario, loop, file)
+    return without(scenario, left_out, file) if left_out else scenario
 
 
 def within(option: str, value: float, least: float, most: float, unit: str = "") -> None:

@@ -50,7 +50,7 @@ def view(
 
     Exit code 1 if the viewer reports a fault in the picture.
     """
-    from gcs.views.viewer import find_recording, picture_time_s, screenshot, serve
+    from gcs.views.viewer import find_recording, picture_time_s, refuse_without_viewer, screenshot, serve
     from gcs.views.viewer import view as open_viewer
 
     if at is not None:
@@ -59,6 +59,7 @@ def view(
         out_file("--picture", picture)
         if picture.suffix.lower() != ".png":
             raise InputError(f"--picture: read {picture}, wanted a name that ends in .png")
+    refuse_without_viewer()
     recording = find_recording(run)
     if web:
         if picture is not None:

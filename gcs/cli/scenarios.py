@@ -6,36 +6,36 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from gcs.cli.options import (
-    AllowUnstable,
-    AsJson,
-    LoopOption,
-    ScenarioFile,
-    answer,
-    load_scenario,
-    print_json,
-    refuse,
-    refuse_or_warn,
-)
+from gcs.cli import front as fronts
+from gcs.cli import options
+from gcs.cli.front import chosen_for, with_link
 from gcs.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from gcs.drive.check import ScenarioCheck, VehicleCheck
+    from gcs.drive.check import CourseCheck, PlannedMotionCheck, ScenarioCheck, VehicleCheck
     from gcs.plan.design import Design
 
 MOST_VEHICLES = 254
 
 
-def scenarios(as_json: AsJson = False) -> None:
+def scenarios(
+    links: Annotated[bool, typer.Option("--links", help="list the link profiles that ship")] = False,
+    as_json: options.AsJson = False,
+) -> None:
     """List the scenarios that ship, by the names that commands accept."""
     from scenarios.shipped import description, names
 
-    answer({name: description(name) for name in names()}, _print_scenarios, as_json=as_json)
+    if links:
+        from scenarios import profiles
 
-
-def _print_scenarios(found: dict[str, str]) -> None:
+        key, found = "links", {name: description(name, profiles.FOLDER) for name in profiles.names()}
+    else:
+        key, found = "scenarios", {name: description(name) for name in names()}
+    if as_json:
+        options.print_json({key: found})
+        return
     from rich.table import Table
 
     from gcs.views.console import plain_console
@@ -54,7 +54,10 @@ def new(
     ] = None,
     columns: Annotated[str | None, typer.Option(metavar="CxN", help="C columns of N vehicles, side by side")] = None,
 ) -> None:
-    """Write a scenario to start from, by default a chain of three."""
+    """Write a scenario to start from, by default a chain of three.
+
+    Writes also scenario.schema.json beside it, from which editors know the keys.
+    """
     from scenarios import shipped
     from scenarios.files import parse
 
@@ -73,6 +76,9 @@ def new(
     parse(text, file)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(text, encoding="utf-8")
+    beside = file.with_name(shipped.SCHEMA.name)  # the file names it: editors then know all keys
+    if not beside.exists():
+        beside.write_bytes(shipped.SCHEMA.read_bytes())
     typer.echo(f"scenario {file}\ncheck    gcs check {file}\nfly      gcs fly {file} --virtual")
 
 
@@ -92,10 +98,13 @@ def _shape(text: str) -> tuple[int, int]:
 
 
 def check(
-    scenario_file: ScenarioFile,
-    loop: LoopOption = None,
-    allow_unstable: AllowUnstable = False,
-    as_json: AsJson = False,
+    scenario_file: options.ScenarioFile,
+    loop: options.LoopOption = None,
+    links: options.LinksOption = None,
+    links_of: fronts.LinksOf = None,
+    allow_unstable: options.AllowUnstable = False,
+    allow_code: options.AllowCode = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Validate a scenario, design its gains and show its start, without flying.
 
@@ -105,12 +114,14 @@ def check(
     from gcs.drive.check import check as checked
     from gcs.plan.planner import flight_plan
 
-    scenario = load_scenario(scenario_file, loop)
-    refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
+    scenario = options.load_scenario(scenario_file, loop, links=links, allow_code=allow_code)
+    options.refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
+    scenario, measured = chosen_for(scenario, links_of)
     design, plan = flight_plan(scenario)
+    design = with_link(design, measured)
     if (unstable := preflight.unstable_loop(plan)) is not None:
-        refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
-    answer(checked(plan), partial(_print_check, design), as_json=as_json)
+        options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
+    options.answer(checked(plan), partial(_print_check, design), as_json=as_json)
 
 
 def _print_check(design: "Design", found: "ScenarioCheck") -> None:
@@ -119,14 +130,25 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
     from gcs.views.scene import plan_view
 
     console = plain_console()
+    for text, code in found.code.items():
+        console.print(f"runs     {text}, sha256 {code.sha256}", markup=False)
     print_design(design, console)
     margin = "no limit" if found.delay_margin_s is None else ms_text(found.delay_margin_s)
+    margin = "unknown" if design.margin_unknown else margin
     console.print(
         f"delay    loop {ms_text(found.expected_loop_delay_s)} expected from the links, margin {margin}: "
-        f"headroom {found.headroom:.0%}"
+        f"headroom {number_text(found.headroom, '.0%')}"
     )
+    if found.channels_not_included:
+        console.print("         without the time that datagrams wait for their channel, which only a flight shows")
     if found.closest_m is not None:
-        console.print(f"places   at least {found.closest_m:.1f} m between any two vehicles")
+        when = f", at {found.closest_s:.1f} s" if found.closest_s else ""
+        console.print(f"places   at least {found.closest_m:.2f} m between any two vehicles{when}")
+    if found.course is not None:
+        console.print(_course_text(found.course))
+    for motion in found.planned:
+        if motion.beyond:
+            console.print(_beyond_text(motion))
     console.print(plan_view({v.system_id: v.place_ne_m for v in found.vehicles}))
     columns: dict[str, Callable[[VehicleCheck], str]] = {
         "vehicle": lambda v: str(v.system_id),
@@ -145,52 +167,97 @@ def _print_check(design: "Design", found: "ScenarioCheck") -> None:
         )
 
 
+def _course_text(course: "CourseCheck") -> str:
+    length = "" if course.length_m is None else f"{course.length_m:,.0f} m in "
+    turns = f"{course.turns} change{'s' * (course.turns != 1)} of velocity"
+    most = f"at most {course.acceleration_max_m_s2:.2f} m/s² and {course.jerk_max_m_s3:.2f} m/s³"
+    return f"course   {length}{course.duration_s:.1f} s; {turns}, {most}"
+
+
+def _beyond_text(motion: "PlannedMotionCheck") -> str:
+    needs = ", ".join(f"{key} {getattr(motion, key):.2f}" for key in motion.beyond)
+    return f"limits   vehicle {motion.system_id} cannot fly the planned motion, which needs {needs}"
+
+
 def design(
-    scenario_file: ScenarioFile,
+    scenario_file: options.ScenarioFile,
     method: Annotated[
         Literal["inclusion", "graph-dk", "graph-lqr"] | None,
         typer.Option(help="design method; default as in the scenario"),
     ] = None,
-    loop: LoopOption = None,
-    allow_unstable: AllowUnstable = False,
-    as_json: AsJson = False,
+    loop: options.LoopOption = None,
+    links: options.LinksOption = None,
+    front: fronts.Front = False,
+    at: fronts.At = None,
+    maximise: fronts.Maximise = "alpha",
+    predict: fronts.Predict = None,
+    links_of: fronts.LinksOf = None,
+    compare_prediction: fronts.ComparePrediction = False,
+    picture: fronts.Picture = None,
+    save: fronts.Save = None,
+    allow_unstable: options.AllowUnstable = False,
+    allow_code: options.AllowCode = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Design the gains of a scenario.
 
     Shows the gains, their robustness and delay margins, and the trade-off between the two.
     """
     from gcs.drive.preflight import unstable_loop
+    from gcs.plan.criteria import with_bounds
+    from gcs.plan.disturbed import with_spread
     from gcs.plan.planner import flight_plan, with_trade_off
     from gcs.views.report import print_design
+    from scenarios.keys.own import NO_LAW
 
-    scenario = load_scenario(scenario_file, loop)
+    scenario = options.load_scenario(scenario_file, loop, links=links, allow_code=allow_code)
     if method is not None:
-        control = scenario.control.model_copy(update={"method": method, "gains": None, "blocks": ()})
+        control = scenario.control.model_copy(update={"method": method, "gains": None, "blocks": ()} | NO_LAW)
         scenario = scenario.model_copy(update={"control": control})
+    if sum((front, at is not None, links_of is not None)) > 1:
+        raise InputError("read several of --front, --at and --links-of, wanted one of them")
+    if front:
+        fronts.show_front(scenario, method, picture, as_json=as_json)
+        return
+    scenario = scenario if at is None else fronts.scenario_at(scenario, at, method, maximise, predict)
+    scenario, measured = chosen_for(scenario, links_of)
+    if save is not None:
+        fronts.save_scenario(scenario, save)
     result, plan = flight_plan(scenario)
+    if compare_prediction:
+        fronts.show_comparison(result, scenario.name, as_json=as_json)
+        return
+    result = with_link(result, measured)
     if (unstable := unstable_loop(plan)) is not None:
-        refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
-    answer(with_trade_off(result), print_design, as_json=as_json)
+        options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
+    found = with_bounds(with_spread(with_trade_off(result), plan), scenario)
+    options.answer(found, print_design, as_json=as_json)
 
 
 def margin(
     model_file: Annotated[
         Path,
         typer.Argument(
-            metavar="MODEL.json|SCENARIO.toml",
+            metavar="MODEL.json|FILE.mat|SCENARIO.toml",
             help="any linear loop with delays, or one sampled and held (docs/reference/margin.md), or a scenario",
         ),
     ],
-    as_json: AsJson = False,
+    allow_code: options.AllowCode = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Find how much delay a linear loop or a scenario tolerates.
 
     Shows the delays at which it is stable, the margin, and where roots cross the stability boundary.
     """
     from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario, print_margin
+    from scenarios.shipped import located
 
-    found = margin_of_scenario(model_file) if model_file.suffix == ".toml" else margin_of_file(model_file)
+    model_file = located(str(model_file))
+    if model_file.suffix == ".toml":
+        found = margin_of_scenario(model_file, allow_code=allow_code)
+    else:
+        found = margin_of_file(model_file)
     if as_json:
-        print_json(margin_fields(found))
+        options.print_json(margin_fields(found))
     else:
         print_margin(found)

@@ -4,34 +4,22 @@ The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
 """
 
 import contextlib
-import itertools
 import os
-from collections.abc import Callable, Generator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gcs.cli import FAILED
-from gcs.cli.options import (
-    AsJson,
-    LoopOption,
-    LoopPlace,
-    OutFolder,
-    ScenarioFile,
-    answer,
-    load_scenario,
-    out_file,
-    out_folder,
-    refuse,
-)
+from gcs.cli import FAILED, options
 from gcs.errors import InputError
 from gcs.interrupts import raised
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
     from gcs.plan.design import Design
+    from gcs.plan.flight_plan import FlightPlan
     from gcs.stress.axes import Axis
     from gcs.stress.campaign import Fly
     from gcs.stress.report import CampaignResult
@@ -39,10 +27,11 @@ if TYPE_CHECKING:
     from gcs.stress.trial import Outcome
 
 _AXIS = "FROM:TO:N"
+DISTURBANCE_FILE = "disturbance.json"
 
 
 def stress(
-    scenario_file: ScenarioFile,
+    scenario_file: options.ScenarioFile,
     delay: Annotated[str, typer.Option(metavar=_AXIS, help="link delay in s, up + down")] = "",
     delay_of: Annotated[
         list[str] | None, typer.Option(metavar=f"ID={_AXIS}", help="link delay in s of one vehicle; repeatable")
@@ -52,7 +41,11 @@ def stress(
     ] = "",
     loss: Annotated[str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way")] = "",
     rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
-    loop: LoopOption = None,
+    loop: options.LoopOption = None,
+    links: options.LinksOption = None,
+    disturbance: Annotated[
+        bool, typer.Option("--disturbance", help="raise the worst disturbance of the errors instead; needs --onset")
+    ] = False,
     onset: Annotated[bool, typer.Option("--onset", help="find the delay at which the formation breaks")] = False,
     tolerance: Annotated[
         float, typer.Option(metavar="FRACTION", help="how close to the onset the last flights are")
@@ -74,9 +67,10 @@ def stress(
         float | None,
         typer.Option(metavar="FRACTION", help="exit with code 1 if onset and margin differ by more; implies --onset"),
     ] = None,
+    allow_code: options.AllowCode = False,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="write JUnit XML for CI")] = None,
-    out: OutFolder = None,
-    as_json: AsJson = False,
+    out: options.OutFolder = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Raise the link delay until the formation breaks.
 
@@ -84,15 +78,18 @@ def stress(
     One of them makes a sweep, two make a map. The loop delay is the link delay plus the wait for the control tick. The
     measured onset is compared with the delay margin.
 
+    With --disturbance and --onset, the vehicles disturb themselves by w = D e, and the size of the worst D is raised at
+    one link delay: that of the scenario, or one --delay. The onset is compared with the stability radii.
+
     Exit code 1 if --assert-onset is missed, a trial failed, or a trial flown again differs.
     """
-    options = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
-    given = [(option, text) for option, texts in options.items() for text in texts or () if text]
+    texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
+    given = [(option, text) for option, texts in texts_of.items() for text in texts or () if text]
     onset = onset or assert_onset is not None
     if (trial or resume) and (out is None or not out.is_dir()):
         flag = "--trial" if trial else "--resume"
         raise InputError(f"--out: read {out}, wanted the folder of a campaign, which {flag} needs")
-    if not (trial or onset or given):
+    if not (trial or onset or given or disturbance):
         raise InputError("nothing to fly; wanted --onset, or an axis such as --delay 0:0.6:13")
     if len(given) > 2:
         raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
@@ -100,29 +97,42 @@ def stress(
         if value is not None and not 0.0 < value < 1.0:
             raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, such as 0.02")
     outlive_readers()
+    if disturbance:
+        others = {option: [text for text in texts or () if text] for option, texts in texts_of.items()}
+        others |= {"--resume": resume, "--trial": trial, "--dask": dask, "--real-time": real_time, "--junit": junit}
+        del others["--delay"]
+        if not onset or any(others.values()):
+            read = next((f"and {option}" for option, value in others.items() if value), "without --onset")
+            raise InputError(f"read --disturbance {read}, wanted --disturbance with --onset and at most one --delay")
+        study, _ = _study(scenario_file, loop, links, real_time=False, allow_code=allow_code)
+        _disturb(scenario_file, study.plan, delay, tolerance=tolerance, allowed=assert_onset, out=out, as_json=as_json)
     if junit is not None:
-        out_file("--junit", junit)
+        options.out_file("--junit", junit)
     from gcs.cli.stress_output import checks_of, print_reflown, print_result
     from gcs.drive.preflight import endless_link
     from gcs.stress.axes import parse_axis
-    from gcs.stress.campaign import dask_workers, local_workers
-    from gcs.stress.refly import refly
+    from gcs.stress.campaign import dask_workers, local_workers, refly
     from gcs.views.junit import write_junit
 
-    study, design = _study(scenario_file, loop, real_time=real_time)
+    study, design = _study(scenario_file, loop, links, real_time=real_time, allow_code=allow_code)
+    if assert_onset is not None and design.margin_unknown:
+        raise InputError(f"--assert-onset: read {assert_onset:g}, wanted no such option: the margin is unknown")
     if trial:
         assert out is not None
         reflown = refly(study, out, trial)
-        typer.echo(reflown.outcome.to_json()) if as_json else print_reflown(reflown)
+        options.print_json(reflown.outcome) if as_json else print_reflown(reflown)
         raise typer.Exit(FAILED if reflown.outcome.error is not None or reflown.differs else 0)
     axes = [parse_axis(option, text, study.plan.formation.system_ids) for option, text in given]
-    refuse(scenario_file, *(endless_link(one.scenario) for one in (study.sweep(axes, seeds=1) if axes else [])))
+    options.refuse(scenario_file, *(endless_link(one.scenario) for one in (study.sweep(axes, seeds=1) if axes else [])))
+    # flights in real time disturb each other: one at a time unless the user knows better
+    at_once = workers or (1 if real_time else len(os.sched_getaffinity(0)))
+    if axes and not (as_json or dask):
+        _say_how_long(study, axes, seeds, at_once)
     result, folder = _campaign(
         study,
         design,
         axes,
-        # flights in real time disturb each other: one at a time unless the user knows better
-        dask_workers(dask) if dask else local_workers(workers or (1 if real_time else len(os.sched_getaffinity(0)))),
+        dask_workers(dask) if dask else local_workers(at_once),
         out,
         resume=resume,
         seeds=seeds,
@@ -132,16 +142,18 @@ def stress(
     )
     if junit is not None:
         write_junit(junit, f"gcs stress {result.scenario}", checks_of(result), time_s=result.flight_time_s)
-    answer(result, partial(print_result, folder=folder), as_json=as_json)
+    options.answer(result, partial(print_result, folder=folder), as_json=as_json)
     raise typer.Exit(0 if result.passed else FAILED)
 
 
-def _study(file: Path, loop: LoopPlace | None, *, real_time: bool) -> "tuple[Study, Design]":
+def _study(
+    file: Path, loop: options.LoopPlace | None, links: str | None, *, real_time: bool, allow_code: bool
+) -> "tuple[Study, Design]":
     from gcs.drive.preflight import bad_start, unstable_loop
     from gcs.plan.planner import flight_plan
     from gcs.stress.study import Study
 
-    scenario = load_scenario(file, loop)
+    scenario = options.load_scenario(file, loop, links=links, allow_code=allow_code)
     if scenario.dynamics == "autopilot":
         wanted = "double_integrator: gcs stress flies no vehicles that have to take off"
         raise InputError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
@@ -149,10 +161,59 @@ def _study(file: Path, loop: LoopPlace | None, *, real_time: bool) -> "tuple[Stu
         wanted = "off, or a number of seconds: gcs stress tests an assumed delay that is fixed"
         raise InputError(f"{file}: control.prediction: read 'measured', wanted {wanted}")
     # a campaign does not fly the slower gains of the schedule, so they need not be designed
-    refuse(file, bad_start(scenario))
+    options.refuse(file, bad_start(scenario))
     design, plan = flight_plan(scenario.with_calm_monitor())
-    refuse(file, unstable_loop(plan))
+    options.refuse(file, unstable_loop(plan))
     return Study(plan, real_time=real_time), design
+
+
+def _say_how_long(study: "Study", axes: "list[Axis]", seeds: int, workers: int) -> None:
+    """Say how many flights a sweep has and how long they will take, by the speed of one second of such a flight."""
+    from gcs.stress.free_response import PROBE_S
+    from gcs.studies.benchmark import benchmark
+
+    scenario, trials = study.plan.scenario, study.sweep(axes, seeds=seeds)
+    flown_s = sum(PROBE_S if trial.kind == "probe" else scenario.duration_s for trial in trials)
+    factor = 1.0 if study.real_time else benchmark(scenario, seconds=1.0, repeat=1).real_time_factor
+    expected = _duration_text(flown_s / factor / workers)
+    typer.echo(f"flights  {len(trials)}, {flown_s:.0f} s in all: about {expected} with {workers} at a time", err=True)
+
+
+def _disturb(
+    file: Path,
+    plan: "FlightPlan",
+    delay: str,
+    *,
+    tolerance: float,
+    allowed: float | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Find the disturbances that break the formation, at the link delay of the scenario or of --delay, and exit."""
+    from gcs.cli.stress_output import print_disturbances
+    from gcs.runs.record import write_whole
+    from gcs.stress.axes import at_coordinates, parse_axis
+    from gcs.stress.disturbance import find_disturbance_onsets, refusal
+
+    delays_s = parse_axis("--delay", delay).values if delay else ()
+    if len(delays_s) > 1:
+        raise InputError(f"--delay: read {len(delays_s)} values, wanted one with --disturbance")
+    if plan.scenario.code:
+        raise InputError(f"{file}: read code, wanted gains and double integrators: the radii are theirs")
+    for delay_s in delays_s:
+        plan = replace(plan, scenario=at_coordinates(plan.scenario, {"delay": delay_s}))
+    options.refuse(file, refusal(plan.scenario))
+    folder = None if out is None else options.out_folder(out, "a new or empty folder")
+
+    def ended() -> None:
+        if not as_json and typer.get_text_stream("stderr").isatty():
+            typer.echo(".", err=True, nl=False)
+
+    result = find_disturbance_onsets(plan, tolerance=tolerance, allowed=allowed, ended=ended)
+    if folder is not None:
+        write_whole(folder / DISTURBANCE_FILE, result.to_json().encode())
+    options.answer(result, print_disturbances, as_json=as_json)
+    raise typer.Exit(FAILED if result.failure else 0)
 
 
 def _campaign(
@@ -174,7 +235,9 @@ def _campaign(
     from gcs.stress.campaign import Store, check_campaign, run_campaign, write_table
     from gcs.stress.report import result_of, write_report
     from gcs.stress.study import NoOnset, find_onset
+    from gcs.views.console import progress
     from scenarios.files import dump
+    from scenarios.own_code import write_code
 
     scenario = dump(study.plan.scenario)
     if resume:
@@ -188,16 +251,17 @@ def _campaign(
         if out is None:
             folder = new_folder(f"{study.plan.scenario.name}-stress")
         else:
-            folder = out if resume else out_folder(out, "a new or empty folder, or --resume")
+            folder = out if resume else options.out_folder(out, "a new or empty folder, or --resume")
         write_whole(folder / SCENARIO_FILE, scenario.encode())
+        write_code(study.plan.scenario, folder)
         store = stack.enter_context(contextlib.closing(Store(folder)))
-        progress = stack.enter_context(_progress(shown))
+        begin = stack.enter_context(progress(shown=shown))
         try:
             if axes:
                 trials = study.sweep(axes, seeds=seeds)
-                sweep = run_campaign(trials, store, fly, ended=progress("flights", len(trials)))
+                sweep = run_campaign(trials, store, fly, ended=begin("flights"))
             if tolerance is not None:
-                run = partial(run_campaign, store=store, fly=fly, ended=progress("onset", None))
+                run = partial(run_campaign, store=store, fly=fly, ended=begin("onset"))
                 onset = find_onset(study, run, tolerance=tolerance)
                 if study.window_s[0] > 0.0:
                     onset_shorter = find_onset(study, run, tolerance=tolerance, shorter=True)
@@ -211,36 +275,19 @@ def _campaign(
     result = result_of(
         study, design, outcomes, axes=axes, sweep=sweep, onset=onset, onset_shorter=onset_shorter, allowed=allowed
     )
-    write_report(folder, result, study=study, axes=axes)
+    if why := write_report(folder, result, study=study, axes=axes):
+        typer.echo(f"no figures: {why}", err=True)
     return result, folder
 
 
-@contextlib.contextmanager
-def _progress(shown: bool) -> "Generator[Callable[[str, int | None], Callable[[Outcome, int], None]]]":
-    """While entered, provides a function (name, total or None) -> callback that advances a progress bar."""
-    from rich import progress
+def _duration_text(seconds: float) -> str:
+    """A rough duration in words: about 20 s, 3 min, 2 h.
 
-    from gcs.views.console import plain_console
-
-    console = plain_console(stderr=True, soft_wrap=False)
-    columns = (
-        progress.TextColumn("{task.description}", markup=False),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TimeElapsedColumn(),
-        progress.TextColumn("left"),
-        progress.TimeRemainingColumn(),
-    )
-    with progress.Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as bar:
-
-        def begin(name: str, total: int | None) -> Any:
-            task = bar.add_task(name, total=total)
-            begun = itertools.count(1)
-
-            def ended(_: "Outcome", left: int) -> None:
-                done = next(begun) if total is None else total - left
-                bar.update(task, completed=done, total=done + left)
-
-            return ended
-
-        yield begin
+    >>> _duration_text(0.4), _duration_text(23.4), _duration_text(200.0), _duration_text(9000.0)
+    ('a second', '23 s', '3 min', '2.5 h')
+    """
+    if seconds < 1.5:
+        return "a second"
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 5400.0 else f"{seconds / 3600.0:.2g} h"

@@ -8,8 +8,10 @@ from rich.console import Console
 from rich.text import Text
 
 from gcs.stress.axes import place_text
-from gcs.stress.refly import Reflown
+from gcs.stress.campaign import Reflown
+from gcs.stress.disturbance import DisturbanceOnset, DisturbanceResult
 from gcs.stress.report import MOST_ROWS, REPORT_FILE, RESULT_FILE, CampaignResult, Noise, refly_command
+from gcs.stress.study import Onset
 from gcs.stress.trial import Outcome
 from gcs.views.console import UNKNOWN, ms_text, plain_console, table_of
 from gcs.views.console import number_text as _number
@@ -22,22 +24,28 @@ _ID = 8
 _KINDS = {"probe": "probes with small errors", "own": "flights from the scenario's initial states"}
 
 
-def print_result(result: CampaignResult, folder: Path) -> None:
-    """Print the onset beside the margin, the points of the sweep, and where the files are."""
+def _wide_console() -> Console:
+    """A console; in a file, where no terminal is narrow, it is wide."""
     console = plain_console()
     if not console.is_terminal:
         console.width = _FILE_WIDTH
+    return console
+
+
+def print_result(result: CampaignResult, folder: Path) -> None:
+    """Print the onset beside the margin, the points of the sweep, and where the files are."""
+    console = _wide_console()
     margin_s, points = result.delay_margin_s, result.points
-    console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
+    if result.gains.margin_unknown:
+        console.print(f"margin   unknown: {result.gains.margin_unknown}")
+    else:
+        console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
     kinds = ", ".join(f"{count} {_KINDS[kind]}" for kind, count in sorted(result.trials_of_kind.items(), reverse=True))
     console.print(f"trials   {result.trials}: {kinds}")
     for onset in (found for found in (result.onset, result.onset_shorter) if found is not None):
         breaks = "" if onset.frequency_rad_s is None else f"; breaks at {onset.frequency_rad_s:.2f} rad/s"
-        console.print(
-            f"onset    {_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms in flight, "
-            f"{onset.difference:+.3%} from the {_limit(result)} of this loop, {_ms(onset.predicted_s)}; "
-            f"continuous model less half a period for the hold: {_ms(onset.predicted_continuous_s)}"
-        )
+        found = f"{_ms(onset.loop_delay_s)} ± {1e3 * onset.error_s:.2f} ms in flight"
+        console.print(f"onset    {found}{_against(result, onset)}")
         console.print(
             f"         {_ms(onset.link_delay_s)} of link delay, up + down: vehicle {onset.critical} waits "
             f"{_ms(onset.waiting_s)} for the control tick{breaks}"
@@ -57,12 +65,23 @@ def print_result(result: CampaignResult, folder: Path) -> None:
     if points := [point for point in points if point.kind == "probe"] or points:
         console.print(table_of(points[:MOST_ROWS], _columns(list(points[0].coordinates)), dense=True))
     for failed in result.trials_failed:
-        console.print(f"failed   {failed.id}, seed {failed.seed}, {place_text(failed.coordinates)}: {_fault(failed)}")
+        fault = (failed.error or "").strip().splitlines()[-1]
+        console.print(f"failed   {failed.id}, seed {failed.seed}, {place_text(failed.coordinates)}: {fault}")
     console.print(f"files    {folder}: {REPORT_FILE}, {RESULT_FILE}, trials.jsonl, trials.parquet")
     if result.worst:
         console.print(f"again    {refly_command(folder, result.worst[0])}")
     if result.failure:
         console.print(Text.assemble(("failed", "bold red"), f"   {result.failure}"))
+
+
+def _against(result: CampaignResult, onset: Onset) -> str:
+    """How far an onset is from what was computed, as far as anything was."""
+    if onset.difference is None:
+        return ", with no margin to compare it with"
+    text = f", {onset.difference:+.3%} from the {_limit(result)} of this loop, {_ms(onset.predicted_s)}"
+    if onset.predicted_continuous_s is None:
+        return text
+    return f"{text}; continuous model less half a period for the hold: {_ms(onset.predicted_continuous_s)}"
 
 
 def _limit(result: CampaignResult) -> str:
@@ -123,6 +142,21 @@ def checks_of(result: CampaignResult) -> list[Check]:
     return [agrees, *(Check(f"trial {outcome.id}", error=outcome.error or "") for outcome in result.trials_failed)]
 
 
-def _fault(outcome: Outcome) -> str:
-    """The last line of a failed trial's traceback."""
-    return (outcome.error or "").strip().splitlines()[-1]
+def print_disturbances(result: DisturbanceResult) -> None:
+    """Print the onsets of disturbances beside the stability radii."""
+    console = _wide_console()
+    columns: dict[str, Callable[[DisturbanceOnset], str]] = {
+        "errors of": lambda o: "one follower" if len(o.vehicles) == 2 else "all vehicles",
+        "disturbance": lambda o: o.kind,
+        "radius, 1/s": lambda o: _number(o.radius_1_s, ".5f"),
+        "at, rad/s": lambda o: f"{o.frequency_rad_s:.2f}",
+        "onset flown, 1/s": lambda o: _number(o.onset_1_s, ".5f"),
+        "±": lambda o: _number(o.error_1_s, "0.1g"),
+        "apart": lambda o: UNKNOWN if o.difference is None else f"{o.difference:+.3%}",
+        "flights": lambda o: str(o.flights),
+    }
+    title = f"disturbances that break {result.scenario} at {ms_text(result.loop_delay_s)} of loop delay"
+    console.print(table_of(result.onsets, columns, title=title))
+    console.print("dynamic: any stable filter, alpha is its radius; constant: a matrix, the same north and east")
+    if result.failure:
+        console.print(f"failed   {result.failure}")

@@ -1,20 +1,24 @@
 """`gcs compare`, `thesis`, `bench` and `capacity`; what they print is in `gcs.cli.study_output`."""
 
+import contextlib
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from gcs.cli import FAILED
-from gcs.cli.options import AsJson, OutFolder, ScenarioFile, answer, load_scenario, print_json, refuse, run_folder
+from gcs.cli import FAILED, options
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
+_SLOWEST_HZ, _FASTEST_HZ = 1.0, 500.0
+"""Bounds of `rates.control_hz`."""
+
 
 def compare(
-    scenario_file: ScenarioFile,
-    out: OutFolder = None,
+    scenario_file: options.ScenarioFile,
+    out: options.OutFolder = None,
     sizes: Annotated[bool, typer.Option(help="also time the designs of longer and longer chains")] = True,
-    as_json: AsJson = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Design and fly a scenario by every method, side by side.
 
@@ -24,16 +28,18 @@ def compare(
     from gcs.drive.preflight import bad_start, endless_link
     from gcs.studies import compare as comparing
     from gcs.studies.compare_cost import design_costs
+    from gcs.views.console import progress
 
     outlive_readers()
-    scenario = load_scenario(scenario_file)
-    refuse(scenario_file, bad_start(scenario), endless_link(scenario))
-    folder = run_folder(out, f"{scenario.name}-compare")
-    routes, flights = comparing.compare(scenario)
-    grown = design_costs() if sizes else []
+    scenario = options.load_scenario(scenario_file, allow_code="a scenario without code: gcs compare designs gains")
+    options.refuse(scenario_file, bad_start(scenario), endless_link(scenario))
+    folder = options.run_folder(out, f"{scenario.name}-compare")
+    with progress(shown=not as_json) as begin:
+        routes, flights = comparing.compare(scenario, ended=begin("methods"))
+        grown = design_costs(begin("longer chains")) if sizes else []
     comparing.write_comparison(folder, scenario, routes, flights, grown)
     if as_json:
-        print_json({"routes": routes, "files": str(folder)})
+        options.print_json({"routes": routes, "files": str(folder)})
     else:
         print_comparison(scenario, routes, grown)
         typer.echo(f"files    {folder}: {comparing.REPORT_FILE}, {comparing.RESULT_FILE}, PNG")
@@ -41,17 +47,19 @@ def compare(
 
 
 def thesis(
-    out: OutFolder = None,
-    as_json: AsJson = False,
+    out: options.OutFolder = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Reproduce the thesis: published and computed figures side by side."""
     from gcs.studies import thesis as source
+    from gcs.views.console import progress
 
-    folder = run_folder(out, "thesis")
-    found = source.claims()
-    page = source.write_page(folder, found)
+    folder = options.run_folder(out, "thesis")
+    with progress(shown=not as_json) as begin:
+        found = source.claims(begin("parts"))
+        page = source.write_page(folder, found)
     if as_json:
-        print_json(found)
+        options.print_json({"claims": found})
         return
     for claim in found:
         typer.echo(f"{claim.place}  {claim.subject}: {claim.verdict}")
@@ -60,7 +68,7 @@ def thesis(
 
 
 def bench(
-    scenario_file: ScenarioFile,
+    scenario_file: options.ScenarioFile,
     vehicles: Annotated[
         int, typer.Option(metavar="N", min=0, max=250, help="number of vehicles, in columns behind a leader")
     ] = 0,
@@ -71,7 +79,8 @@ def bench(
         typer.Option("--real-time", help="fly once over UDP; shows punctuality and the errors of measured latencies"),
     ] = False,
     signed: Annotated[bool, typer.Option("--signed", help="also measure what signing costs")] = False,
-    as_json: AsJson = False,
+    allow_code: options.AllowCode = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Measure how much faster than real time flights are computed.
 
@@ -81,37 +90,60 @@ def bench(
     from gcs.drive.preflight import bad_start, endless_link
     from gcs.studies import benchmark
 
-    scenario = load_scenario(scenario_file)
+    scenario = options.load_scenario(scenario_file, allow_code=allow_code)
     if vehicles:
         scenario = benchmark.with_vehicles(scenario, vehicles)
-    refuse(scenario_file, bad_start(scenario), endless_link(scenario))
+    options.refuse(scenario_file, bad_start(scenario), endless_link(scenario))
     if real_time:
-        answer(benchmark.benchmark_real_time(scenario, seconds=seconds), print_real_time, as_json=as_json)
+        options.answer(benchmark.benchmark_real_time(scenario, seconds=seconds), print_real_time, as_json=as_json)
     else:
         result = benchmark.benchmark(scenario, seconds=seconds, repeat=repeat, signed=signed)
-        answer(result, print_benchmark, as_json=as_json)
+        options.answer(result, print_benchmark, as_json=as_json)
 
 
 def capacity(
-    scenario_file: ScenarioFile,
+    scenario_file: options.ScenarioFile,
     rates: Annotated[str, typer.Option(metavar="HZ,HZ,...", help="telemetry and control rates")] = "2,5,10,20",
     most: Annotated[int, typer.Option(metavar="N", min=2, max=250, help="largest formation tried")] = 100,
     seeds: Annotated[
         int, typer.Option(metavar="N", min=1, help="flights of each formation, all of which must succeed")
     ] = 3,
-    as_json: AsJson = False,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="store flights in this new or empty folder")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="resume the study in --out")] = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Find how many vehicles the links carry at each rate.
 
     The links carry a formation if its loop delay stays within the delay margin.
     """
     from gcs.cli.study_output import print_capacity
+    from gcs.studies.capacity import LoadStore
     from gcs.studies.capacity import capacity as capacity_of
+    from gcs.views.console import progress
 
-    scenario = load_scenario(scenario_file)
-    found = capacity_of(scenario, rates_hz=_rates(rates), most=most, seeds=seeds)
+    if resume and (out is None or not out.is_dir()):
+        raise InputError(f"--out: read {out}, wanted the folder of a study, which --resume needs")
+    rates_hz = _rates(rates)
+    wanted = "a scenario without code: gcs capacity changes its formation"
+    scenario = options.load_scenario(scenario_file, allow_code=wanted)
+    with contextlib.ExitStack() as stack:
+        store = None
+        if out is not None:
+            folder = out if resume else options.out_folder(out, "a new or empty folder, or --resume")
+            store = stack.enter_context(contextlib.closing(LoadStore(folder, scenario, resume=resume)))
+        begin = stack.enter_context(progress(shown=not as_json))
+        found = capacity_of(
+            scenario,
+            rates_hz=rates_hz,
+            most=most,
+            seeds=seeds,
+            fly=None if store is None else store.fly,
+            ended=begin("formations, at most"),
+        )
+        if store is not None:
+            store.write_result(found)
     if as_json:
-        print_json({"capacities": found})
+        options.print_json({"capacities": found})
     else:
         print_capacity(scenario, found)
 
@@ -121,6 +153,7 @@ def _rates(text: str) -> list[float]:
         rates = [float(part) for part in text.split(",")]
     except ValueError:
         rates = []
-    if not rates or not all(0.1 <= rate <= 1000.0 for rate in rates):
-        raise InputError(f"--rates: {text}, wanted numbers from 0.1 to 1000 separated by commas, such as 2,5,10")
+    if not rates or not all(_SLOWEST_HZ <= rate <= _FASTEST_HZ for rate in rates):
+        wanted = f"numbers from {_SLOWEST_HZ:g} to {_FASTEST_HZ:g} separated by commas, such as 2,5,10"
+        raise InputError(f"--rates: read {text}, wanted {wanted}")
     return rates

@@ -56,11 +56,6 @@ def _ms(seconds: float | None) -> str:
     return ms_text(seconds, ".0f", unit="")
 
 
-def _outcome(load: Load) -> str:
-    gone = load.headroom_p01 is None or load.headroom_p01 <= 0.0
-    return "holds" if load.holds else "margin gone" if gone else load.reason
-
-
 _LOAD_COLUMNS: dict[str, Callable[[Load], str]] = {
     "Hz": lambda load: f"{load.rate_hz:g}",
     "UAVs": lambda load: str(load.vehicles),
@@ -68,7 +63,7 @@ _LOAD_COLUMNS: dict[str, Callable[[Load], str]] = {
     "margin\nms": lambda load: _ms(load.delay_margin_s),
     "byte/s": lambda load: f"{load.station_bytes_s:.0f}",
     "lost, %\nup  down": lambda load: f"{100.0 * load.lost_up:.1f}  {100.0 * load.lost_down:4.1f}",
-    "": _outcome,
+    "": lambda load: "holds" if load.holds else load.reason,
 }
 
 

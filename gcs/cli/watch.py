@@ -7,16 +7,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gcs.cli import FAILED, INTERRUPTED
-from gcs.cli.options import AsJson, KeyFile, answer, listening, load_scenario, opened_guard, print_json
+from gcs.cli import FAILED, INTERRUPTED, options
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
     from gcs.plan.design import Design
     from gcs.watch.rebuild_report import RebuildReport
+    from gcs.watch.saved_links import LinkRecorder
 
-_TIMESYNC_HZ = 10.0
+_TIMESYNC_HZ = _POSITION_HZ = 10.0
+SavedLinks = Annotated[
+    Path | None,
+    typer.Option("--save-links", metavar="FILE.toml", help="write the links as a profile that scenarios can name"),
+]
 ComparedMargin = Annotated[
     float | None, typer.Option("--margin", metavar="SECONDS", help="compare with this delay margin", min=0.0)
 ]
@@ -34,12 +38,16 @@ def monitor(
     design: Annotated[
         Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margin of a run's design.json")
     ] = None,
-    key: KeyFile = None,
+    key: options.KeyFile = None,
+    request: Annotated[
+        bool, typer.Option("--request", help="ask vehicles that send no position for it, with SET_MESSAGE_INTERVAL")
+    ] = False,
     silent: Annotated[bool, typer.Option("--silent", help="send nothing; delays may then be lower bounds")] = False,
     seconds: Annotated[float, typer.Option("--for", metavar="SECONDS", help="stop after this time", min=0.1)] = float(
         "inf"
     ),
-    as_json: AsJson = False,
+    save_links: SavedLinks = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Watch latencies against a margin, commanding nothing.
 
@@ -47,15 +55,24 @@ def monitor(
     sends no heartbeat. With --silent it sends nothing and uses the exchanges of a station on the same stream. Without
     any exchange, delays are measured against the fastest frames, which makes them lower bounds.
 
+    An ArduPilot sends no position until it is asked. --request asks each vehicle for LOCAL_POSITION_NED, at the
+    telemetry rate of the scenario or 10 a second; a vehicle that obeys another station may refuse.
+
     Exit code 1 if an expected vehicle was never heard, if none was heard, or if a loop delay (p99) exceeded the margin.
     """
+    if request and silent:
+        raise InputError("read --request and --silent, wanted one of them")
     given, margin_of = _given(margin, design)
+    if save_links is not None:
+        options.out_file("--save-links", save_links)
     if (
         sys.stdout.isatty()
     ):  # a closed terminal sends a signal; a reader that closes its pipe must still end the command
         outlive_readers()
-    with listening("--listen", listen, opened_guard(key, role="monitor")) as link:
-        scenario = None if scenario_file is None else load_scenario(scenario_file)
+    with options.listening("--listen", listen, options.opened_guard(key, role="monitor")) as link:
+        # the formation is all that is needed of a scenario whose margin is given
+        code_allowed = "a margin (--margin or --design), with which no code is run" if given is None else True
+        scenario = None if scenario_file is None else options.load_scenario(scenario_file, allow_code=code_allowed)
         if scenario is not None and given is None:
             from gcs.plan.planner import flight_plan
 
@@ -64,9 +81,12 @@ def monitor(
         from gcs.interrupts import stop_signals
         from gcs.watch.links import Watch
         from gcs.watch.live import watch_links
+        from gcs.watch.saved_links import LinkRecorder
 
         asked_hz = scenario.rates.timesync_hz if scenario else _TIMESYNC_HZ
+        position_hz = scenario.rates.telemetry_hz if scenario else _POSITION_HZ
         watch = Watch(vehicle.system_id for vehicle in scenario.vehicles) if scenario else Watch()
+        recorder = LinkRecorder(watch) if save_links is not None else None
         with stop_signals() as stop_reason:
             report = watch_links(
                 link,
@@ -75,18 +95,22 @@ def monitor(
                 margin_s=None if given is None else given.delay_margin_s,
                 margin_of=margin_of,
                 timesync_hz=0.0 if silent else asked_hz,
+                position_hz=position_hz if request else 0.0,
                 seconds=seconds,
                 shown=not as_json,
+                recorder=recorder,
             )
             interrupted = bool(stop_reason())
     if as_json:
-        print_json(report)
+        options.print_json(report)
     else:
         from gcs.views.console import plain_console
         from gcs.watch.table import render
 
         console = plain_console(soft_wrap=False)
         console.print(render(report, width=console.width))
+    if save_links is not None and recorder is not None:
+        _save(save_links, recorder, f"gcs monitor at {listen}", shown=not as_json)
     bad = {"not heard", "past the margin"} & {vehicle.status for vehicle in report.vehicles}
     raise typer.Exit(INTERRUPTED if interrupted else FAILED if bad or not report.vehicles else 0)
 
@@ -100,7 +124,8 @@ def replay(
     design: Annotated[
         Path | None, typer.Option(metavar="DESIGN.json", help="compare with the margins of this design")
     ] = None,
-    as_json: AsJson = False,
+    save_links: SavedLinks = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Rebuild latencies, errors and margins from a telemetry log.
 
@@ -112,17 +137,35 @@ def replay(
     from gcs.watch.rebuild_report import found, rebuild_report
     from gcs.watch.tlog import read_tlog
 
+    if save_links is not None:
+        options.out_file("--save-links", save_links)
     there = found(run)
     log = read_tlog(there.log_file)
     if scenario_file is not None:
-        there = replace(there, scenario=load_scenario(scenario_file), design=None, recorded=None)
+        code_allowed = "a margin (--margin or --design), with which no code is run" if given is None else True
+        scenario = options.load_scenario(scenario_file, allow_code=code_allowed)
+        there = replace(there, scenario=scenario, design=None, recorded=None)
     if given is not None:
         there = replace(there, design=given)
     elif there.design is None and there.scenario is not None:
         from gcs.plan.planner import flight_plan
 
         there = replace(there, design=flight_plan(there.scenario)[0])
-    answer(rebuild_report(log, there), _print_rebuilt, as_json=as_json)
+    options.answer(rebuild_report(log, there), _print_rebuilt, as_json=as_json)
+    if save_links is not None:
+        from gcs.watch.saved_links import recorded
+
+        _save(save_links, recorded(log.frames), f"gcs replay of {there.log_file.name}", shown=not as_json)
+
+
+def _save(file: Path, recorder: "LinkRecorder", source: str, *, shown: bool) -> None:
+    """Write the links seen as a profile, and say what they are like."""
+    from gcs.watch.saved_links import describe, save
+
+    profile = recorder.profile(source)
+    save(profile, file)
+    if shown:
+        typer.echo("\n".join([*describe(profile), f"links    {file}"]))
 
 
 def _print_rebuilt(report: "RebuildReport") -> None:

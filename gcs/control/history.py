@@ -4,6 +4,7 @@ Scalars and plain tuples: for single reports numpy would be ten times slower.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Protocol
 
 State = tuple[float, float, float, float]
@@ -20,6 +21,14 @@ class States(Protocol):
 
     def at(self, vehicle: int, time_ns: int) -> State | None:
         """The state of a vehicle at an instant; None if it has reported nothing."""
+        ...
+
+
+class Reports(States, Protocol):
+    """What vehicles reported, and where they are at any instant."""
+
+    def newest(self, vehicle: int) -> Report | None:
+        """The newest report of a vehicle; None if it has reported nothing."""
         ...
 
 
@@ -40,6 +49,12 @@ class StateHistory:
     def forget(self, vehicle: int) -> None:
         """Drop what a vehicle reported, for example after its clock has jumped."""
         self._reports[vehicle].clear()
+
+    def of(self, vehicles: Sequence[int]) -> "StateHistory":
+        """The same reports of some of the vehicles, which are counted anew."""
+        some = StateHistory(0)
+        some._reports = [self._reports[vehicle] for vehicle in vehicles]
+        return some
 
     @property
     def complete(self) -> bool:

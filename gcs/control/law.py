@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
-from gcs.control.history import Report, State, StateHistory, States
+from gcs.control.history import Report, Reports, State, States
 from gcs.plan.formation import Formation
 
 Gain = tuple[float, float, float, float, float, float, float, float]
@@ -125,7 +125,7 @@ _UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan,
 
 
 def formation_control(
-    history: StateHistory,
+    history: Reports,
     law: FeedbackLaw,
     blends: Sequence[Blend],
     *,
@@ -199,10 +199,11 @@ def _blended(new: Gain, old: Gain, share: float) -> Gain:
     return a, b, c, d, e, f, g, h
 
 
-def distances_m(controls: Sequence[VehicleControl], now_ns: int) -> FloatArray:
+def distances_m(controls: Sequence[VehicleControl], now_ns: int, down_m: Sequence[float] | None = None) -> FloatArray:
     """Distances (n, n) between vehicles in m, NaN where unknown and to itself.
 
-    Positions are brought to `now_ns` along the reported velocities.
+    Positions are brought to `now_ns` along the reported velocities. `down_m` are the vehicles' altitudes, if they fly
+    at different ones; the distances are horizontal without it.
     """
     positions: list[complex] = []
     for sample_ns, (north, east, v_north, v_east), *_ in controls:
@@ -212,5 +213,8 @@ def distances_m(controls: Sequence[VehicleControl], now_ns: int) -> FloatArray:
     away = position[:, None] - position
     to_north, to_east = away.real, away.imag
     distance = np.sqrt(to_north * to_north + to_east * to_east)  # not abs(away), which rounds as each processor can
+    if down_m is not None:
+        below = np.array(down_m)
+        distance = np.sqrt(distance * distance + np.square(below[:, None] - below))
     distance.flat[:: len(positions) + 1] = nan  # to itself
     return distance

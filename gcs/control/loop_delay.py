@@ -15,9 +15,10 @@ command computed from it acts:
 * With the loop on the ground the state is the vehicle's newest. With loops on board it is the oldest among the newest
   states that the streamed command needs (`VehicleControl.used_ns`).
 
-Error: up and down depend on the estimated offset of the vehicle's clock. Their sum is wrong by at most `sample_bound_s`
-+ `down_bound_s` of the tick record, plus the millisecond in which `time_boot_ms` counts. If both use the same offset,
-its error cancels: it lengthens one by as much as it shortens the other.
+Error: up and down depend on the estimated offset of the vehicle's clock, and each may be wrong by `sample_bound_s` and
+`down_bound_s` of the tick record. If both use the same offset, its error cancels: it lengthens one by as much as it
+shortens the other. What remains is `loop_delay_bound_s`: the millisecond in which `time_boot_ms` counts, the error of
+the stamps in TIMESYNC replies, and what the estimate changed between the two.
 """
 
 from math import ceil, nan
@@ -37,8 +38,8 @@ def loop_delay_s(used_ns: int, sent_ns: int, down_s: float, repeated_s: float = 
 
 
 def headroom(delay_s: float, delay_margin_s: float) -> float:
-    """1 - loop delay / margin; NaN while the loop delay is unknown, minus infinity if the margin is 0."""
-    return 1.0 - delay_s / delay_margin_s if delay_margin_s > 0 else float("-inf")
+    """1 - loop delay / margin; NaN while one of them is unknown, minus infinity if the margin is 0."""
+    return float("-inf") if delay_margin_s <= 0 else 1.0 - delay_s / delay_margin_s
 
 
 class Repetitions:

@@ -1,24 +1,36 @@
 """Where the loop around each vehicle is closed, which decides what the station computes, uploads and sends.
 
-`loop_of` chooses once; nothing else in the station asks for the scenario's `loop`. With the loop on board, a vehicle
-feeds back its own errors and the station streams the rest: K_ij e_j of the other vehicles. All errors streamed to a
-vehicle are taken at one instant, that of the oldest among the newest states it needs. Nothing is extrapolated, and the
-loop delay counts from that instant.
+`gcs.control.manoeuvring.loop_of` chooses once; nothing else in the station asks for the scenario's `loop`. With the
+loop on board, a vehicle feeds back its own errors and the station streams the rest: K_ij e_j of the other vehicles. All
+errors streamed to a vehicle are taken at one instant, that of the oldest among the newest states it needs. Nothing is
+extrapolated, and the loop delay counts from that instant.
 """
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 from gains.sampled.onboard import own_part
-from gcs.control.history import StateHistory
+from gcs.control.history import Reports
 from gcs.control.law import Blend, FeedbackLaw, VehicleControl, VehicleLaw, command_at, feedback_law, formation_control
-from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates
+from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates, Sent
+from gcs.control.responding import RespondingHistory
 from gcs.link import mavlink
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.onboard import own_parameters
 from scenarios.schema import NS_PER_S
 
 Vector = tuple[float, float]
+
+
+class Moment(NamedTuple):
+    """What all vehicles have in common at a control tick."""
+
+    due_ns: int
+    time_s: float
+    """Scenario time."""
+    nominal_velocity_m_s: Vector
+    opening: float = 1.0
+    """Factor on the formation's spacing."""
 
 
 class Order(NamedTuple):
@@ -40,20 +52,8 @@ class Loop(Protocol):
         """The station's share of each vehicle's command, with lost vehicles left out."""
         ...
 
-    def control(
-        self,
-        history: StateHistory,
-        law: FeedbackLaw,
-        blends: Sequence[Blend],
-        *,
-        due_ns: int,
-        nominal_velocity_m_s: Vector,
-        opening: float = 1.0,
-    ) -> list[VehicleControl]:
-        """Errors of every vehicle at the tick that is due, and the acceleration it is sent.
-
-        As `gcs.control.law.formation_control`.
-        """
+    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+        """Errors of every vehicle at a tick, and the acceleration it is sent: see `law.formation_control`."""
         ...
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
@@ -64,13 +64,17 @@ class Loop(Protocol):
         """Fields of the set-point that carries a command."""
         ...
 
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+        """Take in the acceleration that a vehicle is sent."""
+        ...
+
     def parameters(self, system_id: int) -> dict[str, float]:
         """The parameters that a vehicle must hold before it is armed."""
         ...
 
 
-def loop_of(plan: FlightPlan) -> Loop:
-    """The loop that a plan is made for."""
+def steady_loop(plan: FlightPlan) -> Loop:
+    """The loop of a formation that keeps its shape and whose nominal velocity changes in steps."""
     control = plan.scenario.control
     if control.loop == "onboard":
         return StreamedLoop(plan)
@@ -86,21 +90,16 @@ class GroundLoop:
     def law(self, lost: Sequence[bool]) -> FeedbackLaw:
         return feedback_law(self._plan.formation, _gains(self._plan, lost), lost)
 
-    def control(
-        self,
-        history: StateHistory,
-        law: FeedbackLaw,
-        blends: Sequence[Blend],
-        *,
-        due_ns: int,
-        nominal_velocity_m_s: Vector,
-        opening: float = 1.0,
-    ) -> list[VehicleControl]:
-        del due_ns
-        return formation_control(history, law, blends, nominal_velocity_m_s=nominal_velocity_m_s, opening=opening)
+    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+        return formation_control(
+            history, law, blends, nominal_velocity_m_s=now.nominal_velocity_m_s, opening=now.opening
+        )
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         """Nothing to do: the newest states are fed back as they are."""
+
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+        """Nothing to do either."""
 
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
         north, east = order.control.command_m_s2
@@ -120,28 +119,23 @@ class PredictingGroundLoop:
         self._ground, self._row = GroundLoop(plan), plan.formation.row
         self.law, self.parameters = self._ground.law, self._ground.parameters
         prediction, vehicles = plan.scenario.control.prediction, range(plan.model.vehicles)
+        every = plan.responses_in_order
         held_ns = round(plan.scenario.safety.setpoint_timeout_s * NS_PER_S)
-        self._sent = [CommandHistory(held_ns) for _ in vehicles]
+        self._sent: list[Sent] = [
+            CommandHistory(held_ns) if every is None else RespondingHistory(held_ns, every[row]) for row in vehicles
+        ]
         self._deliveries: list[Delivery] = [
             MeasuredDelivery() if isinstance(prediction, str) else FixedDelivery(prediction) for _ in vehicles
         ]
         self._states = PredictedStates(self._sent, self._deliveries, plan.timing.commands)
 
-    def control(
-        self,
-        history: StateHistory,
-        law: FeedbackLaw,
-        blends: Sequence[Blend],
-        *,
-        due_ns: int,
-        nominal_velocity_m_s: Vector,
-        opening: float = 1.0,
-    ) -> list[VehicleControl]:
-        controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_velocity_m_s, opening=opening)
-        for row, (acts_ns, assumed_s) in enumerate(self._states.look(history, due_ns)):
+    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+        nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
+        controls = self._ground.control(history, law, blends, now)
+        for row, (acts_ns, assumed_s) in enumerate(self._states.look(history, now.due_ns)):
             own = law[row]
             if own is not None and acts_ns > 0:
-                command = command_at(self._states, own, row, acts_ns, blends[row], nominal_velocity_m_s, opening)
+                command = command_at(self._states, own, row, acts_ns, blends[row], nominal_m_s, opening)
                 controls[row] = controls[row]._replace(command_m_s2=command, assumed_s=assumed_s)
         return controls
 
@@ -149,8 +143,11 @@ class PredictingGroundLoop:
         self._deliveries[row].measured(down_ns, sent_ns)
 
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
-        self._sent[self._row(system_id)].add(order.due_ns, order.control.command_m_s2)
+        self.remember(self._row(system_id), order.due_ns, order.control.command_m_s2)
         return self._ground.set_point(system_id, order)
+
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+        self._sent[row].add(due_ns, acceleration_m_s2)
 
 
 class StreamedLoop:
@@ -170,23 +167,14 @@ class StreamedLoop:
         streamed = tuple(K - own_part(self._plan.model, K) for K in _gains(self._plan, lost))
         return feedback_law(self._plan.formation, streamed, lost)
 
-    def control(
-        self,
-        history: StateHistory,
-        law: FeedbackLaw,
-        blends: Sequence[Blend],
-        *,
-        due_ns: int,
-        nominal_velocity_m_s: Vector,
-        opening: float = 1.0,
-    ) -> list[VehicleControl]:
-        del due_ns
-        controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_velocity_m_s, opening=opening)
+    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+        nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
+        controls = formation_control(history, law, blends, nominal_velocity_m_s=nominal_m_s, opening=opening)
         for row, (own, blend) in enumerate(zip(law, blends, strict=True)):
             control = controls[row]
             used_ns = _oldest_needed(history, own)
             if own is not None and used_ns not in (0, control.sample_ns):
-                command = command_at(history, own, row, used_ns, blend, nominal_velocity_m_s, opening)
+                command = command_at(history, own, row, used_ns, blend, nominal_m_s, opening)
                 control = control._replace(command_m_s2=command, used_ns=used_ns)
             north, east = control.command_m_s2
             more_north, more_east = self._opened_m_s2[row]
@@ -196,6 +184,9 @@ class StreamedLoop:
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         """Nothing to do: nothing is predicted."""
+
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+        """Nothing to do either."""
 
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
         return mavlink.velocity_set_point(
@@ -215,7 +206,7 @@ def _gains(plan: FlightPlan, lost: Sequence[bool]) -> tuple[Any, ...]:
     return plan.around_loss if any(lost) and plan.around_loss else plan.gains
 
 
-def _oldest_needed(history: StateHistory, law: VehicleLaw | None) -> int:
+def _oldest_needed(history: Reports, law: VehicleLaw | None) -> int:
     """The instant of the oldest among the newest states that a law needs; 0 if it needs none or one is unknown."""
     if law is None:
         return 0

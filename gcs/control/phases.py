@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 
-from scenarios.link_schema import Link
+from scenarios.keys.link import Link
 from scenarios.schema import Scenario
 
 
@@ -39,14 +39,16 @@ def next_phase(
 
 START_PATIENCE_S = 360.0
 """How long vehicles with autopilots may take until all are ready."""
-_LEAST_PATIENCE_S = {"double_integrator": 20.0, "autopilot": START_PATIENCE_S}
+_LAUNCHED_PATIENCE_S = 20.0
+"""The same, of vehicles that are launched in the air."""
 _ROUND_TRIPS = 40.0
 """On slow links a start-up may take this many round trips: commands await each other's answers and are repeated."""
 
 
 def patience_s(scenario: Scenario) -> float:
     """How long a flight may take to begin. Until it does, scenario time is the time since the start minus this."""
-    return max(_LEAST_PATIENCE_S[scenario.dynamics], _ROUND_TRIPS * longest_round_trip_s(scenario))
+    least_s = START_PATIENCE_S if scenario.dynamics == "autopilot" else _LAUNCHED_PATIENCE_S
+    return max(least_s, _ROUND_TRIPS * longest_round_trip_s(scenario))
 
 
 def longest_round_trip_s(scenario: Scenario) -> float:

@@ -6,9 +6,10 @@ under the accelerations u that act in between:
 
     h = t_k + D - s,   v^ = v + V(t_k) - V(s - D),   x^ = x + v h + P(t_k) - P(s - D) - V(s - D) h,
 
-where V' = u and P' = V over the times at which set-points were due, each held until the next. This is
-x^ = Phi(h) x + sum_j Gamma_j u_{k-j} of `gains.sampled.prediction`, with fractions of a period where s lies between
-ticks. V and P are kept as running sums, so the cost does not grow with the delay.
+where V' = u and P' = V over the times at which set-points were due, each held until the next. With a response V' is the
+acceleration that follows u (`gcs.control.responding`). This is x^ = Phi(h) x + sum_j Gamma_j u_{k-j} of
+`gains.sampled.prediction`, with fractions of a period where s lies between ticks. V and P are kept as running sums, so
+the cost does not grow with the delay.
 
 The assumed loop delay is the age of a state when it is first used, plus D.
 """
@@ -19,8 +20,8 @@ from collections.abc import Sequence
 from math import exp
 from typing import NamedTuple, Protocol
 
-from gcs.control.history import State, StateHistory
-from scenarios.part import PREDICTION_MAX_S
+from gcs.control.history import Reports, State, StateHistory
+from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import NS_PER_S
 
 KEPT_S = 3.0 * PREDICTION_MAX_S
@@ -71,18 +72,28 @@ class CommandHistory:
         position = last.P + (last.V + 0.5 * last.u * flown_s) * flown_s
         return velocity, position + velocity * (max(0, since_ns - self._held_ns) * 1e-9)
 
-    def carried(self, state: State, from_ns: int, to_ns: int) -> State:
-        """The state propagated under the set-points due between two times."""
-        (velocity, position), (later_velocity, later_position) = self.sums(from_ns), self.sums(to_ns)
-        north, east, v_north, v_east = state
-        for_s = (to_ns - from_ns) * 1e-9
-        gained, moved = later_velocity - velocity, later_position - position - velocity * for_s
-        return (
-            north + v_north * for_s + moved.real,
-            east + v_east * for_s + moved.imag,
-            v_north + gained.real,
-            v_east + gained.imag,
-        )
+
+class Sent(Protocol):
+    """The set-points sent to one vehicle, and the motion that follows from them: `CommandHistory` or
+    `gcs.control.responding.RespondingHistory`."""
+
+    def add(self, due_ns: int, acceleration_m_s2: tuple[float, float]) -> None: ...
+
+    def sums(self, time_ns: int) -> tuple[complex, complex]: ...
+
+
+def carried(sent: Sent, state: State, from_ns: int, to_ns: int) -> State:
+    """The state propagated under the set-points due between two times."""
+    (velocity, position), (later_velocity, later_position) = sent.sums(from_ns), sent.sums(to_ns)
+    north, east, v_north, v_east = state
+    for_s = (to_ns - from_ns) * 1e-9
+    gained, moved = later_velocity - velocity, later_position - position - velocity * for_s
+    return (
+        north + v_north * for_s + moved.real,
+        east + v_east * for_s + moved.imag,
+        v_north + gained.real,
+        v_east + gained.imag,
+    )
 
 
 class Delivery(Protocol):
@@ -169,13 +180,13 @@ class FirstUses:
 class PredictedStates:
     """States predicted beyond the newest reports: `gcs.control.history.States` as of the last `look`."""
 
-    def __init__(self, sent: Sequence[CommandHistory], deliveries: Sequence[Delivery], commands: int) -> None:
+    def __init__(self, sent: Sequence[Sent], deliveries: Sequence[Delivery], commands: int) -> None:
         self.deliveries, self._sent = deliveries, sent
         self._first_uses = [FirstUses(commands) for _ in sent]
         self._delivery_ns: list[int | None] = [None] * len(sent)
-        self._history = StateHistory(len(sent))
+        self._history: Reports = StateHistory(len(sent))
 
-    def look(self, history: StateHistory, due_ns: int) -> list[tuple[int, float]]:
+    def look(self, history: Reports, due_ns: int) -> list[tuple[int, float]]:
         """Take in the newest states. Returns when each vehicle's set-point acts (ns) and the assumed loop delay (s).
 
         Both are 0 while its state or D is unknown.
@@ -196,4 +207,4 @@ class PredictedStates:
         if newest is None or delivery_ns is None or time_ns <= newest[0]:
             return self._history.at(vehicle, time_ns)
         sample_ns, state = newest
-        return self._sent[vehicle].carried(state, sample_ns - delivery_ns, time_ns - delivery_ns)
+        return carried(self._sent[vehicle], state, sample_ns - delivery_ns, time_ns - delivery_ns)

@@ -90,6 +90,7 @@ TICK = np.dtype(
         ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
         ("down_bound_s", "<f8"),  # most that it can be wrong
         ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s - repeated_s; ground loop: of the newest
+        ("loop_delay_bound_s", "<f8"),  # error that clocks bring into it; NaN if others' states were used
         ("repeated_s", "<f8"),  # how long the set-point has repeated an earlier one, as far as telemetry is slower
         ("assumed_delay_s", "<f8"),  # loop delay over which the vehicle was predicted; 0 without prediction
         ("delay_margin_s", "<f8"),  # longest delay that the gains flown take, as known at the time; infinite: any

@@ -1,14 +1,20 @@
 """A scenario before its flight: places, errors and commands at the start, and the expected loop delay."""
 
-from itertools import combinations
-from math import hypot, inf
+from collections.abc import Iterator
+from math import hypot, inf, isfinite
 
 import numpy as np
+from pydantic import Field
 
 from gcs.control.loop_delay import headroom
-from gcs.plan.at_delay import expected_loop_delay_s
+from gcs.plan.course import PlannedMotion, nearest_planned
+from gcs.plan.design import CodeRecord
+from gcs.plan.expected_delay import expected_loop_delay_s, waits_for_channels
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import Formation
+from gcs.plan.own_law import code_by_key
 from gcs.published import Published
+from scenarios.schema import Scenario
 
 
 class VehicleCheck(Published):
@@ -26,17 +32,52 @@ class VehicleCheck(Published):
     """The acceleration that the vehicle can fly at its initial speed; None without a limit."""
 
 
+class PlannedMotionCheck(Published):
+    """The extremes of the motion that the course and formation changes ask of one vehicle, without any error."""
+
+    system_id: int
+    speed_min_m_s: float
+    speed_max_m_s: float
+    acceleration_max_m_s2: float
+    turn_rate_max_rad_s: float
+    beyond: tuple[str, ...]
+    """The keys of `limits` that this motion exceeds."""
+
+
+class CourseCheck(Published):
+    """A course that takes time to change."""
+
+    duration_s: float
+    """When the last waypoint is reached or the last change is over."""
+    length_m: float | None
+    """Along the waypoints; None without."""
+    turns: int
+    acceleration_max_m_s2: float
+    jerk_max_m_s3: float
+
+
 class ScenarioCheck(Published):
     """A scenario before its flight."""
 
     expected_loop_delay_s: float
+    channels_not_included: bool
+    """Whether datagrams wait for limited bandwidth, which the expected loop delay does not include."""
     delay_margin_s: float | None
     """None if no delay makes the loop unstable; with prediction the upper end of the mismatch window."""
-    headroom: float
-    """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window."""
+    headroom: float | None
+    """1 - expected loop delay / margin; with prediction 1 - mismatch / distance to the end of its window. None without
+    any margin."""
     closest_m: float | None
-    """Least distance between two vehicles in their places; None for a single vehicle."""
+    """Least distance between two vehicles in their places over the flight; None for a single vehicle."""
+    closest_s: float | None
+    """When they are that close."""
+    course: CourseCheck | None
+    """None with steps of the nominal velocity."""
+    planned: tuple[PlannedMotionCheck, ...]
+    """Of each vehicle, if the formation manoeuvres."""
     vehicles: tuple[VehicleCheck, ...]
+    code: dict[str, CodeRecord] = Field(default_factory=dict[str, CodeRecord])
+    """The code that would be run: its file by the key that names it."""
 
 
 def check(plan: FlightPlan) -> ScenarioCheck:
@@ -72,12 +113,48 @@ def check(plan: FlightPlan) -> ScenarioCheck:
     delay_s = expected_loop_delay_s(scenario)
     known_s = {"off": 0.0, "measured": delay_s}
     assumed_s = plan.assumed_s or known_s[str(scenario.control.prediction)]
-    tolerated = plan.tolerance.at(assumed_s)
+    tolerated = plan.tolerance(assumed_s)
     margin_s = tolerated.longer_s[0]
+    left = headroom(tolerated.used_s(0, delay_s - assumed_s), margin_s)
+    nearest = nearest_planned(scenario)
     return ScenarioCheck(
         expected_loop_delay_s=delay_s,
+        channels_not_included=waits_for_channels(scenario),
         delay_margin_s=assumed_s + margin_s if margin_s < inf else None,
-        headroom=headroom(tolerated.used_s(0, delay_s - assumed_s), margin_s),
-        closest_m=min((float(hypot(*(a - b))) for a, b in combinations(place, 2)), default=None),
+        headroom=left if isfinite(left) else None,
+        closest_m=None if nearest is None else nearest.distance_m,
+        closest_s=None if nearest is None else nearest.time_s,
+        course=_course(scenario) if scenario.course.is_smooth else None,
+        planned=tuple(_planned(scenario, formation)) if scenario.manoeuvres else (),
         vehicles=tuple(vehicles),
+        **({"code": code_by_key(scenario)} if scenario.code else {}),
     )
+
+
+def _course(scenario: Scenario) -> CourseCheck:
+    course = scenario.smooth_course()
+    largest = [change.largest() for change in course.changes if change.duration_s]
+    return CourseCheck(
+        duration_s=course.end_s,
+        length_m=course.end_s * (scenario.course.speed_m_s or 0.0) if scenario.course.waypoints_ne_m else None,
+        turns=len(course.changes),
+        acceleration_max_m_s2=max((most for most, _ in largest), default=0.0),
+        jerk_max_m_s3=max((most for _, most in largest), default=0.0),
+    )
+
+
+def _planned(scenario: Scenario, formation: Formation) -> Iterator[PlannedMotionCheck]:
+    motion, limits = PlannedMotion(scenario, formation), scenario.limits
+    behind_another = scenario.course.leader == "external"  # whose speed is not known beforehand
+    for row, system_id in enumerate(formation.system_ids):
+        found = motion.largest(row)
+        exceeded = {
+            "speed_min_m_s": found.speed_min_m_s < limits.speed_min_m_s and not behind_another,
+            "speed_max_m_s": found.speed_max_m_s > (limits.speed_max_m_s or inf),
+            "acceleration_max_m_s2": found.acceleration_max_m_s2 > (limits.acceleration_max_m_s2 or inf),
+            "turn_rate_max_rad_s": found.turn_rate_max_rad_s > (limits.turn_rate_max_rad_s or inf)
+            and not behind_another,
+        }
+        yield PlannedMotionCheck(
+            system_id=system_id, **found._asdict(), beyond=tuple(key for key, is_so in exceeded.items() if is_so)
+        )

@@ -16,6 +16,7 @@ from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.own_law import why_unknown
 from gcs.runs.files import RunTail, read_ticks, write_experiment
 from gcs.runs.grade import Truth, read_truth, truth_of
 from gcs.runs.record import END, EVENTS_FILE, TICKS_FILE, TRUTH_FILE, RunWriter
@@ -110,6 +111,8 @@ def _processor_times() -> IntArray:
 
 def margins_of(plan: FlightPlan) -> Design:
     """The part of a design that a run's files need; the campaign's report has the margins of the continuous model."""
+    if why := why_unknown(plan):
+        return Design(delay_margin_s=None, margin_unknown=why)
     return Design(delay_margin_s=plan.delay_margin_s, delay_margin_continuous_s=None)
 
 

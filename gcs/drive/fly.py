@@ -18,17 +18,9 @@ from gcs.interrupts import held_back, stop_signals
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import described, identified
+from gcs.runs import record
 from gcs.runs.files import write_design, write_experiment
-from gcs.runs.record import (
-    DESIGN_FILE,
-    END,
-    FLEET,
-    NEW_DESIGN,
-    READY_FILE,
-    SCENARIO_FILE,
-    TRUTH_FILE,
-    RunWriter,
-)
+from gcs.runs.record import RunWriter
 from gcs.runs.refusals import REFUSED, Refusals, in_words
 from gcs.runs.summary import finish
 from gcs.runs.summary_record import Summary
@@ -65,7 +57,7 @@ def fly(
             vehicles: VehicleProcess | None = None
             if not fleet:
                 vehicles = VehicleProcess(
-                    folder / SCENARIO_FILE,
+                    folder / record.SCENARIO_FILE,
                     station=link.address,
                     folder=folder,
                     key_file=key_file,
@@ -75,9 +67,9 @@ def fly(
             writer = RunWriter(folder)
             _wait_until_ready(observer, folder, asked_to_stop)
             prepare_real_time()
-            station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS)
+            station = Station(plan, start_ns=clock_ns() + _START_DELAY_NS, stopwatch_ns=time.perf_counter_ns)
             if fleet:
-                writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=FLEET, text=fleet))
+                writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=record.FLEET, text=fleet))
 
             def new_plan(found: FlightPlan) -> None:
                 _note_design(writer, folder, design, found, station.scenario_time_s(clock_ns()))
@@ -89,7 +81,9 @@ def fly(
                 drive(station, link, writer, stop, new_plan, mirror)
                 if station.plan is not plan:  # now with the figures that take too long to compute in flight
                     _write_design(writer, folder, described(design, station.plan))
-                writer.event(Event(time_s=station.scenario_time_s(clock_ns()), kind=END, text=station.end_reason))
+                writer.event(
+                    Event(time_s=station.scenario_time_s(clock_ns()), kind=record.END, text=station.end_reason)
+                )
             finally:
                 unwritten = writer.close()
             if unwritten:  # the observer would wait for the last event, which is among them
@@ -117,7 +111,7 @@ def fly_in_virtual_time(
             if speed is not None:  # otherwise the observer catches up with the flight
                 _wait_until_ready(observer, folder, asked_to_stop)
             station = Station(plan, start_ns=START_NS)
-            writer, vehicles = RunWriter(folder), RecordedVehicles(plan, folder / TRUTH_FILE)
+            writer, vehicles = RunWriter(folder), RecordedVehicles(plan, folder / record.TRUTH_FILE)
             began_s, time_s, flown = time.monotonic(), 0.0, plan
             for rows in fly_lockstep(plan, station=station, vehicles=vehicles):
                 writer.tick(rows)
@@ -139,7 +133,7 @@ def fly_in_virtual_time(
                 _write_design(writer, folder, described(design, flown))
             if counts := Refusals().news(station.counters, last=True):
                 writer.event(Event(time_s=time_s, kind=REFUSED, text=in_words(counts), counts=counts))
-            writer.event(Event(time_s=time_s, kind=END, text=station.end_reason))
+            writer.event(Event(time_s=time_s, kind=record.END, text=station.end_reason))
             vehicles.close()
             unwritten = writer.close()
             if unwritten:
@@ -151,14 +145,14 @@ def _note_design(writer: RunWriter, folder: Path, design: Design, found: FlightP
     """Write the design again with the responses that identification found, and record that as an event."""
     _write_design(writer, folder, identified(design, found))
     text = f"delay margin {found.delay_margin_s:.3f} s with the vehicles' response"
-    writer.event(Event(time_s=time_s, kind=NEW_DESIGN, text=text))
+    writer.event(Event(time_s=time_s, kind=record.NEW_DESIGN, text=text))
 
 
 def _write_design(writer: RunWriter, folder: Path, design: Design) -> None:
     try:
         write_design(folder, design)
     except OSError as error:
-        writer.ended(DESIGN_FILE, error)
+        writer.ended(record.DESIGN_FILE, error)
 
 
 def new_folder(scenario_name: str) -> Path:
@@ -195,5 +189,5 @@ def _observer(folder: Path, viewer: str | None, *, show_table: bool) -> Generato
 
 def _wait_until_ready(observer: "subprocess.Popen[bytes]", folder: Path, asked_to_stop: Callable[[], str]) -> None:
     """Wait for the observer's slow imports, which would otherwise compete with the first ticks for the processor."""
-    while observer.poll() is None and not (folder / READY_FILE).exists() and not asked_to_stop():
+    while observer.poll() is None and not (folder / record.READY_FILE).exists() and not asked_to_stop():
         time.sleep(0.02)

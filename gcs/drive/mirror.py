@@ -102,7 +102,7 @@ def _sets_our_rate(frame: mavlink.Frame) -> bool:
     name = mavlink.message_name(frame.msg_id)
     if name not in ("REQUEST_DATA_STREAM", "COMMAND_LONG", "COMMAND_INT"):
         return False
-    fields = dict(zip(mavlink.field_names(frame.msg_id), frame.fields, strict=True))
+    fields = mavlink.named_fields(frame)
     if name == "REQUEST_DATA_STREAM":
         return fields["req_stream_id"] in _STREAMS_WITH_POSITION
     return fields["command"] == SET_MESSAGE_INTERVAL and fields["param1"] == mavlink.LOCAL_POSITION_NED

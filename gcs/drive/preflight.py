@@ -5,7 +5,7 @@ Each check returns a fault in one line (the scenario's key, what was read, what 
 
 from dataclasses import replace
 from itertools import combinations
-from math import dist
+from math import dist, hypot
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from gains.performance.response import formation_loop
 from gains.sampled.constant import growth_rate
 from gains.sampled.onboard import onboard_loop
 from gcs.link.clocks import REQUEST_LIFETIME_NS
+from gcs.plan.course import nearest_planned
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import plan_formation
 from gcs.plan.onboard import timing_of
 from scenarios.schema import NS_PER_S, Scenario
 
@@ -25,7 +27,7 @@ def unstable_loop(plan: FlightPlan) -> str | None:
 
     A root of the continuous loop; if only sampling destabilises it, the growth rate of the sampled loop instead.
     """
-    if plan.delay_margin_s > 0.0:
+    if not plan.delay_margin_s <= 0.0:  # which NaN is not: unknown
         return None
     control = plan.scenario.control
     key = "control.blocks" if control.blocks else "control.gains" if control.gains is not None else "control"
@@ -75,26 +77,40 @@ def _matrices(plan: FlightPlan) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def bad_start(scenario: Scenario) -> str | None:
-    """Initial states that violate a safety limit at the first tick: a collision or a spacing error beyond its limit."""
-    safety, vehicles = scenario.safety, scenario.leader_first()
+    """Initial states that violate a safety limit at the first tick: a collision or a spacing error beyond its limit.
+
+    Also formation changes that would lead to a collision: the least distance between places, over the whole flight.
+    """
+    safety, vehicles, offset_ne_m = scenario.safety, scenario.leader_first(), plan_formation(scenario).offset_ne_m
     for one, two in combinations(vehicles, 2):
-        apart_m = dist(one.position_ne_m, two.position_ne_m)
+        above_m = scenario.altitude_of(one) - scenario.altitude_of(two) if scenario.dynamics != "autopilot" else 0.0
+        apart_m = hypot(dist(one.position_ne_m, two.position_ne_m), above_m)
         if apart_m < safety.collision_distance_m:
             read = f"vehicles {one.system_id} and {two.system_id} {apart_m:g} m apart"
             wanted = f"at least safety.collision_distance_m = {safety.collision_distance_m:g} m between any two"
             return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
     place = {vehicle.system_id: vehicle.position_ne_m for vehicle in vehicles}
-    for vehicle in vehicles:
-        if vehicle.follows is None or vehicle.offset_ne_m is None:
+    for vehicle, offset in zip(vehicles, offset_ne_m.tolist(), strict=True):
+        if vehicle.follows is None:
             continue
         ahead = place[vehicle.follows]
-        wanted_ne_m = [a + o for a, o in zip(ahead, vehicle.offset_ne_m, strict=True)]
+        wanted_ne_m = [a + o for a, o in zip(ahead, offset, strict=True)]
         error_m = dist(wanted_ne_m, vehicle.position_ne_m)
         if error_m > safety.spacing_error_limit_m:
             read = f"vehicle {vehicle.system_id} with a spacing error of {error_m:g} m"
             wanted = f"at most safety.spacing_error_limit_m = {safety.spacing_error_limit_m:g} m"
             return f"vehicles.position_ne_m: read {read}, wanted {wanted}"
-    return None
+    return _collision_on_the_way(scenario) if scenario.formation_changes else None
+
+
+def _collision_on_the_way(scenario: Scenario) -> str | None:
+    """A collision of the places of two vehicles during or after a formation change."""
+    nearest, least_m = nearest_planned(scenario), scenario.safety.collision_distance_m
+    if nearest is None or nearest.distance_m >= least_m:
+        return None
+    one, two = nearest.system_ids
+    read = f"places of vehicles {one} and {two} {nearest.distance_m:.2f} m apart at {nearest.time_s:.1f} s"
+    return f"formation_changes: read {read}, wanted at least safety.collision_distance_m = {least_m:g} m"
 
 
 def endless_link(scenario: Scenario) -> str | None:

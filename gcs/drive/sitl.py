@@ -43,6 +43,7 @@ class VehicleProcess:
                     "--stop-after-silence", str(ORPHAN_S if outlive_station else _AT_ONCE_S),
                     "--counters", str(folder / VEHICLES_FILE),
                     *([] if key_file is None else ["--key", str(key_file)]),
+                    "--allow-code",  # this process may run it, or it would not have come here
                 ],
                 stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
                 start_new_session=True,  # Ctrl-C goes to the station only, which brings them to safety first

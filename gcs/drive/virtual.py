@@ -18,6 +18,7 @@ from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
 from scenarios.files import load
+from scenarios.own_code import refusal
 from scenarios.schema import Scenario
 from scenarios.shipped import located
 
@@ -92,7 +93,9 @@ class VirtualFlight:
         return np.stack([self.ticks[name.format(axis)] for axis in ("north", "east")], axis=-1)
 
 
-def fly_virtual(scenario: Scenario | Path | str, *, allow_unstable: bool = False) -> VirtualFlight:
+def fly_virtual(
+    scenario: Scenario | Path | str, *, allow_unstable: bool = False, allow_code: bool = False
+) -> VirtualFlight:
     """Fly a scenario in virtual time: real MAVLink bytes, emulated links, no sockets, no files.
 
     Parameters
@@ -101,6 +104,8 @@ def fly_virtual(scenario: Scenario | Path | str, *, allow_unstable: bool = False
         A scenario, its file, or the name of one that ships (`gcs scenarios`).
     allow_unstable
         Whether to fly gains whose loop is unstable even without delay.
+    allow_code
+        Whether to run the Python code that the scenario names.
 
     Raises
     ------
@@ -119,6 +124,8 @@ def fly_virtual(scenario: Scenario | Path | str, *, allow_unstable: bool = False
     """
     if not isinstance(scenario, Scenario):
         scenario = load(located(str(scenario)))
+    if not allow_code and (refused := refusal(scenario, Path(scenario.name))):
+        raise InputError(refused)
     _refuse(scenario, bad_start(scenario) or endless_link(scenario))
     design, plan = flight_plan(scenario)
     if (unstable := unstable_loop(plan)) is not None:

@@ -3,20 +3,31 @@
 One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The error of this offset
 is half the difference between the delays down and up, at most RTT / 2. Short round trips say most, so the estimate is a
 straight line fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. It works at any RTT and
-follows the drift of the vehicle's clock.
+follows the drift of the vehicle's clock. When all exchanges of the window have queued for far longer than those of the
+line before, that line is carried on.
 
 The bound of the error does not depend on that line. The vehicle read its clock after the request left and before the
 reply arrived, so t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits move apart by
 DRIFT_BOUND. The line is kept between them, and the bound is the distance to the farther one. It holds for any delay,
 loss and asymmetry as long as the clock drifts by less than DRIFT_BOUND and has not jumped since the newest exchange.
 
-Limits that contradict each other show that the clock has jumped. A jump shorter than a round trip may not contradict
-them, but makes exchanges differ from the line by more than their round trips and the earlier residuals explain. The
-first such exchange resets the limits; the third in a row is reported as a clock jump.
+Limits that contradict each other show that the clock has jumped, or that replies carry wrong stamps: an autopilot may
+date them back by the time that their bytes take on a serial port, and a simulator's clock slips. By more than
+STAMPS_OFF_NS it is a jump. Less is in doubt, and until it is decided the bound covers the limits before and since. If
+later exchanges fit the limits before, the contradiction was an error of stamps: `stamp_error_ns` is the largest seen
+so far, and from then on no contradiction up to that size counts. The eighth doubtful exchange in a row is a jump.
+
+A jump shorter than a round trip may not contradict the limits, but makes exchanges differ from the line by more than
+their round trips, the earlier residuals and the known error of the stamps explain. They are doubtful, too; the third in
+a row that is off by more than STAMPS_OFF_NS is a jump.
+
+An error of all stamps by the same time cannot be seen: it acts as an asymmetric link. `expected_error_ns` holds what is
+known beforehand of the errors of a kind of vehicle. To an error that exchanges have shown, the bound adds the least
+round trip: the exchange that showed it may itself have been off by that much.
 
 Telemetry shows a jump sooner: a state cannot have been sampled after it was received, nor before one that was sent
-earlier. Such a state is refused, and an exchange is due at once to decide. An overtaken state may predate a jump: it
-proves nothing, and after a jump it is refused.
+earlier. Such a state is refused, and an exchange is due at once to decide. Within the bound it is taken to have been
+sampled when it was received. An overtaken state may predate a jump: it proves nothing, and after a jump it is refused.
 
 The loop delay of a loop closed over the ground is free of the offset's error, see `gcs.control.loop_delay`.
 """
@@ -38,8 +49,13 @@ REQUEST_LIFETIME_NS = 20_000_000_000
 _LONG_AGO_NS = -(1 << 62)
 DRIFT_BOUND = DRIFT_MAX_PPM * 1e-6
 """Rate difference of two clocks beyond which a change of offset is a jump, not drift."""
-DOUBTS = 3
-"""This many doubtful exchanges, with none between them that fits the line, are reported as a jump."""
+DOUBTS, SMALL_DOUBTS = 3, 8
+"""This many doubtful exchanges in a row are a jump: those off by more than STAMPS_OFF_NS, and all others. With two
+fifths of all replies off, eight in a row that exceed all before are rarer than once in a thousand first doubts."""
+STAMPS_OFF_NS = 20_000_000
+"""The largest plausible error of a reply's stamp: 115 bytes at 57600 baud."""
+_SETTLED = 32
+"""A small jump before this many exchanges is not told from errors of stamps, whose size is not known yet."""
 _UNUSUAL = 1.5
 """An exchange this many times farther from the line than any in the window is an outlier, not jitter."""
 _READING_NS = 1000
@@ -50,6 +66,12 @@ _WRAP_NS = _BOOT_MS_NS << 32
 _DOUBTFUL_NS = 10_000
 """An exchange this close to the line is never doubtful."""
 _WEIGHT_FLOOR_NS = 200_000.0
+_TILT = 100e-6
+"""More than the rates of two crystals differ."""
+_WANDER = 10e-6
+"""How far the rate of a crystal changes with its temperature."""
+_QUEUED_NS = 5_000_000.0
+"""Queues up to this never keep a line from being replaced by that of newer exchanges."""
 _EVERY_SAMPLE = 32
 _ESTIMATE_EVERY = 4
 """After the first samples the line is fitted at every fourth only, to save time, and extrapolated in between."""
@@ -85,6 +107,39 @@ class ClockEstimate(NamedTuple):
 UNKNOWN = ClockEstimate(samples=0, offset_ns=0, skew=0.0, bound_ns=0, reference_ns=0)
 
 
+class _Limits(NamedTuple):
+    """Limits of the offset, each with the time at which it holds; in between they move apart by DRIFT_BOUND."""
+
+    low_ns: int
+    low_at_ns: int
+    high_ns: int
+    high_at_ns: int
+
+    def gap_ns(self, other: "_Limits") -> float:
+        """How far these limits exclude others, however the clock has drifted in between; not above 0 if they do not."""
+        return max(
+            other.low_ns - self.high_ns - DRIFT_BOUND * abs(other.low_at_ns - self.high_at_ns),
+            self.low_ns - other.high_ns - DRIFT_BOUND * abs(other.high_at_ns - self.low_at_ns),
+        )
+
+    def joined(self, other: "_Limits", *, tighter: bool) -> "_Limits":
+        """The tighter or the wider of both, compared at the newer time."""
+        pick_low, pick_high = (max, min) if tighter else (min, max)
+        low_at_ns, high_at_ns = max(self.low_at_ns, other.low_at_ns), max(self.high_at_ns, other.high_at_ns)
+        return _Limits(
+            pick_low(self.low_at(low_at_ns), other.low_at(low_at_ns)),
+            low_at_ns,
+            pick_high(self.high_at(high_at_ns), other.high_at(high_at_ns)),
+            high_at_ns,
+        )
+
+    def low_at(self, time_ns: int) -> int:
+        return self.low_ns - _drift(abs(time_ns - self.low_at_ns))
+
+    def high_at(self, time_ns: int) -> int:
+        return self.high_ns + _drift(abs(time_ns - self.high_at_ns))
+
+
 class VehicleClock:
     """TIMESYNC exchanges with one vehicle, and what they show of its clock and its link."""
 
@@ -97,9 +152,13 @@ class VehicleClock:
         """One-way delay from station to vehicle in the newest exchange, by the estimated offset."""
         self.down_bound_ns = 0.0
         """Its largest error."""
+        self.loop_bound_ns = 0.0
+        """The largest error that the clocks bring into a loop delay: age of the newest state plus `down_ns`."""
         self.unmatched = 0
-        self.backdated_ns = 0
-        """The most by which the timestamps of the vehicle's replies are too early."""
+        self.expected_error_ns = 0
+        """The largest error of stamps that is usual for this kind of vehicle."""
+        self.stamp_error_ns = 0.0
+        """The largest error of stamps that contradictions between exchanges have shown."""
         self.lost = False
         """Whether the clock is known to have jumped, but not yet by how much."""
         self.asked_ns = 0
@@ -114,11 +173,23 @@ class VehicleClock:
         self._offset_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
         self._least_ns = self._unusual_ns = 0
         """Least round trip and largest residual of the window at the last fit."""
-        self._low_ns = self._low_at_ns = self._high_ns = self._high_at_ns = 0
-        """Limits of the offset, each with the time at which it held."""
+        self._fastest_ns, self._queued_ns, self._fitted_ns = LATEST_NS, 0.0, _LONG_AGO_NS
+        """Least round trip since the last jump; the time that the exchanges of the line queued; when it was fitted."""
+        self._tilt = _TILT
+        """The largest error of its rate."""
+        self._known = _Limits(0, 0, 0, 0)
+        """Limits of the offset."""
+        self._doubtful: _Limits | None = None
+        """Those since the first doubtful exchange, until it is decided whether the clock has jumped."""
+        self._doubtful_gap_ns = 0.0
+        """The largest contradiction of these."""
+        self._ahead_ns = 0.0
+        """The most by which a state since the newest exchange was sampled after it was received, beyond the bound."""
+        self._held_back_ns = 0
+        """The same within the bound: such a state is taken to have been sampled when it was received."""
         self._since_ns = -1
         """When the first exchange since the last jump was requested."""
-        self._doubts = 0
+        self._doubts = self._doubts_in_a_row = 0
         self._doubted_ns = 0
         """Residual of the first doubtful exchange."""
 
@@ -156,11 +227,14 @@ class VehicleClock:
             return None
         boot_ns = self.boot_ns(boot_ms, received_ns)
         sample_ns = known.to_station_ns(boot_ns)
-        if sample_ns - received_ns > known.bound_at_ns(sample_ns) + _BOOT_MS_NS:
-            if newest:  # else it may be of the clock before a jump
-                self.lost, self._since_ns, self._count = True, received_ns, 0
-                self.estimate = UNKNOWN._replace(skew=known.skew)
-            return None
+        ahead_ns = sample_ns - received_ns
+        if ahead_ns > 0:
+            beyond_ns = ahead_ns - known.bound_at_ns(sample_ns) - _BOOT_MS_NS
+            if beyond_ns > 0.0:
+                self._is_ahead(beyond_ns, received_ns, newest=newest)
+                return None
+            self._held_back_ns = max(self._held_back_ns, ahead_ns)
+            sample_ns = received_ns
         if newest and boot_ns < self._newest_boot_ns:
             self._doubtful_state = True  # or a replay too old for sequence numbers to show: the exchange decides
             return None
@@ -168,6 +242,14 @@ class VehicleClock:
             return None  # of the clock before a jump that an exchange has shown: its instant is unknown
         self._newest_boot_ns = max(boot_ns, self._newest_boot_ns)
         return sample_ns
+
+    def _is_ahead(self, beyond_ns: float, received_ns: int, *, newest: bool) -> None:
+        """Note a state from the future. One that was overtaken may be of the clock before a jump: it proves nothing."""
+        if newest and beyond_ns > STAMPS_OFF_NS:
+            self.lost, self._since_ns, self._count = True, received_ns, 0
+            self.estimate = UNKNOWN._replace(skew=self.estimate.skew)
+        elif newest:
+            self._ahead_ns, self._doubtful_state = max(beyond_ns, self._ahead_ns), True
 
     def reply(self, *, tc1_ns: int, ts1_ns: int, received_ns: int) -> int | None:
         """Take in a reply; returns the round trip in ns, or None if it answers no request or its time is impossible."""
@@ -181,50 +263,87 @@ class VehicleClock:
         self._doubtful_state = False
         middle = ts1_ns + rtt // 2
         offset = tc1_ns - middle
-        low, high = tc1_ns - received_ns - _READING_NS, tc1_ns - ts1_ns + _READING_NS + self.backdated_ns
-        if self.lost or self._contradicts(low, received_ns, high, ts1_ns):
+        own = _Limits(tc1_ns - received_ns - _READING_NS, received_ns, tc1_ns - ts1_ns + _READING_NS, ts1_ns)
+        gap_ns = self._known.gap_ns(own) if self._count else 0.0
+        if self.lost or gap_ns > STAMPS_OFF_NS:
             self._jumped(ts1_ns, keep=0)
-        doubtful = self._is_doubtful(offset, rtt, middle)
-        if self._count == 0 or doubtful:
-            self._low_ns, self._low_at_ns, self._high_ns, self._high_at_ns = low, received_ns, high, ts1_ns
+        before = self.estimate
+        doubtful = self._count > 0 and self._is_doubtful(offset, rtt, middle, gap_ns)
+        if self._count == 0:
+            self._known = own
+        elif doubtful:
+            self._doubt(own, gap_ns)
         else:
-            self._narrow(low, received_ns, high, ts1_ns)
+            self._fit(own)
         slot = self._count % WINDOW
         self._sent_ns[slot], self._rtt_ns[slot], self._offset_ns[slot] = middle, rtt, offset
         self._count += 1
-        if self._doubts == DOUBTS:
-            self._jumped(ts1_ns, keep=DOUBTS)
+        if self._doubts_in_a_row == SMALL_DOUBTS or (self._doubts == DOUBTS and self._doubted_ns > STAMPS_OFF_NS):
+            self._jumped(ts1_ns, keep=max(self._doubts_in_a_row, DOUBTS))
         if self._doubts == 0 and (self._count <= _EVERY_SAMPLE or self._count % _ESTIMATE_EVERY == 0):
             self.estimate = self._estimated(middle)
         self.estimate = self._within_limits(middle)
-        self.down_ns = min(rtt, max(0, self.estimate.to_station_ns(tc1_ns) - ts1_ns))
-        self.down_bound_ns = self.estimate.bound_at_ns(ts1_ns + self.down_ns)
+        self._measure_down(tc1_ns, ts1_ns, rtt, before)
         return rtt
 
-    def _contradicts(self, low_ns: int, low_at_ns: int, high_ns: int, high_at_ns: int) -> bool:
-        """Whether new limits exclude the known ones, however the clock has drifted in between."""
-        if self._count == 0:
-            return False
-        return (
-            low_ns - self._high_ns > DRIFT_BOUND * abs(low_at_ns - self._high_at_ns)
-            or self._low_ns - high_ns > DRIFT_BOUND * abs(high_at_ns - self._low_at_ns)
+    def _measure_down(self, tc1_ns: int, ts1_ns: int, rtt_ns: int, before: ClockEstimate) -> None:
+        """The one-way delay of an exchange, and the largest error of the loop delays that it is used for.
+
+        If the age of a state and this delay use the same offset, its error cancels. What remains is the error of the
+        reply's stamp, the millisecond in which states are stamped, the change of the estimate between the two, and what
+        keeps either of them from being negative.
+        """
+        known = self.estimate
+        down_ns = known.to_station_ns(tc1_ns) - ts1_ns
+        self.down_ns = min(rtt_ns, max(0, down_ns))
+        self.down_bound_ns = known.bound_at_ns(ts1_ns + self.down_ns)
+        changed_ns = abs(known.offset_ns - before.offset_at_ns(known.reference_ns)) if before.samples else 0
+        since_ns = known.reference_ns - before.reference_ns if before.samples else 0
+        self.loop_bound_ns = (
+            self._stamps_off_ns() + _READING_NS + _BOOT_MS_NS
+            + changed_ns + (DRIFT_BOUND + abs(known.skew)) * (since_ns + rtt_ns)
+            + abs(down_ns - self.down_ns) + self._held_back_ns
         )  # fmt: skip
+        self._held_back_ns = 0
 
-    def _narrow(self, low_ns: int, low_at_ns: int, high_ns: int, high_at_ns: int) -> None:
-        """Keep the tighter of the old and the new limits, compared at the newer time."""
-        at_ns = max(low_at_ns, self._low_at_ns)
-        mine, new = self._low_ns - _drift(at_ns - self._low_at_ns), low_ns - _drift(at_ns - low_at_ns)
-        self._low_ns, self._low_at_ns = max(mine, new), at_ns
-        at_ns = max(high_at_ns, self._high_at_ns)
-        mine, new = self._high_ns + _drift(at_ns - self._high_at_ns), high_ns + _drift(at_ns - high_at_ns)
-        self._high_ns, self._high_at_ns = min(mine, new), at_ns
+    def _stamps_off_ns(self) -> float:
+        """The largest error of a stamp."""
+        return max(self.expected_error_ns, self.stamp_error_ns + self._least_ns if self.stamp_error_ns else 0.0)
 
-    def _is_doubtful(self, offset_ns: int, rtt_ns: int, at_ns: int) -> bool:
-        """Whether an exchange is farther off the line than jitter explains; counts such exchanges.
+    @property
+    def _explained_ns(self) -> float:
+        """Contradictions up to this are due to stamps."""
+        return max(self.expected_error_ns, self.stamp_error_ns)
+
+    def _doubt(self, own: _Limits, gap_ns: float) -> None:
+        """Keep the limits of a doubtful exchange beside the known ones."""
+        since = self._doubtful
+        agree = since is not None and since.gap_ns(own) <= self._explained_ns
+        self._doubtful = own if since is None else since.joined(own, tighter=agree)
+        self._doubtful_gap_ns = max(gap_ns, self._doubtful_gap_ns)
+        self._doubts_in_a_row += 1
+        self._ahead_ns = 0.0
+
+    def _fit(self, own: _Limits) -> None:
+        """Narrow the limits by an exchange that fits them, which may show that earlier doubts were errors of stamps."""
+        since, self._doubts_in_a_row = self._doubtful, 0
+        if self._ahead_ns:
+            self.stamp_error_ns, self._ahead_ns = self._explained_ns + self._ahead_ns, 0.0
+        if since is not None:
+            if self._doubts and since.gap_ns(own) <= self._explained_ns:
+                self._doubtful = since.joined(own, tighter=True)
+            else:
+                self.stamp_error_ns = max(self.stamp_error_ns, self._doubtful_gap_ns)
+                self._doubtful, self._doubtful_gap_ns, self._doubts, self._doubted_ns = None, 0.0, 0, 0
+        self._known = self._known.joined(own, tighter=True)
+
+    def _is_doubtful(self, offset_ns: int, rtt_ns: int, at_ns: int, gap_ns: float) -> bool:
+        """Whether an exchange contradicts the limits, or is farther off the line than jitter explains; counts such.
 
         If one way alone became slower by x, so did the round trip, and the offset is off by x / 2.
         """
-        if self._count < 2 * LEAST_SAMPLES:
+        contradicts = gap_ns > self._explained_ns
+        if self._count < 2 * LEAST_SAMPLES and not contradicts:
             return False
         known = self.estimate
         off_ns = abs(offset_ns - known.offset_at_ns(at_ns))
@@ -233,9 +352,9 @@ class VehicleClock:
             + _UNUSUAL * self._unusual_ns
             + DRIFT_BOUND * abs(at_ns - known.reference_ns)
             + _DOUBTFUL_NS
-            + self.backdated_ns
+            + self._explained_ns
         )
-        if off_ns > explained_ns:
+        if contradicts or off_ns > explained_ns:
             self._doubts += 1
             self._doubted_ns = off_ns if self._doubts == 1 else self._doubted_ns
             return True
@@ -244,21 +363,34 @@ class VehicleClock:
         return False
 
     def _jumped(self, ts1_ns: int, *, keep: int) -> None:
-        """Start over with the newest exchanges."""
+        """Start over with the newest exchanges.
+
+        A change that stamps may explain is no jump while their error is not known yet: then it is taken for that error.
+        """
         newest = [k % WINDOW for k in range(self._count - keep, self._count)]
         for kept in (self._sent_ns, self._rtt_ns, self._offset_ns):
             kept[:keep] = kept[newest]
-        self.jumps += 1
+        if keep == SMALL_DOUBTS and self._count - keep < _SETTLED and self._doubtful_gap_ns:
+            self.stamp_error_ns = max(self.stamp_error_ns, self._doubtful_gap_ns)
+        else:
+            self.jumps += 1
+        self._known = self._doubtful or self._known
         self.lost, self._newest_boot_ns = False, _LONG_AGO_NS
-        self._count, self._doubts, self._doubted_ns, self._since_ns = keep, 0, 0, ts1_ns
+        self._doubtful, self._doubtful_gap_ns, self._ahead_ns = None, 0.0, 0.0
+        self._count, self._since_ns = keep, ts1_ns
+        self._fastest_ns, self._fitted_ns, self._tilt = LATEST_NS, _LONG_AGO_NS, _TILT
+        self._doubts = self._doubts_in_a_row = self._doubted_ns = 0
 
     def _within_limits(self, at_ns: int) -> ClockEstimate:
         """The estimate at a time: the line, moved between the limits."""
-        known = self.estimate
-        low_ns = self._low_ns - _drift(abs(at_ns - self._low_at_ns))
-        high_ns = self._high_ns + _drift(abs(at_ns - self._high_at_ns))
+        known, limits = self.estimate, self._known
+        if self._doubtful is not None:
+            limits = limits.joined(self._doubtful, tighter=False)
+        low_ns, high_ns = limits.low_at(at_ns), limits.high_at(at_ns)
+        if low_ns > high_ns:  # by errors of stamps
+            low_ns, high_ns = high_ns, low_ns
         offset_ns = min(max(known.offset_at_ns(at_ns), low_ns), high_ns)
-        bound_ns = max(high_ns - offset_ns, offset_ns - low_ns)
+        bound_ns = max(high_ns - offset_ns, offset_ns - low_ns) + round(self._stamps_off_ns())
         return ClockEstimate(min(self._count, WINDOW), offset_ns, known.skew, bound_ns, at_ns)
 
     def _estimated(self, now_ns: int) -> ClockEstimate:
@@ -277,9 +409,18 @@ class VehicleClock:
         weighted = weight * t
         spread = _sum(weighted * t)
         # The slope of a short stretch would be noise: below 0.3 s (rms) of history the former rate is kept, at first 0.
-        skew = float(_sum(weighted * y) / spread) if spread > 0.09e18 else self.estimate.skew
+        # So would that of exchanges which tilt the line by more than _TILT if they all queued on the same way.
+        tilt = float(_sum(np.abs(weighted) * (rtt - least)) / (2.0 * spread)) if spread > 0.09e18 else _TILT
+        skew = float(_sum(weighted * y) / spread) if tilt < _TILT else self.estimate.skew
         skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, skew))
         self._least_ns, self._unusual_ns = least, round(float(np.abs(y - skew * t).max()))
+        self._fastest_ns = min(self._fastest_ns, least)
+        queued_ns = float(_sum(weight * rtt)) - self._fastest_ns
+        # An offset is off by up to half the time that its exchange queued, and drifts; twice that is clearly worse.
+        if queued_ns > 2.0 * (self._queued_ns + 2.0 * self._tilt * (now_ns - self._fitted_ns)) + _QUEUED_NS:
+            return self.estimate
+        self._queued_ns, self._fitted_ns = queued_ns, now_ns
+        self._tilt = tilt + _WANDER if tilt < _TILT else self._tilt
         offset = base + round(y_mean - skew * t_mean)
         return ClockEstimate(samples=n, offset_ns=offset, skew=skew, bound_ns=0, reference_ns=now_ns)
 

@@ -46,8 +46,8 @@ class Kind:
     """Without set-points it stops but stays guided. If it leaves the guided mode, somebody wanted that."""
     velocity_grows: bool = False
     """Between set-points its velocity target grows with the acceleration."""
-    timesync_backdated_ns: int = 0
-    """The most by which the timestamps of its TIMESYNC replies are too early."""
+    timesync_error_ns: int = 0
+    """The usual largest error of the stamps in its TIMESYNC replies."""
     packed_modes: bool = False
     """A mode has a main and a sub number: two parameters of DO_SET_MODE, packed into one number in HEARTBEAT."""
 

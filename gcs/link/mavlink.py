@@ -75,11 +75,6 @@ class Frame(NamedTuple):
     data: bytes
 
 
-def field_names(msg_id: int) -> list[str]:
-    """Names of a message's fields in wire order; an array has one name but several fields."""
-    return list(_MESSAGES[msg_id].ordered_fieldnames)
-
-
 def named_fields(frame: Frame) -> dict[str, Any]:
     """The fields by their names: an array as a list, characters as a text."""
     message = _MESSAGES[frame.msg_id]

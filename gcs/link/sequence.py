@@ -34,22 +34,9 @@ class SequenceCounter:
     """
 
     __slots__ = (
-        "_lag",
-        "_last",
-        "_newest",
-        "_newest_ns",
-        "_rate_count",
-        "_rate_hz",
-        "_rate_ns",
-        "_run",
-        "_seen",
-        "_steady_frames",
-        "_steady_ns",
-        "duplicate",
-        "late",
-        "lost",
-        "received",
-    )
+        "_lag", "_last", "_newest", "_newest_ns", "_rate_count", "_rate_hz", "_rate_ns", "_run", "_seen",
+        "_steady_frames", "_steady_ns", "duplicate", "late", "lost", "received",
+    )  # fmt: skip
 
     def __init__(self) -> None:
         self.received = self.lost = self.late = self.duplicate = 0

@@ -28,6 +28,20 @@ class Startup(Protocol):
         """Whether it has climbed to half of its take-off altitude or more."""
         ...
 
+    @property
+    def has_landed(self) -> bool:
+        """Whether it has been in the air in this flight and is on the ground again."""
+        ...
+
+    @property
+    def arming_refusals(self) -> int:
+        """How often it has refused to arm since it was armed last."""
+        ...
+
+    def is_news(self, text: str) -> bool:
+        """Whether a text from the vehicle says what it has not just said."""
+        ...
+
     def recognise(self, autopilot: int, vehicle_type: int) -> Kind:
         """The kind of vehicle, as far as its heartbeats show it."""
         ...
@@ -52,7 +66,8 @@ class LaunchedStartup:
     """Start-up of a double integrator: telemetry rate, parameters of the loop on board if any, GUIDED, armed."""
 
     kind = LAUNCHED
-    is_half_way_up = False
+    is_half_way_up = has_landed = False
+    arming_refusals = 0
 
     def __init__(self, telemetry_hz: float, parameters: dict[str, float] | None = None) -> None:
         interval_us = round(1e6 / telemetry_hz)  # vehicles take whole numbers
@@ -66,6 +81,9 @@ class LaunchedStartup:
 
     def recognise(self, autopilot: int, vehicle_type: int) -> Kind:  # noqa: ARG002 - it is what the scenario says
         return LAUNCHED
+
+    def is_news(self, text: str) -> bool:  # noqa: ARG002 - it seldom speaks
+        return True
 
     def take(self, msg_id: int, fields: tuple[Any, ...]) -> None:
         if msg_id == mavlink.PARAM_VALUE:
@@ -103,3 +121,43 @@ class LaunchedStartup:
     def begin_anew(self) -> None:
         self._rate_set = False
         self._upload.begin_anew()
+
+
+class ExternalStartup:
+    """Start-up of a vehicle that somebody else flies: it is asked for messages, and nothing else.
+
+    `own` is the start-up that the station would lead such a vehicle through.
+    """
+
+    def __init__(self, own: Startup) -> None:
+        self._own = own
+        self.recognise, self.take = own.recognise, own.take
+        self.is_news, self.arming_refusals = own.is_news, 0
+        self.accepted, self.refused, self.begin_anew = own.accepted, own.refused, own.begin_anew
+
+    @property
+    def kind(self) -> Kind:
+        return self._own.kind
+
+    @property
+    def refusal(self) -> str:
+        return self._own.refusal
+
+    @property
+    def has_landed(self) -> bool:
+        return self._own.has_landed
+
+    @property
+    def is_half_way_up(self) -> bool:
+        return self._own.is_half_way_up
+
+    def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:
+        """What it lacks in order to be followed; its mode and arming are its pilot's."""
+        del custom_mode, armed
+        guided = self._own.kind.guided_mode
+        step = self._own.next(custom_mode=guided, armed=True, clock_known=clock_known, now_ns=now_ns)
+        asks = step.command is not None and step.command[0] == SET_MESSAGE_INTERVAL
+        return step if asks else Step(step.missing)
+
+    def next_parameter(self, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
+        """None: its parameters are its owner's."""

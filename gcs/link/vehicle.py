@@ -20,7 +20,7 @@ from gcs.link.kinds import (
     mode_command,
 )
 from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter
-from gcs.link.startup import Startup
+from gcs.link.startup import ExternalStartup, Startup
 
 ARMED = 0x80
 STATE_CRITICAL = 5
@@ -61,8 +61,18 @@ class RemoteVehicle:
     `startup` holds what depends on the kind of vehicle. At the end the vehicle lands if `land` is set, else it holds.
     """
 
-    def __init__(self, system_id: int, *, startup: Startup, report: Report = ignored, land: bool = False) -> None:
+    def __init__(
+        self,
+        system_id: int,
+        *,
+        startup: Startup,
+        report: Report = ignored,
+        land: bool = False,
+        external: bool = False,
+    ) -> None:
         self.system_id = system_id
+        self.external = external
+        """Whether somebody else flies it, as planned: it takes part in the formation, and its mode does not matter."""
         self.address: Address | None = None
         self.heard_ns = 0  # newest valid frame
         self.heartbeat_ns = 0  # newest heartbeat
@@ -78,7 +88,9 @@ class RemoteVehicle:
         self.taken_over = False
         """Whether the vehicle's pilot flies it, or its autopilot for a reason of its own. This ends only when it
         reports that it is guided; until then the station asks it for telemetry and commands nothing."""
-        self.startup = startup
+        self.left_out = False
+        """Whether the formation flies without it because it did not become ready in time."""
+        self.startup = ExternalStartup(startup) if external else startup
         self.kind = startup.kind
         self.first_heard_ns: int | None = None
         self._has_been_guided = self._take_off_sent = False
@@ -102,13 +114,15 @@ class RemoteVehicle:
     @property
     def ended(self) -> bool:
         """Whether the vehicle holds or lands, or is not ours to end: it never took off, or somebody else flies it."""
+        if self.external:
+            return True
         if self.kind.piloted and (self.kind is UNRECOGNISED or not self.armed):
             return True
         return self.taken_over or self.custom_mode == self.end_mode
 
     @property
     def guided(self) -> bool:
-        return self.armed and self.custom_mode == self.kind.guided_mode and not self.taken_over
+        return self.external or (self.armed and self.custom_mode == self.kind.guided_mode and not self.taken_over)
 
     @property
     def ready(self) -> bool:
@@ -124,7 +138,7 @@ class RemoteVehicle:
         """What keeps the vehicle from being ready, in words; empty if it is ready."""
         if self.address is None or self.silent:
             return "not heard" if self.address is None else "is silent"
-        if self.taken_over:
+        if self.taken_over and not self.startup.has_landed:
             left = "left" if self._has_been_guided else "is armed and not in"
             return f"{left} {self.kind.guided_name}: flown by its pilot or its autopilot"
         return self._next_step().missing
@@ -177,7 +191,7 @@ class RemoteVehicle:
         was_guided = self.guided
         self.kind = self.startup.recognise(autopilot, vehicle_type)
         if self.kind.piloted:
-            self.clock.backdated_ns = self.kind.timesync_backdated_ns
+            self.clock.expected_error_ns = self.kind.timesync_error_ns
             self._see_pilot(custom_mode, now_ns, armed=armed, critical=critical)
         self.custom_mode, self.armed = custom_mode, armed
         if critical and not self.critical:
@@ -193,6 +207,8 @@ class RemoteVehicle:
         the ground, before arming, anybody may set any mode.
         """
         kind, before = self.kind, self.custom_mode
+        if self.external:
+            return
         if mode == kind.guided_mode:
             self._has_been_guided = True
             self.taken_over = self.taken_over and now_ns - self._doubtful_ns < _FORGET_NUMBERS_NS
@@ -227,10 +243,13 @@ class RemoteVehicle:
         self._command = None
         if result != _ACCEPTED:
             name = RESULTS[result] if result < len(RESULTS) else str(result)
-            self._report("vehicle", f"answered {name} to command {command}", self.system_id)
+            if command != ARM_DISARM or not self.startup.arming_refusals:  # repeated ones are counted
+                self._report("vehicle", f"answered {name} to command {command}", self.system_id)
             self.startup.refused(command, waiting.parameters, now_ns, repeated=waiting.confirmation > 0)
             self._not_before_ns = now_ns + _NS
             return
+        if command == ARM_DISARM and self.startup.arming_refusals > 1:
+            self._report("vehicle", f"arms after {self.startup.arming_refusals} refusals", self.system_id)
         self.startup.accepted(command, waiting.parameters, now_ns)
         if command in (SET_MODE, ARM_DISARM):
             self._outdated.append((now_ns, self.custom_mode, self.armed))
@@ -264,7 +283,8 @@ class RemoteVehicle:
                 return None
             waiting.sent_ns = now_ns
             waiting.confirmation = (waiting.confirmation + 1) & 0xFF
-            if waiting.command == SET_MODE and (waiting.command, waiting.parameters) != self._wanted():
+            revocable = waiting.command == SET_MODE or self.startup.has_landed
+            if revocable and (waiting.command, waiting.parameters) != self._wanted():
                 self._command = waiting = None
         if waiting is None:
             wanted = self._wanted()

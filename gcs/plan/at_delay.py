@@ -13,45 +13,12 @@ from gains.core.requirement import plain
 from gains.design.time_scale import time_scaled
 from gains.performance.flown import ALPHA_KEPT, FlownFormation, FlownLoop, FlownTiming
 from gains.performance.predicted import PredictedLoop
-from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.onboard import own_part
 from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, GainSet
+from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.formation import plan_formation
-from scenarios.link_schema import Jitter, Link
 from scenarios.schema import Scenario
-
-
-def expected_loop_delay_s(scenario: Scenario) -> float:
-    """The expected loop delay (s) over the slowest links, at the slowest of their delay points.
-
-    It is the delay up and down with mean jitter, plus half the shorter period of telemetry and control: the first
-    command computed from a state waits from nothing to a whole period, as the phases of vehicle and station happen to
-    be. With the loop on board, a state from the slowest link up may be needed on the slowest link down.
-    """
-    links = [scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles]
-    if scenario.control.loop == "onboard":
-        around_s = max(_mean_delay_s(up) for up, _ in links) + max(_mean_delay_s(down) for _, down in links)
-    else:
-        around_s = max(_mean_delay_s(up) + _mean_delay_s(down) for up, down in links)
-    return around_s + 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
-
-
-def _mean_delay_s(link: Link) -> float:
-    constant_s = max((point.delay_s for point in link.delay_points), default=link.delay_s)
-    return constant_s + (_mean_jitter_s(link.jitter) if link.jitter is not None else 0.0)
-
-
-def _mean_jitter_s(jitter: Jitter) -> float:
-    match jitter.distribution:
-        case "exponential":
-            return jitter.scale_s or 0.0
-        case "gamma":
-            return (jitter.scale_s or 0.0) * (jitter.shape or 0.0)
-        case "trace":
-            return float(np.mean(jitter.trace_s or (0.0,)))
-        case "uniform" | "normal":
-            return 0.0
 
 
 def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
@@ -75,7 +42,7 @@ def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
 
 def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_set: int = 0) -> FiguresAtDelay:
     """α and the string peak of a design's gain set at a loop delay (s)."""
-    if delay_s is not None and design.vehicles > 1 and _is_predicted(design):
+    if delay_s is not None and design.vehicles > 1 and _is_predicted(design) and not design.margin_unknown:
         return _predicted_at(design, delay_s, gain_set)
     flown, chains = _flown(design, scenario, gain_set) if delay_s is not None else ([], [])
     if delay_s is None or not flown:
@@ -99,7 +66,7 @@ def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDel
     if design.prediction is not None:
         fixed_s = design.prediction.assumed_delay_s
         assumed_s = delay_s if fixed_s is None else fixed_s
-    entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
+    entry = _gain_set(design, gain_set)
     loops = [
         PredictedLoop(chain.gains, design.period_s, assumed_s, chain.response, design.feed_forward)
         for chain in (_follower_loops(design, entry) if design.inclusion_gains is not None else [])
@@ -115,13 +82,17 @@ def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDel
 
 def _flown(design: Design, scenario: Scenario, gain_set: int = 0) -> tuple[list[FlownFormation], list[FlownLoop]]:
     """The formations flown, empty where no α is defined, and the loops of followers in a leader-follower tree."""
-    if design.vehicles < 2 or _is_predicted(design):
+    if design.vehicles < 2 or design.margin_unknown or _is_predicted(design):
         return [], []
-    entry = design.schedule[gain_set] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
+    entry = _gain_set(design, gain_set)
     if design.inclusion_gains is not None:
         chains = _follower_loops(design, entry)
         return [chain.pair for chain in chains], chains
     return [_flown_formation(design, entry, scenario)] if design.K is not None else [], []
+
+
+def _gain_set(design: Design, place: int) -> GainSet:
+    return design.schedule[place] if design.schedule else GainSet(delay_margin_s=design.delay_margin_s)
 
 
 def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
@@ -130,14 +101,8 @@ def _follower_loops(design: Design, entry: GainSet) -> list[FlownLoop]:
     own, front, spacing = (0.0 if gain is None else gain[0][0] for gain in gains)
     if not (own < 0.0 < spacing):
         return []
-    return [
-        FlownLoop(
-            ScalarGains(-own, front * entry.streamed_share, spacing, 0.0),
-            _timing(design, entry),
-            answer,
-        )
-        for answer in set(_responses(design).values()) or [None]
-    ]
+    scalar = ScalarGains(-own, front * entry.streamed_share, spacing, 0.0)
+    return [FlownLoop(scalar, _timing(design, entry), answer) for answer in set(design.responses.values()) or [None]]
 
 
 def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> FlownFormation:
@@ -149,7 +114,7 @@ def _flown_formation(design: Design, entry: GainSet, scenario: Scenario) -> Flow
         gain = own + entry.streamed_share * (first - own)
     else:
         gain = time_scaled(model, first, entry.time_scale)
-    answers = _responses(design)
+    answers = design.responses
     return FlownFormation(
         model,
         gain,
@@ -162,9 +127,3 @@ def _timing(design: Design, entry: GainSet) -> FlownTiming:
     margin_s = inf if entry.delay_margin_s is None else entry.delay_margin_s
     step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
     return FlownTiming(margin_s, design.period_s, design.loop, step_s)
-
-
-def _responses(design: Design) -> dict[int, Response]:
-    """The vehicles' responses by system id; empty if they are unknown or immediate."""
-    known = design.response.vehicles if design.response is not None else ()
-    return {vehicle.system_id: Response(vehicle.lag_s, vehicle.velocity_gain_1_s) for vehicle in known}

@@ -3,13 +3,14 @@
 `gcs.plan.planner.flight_plan` makes it; each stage adds its part to a copy. `gcs.runs.files` reads it back from a run.
 """
 
-from math import inf, isinf
+from math import inf, isinf, nan
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field
 
 from gains.core._semidefinite import SolverFacts
 from gains.core.requirement import Requirement
+from gains.performance.response import Response
 from gcs.published import Published
 
 Matrix = tuple[tuple[float, ...], ...]
@@ -91,8 +92,19 @@ class VehicleResponse(Published):
     """How one vehicle responds to set-points, as in `gains.performance.response.Response`."""
 
     system_id: int
+    model: str = "lag"
     lag_s: float
     velocity_gain_1_s: float
+    dead_time_s: float = 0.0
+    natural_frequency_rad_s: float | None = None
+    damping: float | None = None
+    misfit: float | None = None
+    """The share of the velocity (rms) in the manoeuvre that the response leaves unexplained; None if it was given."""
+
+    @property
+    def response(self) -> Response:
+        """The response itself."""
+        return Response(self.lag_s, self.velocity_gain_1_s, self.dead_time_s, self.natural_frequency_rad_s)
 
 
 class ResponsePart(Published):
@@ -153,6 +165,89 @@ class FiguresAtExpectedDelay(FiguresAtDelay):
     string_peak_kept_to_s: float | None
 
 
+class VehicleSpread(Published):
+    """The root mean square of one follower's spacing error: the true one, and the one that is reported."""
+
+    system_id: int
+    spacing_error_rms_m: float
+    reported_rms_m: float
+
+
+class PredictedSpread(Published):
+    """How far disturbances and errors of navigation spread the spacing errors at a loop delay, in the long run."""
+
+    loop_delay_s: float
+    decay_rate_1_s: float
+    vehicles: tuple[VehicleSpread, ...]
+
+
+class WholeFigures(Published):
+    """α for disturbances of the whole formation together, where that of the design is one follower's."""
+
+    alpha: float
+    loop_delay_s: float
+    alpha_at_loop_delay: float
+
+
+class CriteriaPart(Published):
+    """What a design reaches of everything it can be asked for, asked or not; None where it is not defined."""
+
+    at_delay_s: float
+    """Loop delay of the figures at a delay: the one asked for, or that of the scenario's links."""
+    damping: float
+    natural_frequency_rad_s: float
+    alpha_at_delay: float
+    decay_rate_at_delay_1_s: float
+    spacing_gain_s2: float | None
+    noise_gain: float | None
+    weight: tuple[float, float] = (1.0, 1.0)
+    alpha_bound: float | None = None
+    """α that no controller exceeds at the delay; by `gcs design` only, as what follows."""
+    delays_jumping_s: tuple[float, float] | None = None
+    """Among which delays about the one at hand it may jump at will."""
+    delays_covered_by: str | None = None
+    delays_covered_to_s: float | None = None
+
+
+class CodeRecord(Published):
+    """A file of the user's own code that a scenario names."""
+
+    file: str
+    sha256: str
+
+
+class LinkGains(Published):
+    """Gains for a measured link, with prediction or without, and their figures at its worst delays."""
+
+    prediction: bool
+    refused: str = ""
+    """Why there are none; then the figures are unknown."""
+    K1: float | None = None
+    K2: float | None = None
+    K3: float | None = None
+    alpha: float | None = None
+    decay_rate_1_s: float | None = None
+    string_peak: float | None = None
+    spacing_gain_s2: float | None = None
+    noise_gain: float | None = None
+    stable_s: tuple[float, Margin] | None = None
+    headroom: float | None = None
+
+
+class LinkPart(Published):
+    """What was measured of the links, and why the gains were chosen for them."""
+
+    source: str
+    vehicles: tuple[int, ...]
+    loop_delay_s_least: float
+    loop_delay_s_p50: float
+    loop_delay_s_worst: float
+    headroom: float
+    maximised: str
+    chosen: str
+    candidates: tuple[LinkGains, ...] = ()
+
+
 class Design(Published):
     """The gains of a scenario, their margins and other figures, and the proofs; fields as published in design.json.
 
@@ -191,6 +286,14 @@ class Design(Published):
     onboard: OnboardPart | None = None
     prediction: PredictionPart | None = None
     at_loop_delay: FiguresAtExpectedDelay | None = None
+    whole: WholeFigures | None = None
+    """Only of `gcs design`; so is the spread."""
+    spread: PredictedSpread | None = None
+    criteria: CriteriaPart | None = None
+    margin_unknown: str = ""
+    """Why no delay margin could be computed, which is then None; empty if one was."""
+    code: tuple[CodeRecord, ...] = ()
+    for_link: LinkPart | None = None
 
     @property
     def inclusion_gains(self) -> tuple[Matrix, Matrix, Matrix] | None:
@@ -200,9 +303,16 @@ class Design(Published):
         return self.K1_1_s, self.K2_1_s, self.K3_1_s2
 
     @property
+    def responses(self) -> dict[int, Response]:
+        """The vehicles' responses by system id; empty if they are unknown or immediate."""
+        return {own.system_id: own.response for own in self.response.vehicles} if self.response is not None else {}
+
+    @property
     def margins_s(self) -> tuple[float, ...]:
-        """The delay margins of the gain schedule; infinite where there is none."""
+        """The delay margins of the gain schedule; infinite where there is none, NaN where it is unknown."""
         every = [entry.delay_margin_s for entry in self.schedule] or [self.delay_margin_s]
+        if self.margin_unknown:
+            return (nan,) * len(every)
         return tuple(inf if margin_s is None else margin_s for margin_s in every)
 
     def with_schedule(self, schedule: tuple[GainSet, ...], **parts: Published | str) -> Self:

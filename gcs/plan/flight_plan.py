@@ -1,15 +1,40 @@
-"""The flight plan: formation, gains and their delay margins, as the station flies them."""
+"""The flight plan: formation, gains, the vehicles' responses, and the delay margins of the gains with them."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import inf
+from typing import Any, Literal
+
+import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
+from gains.performance.lone_margin import lone_margin
+from gains.performance.response import Response, sampled_margin
 from gains.sampled.multirate import Timing
 from gcs.plan.formation import Formation
-from gcs.plan.mismatch import Tolerance, tolerance
-from gcs.plan.responses import Responses
+from gcs.plan.mismatch import TABULATED_S, Tabulated, Tolerated, Window, distances, window
 from scenarios.schema import Scenario
+
+
+@dataclass(frozen=True)
+class Responses:
+    """The response of each vehicle by system id, and where it is from."""
+
+    source: Literal["given", "identified"]
+    of: Mapping[int, Response]
+    misfit: Mapping[int, float] = field(default_factory=dict[int, float])
+    """The share of each vehicle's velocity that its identified response leaves unexplained."""
+
+    def in_order(self, system_ids: Sequence[int]) -> list[Response]:
+        """The responses of these vehicles.
+
+        One that was left out of the flight has none. In its place stands that of the last vehicle flown, so that it
+        makes no margin smaller: on a tree, all followers have the same gains.
+        """
+        flown = [system_id for system_id in system_ids if system_id in self.of]
+        return [self.of[system_id if system_id in self.of else flown[-1]] for system_id in system_ids]
 
 
 @dataclass(frozen=True)
@@ -21,6 +46,7 @@ class FlightPlan:
     gain: FloatArray
     """K of u = K e, rows and columns in the order of `gains.formation.model.FormationModel`."""
     delay_margin_s: float
+    """NaN where it is unknown."""
     slower: tuple[tuple[FloatArray, float], ...] = ()
     """The rest of the gain schedule: gain matrices with larger and larger delay margins, and these margins."""
     separable: bool = True
@@ -31,6 +57,8 @@ class FlightPlan:
     """Flown in place of `gains` while a vehicle is lost; empty if those serve. A leader-follower tree stays stable when
     the nearest vehicle ahead stands in for a lost one. Gains on another pattern may need all of their terms, so
     inclusion gains of the same delay margin replace them; the step in the commands is accepted."""
+    law: Callable[..., Any] | None = None
+    """The scenario's own control law (`gcs.plan.own_law.Law`), which is flown instead of `gains`."""
 
     @cached_property
     def gains(self) -> tuple[FloatArray, ...]:
@@ -43,9 +71,26 @@ class FlightPlan:
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
 
     @cached_property
-    def tolerance(self) -> Tolerance:
-        """By how much the loop delay may miss the one that the station assumes."""
-        return tolerance(self.scenario.control.prediction, self.model, self.gains, self.margins_s, self.timing)
+    def tolerance(self) -> Callable[[float], Tolerated]:
+        """By how much the loop delay may miss the one that the station assumes, at that one."""
+        prediction, responses = self.scenario.control.prediction, self.responses_in_order
+        if prediction == "off":
+            without = Tolerated((inf,) * len(self.margins_s), self.margins_s)
+            return lambda _: without
+
+        def windows(K: FloatArray, *assumed_s: float) -> list[Window]:
+            return [window(self.model, K, self.timing, at_s, responses) for at_s in assumed_s]
+
+        if isinstance(prediction, str):
+            return Tabulated([windows(K, *TABULATED_S) for K in self.gains])
+        ends = [distances(windows(K, prediction)[0], prediction) for K in self.gains]
+        fixed = Tolerated(tuple(shorter for shorter, _ in ends), tuple(longer for _, longer in ends))
+        return lambda _: fixed
+
+    @property
+    def responses_in_order(self) -> list[Response] | None:
+        """The vehicles' responses in the model's order; None if they are immediate or unknown."""
+        return None if self.responses is None else self.responses.in_order(self.formation.system_ids)
 
     @property
     def assumed_s(self) -> float | None:
@@ -72,3 +117,56 @@ class FlightPlan:
 def loop_timing(scenario: Scenario) -> Timing:
     """The periods at which states and commands of a scenario are sent."""
     return Timing(1.0 / scenario.rates.control_hz, 1.0 / scenario.rates.telemetry_hz)
+
+
+def given_responses(scenario: Scenario) -> Responses | None:
+    """The scenario's response, as that of each of its vehicles."""
+    given = scenario.response
+    if given is None:
+        return None
+    response = Response(**given.model_dump())
+    return Responses("given", {vehicle.system_id: response for vehicle in scenario.vehicles})
+
+
+def margins_with(plan: FlightPlan, responses: Responses) -> list[float]:
+    """The margin (s) of each of the plan's gains."""
+    steps = margin_steps(plan, responses)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return end.value
+
+
+def margin_steps(plan: FlightPlan, responses: Responses) -> Generator[None, None, list[float]]:
+    """The same, in steps.
+
+    Where every vehicle's loop has a margin of its own and both axes are alike, a step is one vehicle, some milliseconds
+    (`gains.performance.lone_margin`). Other gains take `sampled_margin`, of all vehicles together.
+    """
+    of, margins_s = responses.in_order(plan.formation.system_ids), list[float]()
+    for K in plan.gains:
+        own = own_gains(plan, K)
+        if own is None:
+            margins_s.append(sampled_margin(plan.model, K, of, timing=plan.timing))
+            yield
+            continue
+        margins_s.append(np.inf)
+        for (k1, k3), response in zip(own, of, strict=True):
+            margins_s[-1] = min(margins_s[-1], lone_margin(k1, k3, response, period_s=plan.timing.held_s))
+            yield
+    return margins_s
+
+
+def own_gains(plan: FlightPlan, K: FloatArray) -> list[tuple[float, float]] | None:
+    """k1 and k3 of each vehicle's own loop; None unless it is one of these."""
+    model, found = plan.model, list[tuple[float, float]]()
+    if not plan.separable or plan.timing.commands > 1:
+        return None
+    for i in range(model.vehicles):
+        on_velocity = K[model.input_slice(i), model.velocity_slice(i)]
+        on_spacing = K[model.input_slice(i), model.spacing_slice(i)] if i else 0.0 * on_velocity
+        if not all(np.array_equal(block, block[0, 0] * np.eye(model.axes)) for block in (on_velocity, on_spacing)):
+            return None
+        found.append((-float(on_velocity[0, 0]), float(on_spacing[0, 0])))
+    return found

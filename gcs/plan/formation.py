@@ -17,7 +17,7 @@ class Formation:
     model: FormationModel
     """Who follows whom, and the error model that follows from it."""
     offset_ne_m: FloatArray
-    """Wanted position relative to the vehicle in front, (n, 2); zero for the leader."""
+    """Wanted position relative to the vehicle in front when the flight begins, (n, 2); zero for the leader."""
 
     def row(self, system_id: int) -> int:
         """The place of a vehicle in the order."""
@@ -38,5 +38,20 @@ def plan_formation(scenario: Scenario) -> Formation:
     return Formation(
         system_ids=tuple(row),
         model=FormationModel(tuple(-1 if v.follows is None else row[v.follows] for v in ordered)),
-        offset_ne_m=np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered]),
+        offset_ne_m=_in_north_east(scenario, np.array([v.offset_ne_m or (0.0, 0.0) for v in ordered])),
     )
+
+
+def _in_north_east(scenario: Scenario, offset_m: FloatArray) -> FloatArray:
+    """The offsets at the start of the flight, turned by the first heading if they turn with the course."""
+    if scenario.course.offsets == "fixed":
+        return offset_m
+    north, east = scenario.nominal_velocity_at(0.0)
+    return offset_m @ np.array([[north, east], [-east, north]]) / np.hypot(north, east)
+
+
+def on_one_axis(model: FormationModel, K: FloatArray) -> tuple[FormationModel, FloatArray] | None:
+    """The formation and the gain of one axis; None if K does not act on every axis alike."""
+    one = K[:: model.axes, :: model.axes]
+    alike = np.array_equal(K, np.kron(one, np.eye(model.axes)))
+    return (FormationModel(model.predecessors, axes=1), one) if alike else None

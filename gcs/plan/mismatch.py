@@ -7,25 +7,23 @@ loop delay may be anywhere in the mismatch window (`gains.sampled.prediction`).
 from collections.abc import Sequence
 from functools import lru_cache
 from math import inf
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
+from gains.performance.response import Response, formation_loop
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window, mismatch_window_continuous
-from scenarios.part import PREDICTION_MAX_S
+from scenarios.keys.part import PREDICTION_MAX_S
 
 Window = tuple[float, float]
 """The shortest and the longest loop delay (s) between which a loop is stable."""
-_TABULATED_S = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0, 7.0, PREDICTION_MAX_S)
+TABULATED_S = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.9, 1.3, 2.0, 3.0, 5.0, 7.0, PREDICTION_MAX_S)
 """Assumed delays at which the windows are computed if the delay is measured."""
-
-
-_MOST_ON_THE_WAY, _MOST_AT_TWO_RATES = 600, 60
-"""Most commands on their way for which the sampled window is computed; the second if telemetry has another rate, for
-which it takes a march over delays."""
+_MOST_ON_THE_WAY = 2000
+"""Most commands on their way for which the sampled window is computed."""
 
 
 class Tolerated(NamedTuple):
@@ -52,42 +50,25 @@ class Tolerated(NamedTuple):
         return -mismatch_s * self.longer_s[gain_set] / shorter_s if shorter_s > 0.0 else inf
 
 
-class Tolerance(Protocol):
-    """The tolerated mismatch at an assumed loop delay."""
-
-    def at(self, assumed_s: float) -> Tolerated: ...
-
-
-class Steady:
-    """One tolerance, for an assumed delay that is fixed."""
-
-    def __init__(self, tolerated: Tolerated) -> None:
-        self._tolerated = tolerated
-
-    def at(self, assumed_s: float) -> Tolerated:
-        del assumed_s
-        return self._tolerated
-
-
 class Tabulated:
-    """Tolerances at any assumed delay, rounded to the millisecond, interpolated between computed windows.
+    """The tolerance at any assumed delay, rounded to the millisecond, interpolated between computed windows.
 
     The reciprocals of the distances are interpolated, because they are nearly linear: about k1 + k3 tau^. If only one
     of two neighbouring windows has a lower end, its distance is used.
     """
 
     def __init__(self, windows: Sequence[Sequence[Window]]) -> None:
-        """`windows`: for each gain set, the window at each assumed delay in `_TABULATED_S`."""
+        """`windows`: for each gain set, the window at each assumed delay in `TABULATED_S`."""
         self._known: dict[int, Tolerated] = {}
         with np.errstate(divide="ignore"):
             self._reciprocal = 1.0 / np.array(
-                [[distances(at, s) for at, s in zip(own, _TABULATED_S, strict=True)] for own in windows]
+                [[distances(at, s) for at, s in zip(own, TABULATED_S, strict=True)] for own in windows]
             )
 
-    def at(self, assumed_s: float) -> Tolerated:
+    def __call__(self, assumed_s: float) -> Tolerated:
         key = round(1e3 * assumed_s)
         if key not in self._known:
-            place = float(np.interp(1e-3 * key, _TABULATED_S, np.arange(len(_TABULATED_S))))
+            place = float(np.interp(1e-3 * key, TABULATED_S, np.arange(len(TABULATED_S))))
             before, after = self._reciprocal[:, int(place)], self._reciprocal[:, -(-int(1e9 * place) // 10**9)]
             share = place - int(place)
             mixed = np.where((before == 0.0) | (after == 0.0), np.maximum(before, after), 0.0)
@@ -106,44 +87,54 @@ def distances(window: Window, assumed_s: float) -> tuple[float, float]:
     return assumed_s - least_s if least_s > 0.0 else inf, most_s - assumed_s
 
 
-def tolerance(
-    prediction: float | str,
+def window(
     model: FormationModel,
-    gains: Sequence[FloatArray],
-    margins_s: tuple[float, ...],
+    K: FloatArray,
     timing: Timing,
-) -> Tolerance:
-    """What a gain schedule tolerates; `prediction` is the scenario's key, `margins_s` are those without prediction."""
-    if prediction == "off":
-        return Steady(Tolerated((inf,) * len(margins_s), margins_s))
-    if isinstance(prediction, str):
-        return Tabulated([[window(model, K, timing, at_s) for at_s in _TABULATED_S] for K in gains])
-    found = [distances(window(model, K, timing, prediction), prediction) for K in gains]
-    return Steady(Tolerated(tuple(shorter for shorter, _ in found), tuple(longer for _, longer in found)))
-
-
-def window(model: FormationModel, K: FloatArray, timing: Timing, assumed_s: float) -> Window:
+    assumed_s: float,
+    responses: Sequence[Response] | None = None,
+) -> Window:
     """The mismatch window of a sampled formation that is predicted over `assumed_s`.
 
-    The map of one period has a state for each command on its way. Where these are too many, the window is that of the
-    continuous model, which differs by less than a period of both rates at either end, less such a period at both.
+    `responses` are those of the vehicles in the model's order; without them they respond at once. The map of one period
+    has a state for each command on its way. Where these are too many, the window is that of the continuous model, which
+    differs by less than a period of both rates at either end, less such a period at both.
     """
-    most = _MOST_ON_THE_WAY if timing.commands == 1 else _MOST_AT_TWO_RATES
-    if assumed_s <= most * timing.faster_s:
-        return _window(model, K.tobytes(), timing, assumed_s)
-    least_s, most_s = continuous_window(model, K, timing, assumed_s)
+    if assumed_s <= _MOST_ON_THE_WAY * timing.faster_s:
+        return _window(model, K.tobytes(), timing, assumed_s, None if responses is None else tuple(responses))
+    least_s, most_s = continuous_window(model, K, timing, assumed_s, responses)
     return min(assumed_s, least_s + timing.common_s), max(assumed_s, most_s - timing.common_s)
 
 
-def continuous_window(model: FormationModel, K: FloatArray, timing: Timing, assumed_s: float) -> Window:
+def continuous_window(
+    model: FormationModel,
+    K: FloatArray,
+    timing: Timing,
+    assumed_s: float,
+    responses: Sequence[Response] | None = None,
+) -> Window:
     """The mismatch window of the continuous model, in which the hold counts as half a period of delay."""
     half_s = timing.held_s / 2.0
-    least_s, most_s = mismatch_window_continuous(model.A, model.B, K, assumed_s=assumed_s + half_s)
+    loop, measured = predicted_loop(model, K, responses)
+    least_s, most_s = mismatch_window_continuous(*loop, assumed_s=assumed_s + half_s, measured=measured)
     return max(0.0, least_s - half_s), most_s - half_s
 
 
 @lru_cache(maxsize=1024)
-def _window(model: FormationModel, gain: bytes, timing: Timing, assumed_s: float) -> Window:
+def _window(
+    model: FormationModel, gain: bytes, timing: Timing, assumed_s: float, responses: tuple[Response, ...] | None
+) -> Window:
     """Cached: all flights of a campaign use the same windows."""
     K = np.frombuffer(gain).reshape(model.inputs, model.states)
-    return mismatch_window(model.A, model.B, K, timing, assumed_s=assumed_s)
+    loop, measured = predicted_loop(model, K, responses)
+    return mismatch_window(*loop, timing, assumed_s=assumed_s, measured=measured)
+
+
+def predicted_loop(
+    model: FormationModel, K: FloatArray, responses: Sequence[Response] | None
+) -> tuple[tuple[FloatArray, FloatArray, FloatArray], list[bool] | None]:
+    """A, B and K, and which states are measured: the errors, not what is computed of the responses."""
+    if responses is None:
+        return (model.A, model.B, K), None
+    loop = formation_loop(model, K, responses)
+    return loop, [k < model.states for k in range(len(loop[0]))]

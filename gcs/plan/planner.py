@@ -7,7 +7,7 @@ from math import inf
 import numpy as np
 
 from gains.core.arrays import FloatArray
-from gains.core.requirement import Requirement, plain
+from gains.core.requirement import Criteria, Requirement, plain
 from gains.delay.constant import delay_margin
 from gains.design.design import Design as InclusionDesign
 from gains.design.design import design, evaluate_gains, trade_off
@@ -15,13 +15,15 @@ from gains.design.graph import GraphDesign
 from gains.design.required import requirement_with
 from gains.design.time_scale import time_scaled
 from gains.formation.model import FormationModel
-from gains.formation.pattern import Pattern, leader_follower, with_links, without_links
+from gains.formation.pattern import Pattern, leader_follower, overlapping, with_links, without_links
 from gains.performance.predicted import fed_forward
 from gains.performance.response import Response, continuous_margin, sampled_margin
 from gains.performance.robust import robustness
 from gains.performance.string_stability import string_peak
 from gains.sampled.constant import sampled_delay_margin
+from gcs.errors import InputError
 from gcs.plan.at_delay import with_figures_at_delay
+from gcs.plan.criteria import with_criteria
 from gcs.plan.design import (
     Block,
     Design,
@@ -32,13 +34,20 @@ from gcs.plan.design import (
     VehicleResponse,
     WindowAt,
 )
-from gcs.plan.flight_plan import FlightPlan, loop_timing
+from gcs.plan.flight_plan import FlightPlan, Responses, given_responses, loop_timing, margins_with
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.mismatch import continuous_window, window
 from gcs.plan.onboard import onboard_plan, timing_of
-from gcs.plan.responses import Responses, given_responses
+from gcs.plan.own_law import OWN_DYNAMICS, code_records, own_plan, with_unknown_margin
+from scenarios.keys.own import BUILT_IN
 from scenarios.schema import Scenario
 
+_EQUATIONS = {
+    "lag": "lag a' = u + g (v_s - v) - a, v_s' = u",
+    "lag with dead time": "lag a' = w(t - dead time) - a, w = u + g (v_s - v), v_s' = u",
+    "second order": "a'' / natural frequency^2 + lag a' = u + g (v_s - v) - a, v_s' = u",
+}
+MEASURED_WANTED = "read measured, wanted links to measure: --links-of RUN|FILE.tlog of gcs fly, check or design"
 NOT_YET_KNOWN = "not yet known"
 _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
@@ -54,6 +63,21 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
 
     Raises gains.core.errors.GainsError if the scenario's requirement cannot be met.
     """
+    if scenario.control.for_link == "measured":
+        raise InputError(f"{scenario.name}: control.for_link: {MEASURED_WANTED}")
+    if scenario.control.method == "python":
+        design, plan = own_plan(scenario, flight_plan)
+    else:
+        design, plan = _gains_plan(scenario)
+    if scenario.dynamics in BUILT_IN or design.margin_unknown:
+        return design, plan
+    if scenario.response is None:
+        return with_unknown_margin(design, plan, OWN_DYNAMICS)
+    return design.model_copy(update={"code": code_records(scenario)}), plan
+
+
+def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
+    """Design and plan of gains that are designed or given."""
     formation = plan_formation(scenario)
     model = formation.model
     if scenario.control.method != "inclusion" or scenario.control.blocks:
@@ -87,7 +111,7 @@ def with_trade_off(design: Design) -> Design:
 
     Gains on a general pattern have none.
     """
-    if design.inclusion_gains is None:
+    if design.inclusion_gains is None or design.margin_unknown:
         return design
     wanted = design.requirement or Requirement()
     points = trade_off(period_s=design.period_s, string_peak_max=wanted.string_peak_max, loop=wanted.loop)
@@ -100,20 +124,21 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
         design, plan = onboard_plan(design, plan)
     if plan.scenario.control.prediction != "off":
         design = design.model_copy(update={"prediction": _prediction(plan)})
-    return with_figures_at_delay(design, plan.scenario), plan
+    design = with_figures_at_delay(design, plan.scenario)
+    return with_criteria(design, plan.scenario), plan
 
 
 def _prediction(plan: FlightPlan) -> PredictionPart:
     """The mismatch windows of the fastest gains; computes the tolerance of the plan, which no tick can wait for."""
     assumed_s = plan.assumed_s
-    plan.tolerance.at(assumed_s or 0.0)
+    plan.tolerance(assumed_s or 0.0)
     found = {at_s: _window_at(plan, at_s) for at_s in sorted({assumed_s or _SHOWN_S[0], *_SHOWN_S})}
     own = dict.fromkeys(WindowAt.model_fields) if assumed_s is None else found[assumed_s].model_dump()
     return PredictionPart.model_validate(own | {"windows": tuple(found.values())})
 
 
 def _window_at(plan: FlightPlan, assumed_s: float) -> WindowAt:
-    flown = plan.model, plan.gain, plan.timing, assumed_s
+    flown = plan.model, plan.gain, plan.timing, assumed_s, plan.responses_in_order
     return WindowAt(
         assumed_delay_s=assumed_s,
         mismatch_window_s=window(*flown),
@@ -127,8 +152,11 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
         whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
     if responses is None and plan.timing.commands == 1:  # what the design was found with
         return whole, plan
-    of = None if responses is None else responses.in_order(plan.formation.system_ids)
-    margins_s = tuple(sampled_margin(plan.model, K, of, timing=plan.timing) for K in plan.gains)
+    margins_s = (
+        tuple(margins_with(plan, responses))
+        if responses
+        else tuple(sampled_margin(plan.model, K, None, timing=plan.timing) for K in plan.gains)
+    )
     plan = plan.with_margins(margins_s, responses)
     if responses is not None:
         return described(whole, plan), plan
@@ -145,9 +173,15 @@ def identified(design: Design, plan: FlightPlan) -> Design:
     assert plan.responses is not None
     response = ResponsePart(
         source=plan.responses.source,
-        model="lag a' = u + g (v_s - v) - a, v_s' = u",
+        model="; ".join(sorted({_EQUATIONS[found.model] for found in plan.responses.of.values()})),
         vehicles=tuple(
-            VehicleResponse(system_id=system_id, lag_s=found.lag_s, velocity_gain_1_s=found.velocity_gain_1_s)
+            VehicleResponse(
+                system_id=system_id,
+                model=found.model,
+                damping=found.damping,
+                misfit=plan.responses.misfit.get(system_id),
+                **asdict(found),
+            )
             for system_id, found in sorted(plan.responses.of.items())
         ),
         delay_margin_at_once_s=design.delay_margin_s,
@@ -213,8 +247,10 @@ def _design(scenario: Scenario, model: FormationModel, response: Response | None
     if control.gains is not None:
         own, front, spacing = (gain * np.eye(2) for gain in (control.gains.K1, control.gains.K2, control.gains.K3))
         return evaluate_gains(model, (own, front, spacing), period_s=timing.held_s)
-    requirement = requirement_with(_requirement(scenario), response, timing=timing)
-    return design(model, requirement, period_s=timing.held_s)
+    wanted = _requirement(scenario)
+    if wanted.criteria is None:
+        return design(model, requirement_with(wanted, response, timing=timing), period_s=timing.held_s)
+    return design(model, wanted, period_s=timing.held_s)
 
 
 def _requirement(scenario: Scenario) -> Requirement:
@@ -225,6 +261,7 @@ def _requirement(scenario: Scenario) -> Requirement:
         decay_rate_1_s=control.decay_rate_1_s,
         string_peak_max=control.string_peak_max,
         loop=control.loop,
+        criteria=None if control.criteria is None else Criteria(**control.criteria.model_dump()),
     )
 
 
@@ -232,11 +269,11 @@ def _graph_plan(scenario: Scenario, formation: Formation) -> tuple[Design, Fligh
     """Design and plan on an information pattern, designed or given block by block."""
     control, timing, model = scenario.control, loop_timing(scenario), formation.model
     period_s = timing.held_s
-    pattern = _pattern(scenario, formation)
+    pattern = pattern_of(scenario, formation)
     if control.blocks:
         found = evaluate_gains(model, _given_gain(scenario, formation), pattern=pattern, period_s=period_s)
     else:
-        assert control.method != "inclusion"
+        assert control.method not in ("inclusion", "python")
         wanted = _requirement(scenario)
         onboard = timing_of(scenario)
         found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s, onboard=onboard)
@@ -266,12 +303,14 @@ def _graph_plan(scenario: Scenario, formation: Formation) -> tuple[Design, Fligh
     return _with_responses(Design.model_validate(found.to_dict() | parts), plan, given_responses(scenario))
 
 
-def _pattern(scenario: Scenario, formation: Formation) -> Pattern:
+def pattern_of(scenario: Scenario, formation: Formation) -> Pattern:
     """Who may use whose errors."""
     row, tree = formation.row, leader_follower(formation.model)
     if scenario.control.blocks:
         none = without_links(tree, tree.links)
         return with_links(none, [(row(block.vehicle), row(block.of)) for block in scenario.control.blocks])
+    if (more := scenario.control.overlap) is not None:
+        tree = overlapping(formation.model, ahead=more.ahead, behind=more.behind, leader=more.leader)
     return with_links(tree, [(row(v.system_id), row(heard)) for v in scenario.vehicles for heard in v.hears])
 
 

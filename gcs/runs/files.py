@@ -17,6 +17,7 @@ from gcs.published import Published
 from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE, write_whole
 from gcs.runs.summary_record import Summary
 from scenarios import files as scenario_files
+from scenarios.own_code import write_code
 from scenarios.schema import Scenario
 
 _Record = TypeVar("_Record", bound=Published)
@@ -43,6 +44,7 @@ def write_design(folder: Path, design: Design) -> None:
 def write_experiment(folder: Path, scenario: Scenario, design: Design) -> None:
     """Write what is to be flown into a run's folder."""
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(scenario), encoding="utf-8")
+    write_code(scenario, folder)
     write_design(folder, design)
 
 
@@ -61,7 +63,7 @@ def read_ticks(folder: Path) -> TickArray:
     return ticks
 
 
-_ADDED = {"delay_margin_s": np.nan, "repeated_s": 0.0, "assumed_delay_s": 0.0}
+_ADDED = {"delay_margin_s": np.nan, "loop_delay_bound_s": np.nan, "repeated_s": 0.0, "assumed_delay_s": 0.0}
 """Columns that older runs lack, and the values read instead."""
 
 

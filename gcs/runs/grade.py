@@ -57,7 +57,9 @@ def grade(folder: Path) -> Grade:
     except FileNotFoundError:
         wanted = "the folder of a run whose vehicles the station started"
         raise InputError(f"{folder}: read no {TRUTH_FILE}, wanted {wanted}") from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise InputError(f"{folder / TRUTH_FILE}: {error.strerror}, wanted the truth log in a run's folder") from None
+    except ValueError as error:
         raise InputError(f"{error}, wanted the truth log of a run's vehicles") from None
     if not truth.size:
         raise InputError(f"{folder / TRUTH_FILE}: read no record, wanted the truth log of a run's vehicles")

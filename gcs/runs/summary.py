@@ -5,6 +5,7 @@ Works from the files alone, so a run whose station was killed is finished by the
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,29 @@ from gcs.control.tick import CLOCK_JUMPED, TICK, Event, Mode, TickArray
 from gcs.errors import InputError
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
+from gcs.plan.disturbed import predicted_spread
 from gcs.runs import record
 from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
+from gcs.runs.own_code import own_code
 from gcs.runs.refusals import REFUSED, counted_by_vehicles, counts_of, refused_by_vehicles
-from gcs.runs.summary_record import Clock, Control, Estimate, MarginRange, OneWayDelay, Spread, Summary, VehicleSummary
+from gcs.runs.summary_record import (
+    Clock,
+    Control,
+    Estimate,
+    FlownSpread,
+    MarginRange,
+    OneWayDelay,
+    Spread,
+    Summary,
+    VehicleFlownSpread,
+    VehicleSummary,
+)  # fmt: skip
 from scenarios.schema import Scenario
 
 _SKEW_SPAN_S = 1.0
 """A clock's skew is not estimated over a shorter time than this."""
+_DECAYS = 7.0
+"""The initial errors are gone after this many time constants of the slowest motion: e^-7 of them are left."""
 SILENT_END = "interrupted: the station ended without recording why"
 
 
@@ -42,7 +58,8 @@ def finish(folder: Path, *, unwritten: Sequence[Event] | None = None) -> Summary
     not_logged = list(summary.not_logged)
     if unwritten:
         not_logged.append(f"{record.EVENTS_FILE}: the last {len(unwritten)}")
-    if unwritten is not None and not (folder / record.RECORDING_FILE).exists():
+    recorded = (folder / record.RECORDING_FILE).exists() or find_spec("rerun") is None  # without it none is written
+    if unwritten is not None and not recorded:
         not_logged.append(f"{record.RECORDING_FILE}: see gcs recover")
     if lost := (counted_by_vehicles(folder) or {}).get("truth_lost"):
         not_logged.append(f"{record.TRUTH_FILE}: {lost} records")
@@ -96,7 +113,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
     late = sent[sent["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0)]
     headroom_end = min(_medians(late, "headroom"), default=None)  # of the vehicles, in the last quarter of the flight
     logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
-    slowest_s = max(_medians(sent, "loop_delay_s"), default=None)
+    slowest_s = max((round(delay_s, 9) for delay_s in _medians(sent, "loop_delay_s")), default=None)
     return Summary(
         scenario=scenario.name,
         verdict=verdict(reason, settled, headroom_end=headroom_end, logged=logged),
@@ -109,7 +126,9 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         delay_margin_continuous_s=design.delay_margin_continuous_s,
         response=design.response,
         loop_delay_s=_spread(sent["loop_delay_s"]),
+        loop_delay_bound_s=np.fmax.reduce(sent["loop_delay_bound_s"], initial=np.nan),
         at_loop_delay=figures_at(design, scenario, None if slowest_s is None else round(slowest_s, 9)),
+        spread=_flown_spread(scenario, design, flown, slowest_s),
         headroom_min=np.fmin.reduce(sent["headroom"], initial=np.nan),
         headroom_end=headroom_end,
         settling_time_s=settled,
@@ -123,6 +142,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         refused=counts_of(events, REFUSED),
         mirror=counts_of(events, record.MIRROR),
         mode_changes=tuple(event for event in events if event.kind == "mode" and event.time_s >= 0),
+        **own_code(scenario, design, events),
     )
 
 
@@ -172,7 +192,7 @@ def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown: TickA
     whole = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
     if not whole:
         [alone] = (vehicle.system_id for vehicle in scenario.vehicles)
-        whole = {alone: max(float(np.hypot(*scenario.nominal_velocity[-1].velocity_ne_m_s)), 1.0)}
+        whole = {alone: max(float(np.hypot(*scenario.nominal_velocity_at(scenario.duration_s))), 1.0)}
         errors = {alone: _error(flown, alone, "velocity_error_{}_m_s")}
     latest = 0.0
     for system_id, (time_s, error) in errors.items():
@@ -247,6 +267,35 @@ def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> Clock:
         skew_bound_ppm=skew_bound_ppm,
         jumps=len(jumps_s),
     )
+
+
+def _flown_spread(scenario: Scenario, design: Design, flown: TickArray, delay_s: float | None) -> FlownSpread | None:
+    """The rms of each follower's reported spacing error, from when its start and the last turn are forgotten.
+
+    None if nothing disturbs the vehicles, nothing can be computed, or the flight ended before that.
+    """
+    if scenario.disturbance is None and scenario.navigation is None:
+        return None
+    predicted = predicted_spread(design, scenario, delay_s)
+    if predicted is None:
+        return None
+    from_s = scenario.nominal_velocity[-1].from_s + _DECAYS / predicted.decay_rate_1_s
+    vehicles: list[VehicleFlownSpread] = []
+    for own in predicted.vehicles:
+        rows = flown[(flown["system_id"] == own.system_id) & (flown["time_s"] >= from_s)]
+        square = rows["spacing_error_north_m"] ** 2 + rows["spacing_error_east_m"] ** 2
+        square = square[np.isfinite(square)]
+        if not square.size:
+            return None
+        vehicles.append(
+            VehicleFlownSpread(
+                system_id=own.system_id,
+                reported_rms_m=float(np.sqrt(square.mean())),
+                predicted_rms_m=own.reported_rms_m,
+                predicted_true_rms_m=own.spacing_error_rms_m,
+            )
+        )
+    return FlownSpread(loop_delay_s=predicted.loop_delay_s, from_s=from_s, vehicles=tuple(vehicles))
 
 
 def _control(scenario: Scenario, flown: TickArray) -> Control:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, PlainSerializer
 
 from gcs.control.tick import Event
-from gcs.plan.design import FiguresAtDelay, ResponsePart
+from gcs.plan.design import CodeRecord, FiguresAtDelay, ResponsePart
 from gcs.published import Published
 from gcs.runs.record import STARTED, event_fields
 
@@ -96,6 +96,33 @@ class Control(Published):
     lateness_s: Spread
 
 
+class VehicleFlownSpread(Published):
+    """The root mean square of one follower's spacing error: as reported, and predicted."""
+
+    system_id: int
+    reported_rms_m: Number
+    predicted_rms_m: Number
+    predicted_true_rms_m: Number
+
+
+class FlownSpread(Published):
+    """How far disturbances and errors of navigation spread the spacing errors, flown and predicted."""
+
+    loop_delay_s: Number
+    from_s: Number
+    vehicles: tuple[VehicleFlownSpread, ...] = ()
+
+
+class LawRecord(Published):
+    """The calls of a control law of one's own."""
+
+    calls: int
+    unusable: int
+    over_budget: int | None
+    """None in virtual time, in which calls are not timed."""
+    budget_s: float
+
+
 class Summary(Published):
     """The verdict on a run and its figures. What older files lack keeps its default.
 
@@ -113,7 +140,9 @@ class Summary(Published):
     delay_margin_continuous_s: Number = None
     response: ResponsePart | None = None
     loop_delay_s: Spread
+    loop_delay_bound_s: Number = None
     at_loop_delay: FiguresAtDelay = FiguresAtDelay(loop_delay_s=None)
+    spread: FlownSpread | None = None
     headroom_min: Number
     headroom_end: float | None = None
     settling_time_s: float | None = None
@@ -127,6 +156,9 @@ class Summary(Published):
     mode_changes: tuple[Annotated[Event, PlainSerializer(event_fields)], ...] = ()
     files: tuple[str, ...] = ()
     refused_by_vehicles: dict[str, int] | None = None
+    margin_unknown: str = ""
+    law: LawRecord | None = None
+    code: tuple[CodeRecord, ...] = ()
 
     @property
     def spacing_error_final_m(self) -> float | None:

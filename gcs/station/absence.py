@@ -1,19 +1,24 @@
-"""Which vehicles are absent from the formation: those that are lost, and those that a pilot or autopilot flies."""
+"""Which vehicles are absent: those that are lost, that have landed, or that a pilot or autopilot flies."""
 
 from collections.abc import Sequence
 
+from gcs.autopilot.kinds import STAYS_DISARMED
 from gcs.link.vehicle import RemoteVehicle
 
 LOST, TAKEN_OVER = "is lost", "is taken over by its pilot or its autopilot"
+LEFT_OUT = "is left out: it did not become ready"
 COMPLETED = "completed: duration reached"
 
 
-def absences(vehicles: Sequence[RemoteVehicle], silent: Sequence[bool]) -> list[str]:
-    """Why each vehicle is absent; "" for one that takes part."""
-    return [
-        LOST if gone else TAKEN_OVER if vehicle.taken_over else ""
-        for vehicle, gone in zip(vehicles, silent, strict=True)
-    ]
+def absence(vehicle: RemoteVehicle, *, gone: bool) -> str:
+    """Why a vehicle is absent; "" if it takes part. `gone`: it sends no telemetry."""
+    if vehicle.left_out:
+        return LEFT_OUT
+    if gone:
+        return LOST
+    if vehicle.startup.has_landed:
+        return STAYS_DISARMED
+    return TAKEN_OVER if vehicle.taken_over else ""
 
 
 def describe_change(was: str, now: str) -> str:
@@ -25,7 +30,7 @@ def end_reason(vehicles: Sequence[RemoteVehicle], absent: Sequence[str]) -> str:
     """Why a flight ends: its duration has passed, or no vehicle is left. Absent vehicles are named."""
     if all(reason == LOST for reason in absent):
         return "lost: all vehicles"
-    kinds = (("lost", LOST), ("taken over", TAKEN_OVER))
+    kinds = (("left out", LEFT_OUT), ("lost", LOST), ("taken over", TAKEN_OVER), ("landed", STAYS_DISARMED))
     gone = {
         word: ", ".join(str(v.system_id) for v, reason in zip(vehicles, absent, strict=True) if reason == kind)
         for word, kind in kinds

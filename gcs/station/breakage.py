@@ -1,5 +1,7 @@
 """Ends a flight whose formation is broken: after a collision, or a spacing error beyond the limit.
 
+One that is broken before it begins is `not_formed` and does not begin.
+
 A vehicle that returns from its pilot, its failsafe or silence may be far from its place, and the vehicles behind it,
 whose places are relative to it, as far from theirs. Their errors say nothing about the loop until they have had time to
 return. A vehicle is granted this time again only if it has been within the limit since, or if its pilot flew it: a
@@ -12,6 +14,8 @@ from math import hypot, inf, isfinite, isnan, log, nan, sqrt
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gcs.autopilot.kinds import STAYS_DISARMED
+from gcs.control.history import Reports
 from gcs.control.law import VehicleControl
 from gcs.control.tick import Mode
 from gcs.plan.flight_plan import FlightPlan
@@ -21,6 +25,21 @@ from gcs.station.monitor import VehicleState
 _TIME_CONSTANTS = 3.0
 """After this many time constants an error has decayed to a twentieth."""
 _AWAY = (Mode.LOST, Mode.FAILSAFE)
+
+
+def not_formed(plan: FlightPlan, history: Reports) -> str:
+    """Which vehicle is too far from its place behind the one in front to begin; empty if none is."""
+    limit_m, ids = plan.scenario.safety.spacing_error_limit_m, plan.formation.system_ids
+    for row in plan.model.followers:
+        newest = history.newest(row)
+        ahead = None if newest is None else history.at(plan.model.predecessors[row], newest[0])
+        if newest is None or ahead is None:
+            continue
+        north, east = plan.formation.offset_ne_m[row].tolist()
+        error_m = hypot(newest[1][0] - ahead[0] - north, newest[1][1] - ahead[1] - east)
+        if error_m > limit_m:
+            return f"not formed: vehicle {ids[row]} is {error_m:.0f} m from its place at the start, limit {limit_m:g} m"
+    return ""
 
 
 class Breakage:
@@ -59,7 +78,7 @@ class Breakage:
         for row, (state, why) in enumerate(zip(states, absent, strict=True)):
             if why or state.released or state.mode in _AWAY:
                 self._away[row] = True
-                self._piloted[row] |= why == TAKEN_OVER
+                self._piloted[row] |= why in (TAKEN_OVER, STAYS_DISARMED)
             elif self._away[row]:
                 self._come_back(row, controls, time_s)
         limit_m = self._safety.spacing_error_limit_m

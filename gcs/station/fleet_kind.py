@@ -4,11 +4,15 @@
 the loop is closed is another choice, see `gcs.control.loops`.
 """
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 from gcs.autopilot.fleet import AutopilotFleet
 from gcs.control.history import StateHistory
-from gcs.control.loops import Loop, Order, loop_of
+from gcs.control.law import Blend, VehicleControl
+from gcs.control.loops import Loop, Order
+from gcs.control.manoeuvring import loop_of
+from gcs.control.own_law import FlownLaw, LawHooks
 from gcs.control.phases import Phase, patience_s
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle, Report, in_words, refusals
@@ -19,39 +23,39 @@ from scenarios.schema import NS_PER_S
 class FleetKind(Protocol):
     """The vehicles of one flight, in the order of the formation, and all that depends on their kind."""
 
-    @property
-    def plan(self) -> FlightPlan:
-        """The flight plan; once the vehicles are identified, with margins for their responses."""
-        ...
-
-    @property
-    def vehicles(self) -> list[RemoteVehicle]: ...
-
-    @property
-    def loop(self) -> Loop: ...
-
-    @property
-    def frame_ned_m(self) -> list[tuple[float, float, float]]:
-        """Where each vehicle's local frame begins, in that of the first vehicle."""
-        ...
-
-    @property
-    def speaks_mavlink_1_first(self) -> bool:
-        """Whether a vehicle may speak MAVLink 1 until it hears MAVLink 2."""
-        ...
-
-    @property
-    def holds_when_left_alone(self) -> bool:
-        """Whether a vehicle without set-points holds its velocity; the failsafe of an autopilot may be to fly on."""
-        ...
+    plan: FlightPlan
+    """The flight plan; once the vehicles are identified, with margins for their responses."""
+    vehicles: list[RemoteVehicle]
+    loop: Loop
+    frame_ned_m: list[tuple[float, float, float]]
+    """Where each vehicle's local frame begins, in that of the first vehicle."""
+    speaks_mavlink_1_first: bool
+    """Whether a vehicle may speak MAVLink 1 until it hears MAVLink 2."""
+    holds_when_left_alone: bool
+    """Whether a vehicle without set-points holds its velocity; the failsafe of an autopilot may be to fly on."""
 
     @property
     def identified(self) -> bool:
         """Whether the response of every vehicle is known."""
         ...
 
-    def startup_failure(self, due_ns: int, start_ns: int) -> str:
-        """Why the flight cannot begin: a vehicle cannot be flown, or took too long. Empty while it still may begin."""
+    def startup_failure(self, due_ns: int, start_ns: int, history: StateHistory) -> str:
+        """Why the flight cannot begin: a vehicle cannot be flown, or took too long. Empty while it still may begin.
+
+        Vehicles that others can fly without are left out, and what they reported is forgotten.
+        """
+        ...
+
+    def begin(self) -> None:
+        """The vehicles are ready: report what is known of them."""
+        ...
+
+    def end(self) -> None:
+        """The flight ends: report what was counted."""
+        ...
+
+    def bounded(self, controls: list[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
+        """The commands of the control law, kept to what the vehicles are known to follow."""
         ...
 
     def locate(self, history: StateHistory) -> None:
@@ -67,37 +71,55 @@ class FleetKind(Protocol):
         ...
 
 
-def fleet_of(plan: FlightPlan, report: Report) -> FleetKind:
-    """The fleet that a plan is made for; `report` takes events of its vehicles as (kind, text, system id)."""
-    return (AutopilotFleet if plan.scenario.dynamics == "autopilot" else LaunchedFleet)(plan, report)
+def fleet_of(plan: FlightPlan, report: Report, hooks: LawHooks | None = None) -> FleetKind:
+    """The fleet that a plan is made for; `report` takes events of its vehicles as (kind, text, system id).
+
+    `hooks` are those of a control law of one's own.
+    """
+    if plan.scenario.dynamics == "autopilot":
+        return AutopilotFleet(plan, report)
+    return LaunchedFleet(plan, report, None if plan.law is None else FlownLaw(plan, hooks or LawHooks()))
 
 
 class LaunchedFleet:
-    """Double integrators: in the air from the beginning, in one frame, responding at once."""
+    """Vehicles that are in the air from the beginning, in one frame."""
 
     speaks_mavlink_1_first = False
     holds_when_left_alone = True
     identified = True
 
-    def __init__(self, plan: FlightPlan, report: Report) -> None:
+    def __init__(self, plan: FlightPlan, report: Report, law: FlownLaw | None = None) -> None:
         scenario = plan.scenario
         self.plan = plan
-        self.loop = loop_of(plan)
+        self._law = law
+        self.loop = loop_of(plan, law)
         self.vehicles = [
             RemoteVehicle(
                 system_id,
                 startup=LaunchedStartup(scenario.rates.telemetry_hz, self.loop.parameters(system_id)),
                 report=report,
                 land=scenario.at_end == "land",
+                external=system_id == scenario.external_id,
             )
             for system_id in plan.formation.system_ids
         ]
         self.frame_ned_m = [(0.0, 0.0, 0.0)] * len(self.vehicles)
         self._patience_ns = patience_s(scenario) * NS_PER_S
 
-    def startup_failure(self, due_ns: int, start_ns: int) -> str:
+    def startup_failure(self, due_ns: int, start_ns: int, history: StateHistory) -> str:  # noqa: ARG002
         late = [v for v in self.vehicles if not v.ready] if due_ns - start_ns > self._patience_ns else []
         return refusals(self.vehicles) or in_words("not ready: ", late)
+
+    def begin(self) -> None:
+        """Nothing to report."""
+
+    def end(self) -> None:
+        if self._law is not None:
+            self._law.report()
+
+    def bounded(self, controls: list[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
+        del blends
+        return controls
 
     def locate(self, history: StateHistory) -> None:
         """Nothing to do: all frames are the same."""

@@ -5,6 +5,7 @@ or in virtual time, with the same bytes.
 """
 
 from collections import Counter, deque
+from collections.abc import Callable
 from math import isfinite, nan
 
 import numpy as np
@@ -13,7 +14,8 @@ from gcs.control.history import StateHistory
 from gcs.control.law import distances_m
 from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
-from gcs.control.loops import Order
+from gcs.control.loops import Moment, Order
+from gcs.control.own_law import LAW, LawHooks
 from gcs.control.phases import Phase, next_phase, patience_s
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, SEVERITY, Event, Mode, TickArray
 from gcs.link import mavlink
@@ -21,8 +23,8 @@ from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.kinds import Goal
 from gcs.link.vehicle import SILENCE_S, RemoteVehicle
 from gcs.plan.flight_plan import FlightPlan
-from gcs.station.absence import absences, describe_change, end_reason
-from gcs.station.breakage import Breakage
+from gcs.station.absence import absence, describe_change, end_reason
+from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.monitor import FormationMonitor, Observation
 from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
@@ -35,9 +37,12 @@ _HEARTBEAT_NS = NS_PER_S
 
 
 class Station:
-    """Flies one formation. `start_ns` is the time of the first control tick."""
+    """Flies one formation. `start_ns` is the time of the first control tick.
 
-    def __init__(self, plan: FlightPlan, *, start_ns: int) -> None:
+    With `stopwatch_ns`, the calls of a control law of one's own are timed: in real time.
+    """
+
+    def __init__(self, plan: FlightPlan, *, start_ns: int, stopwatch_ns: Callable[[], int] | None = None) -> None:
         scenario = plan.scenario
         rates = scenario.rates
         self.plan = plan
@@ -47,13 +52,14 @@ class Station:
         self.frames: list[tuple[bytes, int]] = []
         """Frames received since the driver last took them, each with the time at which it was received."""
         self.counters: Counter[str] = Counter()
-        self._fleet = fleet_of(plan, self._report)
+        self._fleet = fleet_of(plan, self._report, LawHooks(self.request_stop, self._note_law, stopwatch_ns))
         self.vehicles = self._fleet.vehicles
         n = len(self.vehicles)
         self._row = {vehicle.system_id: row for row, vehicle in enumerate(self.vehicles)}
         self._history = StateHistory(n)
         self._law = self._fleet.loop.law([False] * n)
         self._breakage = Breakage(plan)
+        self._has_slots = scenario.has_altitude_slots
         self._limits = SetPointLimits.of(scenario.limits)
         self._period_ns = round(NS_PER_S / rates.control_hz)
         period_s = self._period_ns / NS_PER_S
@@ -179,7 +185,8 @@ class Station:
                 vehicle.acknowledge(fields, datagram.received_ns)
             case mavlink.STATUSTEXT:
                 text = fields[1].split(b"\0")[0].decode(errors="replace")
-                self._report("statustext", text, vehicle.system_id)
+                if vehicle.startup.is_news(text):
+                    self._report("statustext", text, vehicle.system_id)
             case _:
                 pass
         vehicle.startup.take(frame.msg_id, fields)
@@ -190,6 +197,8 @@ class Station:
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields
         clock = vehicle.clock
         sample_ns = clock.sampled_ns(boot_ms, datagram.received_ns, newest=vehicle.newest)
+        if vehicle.left_out:
+            return  # on the ground, others may fly over it
         if sample_ns is None:
             if not clock.exchange_due:
                 self._telemetry_ns[row] = datagram.received_ns  # heard before the first exchange
@@ -227,16 +236,13 @@ class Station:
         flying = self.phase is Phase.FLYING
         time_s = self.scenario_time_s(due_ns)
         nominal_m_s = self.plan.scenario.nominal_velocity_at(time_s)
-        controls = self._fleet.loop.control(
-            self._history,
-            self._law,
-            self._monitor.blends(time_s),
-            due_ns=due_ns,
-            nominal_velocity_m_s=nominal_m_s,
-            opening=self._monitor.opening,
-        )
+        blends = self._monitor.blends(time_s)
+        now = Moment(due_ns, time_s, nominal_m_s, self._monitor.opening)
+        controls = self._fleet.loop.control(self._history, self._law, blends, now)
+        controls = self._fleet.bounded(controls, blends)
         controls = [c._replace(command_m_s2=self._limits.command(c.command_m_s2)) for c in controls]
-        distance_m = distances_m(controls, due_ns)
+        slots_m = [reported.down_m for reported in self._reported] if self._has_slots else None
+        distance_m = distances_m(controls, due_ns, slots_m)
         nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
         if flying:
             states = self._monitor.states
@@ -253,7 +259,7 @@ class Station:
             if fields is not None:
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
-            tolerated = self.plan.tolerance.at(control.assumed_s)
+            tolerated = self.plan.tolerance(control.assumed_s)
             self._monitor.margins_s[row] = tolerated.longer_s
             fresh_s = self._fresh_rtt_s[row]
             reported, rtt_s = self._reported[row], fresh_s.popleft() if fresh_s else nan
@@ -274,7 +280,8 @@ class Station:
         flying = self.phase is Phase.FLYING
         silence_ns = SILENCE_S * NS_PER_S
         silent = [self._now_ns - heard_ns > silence_ns for heard_ns in self._telemetry_ns]
-        absent = absences(self.vehicles, silent) if flying else [""] * len(silent)
+        both = zip(self.vehicles, silent, strict=True)
+        absent = [absence(vehicle, gone=gone) if flying else "" for vehicle, gone in both]
         if absent != self._absent:
             for vehicle, now, was in zip(self.vehicles, absent, self._absent, strict=True):
                 if now != was and flying:
@@ -289,7 +296,7 @@ class Station:
         for row, before, after in self._monitor.update(fleet):
             vehicle = self.vehicles[row]
             if flying:
-                vehicle.goal = None if after.released else Goal.FLY
+                vehicle.goal = None if after.released or vehicle.left_out else Goal.FLY
             if after.mode is not before.mode:
                 self._report("mode", f"{before.mode.name} -> {after.mode.name}", vehicle.system_id)
                 self._tell(vehicle, after.mode, after.mode.name, outgoing)
@@ -305,17 +312,20 @@ class Station:
     def _next_phase(self, due_ns: int) -> None:
         waited_s = (due_ns - self._phase_since_ns) / NS_PER_S
         if self.phase is Phase.CONNECTING:
-            self.request_stop(self._fleet.startup_failure(due_ns, self._start_ns))
+            self.request_stop(self._fleet.startup_failure(due_ns, self._start_ns, self._history))
         if self.phase is Phase.IDENTIFYING:
             self.request_stop(self._fleet.identify(due_ns, self._history))
             self.plan = self._fleet.plan
         if self.phase is Phase.FLYING and (waited_s >= self.plan.scenario.duration_s or all(self._absent)):
             self.request_stop(end_reason(self.vehicles, self._absent))
+        all_ready = self.phase is Phase.CONNECTING and all(
+            v.left_out or (v.ready and self._history.newest(row)) for row, v in enumerate(self.vehicles)
+        )
+        if all_ready:
+            self.request_stop(not_formed(self.plan, self._history))
         phase = next_phase(
             self.phase,
-            all_ready=self.phase is Phase.CONNECTING
-            and self._history.complete
-            and all(vehicle.ready for vehicle in self.vehicles),
+            all_ready=all_ready,
             stop=bool(self._stop),
             all_holding=all(v.ended for v in self.vehicles if v.address is not None),
             waited_s=waited_s,
@@ -323,11 +333,14 @@ class Station:
         )
         if phase is self.phase:
             return
+        if self.phase is Phase.CONNECTING and not self._stop:
+            self._fleet.begin()
         self.phase, self._phase_since_ns = phase, due_ns
         if phase is Phase.FLYING:
             self._flight_start_ns = due_ns
         if phase is Phase.ENDING:
             self.end_reason = self._stop
+            self._fleet.end()
             # A broken formation is left to its failsafe, if that holds the vehicles: what broke may be the link.
             alone = self._stop.startswith("broken") and self._fleet.holds_when_left_alone
             for vehicle in self.vehicles:
@@ -353,8 +366,13 @@ class Station:
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""
+        if vehicle.external:
+            return
         fields = mavlink.statustext(SEVERITY[mode], f"vehicle {vehicle.system_id}: {text}")
         self._send(vehicle, mavlink.STATUSTEXT, fields, outgoing)
 
     def _report(self, kind: str, text: str, system_id: int | None = None) -> None:
         self.events.append(Event(time_s=self.scenario_time_s(self._now_ns), kind=kind, text=text, system_id=system_id))
+
+    def _note_law(self, text: str, counts: dict[str, int] | None) -> None:
+        self.events.append(Event(time_s=self.scenario_time_s(self._now_ns), kind=LAW, text=text, counts=counts))

@@ -71,9 +71,10 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
         estimate = clock.estimate
         age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
         up_s = (reported.received_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
-        down_s = down_bound_s = nan
+        down_s = down_bound_s = loop_bound_s = nan
         if clock.down_ns is not None:
             down_s, down_bound_s = clock.down_ns * 1e-9, clock.down_bound_ns * 1e-9
+            loop_bound_s = clock.loop_bound_ns * 1e-9 if control.used_ns == control.sample_ns else nan
         offset_s = bound_s = nan
         if estimate.samples > 0:
             offset_s, bound_s = estimate.offset_at_ns(sent_ns) * 1e-9, estimate.bound_at_ns(sent_ns) * 1e-9
@@ -90,7 +91,7 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
                 *control.spacing_error_m, *control.velocity_error_m_s,
                 *(control.command_m_s2 if commanded else (nan, nan)),
                 nearest_m, reported.queue_s, up_s, reported.bound_s, down_s, down_bound_s,
-                loop_s, repeated_s, control.assumed_s, control.assumed_s + margin_s,
+                loop_s, loop_bound_s, repeated_s, control.assumed_s, control.assumed_s + margin_s,
                 headroom(used_s, margin_s) if margin_s > 0.0 else nan, rtt_s,
                 offset_s, bound_s,
                 frames.received, frames.lost, frames.late, frames.duplicate,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gcs.errors import InputError
-from scenarios.link_schema import Jitter, Link, VehicleLinks
+from scenarios.keys.link import Jitter, Link, VehicleLinks
 from scenarios.schema import Scenario
 
 

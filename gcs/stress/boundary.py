@@ -45,7 +45,7 @@ def map_figure(
     plot.set_facecolor(_BLANK)
     plot.grid(visible=False)
     colors = plot.pcolormesh(cell_edges(across), cell_edges(up), measured.T, cmap="RdBu_r", vmin=-reach, vmax=reach)
-    figure.colorbar(colors, ax=plot, label="growth rate in flight [1/s]: red grows", extend="both")
+    figure.colorbar(colors, ax=plot, label="growth of small errors [1/s]: red grows, blue dies away", extend="both")
     for values, color, dashes, label in (
         (measured, MEASURED, "solid", "boundary in flight"),
         (predicted, _PREDICTED, "dashed", "predicted: sampled model at the loop delay of each flight"),
@@ -159,7 +159,7 @@ def _mark(
         ink = np.where(dark[at[:, 0], at[:, 1]], "white", "#222222")
         for place, color in ((at, ink), (at[:0], np.array(["#222222"]))):  # the second for the legend
             inside = {"color": color} if filled else {"facecolors": "none", "edgecolors": color}
-            label = None if len(place) else f"own initial states: {meaning}"
+            label = None if len(place) else f"from the scenario's start: {meaning}"
             plot.scatter(
                 across[place[:, 0]], up[place[:, 1]], marker=marker, s=size, linewidths=0.9, label=label, **inside
             )

@@ -1,7 +1,8 @@
 """Fly many trials on all processors or on a cluster, and store each as soon as it ends.
 
 The store is one file of JSON lines. A finished trial is appended with one system call, so a killed campaign loses no
-finished trial. A later campaign resumes it: a trial whose id is stored is not flown again.
+finished trial. A later campaign resumes it: a trial whose id is stored is not flown again, unless `refly` is asked to:
+in virtual time it is then the same to the last bit, with files and a Rerun recording.
 """
 
 import contextlib
@@ -13,7 +14,7 @@ import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -23,6 +24,7 @@ from gcs.interrupts import FROM_TERMINAL, held_back
 from gcs.output import DISK_FULL
 from gcs.runs.record import SCENARIO_FILE, RecordLog, write_parquet
 from gcs.stress.measure import fly_trial
+from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, Trial
 
 TRIALS_FILE = "trials.jsonl"
@@ -31,8 +33,6 @@ _PR_SET_PDEATHSIG = 1
 
 Fly = Callable[[Sequence[Trial]], Iterator[Outcome]]
 """Flies trials and yields their outcomes as they end, in any order."""
-Run = Callable[[Sequence[Trial]], list[Outcome]]
-"""Returns the outcomes of trials in their order, flying those that are not stored."""
 
 
 class Store:
@@ -89,11 +89,11 @@ def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None
 
 
 def run_campaign(
-    trials: Sequence[Trial], store: Store, fly: Fly, *, ended: Callable[[Outcome, int], None] | None = None
+    trials: Sequence[Trial], store: Store, fly: Fly, *, ended: Callable[[int], None] | None = None
 ) -> list[Outcome]:
     """Return the outcomes of trials in the given order; those not stored are flown, each once.
 
-    `ended` is called with each outcome and the number of trials still to come. Raises KeyboardInterrupt also if Ctrl-C
+    `ended` is called after each trial with the number still to come. Raises KeyboardInterrupt also if Ctrl-C
     ended a flight in real time; that flight does not count as flown.
     """
     missing = {trial.id: trial for trial in trials if trial.id not in store.outcomes}
@@ -105,13 +105,59 @@ def run_campaign(
             store.add(outcome)
             left -= 1
             if ended is not None:
-                ended(outcome, left)
+                ended(left)
     except OSError as error:
         if error.errno not in DISK_FULL:
             raise
         raise InputError(f"{error.filename}: {error.strerror}; {store.resume}") from None
     # the same trial may have other coordinates in another sweep
     return [replace(store.outcomes[trial.id], coordinates=dict(trial.coordinates)) for trial in trials]
+
+
+@dataclass(frozen=True)
+class Reflown:
+    """A trial flown again.
+
+    `differs` names the figures that changed since its first flight. It is empty in real time, where any may change.
+    """
+
+    outcome: Outcome
+    runs: list[Path]
+    differs: list[str]
+
+
+def refly(study: Study, folder: Path, wanted: str) -> Reflown:
+    """Fly again the one trial in a campaign's folder whose id begins with `wanted`.
+
+    Its runs are left in `flights` beside the campaign's table. A study in real time flies it over UDP, even if it was
+    first flown in virtual time. Raises InputError if not exactly one id begins so, or the trial was flown with another
+    scenario.
+    """
+    from gcs.views.observer import recover_run  # slow to import, and workers need none of it
+
+    check_campaign(folder, "--trial")
+    with contextlib.closing(Store(folder)) as store:
+        found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
+    if len(found) != 1:
+        raise InputError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
+    [stored] = found
+    first = replace(study, real_time=stored.real_time)
+    trial = first.trial(stored.kind, stored.coordinates, seed=stored.seed, probe=stored.probe)
+    if trial.id != stored.id:
+        raise InputError(
+            f"--trial: {stored.id} was flown with another scenario or design; wanted {folder / SCENARIO_FILE}"
+        )
+    again = replace(trial, real_time=trial.real_time or study.real_time)
+    flights, stem = folder / "flights", f"{stored.id}{'-real-time' if again.real_time else ''}"
+    flights.mkdir(parents=True, exist_ok=True)
+    names = (stem if count == 1 else f"{stem}-{count}" for count in range(1, 1000))
+    run = next(flights / name for name in names if not (flights / name).exists())  # `fly_trial` creates it
+    outcome = fly_trial(again, run)
+    runs = [run] if (run / SCENARIO_FILE).exists() else sorted(run.iterdir()) if run.is_dir() else []
+    for flight in runs:
+        recover_run(flight)
+    was, now = (vars(replace(one, elapsed_s=0.0, coordinates={}, error=None)) for one in (stored, outcome))
+    return Reflown(outcome, runs, [name for name in was if was[name] != now[name] and not again.real_time])
 
 
 @contextlib.contextmanager

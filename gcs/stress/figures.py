@@ -11,12 +11,13 @@ from gains.core.arrays import FloatArray
 from gains.sampled.coupled_block import unlike_blocks
 from gcs.stress.axes import Axis, place_text
 from gcs.stress.study import Onset, Study
-from gcs.stress.trial import Outcome, plan_loops
+from gcs.stress.trial import Outcome, is_modelled, plan_loops
 from gcs.views.page import figure_of, saved
 
 SAMPLED, CONTINUOUS, MEASURED, LIMIT = "#1f4e79", "#8aa9c4", "#c1440e", "#444444"
 _RATES = "growth_1_s", "predicted_growth_1_s", "growth_error_1_s"
 _WORST = 6
+_FLIGHTS = {"own": "from the scenario's start", "probe": "a small error"}
 
 
 def growth_figure(
@@ -35,12 +36,13 @@ def growth_figure(
     room_s = 0.03 * (float(np.ptp(delay_s)) or 0.1)
     grid_s = np.linspace(max(0.0, delay_s.min() - room_s), delay_s.max() + room_s, 240)
     # the formation's growth rate is the largest of its loops'
-    kinds = unlike_blocks(plan_loops(study.plan))
-    sampled = np.max([[kind.growth_1_s(at) for at in grid_s.tolist()] for kind in kinds], axis=0)
-    continuous = np.max([[kind.growth_continuous_1_s(at) for at in grid_s.tolist()] for kind in kinds], axis=0)
     above.axhline(0.0, color=LIMIT, linewidth=0.8)
-    above.plot(grid_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
-    above.plot(grid_s, sampled, color=SAMPLED, linewidth=1.4, label="sampled model, exact")
+    if is_modelled(study.plan):
+        kinds = unlike_blocks(plan_loops(study.plan))
+        sampled = np.max([[kind.loop.growth_1_s(at) for at in grid_s.tolist()] for kind in kinds], axis=0)
+        continuous = np.max([[kind.growth_continuous_1_s(at) for at in grid_s.tolist()] for kind in kinds], axis=0)
+        above.plot(grid_s, continuous, color=CONTINUOUS, linewidth=3.5, label="continuous model, hold = half a period")
+        above.plot(grid_s, sampled, color=SAMPLED, linewidth=1.4, label="sampled model, exact")
     style: dict[str, Any] = {"fmt": "o", "color": MEASURED, "markersize": 4.0, "elinewidth": 1.0, "capsize": 2.0}
     above.errorbar(delay_s, measured, yerr=error, label="flights", zorder=3, **style)
     _mark_own(above, own)
@@ -97,9 +99,11 @@ def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
     for outcome in worst:
         error_m = np.maximum(np.array(outcome.trace_m), 1e-6)
         time_s = outcome.trace_period_s * (np.arange(error_m.size) + 0.5)
-        label = f"{outcome.id}  {outcome.kind}, {place_text(outcome.coordinates)}"
+        flight = _FLIGHTS[outcome.kind]
+        label = f"{place_text(outcome.coordinates)}: {outcome.verdict or 'failed'}; {flight}, trial {outcome.id[:8]}"
         plot.semilogy(time_s, error_m, linewidth=1.3, label=label)
     plot.set(xlabel="scenario time [s]", ylabel="largest spacing error of all vehicles [m]")
+    plot.set_xlim(0.0, max(outcome.trace_period_s * len(outcome.trace_m) for outcome in worst))
     plot.legend(frameon=False, fontsize=8)
     return saved(figure, file)
 
@@ -126,6 +130,6 @@ def _mark_own(plot: Any, own: Sequence[Outcome]) -> None:
     for verdict, marker, color in (("stable", "o", SAMPLED), ("unstable", "x", MEASURED)):
         at = [o.loop_delay_s for o in own if o.verdict == verdict and o.loop_delay_s is not None]
         if at:
-            label = f"own initial states: {verdict}"
+            label = f"from the scenario's start: {verdict}"
             edge = {"transform": plot.get_xaxis_transform(), "clip_on": False}
             plot.plot(at, [0.02] * len(at), marker, color=color, markersize=5, fillstyle="none", label=label, **edge)

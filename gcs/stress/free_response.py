@@ -44,7 +44,8 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.grade import commands_of, commands_on_board, effective_delay_s
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
-from scenarios.link_schema import Link
+from gcs.stress.trial import is_modelled
+from scenarios.keys.link import Link
 from scenarios.schema import Limits, Safety, Scenario, Vehicle
 
 PROBE_S = 20.0
@@ -59,6 +60,8 @@ _DIRECTION_NE = np.array([1.0, -0.8])
 because two nearly equal modes are hard to separate where both are large."""
 _LINEAR_SHARE = 0.8
 """Share of the nominal speed that a velocity error may reach: the linearisation is exact at any speed but zero."""
+_SMALL_M_S = 1.0
+"""Velocity error up to which a law or dynamics of one's own are taken for linear."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +94,7 @@ def response_alone(
     # where loop delays differ from command to command, their mean counts: only the truth has it exactly
     flight = fly_plan(probe, real_time=real_time, folder=folder, with_truth=plan.timing.commands > 1)
     errors = _rows_of(flight.ticks, system_ids)
-    return FreeResponse(probe, flight, errors, linear_until_s(scenario, errors, share=_LINEAR_SHARE))
+    return FreeResponse(probe, flight, errors, linear_until_s(scenario, errors, share=_linear_share(plan)))
 
 
 def fly_calm(plan: FlightPlan, folder: Path | None) -> Flight:
@@ -109,7 +112,7 @@ def response_paired(
     count = _alike(rows, calm_rows)
     rows, calm_rows = rows[:count], calm_rows[:count]
     until_s, calm_until_s = (
-        linear_until_s(disturbed.scenario, each, share=_LINEAR_SHARE) for each in (rows, calm_rows)
+        linear_until_s(disturbed.scenario, each, share=_linear_share(plan)) for each in (rows, calm_rows)
     )
     errors = rows.copy()
     for name in CHANNELS:
@@ -133,6 +136,11 @@ def effective_delays_s(
     return {system_id: effective_delay_s(commands(system_id), held_s=held_s) for system_id in system_ids}
 
 
+def _linear_share(plan: FlightPlan) -> float:
+    speed_m_s = float(np.hypot(*plan.scenario.nominal_velocity_at(0.0)))
+    return _LINEAR_SHARE if is_modelled(plan) else min(_LINEAR_SHARE, _SMALL_M_S / speed_m_s)
+
+
 def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
     return ticks[np.isin(ticks["system_id"], system_ids) & ticks["commanded"] & (ticks["time_s"] >= 0.0)]
 
@@ -153,7 +161,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     of the leader (m/s), whose position is not controlled. It points in `_DIRECTION_NE` and differs from vehicle to
     vehicle.
     """
-    scenario, place, duration_s = plan.scenario, plan.formation.place_ne_m(), PROBE_S
+    scenario, place, duration_s = plan.scenario.in_steady_flight(), plan.formation.place_ne_m(), PROBE_S
     if not has_constant_links(scenario) and isfinite(plan.delay_margin_s):
         duration_s = max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
     row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
@@ -161,7 +169,7 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
     vehicles: list[Vehicle] = []
     for vehicle in scenario.vehicles:
         position = np.array(leader.position_ne_m) + place[row[vehicle.system_id]]
-        velocity = np.array(scenario.nominal_velocity[0].velocity_ne_m_s)
+        velocity = np.array(scenario.nominal_velocity_at(0.0))
         if vehicle.system_id in system_ids:
             k = system_ids.index(vehicle.system_id)
             error = amplitude * (1.0 + 0.3 * k) * (-1.0) ** k * _DIRECTION_NE
@@ -173,7 +181,6 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         vehicles.append(vehicle.model_copy(update=update))
     update = {
         "vehicles": tuple(vehicles),
-        "nominal_velocity": scenario.nominal_velocity[:1],
         "limits": Limits(speed_min_m_s=_SPEED_MIN_M_S),
         "duration_s": duration_s,
         "onboard": scenario.onboard.model_copy(update={"position_noise_m": 0.0, "velocity_noise_m_s": 0.0}),
@@ -230,7 +237,7 @@ def linear_until_s(scenario: Scenario, own: TickArray, *, share: float) -> float
     `own` are rows of the probed vehicles, in order of time. `share` is the share of the nominal speed that a velocity
     error may reach.
     """
-    speed = float(np.hypot(*scenario.nominal_velocity[0].velocity_ne_m_s))
+    speed = float(np.hypot(*scenario.nominal_velocity_at(0.0)))
     error_m_s, size_m_s2 = _sizes(own)
     beyond = np.flatnonzero((error_m_s > share * speed) | (size_m_s2 > 0.9 * LARGEST_COMMAND_M_S2))
     return float(own["time_s"][beyond[0]] - own["time_s"][0]) if beyond.size else np.inf

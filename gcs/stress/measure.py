@@ -8,7 +8,7 @@ not the actions that keep a flight within it.
 
 import time  # noqa: TID251 - how long a trial takes is only reported; nothing flown depends on it
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,19 +19,21 @@ from gains.sampled.coupled_block import CoupledBlock, critical_block
 from gcs.drive.flown import first_uses, fly_plan, fly_virtual, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
+from gcs.stress import free_response
 from gcs.stress.axes import has_constant_links
-from gcs.stress.free_response import (
-    PROBE_S,
-    FreeResponse,
-    effective_delays_s,
-    fly_calm,
-    past_limits,
-    probe_scenario,
-    response_alone,
-    response_paired,
-)
+from gcs.stress.free_response import FreeResponse
 from gcs.stress.growth import FOLLOWER_MODES, Growth, envelope_growth, fit_growth, motion_of, norm_growth
-from gcs.stress.trial import CRITICAL, TRACE_PERIOD_S, Outcome, Trial, finite, plan_loops, plan_of, with_summary
+from gcs.stress.trial import (
+    CRITICAL,
+    TRACE_PERIOD_S,
+    Outcome,
+    Trial,
+    finite,
+    is_modelled,
+    plan_loops,
+    plan_of,
+    with_summary,
+)
 
 AMPLITUDES = (1.0, 0.03, 0.001)
 """Initial errors of a probe in m (m/s for the leader); the next is flown if errors leave the linear range too soon."""
@@ -87,7 +89,7 @@ def _own(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     loop = critical_block(plan_loops(plan), delays_s)
     loop_s, link_s, _ = _slowest(plan, loop, delays_s)
     outcome = replace(outcome, critical=loop.system_ids[0], link_delay_s=link_s, loop_delay_s=round(loop_s, 9))
-    outcome = _with_prediction(outcome, loop, delays_s)
+    outcome = _with_prediction(outcome, plan, loop, delays_s)
     start_s = _BEGUN_LOOP_DELAYS * loop_s
     growth = envelope_growth(np.array(outcome.trace_m), period_s=TRACE_PERIOD_S, start_s=start_s)
     return outcome if growth is None else _with_fit(outcome, growth)
@@ -111,28 +113,33 @@ def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     outcome = replace(outcome, link_delay_s=up.delay_s + down.delay_s, waiting_s=round(waiting_s, 9))
 
     def respond(amplitude: float) -> FreeResponse:
-        scenario = probe_scenario(base, probed.system_ids, amplitude=amplitude, links=links, waiting_s=waiting_s)
-        run = _folder_of(folder, amplitude)
-        return response_alone(base, scenario, probed.system_ids, real_time=trial.real_time, folder=run)
+        ids, run = probed.system_ids, _folder_of(folder, amplitude)
+        scenario = free_response.probe_scenario(base, ids, amplitude=amplitude, links=links, waiting_s=waiting_s)
+        return free_response.response_alone(base, scenario, ids, real_time=trial.real_time, folder=run)
 
-    return _with_response(probed, critical, respond, outcome)
+    return _with_response(probed, critical, respond, outcome, amplitudes=_amplitudes(base))
 
 
 def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     """Probe the loop that breaks first on the scenario's own links, by the difference of two flights."""
     base = plan_of(trial)
-    calm = fly_calm(base, _folder_of(folder, 0.0))
-    delays_s = effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
+    calm = free_response.fly_calm(base, _folder_of(folder, 0.0))
+    delays_s = free_response.effective_delays_s(base, calm.ticks, calm, base.formation.system_ids)
     probed = _loop_of(plan_loops(base), delays_s, trial.probe)
     _, link_s, waiting_s = _slowest(base, probed, delays_s)
-    past = past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]])
+    past = free_response.past_limits(base.scenario, calm.ticks[calm.ticks["commanded"]])
     outcome = replace(outcome, link_delay_s=link_s, waiting_s=round(waiting_s, 9), past_limits=past)
 
     def respond(amplitude: float) -> FreeResponse:
         run = _folder_of(folder, amplitude)
-        return response_paired(base, calm, probed.system_ids, amplitude=amplitude, folder=run)
+        return free_response.response_paired(base, calm, probed.system_ids, amplitude=amplitude, folder=run)
 
-    return _with_response(probed, probed, respond, outcome)
+    return _with_response(probed, probed, respond, outcome, amplitudes=_amplitudes(base))
+
+
+def _amplitudes(plan: FlightPlan) -> Sequence[float]:
+    """Initial errors of a probe, in order; a law of one's own may be linear for small ones only."""
+    return AMPLITUDES if is_modelled(plan) else AMPLITUDES[1:]
 
 
 def _folder_of(folder: Path | None, amplitude: float) -> Path | None:
@@ -140,14 +147,19 @@ def _folder_of(folder: Path | None, amplitude: float) -> Path | None:
 
 
 def _with_response(
-    loop: CoupledBlock, critical: CoupledBlock, respond: Callable[[float], FreeResponse], outcome: Outcome
+    loop: CoupledBlock,
+    critical: CoupledBlock,
+    respond: Callable[[float], FreeResponse],
+    outcome: Outcome,
+    *,
+    amplitudes: Sequence[float],
 ) -> Outcome:
     """The outcome with the growth rate of a loop, which represents the critical one.
 
-    The initial error is a metre, or less if a metre leaves the linear range too soon.
+    The initial error is the first of `amplitudes`, or less if that leaves the linear range too soon.
     """
     outcome = replace(outcome, probed=loop.system_ids[0], critical=critical.system_ids[0])
-    for amplitude in AMPLITUDES:
+    for amplitude in amplitudes:
         response = respond(amplitude)
         outcome = with_summary(response.plan, response.flight, replace(outcome, amplitude_m=amplitude))
         outcome = _with_growth(loop, response, outcome)
@@ -174,7 +186,9 @@ def _slowest(plan: FlightPlan, loop: CoupledBlock, loop_delay_s: dict[int, float
     return longest_s, up.delay_s + down.delay_s, longest_s - up.delay_s - down.delay_s
 
 
-def _with_prediction(outcome: Outcome, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> Outcome:
+def _with_prediction(outcome: Outcome, plan: FlightPlan, loop: CoupledBlock, loop_delay_s: dict[int, float]) -> Outcome:
+    if not is_modelled(plan):
+        return outcome
     return replace(
         outcome,
         predicted_growth_1_s=finite(loop.growth_at_1_s(loop_delay_s)),
@@ -206,7 +220,7 @@ def _with_growth(loop: CoupledBlock, response: FreeResponse, outcome: Outcome) -
     spread_s = float(np.nanpercentile(window["loop_delay_s"], 90) - np.nanmedian(window["loop_delay_s"]))
     loop_s = round(max(delays_s.values()), 9)
     outcome = replace(_with_fit(outcome, growth), loop_delay_s=loop_s, loop_delay_spread_s=round(spread_s, 9))
-    return _with_prediction(outcome, loop, delays_s)
+    return _with_prediction(outcome, response.plan, loop, delays_s)
 
 
 def _with_fit(outcome: Outcome, growth: Growth) -> Outcome:
@@ -225,7 +239,7 @@ def _left_linear_range_too_soon(outcome: Outcome) -> bool:
     """Whether a smaller initial error would give a better fit: the errors grew, and the window is too short."""
     if outcome.fit_start_s is None or outcome.fit_end_s is None:
         return False
-    growth_1_s, early = outcome.growth_1_s, outcome.fit_end_s < PROBE_S / 2.0
+    growth_1_s, early = outcome.growth_1_s, outcome.fit_end_s < free_response.PROBE_S / 2.0
     if growth_1_s is None:
         return early
     return growth_1_s > 0.0 and (

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import PlainSerializer
 
+from gcs.errors import extra_wanted
 from gcs.plan.design import Design
 from gcs.published import Published
 from gcs.runs.record import write_whole
@@ -133,7 +134,7 @@ def result_of(
             f"the onset is at {each.loop_delay_s:.5f} s of loop delay, {each.difference:+.3%} from the margin "
             f"{each.predicted_s:.5f} s; {100.0 * allowed:.3g}% is allowed"
             for each in onsets
-            if abs(each.difference) > allowed
+            if each.difference is not None and abs(each.difference) > allowed
         )
     return CampaignResult(
         scenario=study.plan.scenario.name,
@@ -159,7 +160,12 @@ def result_of(
         points=tuple(sweep),
         past_limits=sum(outcome.past_limits for outcome in outcomes),
         noise=_noise(outcomes) if study.real_time else None,
-        provenance=_provenance(study.plan.scenario.seed),
+        provenance=Provenance(
+            seed=study.plan.scenario.seed,
+            versions={"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+            git_commit=_commit(),
+            machine=f"{platform.system()} {platform.machine()}",
+        ),
     )
 
 
@@ -168,15 +174,6 @@ def _noise(outcomes: Sequence[Outcome]) -> Noise:
     known = {name: [v for o in outcomes if (v := getattr(o, name)) is not None] for name in names}
     figures = {name: Typical(median=float(np.median(own)), max=max(own)) for name, own in known.items() if own}
     return Noise(flights=len(outcomes), **figures)
-
-
-def _provenance(seed: int) -> Provenance:
-    return Provenance(
-        seed=seed,
-        versions={"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
-        git_commit=_commit(),
-        machine=f"{platform.system()} {platform.machine()}",
-    )
 
 
 def _version(name: str) -> str | None:
@@ -203,12 +200,11 @@ def exact(study: Study, axes: Sequence[Axis]) -> bool:
     return has_constant_links(at_coordinates(study.plan.scenario, at))
 
 
-def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Sequence[Axis]) -> Path:
-    """Write stress.json, the figures as PNG files, and report.html with the figures embedded."""
-    # matplotlib takes half a second to import
-    from gcs.stress.boundary import map_figure
-    from gcs.stress.figures import axis_figure, growth_figure, worst_figure
+def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Sequence[Axis]) -> str:
+    """Write stress.json, the figures as PNG files, and report.html with the figures embedded.
 
+    Returns why there are no figures, if a package that draws them is not installed.
+    """
     write_whole(folder / RESULT_FILE, result.to_json().encode())
     onset = result.onset
     probes, own = ([outcome for outcome in result.points if outcome.kind == kind] for kind in ("probe", "own"))
@@ -218,19 +214,34 @@ def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Se
     flights = list({outcome.id: outcome for outcome in (*(probes if fitted else ()), *searched)}.values())
     large = [*own, *(flight for each in onsets for flight in each.own)]
     everything = [*large, *probes, *searched]
-    growth = growth_figure(folder / "growth.png", study=study, outcomes=flights, own=large, onset=onset)
-    figures: dict[str, tuple[str, Path | None]] = {"growth": ("Growth of errors against delay", growth)}
-    if len(axes) == 1 and not fitted:
-        figures["axis"] = ("Growth of errors", axis_figure(folder / "axis.png", axis=axes[0], outcomes=points))
-    if len(axes) == 2:
-        drawn = map_figure(folder / "map.png", study=study, axes=axes, outcomes=points, verdicts=own or points)
-        figures["map"] = ("Map", drawn)
-    figures["worst"] = ("The worst flights", worst_figure(folder / "worst.png", everything))
+
+    def drawn() -> dict[str, tuple[str, Path | None]]:
+        from gcs.stress.boundary import map_figure
+        from gcs.stress.figures import axis_figure, growth_figure, worst_figure
+
+        growth = growth_figure(folder / "growth.png", study=study, outcomes=flights, own=large, onset=onset)
+        figures: dict[str, tuple[str, Path | None]] = {"growth": ("Growth of errors against delay", growth)}
+        if len(axes) == 1 and not fitted:
+            figures["axis"] = ("Growth of errors", axis_figure(folder / "axis.png", axis=axes[0], outcomes=points))
+        if len(axes) == 2:
+            map_ = map_figure(folder / "map.png", study=study, axes=axes, outcomes=points, verdicts=own or points)
+            figures["map"] = ("Map", map_)
+        figures["worst"] = ("The worst flights", worst_figure(folder / "worst.png", everything))
+        return figures
+
+    not_drawn = ""
+    try:
+        figures = drawn()
+    except ModuleNotFoundError as error:
+        figures, not_drawn = {}, extra_wanted(error.name)
+        if not not_drawn:
+            raise
     page = rendered(
         _TEMPLATE,
         result=result,
         onset=onset,
         figures={name: (title, data_uri(file)) for name, (title, file) in figures.items() if file is not None},
+        not_drawn=not_drawn,
         large=large if len(axes) < 2 else [],
         points=points[:MOST_ROWS],
         left_out=max(0, len(points) - MOST_ROWS),
@@ -241,9 +252,8 @@ def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Se
         gains=_gains(result.gains),
         again=refly_command(folder, result.worst[0]) if result.worst else "",
     )
-    file = folder / REPORT_FILE
-    file.write_text(page, encoding="utf-8")
-    return file
+    (folder / REPORT_FILE).write_text(page, encoding="utf-8")
+    return not_drawn
 
 
 def refly_command(folder: Path, trial_id: str) -> str:

@@ -13,9 +13,9 @@ from gains.sampled.coupled_block import unlike_blocks
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.mismatch import Window
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
-from gcs.stress.campaign import Run
-from gcs.stress.onset import GrowthPoint, Zero, locate_zero
-from gcs.stress.trial import CRITICAL, Kind, Outcome, Trial, plan_loops, sparse_gain
+from gcs.stress.bracket import bracketed
+from gcs.stress.growth import GrowthPoint, Zero, locate_zero
+from gcs.stress.trial import CRITICAL, Kind, Outcome, Run, Trial, is_modelled, plan_loops, sparse_gain
 
 _ROUNDS = 8
 _FLIGHTS_A_ROUND = 5
@@ -37,7 +37,7 @@ class Study:
     @cached_property
     def window_s(self) -> Window:
         """The loop delays between which the plan is predicted to be stable; without prediction the first is 0."""
-        assumed_s, tolerated = self.plan.assumed_s or 0.0, self.plan.tolerance.at(0.0)
+        assumed_s, tolerated = self.plan.assumed_s or 0.0, self.plan.tolerance(0.0)
         return max(0.0, assumed_s - tolerated.shorter_s[0]), assumed_s + tolerated.longer_s[0]
 
     def trial(self, kind: Kind, coordinates: dict[str, float], *, seed: int, probe: int = CRITICAL) -> Trial:
@@ -77,14 +77,15 @@ class Onset:
     All delays are loop delays of the vehicle that breaks first, except `link_delay_s`: the total link delay, up plus
     down, that causes this loop delay and is shorter by `waiting_s`. `predicted_s` is the sampled margin of the design,
     or with prediction the end of its mismatch window. `difference` is `loop_delay_s` / `predicted_s` − 1.
-    `predicted_continuous_s` is the same for the continuous model, less half a period for the hold.
+    `predicted_continuous_s` is the same for the continuous model, less half a period for the hold. None where there is
+    no model: of a law that is not linear, or of dynamics of one's own.
     """
 
     loop_delay_s: float
     error_s: float
-    predicted_s: float
-    predicted_continuous_s: float
-    difference: float
+    predicted_s: float | None
+    predicted_continuous_s: float | None
+    difference: float | None
     link_delay_s: float
     waiting_s: float
     slope_1_s2: float
@@ -115,16 +116,23 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
 
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
     and those of later rounds over a fraction of one if no smooth curve fits. The search follows the measured growth;
-    the prediction only tells it where to start. `shorter` looks for the onset below the assumed delay of a station that
-    predicts, where growth falls as the delay rises. Raises NoOnset with the reason.
+    the prediction only tells it where to start. Where there is none, flights do (`gcs.stress.bracket`). `shorter` looks
+    for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. Raises
+    NoOnset with the reason.
     """
-    predicted_s, way = study.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
-    if predicted_s == np.inf:
+    expected_s, way = study.window_s[0 if shorter else 1], -1.0 if shorter else 1.0
+    if expected_s == np.inf:
         raise _no_limit(study, run, tolerance=tolerance)
-    if predicted_s <= 0.0:
-        raise NoOnset(f"the predicted margin is {predicted_s:g} s: there is no delay at which it is stable")
+    if expected_s <= 0.0:
+        raise NoOnset(f"the predicted margin is {expected_s:g} s: there is no delay at which it is stable")
     first_seed = study.plan.scenario.seed
-    centre_s, width_s = predicted_s - study.plan.timing.faster_s / 2.0, _FIRST_WIDTH * tolerance * predicted_s
+    centre_s, width_s = expected_s - study.plan.timing.faster_s / 2.0, _FIRST_WIDTH * tolerance * expected_s
+    if np.isnan(expected_s):
+        found = bracketed(lambda link_s: study.trial("probe", {"delay": link_s}, seed=first_seed), run)
+        if isinstance(found, str):
+            raise NoOnset(found)
+        expected_s, width_s = (found[0] + found[1]) / 2.0, (found[1] - found[0]) / 2.0
+        centre_s = expected_s
     flights: dict[str, Outcome] = {}
     random_links = not has_constant_links(study.plan.scenario)
     noisy = study.real_time or random_links  # closer flights would show only noise
@@ -153,7 +161,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
         zero = replace(zero, loop_delay_s=way * zero.loop_delay_s)
         waiting_s = _waiting_s(near)
         ahead_s = max(0.0, zero.loop_delay_s - waiting_s) - centre_s
-        wanted_s = tolerance * predicted_s
+        wanted_s = tolerance * expected_s
         close = noisy or zero.misfit <= _SMOOTH_MISFIT or width_s <= 1.001 * _FINEST_WIDTH * wanted_s
         if zero.inside and close and width_s <= 1.001 * wanted_s:
             return _found(study, run, zero, near, tuple(flights.values()), rounds=round_number, shorter=shorter)
@@ -223,22 +231,22 @@ def _found(
     rounds: int,
     shorter: bool,
 ) -> Onset:
-    loops = plan_loops(study.plan)
+    blocks = plan_loops(study.plan)
     nearest = min(near, key=lambda outcome: abs((outcome.loop_delay_s or np.inf) - zero.loop_delay_s))
     assert nearest.probed is not None
     assert nearest.critical is not None
-    loop = next(loop for loop in loops if nearest.probed in loop.system_ids)
+    block = next(block for block in blocks if nearest.probed in block.system_ids)
     end, way = (0, -1.0) if shorter else (1, 1.0)
-    ends_s = [way * kind.window_s()[end] for kind in unlike_blocks(loops)]
+    ends_s = [way * kind.loop.window_s()[end] for kind in unlike_blocks(blocks)]
     # for the loop that breaks first, test the figure that the station flies by
-    own_s = loop.window_s()[end]
-    predicted_s = study.window_s[end] if way * own_s == min(ends_s) else own_s
+    own_s = block.loop.window_s()[end]
+    predicted_s = study.window_s[end] if way * own_s == min(ends_s) or not is_modelled(study.plan) else own_s
     waiting_s = _waiting_s(near)
     link_s = max(0.0, zero.loop_delay_s - waiting_s)
     seed = study.plan.scenario.seed
     at_onset = {"delay": round(link_s, 6)}
-    others = [kind.system_ids[0] for kind in unlike_blocks(loops) if not kind.same_as(loop)]
-    others = dict.fromkeys([*others, loops[-1].system_ids[-1]])
+    others = [kind.system_ids[0] for kind in unlike_blocks(blocks) if not kind.same_as(block)]
+    others = dict.fromkeys([*others, blocks[-1].system_ids[-1]])
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
     # with prediction, stay away from the other end of the window
     aside_s = 0.1 * link_s if study.plan.assumed_s is None else 0.5 * abs(predicted_s - study.plan.assumed_s)
@@ -247,9 +255,9 @@ def _found(
     return Onset(
         loop_delay_s=zero.loop_delay_s,
         error_s=zero.error_s,
-        predicted_s=predicted_s,
-        predicted_continuous_s=loop.window_continuous_s()[end],
-        difference=zero.loop_delay_s / predicted_s - 1.0,
+        predicted_s=None if np.isnan(predicted_s) else predicted_s,
+        predicted_continuous_s=block.loop.window_continuous_s()[end] if is_modelled(study.plan) else None,
+        difference=None if np.isnan(predicted_s) else zero.loop_delay_s / predicted_s - 1.0,
         link_delay_s=link_s,
         waiting_s=waiting_s,
         slope_1_s2=zero.slope_1_s2,

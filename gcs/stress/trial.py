@@ -5,8 +5,10 @@ Both can be pickled. `gcs.stress.measure` flies trials.
 
 import hashlib
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from math import isnan
 from typing import Literal
 
 import numpy as np
@@ -15,10 +17,12 @@ from gains.core.arrays import FloatArray
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
 from gcs.control.tick import TickArray
 from gcs.drive.flown import Flight, margins_of
-from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.flight_plan import FlightPlan, given_responses
 from gcs.plan.formation import plan_formation
 from gcs.plan.onboard import timing_of
+from gcs.plan.own_law import law_of
 from gcs.runs.summary import summarise
+from scenarios.keys.own import BUILT_IN
 from scenarios.schema import Scenario
 
 Kind = Literal["probe", "own"]
@@ -109,6 +113,10 @@ class Outcome:
         return json.dumps(asdict(self), allow_nan=False)
 
 
+Run = Callable[[Sequence[Trial]], list[Outcome]]
+"""Returns the outcomes of trials in their order, flying those that are not stored."""
+
+
 def sparse_gain(K: FloatArray) -> tuple[tuple[int, int, float], ...]:
     """The nonzero entries of K, as in `Trial.gain`."""
     return tuple((int(i), int(j), float(K[i, j])) for i, j in np.argwhere(K != 0.0))
@@ -120,7 +128,15 @@ def plan_of(trial: Trial) -> FlightPlan:
     K = np.zeros((formation.model.inputs, formation.model.states))
     for row, column, value in trial.gain:
         K[row, column] = value
-    return FlightPlan(trial.scenario.with_calm_monitor(), formation, K, trial.delay_margin_s)
+    scenario = trial.scenario.with_calm_monitor()
+    responses, law = given_responses(scenario), law_of(scenario)
+    return FlightPlan(scenario, formation, K, trial.delay_margin_s, responses=responses, law=law)
+
+
+def is_modelled(plan: FlightPlan) -> bool:
+    """Whether the models of `plan_loops` describe the flights: not those of a law that is not linear, or of dynamics of
+    one's own, of which they tell only which vehicles are coupled."""
+    return not isnan(plan.delay_margin_s) and plan.scenario.dynamics in BUILT_IN
 
 
 def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:

@@ -17,6 +17,7 @@ from gcs.published import Published
 from gcs.runs.grade import Grade, grade
 from gcs.runs.summary_record import Control
 from gcs.station import station
+from scenarios.keys.course import Course
 from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
 
@@ -86,7 +87,9 @@ class _Timed:
 
 
 def with_vehicles(scenario: Scenario, count: int) -> Scenario:
-    """The scenario with this many vehicles in columns behind one leader, all in place."""
+    """The scenario with this many vehicles in columns behind one leader, all in place, and without manoeuvres."""
+    if scenario.manoeuvres:
+        scenario = scenario.in_steady_flight().model_copy(update={"course": Course()})
     velocity = scenario.nominal_velocity[0].velocity_ne_m_s
     vehicles = [Vehicle(system_id=1, position_ne_m=(0.0, 0.0), velocity_ne_m_s=velocity)]
     for k in range(count - 1):

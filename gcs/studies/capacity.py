@@ -2,10 +2,16 @@
 
 For each rate, growing formations fly in virtual time over the scenario's own links and channels, until the loop delay
 exceeds the margin of the gains designed for that rate, or the formation no longer flies. Losses are random, so each
-formation flies with several seeds, and is carried only if it holds with all of them.
+formation flies with several seeds, and is carried only if it holds with all of them. In a folder each flight is stored
+as soon as it ends, so that a study can be resumed.
 """
 
-from dataclasses import dataclass, replace
+import contextlib
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from math import ceil, log2
+from pathlib import Path
 
 import numpy as np
 
@@ -16,15 +22,21 @@ from gcs.drive.lockstep import LINK_DOWN, LINK_UP, START_NS, LinkLosses, Sent, V
 from gcs.drive.preflight import bad_start, endless_link, unstable_loop
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
+from gcs.published import json_text
+from gcs.runs.record import SCENARIO_FILE, RecordLog, write_whole
 from gcs.station.station import Station
 from gcs.studies.benchmark import with_vehicles
+from scenarios.files import dump
 from scenarios.schema import Scenario
 
+LOADS_FILE, RESULT_FILE = "loads.jsonl", "capacity.json"
 _START_ERROR_M = 2.0
 """Initial displacement of every second vehicle to the east."""
 _DECAYED = 0.1
 """A formation under control has reduced its errors to this share by the last third of a flight."""
 FEWEST = 2
+SECONDS = 180.0
+"""Duration of each flight."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +60,7 @@ class Load:
     """Largest spacing error of all vehicles: the median over the last third of the flight, because one lost set-point
     affects it for seconds."""
     reason: str
-    """How the flight ended."""
+    """What became of the errors, or why the flight ended early."""
     holds: bool
     """Errors fell to a tenth of their initial size, and 99 of 100 ticks had headroom."""
 
@@ -76,13 +88,25 @@ class _Counted:
         return arrived
 
 
+FlyLoaded = Callable[[Scenario, float, int], Load]
+"""Flies a scenario at a rate (Hz) with a number of vehicles, as `fly_loaded`."""
+
+
 def capacity(
-    scenario: Scenario, *, rates_hz: list[float], most: int, seeds: int = 3, seconds: float = 180.0
+    scenario: Scenario,
+    *,
+    rates_hz: list[float],
+    most: int,
+    seeds: int = 3,
+    seconds: float = SECONDS,
+    fly: FlyLoaded | None = None,
+    ended: Callable[[int], None] = lambda _: None,
 ) -> list[Capacity]:
     """The capacity at each rate, up to `most` vehicles: the size doubles until one fails, then bisection.
 
     Each formation flies with the scenario's seed and those that follow it. Flights last `seconds`, long because errors
-    decay slowly near the margin. Raises InputError if the scenario gives gains as blocks of its own formation, its
+    decay slowly near the margin. `fly` flies in the place of `fly_loaded`; `ended` is called after each formation with
+    the greatest number still to come. Raises InputError if the scenario gives gains as blocks of its own formation, its
     vehicles take off first, or it cannot fly.
     """
     if blocks := len(scenario.control.blocks):
@@ -96,28 +120,53 @@ def capacity(
     for fault in (bad_start(formed), endless_link(formed)):
         if fault is not None:
             raise InputError(f"{scenario.name}: {fault}")
-    return [_capacity_of(scenario, rate_hz, most, seeds) for rate_hz in rates_hz]
+    searches = [_Search(scenario, rate_hz, most, seeds, fly or fly_loaded) for rate_hz in rates_hz]
+    for k, search in enumerate(searches):
+        while search.wants_more:
+            search.advance()
+            ended(sum(later.at_most_left for later in searches[k:]))
+    return [search.found for search in searches]
 
 
-def _capacity_of(scenario: Scenario, rate_hz: float, most: int, seeds: int) -> Capacity:
-    found = Capacity(rate_hz, most=None, next=None)
-    low, count = FEWEST - 1, FEWEST
-    try:
-        while count > low:
-            load = worst_load(scenario, rate_hz, count, seeds)
-            found = replace(found, most=load) if load.holds else replace(found, next=load)
-            low = count if load.holds else low
-            count = min(2 * low, most) if found.next is None else (low + found.next.vehicles) // 2
-    except GainsError as error:
-        return replace(found, failed=str(error))
-    return found
+class _Search:
+    """The search for the capacity at one rate: the size doubles until a formation fails, then bisection."""
+
+    def __init__(self, scenario: Scenario, rate_hz: float, most: int, seeds: int, fly: FlyLoaded) -> None:
+        self.found = Capacity(rate_hz, most=None, next=None)
+        self._scenario, self._most, self._seeds, self._fly = scenario, most, seeds, fly
+        self._low, self._count = FEWEST - 1, FEWEST
+
+    @property
+    def wants_more(self) -> bool:
+        return self._count > self._low and not self.found.failed
+
+    @property
+    def at_most_left(self) -> int:
+        """The greatest number of formations that it may still fly."""
+        if not self.wants_more:
+            return 0
+        beyond = self.found.next.vehicles if self.found.next is not None else self._most + 1
+        doublings = 0 if self.found.next is not None else ceil(log2(self._most / self._count)) + 1
+        return doublings + ceil(log2(max(1, beyond - self._low)))
+
+    def advance(self) -> None:
+        """Fly the next formation."""
+        try:
+            load = worst_load(self._scenario, self.found.rate_hz, self._count, self._seeds, self._fly)
+        except GainsError as error:
+            self.found = replace(self.found, failed=str(error))
+            return
+        self.found = replace(self.found, most=load) if load.holds else replace(self.found, next=load)
+        self._low = self._count if load.holds else self._low
+        beyond = self.found.next
+        self._count = min(2 * self._low, self._most) if beyond is None else (self._low + beyond.vehicles) // 2
 
 
-def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int) -> Load:
+def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int, fly: FlyLoaded | None = None) -> Load:
     """The first flight that does not hold; if all do, the one of least headroom."""
     loads: list[Load] = []
     for seed in range(scenario.seed, scenario.seed + seeds):
-        loads.append(fly_loaded(scenario.model_copy(update={"seed": seed}), rate_hz, vehicles))
+        loads.append((fly or fly_loaded)(scenario.model_copy(update={"seed": seed}), rate_hz, vehicles))
         if not loads[-1].holds:
             return loads[-1]
     return min(loads, key=lambda load: load.headroom_p01 or 0.0)
@@ -128,8 +177,7 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
 
     Raises GainsError if no gains meet the scenario's requirement at this rate, or the given ones are unstable at it.
     """
-    rates = scenario.rates.model_copy(update={"control_hz": rate_hz, "telemetry_hz": rate_hz})
-    formed = with_vehicles(scenario.with_calm_monitor().model_copy(update={"rates": rates}), vehicles)
+    formed = with_vehicles(_at_rate(scenario.with_calm_monitor(), rate_hz), vehicles)
     _, plan = flight_plan(_displaced(formed))
     if (unstable := unstable_loop(plan)) is not None:
         raise GainsError(unstable)
@@ -153,12 +201,35 @@ def fly_loaded(scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
         lost_up=losses.share(LINK_UP),
         lost_down=losses.share(LINK_DOWN),
         error_end_m=error_end_m,
-        reason=f"off by {error_end_m:.2g} m" if completed else "limit broken",
+        reason=_reason(station.end_reason, error_end_m, headroom_p01),
         holds=completed and error_end_m < _DECAYED * _START_ERROR_M and headroom_p01 is not None and headroom_p01 > 0.0,
     )
 
 
+def _at_rate(scenario: Scenario, rate_hz: float) -> Scenario:
+    """The scenario with telemetry and control at this rate.
+
+    Sensor and loop on board run at the least multiples of it that are no slower than the scenario's own.
+    """
+    rates = scenario.rates.model_copy(update={"control_hz": rate_hz, "telemetry_hz": rate_hz})
+    if scenario.control.loop != "onboard":
+        return scenario.model_copy(update={"rates": rates})
+    sensor_hz = rate_hz * ceil(scenario.onboard.sensor_hz / rate_hz)
+    onboard = {"sensor_hz": sensor_hz, "rate_hz": sensor_hz * ceil(scenario.onboard.rate_hz / sensor_hz)}
+    return scenario.model_copy(update={"rates": rates, "onboard": scenario.onboard.model_copy(update=onboard)})
+
+
+def _reason(end_reason: str, error_end_m: float, headroom_p01: float | None) -> str:
+    if not end_reason.startswith("completed"):
+        return end_reason
+    if headroom_p01 is None:
+        return "no loop delay measured"
+    return "margin gone" if headroom_p01 <= 0.0 else f"off by {error_end_m:.2g} m"
+
+
 def _error_end_m(flown: TickArray) -> float:
+    if not flown.size:  # the flight did not begin
+        return _START_ERROR_M
     last = flown[flown["time_s"] >= 2.0 / 3.0 * flown["time_s"][-1]]
     error_m = np.nan_to_num(np.hypot(last["spacing_error_north_m"], last["spacing_error_east_m"]))
     _, first = np.unique(last["tick"], return_index=True)
@@ -177,3 +248,46 @@ def _displaced(scenario: Scenario) -> Scenario:
         for north, east in [vehicle.position_ne_m]
     ]
     return scenario.model_copy(update={"vehicles": tuple(vehicles)})
+
+
+class LoadStore:
+    """Flies formations as `fly_loaded` does, except those whose flight the folder already holds.
+
+    Raises InputError if the folder is to be resumed and holds no study of this scenario.
+    """
+
+    def __init__(self, folder: Path, scenario: Scenario, *, resume: bool) -> None:
+        self._folder, self._loads = folder, dict[tuple[float, int, int], Load]()
+        file, text = folder / SCENARIO_FILE, dump(scenario)
+        if resume and not file.is_file():
+            raise InputError(f"--resume: read no {SCENARIO_FILE} in {folder}, wanted the folder of a capacity study")
+        if resume and file.read_text(encoding="utf-8") != text:
+            raise InputError(f"--resume: {folder} holds a study of another scenario, wanted {file}")
+        write_whole(file, text.encode())
+        self._log = RecordLog(folder / LOADS_FILE)
+        lines = (folder / LOADS_FILE).read_bytes()
+        for line in lines.splitlines():
+            with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; it is flown again
+                self._keep(Load(**json.loads(line)))
+        if lines and not lines.endswith(b"\n"):
+            self._log.add(b"\n")
+
+    def fly(self, scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
+        """The flight of this many vehicles at a rate, from the folder or flown now."""
+        stored = self._loads.get((rate_hz, vehicles, scenario.seed))
+        if stored is not None:
+            return stored
+        load = fly_loaded(scenario, rate_hz, vehicles)
+        self._log.add((json.dumps(asdict(load), allow_nan=False) + "\n").encode())
+        return self._keep(load)
+
+    def write_result(self, found: list[Capacity]) -> None:
+        """Write capacity.json."""
+        write_whole(self._folder / RESULT_FILE, json_text({"capacities": [asdict(each) for each in found]}).encode())
+
+    def close(self) -> None:
+        self._log.close()
+
+    def _keep(self, load: Load) -> Load:
+        self._loads[load.rate_hz, load.vehicles, load.seed] = load
+        return load

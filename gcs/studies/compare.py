@@ -4,7 +4,6 @@ Each route designs for the requirement with the information it may use, and flie
 from the same initial states. Robustness and string peak are computed for all routes on the whole formation.
 """
 
-import json
 import time  # noqa: TID251 - design time is one of the figures; nothing flown depends on it
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_virtual
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
+from gcs.published import json_text
 from gcs.runs.record import SCENARIO_FILE
 from gcs.runs.summary import summarise
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
@@ -72,11 +72,11 @@ class Route:
 Flights = dict[Method, TickArray]
 
 
-def compare(scenario: Scenario) -> tuple[list[Route], Flights]:
-    """Design and fly the scenario by every route."""
+def compare(scenario: Scenario, *, ended: Callable[[int], None] = lambda _: None) -> tuple[list[Route], Flights]:
+    """Design and fly the scenario by every route; `ended` is called after each with the number still to come."""
     routes: list[Route] = []
     flights: Flights = {}
-    for method in METHODS:
+    for left, method in zip(reversed(range(len(METHODS))), METHODS, strict=True):
         update = {"method": method, "gains": None, "blocks": ()}
         control = Control.model_validate(scenario.control.model_dump() | update)
         vehicles = scenario.vehicles
@@ -88,9 +88,10 @@ def compare(scenario: Scenario) -> tuple[list[Route], Flights]:
             route, ticks = _route(method, scenario.model_copy(update={"control": control, "vehicles": vehicles}))
         except GainsError as error:
             routes.append(Route(method, failed=str(error)))
-            continue
-        routes.append(route)
-        flights[method] = ticks
+        else:
+            routes.append(route)
+            flights[method] = ticks
+        ended(left)
     return routes, flights
 
 
@@ -174,7 +175,7 @@ def write_comparison(
     """Write compare.json, the figures, and the page compare.html."""
     (folder / SCENARIO_FILE).write_text(dump(scenario), encoding="utf-8")
     result = {"scenario": scenario.name, "routes": routes, "sizes": grown}
-    (folder / RESULT_FILE).write_text(json.dumps(result, indent=2, default=vars), encoding="utf-8")
+    (folder / RESULT_FILE).write_text(json_text(result, default=vars), encoding="utf-8")
     figures = {"Spacing errors and commands in flight": errors_figure(folder / "flights.png", flights.items())}
     if grown:
         figures["Cost of a design against the number of vehicles"] = sizes_figure(folder / "sizes.png", grown)

@@ -40,11 +40,12 @@ class DesignCost:
     free_gains: int
 
 
-def design_costs() -> list[DesignCost]:
+def design_costs(ended: Callable[[int], None] = lambda _: None) -> list[DesignCost]:
     """Costs for chains of growing length; times of quick designs are medians of several.
 
     The decentralised routes meet a sampled margin of 0.3 s at 50 Hz and certify it. The centralised designs
-    have no margin to meet: the LQR solves one Riccati equation, the LMI one semidefinite programme.
+    have no margin to meet: the LQR solves one Riccati equation, the LMI one semidefinite programme. `ended` is called
+    after each method with the number still to come.
     """
     found: list[DesignCost] = []
     _inclusion(3)  # imports at first use are not part of a design
@@ -56,7 +57,7 @@ def design_costs() -> list[DesignCost]:
         "centralised LQR": _centralised_lqr,
         "centralised LMI": _centralised_lmi,
     }
-    for label, method in methods.items():
+    for left, (label, method) in zip(reversed(range(len(methods))), methods.items(), strict=True):
         for vehicles, following in zip(_SIZES, (*_SIZES[1:], _SIZES[-1]), strict=True):
             if _too_large(label, vehicles):
                 break
@@ -64,6 +65,7 @@ def design_costs() -> list[DesignCost]:
             found.append(DesignCost(label, vehicles, taken_s, free))
             if taken_s * (following / vehicles) ** 3 > _LONGEST_S:
                 break
+        ended(left)
     return found
 
 

@@ -4,7 +4,7 @@ Source: P. R. Sahoo, "Decentralized Control Design Approaches for Formation Cont
 thesis, NIT Rourkela, 2012. Each number that contradicts it is found by two independent methods.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import compress, islice, product
 from pathlib import Path
@@ -60,10 +60,14 @@ class Claim:
     """"agrees", "erratum", "holds with conditions", or "not checkable": nothing was printed to compare with."""
 
 
-def claims() -> list[Claim]:
-    """All claims, in the order of the source."""
+def claims(ended: Callable[[int], None] = lambda _: None) -> list[Claim]:
+    """All claims, in the order of the source; `ended` is called after each part with the number still to come."""
     parts = (_modelling, _inclusion, _expansion, _graph, _sweep_algorithm, _delay, _subsets, _comparison)
-    return [claim for part in parts for claim in part()]
+    found: list[Claim] = []
+    for left, part in zip(reversed(range(len(parts))), parts, strict=True):
+        found += part()
+        ended(left)
+    return found
 
 
 def late_neighbours(K: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatArray]:

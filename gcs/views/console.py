@@ -1,4 +1,4 @@
-"""What terminals show: text as it is, numbers, tables that fit, and pictures drawn anew.
+"""What terminals show: text as it is, numbers, tables that fit, pictures drawn anew, and progress.
 
 What users, files and vehicles wrote is never read as markup.
 """
@@ -91,3 +91,40 @@ def live_display(*, shown: bool, transient: bool = False) -> Generator[Live | No
 def draw(live: Live, picture: Callable[..., RenderableType]) -> None:
     """Draw a picture of a `width` and `height`; the terminal's last line stays free, or the cursor would scroll it."""
     live.update(picture(width=live.console.width, height=live.console.height - 1), refresh=True)
+
+
+Ended = Callable[[int], None]
+"""Called whenever a piece of work has ended, with the number of pieces still to come."""
+
+
+@contextmanager
+def progress(*, shown: bool) -> Generator[Callable[[str], Ended]]:
+    """While entered, provides a function that begins a bar of a name; nothing is drawn where there is no terminal.
+
+    The number of pieces may change on the way, as in a search.
+    """
+    from rich import progress as bars
+
+    console = plain_console(stderr=True, soft_wrap=False)
+    columns = (
+        bars.TextColumn("{task.description}", markup=False),
+        bars.BarColumn(),
+        bars.MofNCompleteColumn(),
+        bars.TimeElapsedColumn(),
+        bars.TextColumn("left"),
+        bars.TimeRemainingColumn(elapsed_when_finished=False),
+    )
+    drawn = shown and console.is_terminal
+    with bars.Progress(*columns, console=console, disable=not drawn, transient=True) as bar:
+
+        def begin(name: str) -> Ended:
+            task, done = bar.add_task(name, total=None), 0
+
+            def ended(left: int) -> None:
+                nonlocal done
+                done += 1
+                bar.update(task, completed=done, total=done + left)
+
+            return ended
+
+        yield begin

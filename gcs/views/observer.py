@@ -16,8 +16,10 @@ import sys
 import time  # noqa: TID251 (this process is a driver: it runs at the pace of the flight it watches)
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from gcs.errors import InputError
+from gcs.control.tick import Event, TickArray
+from gcs.errors import InputError, extra_wanted
 from gcs.output import outlive_readers
 from gcs.plan.design import Design
 from gcs.runs.files import RunTail, by_tick, read_design, read_scenario, read_ticks
@@ -25,8 +27,12 @@ from gcs.runs.record import DESIGN_FILE, END, NEW_DESIGN, READY_FILE, RECORDING_
 from gcs.runs.summary import finish
 from gcs.runs.summary_record import Summary
 from gcs.views.console import live_display
+from gcs.views.flight_report import leave_report
 from gcs.views.table import Display, FlightState
 from scenarios.schema import Scenario
+
+if TYPE_CHECKING:
+    from gcs.views.recording import Recording
 
 POLL_S = 0.1
 TABLE_S = 0.24
@@ -47,13 +53,13 @@ class Parent:
         return os.getppid() != self.pid
 
 
-def main(argv: list[str] | None = None) -> int:
+def main() -> int:
     parser = argparse.ArgumentParser(prog="gcs.views.observer", description="follow a flight: live table and recording")
     parser.add_argument("folder", type=Path, help="the run's folder")
     parser.add_argument("--parent", type=int, required=True, metavar="PID", help="process id of the ground station")
     parser.add_argument("--no-table", action="store_true", help="write the recording and print nothing")
     parser.add_argument("--viewer", metavar="URL", help="send the recording to this Rerun viewer, too")
-    arguments = parser.parse_args(argv)
+    arguments = parser.parse_args()
     parent = Parent(arguments.parent)
 
     def stop(*_: object) -> None:
@@ -64,8 +70,7 @@ def main(argv: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, stop)
     outlive_readers()
     os.environ.setdefault("RUST_LOG", "off")  # Rerun would write errors over the table; one line at the end says them
-    import gcs.views.recording  # noqa: F401  # pyright: ignore[reportUnusedImport]
-
+    import_recording()
     os.nice(10)  # not before: the station waits until this is ready
     ready = arguments.folder / READY_FILE
     try:
@@ -89,12 +94,10 @@ def observe(
     folder: Path, scenario: Scenario, design: Design, *, parent: Parent, show_table: bool, viewer: str | None = None
 ) -> None:
     """Follow the run in `folder` until it ends or is left alone."""
-    from gcs.views.recording import Recording  # Rerun is slow to import
-
     system_ids = [vehicle.system_id for vehicle in scenario.vehicles]
     tail = RunTail(folder, len(system_ids))
     state = FlightState(scenario, design)
-    with Recording(folder, scenario, design, viewer) as recording, live_display(shown=show_table) as live:
+    with _recording(folder, scenario, design, viewer) as recording, live_display(shown=show_table) as live:
         display = Display(state, live, shown=show_table)
         news = table_due = send_due = time.monotonic()
         ended = False
@@ -127,12 +130,13 @@ def observe(
 def recover_run(folder: Path) -> Summary:
     """Finish the files of a run that has ended, flight.rrd among them, and return its summary."""
     finish(folder)
-    record_run(folder)
-    return finish(folder)  # again: the summary lists the files
+    if import_recording():
+        record_run(folder)
+    return leave_report(folder, finish(folder))  # again: the summary lists the files
 
 
 def record_run(folder: Path) -> Path:
-    """Make flight.rrd from the other files of a run that has ended, and return its path."""
+    """Make flight.rrd from the other files of a run that has ended, and return its path; needs the extra viewer."""
     from gcs.views.recording import Recording
 
     scenario, design = read_scenario(folder), read_design(folder / DESIGN_FILE)
@@ -144,6 +148,41 @@ def record_run(folder: Path) -> Path:
             recording.add(ticks[start : start + step], [])
             recording.send()
     return folder / RECORDING_FILE
+
+
+def import_recording() -> bool:
+    """Import what writes recordings, which is slow; False, and one line, if Rerun is not installed."""
+    try:
+        import gcs.views.recording  # noqa: F401  # pyright: ignore[reportUnusedImport]
+    except ModuleNotFoundError as error:
+        if not (why := extra_wanted(error.name)):
+            raise
+        print(f"no {RECORDING_FILE}: {why}", file=sys.stderr)
+        return False
+    return True
+
+
+class _NoRecording:
+    """Stands for the recording where Rerun is not installed."""
+
+    def __enter__(self) -> "_NoRecording":
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def add(self, ticks: TickArray, events: list[Event]) -> None: ...
+
+    def redesigned(self, design: Design) -> None: ...
+
+    def send(self) -> None: ...
+
+
+def _recording(folder: Path, scenario: Scenario, design: Design, viewer: str | None) -> "Recording | _NoRecording":
+    try:
+        from gcs.views.recording import Recording  # Rerun is slow to import
+    except ModuleNotFoundError:
+        return _NoRecording()
+    return Recording(folder, scenario, design, viewer)
 
 
 def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, Design] | None:

@@ -32,19 +32,8 @@ from gcs.control.phases import patience_s
 from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.design import Design
 from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
-from gcs.views.scene import (
-    PICTURE_S,
-    TRAIL_STEP_S,
-    Color,
-    Floats,
-    Newest,
-    PictureTimes,
-    dimmed,
-    positions_m,
-    tree_of,
-    vehicle_colors,
-    wanted_extent_m,
-)
+from gcs.views import scene
+from gcs.views.scene import Color, Floats
 from gcs.views.table import event_text
 from scenarios.schema import Scenario
 
@@ -96,18 +85,18 @@ class Recording:
         count = len(scenario.vehicles)
         self._folder = folder
         self._scenario = scenario
-        self._tree = tree_of(scenario)
+        self._tree = scene.tree_of(scenario)
         self._labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
         self._levels = _levels(scenario)
         self._predicts = scenario.control.prediction != "off"
         self._before_s = patience_s(scenario)
         self._ticks: list[TickArray] = []
         self._events: list[Event] = []
-        self._newest_m = Newest(count, 3)
-        self._newest_rtt_ms = Newest(count)
+        self._newest_m = scene.Newest(count, 3)
+        self._newest_rtt_ms = scene.Newest(count)
         self._modes = np.full(count, -1)
-        self._picture_times = PictureTimes(PICTURE_S)
-        self._trail_times = PictureTimes(TRAIL_STEP_S)
+        self._picture_times = scene.PictureTimes(scene.PICTURE_S)
+        self._trail_times = scene.PictureTimes(scene.TRAIL_STEP_S)
         self._trail_ends_m: dict[str, Floats] = {}
         self._stream = rr.RecordingStream("formation-gcs")
         sinks = [rr.FileSink(folder / UNFINISHED_FILE), *([] if viewer is None else [rr.GrpcSink(viewer)])]
@@ -194,7 +183,7 @@ class Recording:
 
     def _send_scene(self, ticks: TickArray) -> None:
         """Positions at each tick's own instant, seen from the leader and over the ground."""
-        all_m = self._newest_m.fill(positions_m(ticks))
+        all_m = self._newest_m.fill(scene.positions_m(ticks))
         shown = list(self._picture_times.pick(ticks["time_s"][:, 0]))
         if not shown:
             return
@@ -213,7 +202,7 @@ class Recording:
         if not tree.followers:
             return
         own_m, front_m = place_m[:, tree.followers], place_m[:, tree.fronts]
-        wanted_m = front_m + tree.offsets_m
+        wanted_m = front_m + tree.offsets_at_m(times_s)
         lengths = [len(tree.followers)] * times_s.size
         for name, end_m in (("follows", front_m), ("gaps", wanted_m)):
             lines = rr.LineStrips3D.columns(strips=_segments(own_m, end_m)).partition(lengths)
@@ -240,7 +229,7 @@ class Recording:
 
     def _log_scene_styles(self) -> None:
         """Colours, names and sizes of what moves."""
-        colors, few = vehicle_colors(len(self._labels)), len(self._labels) <= LABELS_MAX
+        colors, few = scene.vehicle_colors(len(self._labels)), len(self._labels) <= LABELS_MAX
         own = [colors[k] for k in self._tree.followers]
         spacing_m = min((math.hypot(*offset) for offset in self._tree.offsets_m[:, :2]), default=1.0)
         ring_m = [0.06 * spacing_m, 0.06 * spacing_m, 0.0]
@@ -265,12 +254,12 @@ class Recording:
             style = rr.SeriesLines(colors=colors, names=names, widths=[width] * len(names))
             self._stream.log(path, style, static=True)
 
-        labels, colors = self._labels, vehicle_colors(len(self._labels))
+        labels, colors = self._labels, scene.vehicle_colors(len(self._labels))
         followers = self._tree.followers
         lines("spacing/error_m", [labels[k] for k in followers], [colors[k] for k in followers])
         for path in _CURVES:
             lines(path, labels, colors)
-        lines("delay/rtt_ms", [f"{label} RTT" for label in labels], [dimmed(color) for color in colors], 0.8)
+        lines("delay/rtt_ms", [f"{label} RTT" for label in labels], [scene.dimmed(color) for color in colors], 0.8)
         if self._predicts:
             lines("delay/assumed_ms", [f"{label} assumed" for label in labels], colors)
         lines("delay/margin_ms", [f"{label} margin" for label in labels], [LIMIT_COLOR] * len(labels), 3.5)
@@ -374,7 +363,7 @@ def _blueprint(scenario: Scenario, design: Design) -> Any:
 
 def _scene_view(root: str, scenario: Scenario) -> Any:
     """A 3D view from behind and above, from so far that it holds the wanted formation."""
-    middle_m, reach_m = wanted_extent_m(scenario)
+    middle_m, reach_m = scene.wanted_extent_m(scenario)
     # What is long from north to south comes near the eye at its southern end: such a formation needs more room.
     radius_m = max(math.hypot(*reach_m), 1.4 * reach_m[0]) or 50.0
     if root == "formation":

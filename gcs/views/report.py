@@ -6,17 +6,31 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from gcs.plan.design import Block, Design, FiguresAtDelay, FiguresAtExpectedDelay, ResponsePart, TradeOffPoint, WindowAt
+from gcs.plan.design import (
+    Block,
+    CriteriaPart,
+    Design,
+    FiguresAtDelay,
+    FiguresAtExpectedDelay,
+    ResponsePart,
+    TradeOffPoint,
+    WindowAt,
+)
 from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
-from gcs.runs.summary_record import Summary, VehicleSummary
+from gcs.runs.summary_record import FlownSpread, Summary, VehicleSummary
 from gcs.views.console import UNKNOWN, ms_text, number_text, plain_console, table_of
+from gcs.views.own_code import code_text, law_text, print_code
 
 
 def print_design(design: Design, console: Console | None = None) -> None:
     """Gains, robustness, both margins, and the trade-off between robustness and margin."""
     console = console or plain_console()
     console.print(f"design   {design.method}, loop {design.loop}, period {design.period_s * 1e3:g} ms")
+    print_code(design.code, console)
+    if design.margin_unknown:
+        console.print(f"margin   unknown: {design.margin_unknown}")
+        return
     if design.inclusion_gains is not None and design.behaviour is not None:
         own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
         console.print(f"gains    K1 {own:+.4f} 1/s, K2 {front:+.4f} 1/s, K3 {spacing:+.4f} 1/s²")
@@ -34,8 +48,55 @@ def print_design(design: Design, console: Console | None = None) -> None:
     console.print(f"alpha    {design.alpha:.4f} ({bound}), decay {decay_1_s:.2f} 1/s without delay{loss}")
     if design.at_loop_delay is not None:
         _print_figures_at_delay(design.at_loop_delay, console)
+    if (whole := design.whole) is not None:
+        at = f"{whole.alpha_at_loop_delay:.4f} at {ms_text(whole.loop_delay_s)} of loop delay"
+        console.print(
+            f"whole    {whole.alpha:.4f} if all vehicles are disturbed together, {at}; alpha is one follower's"
+        )
+    if design.spread is not None and design.spread.vehicles:
+        most = max(design.spread.vehicles, key=lambda own: own.reported_rms_m)
+        at = f"at {ms_text(design.spread.loop_delay_s)} of loop delay"
+        console.print(
+            f"spread   {most.reported_rms_m:.3f} m rms of the spacing error reported by vehicle {most.system_id}, the "
+            f"largest, {at}; {most.spacing_error_rms_m:.3f} m of the true one"
+        )
+    if (link := design.for_link) is not None:
+        ends = f"{ms_text(link.loop_delay_s_least)} to {ms_text(link.loop_delay_s_worst)}"
+        measured = f"loop delay {ms_text(link.loop_delay_s_p50)} (median), {ends}, measured in {link.source}"
+        console.print(f"link     {measured}; wanted headroom {link.headroom:.0%} at the worst")
+        console.print(f"         chosen {link.chosen}")
+    if design.criteria is not None:
+        _print_criteria(design.criteria, console)
     if design.trade_off:
         console.print(table_of(design.trade_off, _TRADE_OFF_COLUMNS, title="the trade-off it sits on"))
+
+
+def _print_criteria(found: CriteriaPart, console: Console) -> None:
+    at = f"at {ms_text(found.at_delay_s)} of loop delay"
+    bound = ""
+    if found.alpha_bound:
+        share = found.alpha_at_delay / found.alpha_bound
+        bound = f", {share:.0%} of {found.alpha_bound:.4f}, which no controller exceeds"
+    console.print(
+        f"criteria roots have damping {found.damping:.3f} and natural frequencies up to "
+        f"{found.natural_frequency_rad_s:.3f} rad/s"
+    )
+    weight = "" if found.weight == (1.0, 1.0) else f" with W = {found.weight[0]:g}, {found.weight[1]:g}"
+    console.print(
+        f"         {at}: decay {found.decay_rate_at_delay_1_s:.3f} 1/s, alpha{weight} {found.alpha_at_delay:.4f}{bound}"
+    )
+    console.print(
+        f"         disturbing acceleration to spacing error {number_text(found.spacing_gain_s2, '.3f')} s², "
+        f"noise to command {number_text(found.noise_gain, '.3f')}"
+    )
+    if found.delays_jumping_s is not None:
+        low_s, high_s = found.delays_jumping_s
+        console.print(f"         stable for delays that jump between {ms_text(low_s)} and {ms_text(high_s)}")
+    if found.delays_covered_by is not None:
+        console.print(
+            f"         delays asked for: proved by the bound {found.delays_covered_by}, "
+            f"up to {ms_text(found.delays_covered_to_s)}"
+        )
 
 
 def _print_margins(design: Design, console: Console) -> None:
@@ -140,28 +201,59 @@ def print_summary(summary: Summary, folder: Path, console: Console | None = None
         console.print(f"look     gcs view {folder}")
 
 
-def print_flight(summary: Summary, console: Console) -> None:
-    style = {"stable": "bold green", "unstable": "bold red"}.get(summary.verdict, "bold yellow")
+def flight_lines(summary: Summary) -> dict[str, str]:
+    """What is said of a flight as a whole, by its headings; `verdict` without the verdict itself."""
     flown = "" if summary.fleet == STARTED else f"; vehicles {summary.fleet}"
-    console.print(Text.assemble("verdict  ", (summary.verdict, style), f": {_reason(summary)}{flown}"))
-    for text in summary.not_logged:
-        console.print(f"log      not written: {text}")
-    console.print(f"delay    {delay_text(summary)}")
+    lines = {"verdict": f"{_reason(summary)}{flown}", "delay": delay_text(summary)}
     if summary.at_loop_delay.alpha is not None:
-        console.print(f"alpha    {figures_text(summary.at_loop_delay)}")
-    console.print(_response(summary.response), end="")
+        lines["alpha"] = figures_text(summary.at_loop_delay)
+    if summary.code:
+        lines["code"] = code_text(summary.code)
+    if summary.law is not None:
+        lines["law"] = law_text(summary.law)
+    if summary.spread is not None and summary.spread.vehicles:
+        lines["spread"] = _spread_text(summary.spread)
     if (control := summary.control) is not None:
         settled_s = summary.settling_time_s
-        console.print(
-            f"control  {control.ticks} ticks at {control.rate_hz:g} Hz, {control.deadline_misses} deadline misses; "
+        lines["control"] = (
+            f"{control.ticks} ticks at {control.rate_hz:g} Hz, {control.deadline_misses} deadline misses; "
             f"{'not settled' if settled_s is None else f'settled after {settled_s:.1f} s'}"
         )
+    if summary.not_logged:
+        lines["not written"] = "; ".join(summary.not_logged)
+    return lines
+
+
+def print_flight(summary: Summary, console: Console) -> None:
+    style = {"stable": "bold green", "unstable": "bold red"}.get(summary.verdict, "bold yellow")
+    lines = flight_lines(summary)
+    console.print(Text.assemble("verdict  ", (summary.verdict, style), f": {lines['verdict']}"))
+    for text in summary.not_logged:
+        console.print(f"log      not written: {text}")
+    for name in ("delay", "alpha"):
+        if name in lines:
+            console.print(f"{name:<9}{lines[name]}")
+    console.print(_response(summary.response), end="")
+    for name in ("spread", "control", "law", "code"):
+        if name in lines:
+            console.print(f"{name:<9}{lines[name]}")
     for who, counts in (("station", summary.refused), ("vehicles", summary.refused_by_vehicles)):
         if counts:
             console.print(f"refused  by the {who}: {in_words(counts)}")
     if summary.mirror:
         console.print(f"mirror   {in_words(summary.mirror)}")
     console.print(table_of(summary.vehicles, _VEHICLE_COLUMNS))
+
+
+def _spread_text(spread: FlownSpread) -> str:
+    """The rms of the follower whose errors are predicted to spread most, and how far all are from what is predicted."""
+    most = max(spread.vehicles, key=lambda own: own.predicted_rms_m or 0.0)
+    apart = [(own.reported_rms_m or 0.0) / (own.predicted_rms_m or 1.0) - 1.0 for own in spread.vehicles]
+    of_all = "" if len(apart) == 1 else f", all vehicles {min(apart):+.1%} to {max(apart):+.1%}"
+    return (
+        f"vehicle {most.system_id}: {number_text(most.reported_rms_m, '.3f')} m rms of the reported spacing error from "
+        f"{number_text(spread.from_s, '.1f')} s on, {number_text(most.predicted_rms_m, '.3f')} m predicted{of_all}"
+    )
 
 
 def _reason(summary: Summary) -> str:
@@ -178,13 +270,17 @@ def _reason(summary: Summary) -> str:
 def delay_text(summary: Summary) -> str:
     """Loop delay against the margin."""
     delay, margin_s = summary.loop_delay_s, summary.delay_margin_s
-    margin = "no limit" if summary.loop == "onboard" and margin_s is None else f"margin {ms_text(margin_s)}"
+    margin = "no limit" if margin_s is None else f"margin {ms_text(margin_s)}"
+    if summary.margin_unknown:
+        margin = f"margin unknown: {summary.margin_unknown}"
     slowest_s = max((vehicle.delay_margin_s.max or 0.0 for vehicle in summary.vehicles), default=0.0)
     if margin_s is not None and slowest_s > margin_s:
         way = "slower gains" if summary.prediction == "off" else "prediction"
         margin += f", up to {ms_text(slowest_s)} with {way}"
+    bound_s = summary.loop_delay_bound_s
+    error = "" if bound_s is None else f" (clocks: ± {ms_text(bound_s)})"
     return (
-        f"loop {ms_text(delay.p50)} p50, {ms_text(delay.p99)} p99, {ms_text(delay.max)} max; "
+        f"loop {ms_text(delay.p50)} p50, {ms_text(delay.p99)} p99, {ms_text(delay.max)} max{error}; "
         f"{margin}; least headroom {number_text(summary.headroom_min, '.0%')}"
     )
 
@@ -200,10 +296,13 @@ def _response(response: ResponsePart | None) -> str:
         sorted(texts)
         for texts in zip(*((f"{v.lag_s:.3f}", f"{v.velocity_gain_1_s:.2f}") for v in response.vehicles), strict=True)
     )
+    models = sorted({vehicle.model for vehicle in response.vehicles})
+    late_ms = sorted(round(1e3 * vehicle.dead_time_s) for vehicle in response.vehicles)
+    dead = f", dead time {' to '.join(dict.fromkeys(map(str, (late_ms[0], late_ms[-1]))))} ms" if late_ms[-1] else ""
     peak = response.string_peak
     grows = "" if peak is None else f"; spacing errors grow {peak:.2f} times at most from vehicle to vehicle with it"
     lag, gain = (" to ".join(dict.fromkeys((each[0], each[-1]))) for each in (lags, gains))
     return (
-        f"response {response.source}: lag {lag} s, velocity gain {gain} 1/s; included in the margin, which would be "
-        f"{ms_text(response.delay_margin_at_once_s)} without it{grows}\n"
+        f"response {response.source} ({', '.join(models)}): lag {lag} s{dead}, velocity gain {gain} 1/s; included in "
+        f"the margin, which would be {ms_text(response.delay_margin_at_once_s)} without it{grows}\n"
     )

@@ -2,7 +2,7 @@
 
 import colorsys
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs.control.tick import TickArray
+from gcs.plan.course import PlannedMotion
 from gcs.plan.formation import plan_formation
 from scenarios.schema import Scenario
 
@@ -25,17 +26,9 @@ _ASPECT = 2.0
 
 # Ten colours that are easy to tell apart on a dark ground; more vehicles take hues around the circle.
 PALETTE: tuple[Color, ...] = (
-    (240, 240, 240),
-    (66, 165, 245),
-    (255, 167, 38),
-    (102, 187, 106),
-    (236, 90, 160),
-    (255, 238, 88),
-    (38, 198, 218),
-    (171, 130, 255),
-    (239, 83, 80),
-    (174, 213, 129),
-)
+    (240, 240, 240), (66, 165, 245), (255, 167, 38), (102, 187, 106), (236, 90, 160),
+    (255, 238, 88), (38, 198, 218), (171, 130, 255), (239, 83, 80), (174, 213, 129),
+)  # fmt: skip
 
 
 def vehicle_colors(count: int) -> list[Color]:
@@ -61,18 +54,38 @@ class Tree:
     fronts: list[int]
     """For each follower, the vehicle that it follows."""
     offsets_m: Floats
-    """For each follower, its wanted position relative to that vehicle: (followers, 3), NED."""
+    """For each follower, its wanted position relative to that vehicle when the flight begins: (followers, 3), NED."""
+    places_m: Callable[[float], Floats] | None = None
+    """The places (vehicles, 3) relative to the leader at a scenario time, if they change in flight."""
+
+    def offsets_at_m(self, times_s: Floats) -> Floats:
+        """The wanted positions at these times: (times, followers, 3), or (followers, 3) if they are always the same."""
+        if self.places_m is None:
+            return self.offsets_m
+        places_m = np.stack([self.places_m(time_s) for time_s in times_s.tolist()])
+        return places_m[:, self.followers] - places_m[:, self.fronts]
 
 
 def tree_of(scenario: Scenario) -> Tree:
     """The formation's tree as arrays."""
     index = {vehicle.system_id: k for k, vehicle in enumerate(scenario.vehicles)}
-    offsets = [(*v.offset_ne_m, 0.0) for v in scenario.vehicles if v.offset_ne_m is not None]
+    formation = plan_formation(scenario)
+    rows = [formation.row(vehicle.system_id) for vehicle in scenario.vehicles]
+    down_m = -np.array([[scenario.altitude_of(vehicle)] for vehicle in scenario.vehicles])
+
+    def with_down(place_ne_m: Floats) -> Floats:
+        return np.hstack([place_ne_m[rows], down_m])
+
+    place_m = with_down(formation.place_ne_m())
+    followers = [k for k, vehicle in enumerate(scenario.vehicles) if vehicle.follows is not None]
+    fronts = [index[vehicle.follows] for vehicle in scenario.vehicles if vehicle.follows is not None]
+    motion = PlannedMotion(scenario, formation) if scenario.manoeuvres else None
     return Tree(
         leader=next(k for k, vehicle in enumerate(scenario.vehicles) if vehicle.follows is None),
-        followers=[k for k, vehicle in enumerate(scenario.vehicles) if vehicle.follows is not None],
-        fronts=[index[vehicle.follows] for vehicle in scenario.vehicles if vehicle.follows is not None],
-        offsets_m=np.array(offsets, dtype=float).reshape(-1, 3),
+        followers=followers,
+        fronts=fronts,
+        offsets_m=place_m[followers] - place_m[fronts],
+        places_m=None if motion is None else lambda time_s: with_down(motion.places_ne_m(time_s)),
     )
 
 

@@ -54,6 +54,7 @@ class FlightState:
         self.scenario = scenario
         self.margin_s = np.nan
         """Delay margin of the fastest gains."""
+        self.margin_unknown = ""
         self.redesigned(design)
         self.phase = UNKNOWN
         self.refused = ""
@@ -80,6 +81,7 @@ class FlightState:
         """Compare with the margins of a design."""
         self._design = design
         self._at_delay: dict[tuple[int, int], str] = {}
+        self.margin_unknown = design.margin_unknown
         self.margin_s = np.nan if design.delay_margin_s is None else design.delay_margin_s
 
     def at_delay(self, figures: "Figures") -> str:
@@ -188,8 +190,8 @@ def _headline(state: FlightState) -> Text:
     time = UNKNOWN if np.isnan(state.time_s) else time_text(state.time_s, state.before_s, ".1f")
     line = Text.assemble((state.scenario.name, "bold"), "  ", (state.phase, "bold cyan"), f"  {time}")
     loop = state.scenario.control.loop
-    margin = ms_text(state.margin_s, ".0f", unit="")
-    line.append(f"   delay margin {margin} ms (sampled, {loop} loop, fastest gains)", style="dim")
+    margin = f"{ms_text(state.margin_s, '.0f', unit='')} ms (sampled, {loop} loop, fastest gains)"
+    line.append(f"   delay margin {'unknown' if state.margin_unknown else margin}", style="dim")
     line.no_wrap = True
     return line
 
@@ -211,9 +213,11 @@ def _vehicles(state: FlightState, figures: Figures, order: list[int], width: int
         101,
         lambda k: ms_text(state.newest["assumed_delay_s"][k], ".0f", unit=""),
     )
+    altitude: FittedColumn[int] = ("altitude\nm", 8, 76, lambda k: number_text(-state.newest["down_m"][k], ".1f"))
     columns: list[FittedColumn[int]] = [
         ("id", 3, 0, lambda k: str(vehicles[k].system_id)),
         ("follows", 7, 101, lambda k: number_text(vehicles[k].follows, "d")),
+        *([altitude] if state.scenario.has_altitude_slots else []),
         ("spacing\nerror m", 7, 0, lambda k: number_text(error_m[k], ".2f")),
         ("error\n%", 5, 76, lambda k: number_text(100 * error_m[k] / figures.spacing_m[k], ".1f")),
         ("RTT\nms", 6, 76, lambda k: ms_text(figures.rtt_s[k], unit="")),

@@ -14,7 +14,7 @@ from math import floor
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from gcs.errors import InputError
+from gcs.errors import InputError, extra_wanted
 from gcs.interrupts import raised
 from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 
@@ -25,6 +25,12 @@ DEFAULT_PICTURE_S = 10.0
 _MAGIC = b"RRF"
 """The first bytes of every .rrd file."""
 _WANTED = "wanted a recording of a run (.rrd)"
+
+
+def refuse_without_viewer() -> None:
+    """Raise InputError if Rerun is not installed."""
+    if importlib.util.find_spec("rerun") is None:
+        raise InputError(extra_wanted("rerun"))
 
 
 def view(folder_or_rrd: Path) -> int:
@@ -217,5 +223,5 @@ def _program() -> str:
     package = importlib.util.find_spec("rerun_cli")
     program = Path(package.origin or "").parent / "rerun" if package else Path("rerun")
     if not program.is_file():
-        raise InputError("the Rerun viewer is not installed; it comes with the Python package rerun-sdk")
+        raise InputError(extra_wanted("rerun_cli"))
     return str(program)

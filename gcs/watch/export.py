@@ -2,7 +2,7 @@
 
 A run gives the topics `/vehicle/ID/tick`, with the columns of ticks.parquet, and `/events`. A telemetry log gives one
 topic for each sender and kind of message, `/mavlink/ID/LOCAL_POSITION_NED` for example. Times of a run count from its
-first tick, those of a log since 1970.
+first tick on the station's clock, those of a log since 1970.
 """
 
 import csv
@@ -14,7 +14,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gcs.errors import InputError
+import numpy as np
+
+from gcs.control.tick import TickArray
 from gcs.link import mavlink
 from gcs.runs.files import RunTail, read_ticks
 from gcs.watch.tlog import read_tlog
@@ -47,16 +49,25 @@ def messages_of(source: Path) -> list[Message]:
 def _of_run(folder: Path) -> Iterator[Message]:
     ticks = read_ticks(folder)
     names = ticks.dtype.names or ()
-    began_s = float(ticks["time_s"].min(initial=0.0))
-
-    def since_ns(time_s: float) -> int:
-        return max(0, round((time_s - began_s) * NS_PER_S))
-
+    began_ns = int(ticks["due_ns"][0]) if ticks.size else 0
     for row in ticks.tolist():
         fields = _known(dict(zip(names, row, strict=True)))
-        yield Message(f"/vehicle/{fields['system_id']}/tick", "ticks", since_ns(fields["time_s"]), fields)
+        yield Message(f"/vehicle/{fields['system_id']}/tick", "ticks", fields["due_ns"] - began_ns, fields)
     for event in RunTail(folder).events():
-        yield Message("/events", "events", since_ns(event.time_s), _known(asdict(event)))
+        yield Message("/events", "events", _since_ns(ticks, event.time_s), _known(asdict(event)))
+
+
+def _since_ns(ticks: TickArray, time_s: float) -> int:
+    """The scenario time of an event as time since the first tick.
+
+    Scenario time leaps to 0 when the formation is complete, the station's clock does not: an event counts from the
+    last tick before it.
+    """
+    if not ticks.size:
+        return 0
+    before = ticks[max(0, int(np.searchsorted(ticks["time_s"], time_s, side="right")) - 1)]
+    later_ns = max(0, round((time_s - float(before["time_s"])) * NS_PER_S))
+    return int(before["due_ns"]) - int(ticks["due_ns"][0]) + later_ns
 
 
 def _of_log(file: Path) -> Iterator[Message]:
@@ -76,14 +87,8 @@ def _known(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_mcap(file: Path, messages: Sequence[Message]) -> None:
-    """Write messages as JSON with a schema for each topic.
-
-    Raises InputError if the package mcap is not installed.
-    """
-    try:
-        from mcap.writer import Writer
-    except ModuleNotFoundError:
-        raise InputError("--mcap: the package mcap is not installed; wanted pip install formation-gcs[mcap]") from None
+    """Write messages as JSON with a schema for each topic; needs the package mcap."""
+    from mcap.writer import Writer
 
     properties: dict[str, dict[str, dict[str, str]]] = defaultdict(dict)
     for message in messages:

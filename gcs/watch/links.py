@@ -17,6 +17,7 @@ import numpy as np
 from gcs.control.loop_delay import headroom, loop_delay_s
 from gcs.link import mavlink
 from gcs.link.datagram import Address, Outgoing
+from gcs.link.kinds import SET_MESSAGE_INTERVAL
 from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from gcs.published import Published
@@ -39,6 +40,8 @@ _LEAST_NS = 10 * NS_PER_S
 """The fastest frame is that of the last one to two such spans. A drift of 20 ppm adds up to 0.4 ms in two."""
 _AUTOPILOT, _NO_AUTOPILOT, _STATION = 1, 8, 6
 """Component id of an autopilot; MAV_AUTOPILOT_INVALID; MAV_TYPE_GCS."""
+ASK_AGAIN_NS = 2 * NS_PER_S
+"""Time between two requests for the same vehicle's positions."""
 _POSITIONS = (mavlink.LOCAL_POSITION_NED, mavlink.GLOBAL_POSITION_INT)
 
 
@@ -270,29 +273,50 @@ class Watch:
 class Requests:
     """TIMESYNC requests, in turn to each address that vehicles send from; all vehicles behind it answer.
 
-    With a rate of 0 there are none.
+    With a rate of 0 there are none. With a `position_hz`, each vehicle that sends no position is asked to report its
+    LOCAL_POSITION_NED at that rate, again and again until it does.
     """
 
-    def __init__(self, timesync_hz: float) -> None:
-        self.sent = 0
+    def __init__(self, timesync_hz: float, position_hz: float = 0.0) -> None:
+        self.sent = self.positions_asked = 0
+        self._position_interval_us = round(1e6 / position_hz) if position_hz else 0
+        self._asked_ns: dict[int, int] = {}
         self.next_ns = 0 if timesync_hz else 1 << 62
         self._period_ns = NS_PER_S / (timesync_hz or 1.0)
         self._sequences: Counter[Address] = Counter()
 
     def due(self, watch: Watch, now_ns: int) -> list[Outgoing]:
-        """The request to be sent now, if any."""
+        """The requests to be sent now."""
+        asked = self._for_positions(watch, now_ns) if self._position_interval_us else []
         if now_ns < self.next_ns:
-            return []
+            return asked
         addresses = {address for vehicle in watch.vehicles.values() if (address := vehicle.remote.address) is not None}
         self.next_ns = now_ns + round(self._period_ns / max(1, len(addresses)))
         if not addresses:
-            return []
+            return asked
         address = min(addresses, key=lambda address: (self._sequences[address], address))
-        self._sequences[address] += 1
         self.sent += 1
-        fields = mavlink.timesync(tc1_ns=0, ts1_ns=watch.ask(now_ns))
-        sequence = self._sequences[address]
-        return [Outgoing(mavlink.encode(mavlink.TIMESYNC, fields, sequence=sequence, system_id=SYSTEM_ID), address)]
+        return [*asked, self._numbered(mavlink.TIMESYNC, mavlink.timesync(tc1_ns=0, ts1_ns=watch.ask(now_ns)), address)]
+
+    def _for_positions(self, watch: Watch, now_ns: int) -> list[Outgoing]:
+        asked: list[Outgoing] = []
+        for system_id, vehicle in watch.vehicles.items():
+            address, waited_ns = vehicle.remote.address, now_ns - self._asked_ns.get(system_id, 0)
+            if address is None or now_ns - vehicle.state_ns < SILENT_NS or waited_ns < ASK_AGAIN_NS:
+                continue
+            self._asked_ns[system_id] = now_ns
+            self.positions_asked += 1
+            parameters = float(mavlink.LOCAL_POSITION_NED), float(self._position_interval_us)
+            fields = mavlink.command_long(
+                SET_MESSAGE_INTERVAL, target_system=system_id, confirmation=0, parameters=parameters
+            )
+            asked.append(self._numbered(mavlink.COMMAND_LONG, fields, address))
+        return asked
+
+    def _numbered(self, msg_id: int, fields: tuple[object, ...], address: Address) -> Outgoing:
+        self._sequences[address] += 1
+        data = mavlink.encode(msg_id, fields, sequence=self._sequences[address], system_id=SYSTEM_ID)
+        return Outgoing(data, address)
 
 
 def _spread(values: "array[float]", last: int) -> Estimate:

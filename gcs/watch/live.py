@@ -1,7 +1,7 @@
 """`gcs monitor`: the driver that watches the links of a socket and commands nothing.
 
-It sends only TIMESYNC requests, under a system id that is not a station's. It sends no heartbeat: a vehicle whose
-station is gone has to notice.
+It sends only TIMESYNC requests and, if told to, requests for positions, under a system id that is not a station's. It
+sends no heartbeat: a vehicle whose station is gone has to notice.
 """
 
 import math
@@ -12,6 +12,7 @@ from gcs.drive.udp import StationSocket, clock_ns
 from gcs.link import mavlink
 from gcs.views.console import draw, live_display
 from gcs.watch.links import Requests, Watch, WatchReport
+from gcs.watch.saved_links import LinkRecorder
 from gcs.watch.table import plain_line, render
 from scenarios.schema import NS_PER_S
 
@@ -29,14 +30,18 @@ def watch_links(
     margin_s: float | None,
     margin_of: str,
     timesync_hz: float,
+    position_hz: float,
     seconds: float,
     shown: bool,
+    recorder: LinkRecorder | None = None,
 ) -> WatchReport:
     """Watch for the time asked or until there is a reason to stop; returns the figures of the whole time.
 
     `margin_of` says where the margin is from. `timesync_hz` is the rate of requests to each address, 0 to send nothing.
+    Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder`
+    notes every frame that `watch` takes.
     """
-    requests = Requests(timesync_hz)
+    requests = Requests(timesync_hz, position_hz)
     start_ns = now_ns = clock_ns()
     end_ns = start_ns + round(seconds * NS_PER_S) if math.isfinite(seconds) else 1 << 62
 
@@ -47,7 +52,7 @@ def watch_links(
             delay_margin_s=margin_s,
             margin_of=margin_of,
             silent=timesync_hz == 0,
-            sent={"TIMESYNC": requests.sent},
+            sent={"TIMESYNC": requests.sent, "SET_MESSAGE_INTERVAL": requests.positions_asked},
             send_errors=link.send_errors,
             stations=tuple(sorted(watch.stations)),
             refused=dict(watch.counters),
@@ -62,6 +67,8 @@ def watch_links(
             for datagram in link.receive(watch.counters):
                 for frame in mavlink.decode_either(datagram.data, watch.counters):
                     watch.take(frame, datagram.received_ns, datagram.address)
+                    if recorder is not None:
+                        recorder.note(frame, datagram.received_ns)
             now_ns = clock_ns()
             look_ns = watch.look(now_ns)
             link.send(requests.due(watch, now_ns))

@@ -19,6 +19,7 @@ import numpy as np
 from gcs.control.history import StateHistory
 from gcs.control.law import Blend, distances_m
 from gcs.control.loop_delay import Repetitions
+from gcs.control.loops import Moment
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.vehicle import SILENCE_S, ignored
@@ -265,21 +266,17 @@ class _Rebuilding:
         lost = [flying and sent_ns - heard_ns > SILENCE_S * NS_PER_S for heard_ns in self._telemetry_ns]
         if lost != self._lost:
             self._lost, self._law = lost, self._fleet.loop.law(lost)
-        controls = self._fleet.loop.control(
-            self._history,
-            self._law,
-            [_NO_BLEND] * len(lost),
-            due_ns=due_ns,
-            nominal_velocity_m_s=self._scenario.nominal_velocity_at(time_s),
-        )
-        nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns), axis=1).tolist()
+        now = Moment(due_ns, time_s, self._scenario.nominal_velocity_at(time_s))
+        controls = self._fleet.loop.control(self._history, self._law, [_NO_BLEND] * len(lost), now)
+        slots_m = [reported.down_m for reported in self._reported] if self._scenario.has_altitude_slots else None
+        nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns, slots_m), axis=1).tolist()
         seen: list[VehicleTick] = []
         for row, (vehicle, control, state) in enumerate(zip(self._vehicles, controls, self._states, strict=True)):
             command = commands.get(vehicle.remote.system_id)
             sent = control._replace(command_m_s2=command or (nan, nan))
             repeated_s = self._repetitions.repeated_s(row, control.used_ns, due_ns)
             figures = self._fresh_rtt_s(row, vehicle), nearest_m[row], command is not None
-            tolerated = self._fleet.plan.tolerance.at(control.assumed_s)
+            tolerated = self._fleet.plan.tolerance(control.assumed_s)
             seen.append(VehicleTick(vehicle.remote, state, sent, self._reported[row], *figures, tolerated, repeated_s))
         number = round((due_ns - self._start_ns) / self._period_ns)
         rows, _ = tick_rows(Tick(number, time_s, due_ns, key_ms, seen), sent_ns)

@@ -12,6 +12,7 @@ from gcs.views.table import headroom_text
 from gcs.watch.links import LOWER_BOUND, LinkFigures, WatchReport
 
 STATUS_STYLES = {"measured": "green", "past the margin": "bold red", "silent": "bold red", "not heard": "bold red"}
+NOT_ASKED = "many autopilots send none until a station asks; --request asks"
 _USUAL, _WIDE = 73, 140
 """Widths of terminals from which more columns are shown."""
 
@@ -24,7 +25,7 @@ def render(report: WatchReport, *, width: int, height: int | None = None) -> Ren
         vehicles = sorted(sorted(vehicles, key=_badness)[: max(1, room - 1)], key=lambda figures: figures.system_id)
     table = links_table(vehicles, width) if vehicles else Text("no vehicle heard", "bold red")
     hidden = len(report.vehicles) - len(vehicles)
-    return Group(_headline(report), table, *not_shown(hidden), _footer(report))
+    return Group(_headline(report), table, *not_shown(hidden), *_without_position(report), _footer(report))
 
 
 def plain_line(report: WatchReport) -> str:
@@ -49,7 +50,8 @@ def _badness(figures: LinkFigures) -> tuple[bool, float]:
 def _headline(report: WatchReport) -> Text:
     line = Text.assemble(("links", "bold"), f" at {report.listening}  {report.duration_s:.1f} s", no_wrap=True)
     margin_s = report.delay_margin_s
-    of = f"{ms_text(margin_s)} ({report.margin_of})" if margin_s is not None else "none given"
+    unlimited = "no limit" if report.margin_of else "none given"
+    of = unlimited if margin_s is None else f"{ms_text(margin_s)} ({report.margin_of})"
     line.append(f"   delay margin {of}", style="dim")
     return line
 
@@ -82,8 +84,19 @@ def _bound(figures: LinkFigures) -> str:
     return "≥ " if figures.loop_delay_s.status == LOWER_BOUND else ""
 
 
+def _without_position(report: WatchReport) -> list[Text]:
+    """Why there is no position, if that is so: an ArduPilot streams none unless it is asked."""
+    without = [str(v.system_id) for v in report.vehicles if v.loop_delay_s.p50 is None and v.received]
+    if not without:
+        return []
+    why = "asked for, but not sent yet" if report.sent.get("SET_MESSAGE_INTERVAL") else NOT_ASKED
+    return [Text(f"no position from {' '.join(without)}: {why}", "yellow")]
+
+
 def _footer(report: WatchReport) -> Text:
-    text = "nothing is sent" if report.silent else f"sent {report.sent['TIMESYNC']} TIMESYNC requests, nothing else"
+    asked = report.sent.get("SET_MESSAGE_INTERVAL", 0)
+    more = f"{asked} requests for positions" if asked else "nothing else"
+    text = "nothing is sent" if report.silent else f"sent {report.sent['TIMESYNC']} TIMESYNC requests, {more}"
     if report.stations:
         text += f"; stations heard: {' '.join(map(str, report.stations))}"
     if report.refused:

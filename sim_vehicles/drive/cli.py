@@ -64,9 +64,13 @@ class _UsageError(Exception):
 
 def _run(options: argparse.Namespace, signals: list[int], opened: contextlib.ExitStack) -> None:
     from scenarios.files import load
+    from scenarios.own_code import refusal
     from sim_vehicles.links.truth import TruthLog
 
     scenario, log = load(options.scenario), None
+    refused = None if options.allow_code or options.links_only else refusal(scenario, options.scenario)
+    if refused is not None:
+        raise _UsageError(refused)
     if options.truth:
         try:
             log = TruthLog(options.truth)
@@ -278,6 +282,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--links-only", action="store_true", help="simulate no vehicles; put the links in front of other vehicles"
     )
+    parser.add_argument("--allow-code", action="store_true", help="run the Python code that the scenario names")
     parser.add_argument(
         "--vehicle-port",
         type=_port,

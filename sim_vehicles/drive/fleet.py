@@ -13,25 +13,29 @@ from operator import itemgetter
 from scenarios import schema
 from scenarios.files import fingerprint
 from scenarios.signing.link import SignedLink
-from sim_vehicles.links.links import Link, LinkSet
+from sim_vehicles.links.links import Link, LinkSet, is_set_point
 from sim_vehicles.links.truth import Record
+from sim_vehicles.motion.double_integrator import State
+from sim_vehicles.motion.sector import SectorBound
 from sim_vehicles.services.clock import NEVER_NS
 from sim_vehicles.services.services import LONGEST_TEXT
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
-from sim_vehicles.vehicles.dynamics import State
+from sim_vehicles.vehicles.external import ExternallyFlown
 from sim_vehicles.vehicles.onboard import VehicleLoop
 from sim_vehicles.vehicles.shell import Change, Radio, Shell
 
 Datagram = tuple[int, bytes, int]
 """(system id of the vehicle, bytes, host time in ns)"""
 
+_SECTOR = 0
+"""In place of a system id: the disturbance that depends on the errors of all vehicles."""
 _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 
 @dataclass(slots=True)
 class _Member:
-    vehicle: Shell[DoubleIntegrator | Copter]
+    vehicle: Shell[DoubleIntegrator | Copter | ExternallyFlown]
     up: Link
     down: Link
     signed: SignedLink | None = None
@@ -46,9 +50,9 @@ class Fleet:
 
     Vehicles do not affect each other, so each is brought up to date only when one of its datagrams can leave, in order
     of that time and of system id. Nothing comes too late for it, since everything it does has its exact instant. There
-    are two exceptions: in a shared channel one vehicle's datagrams delay another's, and a sensor sees another vehicle.
-    Then events run in order of time, at the same instant first the station's datagrams and then the vehicles by system
-    id.
+    are three exceptions: in a shared channel one vehicle's datagrams delay another's, a sensor sees another vehicle,
+    and a disturbance may depend on the errors of all. Then events run in order of time, at the same instant first that
+    disturbance, then the station's datagrams and then the vehicles by system id.
 
     `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and the vehicles
     get only what could be verified.
@@ -66,6 +70,8 @@ class Fleet:
         self._record = record
         self._start_ns = start_ns
         self._members: dict[int, _Member] = {}
+        self._external: ExternallyFlown | None = None
+        """The leader, until the flight begins, if somebody else flies it."""
         self._heap: list[tuple[int, int]] = []
         """(leaves_ns, system id); an entry that its member contradicts is stale and skipped."""
         self._links = LinkSet(scenario, start_ns, record=record)
@@ -76,21 +82,27 @@ class Fleet:
         self._entered = 0
         sensors = scenario.control.loop == "onboard"
         experiment = f"{fingerprint(scenario)} {scenario.name}"[:LONGEST_TEXT]
-        self._in_order = sensors or self._links.have_channels
+        disturbance = scenario.disturbance
+        self._sector = None if disturbance is None or disturbance.sector is None else SectorBound(scenario)
+        self._in_order = sensors or self._links.have_channels or self._sector is not None
         for own in sorted(scenario.vehicles, key=lambda vehicle: vehicle.system_id):
             radio = Radio(scenario, own, start_ns, record)
-            craft: DoubleIntegrator | Copter
+            craft: DoubleIntegrator | Copter | ExternallyFlown
             if scenario.dynamics == "autopilot":
                 craft = Copter(scenario, own, radio)
             else:
                 onboard = VehicleLoop(scenario, own.system_id, self._seen) if sensors else None
                 craft = DoubleIntegrator(scenario, own, radio, onboard)
+            if own.system_id == scenario.external_id:
+                craft = self._external = ExternallyFlown(scenario, craft, scenario.altitude_of(own))
             vehicle = Shell(scenario, radio, craft, signed=bool(signed), experiment=experiment)
             self._members[own.system_id] = _Member(
                 vehicle, *self._links.of(own.system_id), signed[own.system_id] if signed else None
             )
         for member in self._members.values():
             self._plan(member)
+        if self._sector is not None:
+            heapq.heappush(self._acts, (start_ns, _SECTOR))
 
     @property
     def system_ids(self) -> tuple[int, ...]:
@@ -129,7 +141,7 @@ class Fleet:
             total.update(member.vehicle.counters)
         return total
 
-    def vehicle(self, system_id: int) -> Shell[DoubleIntegrator | Copter]:
+    def vehicle(self, system_id: int) -> Shell[DoubleIntegrator | Copter | ExternallyFlown]:
         """One vehicle, as of the last time it was brought up to date; `state` is exact at any time."""
         return self._members[system_id].vehicle
 
@@ -147,10 +159,11 @@ class Fleet:
 
         `received` are datagrams of the station, with the instants at which each enters its vehicle's down link.
         """
-        if self._links.zero_ns == NEVER_NS:
+        if self._links.zero_ns == NEVER_NS or self._external is not None:
             received = list(received)
             for _, data, time_ns in received:
                 self._links.hear(data, time_ns)
+                self._begin(data, time_ns)
         if self._in_order:
             self._run_in_order(received, now_ns)
         else:
@@ -174,6 +187,14 @@ class Fleet:
             self._plan(member)
         out.sort(key=_DUE_THEN_SYSTEM_ID)
         return out
+
+    def _begin(self, data: bytes, time_ns: int) -> None:
+        """The station's first set-point begins the flight of a leader flown by somebody else."""
+        if self._external is not None and is_set_point(data):
+            self._external.begin(time_ns)
+            self._external = None
+            for member in self._members.values():
+                self._plan(member)
 
     def state(self, system_id: int, now_ns: int) -> State:
         """The true state of a vehicle now, after everything that has reached it by now."""
@@ -204,6 +225,9 @@ class Fleet:
                 member.down.send(data, time_ns)
             elif acts_ns <= now_ns:
                 heapq.heappop(acts)
+                if acting_id == _SECTOR:
+                    self._disturb(acts_ns)
+                    continue
                 member = self._members[acting_id]
                 if acts_ns != member.acts_ns:
                     continue
@@ -211,6 +235,16 @@ class Fleet:
             else:
                 return
             self._plan(member)
+
+    def _disturb(self, now_ns: int) -> None:
+        """Push the vehicles by what their true errors are now, until the next period."""
+        assert self._sector is not None
+        crafts = {system_id: member.vehicle.craft for system_id, member in self._members.items()}
+        for system_id, push in self._sector.pushes(lambda system_id: crafts[system_id].state_at(now_ns)).items():
+            craft = crafts[system_id]
+            assert isinstance(craft, DoubleIntegrator)  # the scenario's check sees to it
+            craft.push(push, now_ns)
+        heapq.heappush(self._acts, (now_ns + self._sector.period_ns, _SECTOR))
 
     def _live(self, member: _Member, now_ns: int) -> None:
         """Bring a vehicle up to date; what it sends enters its up link."""

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from scenarios import link_schema
+from scenarios.keys import link as link_keys
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links.truth import CORRUPTED, LOST, OUTAGE, PASSED
 
@@ -69,7 +69,7 @@ class LinkBehaviour:
         return len(self.points_ns) > 1 or bool(self.outages_ns)
 
 
-def behaviour_of(link: link_schema.Link) -> LinkBehaviour:
+def behaviour_of(link: link_keys.Link) -> LinkBehaviour:
     points = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
     points_ns = tuple((_ns(time_s), _ns(delay_s)) for time_s, delay_s in points)
     bursts = link.loss_bursts
@@ -87,9 +87,9 @@ def behaviour_of(link: link_schema.Link) -> LinkBehaviour:
     )
 
 
-def constant(link: link_schema.Link) -> bool:
+def constant(link: link_keys.Link) -> bool:
     """Whether the link only delays, by its constant delay_s."""
-    plain = link_schema.Link(delay_s=link.delay_s, reordering=link.reordering, channel=link.channel)
+    plain = link_keys.Link(delay_s=link.delay_s, reordering=link.reordering, channel=link.channel)
     return link == plain and link.channel is None
 
 
@@ -142,7 +142,7 @@ class _Delays(Protocol):
 class Stream:
     """The draws of one link, datagram by datagram."""
 
-    def __init__(self, link: link_schema.Link, seed: int, key: tuple[int, int]) -> None:
+    def __init__(self, link: link_keys.Link, seed: int, key: tuple[int, int]) -> None:
         fates, delays = np.random.SeedSequence(seed, spawn_key=key).spawn(2)
         self._fates = np.random.default_rng(fates)
         self._delays = _delays_of(link.jitter, np.random.default_rng(delays))
@@ -160,7 +160,7 @@ class Stream:
         return self._block.pop()
 
 
-def _delays_of(jitter: link_schema.Jitter | None, rng: np.random.Generator) -> _Delays:
+def _delays_of(jitter: link_keys.Jitter | None, rng: np.random.Generator) -> _Delays:
     if jitter is None:
         return lambda count: [(0.0, 0.0)] * count
     if jitter.distribution == "trace":
@@ -196,13 +196,13 @@ def _in_trace_order(trace_s: tuple[float, ...], rng: np.random.Generator) -> _De
     return drawn
 
 
-def _least_jitter_ns(jitter: link_schema.Jitter | None) -> int:
+def _least_jitter_ns(jitter: link_keys.Jitter | None) -> int:
     match jitter:
-        case link_schema.Jitter(distribution="uniform", scale_s=float(scale_s)):
+        case link_keys.Jitter(distribution="uniform", scale_s=float(scale_s)):
             return -_ns(scale_s)
-        case link_schema.Jitter(distribution="normal"):
+        case link_keys.Jitter(distribution="normal"):
             return -(2**63)
-        case link_schema.Jitter(distribution="trace", trace_s=(_, *_) as trace_s):
+        case link_keys.Jitter(distribution="trace", trace_s=(_, *_) as trace_s):
             return _ns(min(trace_s))
         case _:
             return 0

@@ -7,7 +7,8 @@ waits for bandwidth. A link that only delays by a constant draws no random numbe
 import heapq
 from collections import Counter, deque
 
-from scenarios import link_schema, schema
+from scenarios import schema
+from scenarios.keys import link as link_keys
 from scenarios.schema import NS_PER_S
 from sim_vehicles.links import truth
 from sim_vehicles.links.fate import Stream, behaviour_of, constant, flipped, outcome
@@ -23,6 +24,12 @@ UP_STREAM, DOWN_STREAM = 1, 2
 SETPOINT_IDS = (82, 84, 86)
 """SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first of them begins the flight."""
 
+
+def is_set_point(data: bytes) -> bool:
+    """Whether a frame is one of the messages that begin the flight."""
+    return message_id(data) in SETPOINT_IDS
+
+
 Entry = tuple[int, int, int, bytes, int, int]
 """(due_ns, number, entered_ns, data, fate, queued_ns). A duplicate has the number of its original."""
 
@@ -33,7 +40,7 @@ class Channel:
     Sends one datagram at a time, in order of arrival; those of one instant in order of `send`.
     """
 
-    def __init__(self, channel: link_schema.Channel) -> None:
+    def __init__(self, channel: link_keys.Channel) -> None:
         self._ns_per_byte = channel.bits_per_byte * NS_PER_S / channel.bandwidth_bit_s
         self._most_bytes = channel.queue_bytes
         self._most_datagrams = channel.queue_datagrams
@@ -72,7 +79,7 @@ class Link:
 
     def __init__(
         self,
-        link: link_schema.Link,
+        link: link_keys.Link,
         *,
         capacity: int = CAPACITY,
         seed: int = 0,
@@ -203,7 +210,7 @@ class LinkSet:
 
     def hear(self, data: bytes, time_ns: int) -> None:
         """Look for the station's first set-point, which begins the flight and the links' time."""
-        if message_id(data) in SETPOINT_IDS and time_ns < self.zero_ns:
+        if is_set_point(data) and time_ns < self.zero_ns:
             self.zero_ns = time_ns
             for link in (link for pair in self._pairs.values() for link in pair):
                 link.zero_ns = time_ns
@@ -218,7 +225,7 @@ class LinkSet:
             total["link_down_dropped"] += down.dropped
         return total
 
-    def _made(self, link: link_schema.Link, system_id: int, kind: int) -> Link:
+    def _made(self, link: link_keys.Link, system_id: int, kind: int) -> Link:
         made = Link(
             link, seed=self._seed, system_id=system_id, kind=kind, channel=self._channel(link.channel, system_id, kind),
             record=self._record,

@@ -9,12 +9,14 @@ import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 SAMPLED, ACTED, LINK_UP, LINK_DOWN = 1, 2, 3, 4
-KINDS = SAMPLED, ACTED, LINK_UP, LINK_DOWN
+PUSHED, CARRIED, POSITION_ERROR, VELOCITY_ERROR = 5, 6, 7, 8
+KINDS = SAMPLED, ACTED, LINK_UP, LINK_DOWN, PUSHED, CARRIED, POSITION_ERROR, VELOCITY_ERROR
 
 DTYPE = np.dtype(
     [
@@ -38,6 +40,9 @@ if it has none) entered the link at `entered_ns`, was due at `due_ns`, and left 
 to a socket (in virtual time, to the station); downwards the simulated vehicle took it. It waited `queued_ns` for the
 channel. `fate` is the sum of what happened to it, see FATES. With one of DROPPED it never left: due_ns and time_ns
 equal entered_ns. A duplicated datagram has two records; the copy's has DUPLICATE.
+PUSHED, CARRIED, POSITION_ERROR, VELOCITY_ERROR: a disturbance, in the units of `disturbances`, times 1e9; `entered_ns`
+and `due_ns` hold its north and east components, and `disturbances` reads them. From `time_ns` on the vehicle is pushed
+by an acceleration, or carried at a velocity. The state sampled with time_boot_ms `key` was reported with these errors.
 """
 
 PASSED = 0
@@ -55,6 +60,7 @@ FATES = {
 _MAGIC = b"UAVTRUE2"
 _PACK = struct.Struct("<BBIqqqBq").pack
 _BATCH = 1024
+_PARTS = 1e9
 
 
 Row = tuple[int, int, int, int, int, int] | tuple[int, int, int, int, int, int, int, int]
@@ -106,6 +112,20 @@ class TruthLog:
         with contextlib.suppress(OSError):
             os.ftruncate(self._file, self._end)
         os.close(self._file)
+
+
+def disturbance_row(kind: int, system_id: int, key: int, time_ns: int, north: float, east: float) -> Row:
+    """The record of a disturbance with these components in SI units."""
+    return kind, system_id, key, time_ns, round(north * _PARTS), round(east * _PARTS)
+
+
+def disturbances(truth: npt.NDArray[np.void], kind: int, system_id: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """When (ns, shape (k,)), and north and east, shape (k, 2), of a vehicle's disturbances of one kind.
+
+    PUSHED in m/s², CARRIED in m/s, POSITION_ERROR in m, VELOCITY_ERROR in m/s.
+    """
+    own = truth[(truth["kind"] == kind) & (truth["system_id"] == system_id)]
+    return own["time_ns"], np.stack([own["entered_ns"], own["due_ns"]], axis=1) / _PARTS
 
 
 def read_truth(path: Path) -> npt.NDArray[np.void]:

@@ -147,6 +147,17 @@ def global_origin(place_deg: tuple[float, float], altitude_m: float) -> Message:
     return dialect.MAVLink_gps_global_origin_message(*_degrees_e7(place_deg), round(altitude_m * 1e3))
 
 
+def position_target(
+    boot_ms: int, mask: int, velocity_ned_m_s: tuple[float, float, float], acceleration_ne_m_s2: tuple[float, float]
+) -> Message:
+    """POSITION_TARGET_LOCAL_NED of a vehicle that steers to a velocity, an acceleration or both."""
+    nowhere, yaw = (0.0, 0.0, 0.0), (0.0, 0.0)
+    acceleration = *acceleration_ne_m_s2, 0.0
+    return dialect.MAVLink_position_target_local_ned_message(
+        boot_ms, dialect.MAV_FRAME_LOCAL_NED, mask, *nowhere, *velocity_ned_m_s, *acceleration, *yaw
+    )
+
+
 class Condition(NamedTuple):
     """A vehicle's state at one instant, for GLOBAL_POSITION_INT and the messages of EXTRA."""
 

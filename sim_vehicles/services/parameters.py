@@ -127,6 +127,11 @@ def fixed(name: str, value: int) -> Parameter:
     return Parameter(name, value, value, value, whole=True)
 
 
+def limit(name: str, value: float) -> Parameter:
+    """A limit of what the vehicle follows, which cannot be changed in flight."""
+    return Parameter(name, value, value, value)
+
+
 _ARDUPILOT_VALUES: dict[str, float] = {
     "ARMING_CHECK": 1,
     "FRAME_CLASS": 1,

@@ -5,18 +5,23 @@ velocity and acceleration set-points with a lag, and lands. The fleet flies it i
 "autopilot"`.
 """
 
+import heapq
 import math
-from collections import deque
 from collections.abc import Mapping
 
 import numpy as np
 
 from scenarios import schema
 from scenarios.schema import NS_PER_S
+from sim_vehicles.motion.air import Air
+from sim_vehicles.motion.copter import Motion, Target, advance, shifted
+from sim_vehicles.motion.double_integrator import State, state_from
+from sim_vehicles.motion.lagged import inner_of
+from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.services import mavlink, messages
 from sim_vehicles.services.clock import NEVER_NS, BootClock
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
-from sim_vehicles.vehicles.copter_dynamics import Motion, Target, advance
+from sim_vehicles.services.sitl import slips
 from sim_vehicles.vehicles.copter_rules import (
     FAILED,
     PX4_TAKEOFF_ALTITUDE,
@@ -26,8 +31,7 @@ from sim_vehicles.vehicles.copter_rules import (
     parameters,
     setpoint_target,
 )
-from sim_vehicles.vehicles.dynamics import State, state_from
-from sim_vehicles.vehicles.setpoints import ABSURD
+from sim_vehicles.vehicles.setpoints import ABSURD, POSITION_AXES, VELOCITY_AXES, YAW_IGNORED, YAW_RATE_IGNORED
 from sim_vehicles.vehicles.shell import Answer, Radio
 
 ORIGIN_STREAM = 7
@@ -36,10 +40,15 @@ TAKEN_OFF_M = 0.3
 HOME_M = 0.5
 """Distance to home at which a return becomes a landing."""
 SINK_FAST_M_S, SINK_M_S, SINK_SLOWLY_BELOW_M = 1.5, 0.7, 5.0
-REPORTED = mavlink.LOCAL_POSITION, mavlink.GLOBAL_POSITION, mavlink.GLOBAL_ORIGIN, mavlink.HOME_POSITION
+REPORTED = (
+    mavlink.LOCAL_POSITION, mavlink.POSITION_TARGET,
+    mavlink.GLOBAL_POSITION, mavlink.GLOBAL_ORIGIN, mavlink.HOME_POSITION,
+)  # fmt: skip
 """With the estimator's, the messages that can be requested besides those of every vehicle."""
 READY_FLAGS, NOT_READY_FLAGS = 0x33F, 0x481
 """Estimator flags when all is well; and with attitude only, constant position mode, uninitialised."""
+_NO_POSITION = "Need Position Estimate"
+_NO_JUMP = NEVER_NS, 0, ""
 _ACCEPTED: Answer = mavlink.ACCEPTED, ""
 
 
@@ -51,20 +60,23 @@ class Copter:
         self.settings = scenario.autopilot
         self.rules = RULES[own.flavour or scenario.autopilot.flavour]
         self.version, self.version_1_first = self.rules.version, self.rules.version_1_first
-        self.parameters = parameters(self.rules, own.system_id)
+        self.parameters = parameters(self.rules, own.system_id, self.settings)
         self.intervals_us: Mapping[int, int] = dict.fromkeys((*REPORTED, self.rules.estimator_message), 0)
         self.reports_from_ns = start_ns + round(self.settings.telemetry_after_s * NS_PER_S)
         self.mode = self.rules.first_mode
         self.armed = self.failsafe = False
         self.landed = True
         self.home_ne_m = own.position_ne_m
-        self.motion = Motion(*own.position_ne_m)
+        self.motion = Motion(*own.position_ne_m, inner=inner_of(self.settings))
         stream = np.random.SeedSequence(scenario.seed, spawn_key=(own.system_id, ORIGIN_STREAM))
         spread = (2.0 * np.random.default_rng(stream).random(3) - 1.0) * self.settings.origin_spread_m
         north_m, east_m, up_m = spread.tolist()
         self.origin_neu_m: tuple[float, float, float] = (north_m, east_m, up_m)
         """Origin of its local frame, in the scenario's frame."""
         self._radio = radio
+        still, exact = scenario.disturbance is None, scenario.navigation is None
+        self._air = None if still else Air(scenario, own.system_id, start_ns, radio.record)
+        self._navigator = None if exact else Navigator(scenario, own.system_id, radio.record)
         self._target = Target()
         self._takeoff_m: float | None = None
         self._motion_ns = start_ns
@@ -73,15 +85,17 @@ class Copter:
         self._read_timeouts()
         self._refusals_left = self.settings.arming_refusals
         self._ready_ns = start_ns + round(self.settings.ready_after_s * NS_PER_S)
-        self._jumps = deque(
-            (start_ns + round(j.at_s * NS_PER_S), round(j.by_s * NS_PER_S)) for j in self.settings.clock_jumps
-        )
+        jumps = ((start_ns + round(j.at_s * NS_PER_S), round(j.by_s * NS_PER_S)) for j in self.settings.clock_jumps)
+        slipping = slips(scenario, own.system_id, start_ns)
+        self._jumps = heapq.merge(((*jump, "clock jumped") for jump in jumps), ((*slip, "") for slip in slipping))
+        self._jump = next(self._jumps, _NO_JUMP)
+        self._complains_ns = start_ns + self._complaint_ns if self.rules.complains_every_s else NEVER_NS
 
     def state_at(self, time_ns: int) -> State:
         """The true state in the scenario's frame at a time after the last event, if nothing arrives until then."""
         motion = self.motion
         if not self.landed and time_ns > self._motion_ns:
-            motion, _ = advance(motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
+            motion, _ = self._flown(time_ns, foreseen=True)
         return state_from(motion[0:2], motion[2:4])
 
     # What happens by itself
@@ -89,7 +103,7 @@ class Copter:
     @property
     def deadline_ns(self) -> int:
         """The next instant at which an event happens that is not a report."""
-        deadline_ns = self._jumps[0][0] if self._jumps else NEVER_NS
+        deadline_ns = min(self._jump[0], self._complains_ns)
         if self._setpoint_ns is not None and not self.landed and self.mode == self.rules.guided_mode:
             deadline_ns = min(deadline_ns, self._setpoint_ns + self._setpoint_timeout_ns)
         if self.armed and self.landed:
@@ -97,18 +111,28 @@ class Copter:
         return deadline_ns
 
     def happen(self, time_ns: int) -> None:
-        """Run the event at the deadline: a clock jump, a disarming on the ground, or set-points that stop."""
+        """Run the event at the deadline: a jump, a complaint, a disarming on the ground, or set-points that stop."""
         self._advance(time_ns)
-        if self._jumps and time_ns == self._jumps[0][0]:
-            _, by_ns = self._jumps.popleft()
+        if time_ns == self._jump[0]:
+            _, by_ns, text = self._jump
+            self._jump = next(self._jumps, _NO_JUMP)
             clock = self._radio.clock
             self._radio.set_clock(BootClock(time_ns, clock.boot_ns(time_ns) + by_ns, clock.drift_ppb), time_ns)
-            self._radio.tell(time_ns, "clock jumped")
+            if text:
+                self._radio.tell(time_ns, text)
+        elif time_ns == self._complains_ns:
+            self._complains_ns = NEVER_NS if self._ready(time_ns) else time_ns + self._complaint_ns
+            if not self._ready(time_ns):
+                self._radio.say(time_ns, f"PreArm: {_NO_POSITION}")
         elif self.armed and self.landed:
             self.armed = False
             self._radio.tell(time_ns, "disarmed: not taken off")
         else:
             self._lose_setpoints(time_ns)
+
+    @property
+    def _complaint_ns(self) -> int:
+        return round(self.rules.complains_every_s * NS_PER_S)
 
     def _lose_setpoints(self, time_ns: int) -> None:
         """Stop: ArduCopter stays in guided mode, PX4 leaves offboard and holds."""
@@ -186,7 +210,7 @@ class Copter:
         if self.armed:
             return _ACCEPTED
         if not self._ready(time_ns):
-            return self.rules.arming_refused, "PreArm: Need Position Estimate"
+            return self.rules.arming_refused, f"Arm: {_NO_POSITION}"
         if self._refusals_left:
             self._refusals_left -= 1
             return self.rules.arming_refused, "Arm: Accels inconsistent"
@@ -243,14 +267,18 @@ class Copter:
             return encoder.heartbeat(self.mode, armed=self.armed, flying=flying, critical=self.failsafe, autopilot=kind)
         if message_id == mavlink.LOCAL_POSITION and ready:
             down_m = origin_up_m - motion.altitude_m
-            position = motion.north_m - origin_north_m, motion.east_m - origin_east_m, down_m
-            return encoder.local_position(boot_ms, position, (*motion[2:4], -motion.climb_m_s))
+            place, velocity = (motion.north_m - origin_north_m, motion.east_m - origin_east_m), motion[2:4]
+            if self._navigator is not None:
+                place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
+            return encoder.local_position(boot_ms, (*place, down_m), (*velocity, -motion.climb_m_s))
         if message_id == self.rules.estimator_message:
             message = messages.estimator_flags(message_id, boot_ms * 1000, READY_FLAGS if ready else NOT_READY_FLAGS)
         elif message_id == mavlink.GLOBAL_POSITION or message_id in messages.EXTRA:
             message = messages.report(message_id, self._condition(boot_ms, has_position=ready))
         elif message_id == mavlink.GLOBAL_ORIGIN and ready:
             message = messages.global_origin(degrees(origin_north_m, origin_east_m), ORIGIN_ALTITUDE_M + origin_up_m)
+        elif message_id == mavlink.POSITION_TARGET and self._steers:
+            message = self._active_target(boot_ms)
         elif message_id == mavlink.HOME_POSITION and ready:
             north, east = self.home_ne_m
             local = north - origin_north_m, east - origin_east_m, origin_up_m
@@ -258,6 +286,17 @@ class Copter:
         else:
             return None
         return encoder.pack(message)
+
+    @property
+    def _steers(self) -> bool:
+        """Whether it follows set-points, or stands because they have stopped."""
+        return self.mode == self.rules.guided_mode and not self.landed and self._takeoff_m is None
+
+    def _active_target(self, boot_ms: int) -> messages.Message:
+        """What it steers to now: the velocity of the set-point, grown by the acceleration since, and the latter."""
+        target = self._target
+        mask = POSITION_AXES | YAW_IGNORED | YAW_RATE_IGNORED | (0 if target.velocity_gain_1_s else VELOCITY_AXES)
+        return messages.position_target(boot_ms, mask, (*target[2:4], -target.climb_m_s), target[0:2])
 
     def _condition(self, boot_ms: int, *, has_position: bool) -> messages.Condition:
         """What it reports to other ground stations; it tilts to accelerate."""
@@ -289,13 +328,28 @@ class Copter:
         self._setpoint_ns = None
         self._radio.tell(time_ns, "takes off")
 
+    def _flown(self, time_ns: int, *, foreseen: bool = False) -> tuple[Motion, Target]:
+        """Motion and target at a later instant."""
+        if self._air is None:
+            return advance(self.motion, self._target, self.settings, (time_ns - self._motion_ns) / NS_PER_S)
+
+        def move(own: tuple[Motion, Target], duration_s: float) -> tuple[Motion, Target]:
+            return advance(*own, self.settings, duration_s)
+
+        def shift(own: tuple[Motion, Target], *by: float) -> tuple[Motion, Target]:
+            return shifted(own[0], *by), own[1]
+
+        own = self.motion, self._target
+        return self._air.moved(own, move, shift, self._motion_ns, time_ns, foreseen=foreseen)
+
     def _advance(self, time_ns: int) -> None:
         if time_ns <= self._motion_ns:
             return
-        duration_s, self._motion_ns = (time_ns - self._motion_ns) / NS_PER_S, time_ns
+        if not self.landed:
+            self.motion, self._target = self._flown(time_ns)
+        self._motion_ns = time_ns
         if self.landed:
             return
-        self.motion, self._target = advance(self.motion, self._target, self.settings, duration_s)
         altitude_m = self.motion.altitude_m
         if self._takeoff_m is not None and altitude_m > self._takeoff_m - TAKEN_OFF_M:
             self._takeoff_m = None
@@ -308,7 +362,8 @@ class Copter:
             self._target = self._target._replace(climb_m_s=-sink)
             if altitude_m <= 0.0:
                 self.landed, self.armed = True, False
-                self.motion = Motion(self.motion.north_m, self.motion.east_m, yaw_rad=self.motion.yaw_rad)
+                where, yaw_rad = self.motion[:2], self.motion.yaw_rad
+                self.motion = Motion(*where, yaw_rad=yaw_rad, inner=inner_of(self.settings))
                 self._radio.tell(time_ns, "landed")
         elif self.mode == self.rules.return_mode and math.dist(self.motion[:2], self.home_ne_m) < HOME_M:
             self.mode = self.rules.land_mode

@@ -7,10 +7,11 @@ offboardCheck.cpp.
 import math
 from dataclasses import dataclass
 
+from scenarios.schema import Autopilot
+from sim_vehicles.motion.copter import Target
 from sim_vehicles.services import mavlink
 from sim_vehicles.services.mavlink import Command, Setpoint
-from sim_vehicles.services.parameters import ARDUPILOT_SETUP, PX4_SETUP, Parameter, Parameters, fixed, timeout
-from sim_vehicles.vehicles.copter_dynamics import Target
+from sim_vehicles.services.parameters import ARDUPILOT_SETUP, PX4_SETUP, Parameter, Parameters, fixed, limit, timeout
 from sim_vehicles.vehicles.setpoints import (
     ABSURD,
     ACCELERATION_AXES,
@@ -27,6 +28,8 @@ from sim_vehicles.vehicles.setpoints import (
 TEMPORARILY_REJECTED, FAILED = 1, 4
 PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
 """The parameter with the altitude above ground, in m, of a take-off command without an altitude."""
+MOST_JERK_M_S3 = 20.0
+"""What both autopilots allow at most, for a vehicle without a limit."""
 GROUND_DISARM_S = 10.0
 """Both autopilots disarm if they have not taken off this long after arming."""
 
@@ -64,6 +67,8 @@ class Rules:
     setpoint_timeout_s: float
     velocity_grows: bool
     """Whether the velocity target integrates the acceleration between two set-points."""
+    complains_every_s: float
+    """How often it says by itself why it cannot be armed; 0 for never."""
     version_1_first: bool
     """Whether it speaks MAVLink 1 until it hears MAVLink 2 (MAV_PROTO_VER 0)."""
 
@@ -86,6 +91,7 @@ ARDUPILOT = Rules(
     ground_disarm_parameter="DISARM_DELAY",
     setpoint_timeout_s=3.0,
     velocity_grows=True,
+    complains_every_s=30.0,
     version_1_first=False,
 )
 PX4 = Rules(
@@ -113,20 +119,24 @@ PX4 = Rules(
     ground_disarm_parameter="COM_DISARM_PRFLT",
     setpoint_timeout_s=1.0,
     velocity_grows=False,
+    complains_every_s=0.0,
     version_1_first=True,
 )
 RULES = {"ardupilot": ARDUPILOT, "px4": PX4}
 
 
-def parameters(rules: Rules, system_id: int) -> Parameters:
+def parameters(rules: Rules, system_id: int, settings: Autopilot) -> Parameters:
     known = [
         fixed(rules.system_id_parameter, system_id),
         timeout(rules.setpoint_timeout_parameter, rules.setpoint_timeout_s),
         timeout(rules.ground_disarm_parameter, GROUND_DISARM_S),
     ]
+    jerk_m_s3 = settings.jerk_max_m_s3 or MOST_JERK_M_S3
     if rules is PX4:
+        known += [limit("MPC_ACC_HOR", settings.acceleration_max_m_s2), limit("MPC_JERK_AUTO", jerk_m_s3)]
         known += [Parameter(PX4_TAKEOFF_ALTITUDE, 2.5, 0.5, 1000.0), *PX4_SETUP]
     else:
+        known += [limit("WPNAV_ACCEL", 100.0 * settings.acceleration_max_m_s2), limit("PSC_JERK_XY", jerk_m_s3)]
         known += ARDUPILOT_SETUP
     return Parameters(known, bytewise=rules.parameters_bytewise)
 

@@ -8,12 +8,10 @@ import math
 from collections.abc import Mapping
 
 from scenarios import schema
+from scenarios.keys.own import BUILT_IN
 from scenarios.schema import NS_PER_S
-from sim_vehicles.services import mavlink, messages
-from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
-from sim_vehicles.services.parameters import ARDUPILOT_SETUP, Parameters, fixed, timeout
-from sim_vehicles.services.services import whole
-from sim_vehicles.vehicles.dynamics import (
+from sim_vehicles.motion.air import Air, Push, air_of
+from sim_vehicles.motion.double_integrator import (
     COAST,
     VELOCITY_GAIN_1_S,
     Command,
@@ -21,8 +19,15 @@ from sim_vehicles.vehicles.dynamics import (
     advance,
     bounds_of,
     rates,
+    shifted,
     state_from,
 )
+from sim_vehicles.motion.navigation import Navigator
+from sim_vehicles.motion.own import OwnMotion
+from sim_vehicles.services import mavlink, messages
+from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
+from sim_vehicles.services.parameters import ARDUPILOT_SETUP, Parameters, fixed, timeout
+from sim_vehicles.services.services import whole
 from sim_vehicles.vehicles.flight_mode import MODE_NAMES, FlightMode
 from sim_vehicles.vehicles.onboard import STEP, VehicleLoop, formation_parameters
 from sim_vehicles.vehicles.setpoints import ACCELERATION, AXES, VELOCITY, VELOCITY_ACCELERATION, fault, to_local
@@ -59,11 +64,15 @@ class DoubleIntegrator:
         self.reports_from_ns = radio.start_ns
         self._radio = radio
         self._onboard = onboard
-        self._altitude_m = scenario.altitude_m
+        self._altitude_m = scenario.altitude_of(own)
         self._bounds = bounds_of(scenario.limits)
         self._state = state_from(own.position_ne_m, own.velocity_ne_m_s)
         self._state_ns = radio.start_ns
         self._command = COAST
+        self._air = air_of(scenario, own.system_id, radio.start_ns, radio.record)
+        self._own = None if scenario.dynamics in BUILT_IN else OwnMotion(scenario, self._note_fault)
+        """Dynamics of its own, which replace the double integrator's; `_air` is there, too, then."""
+        self._navigator = None if scenario.navigation is None else Navigator(scenario, own.system_id, radio.record)
         if onboard is not None:
             radio.schedule.set_interval(STEP, onboard.interval_us, radio.start_ns)
 
@@ -76,6 +85,8 @@ class DoubleIntegrator:
         """The true state at a time after the last event, if nothing arrives until then."""
         if not self.flight.flying or time_ns <= self._state_ns:
             return self._state
+        if self._air is not None:
+            return self._pushed(self._air, time_ns, foreseen=True)
         return advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
 
     def acts_at(self, time_ns: int) -> int:
@@ -218,8 +229,10 @@ class DoubleIntegrator:
         self._advance(time_ns)
         if message_id == mavlink.LOCAL_POSITION:
             state = self._state
-            position = state[0], state[1], -self._altitude_m
-            return encoder.local_position(boot_ms, position, (*state.velocity_ne_m_s(), 0.0))
+            place, velocity = state[0:2], state.velocity_ne_m_s()
+            if self._navigator is not None:
+                place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
+            return encoder.local_position(boot_ms, (*place, -self._altitude_m), (*velocity, 0.0))
         return encoder.pack(messages.report(message_id, self._condition(boot_ms)))
 
     def _condition(self, boot_ms: int) -> messages.Condition:
@@ -240,6 +253,32 @@ class DoubleIntegrator:
 
     def _advance(self, time_ns: int) -> None:
         if time_ns > self._state_ns:
-            if self.flight.flying:
+            if self.flight.flying and self._air is not None:
+                self._state = self._pushed(self._air, time_ns)
+            elif self.flight.flying:
                 self._state = advance(self._state, self._command, self._bounds, (time_ns - self._state_ns) / NS_PER_S)
             self._state_ns = time_ns
+
+    def push(self, push: Push, time_ns: int) -> None:
+        """Be pushed by this from now on, beside wind and gusts."""
+        assert self._air is not None
+        self._advance(time_ns)
+        self._air.add(push)
+
+    def _pushed(self, air: Air, time_ns: int, *, foreseen: bool = False) -> State:
+        moved = advance
+        if self._own is not None:
+            moved = self._own.foreseen if foreseen else self._own.advance
+
+        def move(state: State, duration_s: float) -> State:
+            return moved(state, self._command, self._bounds, duration_s)
+
+        return air.moved(self._state, move, shifted, self._state_ns, time_ns, foreseen=foreseen)
+
+    def _note_fault(self, text: str) -> None:
+        """Count a step that its own dynamics could not make, and say so once."""
+        counters = self._radio.counters
+        counters["model_faults"] += 1
+        if counters["model_faults"] == 1:
+            self._radio.tell(self._state_ns, f"its dynamics: {text}")
+            self._radio.say(self._state_ns, f"dynamics: {text}"[:50])  # the characters of one chunk

@@ -18,8 +18,8 @@ import numpy as np
 
 from scenarios import schema
 from scenarios.schema import NS_PER_S
+from sim_vehicles.motion.double_integrator import Command, State
 from sim_vehicles.services.parameters import Parameter, Parameters
-from sim_vehicles.vehicles.dynamics import Command, State
 
 STEP = -1
 """A step of this loop, as an entry of the vehicle's schedule beside the message ids."""

@@ -11,6 +11,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from scenarios import schema
 from sim_vehicles.links.truth import ACTED, SAMPLED, Record
+from sim_vehicles.motion.double_integrator import State
 from sim_vehicles.services import mavlink
 from sim_vehicles.services.authority import Authority
 from sim_vehicles.services.clock import BootClock
@@ -18,7 +19,7 @@ from sim_vehicles.services.messages import PARAMETER_VALUE, ParameterSet, SetMod
 from sim_vehicles.services.parameters import Parameters
 from sim_vehicles.services.schedule import Schedule
 from sim_vehicles.services.services import Services
-from sim_vehicles.vehicles.dynamics import State
+from sim_vehicles.services.sitl import backdating_ns
 
 TIMESYNC_INTERVAL_US = 10_000_000
 HEARTBEAT_INTERVAL_US = 1_000_000
@@ -123,6 +124,7 @@ class Shell(Generic[Flown]):
         self.authority = Authority(scenario.safety.heartbeat_timeout_s)
         self._speaks_version_1 = craft.version_1_first and not signed  # MAVLink 1 cannot be signed
         self._timesync_ts1 = -1
+        self._backdating_ns = backdating_ns(scenario, radio.system_id)
         from_ns = craft.reports_from_ns
         self._schedule = schedule = radio.schedule
         schedule.add_once(mavlink.HEARTBEAT, radio.start_ns)  # so that a station finds it at once
@@ -220,7 +222,7 @@ class Shell(Generic[Flown]):
         elif message.tc1 == 0:
             self.counters["timesync_requests"] += 1
             # Never 0, even at boot: that would make the reply a request.
-            tc1 = self.radio.clock.boot_ns(time_ns) or 1
+            tc1 = self.radio.clock.boot_ns(time_ns) - next(self._backdating_ns, 0) or 1
             self.radio.send(self.radio.encoder.timesync(tc1, message.ts1), time_ns)
         else:  # an unrequested reply is for another vehicle, or a duplicate
             asked = message.ts1 == self._timesync_ts1

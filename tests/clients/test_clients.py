@@ -18,7 +18,8 @@ from typing import Any
 
 import pytest
 
-from tests.support.flown_fleet import PATIENCE_S, copters, fleet
+from tests.support.flown_fleet import copters, fleet
+from tests.support.processes import PATIENCE_S
 
 HINT = "is not installed: python3 make.py clients"
 MAVPROXY = shutil.which("mavproxy.py", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))

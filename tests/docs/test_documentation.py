@@ -21,6 +21,10 @@ from docs.generate.runner import CommandError, Runner
 from docs.generate.sessions import Step, steps_of
 from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario
 from gcs.drive.lockstep import START_NS, fly_lockstep
+from gcs.drive.virtual import fly_virtual
+from gcs.plan.criteria import with_bounds
+from gcs.plan.design import Design, LinkGains, LinkPart
+from gcs.plan.disturbed import with_spread
 from gcs.plan.planner import flight_plan, with_trade_off
 from gcs.runs.files import write_design
 from gcs.runs.record import SCENARIO_FILE, RunWriter
@@ -28,7 +32,10 @@ from gcs.runs.summary import finish
 from gcs.station.station import Station
 from gcs.stress.trial import Outcome
 from scenarios import files
+from scenarios.keys.criteria import Criteria
+from scenarios.keys.disturbance import Navigation
 from scenarios.schema import FixedGains, Response
+from tests.support.own_code import coded
 
 ROOT = blocks.ROOT
 PAGES = {str(page.relative_to(ROOT)): page for page in blocks.pages()}
@@ -41,7 +48,6 @@ def test_the_reference_and_the_schema_follow_from_the_code() -> None:
     assert reference.stale() == [], "python3 make.py reference"
 
 
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", [name for name, figure in figures.FIGURES.items() if figure.quick])
 def test_quick_exact_figures_are_those_that_the_commands_give(name: str) -> None:
     assert measurements.stale([name]) == [], f"python3 make.py measurements {name}"
@@ -100,7 +106,8 @@ def fly(folder: Path, name: str, **changes: Any) -> dict[str, Any]:
 
 def test_every_field_of_a_summary_is_described_and_no_other(tmp_path: Path) -> None:
     known = described()["summary"]
-    assert found_fields(fly(tmp_path, "chain3"), known) == known.keys()
+    own = fly_virtual(coded(law="soft"), allow_code=True).summary.to_dict()
+    assert found_fields(fly(tmp_path, "chain3"), known) | found_fields(own, known) == known.keys()
 
 
 def test_every_field_of_a_design_is_described_and_no_other() -> None:
@@ -113,8 +120,17 @@ def test_every_field_of_a_design_is_described_and_no_other() -> None:
     load["predicted"] = load["chain3"].model_copy(update={"control": predicted})
     fed = {"gains": FixedGains(K1=-3.4, K2=3.1, K3=5.6), "delay_margin_s": None, "feed_forward": 0.9}
     load["fed forward"] = load["chain3"].model_copy(update={"control": load["chain3"].control.model_copy(update=fed)})
-    designs = (with_trade_off(flight_plan(scenario)[0]) for scenario in load.values())
-    found = [found_fields(design.to_dict(), known) for design in designs]
+    load["noisy"] = load["chain3"].model_copy(update={"navigation": Navigation(position_noise_m=1.0)})
+    varying = load["chain3"].control.model_copy(update={"criteria": Criteria(delays_s=(0.0, 0.1))})
+    load["varying"] = load["chain3"].model_copy(update={"control": varying})
+    load["own law"] = coded(law="soft")
+    planned = (flight_plan(scenario) for scenario in load.values())
+    designs = (with_bounds(with_spread(with_trade_off(design), plan), plan.scenario) for design, plan in planned)
+    link = LinkPart(
+        source="runs/log", vehicles=(1,), loop_delay_s_least=0.1, loop_delay_s_p50=0.2, loop_delay_s_worst=0.3,
+        headroom=0.3, maximised="alpha", chosen="", candidates=(LinkGains(prediction=True),),
+    )  # fmt: skip
+    found = [found_fields(design.to_dict(), known) for design in (*designs, Design(delay_margin_s=1.0, for_link=link))]
     assert set[str]().union(*found) == known.keys()
 
 
@@ -174,6 +190,7 @@ def python(text: str, session: dict[str, Any]) -> None:
 def folder(tmp_path: Path) -> Path:
     """A place like the repository, whose scenarios are flown for a short time."""
     (tmp_path / "docs").symlink_to(ROOT / "docs")
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     shutil.copytree(ROOT / "scenarios", tmp_path / "scenarios", ignore=shutil.ignore_patterns("*.py*", "__pycache__"))
     for file in (tmp_path / "scenarios").glob("*.toml"):
         text = file.read_text(encoding="utf-8")
@@ -183,7 +200,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 # the README's command in virtual time is that of a figure, which is compared above
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", [name for name in SESSIONS if name != "README.md"])
 def test_what_a_page_says_to_type_works(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
@@ -191,7 +207,6 @@ def test_what_a_page_says_to_type_works(name: str, folder: Path, monkeypatch: py
 
 
 @pytest.mark.realtime
-@pytest.mark.timeout(300)
 @pytest.mark.xdist_group("documentation")
 @pytest.mark.parametrize("name", [n for n in SESSIONS if any(step.realtime for step in steps_of(PAGES[n]))])
 def test_what_a_page_says_to_type_works_in_real_time(name: str, folder: Path) -> None:

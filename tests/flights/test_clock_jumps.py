@@ -12,7 +12,7 @@ from gcs.control.tick import CLOCK_JUMPED
 from gcs.drive.lockstep import START_NS, Sent, fly_lockstep
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
-from scenarios.link_schema import Link, Links
+from scenarios.keys.link import Link, Links
 from scenarios.schema import ClockJump, Rates, Scenario, Vehicle
 from sim_vehicles.drive.fleet import Fleet
 from tests.support.flown_copters import COPTERS5, TRUTH, Flight, fly

@@ -21,7 +21,7 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.station.station import Station
 from scenarios.files import load
-from scenarios.link_schema import Jitter, Link, Links
+from scenarios.keys.link import Jitter, Link, Links
 from scenarios.schema import Monitor, Safety
 from tests.support.delay_ramp import ramp
 from tests.support.known import known

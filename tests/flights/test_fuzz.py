@@ -156,7 +156,7 @@ def of_the_flight(station: Station) -> list[Event]:
     return [event for event in station.events if event.kind != "link"]
 
 
-@pytest.mark.timeout(120 + COUNT // 200)
+@pytest.mark.timeout(600 + COUNT // 200)
 @pytest.mark.parametrize(
     ("kind", "key"),
     [

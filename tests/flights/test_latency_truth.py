@@ -13,7 +13,7 @@ from gcs.runs.grade import Truth, graded, true_loop_delays_s, true_round_trips
 from gcs.runs.summary import summarise
 from gcs.station.station import Station
 from scenarios.files import load
-from scenarios.link_schema import Jitter, Link, Links, Outage
+from scenarios.keys.link import Jitter, Link, Links, Outage
 from scenarios.schema import Clocks, FixedGains, Monitor, Safety
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import DTYPE, LINK_UP, SAMPLED, Row

@@ -29,7 +29,7 @@ from gcs.stress.study import NoOnset, Study, find_onset
 from gcs.stress.trial import CRITICAL, Outcome, Trial, plan_loops, sparse_gain
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load, parse, with_loop
-from scenarios.link_schema import Link, Outage, VehicleLinks
+from scenarios.keys.link import Link, Outage, VehicleLinks
 from scenarios.schema import FixedGains, Limits, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import ACTED, DTYPE, SAMPLED

@@ -5,6 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from gains.performance.predicted import PredictedLoop
+from gains.performance.scalar_gains import ScalarGains
 from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_virtual
 from gcs.plan.flight_plan import FlightPlan
@@ -13,7 +15,7 @@ from gcs.stress.axes import at_coordinates
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from scenarios.files import load
-from scenarios.link_schema import DelayPoint, Jitter, Link, Links
+from scenarios.keys.link import DelayPoint, Jitter, Link, Links
 from scenarios.schema import Control, FixedGains, Limits, NominalVelocity, Scenario
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
@@ -59,7 +61,7 @@ def test_errors_change_at_the_rate_of_the_certificate(assumed_s: float, loop_s: 
     growth, predicted = known(outcome.growth_1_s), known(outcome.predicted_growth_1_s)
     # telemetry is rounded to float32: 0.1 mm, to which an error of a metre decays in a few seconds
     assert growth == pytest.approx(predicted, abs=0.01 + 0.01 * abs(predicted))
-    tolerated = planned(assumed_s).tolerance.at(assumed_s)
+    tolerated = planned(assumed_s).tolerance(assumed_s)
     mismatch_s = known(outcome.loop_delay_s) - assumed_s
     assert (growth < 0.0) == (-tolerated.shorter_s[0] < mismatch_s < tolerated.longer_s[0])
 
@@ -114,6 +116,47 @@ def test_drift_to_ten_margins_is_followed_through_jitter_and_losses() -> None:
     ticks = fly_virtual(plan).ticks
     assert ticks["loop_delay_s"][-3:].min() > 2.9
     assert errors_m(ticks, from_s=12.0) < 0.01 * 172.4
+
+
+@pytest.mark.parametrize(("loop_s", "peak"), [(0.3, 1.0), (0.42, 1.25)])
+def test_commands_grow_down_the_chain_as_computed(loop_s: float, peak: float) -> None:
+    """Without mismatch, and half-way up the window: the spectra of the commands of the second and the third vehicle."""
+    slow, base = 1.0, chain3(0.3)  # errors of the clocks are errors of position in proportion to the speed
+    [leader] = [vehicle for vehicle in base.vehicles if vehicle.follows is None]
+    formation = flight_plan(base)[1].formation
+    place_ne_m = formation.place_ne_m() + leader.position_ne_m
+    vehicles = tuple(
+        vehicle.model_copy(
+            update={
+                "position_ne_m": tuple(place_ne_m[formation.row(vehicle.system_id)].tolist()),
+                "velocity_ne_m_s": (slow + 3.0 * (vehicle is leader), 0.0),
+            }
+        )
+        for vehicle in base.vehicles
+    )
+    changes = {
+        "vehicles": vehicles,
+        "nominal_velocity": (NominalVelocity(from_s=0.0, velocity_ne_m_s=(slow, 0.0)),),
+        "limits": Limits(speed_min_m_s=0.1),
+        "duration_s": 25.0,
+    }
+    plan = flight_plan(at_coordinates(base.model_copy(update=changes), {"delay": loop_s - 0.01}).with_calm_monitor())[1]
+    ticks = fly_virtual(plan).ticks
+    ticks = ticks[ticks["commanded"]]
+    assert np.median(ticks["loop_delay_s"]) == pytest.approx(loop_s, abs=0.004)
+    omega = np.linspace(0.3, 8.0, 78)
+    spectra = []
+    for vehicle in base.leader_first()[1:]:
+        rows = ticks[ticks["system_id"] == vehicle.system_id]
+        spectra.append(np.exp(-1j * np.outer(omega, rows["due_ns"] * 1e-9)) @ rows["command_north_m_s2"])
+    loop = PredictedLoop(ScalarGains(-GAINS.K1, GAINS.K2, GAINS.K3, 0.0), 0.02, 0.3)
+    delay_s = float(np.median(ticks["loop_delay_s"][ticks["system_id"] == base.leader_first()[2].system_id]))
+    strong = np.abs(spectra[0]) > 0.5 * np.abs(spectra[0]).max()
+    flown, computed = np.abs(spectra[1] / spectra[0])[strong], loop.growth(omega[strong], delay_s)
+    # the two vehicles' delays differ by milliseconds, and elsewhere rounding of telemetry is no longer small
+    assert flown == pytest.approx(computed, abs=0.04)
+    assert flown.max() == pytest.approx(peak, abs=0.05)
+    assert flown.max() == pytest.approx(min(loop.string_peak(delay_s), computed.max()), abs=0.03)
 
 
 def chain3(prediction: float | str) -> Scenario:

@@ -17,7 +17,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
 from scenarios.files import load
-from scenarios.part import Flavour
+from scenarios.keys.part import Flavour
 from scenarios.schema import FixedGains, Response
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps

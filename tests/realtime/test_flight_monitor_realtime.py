@@ -12,7 +12,7 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.record import event_fields
 from gcs.station.station import Station
 from scenarios.files import dump, load
-from scenarios.link_schema import DelayPoint, Jitter, Link, Links
+from scenarios.keys.link import DelayPoint, Jitter, Link, Links
 from scenarios.schema import Monitor, Scenario
 from tests.support.paths import SCENARIOS
 

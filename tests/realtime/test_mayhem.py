@@ -29,13 +29,12 @@ from scenarios.files import dump, load
 from scenarios.schema import FixedGains
 from sim_vehicles.links.truth import read_truth
 from tests.support.paths import SCENARIOS
-from tests.support.processes import free_port, until
+from tests.support.processes import PATIENCE_S, free_port, until
 
-pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes"), pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
 
 TIMES = int(os.environ.get("MAYHEM", "1"))
 SEED = int(os.environ.get("MAYHEM_SEED", "1"))
-PATIENCE_S = 100.0
 FLIGHT_S = 3.0
 BEFORE_S, AFTER_S = 5.0, 1.5
 """About how long a flight needs to begin, and to write its files at the end."""

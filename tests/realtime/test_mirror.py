@@ -28,12 +28,12 @@ from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from tests.support.flown_fleet import until
 from tests.support.paths import ROOT
+from tests.support.processes import PATIENCE_S
 from tests.support.signed_peer import EPOCH_NS, KEY, NOW_NS, a_sender
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("processes")]
 
 GCS = [sys.executable, "-m", "gcs.cli.main"]
-PATIENCE_S = 60.0
 PROBE = 31000
 """A command that nobody else sends."""
 

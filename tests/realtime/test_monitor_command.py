@@ -14,11 +14,11 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.link import mavlink
 from tests.support.paths import ROOT
+from tests.support.processes import PATIENCE_S
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
 MONITOR = [sys.executable, "-m", "gcs.cli.main", "monitor"]
-PATIENCE_S = 60.0
 
 
 def free_address() -> str:

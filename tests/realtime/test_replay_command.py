@@ -11,11 +11,10 @@ import pytest
 
 from scenarios.files import dump, load
 from tests.support.paths import ROOT
+from tests.support.processes import GCS, PATIENCE_S
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("realtime")]
 
-GCS = [sys.executable, "-m", "gcs.cli.main"]
-PATIENCE_S = 60.0
 LISTENER = """
 import select, sys, time
 from pymavlink import mavutil

@@ -69,7 +69,14 @@ def test_link_delay_override_reaches_vehicles_with_links_of_their_own() -> None:
     assert [link.delay_s for link in other.link_of(3)] == [0.4, 0.02]
 
 
+SECTOR = "[rates]", "[disturbance.sector]\nnorm_1_s = 1.0\ndirection = {}\n{}\n[rates]"
+SQUARE = [[1.0] * 9] * 9
 BAD = {
+    "gusts without a time": ("[rates]", "[disturbance]\ngusts = { deviation_m_s2 = 1.0 }\n[rates]", "disturb", "value"),
+    "sector too small": (SECTOR[0], SECTOR[1].format([[1.0]], ""), "disturbance.sector.direction", "9 rows of 9"),
+    "sector of zeros": (SECTOR[0], SECTOR[1].format([[0.0] * 9] * 9, ""), "disturbance.sector.direction", "not all"),
+    "too few filters": (SECTOR[0], SECTOR[1].format(SQUARE, "all_pass_in = [0.5]"), "disturbance.sector.all", "9 numb"),
+    "filter too slow": (SECTOR[0], SECTOR[1].format(SQUARE, "all_pass_out = [-1]"), "disturbance.sector.all", "than"),
     "unknown key": ("follows = 1", "folows = 1", "vehicle 2: folows", "follows"),
     "unknown section": ("[rates]", "[rate]", "rate", "rates"),
     "wrong unit": ("up = { delay_s = 0.02 }", "up = { delay_ms = 20 }", "links.up.delay_ms", "delay_s"),

@@ -16,7 +16,7 @@ from gcs.control.tick import CLOCK_JUMPED, Mode
 from gcs.drive.flown import margins_of
 from gcs.runs.grade import instants, true_loop_delays_s
 from gcs.runs.summary import summarise
-from scenarios.link_schema import Link
+from scenarios.keys.link import Link
 from scenarios.schema import Scenario
 from sim_vehicles.links.truth import ACTED, SAMPLED
 from tests.soak.soak_flight import Flown, Stretch

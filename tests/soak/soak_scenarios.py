@@ -8,7 +8,9 @@ import math
 
 import numpy as np
 
-from scenarios import link_schema, schema
+from scenarios import schema
+from scenarios.keys import disturbance as disturbance_keys
+from scenarios.keys import link as link_keys
 from scenarios.schema import Scenario
 from tests.soak.soak_draws import Part, Rng, between, chance, most_of, one_of, some, spread, whole
 
@@ -44,6 +46,8 @@ def random_scenario(rng: Rng, name: str) -> Part:
         altitude_m=between(rng, 3.0, 8.0) if autopilot else one_of(rng, 0.0, 1000.0),
         vehicles=vehicles,
         nominal_velocity=_nominal_velocity(rng, speed_m_s, duration_s, limits),
+        course=None,
+        formation_changes=None,
         limits=limits,
         rates=rates,
         control=control,
@@ -55,19 +59,48 @@ def random_scenario(rng: Rng, name: str) -> Part:
         dynamics="autopilot" if autopilot else "double_integrator",
         autopilot=_autopilot(rng, duration_s),
         response=_response(rng) if autopilot and chance(rng, 0.6) else None,
+        disturbance=None,
+        navigation=None,
+        code=None,
         at_end=one_of(rng, "hold", "land"),
     )
-    if not autopilot and not onboard:
-        one_rate = rates["control_hz"] == rates["telemetry_hz"] <= 50.0  # else the windows take minutes
-        _predict(np.random.default_rng(drawn["seed"]), control, often=0.15 if one_rate else 0.0)
+    drawn |= _disturbed(np.random.default_rng((drawn["seed"], 1)))
+    if not onboard and (not autopilot or "response" in drawn):
+        fast = max(rates.values()) > 100.0  # the windows of a whole schedule take half a minute
+        _predict(np.random.default_rng(drawn["seed"]), control, measured=0.5 if fast else "measured", fed=not autopilot)
     return drawn
 
 
-def _predict(rng: Rng, control: Part, *, often: float) -> None:
+def _disturbed(rng: Rng) -> Part:
+    """Wind, gusts and errors of navigation, with random numbers of their own: all else is as without them.
+
+    They stay small beside the spacing: the soak judges formations by whether their errors settle.
+    """
+    gusts = whole(
+        disturbance_keys.Gusts,
+        deviation_m_s2=spread(rng, 1e-4, 3e-3),
+        correlation_time_s=spread(rng, 0.1, 20.0),
+        common=chance(rng, 0.3),
+    )
+    wind = between(rng, -0.005, 0.005), between(rng, -0.005, 0.005)
+    air = whole(disturbance_keys.Disturbance, wind_ne_m_s2=wind, gusts=some(rng, 0.7, gusts), sector=None)
+    navigation = whole(
+        disturbance_keys.Navigation,
+        position_noise_m=spread(rng, 1e-4, 1e-3),
+        velocity_noise_m_s=spread(rng, 1e-4, 1e-3),
+        position_bias_m=spread(rng, 1e-4, 1e-2),
+        velocity_bias_m_s=spread(rng, 1e-5, 1e-3),
+        bias_time_s=spread(rng, 1.0, 100.0),
+    )
+    found = {"disturbance": some(rng, 0.15, air), "navigation": some(rng, 0.15, navigation)}
+    return {name: part for name, part in found.items() if part is not None}
+
+
+def _predict(rng: Rng, control: Part, *, measured: float | str, fed: bool) -> None:
     """Prediction and feed-forward, with random numbers of their own: all else is as without them."""
-    if chance(rng, often):
-        control["prediction"] = one_of(rng, "measured", spread(rng, 0.02, 1.0))
-    if "gains" in control and chance(rng, 0.2):
+    if chance(rng, 0.15):
+        control["prediction"] = one_of(rng, measured, spread(rng, 0.02, 1.0))
+    if fed and "gains" in control and chance(rng, 0.2):
         control["feed_forward"] = between(rng, 0.0, 1.0)
 
 
@@ -94,6 +127,7 @@ def random_vehicles(rng: Rng, count: int, pitch_m: float, speed_m_s: float, *, a
                 hears=others or None,
                 position_ne_m=np.round(place[k] + error_m[k], 3).tolist(),
                 velocity_ne_m_s=velocity,
+                altitude_m=None,  # the soak judges horizontal distances
                 flavour=one_of(rng, None, "ardupilot", "px4") if autopilot else None,
             )
         )
@@ -180,9 +214,19 @@ def _control(rng: Rng, vehicles: list[Part], rates: Part, *, onboard: bool, auto
         string_peak_max=one_of(rng, 1.0, 1.0, between(rng, 1.0, 2.0)),
         feed_forward=None,  # these two: see _predict
         prediction=None,
+        for_link=None,  # a link is measured before the flight: not in virtual time
+        link_headroom=None,
+        controller=None,
+        linear=None,
+        criteria=None,  # their search takes longer than the flight
+        overlap=some(np.random.default_rng(vehicles[0]["system_id"]), 0.3, _overlap(way)),
         gains=fixed_gains(rng, stable=chance(rng, 0.93), own_1_s=spread(rng, 0.2, 6.0)) if way == "gains" else None,
         blocks=_blocks(rng, vehicles) if way == "blocks" else None,
     )
+
+
+def _overlap(way: str) -> Part | None:
+    return whole(schema.Overlap, ahead=2, behind=True, leader=True) if way == "graph" else None
 
 
 def _blocks(rng: Rng, vehicles: list[Part]) -> list[Part]:
@@ -211,7 +255,7 @@ def _jitter(rng: Rng) -> Part:
     scale_s = spread(rng, 1e-4, 0.05)
     trace = [round(value, 5) for value in rng.exponential(scale_s, size=int(rng.integers(1, 20))).tolist()]
     return whole(
-        link_schema.Jitter,
+        link_keys.Jitter,
         distribution=kind,
         scale_s=scale_s if kind != "trace" else None,
         shape=spread(rng, 0.3, 5.0) if kind == "gamma" else None,
@@ -224,12 +268,12 @@ def _link(rng: Rng, channels: list[str], duration_s: float, *, calm: bool) -> Pa
     delay_s = one_of(rng, 0.0, between(rng, 0.0, 0.05), between(rng, 0.0, 0.15), spread(rng, 1e-4, 1.0))
     at_s = sorted(between(rng, 0.0, duration_s) for _ in range(int(rng.integers(1, 5))))
     points = [
-        whole(link_schema.DelayPoint, at_s=time_s, delay_s=between(rng, 0.0, 0.15)) for time_s in dict.fromkeys(at_s)
+        whole(link_keys.DelayPoint, at_s=time_s, delay_s=between(rng, 0.0, 0.15)) for time_s in dict.fromkeys(at_s)
     ]
     from_s = between(rng, 0.0, duration_s)
-    outage = whole(link_schema.Outage, from_s=from_s, until_s=round(from_s + spread(rng, 0.05, 5.0), 4))
+    outage = whole(link_keys.Outage, from_s=from_s, until_s=round(from_s + spread(rng, 0.05, 5.0), 4))
     bursts = whole(
-        link_schema.LossBursts,
+        link_keys.LossBursts,
         to_bad_probability=spread(rng, 0.001, 0.2),
         to_good_probability=spread(rng, 0.05, 1.0),
         loss_good_probability=one_of(rng, 0.0, 0.02),
@@ -238,7 +282,7 @@ def _link(rng: Rng, channels: list[str], duration_s: float, *, calm: bool) -> Pa
     moving, bursty = chance(rng, 0.15), chance(rng, 0.2)
     often = 0.0 if calm else 1.0
     return whole(
-        link_schema.Link,
+        link_keys.Link,
         delay_s=0.0 if moving and not calm else delay_s,
         delay_points=points if moving and not calm else None,
         jitter=some(rng, 0.5 * often, _jitter(rng)),
@@ -257,12 +301,13 @@ def _links(rng: Rng, system_ids: list[int], duration_s: float) -> Part:
     names = [] if calm or chance(rng, 0.75) else ["a", "b"][: int(rng.integers(1, 3))]
     channels = [_channel(rng, name) for name in names]
     return whole(
-        link_schema.Links,
+        link_keys.Links,
+        profile=None,  # reading it replaces the links
         up=_link(rng, names, duration_s, calm=calm),
         down=_link(rng, names, duration_s, calm=calm),
         vehicles=[
             whole(
-                link_schema.VehicleLinks,
+                link_keys.VehicleLinks,
                 system_id=system_id,
                 up=some(rng, 0.7, _link(rng, names, duration_s, calm=calm)),
                 down=some(rng, 0.7, _link(rng, names, duration_s, calm=calm)),
@@ -278,7 +323,7 @@ def _links(rng: Rng, system_ids: list[int], duration_s: float) -> Part:
 def _channel(rng: Rng, name: str) -> Part:
     bytes_count = chance(rng, 0.5)
     return whole(
-        link_schema.Channel,
+        link_keys.Channel,
         name=name,
         bandwidth_bit_s=spread(rng, 19_200.0, 1e7),
         bits_per_byte=one_of(rng, 8, 10),
@@ -302,6 +347,7 @@ def _safety(rng: Rng, pitch_m: float) -> Part:
     return whole(
         schema.Safety,
         setpoint_timeout_s=one_of(rng, 1.0, spread(rng, 0.3, 10.0)),
+        ready_patience_s=None,  # long enough for each start
         heartbeat_timeout_s=one_of(rng, 3.0, spread(rng, 1.5, 10.0)),
         spacing_error_limit_m=one_of(rng, 1000.0, round(pitch_m * between(rng, 2.0, 20.0), 2)),
         collision_distance_m=one_of(rng, 0.0, round(pitch_m * between(rng, 0.0, 0.3), 3)),
@@ -337,6 +383,9 @@ def _autopilot(rng: Rng, duration_s: float) -> Part:
         schema.Autopilot,
         flavour=one_of(rng, "ardupilot", "px4"),
         lag_s=one_of(rng, 0.15, spread(rng, 0.05, 0.5)),
+        dead_time_s=None,  # tests of identification fly the other models
+        natural_frequency_rad_s=None,
+        jerk_max_m_s3=None,
         velocity_gain_1_s=one_of(rng, 2.0, spread(rng, 0.5, 4.0)),
         acceleration_max_m_s2=one_of(rng, 5.0, spread(rng, 2.0, 15.0)),
         speed_max_m_s=one_of(rng, 12.0, between(rng, 8.0, 30.0)),
@@ -348,12 +397,15 @@ def _autopilot(rng: Rng, duration_s: float) -> Part:
         clock_jumps=[whole(schema.ClockJump, at_s=at_s, by_s=by_s) for at_s, by_s in zip(jumps, lengths, strict=True)]
         if chance(rng, 0.12)
         else None,
+        sitl=None,  # bounds hold only once the errors of stamps have shown
     )
 
 
 def _response(rng: Rng) -> Part:
     return whole(
         schema.Response,
+        dead_time_s=None,
+        natural_frequency_rad_s=None,
         lag_s=spread(rng, 0.05, 0.5),
         velocity_gain_1_s=one_of(rng, 0.0, 2.0, spread(rng, 0.5, 4.0)),
     )

@@ -24,6 +24,8 @@ from tests.soak.soak_judge import judge
 from tests.support.paths import ROOT, SCENARIOS
 
 SEED, PARTS, FLIGHTS = 20, 20, 10
+UNDRAWN = {"FormationChange", "ChangedOffset", "Sector", "Criteria"}
+"""Parts that only tests of their own fly: the invariants expect errors of one shape that decay, and quick designs."""
 
 
 @pytest.mark.parametrize("part", range(PARTS))
@@ -127,7 +129,7 @@ def test_every_part_of_the_schema_is_drawn() -> None:
         return set().union(*(parts(one) for one in value)) if isinstance(value, tuple) else set()
 
     drawn = set().union(*(parts(experiment(SEED, number).scenario) for number in range(60)))
-    assert drawn == {one.__name__ for one in schema.Part.__subclasses__()}
+    assert drawn | UNDRAWN == {one.__name__ for one in schema.Part.__subclasses__()}
 
 
 def test_an_experiment_is_read_back_as_it_was_saved(tmp_path: Path) -> None:

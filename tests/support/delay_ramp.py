@@ -1,6 +1,6 @@
 """Links whose delay rises and falls again, for the tests of the monitor and of its log."""
 
-from scenarios.link_schema import DelayPoint, Link, Links
+from scenarios.keys.link import DelayPoint, Link, Links
 
 
 def ramp(highest_s: float) -> Links:

@@ -12,7 +12,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
 from scenarios.files import load
-from scenarios.link_schema import Link, Links
+from scenarios.keys.link import Link, Links
 from scenarios.schema import Response, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter import Copter

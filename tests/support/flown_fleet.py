@@ -11,9 +11,7 @@ from typing import Any
 from scenarios import files
 from scenarios.schema import Scenario
 from tests.support.paths import SCENARIOS
-from tests.support.processes import free_port
-
-PATIENCE_S = 60.0
+from tests.support.processes import PATIENCE_S, free_port
 
 
 def until(condition: Callable[[], Any], what: str) -> None:

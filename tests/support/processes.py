@@ -16,7 +16,7 @@ from scenarios.files import dump, load
 from tests.support.paths import SCENARIOS
 
 GCS = [sys.executable, "-m", "gcs"]
-PATIENCE_S = 60.0
+PATIENCE_S = 180.0
 
 
 def short(tmp_path: Path, name: str, duration_s: float) -> Path:

@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from scenarios.link_schema import Link, Links
+from scenarios.keys.link import Link, Links
 from scenarios.schema import Clocks, Limits, NominalVelocity, Safety, Scenario, Vehicle
 from sim_vehicles.vehicles.double_integrator import DoubleIntegrator
 from sim_vehicles.vehicles.shell import Craft, Radio, Shell

@@ -17,8 +17,9 @@ from typing import Protocol
 
 import pyte
 
+from tests.support.processes import PATIENCE_S
+
 PROMPT = "ready> "
-PATIENCE_S = 60.0
 _SHELL = "import fcntl, os, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execvp('sh', ['sh', '-i'])"
 """A shell whose terminal is the one it is given, so that Ctrl-C goes to what runs in it."""
 

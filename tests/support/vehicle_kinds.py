@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from scenarios.part import Flavour
+from scenarios.keys.part import Flavour
 from scenarios.schema import Autopilot
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.shell import Craft, Shell

@@ -37,16 +37,6 @@ def test_without_prediction_it_is_the_flown_loop() -> None:
         assert found.string_peak(delay_s) == pytest.approx(same.string_peak(delay_s), rel=2e-3)
 
 
-def test_a_motion_that_no_command_explains_is_seen_late_once() -> None:
-    """The first ratio by its formula: ((k2 + k3 tau) s + k3) e^{-s tau} over s^2 + (k1 s + k3)."""
-    tau_s, k = 0.6, GAINS
-    loop = PredictedLoop(k, 1e-4, tau_s)
-    s = 1j * np.logspace(-2, 2, 20001)
-    peak = np.abs(((k.k2 + k.k3 * tau_s) * s + k.k3) / (s**2 + k.k1 * s + k.k3)).max()
-    assert loop.first_string_peak(tau_s) == pytest.approx(peak, rel=1e-3)
-    assert peak > 1.3 > loop.string_peak(tau_s)
-
-
 def test_feeding_forward_the_command_in_front_stops_growth_at_delay() -> None:
     fed = PredictedLoop(ScalarGains(3.408, 3.13, 5.608, 0.0), PERIOD_S, 0.0, feed_forward=0.9)
     assert [round(fed.string_peak(delay_s), 2) for delay_s in (0.0, 0.1, 0.2, 0.25, 0.29)] == [1.0, 1.0, 1.0, 1.0, 1.01]

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from gains.core.errors import BadModelError
 from gains.sampled._loop import HeldPlant
 from gains.sampled.constant import growth_rate
-from gains.sampled.multirate import Timing, lifted_growth, multirate_delay_margin, multirate_growth_rate, multirate_map
+from gains.sampled.multirate import Timing, lifted_radius, multirate_delay_margin, multirate_growth_rate, multirate_map
 from gcs.stress.growth import Motion, fit_growth
 
 Matrix = NDArray[np.float64]
@@ -134,7 +134,8 @@ def test_whole_ratios_are_the_sampled_loop_with_the_slower_period(
     """The map of events and that of `gains.sampled.constant`, which share no formula."""
     timing, plant = Timing(control_s, telemetry_s), HeldPlant(*TWO_INPUTS, period_s=0.1)
     alone = growth_rate(*TWO_INPUTS, period_s=0.1, delay_s=delay_s)
-    assert lifted_growth([plant], timing, delay_s=delay_s) == pytest.approx(alone, rel=1e-9)
+    events = np.log(lifted_radius(plant, timing, delay_s=delay_s)) / timing.common_s
+    assert events == pytest.approx(alone, rel=1e-9)
     assert multirate_growth_rate(*TWO_INPUTS, timing, delay_s=delay_s) == alone
 
 

@@ -9,18 +9,19 @@ from scipy.linalg import expm
 from gains import (
     BadModelError,
     FormationModel,
-    OnboardTiming,
     Response,
     Timing,
     mismatch_window,
     mismatch_window_continuous,
-    onboard_loop,
     predicted_growth_rate,
     rightmost_root,
 )
 from gains.core.arrays import FloatArray
 from gains.performance.response import formation_loop
-from gains.sampled.prediction import onboard_mismatch_window, predicted_map
+from gains.sampled._loop import HeldPlant
+from gains.sampled._mismatch import block_window
+from gains.sampled._nyquist import rates_window
+from gains.sampled.multirate import Predictor, lifted_radius
 
 Loop = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -71,6 +72,12 @@ def lifted(loop: Loop, period_s: float, delay_s: float, assumed_s: float) -> Flo
 
 def radius(loop: Loop, period_s: float, delay_s: float, assumed_s: float) -> float:
     return float(np.abs(np.linalg.eigvals(lifted(loop, period_s, delay_s, assumed_s))).max())
+
+
+def believed_radius(loop: Loop, believed: Loop) -> float:
+    """Spectral radius at 1.5 s, true and assumed, where the station predicts another loop than the true one."""
+    true, other = (HeldPlant(*matrices, RATES.common_s) for matrices in (loop, believed))
+    return lifted_radius(true, RATES, delay_s=1.5, predictor=Predictor(other, 1.5))
 
 
 def flown_growth(
@@ -158,6 +165,49 @@ def test_windows_are_those_of_the_published_table(
     )
 
 
+POSITION_AND_VELOCITY = [True, True, False]
+
+
+@pytest.mark.parametrize(
+    "rates", [RATES, Timing(0.02, 0.1), Timing(0.02, 0.05), Timing(0.05, 0.02), Timing(1.0 / 200.0, 1.0 / 30.0)]
+)
+def test_a_computed_lag_has_the_window_of_its_lifted_map(rates: Timing) -> None:
+    """No telemetry holds an acceleration. The lifted map shares no algebra with the crossings."""
+    loop, seen = follower(lag_s=0.15), POSITION_AND_VELOCITY
+    window_s = mismatch_window(*loop, rates, assumed_s=0.613, measured=seen)
+    for end_s, way in zip(window_s, (-1.0, 1.0), strict=True):
+        aside = [
+            predicted_growth_rate(*loop, rates, assumed_s=0.613, delay_s=end_s + way * s, measured=seen)
+            for s in (-1e-6, 1e-6)
+        ]
+        assert aside[0] < 0.0 < aside[1]
+    # a lag that is computed leaves 10 % more than one that is measured
+    assert window_s[1] > mismatch_window(*loop, rates, assumed_s=0.613)[1]
+
+
+def test_crossings_and_nyquist_agree_at_one_rate() -> None:
+    for loop, measured in ((follower(), None), (follower(lag_s=0.15), None), (follower(lag_s=0.15), [1, 1, 0])):
+        for assumed_s in (0.3, 1.507):
+            mask = None if measured is None else np.array(measured, dtype=np.bool_)
+            plant = HeldPlant(*loop, PERIOD_S, mask)
+            assert rates_window(plant, RATES, assumed_s) == pytest.approx(block_window(plant, assumed_s), abs=1e-9)
+
+
+def test_a_computed_response_ends_its_continuous_window_on_the_axis() -> None:
+    A, B, K = follower(lag_s=0.15)
+    carried = np.zeros((3, 3))
+    carried[:2, :2] = expm(A[:2, :2] * 0.6)
+    for end_s in mismatch_window_continuous(A, B, K, assumed_s=0.6, measured=POSITION_AND_VELOCITY):
+        late = B @ K @ carried
+        root = rightmost_root([(A + B @ K, 0.0), (late, end_s), (-late, 0.6)])
+        assert root.real == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_measured_state_that_a_computed_one_needs_is_refused() -> None:
+    with pytest.raises(BadModelError, match="measured"):
+        mismatch_window(*follower(), RATES, assumed_s=0.3, measured=[True, False])
+
+
 def test_half_the_speed_tolerates_268_ms_at_1_5_s() -> None:
     least_s, most_s = mismatch_window(*follower(K1 / 2.0, K3 / 4.0), RATES, assumed_s=1.5)
     assert int(1e3 * min(1.5 - least_s, most_s - 1.5)) == 268
@@ -172,12 +222,10 @@ def test_a_modelled_lag_leaves_the_published_window_and_decay() -> None:
         assert radius(loop, PERIOD_S, end_s, 1.5) == pytest.approx(1.0, abs=1e-9)
     assert predicted_growth_rate(*loop, RATES, assumed_s=1.5, delay_s=1.5) == pytest.approx(-1.66, abs=5e-3)
     for believed_s in (0.10, 0.15, 0.20):
-        step = predicted_map(*loop, RATES, assumed_s=1.5, delay_s=1.5, believed=follower(lag_s=believed_s)[:2])
-        assert np.abs(np.linalg.eigvals(step)).max() < 1.0
+        assert believed_radius(loop, follower(lag_s=believed_s)) < 1.0
     # believing that there is none is not
-    none = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.array([[0.0], [1.0], [0.0]])
-    step = predicted_map(*loop, RATES, assumed_s=1.5, delay_s=1.5, believed=none)
-    assert np.abs(np.linalg.eigvals(step)).max() > 1.0
+    none = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), np.array([[0.0], [1.0], [0.0]]), loop[2]
+    assert believed_radius(loop, none) > 1.0
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -293,19 +341,6 @@ def test_a_formation_of_lagging_vehicles_has_its_blocks_window() -> None:
     assert mismatch_window(*loop, RATES, assumed_s=0.7) == pytest.approx(
         mismatch_window(*follower(lag_s=0.15), RATES, assumed_s=0.7), abs=1e-9
     )
-
-
-def test_the_onboard_loop_predicts_only_what_comes_from_others() -> None:
-    """Two vehicles that act on each other: without mismatch as without delay, and a tree takes every delay."""
-    model = FormationModel((-1, 0), axes=1)
-    timing = OnboardTiming(control_s=0.1, steps=5)
-    both = onboard_loop(model, np.array([[-1.1, -2.6, 0.3], [-1.4, 2.3, -2.6]]), timing)
-    least_s, most_s = onboard_mismatch_window(both, assumed_s=1.47)
-    assert least_s < 1.47 < most_s
-    # without prediction it takes 0.33 s
-    assert both.sampled_margin_s() < least_s
-    tree = onboard_loop(model, model.overlapping_gain([[-1.5]], [[0.5]], [[1.0]]), timing)
-    assert onboard_mismatch_window(tree, assumed_s=1.47) == (0.0, inf)
 
 
 def test_what_is_not_an_assumption_is_refused() -> None:

@@ -18,6 +18,7 @@ BEFORE = Seen(
     origin_known=True,
     custom_mode=0,
     armed=False,
+    has_landed=False,
     took_off=False,
     airborne=False,
     relative_altitude_m=0.0,
@@ -89,6 +90,61 @@ def test_a_vehicle_found_flying_is_not_told_to_take_off() -> None:
     startup.take(33, (1000, -353632620, 1491652370, 596_000, 12_000, 0, 0, 0, 0))
     startup.next(custom_mode=4, armed=True, clock_known=True, now_ns=0)
     assert startup.airborne
+
+
+def startup_that_flew() -> AutopilotStartup:
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+    startup.recognise(3, 2)
+    startup.take(0, (4, 2, 3, 0x80, 4, 3))
+    startup.take(33, (1000, -353632620, 1491652370, 590_000, 6_000, 0, 0, 0, 0))
+    return startup
+
+
+@pytest.mark.parametrize(("base_mode", "status", "lands"), [(0x00, 3, True), (0x80, 3, True), (0x80, 4, False)])
+def test_a_vehicle_on_the_ground_after_flight_has_landed(base_mode: int, status: int, *, lands: bool) -> None:
+    startup = startup_that_flew()
+    startup.take(33, (2000, -353632620, 1491652370, 584_100, 100, 0, 0, 0, 0))
+    assert not startup.has_landed  # low, but its motors carry it
+    startup.take(0, (4, 2, 3, base_mode, status, 3))
+    assert startup.has_landed == lands
+    startup.begin_anew()  # as after a restart of its autopilot
+    assert startup.has_landed == lands
+
+
+def test_a_landed_vehicle_that_its_pilot_flies_again_is_flown() -> None:
+    startup = startup_that_flew()
+    startup.take(0, (4, 2, 3, 0, 3, 3))
+    startup.take(0, (5, 2, 3, 0x80, 4, 3))
+    assert not startup.has_landed  # the altitude is from before
+    startup.take(0, (5, 2, 3, 0, 3, 3))
+    startup.take(33, (2000, -353632620, 1491652370, 584_100, 100, 0, 0, 0, 0))
+    startup.take(0, (5, 2, 3, 0x80, 4, 3))
+    assert startup.has_landed
+    startup.take(33, (3000, -353632620, 1491652370, 589_000, 5_000, 0, 0, 0, 0))
+    assert not startup.has_landed
+
+
+def test_before_its_flight_a_vehicle_is_armed_again_and_again() -> None:
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+    startup.recognise(3, 2)
+    for base_mode in (0x80, 0, 0x80, 0):
+        startup.take(0, (4, 2, 3, base_mode, 3, 3))
+        startup.take(33, (1000, -353632620, 1491652370, 584_400, 400, 0, 0, 0, 0))  # its barometer drifts
+    assert not startup.has_landed
+
+
+def test_repeated_refusals_to_arm_are_one_text_and_a_count() -> None:
+    startup = AutopilotStartup(altitude_m=ALTITUDE_M, telemetry_hz=50.0)
+    startup.recognise(3, 2)
+    startup.take(0, (4, 2, 3, 0, 3, 3))
+    news = [startup.is_news("Arm: Throttle too high") for _ in range(3)]
+    assert news == [True, False, False]
+    for _ in range(3):
+        startup.refused(400, (1.0,), 0, repeated=False)
+    assert startup.arming_refusals == 3
+    startup.take(0, (4, 2, 3, 0x80, 4, 3))
+    assert startup.arming_refusals == 0
+    assert [startup.is_news("Land complete") for _ in range(2)] == [True, True]  # in the air everything is said
 
 
 def test_a_takeoff_counts_though_unanswered_and_refused_on_repetition() -> None:

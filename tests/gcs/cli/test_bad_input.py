@@ -48,6 +48,8 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
         ("view {run} --picture {run}", "run: Is a directory, wanted a file that can be written"),
         ("view {run} --picture {run}/a.png --at nan", "--at: read nan, wanted seconds from"),
         ("view {run} --picture {run}/a.png --at 1e300", "--at: read 1e+300, wanted seconds from"),
+        ("grade README.md", "README.md/truth.bin: Not a directory, wanted the truth log in a run's folder"),
+        ("scenarios --linkz", "No such option: --linkz"),
         ("view README.md", "README.md: read a file of another kind; wanted a recording of a run (.rrd)"),
         (f"fly {CHAIN} --link-delay nan", "--link-delay: read nan, wanted seconds from 0 to 60"),
         (

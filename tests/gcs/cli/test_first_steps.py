@@ -71,8 +71,8 @@ def test_a_virtual_flight_leaves_the_files_of_a_real_one(tmp_path: Path, monkeyp
         assert gcs(monkeypatch, "fly", "trio.toml", "--virtual", "--out", folder, "--json") == 0
     files = {file.name for file in Path("one").iterdir()}
     assert files == {
-        "design.json", "events.jsonl", "flight.rrd", "flight.tlog", "scenario.toml", "summary.json", "ticks.parquet",
-        "truth.bin",
+        "design.json", "events.jsonl", "flight.rrd", "flight.tlog", "report.html", "scenario.toml", "summary.json",
+        "ticks.parquet", "truth.bin",
     }  # fmt: skip
     graded = grade(Path("one"))
     assert graded.loop_delay.error_max_s == pytest.approx(0.0, abs=1e-5)
@@ -89,7 +89,7 @@ def test_names_of_shipped_scenarios_are_taken_in_place_of_files(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert gcs(monkeypatch, "scenarios", "--json") == 0
-    assert list(json.loads(capsys.readouterr().out)) == names()
+    assert list(json.loads(capsys.readouterr().out)["scenarios"]) == names()
     assert gcs(monkeypatch, "check", "chain3", "--json") == 0
     assert json.loads(capsys.readouterr().out)["delay_margin_s"] == pytest.approx(0.3)
 

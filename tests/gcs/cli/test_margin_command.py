@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from gains.core.errors import BadModelError, DisagreementError
 from gains.margin.loop_margin import loop_margin
@@ -257,3 +258,16 @@ def test_a_scenario_has_the_margins_of_the_loop_it_flies(
 def test_a_scenario_whose_vehicles_answer_late_is_refused() -> None:
     with pytest.raises(ModelFileError, match="dynamics: read 'autopilot', wanted double_integrator"):
         margin_of_scenario(SCENARIOS / "copters5.toml")
+
+
+def test_matlab_file_is_read_as_its_json_would_be(tmp_path: Path) -> None:
+    held = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "K": [[-1.0, -1.5]], "hold": True, "period": 0.02}
+    savemat(tmp_path / "held.mat", held)
+    (tmp_path / "held.json").write_text(json.dumps(held), encoding="utf-8")
+    assert margin_of_file(tmp_path / "held.mat") == margin_of_file(tmp_path / "held.json")
+
+
+def test_file_that_is_not_matlab_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "bad.mat").write_bytes(b"MATLAB, but not really" * 10)
+    with pytest.raises(ModelFileError, match="wanted a MATLAB file"):
+        margin_of_file(tmp_path / "bad.mat")

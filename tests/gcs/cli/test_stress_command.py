@@ -56,6 +56,11 @@ def test_a_resumed_campaign_neither_loses_nor_repeats_a_flight(tmp_path: Path) -
     ("arguments", "wanted"),
     [
         ((), "--"),
+        (("--disturbance",), "--onset"),
+        (("--disturbance", "--onset", "--loss", "0.1"), "--loss"),
+        (("--disturbance", "--onset", "--delay", "0.1,0.2"), "--delay"),
+        (("--disturbance", "--onset", "--loop", "onboard"), "control.loop"),
+        (("--disturbance", "--onset", "--links", "nowhere"), "nowhere"),
         (("--delay", "0:0.6:0"), "--delay"),
         (("--delay", "nonsense"), "--delay"),
         (("--onset", "--resume"), "--resume"),

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
+from gains.performance.response import Response, formation_loop
 from gcs.control.history import StateHistory
 from gcs.control.prediction import (
     FASTEST,
@@ -17,7 +20,9 @@ from gcs.control.prediction import (
     FixedDelivery,
     MeasuredDelivery,
     PredictedStates,
+    carried,
 )
+from gcs.control.responding import RespondingHistory
 
 MS, S = 1_000_000, 1_000_000_000
 START = 10 * S
@@ -59,14 +64,14 @@ def test_states_are_carried_on_as_if_each_piece_were_integrated(
     due_ms = np.cumsum([gap_ms for gap_ms, _ in steps]).tolist()
     commands = [(START + due * MS, u) for due, (_, u) in zip(due_ms, steps, strict=True)]
     from_ns, to_ns = START + from_ms * MS, START + (from_ms + for_ms) * MS
-    carried = history_of(commands).carried(STATE, from_ns, to_ns)
+    found = carried(history_of(commands), STATE, from_ns, to_ns)
     # sums over minutes of 30 m/s² reach 1e4 m, and are subtracted from each other
-    assert np.array(carried) == pytest.approx(integrated(commands, from_ns, to_ns), rel=1e-9, abs=1e-8)
+    assert np.array(found) == pytest.approx(integrated(commands, from_ns, to_ns), rel=1e-9, abs=1e-8)
 
 
 def test_without_set_points_a_vehicle_holds_velocity_after_the_timeout() -> None:
     history = history_of([(START, (1.0, 0.0)), (START + 9 * S, (2.0, 0.0))], held_ns=S)
-    north, _, v_north, _ = history.carried((0.0, 0.0, 0.0, 0.0), START, START + 10 * S)
+    north, _, v_north, _ = carried(history, (0.0, 0.0, 0.0, 0.0), START, START + 10 * S)
     assert v_north == pytest.approx(1.0 + 2.0)
     assert north == pytest.approx(0.5 + 8.0 * 1.0 + 1.0 + 1.0)
 
@@ -77,7 +82,7 @@ def test_forgetting_set_points_older_than_any_prediction_changes_nothing() -> No
     remembered = len(history._due_ns)  # pyright: ignore[reportPrivateUsage] - what it forgets shows nowhere else
     assert remembered < 2 * KEPT_S * 50 + 2
     since_ns = now_ns - 3 * S
-    found = history.carried(STATE, since_ns, now_ns)
+    found = carried(history, STATE, since_ns, now_ns)
     assert np.array(found) == pytest.approx(integrated(commands, since_ns, now_ns), abs=1e-6)
 
 
@@ -149,3 +154,27 @@ def test_jitter_is_smoothed() -> None:
     assumed_s = followed(lambda t: 1.0 + float(draws[round(10 * t)]), seconds=60.0)[:, 1]
     assert assumed_s[1000:].std() < 0.03 / 3**0.5 / 2.0  # less than half of the jitter's
     assert assumed_s[1000:].mean() == pytest.approx(1.0, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    "response", [Response(0.15, 2.0), Response(0.3, 0.0), Response(0.125, 2.0), Response(1.0, 3.0)]
+)
+def test_a_response_moves_as_its_differential_equation_says(response: Response) -> None:
+    """Also where its two modes coincide, at four times the lag times the gain, and where they oscillate."""
+    rng = np.random.default_rng(7)
+    history, held_ns = RespondingHistory(S, response), 20 * MS
+    A, B, _ = formation_loop(FormationModel((-1,), axes=1), np.array([[-1.0]]), [response])
+    state, position = np.zeros((len(A), 2)), np.zeros(2)
+    fine = 40
+    step = expm(np.block([[A, B], [np.zeros((1, len(A) + 1))]]) * (held_ns * 1e-9 / fine))
+    for k in range(100):
+        u = rng.standard_normal(2)
+        history.add(START + k * held_ns, (float(u[0]), float(u[1])))
+        for _ in range(fine):
+            before = state[0].copy()
+            state = step[:-1, :-1] @ state + step[:-1, -1:] * u
+            position += (before + state[0]) / 2.0 * held_ns * 1e-9 / fine
+        velocity, moved = history.sums(START + (k + 1) * held_ns)
+        # coinciding modes are parted by a thousandth of the lag; positions are summed by trapezoids
+        assert [velocity.real, velocity.imag] == pytest.approx(state[0].tolist(), abs=1e-3)
+        assert [moved.real, moved.imag] == pytest.approx(position.tolist(), abs=1e-3)

@@ -13,7 +13,7 @@ from gcs.drive.preflight import bad_start, endless_link, unstable_loop, without_
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from scenarios.files import load
-from scenarios.link_schema import DelayPoint, Link, Links
+from scenarios.keys.link import DelayPoint, Link, Links
 from tests.support.paths import ROOT
 
 CHAIN = load(ROOT / "scenarios/chain3.toml")

@@ -9,14 +9,15 @@ from rich.console import Console
 
 from gains.performance.flown import FlownFormation, FlownTiming
 from gcs.drive.flown import fly_virtual
-from gcs.plan.at_delay import expected_loop_delay_s, figures_at
+from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design, FiguresAtDelay
+from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.views.report import print_design
 from gcs.views.table import FlightState, plain_line
 from scenarios.files import load, with_loop
-from scenarios.link_schema import DelayPoint, Jitter, Link, Links, VehicleLinks
+from scenarios.keys.link import DelayPoint, Jitter, Link, Links, VehicleLinks
 from scenarios.schema import Rates
 from tests.support.known import known
 from tests.support.paths import ROOT
@@ -62,7 +63,8 @@ def test_the_expected_loop_delay_is_that_of_the_slowest_links() -> None:
     )
     slow = TRIANGLE.model_copy(update={"links": links, "rates": Rates(telemetry_hz=10.0)})
     # half the shorter period, that of control: a repeated command is no later than the first one from its state
-    assert expected_loop_delay_s(slow) == pytest.approx(0.03 + 0.02 + 0.1 + 0.01)
+    # the median of this jitter is 16.8 ms, and the wait makes the sum less lopsided
+    assert expected_loop_delay_s(slow) == pytest.approx(0.03 + 0.0168 + 0.1 + 0.01, abs=0.002)
 
 
 def test_table_and_summary_tell_both_at_the_measured_loop_delay() -> None:

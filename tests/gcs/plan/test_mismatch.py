@@ -32,14 +32,14 @@ def exact(gain_set: int, assumed_s: float) -> tuple[float, float]:
 
 def test_without_prediction_any_delay_up_to_the_margin_is_tolerated() -> None:
     plan = planned("off")
-    tolerated = plan.tolerance.at(0.0)
+    tolerated = plan.tolerance(0.0)
     assert tolerated.longer_s == plan.margins_s
     assert set(tolerated.shorter_s) == {inf}
     assert tolerated.used_s(0, 0.1) == 0.1
 
 
 def test_a_fixed_assumption_tolerates_the_published_mismatch() -> None:
-    tolerated = planned(0.6).tolerance.at(0.6)
+    tolerated = planned(0.6).tolerance(0.6)
     assert tolerated.longer_s[0] == pytest.approx(0.156, abs=1e-3)  # the table of docs/explanation/prediction.md
     assert tolerated.shorter_s[0] == pytest.approx(0.149, abs=1e-3)
     assert tolerated.shorter_s[2] == inf
@@ -49,7 +49,7 @@ def test_a_fixed_assumption_tolerates_the_published_mismatch() -> None:
 @pytest.mark.parametrize("gain_set", [0, 1, 2])
 @pytest.mark.parametrize("assumed_s", [0.07, 0.25, 0.52, 1.1, 1.6, 2.4, 6.1, 9.0])
 def test_the_table_has_the_exact_windows_or_somewhat_narrower_ones(gain_set: int, assumed_s: float) -> None:
-    tolerated, (least_s, most_s) = planned("measured").tolerance.at(assumed_s), exact(gain_set, assumed_s)
+    tolerated, (least_s, most_s) = planned("measured").tolerance(assumed_s), exact(gain_set, assumed_s)
     # where a window begins to have a lower end, its upper end has a kink, which the table rounds off by 13 % at most
     assert 0.85 < tolerated.longer_s[gain_set] / (most_s - assumed_s) < 1.04
     if least_s > 0.0:
@@ -57,13 +57,13 @@ def test_the_table_has_the_exact_windows_or_somewhat_narrower_ones(gain_set: int
 
 
 def test_a_window_that_begins_at_no_delay_ends_at_none() -> None:
-    tolerated = planned("measured").tolerance.at(0.1)
+    tolerated = planned("measured").tolerance(0.1)
     assert tolerated.shorter_s[0] == inf
     assert tolerated.used_s(0, -0.05) == -0.05
 
 
 def test_too_short_and_too_long_delays_use_the_same_share() -> None:
-    tolerated = planned(1.5).tolerance.at(1.5)
+    tolerated = planned(1.5).tolerance(1.5)
     used_s = tolerated.used_s(0, -tolerated.shorter_s[0])
     assert used_s == pytest.approx(tolerated.longer_s[0])
     assert np.isnan(tolerated.used_s(0, np.nan))
@@ -71,4 +71,4 @@ def test_too_short_and_too_long_delays_use_the_same_share() -> None:
 
 def test_the_windows_are_those_of_the_gains_flown() -> None:
     slowed = replace(planned(1.5), gain=planned(1.5).gains[1], slower=())
-    assert slowed.tolerance.at(1.5).longer_s == pytest.approx((planned(1.5).tolerance.at(1.5).longer_s[1],))
+    assert slowed.tolerance(1.5).longer_s == pytest.approx((planned(1.5).tolerance(1.5).longer_s[1],))

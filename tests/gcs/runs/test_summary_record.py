@@ -27,7 +27,9 @@ def test_a_summary_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     write_run(tmp_path, scenario, ticks_of(scenario, start_s=0.0, count=100))
     summary = finish(tmp_path)
     assert read_summary(tmp_path / SUMMARY_FILE).to_dict() == summary.to_dict()
-    assert json.loads((tmp_path / SUMMARY_FILE).read_text(encoding="utf-8")) == summary.to_dict()
+    assert (
+        json.loads((tmp_path / SUMMARY_FILE).read_text(encoding="utf-8")) == {"schema_version": 1} | summary.to_dict()
+    )
 
 
 def test_an_older_runs_summary_is_read_without_later_fields(tmp_path: Path) -> None:

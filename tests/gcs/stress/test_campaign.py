@@ -13,15 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from gcs.errors import InputError
-from gcs.stress.campaign import (
-    PARQUET_FILE,
-    TRIALS_FILE,
-    Store,
-    dask_workers,
-    local_workers,
-    run_campaign,
-    write_table,
-)
+from gcs.stress.campaign import PARQUET_FILE, TRIALS_FILE, Store, dask_workers, local_workers, run_campaign, write_table
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
 from tests.support.paths import ROOT
@@ -96,7 +88,7 @@ def test_a_line_cut_short_costs_its_own_trial_only(tmp_path: Path) -> None:
 
 def test_a_trial_that_raises_is_recorded_and_the_others_fly(tmp_path: Path) -> None:
     wanted, store, left = trials(3, bad=1), Store(tmp_path), list[int]()
-    outcomes = run_campaign(wanted, store, Here(), ended=lambda _, count: left.append(count))
+    outcomes = run_campaign(wanted, store, Here(), ended=left.append)
     store.close()
     assert [outcome.error is None for outcome in outcomes] == [True, False, True]
     assert "IndexError" in (outcomes[1].error or "")
@@ -136,7 +128,7 @@ from gcs.stress.campaign import Store, local_workers, run_campaign
 if __name__ == "__main__":
     store = Store(Path(sys.argv[1]))
     with local_workers(2) as fly:
-        run_campaign(trials(40), store, fly, ended=lambda outcome, left: print(left, flush=True))
+        run_campaign(trials(40), store, fly, ended=lambda left: print(left, flush=True))
 """
 
 

@@ -18,7 +18,7 @@ from gcs.stress.growth import CHANNELS
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
-from scenarios.link_schema import Link, VehicleLinks
+from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Limits
 from tests.support.stress_pair import SCENARIO, pair_plan
 

@@ -32,19 +32,20 @@ def test_the_window_is_the_published_one(study: Study) -> None:
 
 @pytest.mark.parametrize("shorter", [False, True])
 def test_the_search_ends_at_either_end_of_the_window(study: Study, *, shorter: bool) -> None:
-    loop = plan_loops(study.plan)[-1]
+    block = plan_loops(study.plan)[-1]
 
     def fly(trial: Trial) -> Outcome:
         link_s = dict(trial.coordinates)["delay"]
-        growth_1_s = loop.growth_1_s(link_s + WAITING_S)
+        growth_1_s = block.loop.growth_1_s(link_s + WAITING_S)
         verdict = "unstable" if growth_1_s > 0.0 else "stable"
         known = Outcome(trial.id, trial.kind, 1, dict(trial.coordinates), real_time=False, verdict=verdict)
         delays = {"link_delay_s": link_s, "loop_delay_s": link_s + WAITING_S, "waiting_s": WAITING_S}
         rates = {"growth_1_s": growth_1_s, "growth_error_1_s": 1e-6, "predicted_growth_1_s": growth_1_s}
-        return replace(known, **delays, **rates, probed=loop.system_ids[0], critical=loop.system_ids[0])
+        return replace(known, **delays, **rates, probed=block.system_ids[0], critical=block.system_ids[0])
 
     onset = find_onset(study, lambda trials: [fly(trial) for trial in trials], tolerance=0.01, shorter=shorter)
     assert onset.predicted_s == pytest.approx(study.window_s[0 if shorter else 1], rel=1e-9)
+    assert onset.difference is not None
     assert abs(onset.difference) < 1e-4
     assert onset.link_delay_s == pytest.approx(onset.loop_delay_s - WAITING_S)
     assert [flight.verdict for flight in onset.own] == (["unstable", "stable"] if shorter else ["stable", "unstable"])

@@ -5,13 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gcs.errors import InputError
-from gcs.stress.axes import (
-    at_coordinates,
-    has_constant_links,
-    parse_axis,
-    split_delay,
-)
-from scenarios.link_schema import Jitter, Link
+from gcs.stress.axes import at_coordinates, has_constant_links, parse_axis, split_delay
+from scenarios.keys.link import Jitter, Link
 from tests.support.stress_pair import SCENARIO
 
 

@@ -10,7 +10,7 @@ from gcs.stress.boundary import cell_edges, guaranteed_line, two_delays_lines
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
-from scenarios.link_schema import Jitter, Link
+from scenarios.keys.link import Jitter, Link
 from tests.support.stress_pair import SCENARIO, pair_plan
 
 DELAY_JITTER = (Axis("delay", (0.02, 0.25)), Axis("jitter", (0.0, 0.05)))

@@ -107,6 +107,7 @@ def test_a_margin_that_the_gains_lack_is_exposed(tmp_path: Path) -> None:
     plan = pair_plan()
     onset = found_with(replace(plan, gain=1.25 * plan.gain), tmp_path)
     assert onset.predicted_s == plan.delay_margin_s
+    assert onset.difference is not None
     assert onset.difference < -0.1
     true_s = Study(replace(plan, gain=1.25 * plan.gain))
     assert onset.loop_delay_s == pytest.approx(margin_of(true_s.plan), rel=5e-4)

@@ -19,7 +19,7 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import Trial, plan_of
 from scenarios.files import load
-from scenarios.link_schema import Link, VehicleLinks
+from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Clocks, Control, GainBlock
 from tests.support.paths import SCENARIOS
 from tests.support.stress_pair import SCENARIO, pair_plan

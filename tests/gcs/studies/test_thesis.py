@@ -89,7 +89,7 @@ def test_page_holds_every_claim_and_its_figures(tmp_path: Path) -> None:
     folder = tmp_path / "thesis"
     result = CliRunner().invoke(app, ["thesis", "--out", str(folder), "--json"])
     assert result.exit_code == 0, result.output
-    claims = json.loads(result.output)
+    claims = json.loads(result.output)["claims"]
     verdicts = {claim["subject"]: claim["verdict"] for claim in claims}
     assert verdicts["delay margin under (5.2)"] == "erratum"
     assert verdicts["the LMI with Y = diag(Y1, Y2, Y1)"] == "erratum"

@@ -17,9 +17,9 @@ from gcs.views import viewer
 from gcs.views.recording import length_s
 from scenarios.files import dump, load
 from tests.support.paths import SCENARIOS
+from tests.support.processes import PATIENCE_S
 
-pytestmark = [pytest.mark.xdist_group("processes"), pytest.mark.timeout(180)]
-PATIENCE_S = 60.0
+pytestmark = pytest.mark.xdist_group("processes")
 needs_vulkan = pytest.mark.skipif(viewer.vulkan_missing(), reason="no Vulkan driver to draw with")
 
 

@@ -20,7 +20,7 @@ from gcs.views.observer import record_run
 from gcs.views.report import delay_text
 from gcs.views.viewer import screenshot, vulkan_missing
 from scenarios.files import dump, load
-from scenarios.link_schema import DelayPoint, Link, VehicleLinks
+from scenarios.keys.link import DelayPoint, Link, VehicleLinks
 from scenarios.schema import Scenario
 from tests.support.paths import SCENARIOS
 from tests.support.recordings import read_back

@@ -188,3 +188,16 @@ def test_refusals_have_their_own_line_and_are_no_news() -> None:
     state.add(ticks_of(line(2), start_s=1.0, count=1), [event, replace(event, text="5 unsigned, 1 replayed")])
     assert [text for text in drawn(state) if "refused" in text] == ["refused: 5 unsigned, 1 replayed"]
     assert state.news == []
+
+
+def test_altitudes_are_shown_where_vehicles_fly_at_several() -> None:
+    level = line(2)
+    slots = level.model_copy(
+        update={"vehicles": (level.vehicles[0], level.vehicles[1].model_copy(update={"altitude_m": 315.0}))}
+    )
+    ticks = ticks_of(slots, start_s=0.0, count=50)
+    ticks["down_m"][-1] = [-300.25, -315.0]
+    lines = drawn(flown(slots, ticks))
+    assert "altitude" in " ".join(lines)
+    assert {"300.2", "315.0"} <= {cell for text in lines for cell in text.split()}
+    assert "altitude" not in " ".join(drawn(flown(level)))

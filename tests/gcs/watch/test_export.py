@@ -59,6 +59,19 @@ def test_a_run_as_mcap_holds_every_value_of_every_tick(
         assert np.isnan(values[~finite]).all()
 
 
+def test_exported_times_are_on_one_clock_without_leaps(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert export(monkeypatch, run, "--csv", tmp_path / "csv") == 0
+    rows = pyarrow.csv.read_csv(tmp_path / "csv" / "ticks.csv")
+    times_ns = np.unique(rows["time_ns"].to_numpy())
+    assert set(np.diff(times_ns).tolist()) == {20_000_000}  # 50 Hz, also where scenario time leaps to 0
+    begun_ns = rows["time_ns"].to_numpy()[rows["time_s"].to_numpy() == 0.0][0]
+    events = pyarrow.csv.read_csv(tmp_path / "csv" / "events.csv")
+    at_start = events["time_ns"].to_numpy()[events["time_s"].to_numpy() == 0.0]
+    assert set(at_start.tolist()) == {begun_ns}
+
+
 def test_a_log_as_csv_has_one_file_per_message_kind(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert export(monkeypatch, run / TLOG_FILE, "--csv", tmp_path / "csv", "--mcap", tmp_path / "log.mcap") == 0
     rows = 0

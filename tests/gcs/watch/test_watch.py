@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from gcs.link import mavlink
-from gcs.watch.links import SYSTEM_ID, Requests, Watch
-from gcs.watch.table import links_table
+from gcs.watch.links import SYSTEM_ID, Requests, Watch, WatchReport
+from gcs.watch.table import NOT_ASKED, links_table, render
 from scenarios.files import load
-from scenarios.link_schema import Jitter, Link, Links
+from scenarios.keys.link import Jitter, Link, Links
 from scenarios.schema import Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import SAMPLED, Row
+from tests.support.flown_copters import three
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 from tests.support.sim_client import arm, guided, heartbeat, setpoint
@@ -35,11 +36,11 @@ def linked(up: Link, down: Link) -> Scenario:
 class Watched:
     """A fleet that nobody flies, and a watch of it; what a station would send may be put in as well."""
 
-    def __init__(self, scenario: Scenario, *, timesync_hz: float) -> None:
+    def __init__(self, scenario: Scenario, *, timesync_hz: float, position_hz: float = 0.0) -> None:
         self.rows: list[Row] = []
         self.fleet = Fleet(scenario, START_NS, record=self.rows.append)
         self.watch = Watch()
-        self.requests = Requests(timesync_hz)
+        self.requests = Requests(timesync_hz, position_hz)
         self.now_ns = START_NS
         self.sent: list[bytes] = []
         self.true_ages_s: list[float] = []
@@ -217,3 +218,26 @@ def test_the_links_table_fits_the_terminal_with_headroom_and_status(width: int) 
     assert sum(line.endswith(" measured") for line in lines) == 3
     for line, vehicle in zip(lines[-3:], figures, strict=True):
         assert f"{100 * known(vehicle.headroom):.0f}" in line.split()
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_positions_come_if_asked_for_and_else_the_reason_is_told(asked: bool) -> None:
+    """Copters send none by themselves, as ArduPilot. Those that do are not asked again."""
+    watched = Watched(three(), timesync_hz=10.0, position_hz=20.0 if asked else 0.0)
+    watched.run(8.0)
+    vehicles = watched.watch.figures(watched.now_ns, None)
+    report = WatchReport(
+        listening="", duration_s=8.0, delay_margin_s=None, margin_of="", silent=False, send_errors=0, stations=(),
+        sent={"TIMESYNC": 1, "SET_MESSAGE_INTERVAL": watched.requests.positions_asked}, refused={},
+        vehicles=tuple(vehicles),
+    )  # fmt: skip
+    text = io.StringIO()
+    Console(file=text, width=120).print(render(report, width=120))
+    if asked:
+        assert [vehicle.status for vehicle in vehicles] == ["measured"] * 3
+        assert [vehicle.telemetry_hz for vehicle in vehicles] == pytest.approx([20.0] * 3, rel=0.02)
+        assert 3 <= watched.requests.positions_asked <= 9
+        assert "no position" not in text.getvalue()
+    else:
+        assert [vehicle.status for vehicle in vehicles] == ["no position"] * 3
+        assert f"no position from 1 2 3: {NOT_ASKED}" in text.getvalue()

@@ -3,7 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from scenarios.link_schema import Link, Links, VehicleLinks
+from scenarios.keys.link import Link, Links, VehicleLinks
 from sim_vehicles.drive.fleet import Datagram, Fleet
 from sim_vehicles.links.truth import ACTED, LINK_DOWN, LINK_UP, SAMPLED, Row
 from tests.support.sim_client import (

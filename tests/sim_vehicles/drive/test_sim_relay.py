@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from scenarios import link_schema, schema
+from scenarios import schema
 from scenarios.files import dump
-from scenarios.link_schema import Jitter, Links
+from scenarios.keys import link as link_keys
+from scenarios.keys.link import Jitter, Links
 from sim_vehicles.drive.relay_udp import MOST_PEERS, Peers
 from sim_vehicles.links.links import CAPACITY, LinkSet
 from sim_vehicles.links.relay import Passing, Relay, holds_key, sender
@@ -25,7 +26,7 @@ from sim_vehicles.services.clock import NEVER_NS
 from tests.support.processes import free_port
 from tests.support.sim_client import MS, SECOND, START, heartbeat, scenario, setpoint
 
-WILD = link_schema.Link(
+WILD = link_keys.Link(
     delay_s=0.02,
     jitter=Jitter(distribution="uniform", scale_s=0.005),
     reordering=True,
@@ -102,8 +103,8 @@ def test_a_flood_beyond_capacity_is_dropped_and_counted() -> None:
 
 
 def test_the_links_time_begins_with_the_stations_first_set_point() -> None:
-    ramp = link_schema.Link(
-        delay_points=(link_schema.DelayPoint(at_s=0.0, delay_s=0.1), link_schema.DelayPoint(at_s=1.0, delay_s=0.3))
+    ramp = link_keys.Link(
+        delay_points=(link_keys.DelayPoint(at_s=0.0, delay_s=0.1), link_keys.DelayPoint(at_s=1.0, delay_s=0.3))
     )
     late = scenario(1).model_copy(update={"links": Links(up=ramp, down=ramp)})
     sent = [

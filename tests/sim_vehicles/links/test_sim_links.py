@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scenarios import link_schema
-from scenarios.link_schema import DelayPoint, Jitter, LossBursts, Outage
+from scenarios.keys import link as link_keys
+from scenarios.keys.link import DelayPoint, Jitter, LossBursts, Outage
 from sim_vehicles.links.links import Entry, Link
 from sim_vehicles.links.truth import CORRUPTED, DROPPED, DUPLICATE, LINK_FULL, LINK_UP, OUTAGE, Row
 from sim_vehicles.services.clock import NEVER_NS
@@ -22,7 +22,7 @@ def times(out: list[Entry]) -> list[tuple[bytes, int]]:
 
 
 def test_a_datagram_leaves_exactly_its_delay_later() -> None:
-    link = Link(link_schema.Link(delay_s=0.0123))
+    link = Link(link_keys.Link(delay_s=0.0123))
     assert link.next_due_ns == NEVER_NS
     link.send(b"a", 5)
     assert link.next_due_ns == 12_300_005
@@ -34,7 +34,7 @@ def test_a_datagram_leaves_exactly_its_delay_later() -> None:
 
 @given(st.lists(st.integers(0, 50), max_size=40), st.lists(st.integers(0, 80), max_size=10))
 def test_datagrams_leave_once_in_order_of_time_and_entry(entered: list[int], looks: list[int]) -> None:
-    link = Link(link_schema.Link(delay_s=10e-9))
+    link = Link(link_keys.Link(delay_s=10e-9))
     for number, time_ns in enumerate(entered):
         link.send(bytes([number]), time_ns)
     out = [datagram for now_ns in [*sorted(looks), 100] for datagram in times(link.due(now_ns))]
@@ -45,7 +45,7 @@ def test_datagrams_leave_once_in_order_of_time_and_entry(entered: list[int], loo
 @pytest.mark.parametrize("jitter", [None, Jitter(distribution="uniform", scale_s=1e-9)])
 def test_a_full_link_drops_what_comes_and_counts_it(jitter: Jitter | None) -> None:
     rows: list[Row] = []
-    link = Link(link_schema.Link(delay_s=1.0, jitter=jitter), capacity=3, record=rows.append)
+    link = Link(link_keys.Link(delay_s=1.0, jitter=jitter), capacity=3, record=rows.append)
     for number in range(5):
         link.send(bytes([number]), number)
     assert (link.entered, link.dropped, link.under_way) == (5, 2, 3)
@@ -58,7 +58,7 @@ def test_a_full_link_drops_what_comes_and_counts_it(jitter: Jitter | None) -> No
 def test_a_ramp_is_exact_at_given_instants() -> None:
     points = ((1.0, 0.02), (3.0, 0.42), (3.0, 0.1), (4.0, 0.1), (6.0, 0.0))
     schedule = tuple(DelayPoint(at_s=at_s, delay_s=delay_s) for at_s, delay_s in points)
-    link = Link(link_schema.Link(delay_points=schedule, reordering=True))
+    link = Link(link_keys.Link(delay_points=schedule, reordering=True))
     link.zero_ns = 7 * SECOND
     expected_ms = {
         0.0: 20,
@@ -83,7 +83,7 @@ def test_a_ramp_is_exact_at_given_instants() -> None:
 
 def test_before_link_time_zero_the_first_delay_applies_without_outage() -> None:
     points = (DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=1.0, delay_s=0.5))
-    link = Link(link_schema.Link(delay_points=points, outages=(Outage(from_s=0.0, until_s=9.0),)))
+    link = Link(link_keys.Link(delay_points=points, outages=(Outage(from_s=0.0, until_s=9.0),)))
     link.send(b"early", 5 * SECOND)
     assert times(link.due(NEVER_NS)) == [(b"early", 5 * SECOND + 20 * MS)]
 
@@ -91,7 +91,7 @@ def test_before_link_time_zero_the_first_delay_applies_without_outage() -> None:
 def test_an_outage_includes_its_start_not_its_end() -> None:
     rows: list[Row] = []
     link = Link(
-        link_schema.Link(outages=(Outage(from_s=1.0, until_s=2.0), Outage(from_s=3.0, until_s=4.0))), record=rows.append
+        link_keys.Link(outages=(Outage(from_s=1.0, until_s=2.0), Outage(from_s=3.0, until_s=4.0))), record=rows.append
     )
     link.zero_ns = 0
     for time_ns in (0, SECOND - 1, SECOND, 2 * SECOND - 1, 2 * SECOND, 3 * SECOND, 4 * SECOND):
@@ -109,7 +109,7 @@ jitters = st.one_of(
 )
 bursts = st.builds(LossBursts, to_bad_probability=probability, to_good_probability=st.sampled_from([0.1, 1.0]))
 misbehaving = st.builds(
-    link_schema.Link,
+    link_keys.Link,
     delay_s=st.sampled_from([0.0, 0.004]),
     jitter=jitters,
     reordering=st.booleans(),
@@ -121,7 +121,7 @@ misbehaving = st.builds(
 arrivals = st.lists(st.integers(0, 50 * MS), max_size=60).map(sorted)
 
 
-def passed(behaviour: link_schema.Link, entered: list[int], seed: int, rows: list[Row]) -> tuple[Link, list[Entry]]:
+def passed(behaviour: link_keys.Link, entered: list[int], seed: int, rows: list[Row]) -> tuple[Link, list[Entry]]:
     """The link and what came out of it, the last second included, when numbered datagrams entered at these times."""
     link = Link(behaviour, capacity=20, seed=seed, record=rows.append)
     link.zero_ns = 0
@@ -137,7 +137,7 @@ def passed(behaviour: link_schema.Link, entered: list[int], seed: int, rows: lis
 
 @given(misbehaving, arrivals, st.integers(0, 2**32))
 def test_nothing_is_invented_and_nothing_disappears_unrecorded(
-    behaviour: link_schema.Link, entered: list[int], seed: int
+    behaviour: link_keys.Link, entered: list[int], seed: int
 ) -> None:
     rows: list[Row] = []
     link, out = passed(behaviour, entered, seed, rows)
@@ -158,7 +158,7 @@ def test_nothing_is_invented_and_nothing_disappears_unrecorded(
 
 @given(misbehaving.filter(lambda link: not link.reordering), arrivals, st.integers(0, 2**32))
 def test_without_reordering_no_datagram_leaves_before_an_earlier_one(
-    behaviour: link_schema.Link, entered: list[int], seed: int
+    behaviour: link_keys.Link, entered: list[int], seed: int
 ) -> None:
     _, out = passed(behaviour, entered, seed, [])
     numbers = [number for _, number, *_ in out]
@@ -167,7 +167,7 @@ def test_without_reordering_no_datagram_leaves_before_an_earlier_one(
 
 def test_with_reordering_some_do() -> None:
     jitter = Jitter(distribution="uniform", scale_s=0.03)
-    link = link_schema.Link(delay_s=0.03, jitter=jitter, reordering=True)
+    link = link_keys.Link(delay_s=0.03, jitter=jitter, reordering=True)
     _, out = passed(link, [k * MS for k in range(20)], 1, [])
     numbers = [number for _, number, *_ in out]
     assert sorted(numbers) == list(range(1, 21))

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scenarios import link_schema
-from scenarios.link_schema import Jitter, LossBursts
+from scenarios.keys import link as link_keys
+from scenarios.keys.link import Jitter, LossBursts
 from sim_vehicles.links.fate import flipped
 from sim_vehicles.links.links import Link, LinkSet
 from sim_vehicles.links.truth import CORRUPTED, DUPLICATE, Row
@@ -27,7 +27,7 @@ SAMPLES = 2000
 """For Kolmogorov-Smirnov: an error of 4 % in the distribution function is found."""
 
 
-def delays_s(link: link_schema.Link, *, count: int, seed: int = 3) -> list[float]:
+def delays_s(link: link_keys.Link, *, count: int, seed: int = 3) -> list[float]:
     """Delays of datagrams that enter one a ms, by their order of entry."""
     under_test = Link(link, capacity=count, seed=seed)
     for k in range(count):
@@ -46,7 +46,7 @@ def delays_s(link: link_schema.Link, *, count: int, seed: int = 3) -> list[float
     ids=lambda value: value.distribution if isinstance(value, Jitter) else "",
 )
 def test_delays_have_the_distribution_that_is_documented(jitter: Jitter, expected: Any) -> None:
-    found = delays_s(link_schema.Link(delay_s=0.1, jitter=jitter, reordering=True), count=SAMPLES)
+    found = delays_s(link_keys.Link(delay_s=0.1, jitter=jitter, reordering=True), count=SAMPLES)
     assert stats.kstest(found, expected.cdf).pvalue > 0.001
     assert np.mean(found) == pytest.approx(expected.mean(), abs=4 * expected.std() / math.sqrt(SAMPLES))
     # 10 %: the standard error of a standard deviation is below 3 % for each of these distributions.
@@ -55,7 +55,7 @@ def test_delays_have_the_distribution_that_is_documented(jitter: Jitter, expecte
 
 def test_the_delay_is_cut_off_at_zero() -> None:
     jitter = Jitter(distribution="normal", scale_s=0.01)
-    found = np.array(delays_s(link_schema.Link(delay_s=0.005, jitter=jitter, reordering=True), count=SAMPLES))
+    found = np.array(delays_s(link_keys.Link(delay_s=0.005, jitter=jitter, reordering=True), count=SAMPLES))
     assert found.min() == 0.0
     share = stats.norm(0.005, 0.01).cdf(0.0)
     assert np.mean(found == 0.0) == pytest.approx(share, abs=4 * math.sqrt(share * (1 - share) / SAMPLES))
@@ -63,7 +63,7 @@ def test_the_delay_is_cut_off_at_zero() -> None:
 
 def test_a_delay_trace_repeats_in_its_order() -> None:
     trace = (0.01, 0.02, 0.05, 0.03, 0.0)
-    link = link_schema.Link(delay_s=0.001, jitter=Jitter(distribution="trace", trace_s=trace), reordering=True)
+    link = link_keys.Link(delay_s=0.001, jitter=Jitter(distribution="trace", trace_s=trace), reordering=True)
     found = [round(delay_s - 0.001, 9) for delay_s in delays_s(link, count=300)]
     begin = trace.index(found[0])
     assert found == [trace[(begin + k) % 5] for k in range(300)]
@@ -74,7 +74,7 @@ def test_a_delay_trace_repeats_in_its_order() -> None:
 @pytest.mark.parametrize("wanted", [0.0, 0.03, 0.4, 1.0])
 def test_independent_loss_duplication_and_corruption_have_their_probabilities(wanted: float) -> None:
     link = Link(
-        link_schema.Link(loss_probability=0.1, duplicate_probability=wanted, corrupt_probability=wanted),
+        link_keys.Link(loss_probability=0.1, duplicate_probability=wanted, corrupt_probability=wanted),
         capacity=2 * COUNT,
     )
     for k in range(COUNT):
@@ -91,7 +91,7 @@ def test_bursts_follow_the_gilbert_elliott_model() -> None:
     p, r = 0.02, 0.2
     rows: list[Row] = []
     burst = LossBursts(to_bad_probability=p, to_good_probability=r)
-    link = Link(link_schema.Link(loss_bursts=burst), capacity=COUNT, record=rows.append)
+    link = Link(link_keys.Link(loss_bursts=burst), capacity=COUNT, record=rows.append)
     for k in range(COUNT):
         link.send(b"", k)
     lost = np.zeros(COUNT, bool)
@@ -111,7 +111,7 @@ def test_good_and_bad_state_lose_at_their_rates() -> None:
     burst = LossBursts(
         to_bad_probability=0.1, to_good_probability=0.1, loss_good_probability=0.02, loss_bad_probability=0.6
     )
-    link = Link(link_schema.Link(loss_bursts=burst), capacity=COUNT)
+    link = Link(link_keys.Link(loss_bursts=burst), capacity=COUNT)
     for k in range(COUNT):
         link.send(b"", k)
     # Half the time bad; c = 0.8 makes the error of that share sqrt(9) times that of independent states.
@@ -119,7 +119,7 @@ def test_good_and_bad_state_lose_at_their_rates() -> None:
 
 
 def test_corruption_flips_one_to_four_bits_anywhere() -> None:
-    link = Link(link_schema.Link(corrupt_probability=1.0), capacity=COUNT)
+    link = Link(link_keys.Link(corrupt_probability=1.0), capacity=COUNT)
     for k in range(2000):
         link.send(bytes(6), k)
     words = [int.from_bytes(entry[3], "big") for entry in link.due(NEVER_NS)]
@@ -131,10 +131,10 @@ def test_corruption_flips_one_to_four_bits_anywhere() -> None:
     assert flipped(b"", (0.5,)) == b""
 
 
-def drawn_by(link: link_schema.Link, seed: int, others: int) -> list[list[tuple[int, ...]]]:
+def drawn_by(link: link_keys.Link, seed: int, others: int) -> list[list[tuple[int, ...]]]:
     """What the links of vehicle 2, up and down, do to the same datagrams while other vehicles send some of theirs."""
     changed = scenario(3, seed=seed)
-    links = LinkSet(changed.model_copy(update={"links": link_schema.Links(up=link, down=link)}), 0)
+    links = LinkSet(changed.model_copy(update={"links": link_keys.Links(up=link, down=link)}), 0)
     for k in range(200):
         for busy in (1, 3):
             for _ in range(others):
@@ -144,7 +144,7 @@ def drawn_by(link: link_schema.Link, seed: int, others: int) -> list[list[tuple[
     return [[(due, number, fate) for due, number, _, _, fate, _ in own.due(NEVER_NS)] for own in links.of(2)]
 
 
-RESTLESS = link_schema.Link(
+RESTLESS = link_keys.Link(
     delay_s=0.01,
     jitter=Jitter(distribution="exponential", scale_s=0.01),
     loss_probability=0.1,
@@ -172,7 +172,7 @@ def test_other_vehicles_traffic_does_not_change_a_links_draws() -> None:
 def test_an_added_effect_leaves_the_other_draws(change: dict[str, float]) -> None:
     """Delays of what arrives in both cases are equal: every datagram takes the same draws, used or not."""
     link = RESTLESS.model_copy(update={"reordering": True})
-    by_number: Callable[[link_schema.Link], dict[int, int]] = lambda own: {  # noqa: E731 - two lines that are one
+    by_number: Callable[[link_keys.Link], dict[int, int]] = lambda own: {  # noqa: E731 - two lines that are one
         number: due for due, number, fate in drawn_by(own, seed=1, others=0)[0] if not fate & DUPLICATE
     }
     before, after = by_number(link), by_number(link.model_copy(update=change))

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from scenarios.part import Flavour
+from scenarios.keys.part import Flavour
 from scenarios.schema import Autopilot, ClockJump, Scenario
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.shell import Shell

@@ -1,0 +1,86 @@
+"""Search for the best point of a function that has kinks, by the adaptation of a normal distribution (CMA-ES).
+
+Points are only compared, never differentiated: a peak over frequencies, a rightmost root or a limit that is just met
+has no slope where it matters. Draws are seeded, so that the same search finds the same point.
+
+Source: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, with its default constants.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+
+Rank = tuple[float, float]
+"""What a point is worth, less being better: how far it is from what must hold (0 if it holds), then its cost."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The best point of a search, and its rank."""
+
+    point: FloatArray
+    rank: Rank
+
+
+def best_of(
+    rank: Callable[[FloatArray], Rank],
+    start: FloatArray,
+    *,
+    step: float,
+    evaluations: int,
+    resolution: float = 1e-7,
+    enough: Callable[[Rank], bool] = lambda _: False,
+) -> Found:
+    """Return the best point found from `start` (n,) with about as many evaluations, and fewer once steps are small.
+
+    `step` is the standard deviation of the first draws along every axis; the search ends below `resolution`, or at a
+    point that is `enough`.
+
+    >>> found = best_of(lambda x: (0.0, abs(x[0] - 1.0) + abs(x[1])), np.zeros(2), step=0.5, evaluations=600)
+    >>> (found.point**2).round(3).tolist()
+    [1.0, 0.0]
+    """
+    n = start.size
+    population = 4 + int(3 * np.log(n))
+    parents = population // 2
+    weights = np.log((population + 1) / 2) - np.log(np.arange(1, parents + 1))
+    weights /= weights.sum()
+    mass = 1.0 / float((weights**2).sum())
+    c_sigma = (mass + 2) / (n + mass + 5)
+    damping = 1 + 2 * max(0.0, ((mass - 1) / (n + 1)) ** 0.5 - 1) + c_sigma
+    c_path = (4 + mass / n) / (n + 4 + 2 * mass / n)
+    c_one = 2 / ((n + 1.3) ** 2 + mass)
+    c_many = min(1 - c_one, 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass))
+    usual = n**0.5 * (1 - 1 / (4 * n) + 1 / (21 * n * n))
+
+    rng = np.random.default_rng(0)
+    mean, covariance, sigma = start.astype(np.float64), np.eye(n), step
+    path, sigma_path = np.zeros(n), np.zeros(n)
+    best = Found(mean, rank(mean))
+    for turn in range(max(1, evaluations // population)):
+        values, axes = np.linalg.eigh((covariance + covariance.T) / 2)
+        lengths = np.sqrt(values.clip(min=1e-20))
+        if sigma * float(lengths.max()) < resolution or enough(best.rank):
+            break
+        draws = rng.standard_normal((population, n)) * lengths @ axes.T
+        points = mean + sigma * draws
+        ranks = [rank(point) for point in points]
+        order = sorted(range(population), key=lambda k: ranks[k])
+        if ranks[order[0]] < best.rank:
+            best = Found(points[order[0]], ranks[order[0]])
+        chosen = draws[order[:parents]]
+        shift = weights @ chosen
+        mean = mean + sigma * shift
+        sigma_path = (1 - c_sigma) * sigma_path + (c_sigma * (2 - c_sigma) * mass) ** 0.5 * (
+            axes @ ((axes.T @ shift) / lengths)
+        )
+        length = float(np.linalg.norm(sigma_path))
+        steady = length / (1 - (1 - c_sigma) ** (2 * turn + 2)) ** 0.5 < (1.4 + 2 / (n + 1)) * usual
+        path = (1 - c_path) * path + steady * (c_path * (2 - c_path) * mass) ** 0.5 * shift
+        kept = 1 - c_one - c_many + (0.0 if steady else c_one * c_path * (2 - c_path))
+        covariance = kept * covariance + c_one * np.outer(path, path) + c_many * (chosen.T * weights) @ chosen
+        sigma *= float(np.exp(min(1.0, c_sigma / damping * (length / usual - 1))))
+    return best

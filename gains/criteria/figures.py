@@ -1,0 +1,172 @@
+"""Every figure that a design can be asked for, of given gains at a loop delay."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import inf
+from typing import Self
+
+import numpy as np
+
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.criteria.norms import noise_gain, peak_gain
+from gains.criteria.poles import pole_region, roots_of
+from gains.delay.constant import analyse_delay, delay_margin
+from gains.delay.rightmost import rightmost_root
+from gains.formation.model import FormationModel
+from gains.performance.flown import FlownFormation, FlownLoop, FlownTiming
+from gains.performance.response import Response, formation_loop
+from gains.performance.robust import disturbance_bound
+from gains.sampled.constant import sampled_delay_margin
+from gains.sampled.onboard import own_part
+from gains.varying.jitter import spread_bound
+
+
+@dataclass(frozen=True, eq=False)
+class LoopFigures:
+    """What a formation of one axis is good for with a gain K (inputs, states) of u = K e, each figure when it is read.
+
+    Figures at a delay are those of the loop as flown at `delay_s`; None stands for no delay and no hold. `weight` is
+    that of spacing errors and of velocity errors, see `gains.core.requirement.Criteria`. Where errors run down a chain
+    of equal followers, `chain` is one of them. Figures without delay do not include a response.
+
+    >>> from gains.formation.model import FormationModel
+    >>> lone = LoopFigures(FormationModel((-1,), axes=1), np.array([[-1.0]]), FlownTiming(np.inf, 0.02), 0.29)
+    >>> round(lone.decay_rate_1_s, 6), round(lone.decay_rate_at_delay_1_s, 3), round(lone.alpha_at_delay, 3)
+    (1.0, 1.631, 1.0)
+    """
+
+    model: FormationModel
+    K: FloatArray
+    timing: FlownTiming
+    """Its margin is not used."""
+    delay_s: float | None = None
+    weight: tuple[float, float] | None = None
+    responses: tuple[Response, ...] | None = None
+    chain: FlownLoop | None = None
+    thinned: int = 1
+    """In a search figures may be rougher: only every so-manieth frequency is looked at first; 1 is exact."""
+
+    @property
+    def exact(self) -> Self:
+        """The same figures, none of them rough."""
+        return replace(self, thinned=1)
+
+    @cached_property
+    def closed_loop(self) -> FloatArray:
+        """A + B K."""
+        return self.model.A + self.model.B @ self.K
+
+    @cached_property
+    def decay_rate_1_s(self) -> float:
+        """−Re of the rightmost root without delay."""
+        return -float(self._roots.real.max())
+
+    @cached_property
+    def alpha(self) -> float:
+        """α without delay."""
+        return disturbance_bound(self.closed_loop, self.W)
+
+    @property
+    def damping_min(self) -> float:
+        """Least damping ratio of a root without delay."""
+        return pole_region(self._roots)[0]
+
+    @property
+    def natural_frequency_max_rad_s(self) -> float:
+        """Largest natural frequency of a root without delay."""
+        return pole_region(self._roots)[1]
+
+    @cached_property
+    def delay_margin_s(self) -> float:
+        """Margin of the sampled loop, all feedback late, of vehicles that respond at once; in searches about that."""
+        A, B, K, period_s = self.model.A, self.model.B, self.K, self.timing.period_s
+        if self.decay_rate_1_s <= 0.0:
+            return 0.0
+        if self.thinned > 1:  # exact but for terms in the square of the period
+            return max(delay_margin(A, B @ K) - period_s / 2.0, 0.0)
+        return sampled_delay_margin(A, B, K, period_s=period_s)
+
+    @cached_property
+    def decay_rate_at_delay_1_s(self) -> float:
+        """−Re of the rightmost root at the delay."""
+        if self.delay_s is None:
+            return self.decay_rate_1_s
+        A, B, K = formation_loop(self.model, self.K, self.responses)
+        own = np.zeros_like(K)
+        own[:, : self.model.states] = own_part(self.model, self.K)
+        own_s, late_s = self.timing.delays_s(self.delay_s)
+        return -rightmost_root([(A, 0.0), (B @ own, own_s), (B @ (K - own), late_s)]).real
+
+    @cached_property
+    def alpha_at_delay(self) -> float:
+        """α at the delay; 0 if the loop is unstable there."""
+        if self.delay_s is None:
+            return self.alpha
+        if self.decay_rate_at_delay_1_s <= 0.0:
+            return 0.0
+        return 1.0 / peak_gain(self._characteristic, np.eye(self.model.states), self.W, self._frequencies)
+
+    @cached_property
+    def spacing_gain_max_s2(self) -> float:
+        """H∞ gain from disturbing accelerations to spacing errors; `inf` if the loop is unstable, 0 of one vehicle."""
+        if self.decay_rate_at_delay_1_s <= 0.0:
+            return inf
+        if self.model.vehicles == 1:
+            return 0.0
+        outputs = np.eye(self.model.states)[self.model.spacing_mask]
+        return peak_gain(self._characteristic, self.model.B, outputs, self._frequencies)
+
+    @cached_property
+    def noise_gain_max(self) -> float:
+        """H2 gain from measurement noise to the noisiest command, in the ground loop; `inf` if it is unstable."""
+        if self.decay_rate_at_delay_1_s <= 0.0:
+            return inf
+        loop = formation_loop(self.model, self.K, self.responses)
+        return noise_gain(*loop, period_s=self.timing.period_s, delay_s=self.delay_s or 0.0)
+
+    @cached_property
+    def string_peak(self) -> float:
+        """Largest growth of a spacing error from vehicle to vehicle, without delay and at the delay; 1 if none runs."""
+        if self.chain is None:
+            return 1.0
+        at_once = replace(self.chain, timing=replace(self.timing, period_s=0.0, step_s=0.0, loop="ground"))
+        return max(at_once.string_peak(0.0), self.chain.string_peak(self.delay_s or 0.0))
+
+    def proved_spread_s(self, mean_s: float, rate: float) -> float:
+        """How far the loop delay may be from a mean (s) on both sides, both late by half a hold, with the loop stable.
+
+        `rate` 0: constant but not known, exact. Any other: proved by `gains.varying.jitter.spread_bound`, in a search
+        estimated. 0 if the loop is unstable at the mean.
+        """
+        A, late = self.model.A, self.model.B @ self.K
+        middle_s = mean_s + self.timing.period_s / 2.0
+        if rate > 0.0:
+            # with several inputs the scaling takes minutes
+            exact = self.thinned == 1 and self.model.vehicles == 2
+            return spread_bound(A, late, mean_s=middle_s, rate=rate, scaled=exact)
+        for start_s, end_s in analyse_delay(A, late).stable_intervals_s:
+            if start_s < middle_s < end_s or start_s == 0.0 == middle_s:
+                return min(mean_s if start_s == 0.0 else middle_s - start_s, end_s - middle_s)
+        return 0.0
+
+    @cached_property
+    def _roots(self) -> ComplexArray:
+        return roots_of(self.closed_loop)
+
+    @property
+    def W(self) -> FloatArray:  # noqa: N802 - the source's letter
+        """Diagonal matrix of the weights of the states."""
+        spacing, velocity = self.weight or (1.0, 1.0)
+        return np.diag(np.where(self.model.spacing_mask, spacing, velocity))
+
+    @cached_property
+    def _flown(self) -> FlownFormation:
+        timing = self.timing if self.delay_s is not None else FlownTiming(inf, 0.0)
+        return FlownFormation(self.model, self.K, timing, self.responses)
+
+    @cached_property
+    def _frequencies(self) -> FloatArray:
+        return self._flown.frequencies()[:: self.thinned]
+
+    def _characteristic(self, omega: FloatArray) -> ComplexArray:
+        return self._flown.characteristic(omega, self.delay_s or 0.0)

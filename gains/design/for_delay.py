@@ -1,0 +1,262 @@
+"""Gains that are best at a loop delay: the one place that searches them there.
+
+Gains with a margin of twice a delay are not the best at that delay: at 0.3 s and 50 Hz they decay at 1.31 1/s there and
+withstand α = 0.525; gains searched for the delay decay at 1.89 1/s, or withstand 0.632. The search compares gains by
+the figures of `gains.criteria.figures` at the delay, first by how far they are from the requirement, then by what is
+maximised. What decays fastest is known in closed form, and no search begins worse.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import exp, inf, log, sqrt
+from typing import Protocol
+
+import numpy as np
+
+from gains.core._evolution import Found, Rank, best_of
+from gains.core.arrays import BoolArray, FloatArray
+from gains.core.errors import InfeasibleError, SolverError
+from gains.core.requirement import Requirement
+from gains.core.structure import positive_seconds
+from gains.criteria.figures import LoopFigures
+from gains.criteria.parts import Figures, Part, parts_of
+from gains.delay.constant import delay_margin
+from gains.design.time_scale import time_scaled
+from gains.formation.model import FormationModel
+from gains.performance.flown import FlownLoop, FlownTiming
+from gains.performance.scalar_gains import PAIR, ScalarGains
+
+# How many gains a search compares.
+_EVALUATIONS = 320
+# Searches until gains meet with exact figures what they met with rough ones.
+_AIMS = 4
+# Frequencies left out while searching; peaks are looked at closer in any case.
+_THINNED = 4
+# At no delay and no hold gains have no scale of their own: the search begins at that of this delay.
+_NO_DELAY_S = 0.1
+# how far an unstable loop counts as being from any requirement
+_UNSTABLE = 1e4
+# and one that meets no part that is quick to compute; above every shortfall of those that are not
+_SLOW_PARTS = 2e3
+# margins from which gains on a pattern are started, as multiples of the delay with half a hold
+_SPARES = 1.5, 2.0, 3.0
+_FASTEST = 2.0 - sqrt(2.0)
+
+
+def fastest_at_delay(late_s: float) -> tuple[float, float]:
+    """Return the (k1, k3) with which s² + (k1 s + k3) e^{−s late} decays fastest: a triple root at −(2 − √2) / late.
+
+    >>> [round(gain, 4) for gain in fastest_at_delay(0.31)]
+    [1.4876, 0.8233]
+    """
+    x = -_FASTEST
+    k1 = -x * (2.0 + x) * exp(x)
+    return k1 / late_s, -(x * x * exp(x) + k1 * x) / late_s**2
+
+
+def criteria_gains(wanted: Requirement, period_s: float) -> ScalarGains:
+    """Return the gains of the inclusion principle that meet a requirement with criteria and are best in its objective.
+
+    They are the same for every vehicle of a leader-follower tree of any size. Commands are held for `period_s`, which
+    counts as half a period of delay. The α of the result is that at the delay. BadModelError if the period is not
+    positive; InfeasibleError if no gains were found, with how far each part alone would have to be relaxed.
+
+    Fastest decay at 0.3 s and 50 Hz:
+
+    >>> from gains.core.requirement import Criteria, Requirement
+    >>> fastest = Criteria(at_delay_s=0.3, maximise="decay_rate_at_delay_1_s")
+    >>> found = criteria_gains(Requirement(criteria=fastest), 0.02)
+    >>> round(found.k1, 2), round(found.k3, 2)
+    (1.49, 0.82)
+    """
+    criteria = wanted.criteria
+    assert criteria is not None
+    timing = FlownTiming(inf, positive_seconds("period_s", period_s))
+    tree = TreeGains(criteria.at_delay_s, timing, criteria.weight)
+    point, figures = searched(tree, wanted)
+    return replace(tree.gains(point), alpha=figures.alpha_at_delay)
+
+
+class GainFamily(Protocol):
+    """Gains that a search chooses from."""
+
+    @property
+    def step(self) -> float:
+        """Standard deviation of the first draws."""
+        ...
+
+    @property
+    def starts(self) -> Sequence[FloatArray]:
+        """Points from which to search."""
+        ...
+
+    def figures(self, point: FloatArray) -> Figures:
+        """The figures of the gains of a point."""
+        ...
+
+
+def _late_s(delay_s: float | None, timing: FlownTiming) -> float:
+    return (delay_s or _NO_DELAY_S) + timing.period_s / 2.0
+
+
+@dataclass(frozen=True)
+class TreeGains:
+    """k1, k2 and k3 of a vehicle behind another; a point is (ln k1 late, k2 / k1, ln k3 / k1²)."""
+
+    delay_s: float | None
+    timing: FlownTiming
+    weight: tuple[float, float] | None = None
+    step: float = 0.3
+
+    @property
+    def late_s(self) -> float:
+        """The delay with half a hold."""
+        return _late_s(self.delay_s, self.timing)
+
+    @property
+    def starts(self) -> Sequence[FloatArray]:
+        k1, k3 = fastest_at_delay(self.late_s)
+        return [np.array([log(scale * k1 * self.late_s), 0.2, log(k3 / k1**2)]) for scale in (1.0, 1.7)]
+
+    def gains(self, point: FloatArray) -> ScalarGains:
+        """The gains of a point; their α is not known."""
+        first, share, last = (float(entry) for entry in np.clip(point, -20.0, 20.0))
+        k1 = exp(first) / self.late_s
+        return ScalarGains(k1, share * k1, exp(last) * k1**2, 0.0)
+
+    def figures(self, point: FloatArray) -> LoopFigures:
+        gains = self.gains(point)
+        chain = FlownLoop(gains, self.timing)
+        return LoopFigures(PAIR, gains.K, self.timing, self.delay_s, self.weight, chain=chain, thinned=_THINNED)
+
+
+@dataclass(frozen=True, eq=False)
+class PatternGains:
+    """The free entries of K on a pattern, for one axis; a point holds them in the unit of time of the delay."""
+
+    model: FormationModel
+    mask: BoolArray
+    bases: tuple[FloatArray, ...]
+    """Gains (inputs, states) that stabilise, from which to start in several time scales."""
+    delay_s: float | None
+    timing: FlownTiming
+    weight: tuple[float, float] | None = None
+    step: float = 0.05
+
+    @cached_property
+    def _units(self) -> FloatArray:
+        """What one unit of a point is worth at each entry: 1 / late for velocity errors, 1 / late² for spacing."""
+        late_s = _late_s(self.delay_s, self.timing)
+        units = np.full(self.mask.shape, 1.0 / late_s)
+        units[:, self.model.spacing_mask] /= late_s
+        return units
+
+    @property
+    def starts(self) -> Sequence[FloatArray]:
+        late_s = _late_s(self.delay_s, self.timing)
+        margins = [delay_margin(self.model.A, self.model.B @ base) for base in self.bases]
+        scaled = (
+            time_scaled(self.model, base, spare * late_s / margin_s)
+            for base, margin_s in zip(self.bases, margins, strict=True)
+            for spare in _SPARES
+        )
+        return [self.point(K) for K in scaled]
+
+    def point(self, K: FloatArray) -> FloatArray:
+        """The point of a K with the pattern."""
+        return (K / self._units)[self.mask]
+
+    def gain(self, point: FloatArray) -> FloatArray:
+        """K of a point."""
+        K = np.zeros(self.mask.shape)
+        K[self.mask] = point
+        return K * self._units
+
+    def figures(self, point: FloatArray) -> LoopFigures:
+        return LoopFigures(self.model, self.gain(point), self.timing, self.delay_s, self.weight, thinned=_THINNED)
+
+
+def searched(family: GainFamily, wanted: Requirement, *, evaluations: int = _EVALUATIONS) -> tuple[FloatArray, Figures]:
+    """Return the point of a family that meets a requirement with criteria and is best in its objective, with figures.
+
+    `evaluations` is how many gains are compared. InfeasibleError if none was found that meets the requirement; its
+    message says how far each part alone would have to be relaxed.
+    """
+    assert wanted.criteria is not None
+    objective = wanted.criteria.objective or ("alpha" if wanted.delay_margin_s is not None else "delay_margin_s")
+    parts = aims = parts_of(wanted)
+    missed: list[float] = []
+    for _ in range(_AIMS):
+        found = _searched(family, objective, aims, family.starts, evaluations)
+        if found.rank[0] > 0.0:
+            most = [_most(family, aim, [other for other in aims if other is not aim], found.point) for aim in aims]
+            met = [each.point for each in most if _shortfall(family.figures(each.point), aims) == 0.0]
+            if not met:
+                raise InfeasibleError(_refusal(aims, most))
+            found = _searched(family, objective, aims, met, evaluations)
+        # the figures of the search are rough
+        exact = family.figures(found.point).exact
+        missed = [part.shortfall(exact) for part in parts]
+        if not any(missed):
+            return found.point, exact
+        aims = [aim.tightened(short) for aim, short in zip(aims, missed, strict=True)]
+    raise SolverError(f"the search misses {wanted} by {max(missed):.2g} of it; relax what is asked for by that")
+
+
+def _refusal(parts: Sequence[Part], most: Sequence[Found]) -> str:
+    """What cannot be had together, and how far each part alone would have to be relaxed."""
+    named = " and ".join(f"{part.name} = {part.wanted_text}" for part in parts)
+    conflict = "exclude each other" if len(parts) > 1 else "cannot be reached"
+    reached = [
+        part.relaxed(found.rank[1] * (-1.0 if part.at_least else 1.0))
+        for part, found in zip(parts, most, strict=True)
+        if found.rank[0] == 0.0
+    ]
+    return f"{named} {conflict}: {' or '.join(text for text in reached if text) or 'relax more than one of them'}"
+
+
+def _searched(
+    family: GainFamily, objective: str, parts: Sequence[Part], starts: Sequence[FloatArray], evaluations: int
+) -> Found:
+    """The best point of a search that meets the parts, or the nearest to it."""
+
+    def rank(point: FloatArray) -> Rank:
+        figures = family.figures(point)
+        short = _shortfall(figures, parts)
+        return short, -float(getattr(figures, objective)) if short == 0.0 else inf
+
+    return _from_best_start(rank, family, starts, evaluations)
+
+
+def _most(family: GainFamily, part: Part, others: Sequence[Part], nearest: FloatArray) -> Found:
+    """The point at which a part is met best of all that meet the others."""
+    sign = 1.0 if part.at_least else -1.0
+
+    def rank(point: FloatArray) -> Rank:
+        figures = family.figures(point)
+        short = _shortfall(figures, others)
+        return short, -sign * part.figure(figures) if short == 0.0 else inf
+
+    return _from_best_start(rank, family, [nearest, *family.starts], _EVALUATIONS)
+
+
+def _from_best_start(
+    rank: Callable[[FloatArray], Rank], family: GainFamily, starts: Sequence[FloatArray], evaluations: int
+) -> Found:
+    """The best point of a search from the best of the starts."""
+    return best_of(rank, min(starts, key=rank), step=family.step, evaluations=evaluations)
+
+
+def _shortfall(figures: Figures, parts: Sequence[Part]) -> float:
+    """How far gains are from all parts: the largest shortfall, or by how much the loop is unstable.
+
+    Parts that take long to compute are looked at only where all others are met.
+    """
+    for slowest in (figures.decay_rate_1_s, figures.decay_rate_at_delay_1_s):
+        if slowest <= 0.0:
+            return _UNSTABLE - slowest
+    quick = max((part.shortfall(figures) for part in parts if not part.is_slow), default=0.0)
+    if quick > 0.0:
+        return _SLOW_PARTS + quick
+    return max((part.shortfall(figures) for part in parts if part.is_slow), default=0.0)

@@ -1,0 +1,170 @@
+"""The best that can be had at a loop delay: robustness, decay, string peak and disturbance gain, by every route.
+
+At each delay and for each route the ends of the front are searched, the gains with the largest α and those with the
+fastest decay, with prediction over the delay and without. All are asked for stability at every constant delay up to a
+share of the delay to either side, so that neither way counts on a delay that is known exactly.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import GainsError
+from gains.core.requirement import Criteria, Requirement
+from gains.criteria.figures import LoopFigures
+from gains.criteria.parts import Figures
+from gains.criteria.predicted import PredictedFigures
+from gains.design.for_delay import GainFamily, PatternGains, TreeGains, searched
+from gains.design.graph import lqr_bases
+from gains.design.predicted import PredictedPattern, PredictedTree
+from gains.formation.model import FormationModel
+from gains.formation.pattern import Pattern
+from gains.performance.flown import FlownTiming
+
+Method = Literal["inclusion", "graph-lqr"]
+Aim = Literal["alpha_at_delay", "decay_rate_at_delay_1_s"]
+AIMS: tuple[Aim, Aim] = "alpha_at_delay", "decay_rate_at_delay_1_s"
+# gains that a search compares; α is within about 2 % of that of a search three times as long
+_EVALUATIONS: dict[Method, int] = {"inclusion": 120, "graph-lqr": 40}
+# a point that is worse by no more than this share is not worse
+_ALIKE = 1e-3
+
+
+class Route(NamedTuple):
+    """A way to design, with or without prediction, and the end of the front that is wanted."""
+
+    method: Method
+    predicted: bool
+    aim: Aim
+
+
+@dataclass(frozen=True, eq=False)
+class FrontPoint:
+    """The gains that a route finds for a loop delay, and their figures there; K (inputs, states) of one axis.
+
+    `alpha` and `spacing_gain_s2` are of the whole formation, `alpha_design` is as the method reports it: of inclusion
+    that of one follower. `stable_s` are the constant delays about this one between which the loop is stable.
+    `is_efficient`: no other point at this delay is as good in α, decay, string peak and disturbance gain, and better in
+    one. Where errors run both ways no string peak is defined.
+    """
+
+    route: Route
+    delay_s: float
+    K: FloatArray
+    alpha: float
+    alpha_design: float
+    decay_rate_1_s: float
+    string_peak: float | None
+    spacing_gain_s2: float
+    noise_gain: float
+    stable_s: tuple[float, float]
+    is_efficient: bool = True
+
+
+class Refusal(NamedTuple):
+    """Why a route has no point at a delay."""
+
+    route: Route
+    delay_s: float
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class FrontSearch:
+    """What a front is made of. `tolerated` is the share by which the delay may differ from that designed for."""
+
+    formation: FormationModel
+    pattern: Pattern
+    period_s: float
+    tolerated: float = 0.2
+    string_peak_max: float | None = 1.0
+
+    def points(self, routes: Sequence[Route], delays_s: Sequence[float]) -> Iterator[FrontPoint | Refusal]:
+        """The points of each route, one delay after the other; those of a delay do not depend on the others."""
+        methods: dict[Method, None] = dict.fromkeys(route.method for route in routes)
+        for method in methods:
+            graph = lqr_bases(self.formation, self.pattern)[1] if method == "graph-lqr" else None
+            for route in (route for route in routes if route.method == method):
+                for delay_s in delays_s:
+                    family = self._family(route, delay_s, graph)
+                    try:
+                        point, found = searched(family, self.wanted(route, delay_s), evaluations=_EVALUATIONS[method])
+                    except GainsError as error:
+                        yield Refusal(route, delay_s, str(error))
+                        continue
+                    yield self._point(route, delay_s, family, point, found)
+
+    def wanted(self, route: Route, delay_s: float) -> Requirement:
+        """What is asked of the gains at a delay."""
+        around_s = (1.0 - self.tolerated) * delay_s, (1.0 + self.tolerated) * delay_s
+        criteria = Criteria(delay_s, route.aim, delays_s=around_s, delay_rate=0.0)
+        return Requirement(criteria=criteria, string_peak_max=self.string_peak_max)
+
+    def _family(self, route: Route, delay_s: float, graph: PatternGains | None) -> GainFamily:
+        timing = FlownTiming(inf, self.period_s)
+        if graph is not None:
+            gains = replace(graph, delay_s=delay_s, timing=timing)
+            return PredictedPattern(gains) if route.predicted else gains
+        if route.predicted:
+            return PredictedTree(delay_s, self.period_s, tolerated=self.tolerated)
+        return TreeGains(delay_s, timing)
+
+    def _point(self, route: Route, delay_s: float, family: GainFamily, point: FloatArray, found: Figures) -> FrontPoint:
+        single = FormationModel(self.formation.predecessors, axes=1)
+        K = _gain(family, point, single)
+        whole = self.figures(single, K, delay_s, predicted=route.predicted)
+        return FrontPoint(
+            route=route,
+            delay_s=delay_s,
+            K=K,
+            alpha=whole.alpha_at_delay,
+            alpha_design=found.alpha_at_delay,
+            decay_rate_1_s=found.decay_rate_at_delay_1_s,
+            string_peak=found.string_peak if route.method == "inclusion" else None,
+            spacing_gain_s2=whole.spacing_gain_max_s2,
+            noise_gain=whole.noise_gain_max,
+            stable_s=whole.window_s if isinstance(whole, PredictedFigures) else (0.0, whole.delay_margin_s),
+        )
+
+    def figures(
+        self, single: FormationModel, K: FloatArray, delay_s: float, *, predicted: bool
+    ) -> LoopFigures | PredictedFigures:
+        """All figures of gains at a delay."""
+        if predicted:
+            return PredictedFigures(single, K, self.period_s, delay_s, (delay_s,))
+        return LoopFigures(single, K, FlownTiming(inf, self.period_s), delay_s)
+
+
+def _gain(family: GainFamily, point: FloatArray, single: FormationModel) -> FloatArray:
+    """K of a point, of the whole formation."""
+    if isinstance(family, PredictedPattern):
+        return family.pattern.gain(point)
+    if isinstance(family, PatternGains):
+        return family.gain(point)
+    assert isinstance(family, TreeGains | PredictedTree)
+    found = (family if isinstance(family, TreeGains) else family.tree).gains(point)
+    return single.overlapping_gain([[-found.k1]], [[found.k2]], [[found.k3]])
+
+
+def efficient(points: Sequence[FrontPoint]) -> list[FrontPoint]:
+    """The points, each compared with the others at its delay."""
+    return [
+        replace(own, is_efficient=not any(_beats(other, own) for other in points if other.delay_s == own.delay_s))
+        for own in points
+    ]
+
+
+def _beats(other: FrontPoint, own: FrontPoint) -> bool:
+    pairs = [
+        (other.alpha, own.alpha),
+        (other.decay_rate_1_s, own.decay_rate_1_s),
+        (own.spacing_gain_s2, other.spacing_gain_s2),
+    ]
+    if other.string_peak is not None and own.string_peak is not None:
+        pairs.append((own.string_peak, other.string_peak))
+    better = np.array([mine / yours for mine, yours in pairs])
+    return bool((better >= 1.0 - _ALIKE).all() and (better > 1.0 + _ALIKE).any())

@@ -1,0 +1,227 @@
+"""What gusts and noise do to a formation in flight: the stationary spread of its errors, exact at a loop delay.
+
+The loop is sampled and held (`gains.sampled.constant`), with everything that pushes it::
+
+    x' = A x + B u + E w,     w' = −w / τ_w + white noise     gusts: accelerations, standard deviation σ_w
+    u_k = K (x_k + M (ν_k + b_k))                              what the station knows is wrong by noise and bias
+    b_{k+1} = e^{−T/τ_b} b_k + white noise
+
+ν is white, b has the correlation time τ_b, and M takes errors of positions and velocities to those of e. All vehicles
+sample at one instant; where they do not, a station that interpolates between two reports averages their white noise. A
+station that predicts feeds back the state that it expects at the loop delay it assumes, from its own commands.
+
+With the gust among the states and late commands beside them, one period is s_{k+1} = F s_k + noise of covariance Q, and
+the stationary covariance is P = F P F' + Q, which doubling solves: P = Q + F Q F' + F² Q F²' + ... A steady wind adds a
+mean.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import ceil, exp
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gains.core.errors import BadModelError
+from gains.formation.model import FormationModel
+from gains.sampled._loop import HeldPlant, held_entry, matrix_exponentials, radius_of, rate_of, settled_covariance
+from gains.sampled.multirate import Predictor, Timing, multirate_map
+
+
+@dataclass(frozen=True)
+class Gusts:
+    """First-order gusts: an acceleration on each axis of each vehicle, or the same for all of them."""
+
+    deviation_m_s2: float
+    correlation_s: float
+    common: bool = False
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """Errors of reported positions and velocities on each axis: white noise, and a bias of the first order."""
+
+    position_noise_m: float = 0.0
+    velocity_noise_m_s: float = 0.0
+    position_bias_m: float = 0.0
+    velocity_bias_m_s: float = 0.0
+    bias_time_s: float = 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Stationary means and standard deviations of the errors e, in the order of the model's states."""
+
+    mean: FloatArray
+    true: FloatArray
+    """Standard deviations of the errors themselves."""
+    reported: FloatArray
+    """Standard deviations of the errors as reported, noise and bias included."""
+
+
+@dataclass(frozen=True, eq=False)
+class DisturbedFormation:
+    """A formation that a station flies at a loop delay, with gusts and errors of sensing.
+
+    A, B and K are those of e' = A e + B u, u = K e; further states (`gains.performance.response.formation_loop`) follow
+    the model's. With `assumed_s` the station predicts over that loop delay. Feedback u = −w through a leader alone,
+    pushed by gusts with a correlation time of one second: the variance is 1 / (1 (1 + 1)) in continuous time.
+
+    >>> leader = FormationModel((-1,), axes=1)
+    >>> flown = DisturbedFormation(leader, leader.A, leader.B, np.array([[-1.0]]), 0.001, 0.0, Gusts(1.0, 1.0))
+    >>> round(float(flown.spread().true[0] ** 2), 3)
+    0.5
+    """
+
+    model: FormationModel
+    A: FloatArray
+    B: FloatArray
+    K: FloatArray
+    period_s: float
+    delay_s: float
+    gusts: Gusts | None = None
+    sensing: Sensing = Sensing()
+    wind_m_s2: FloatArray | None = None
+    """Steady acceleration of every vehicle, one for each axis."""
+    assumed_s: float | None = None
+
+    def spread(self) -> Spread:
+        """The stationary spread. Raises BadModelError if the loop is not stable."""
+        F, Q, entry, seen = self._lifted
+        covariance = settled_covariance(F, Q)
+        if covariance is None:
+            raise BadModelError(f"the loop is not stable at {self.delay_s:g} s of loop delay; wanted a stable one")
+        n = self.model.states
+        reported = np.diag(seen @ covariance @ seen.T) + np.diag(self._noise @ self._noise.T)
+        mean = np.linalg.solve(np.eye(len(F)) - F, entry)[:n].astype(np.float64) if entry.any() else np.zeros(n)
+        return Spread(mean, np.sqrt(np.maximum(np.diag(covariance)[:n], 0.0)), np.sqrt(reported))
+
+    def decay_1_s(self) -> float:
+        """How fast the errors decay, 1/s: the slowest root of the loop without gusts and bias."""
+        calm = replace(self, gusts=None, sensing=Sensing())
+        return -rate_of(radius_of(calm.period_map()), self.period_s)
+
+    def period_map(self) -> FloatArray:
+        """F: the map of states, gusts, late commands and bias over one period."""
+        return self._lifted[0]
+
+    def closed(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """(zI − Φ − G(z) K)^{−1} at points z (k, 1, 1): from what is added to the states after a period to the states.
+
+        G(z) is what late and held commands do; its size is that of the states, the gusts among them.
+        """
+        T, size = self.period_s, len(self._pushed.A)
+        Phi, acts = self._pushed.transition(np.array([T]))[0][0], held_entry(self._pushed, z, self.delay_s)
+        reach, held = self._expected
+        back = sum((hold * z ** (-age) for age, hold in held.items()), np.zeros_like(self.B) + 0j * z)
+        command = np.linalg.inv(np.eye(self.B.shape[1]) - self.K @ back) @ self.K @ reach
+        feedback = np.concatenate([command, np.zeros((*command.shape[:2], self._entry.shape[1]))], axis=2)
+        return np.linalg.inv(z * np.eye(size) - Phi - acts @ feedback).astype(np.complex128)
+
+    @cached_property
+    def _entry(self) -> FloatArray:
+        """E: from gusts to the states, (n, gusts)."""
+        model, gusts = self.model, self.gusts
+        if gusts is None or gusts.deviation_m_s2 == 0.0:
+            return np.zeros((len(self.A), 0))
+        each = np.zeros((len(self.A), model.inputs))
+        each[: model.states] = model.B
+        return each @ np.kron(np.ones((model.vehicles, 1)), np.eye(model.axes)) if gusts.common else each
+
+    @cached_property
+    def _pushed(self) -> HeldPlant:
+        """The plant with the gusts among its states."""
+        n, count = self._entry.shape
+        A = np.zeros((n + count, n + count))
+        A[:n, :n], A[:n, n:] = self.A, self._entry
+        if self.gusts is not None:
+            A[n:, n:] = -np.eye(count) / self.gusts.correlation_s
+        B = np.vstack([self.B, np.zeros((count, self.B.shape[1]))])
+        return HeldPlant(A, B, np.hstack([self.K, np.zeros((len(self.K), count))]), self.period_s)
+
+    @cached_property
+    def _push_covariance(self) -> FloatArray:
+        """What the gusts add in a period: ∫ e^{A s} W e^{A' s} ds, by the exponential of Van Loan (1978)."""
+        A, n = self._pushed.A, len(self.A)
+        size = len(A)
+        W = np.zeros((size, size))
+        if self.gusts is not None:
+            W[n:, n:] = np.eye(size - n) * 2.0 * self.gusts.deviation_m_s2**2 / self.gusts.correlation_s
+        block = np.zeros((2 * size, 2 * size))
+        block[:size, :size], block[:size, size:], block[size:, size:] = -A, W, A.T
+        whole = matrix_exponentials(block[np.newaxis] * self.period_s)[0]
+        covariance = whole[size:, size:].T @ whole[:size, size:]
+        return (covariance + covariance.T) / 2.0
+
+    def _of_vehicles(self, position_m: float, velocity_m_s: float) -> FloatArray:
+        """From errors of each vehicle's position and velocity to those of e: (states, 2 inputs)."""
+        model = self.model
+        M = np.zeros((model.states, 2 * model.inputs))
+        for i in range(model.vehicles):
+            place = model.input_slice(i)
+            speed = slice(place.start + model.inputs, place.stop + model.inputs)
+            M[model.velocity_slice(i), speed] = velocity_m_s * np.eye(model.axes)
+            if i > 0:
+                ahead = model.input_slice(model.predecessors[i])
+                M[model.spacing_slice(i), place] = -position_m * np.eye(model.axes)
+                M[model.spacing_slice(i), ahead] = position_m * np.eye(model.axes)
+        return M
+
+    @cached_property
+    def _noise(self) -> FloatArray:
+        return self._of_vehicles(self.sensing.position_noise_m, self.sensing.velocity_noise_m_s)
+
+    @cached_property
+    def _bias(self) -> FloatArray:
+        return self._of_vehicles(self.sensing.position_bias_m, self.sensing.velocity_bias_m_s)
+
+    @cached_property
+    def _expected(self) -> tuple[FloatArray, dict[int, FloatArray]]:
+        """x^ = reach x_k + Σ held[j] u_{k−j}: what the station feeds back, from its own model of the plant."""
+        n = len(self.A)
+        if self.assumed_s is None:
+            return np.eye(n), {}
+        T, plant = self.period_s, HeldPlant(self.A, self.B, self.K, self.period_s)
+        held: dict[int, FloatArray] = {}
+        for age in range(1, ceil(self.assumed_s / T - 1e-9) + 1):
+            # u_{k−j} acts, as assumed, from τ^ − jT to one period later: ever since the last jT before τ^
+            ends_s = np.array([min(age * T, self.assumed_s), (age - 1) * T])
+            longer, shorter = plant.transition(ends_s)[1]
+            held[age] = longer - shorter
+        return plant.transition(np.array([self.assumed_s]))[0][0], held
+
+    @cached_property
+    def _lifted(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """F and Q of s = (x, w, u_{k−1}, ..., b), what a steady wind adds in a period, and e as reported."""
+        T, model, n = self.period_s, self.model, len(self.A)
+        step = self._stepped(self.K)
+        # what a wrong e does in a period
+        wrong = (step - self._stepped(np.zeros_like(self.K)))[:, : model.states]
+        told, seen = wrong @ self._noise, np.eye(model.states, len(step))
+        added = told @ told.T
+        added[: len(self._push_covariance), : len(self._push_covariance)] += self._push_covariance
+        if self._bias.any():
+            drifts, fades = np.eye(self._bias.shape[1]), exp(-T / self.sensing.bias_time_s)
+            none = np.zeros((len(drifts), len(step)))
+            step = np.block([[step, wrong @ self._bias], [none, fades * drifts]])
+            added = np.block([[added, none.T], [none, (1.0 - fades**2) * drifts]])
+            seen = np.hstack([seen, self._bias])
+        steady = np.zeros(len(step))
+        if self.wind_m_s2 is not None:
+            acts = np.zeros((n, model.inputs))
+            acts[: model.states] = model.B
+            hold = HeldPlant(self.A, acts, acts.T, T).transition(np.array([T]))[1][0]
+            steady[:n] = hold @ np.tile(self.wind_m_s2, model.vehicles)
+        return step, added, steady, seen
+
+    def _stepped(self, K: FloatArray) -> FloatArray:
+        """The map of (x, w, u_{k−1}, ...) over one period with another gain; the station believes in no gusts."""
+        plant = replace(self._pushed, K=np.hstack([K, np.zeros((len(K), self._entry.shape[1]))]))
+        predictor = None
+        if self.assumed_s is not None:
+            calm = np.zeros_like(plant.A)
+            calm[: len(self.A), : len(self.A)] = self.A
+            predictor = Predictor(replace(plant, A=calm), self.assumed_s)
+        timing = Timing(self.period_s, self.period_s)
+        return multirate_map(plant, timing, delay_s=self.delay_s, predictor=predictor)

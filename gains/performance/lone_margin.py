@@ -1,0 +1,75 @@
+"""The sampled margin of one vehicle's own loop by a frequency sweep: in milliseconds, and without a state matrix.
+
+With u = -k1 v - k3 x, sampled and held for T, its loop is
+
+    L(w) = sum over n of P(s_n) (1 - e^{-s_n T}) / (s_n T) e^{-s_n tau},  s_n = j (w + 2 pi n / T)
+    P(s) = (k1 s + k3) / s^2 h(s)
+
+with the response h = a / u, dead time and all. The least delay tau at which L = -1 is the margin. A station computes it
+in flight, where `gains.performance.response.sampled_margin`, which shares no algebra with it, would take too long.
+"""
+
+from collections.abc import Callable
+from math import inf, pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gains.core.arrays import FloatArray
+from gains.performance.response import Response, formation_loop
+from gains.performance.scalar_gains import PAIR, ScalarGains
+from gains.sampled.constant import growth_rate
+
+_FREQUENCIES, _LOWEST, _ALIASES, _ROUNDS = 300, 1e-3, 6, 12
+
+
+def lone_margin(k1: float, k3: float, response: Response, *, period_s: float) -> float:
+    """Return the least loop delay (s) at which u = -k1 v - k3 x loses stability; 0 if at once, `inf` if at none.
+
+    `k1` > 0 in 1/s, `k3` >= 0 in 1/s² (0 for a leader).
+
+    The leader of `gains.performance.response.sampled_margin`:
+
+    >>> round(lone_margin(1.0, 0.0, Response(1.0, 0.0), period_s=0.02), 3)
+    1.141
+    """
+    if not k1 > 0.0:
+        return 0.0
+    follower = formation_loop(PAIR, ScalarGains(k1, 0.0, k3, 0.0).K, (response, response))
+    if k3 > 0.0 and growth_rate(*follower, period_s=period_s, delay_s=0.0) >= 0.0:
+        return 0.0
+
+    bands = 2.0 * pi / period_s * np.arange(-_ALIASES, _ALIASES + 1.0)[:, np.newaxis]
+
+    def loop(omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
+        w = omega + bands
+        s = 1j * w
+        held = (1.0 - np.exp(-s * period_s)) / (s * period_s)
+        total = (k1 * s + k3) / s**2 * response.transfer(w) * held * np.exp(-s * delay_s)
+        return total.sum(axis=0)
+
+    slowest = min(k1, k3 / k1) if k3 > 0.0 else k1
+    omega = np.append(np.geomspace(_LOWEST * slowest, 0.999 * pi / period_s, _FREQUENCIES), pi / period_s)
+    beyond = np.abs(loop(omega, 0.0)) >= 1.0
+    crossed = np.flatnonzero(beyond[1:] != beyond[:-1])
+    return min((_at_crossing(loop, float(omega[k]), float(omega[k + 1])) for k in crossed), default=inf)
+
+
+def _at_crossing(loop: Callable[[FloatArray, float], NDArray[np.complex128]], low: float, high: float) -> float:
+    """The delay at which the loop is -1 near the frequency where its size passes one."""
+    delay_s = 0.0
+    for _ in range(_ROUNDS):
+        at = np.linspace(low, high, 9)
+        value = loop(at, delay_s)
+        size = np.log(np.abs(value))
+        # the size hardly depends on the delay: look a little farther than where it was
+        crossing = float(np.interp(0.0, *(size, at) if size[0] < size[-1] else (size[::-1], at[::-1])))
+        phase = float(np.angle(-loop(np.array([crossing]), delay_s)[0]))
+        if delay_s == 0.0 and phase < 0.0:
+            phase += 2.0 * pi
+        delay_s += phase / crossing
+        width = max((high - low) / 8.0, 1e-9 * crossing)
+        low, high = crossing - width, crossing + width
+        if abs(phase) < 1e-10:
+            break
+    return delay_s

@@ -1,0 +1,225 @@
+"""How large a disturbance w = Δ e a formation in flight takes before it is unstable: stability radii at a loop delay.
+
+The loop is sampled and held, as in `gains.performance.disturbed`. Every period a disturbance is computed from the true
+errors of some vehicles, w_k = Δ e_k, and pushes e' = A e + B u + w until the next (3.20-3.24). With M(z) from w to e,
+the loop is unstable from that size |Δ| on at which det(I − M(z) Δ) = 0 somewhere on the unit circle:
+
+    complex radius   1 / max σ_1(M)     Δ may be any stable filter: it turns the phase of each error at will
+    real radius      1 / max μ_R(M)     Δ is a constant matrix, the same on each axis
+
+    μ_R(M) = inf over 0 < γ ≤ 1 of σ_2 [[Re M, −γ Im M], [Im M / γ, Re M]],
+
+by the formula of Qiu, Bernhardsson, Rantzer, Davison, Young and Doyle, "A formula for computation of the real stability
+radius", Automatica 31(6), 1995; where z is real, μ_R is σ_1(M). A constant Δ that couples two axes acts as a complex
+one of one axis, so the complex radius is also that of constant disturbances of north and east together.
+
+The worst Δ comes with either radius. The complex one has rank one, and first-order all-pass filters (c + 1/z) /
+(1 + c/z) give each of its entries the phase that it has at the worst frequency, so its size is the same at all others.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf, pi, tau
+
+import numpy as np
+
+from gains.core._bracketing import local_maxima, peaks
+from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.errors import BadModelError
+from gains.performance.disturbed import DisturbedFormation
+from gains.sampled._loop import HeldPlant
+
+# angles per period of the first look, the least of them, and the range of log γ
+_ANGLES, _LEAST_ANGLE, _LEAST_LOG_GAMMA = 400, 1e-5, -14.0
+_GAMMAS = 25
+# entries of the worst disturbance this small beside its largest are none
+_NOTHING = 1e-9
+_ROTATIONS = 180
+
+
+@dataclass(frozen=True, eq=False)
+class Worst:
+    """A stability radius, and the disturbance of that size which makes the loop unstable.
+
+    w = radius · out(z) D in(z) e, with D = `direction` of norm one, and all-pass filters for each column and row: their
+    coefficients c, of which 1 passes an error on as it is.
+    """
+
+    radius_1_s: float
+    """`inf` if no disturbance of these errors makes the loop unstable, and the others are then empty."""
+    frequency_rad_s: float
+    direction: FloatArray
+    all_pass_in: tuple[float, ...] = ()
+    all_pass_out: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class SectorLoop:
+    """The loop of a formation of one axis, and the errors (places in e) from which w is computed and on which it acts.
+
+    A vehicle alone, x' = −x + w sampled at 1 kHz, is unstable from w = x on:
+
+    >>> from gains.formation.model import FormationModel
+    >>> leader = FormationModel((-1,), axes=1)
+    >>> loop = SectorLoop(DisturbedFormation(leader, leader.A, leader.B, np.array([[-1.0]]), 0.001, 0.0), (0,))
+    >>> round(loop.complex_radius().radius_1_s, 9), round(loop.real_radius().radius_1_s, 9)
+    (1.0, 1.0)
+    """
+
+    formation: DisturbedFormation
+    errors: tuple[int, ...]
+
+    def response(self, omega_rad_s: FloatArray) -> ComplexArray:
+        """M at frequencies (k,): from a held w to e, (k, errors, errors)."""
+        z = np.exp(1j * omega_rad_s * self.formation.period_s)[:, np.newaxis, np.newaxis].astype(np.complex128)
+        chosen = list(self.errors)
+        return (self.formation.closed(z)[:, chosen] @ self._entry).astype(np.complex128)
+
+    def complex_radius(self) -> Worst:
+        """The least size of a disturbance that may be any stable filter."""
+
+        def largest(omega: FloatArray) -> FloatArray:
+            return np.linalg.norm(self.response(omega), ord=2, axis=(1, 2)).astype(np.float64)
+
+        omega, peak = self._peak(largest, np.zeros(0), np.zeros(0))
+        if peak <= 0.0:
+            return Worst(inf, 0.0, np.zeros((0, 0)))
+        left, _, right = np.linalg.svd(self.response(np.array([omega]))[0])
+        return self._filtered(1.0 / peak, omega, left[:, 0], right[0].conj())
+
+    def real_radius(self) -> Worst:
+        """The least size of a constant disturbance, the same on each axis."""
+        ends = np.array([0.0, pi / self.formation.period_s])
+        at_ends = np.linalg.norm(self.response(ends).real, ord=2, axis=(1, 2))
+
+        def largest(omega: FloatArray) -> FloatArray:
+            M = self.response(omega)
+            values = np.linalg.norm(M, ord=2, axis=(1, 2)).astype(np.float64)  # μ_R is no larger
+            if (likely := values > at_ends.max()).any():
+                values[likely] = _real_measure(M[likely])[0]
+            return values
+
+        omega, peak = self._peak(largest, ends, at_ends)
+        if peak <= 0.0:
+            return Worst(inf, 0.0, np.zeros((0, 0)))
+        [M] = self.response(np.array([omega]))
+        if omega in ends:
+            left, _, right = np.linalg.svd(M.real)
+            return Worst(1.0 / peak, omega, np.outer(right[0], left[:, 0]))
+        direction = _worst_constant(M, float(_real_measure(M[np.newaxis])[1][0]))
+        return Worst(1.0 / peak, omega, direction)
+
+    @property
+    def _entry(self) -> FloatArray:
+        """What a held w of these errors does to the states in one period, (states, errors)."""
+        formation = self.formation
+        size, T = len(formation.A), formation.period_s
+        if formation.gusts is not None:
+            raise BadModelError("gusts are given; wanted a formation that nothing but w disturbs")
+        acts = np.eye(size)[:, list(self.errors)]
+        return HeldPlant(formation.A, acts, acts.T, T).transition(np.array([T]))[1][0]
+
+    def _peak(
+        self, function: Callable[[FloatArray], FloatArray], more: FloatArray, values: FloatArray
+    ) -> tuple[float, float]:
+        """Frequency and height of the largest value, local maxima refined; `more` frequencies have known values."""
+        T = self.formation.period_s
+        grid = np.geomspace(_LEAST_ANGLE, pi * (1.0 - 1e-9), _ANGLES) / T
+        grid = np.unique(np.concatenate([[0.0] if not more.size else [], grid, self._resonances()]))
+        looked = function(grid)
+        inner = local_maxima(looked)
+        refined = peaks(function, grid[inner - 1], grid[inner + 1]) if inner.size else np.zeros(0)
+        omega = np.concatenate([more, grid, refined])
+        heights = np.concatenate([values, looked, function(refined) if inner.size else refined])
+        at = int(np.argmax(heights))
+        return float(omega[at]), float(heights[at])
+
+    def _resonances(self) -> FloatArray:
+        """The frequencies (rad/s) of the loop's own motions, where narrow peaks are."""
+        z = np.linalg.eigvals(self.formation.period_map())
+        omega = np.abs(np.angle(z[np.abs(z) > 0.5])) / self.formation.period_s
+        return omega[(omega > 0.0) & (omega < (1.0 - 1e-9) * pi / self.formation.period_s)]
+
+    def _filtered(self, radius: float, omega: float, left: ComplexArray, right: ComplexArray) -> Worst:
+        """v u* of rank one as all-pass filters at an angle: a phase common to both is free, and keeps them fast."""
+        angle = omega * self.formation.period_s
+        sizes = np.outer(np.abs(right), np.abs(left))
+        if angle == 0.0 or angle >= pi * (1.0 - 1e-6):
+            return Worst(radius, omega, np.outer(right.real, left.real))
+        entries = [(right, +1), (left, -1)]
+        best: tuple[float, list[FloatArray], list[FloatArray]] = (inf, [], [])
+        for turn in np.linspace(0.0, pi, _ROTATIONS, endpoint=False).tolist():
+            signs: list[FloatArray] = []
+            filters: list[FloatArray] = []
+            for vector, way in entries:
+                phase = way * np.angle(vector * np.exp(1j * turn))
+                sign, c = _all_pass(phase, angle)
+                none = np.abs(vector) <= _NOTHING
+                signs.append(np.where(none, 1.0, sign))
+                filters.append(np.where(none, 1.0, c))
+            worst = max(
+                float(np.abs(c[np.abs(v) > _NOTHING]).max()) for c, (v, _) in zip(filters, entries, strict=True)
+            )
+            if worst < best[0]:
+                best = worst, signs, filters
+        _, (out_signs, in_signs), (out, into) = best
+        direction = sizes * np.outer(out_signs, in_signs)
+        return Worst(radius, omega, direction, tuple(into.tolist()), tuple(out.tolist()))
+
+
+def _all_pass(phase: FloatArray, angle: float) -> tuple[FloatArray, FloatArray]:
+    """Signs s and coefficients c with s (c + e^{−jθ}) / (1 + c e^{−jθ}) = e^{j phase} at θ = angle in (0, π)."""
+    lag = np.mod(-phase, tau)
+    sign = np.where(lag < pi, 1.0, -1.0)
+    lag = np.mod(lag, pi)
+    return sign, np.sin((angle - lag) / 2.0) / np.sin((angle + lag) / 2.0)
+
+
+def _doubled(M: ComplexArray, gamma: FloatArray) -> FloatArray:
+    """[[Re M, −γ Im M], [Im M / γ, Re M]] for each of (k,)."""
+    g = gamma[:, np.newaxis, np.newaxis]
+    above = np.concatenate([M.real, -g * M.imag], axis=2)
+    return np.concatenate([above, np.concatenate([M.imag / g, M.real], axis=2)], axis=1)
+
+
+def _real_measure(M: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """μ_R of each of M (k, n, n), and the γ at which it is attained. σ_2 has one minimum over log γ."""
+
+    def minus(log_gamma: FloatArray) -> FloatArray:
+        values = np.linalg.svd(_doubled(M, np.exp(log_gamma)), compute_uv=False)
+        return -values[:, 1].astype(np.float64)
+
+    logs = np.linspace(_LEAST_LOG_GAMMA, 0.0, _GAMMAS)
+    looked = np.stack([minus(np.full(len(M), each)) for each in logs])
+    best = np.argmax(looked, axis=0)
+    low, high = logs[np.maximum(best - 1, 0)], logs[np.minimum(best + 1, _GAMMAS - 1)]
+    at = peaks(minus, low, high)
+    values, ends = minus(at), looked[best, np.arange(len(M))]
+    gamma = np.where(values >= ends, at, logs[best])
+    return -np.maximum(values, ends), np.exp(gamma)
+
+
+def _worst_constant(M: ComplexArray, gamma: float) -> FloatArray:
+    """The real Δ of least norm with det(I − M Δ) = 0, scaled to norm one.
+
+    With P v = σ u, M (v_1 + jγ v_2) = σ (u_1 + jγ u_2): Δ takes σ u_1 to v_1 and σ u_2 to v_2. It has the norm 1 / σ if
+    |u_1| = |v_1| and u_1'u_2 = v_1'v_2. The first holds where σ_2 is stationary in γ, or for some vector between those
+    of two singular values that meet in the minimum; the second follows from P v = σ u and P'u = σ v.
+    """
+    left, values, right = np.linalg.svd(_doubled(M[np.newaxis], np.array([gamma]))[0])
+    n, pair = len(M), 0 if values[0] - values[1] < values[1] - values[2] else 2
+
+    def excess(j: int, k: int) -> float:
+        return float(left[:n, j] @ left[:n, k] - right[j, :n] @ right[k, :n])
+
+    # turned by t within the pair: excess(1, 1) cos² t + 2 excess(1, pair) cos t sin t + excess(pair, pair) sin² t = 0
+    single, both, other = excess(1, 1), excess(1, pair), excess(pair, pair)
+    size, turn = np.hypot((single - other) / 2.0, both), np.arctan2(both, (single - other) / 2.0)
+    opening = np.arccos(np.clip(-(single + other) / (2.0 * size), -1.0, 1.0)) if size > 0.0 else 0.0
+    found: list[tuple[float, FloatArray]] = []
+    for at in (0.0, (turn + opening) / 2.0, (turn - opening) / 2.0):
+        u, v = (np.cos(at) * w[1] + np.sin(at) * w[pair] for w in (left.T, right))
+        direction = np.stack([v[:n], v[n:]], axis=1) @ np.linalg.pinv(np.stack([u[:n], u[n:]], axis=1))
+        found.append((float(np.linalg.norm(direction, 2)), direction))
+    size, direction = min(found, key=lambda each: abs(each[0] - 1.0))
+    return direction / size

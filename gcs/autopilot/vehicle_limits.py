@@ -1,0 +1,167 @@
+"""What an autopilot follows at most: asked of it as parameters, and kept to by the commands it is sent.
+
+A command beyond these is not followed, and the loop that is then closed is not the one whose margin is known: it cycles
+or overshoots. So far from its place a vehicle is led along a braking curve instead of the linear law.
+"""
+
+from collections.abc import Sequence
+from math import hypot, inf, isfinite, sqrt
+from typing import Any
+
+from gcs.autopilot.kinds import ARDUCOPTER, PX4_COPTER
+from gcs.control.law import Blend, VehicleControl
+from gcs.link import mavlink
+from gcs.link.kinds import Kind
+from gcs.plan.flight_plan import FlightPlan, own_gains
+from scenarios.schema import NS_PER_S
+
+ACCELERATION_M_S2, JERK_M_S3 = 2.0, 4.0
+"""Bounds for a vehicle that does not tell its own."""
+_ACCELERATION_SHARE, _JERK_SHARE = 0.9, 0.8
+"""Of the limits it tells: the velocity loop adds to what is commanded."""
+_BRAKING_SHARE = 0.3
+"""Of the acceleration, for which the braking curve is drawn: the jerk limit and the response take the rest."""
+_PARAMETERS = {
+    ARDUCOPTER.name: (("WPNAV_ACCEL", 0.01), ("PSC_JERK_XY", 1.0), ("GUID_TIMEOUT", 1.0)),
+    PX4_COPTER.name: (("MPC_ACC_HOR", 1.0), ("MPC_JERK_AUTO", 1.0), ("COM_OF_LOSS_T", 1.0)),
+}
+"""Acceleration, jerk and set-point time-out of each kind, and their units in m/s^2, m/s^3 and s."""
+_ATTEMPTS, _PATIENCE_NS = 3, NS_PER_S
+
+
+class ToldLimits:
+    """The limits that one vehicle tells; None while, or if, it does not."""
+
+    def __init__(self) -> None:
+        self.acceleration_m_s2: float | None = None
+        self.jerk_m_s3: float | None = None
+        self.timeout_s: float | None = None
+        self._kind = ""
+        self._asked: dict[str, int] = {}
+        self._not_before_ns = 0
+
+    def next(self, kind: Kind, now_ns: int, *, target_system: int, rtt_ns: int) -> tuple[int, tuple[Any, ...]] | None:
+        """Message id and fields of the question that is due, if any: a few for each parameter, one at a time."""
+        if now_ns < self._not_before_ns or kind.name not in _PARAMETERS:
+            return None
+        self._kind = kind.name
+        for (name, _), known in zip(_PARAMETERS[kind.name], self._values, strict=True):
+            if known is None and self._asked.get(name, 0) < _ATTEMPTS:
+                self._asked[name] = self._asked.get(name, 0) + 1
+                self._not_before_ns = now_ns + max(_PATIENCE_NS, 3 * rtt_ns)
+                return mavlink.PARAM_REQUEST_READ, mavlink.param_request_read(name, target_system=target_system)
+        return None
+
+    def take(self, fields: tuple[Any, ...]) -> None:
+        """Take in a PARAM_VALUE; a value that is no positive number says nothing."""
+        value, _, _, field, _ = fields
+        name = field.partition(b"\0")[0].decode("ascii", "replace")
+        names = [known for known, _ in _PARAMETERS.get(self._kind, ())]
+        if name not in self._asked or not (isfinite(value) and value > 0.0):
+            return
+        self._not_before_ns = 0
+        at = names.index(name)
+        value = round(value * _PARAMETERS[self._kind][at][1], 6)
+        match at:
+            case 0:
+                self.acceleration_m_s2 = value
+            case 1:
+                self.jerk_m_s3 = value
+            case _:
+                self.timeout_s = value
+
+    @property
+    def _values(self) -> tuple[float | None, float | None, float | None]:
+        return self.acceleration_m_s2, self.jerk_m_s3, self.timeout_s
+
+    @property
+    def acceleration_bound_m_s2(self) -> float:
+        """The largest acceleration that the vehicle is sent."""
+        told = self.acceleration_m_s2
+        return ACCELERATION_M_S2 if told is None else _ACCELERATION_SHARE * told
+
+    @property
+    def jerk_bound_m_s3(self) -> float:
+        """How fast that acceleration may change."""
+        return JERK_M_S3 if self.jerk_m_s3 is None else _JERK_SHARE * self.jerk_m_s3
+
+    def in_words(self) -> str:
+        """The bounds, and where they are from."""
+        told = [
+            f"{name} {value:g} {unit}"
+            for (name, _), value, unit in zip(
+                _PARAMETERS.get(self._kind, ()), self._values, ("m/s^2", "m/s^3", "s"), strict=False
+            )
+            if value is not None
+        ]
+        source = ", ".join(told) if told else "it tells no limits"
+        return f"set-points within {self.acceleration_bound_m_s2:g} m/s^2 and {self.jerk_bound_m_s3:g} m/s^3: {source}"
+
+
+class Bounds:
+    """Keeps the commands of a formation to what each vehicle follows."""
+
+    def __init__(self, plan: FlightPlan, limits: Sequence[ToldLimits]) -> None:
+        self._limits = limits
+        self._most_m_s2 = plan.scenario.limits.acceleration_max_m_s2 or inf
+        self._period_s = 1.0 / plan.scenario.rates.control_hz
+        self._gains = [own_gains(plan, K) for K in plan.gains]
+        self._last = [(0.0, 0.0)] * len(limits)
+        self._approaches = [True] * len(limits)
+        """Whether a vehicle is on its way to its place. Once there it is left to the linear law: beyond its margin the
+        braking curve would turn growing errors into a limit cycle, which hides that the loop is unstable."""
+
+    def acceleration_m_s2(self, row: int) -> float:
+        """The largest acceleration that a vehicle is commanded."""
+        return min(self._most_m_s2, self._limits[row].acceleration_bound_m_s2)
+
+    def rest(self, row: int) -> None:
+        """The vehicle is commanded nothing: its next command starts from none."""
+        self._last[row], self._approaches[row] = (0.0, 0.0), True
+
+    def bounded(self, controls: Sequence[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
+        """The commands along the braking curve, within the limits of acceleration and jerk."""
+        return [self._bounded(row, control, blends[row]) for row, control in enumerate(controls)]
+
+    def _bounded(self, row: int, control: VehicleControl, blend: Blend) -> VehicleControl:
+        north, east = control.command_m_s2
+        if not (isfinite(north) and isfinite(east)):
+            return control
+        limit = self.acceleration_m_s2(row)
+        less_north, less_east = self._braking(row, control, blend, _BRAKING_SHARE * limit)
+        north, east = north - less_north, east - less_east
+        north, east = _shortened(north, east, limit)
+        (was_north, was_east), jerk = self._last[row], self._limits[row].jerk_bound_m_s3
+        far = hypot(north - was_north, east - was_east) / (jerk * self._period_s)
+        if far > 1.0:
+            north, east = was_north + (north - was_north) / far, was_east + (east - was_east) / far
+        self._last[row] = north, east
+        return control._replace(command_m_s2=(north, east))
+
+    def _braking(self, row: int, control: VehicleControl, blend: Blend, braking_m_s2: float) -> tuple[float, float]:
+        """What the linear law commands too much, far from its place.
+
+        It approaches at lambda e with lambda = k3 / k1. Beyond e_0 = b / lambda^2 that would need a braking faster than
+        b, so that the speed there is sqrt(2 b (e - e_0 / 2)).
+        """
+        error_north, error_east = control.spacing_error_m
+        error_m = hypot(error_north, error_east)
+        gains = self._gains[blend.flown]
+        if gains is None or not error_m > 0.0:  # NaN for the leader
+            return 0.0, 0.0
+        k1, k3 = gains[row]
+        if not (k1 > 0.0 and k3 > 0.0):
+            return 0.0, 0.0
+        rate = k3 / k1
+        linear_m = braking_m_s2 / rate**2
+        self._approaches[row] &= error_m > linear_m
+        if not self._approaches[row]:
+            return 0.0, 0.0
+        counted_m = sqrt(2.0 * braking_m_s2 * (error_m - linear_m / 2.0)) / rate
+        less = k3 * (1.0 - counted_m / error_m)
+        return less * error_north, less * error_east
+
+
+def _shortened(north: float, east: float, longest: float) -> tuple[float, float]:
+    over = hypot(north, east) / longest
+    return (north / over, east / over) if over > 1.0 else (north, east)

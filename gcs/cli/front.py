@@ -1,0 +1,164 @@
+"""The options of `gcs design --front`, `--at` and of `--links-of`, and what they print."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from gcs.cli.options import out_file, within
+from gcs.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from gains.design.front import Method
+    from gcs.plan.design import Design, LinkPart
+    from gcs.studies.front import FrontFields, PointFields
+    from gcs.studies.prediction import Compared, Comparison
+    from scenarios.schema import Scenario
+
+LinksOf = Annotated[
+    Path | None,
+    typer.Option(
+        "--links-of", metavar="RUN|FILE.tlog", help="choose gains for the links in this run or log (control.for_link)"
+    ),
+]
+Front = Annotated[
+    bool, typer.Option("--front", help="show the best α and decay at loop delays, with and without prediction")
+]
+At = Annotated[
+    float | None, typer.Option("--at", metavar="SECONDS", help="use the point of the front at this loop delay")
+]
+Maximise = Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: what is largest at this point")]
+Predict = Annotated[
+    Literal["on", "off"] | None, typer.Option(help="with --at: over that delay; default whichever is better")
+]
+ComparePrediction = Annotated[
+    bool,
+    typer.Option("--compare-prediction", help="show the loop delay these gains take with prediction, and its price"),
+]
+Picture = Annotated[Path | None, typer.Option(metavar="FILE.svg|png", help="with --front: draw it into this file")]
+Save = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.toml", help="with --at or --links-of: write the scenario with these gains"),
+]
+
+
+def chosen_for(scenario: "Scenario", links_of: Path | None) -> "tuple[Scenario, LinkPart | None]":
+    """The scenario with gains for the links of --links-of, and why these; unchanged without it.
+
+    A scenario without `for_link` gives up its gains, its method and its requirements on margin, alpha and decay.
+    """
+    if links_of is None:
+        return scenario, None
+    from gcs.watch.for_link import OPTION, for_measured_links
+    from scenarios.files import checked
+
+    control = scenario.control
+    if control.for_link == "off":
+        kept = {name: getattr(control, name) for name in ("loop", "string_peak_max", "criteria", "link_headroom")}
+        control = type(control)(for_link="measured", **kept)
+    asked = checked(scenario.model_copy(update={"control": control}), Path(OPTION))
+    return for_measured_links(asked, links_of)
+
+
+def with_link(design: "Design", part: "LinkPart | None") -> "Design":
+    """The design with what was measured of the links."""
+    return design if part is None else design.model_copy(update={"for_link": part})
+
+
+def save_scenario(scenario: "Scenario", file: Path) -> None:
+    """Write a scenario that can be flown."""
+    from scenarios.files import dump
+
+    out_file("--save", file)
+    file.write_text(dump(scenario), encoding="utf-8")
+
+
+def show_front(scenario: "Scenario", method: str | None, picture_file: Path | None, *, as_json: bool) -> None:
+    """Search the front and print it."""
+    from gcs.cli.options import print_json
+    from gcs.studies.front import DELAYS_S, METHODS, front, picture
+    from gcs.views.console import progress
+
+    if method == "graph-dk":
+        raise InputError("--method: read graph-dk, wanted inclusion or graph-lqr with --front or --at")
+    if picture_file is not None:
+        out_file("--picture", picture_file)
+        if picture_file.suffix not in {".svg", ".png", ".pdf"}:
+            raise InputError(f"--picture: read {picture_file}, wanted a file name that ends in .svg, .png or .pdf")
+    methods: Sequence[Method] = [own for own in METHODS if method in (None, own)]
+    with progress(shown=not as_json) as begin:
+        found = front(scenario, methods, DELAYS_S, ended=begin("front"))
+    if picture_file is not None:
+        picture(found, picture_file)
+    if as_json:
+        print_json(found)
+    else:
+        _print_front(found)
+
+
+def _print_front(found: "FrontFields") -> None:
+    from gcs.views.console import ms_text, number_text, plain_console, table_of
+
+    console = plain_console()
+    around = f"stable at every constant delay within {found.tolerated:.0%} of the loop delay"
+    console.print(f"front    each {around}; string peak at most {found.string_peak_max:g} by inclusion")
+    columns: dict[str, Callable[[PointFields], str]] = {
+        "loop delay": lambda p: ms_text(p.loop_delay_s, ".0f"),
+        "largest": lambda p: p.maximised,
+        "method": lambda p: p.method,
+        "prediction": lambda p: "on" if p.prediction else "off",
+        "alpha": lambda p: number_text(p.alpha_design, ".3f"),
+        "whole": lambda p: number_text(p.alpha, ".3f"),
+        "decay, 1/s": lambda p: number_text(p.decay_rate_1_s, ".3f"),
+        "string peak": lambda p: number_text(p.string_peak, ".2f"),
+        "disturbance, s²": lambda p: number_text(p.spacing_gain_s2, ".3f"),
+        "noise": lambda p: number_text(p.noise_gain, ".2f"),
+        "on the front": lambda p: "refused" if p.refused else "yes" if p.is_efficient else "",
+    }
+    console.print(table_of(found.points, columns))
+    for point in (point for point in found.points if point.refused):
+        console.print(
+            f"refused  {point.method}, largest {point.maximised} at {point.loop_delay_s:g} s: {point.refused}"
+        )
+
+
+def show_comparison(design: "Design", name: str, *, as_json: bool) -> None:
+    """Compare the loop delays with prediction and without, and print that."""
+    from gcs.cli.options import answer
+    from gcs.studies.prediction import compared
+
+    answer(compared(design, name), _print_comparison, as_json=as_json)
+
+
+def _print_comparison(found: "Comparison") -> None:
+    from gcs.views.console import ms_text, plain_console, table_of
+
+    columns: dict[str, Callable[[Compared], str]] = {
+        "prediction": lambda w: "off" if w.tolerated is None else f"±{w.tolerated:.0%}",
+        "loop delay": lambda w: ms_text(w.loop_delay_s),
+        "ratio": lambda w: f"{w.ratio:.2f}",
+        "stable between": lambda w: f"{1e3 * w.stable_s[0]:.1f} and {ms_text(w.stable_s[1])}",
+        "decay, 1/s": lambda w: f"{w.decay_rate_1_s:.3f}",
+        "string peak": lambda w: f"{w.string_peak:.2f}",
+        "alpha": lambda w: f"{w.alpha:.3f}",
+        "disturbance, s²": lambda w: f"{w.spacing_gain_s2:.3f}",
+        "noise": lambda w: f"{w.noise_gain:.2f}",
+    }
+    plain_console().print(table_of(found.ways, columns))
+
+
+def scenario_at(
+    scenario: "Scenario", delay_s: float, method: str | None, maximise: str, predict: Literal["on", "off"] | None
+) -> "Scenario":
+    """The scenario with the gains of a point of the front."""
+    from gcs.studies.front import point_at
+
+    within("--at", delay_s, 0.001, 10.0, "seconds")
+    asked = method or scenario.control.method
+    own: Method = "graph-lqr" if asked == "graph-lqr" else "inclusion"
+    if asked == "graph-dk":
+        raise InputError("--method: read graph-dk, wanted inclusion or graph-lqr with --front or --at")
+    aim = "alpha_at_delay" if maximise == "alpha" else "decay_rate_at_delay_1_s"
+    return point_at(scenario, delay_s, own, aim, predict)[0]

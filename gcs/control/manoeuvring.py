@@ -1,0 +1,114 @@
+"""The loop of a formation that manoeuvres: another loop, fed with states relative to the planned motion.
+
+With the planned motion r_k of vehicle k (`gcs.plan.course`), the inner loop sees
+
+    x~_k = x_k - (place_k(t) - place_k(0), r_k'(t)),   each at the instant t of the state,
+
+and computes from it as if the formation flew straight on in the shape it has at the start: its law, its gains and its
+margins do not change. What the plan accelerates is added to its command: r_k'' in the middle of the time over which the
+set-point acts, one-way delay included. So a vehicle that follows the plan has no errors, however long the delay.
+
+Behind a leader that somebody else flies v_d is the velocity this vehicle reports. Its acceleration is not known, so
+none is added for it, and errors grow in its turns.
+"""
+
+from collections.abc import Sequence
+from math import nan
+from typing import Any
+
+from gcs.control.history import Report, Reports, State
+from gcs.control.law import Blend, FeedbackLaw, VehicleControl
+from gcs.control.loops import Loop, Moment, Order, Vector, steady_loop
+from gcs.control.own_law import FlownLaw, OwnLawLoop
+from gcs.plan.course import PlannedMotion
+from gcs.plan.flight_plan import FlightPlan
+from scenarios.schema import NS_PER_S
+
+_ACCELERATION = slice(7, 9)
+"""North and east among the fields of SET_POSITION_TARGET_LOCAL_NED."""
+
+
+def loop_of(plan: FlightPlan, law: FlownLaw | None = None) -> Loop:
+    """The loop that a plan is made for; `law` computes its commands if it is given."""
+    loop = steady_loop(plan) if law is None else OwnLawLoop(plan, law)
+    return ManoeuvringLoop(plan, loop) if plan.scenario.manoeuvres else loop
+
+
+class ManoeuvringLoop:
+    """See `gcs.control.loops.Loop`; `inner` is the loop that closes around the planned motion."""
+
+    def __init__(self, plan: FlightPlan, inner: Loop) -> None:
+        self._inner, self._row = inner, plan.formation.row
+        self._motion = PlannedMotion(plan.scenario, plan.formation)
+        self._start_m = plan.formation.place_ne_m().tolist()
+        self.follows_another = plan.scenario.course.leader == "external"
+        vehicles = range(plan.model.vehicles)
+        self._down_ns = [0 for _ in vehicles]
+        self._half_period_ns = round(plan.timing.step_s * NS_PER_S / 2.0)
+        self._planned: list[tuple[Vector, Vector]] = [((0.0, 0.0), (0.0, 0.0)) for _ in vehicles]
+        """Planned velocity and acceleration of each vehicle while the set-point of the newest tick acts."""
+        self.law, self.parameters = inner.law, inner.parameters
+
+    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+        still = now._replace(nominal_velocity_m_s=(0.0, 0.0))  # the nominal velocity is part of the planned motion
+        controls = self._inner.control(_RelativeStates(self, history, now), law, blends, still)
+        for row, control in enumerate(controls):
+            acts_s = now.time_s + (self._down_ns[row] + self._half_period_ns) * 1e-9
+            _, velocity, more = self._motion.reference(row, acts_s, now.opening)
+            self._planned[row] = velocity, more
+            north, east = control.command_m_s2
+            command = (nan, nan) if self.follows_another and row == 0 else (north + more[0], east + more[1])
+            newest = history.newest(row)
+            state = control.state if newest is None else newest[1]
+            controls[row] = control._replace(state=state, command_m_s2=command)
+        return controls
+
+    def relative(self, row: int, state: State, time_s: float, opening: float, leader: State | None) -> State:
+        """A state relative to the planned motion; `leader` is that of a leader flown by somebody else."""
+        place, velocity, _ = self._motion.reference(row, time_s, opening)
+        start_north, start_east = self._start_m[row]
+        north, east, v_north, v_east = state
+        if leader is not None:
+            velocity = velocity[0] + leader[2], velocity[1] + leader[3]
+        return (
+            north - (place[0] - opening * start_north),
+            east - (place[1] - opening * start_east),
+            v_north - velocity[0],
+            v_east - velocity[1],
+        )
+
+    def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
+        self._down_ns[row] = down_ns
+        self._inner.delivered(row, down_ns, sent_ns)
+
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+        (_, (more_north, more_east)), (north, east) = self._planned[row], acceleration_m_s2
+        self._inner.remember(row, due_ns, (north - more_north, east - more_east))
+
+    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
+        """The inner loop's set-point, as it knows its own part of the command only, with the planned part added."""
+        velocity, (more_north, more_east) = self._planned[self._row(system_id)]
+        north, east = order.control.command_m_s2
+        own = order.control._replace(command_m_s2=(north - more_north, east - more_east))
+        fields = self._inner.set_point(system_id, order._replace(control=own, nominal_velocity_m_s=velocity))
+        return (*fields[: _ACCELERATION.start], north, east, *fields[_ACCELERATION.stop :])
+
+
+class _RelativeStates:
+    """`gcs.control.history.Reports` relative to the planned motion, as of one tick."""
+
+    def __init__(self, loop: ManoeuvringLoop, history: Reports, now: Moment) -> None:
+        self._loop, self._history, self._now = loop, history, now
+
+    def newest(self, vehicle: int) -> Report | None:
+        report = self._history.newest(vehicle)
+        return None if report is None else (report[0], self._relative(vehicle, report[1], report[0]))
+
+    def at(self, vehicle: int, time_ns: int) -> State | None:
+        state = self._history.at(vehicle, time_ns)
+        return None if state is None else self._relative(vehicle, state, time_ns)
+
+    def _relative(self, vehicle: int, state: State, instant_ns: int) -> State:
+        leader = self._history.at(0, instant_ns) if self._loop.follows_another else None
+        time_s = self._now.time_s + (instant_ns - self._now.due_ns) * 1e-9
+        return self._loop.relative(vehicle, state, time_s, self._now.opening, leader)

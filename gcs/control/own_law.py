@@ -1,0 +1,141 @@
+"""A control law of one's own in flight: called once a tick, timed, and never trusted.
+
+The law gets the states of all vehicles at one instant, that of the oldest among their newest states, so that nothing is
+extrapolated; the loop delay counts from that instant. A vehicle for which it gives no usable command, because it raised
+an exception or returned another shape, NaN or infinity, is sent zero acceleration: it holds its velocity. After
+`BAD_IN_A_ROW` such calls in a row the flight ends, and the vehicles hold.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import isfinite, nan
+from typing import Any
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gcs.control.history import Reports
+from gcs.control.law import Blend, FeedbackLaw, VehicleControl, feedback_law, formation_control
+from gcs.control.loops import GroundLoop, Moment
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.own_law import LawFormation, accelerations, law_formation
+
+BUDGET_SHARE = 0.2
+"""Share of the control period that a call of a law may take."""
+BAD_IN_A_ROW = 25
+"""So many calls in a row without a usable command for every vehicle end the flight."""
+LAW = "law"
+"""Kind of the events about a law: its first bad call, and its counts at the end."""
+CALLS, BAD, OVER = "calls", "bad", "over budget"
+Vector = tuple[float, float]
+_HOLD = 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class LawHooks:
+    """What a law needs of the station that flies it."""
+
+    stop: Callable[[str], None] = lambda _: None
+    """Ends the flight for a reason."""
+    note: Callable[[str, dict[str, int] | None], None] = lambda _text, _counts: None
+    """Takes the text of an event, and what it counts."""
+    clock_ns: Callable[[], int] | None = None
+    """Measures how long calls take; None in virtual time, in which nothing may depend on the machine."""
+
+
+class FlownLaw:
+    """The law of a flight, its memory and its record."""
+
+    def __init__(self, plan: FlightPlan, hooks: LawHooks) -> None:
+        assert plan.law is not None
+        self._law, self._hooks = plan.law, hooks
+        self._budget_ns = round(BUDGET_SHARE * plan.timing.step_s * 1e9)
+        self._memory: dict[str, Any] = {}
+        self._counts = Counter({CALLS: 0, BAD: 0} | ({} if hooks.clock_ns is None else {OVER: 0}))
+        self._bad_in_a_row = 0
+
+    def commands(self, t_s: float, states: FloatArray, formation: LawFormation) -> list[Vector]:
+        """The acceleration of each vehicle, zero in place of one that cannot be used; lost vehicles have NaN states."""
+        lost: list[bool] = np.isnan(states[:, 0]).tolist()
+        clock_ns, fault = self._hooks.clock_ns, ""
+        began_ns = 0 if clock_ns is None else clock_ns()
+        try:
+            found = self._called(t_s, states, formation)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the user's law raises
+            found, fault = [(nan, nan)] * len(states), f"{type(error).__name__}: {error}"
+        if clock_ns is not None and clock_ns() - began_ns > self._budget_ns:
+            self._counts[OVER] += 1
+        bad = [row for row, command in enumerate(found) if not lost[row] and not _is_usable(command)]
+        self._counts[CALLS] += 1
+        self._judge(bad, fault or f"returned {found[bad[0]] if bad else ''}", formation)
+        return [command if _is_usable(command) else _HOLD for command in found]
+
+    def report(self) -> None:
+        """Note what has been counted: the flight ends."""
+        texts = (f"{count} {name}" for name, count in self._counts.items())
+        self._hooks.note(", ".join(texts), dict(self._counts))
+
+    def _called(self, t_s: float, states: FloatArray, formation: LawFormation) -> list[Vector]:
+        with np.errstate(all="ignore"):  # what is not finite is counted
+            answer = self._law(t_s, states, formation, self._memory)
+        return [(north, east) for north, east in accelerations(answer, len(states)).tolist()]
+
+    def _judge(self, bad: Sequence[int], fault: str, formation: LawFormation) -> None:
+        if not bad:
+            self._bad_in_a_row = 0
+            return
+        self._bad_in_a_row += 1
+        self._counts[BAD] += 1
+        ids = " ".join(str(formation.system_ids[row]) for row in bad[:8])
+        what = " ".join(f"{fault}, vehicle{'s' * (len(bad) > 1)} {ids}".split())[:200]
+        if self._counts[BAD] == 1:
+            self._hooks.note(f"no usable command: {what}", None)
+        if self._bad_in_a_row == BAD_IN_A_ROW:
+            self._hooks.stop(f"law failed: {BAD_IN_A_ROW} calls in a row without a usable command, the last: {what}")
+
+
+class OwnLawLoop:
+    """The ground loop whose commands a law of one's own computes. See `gcs.control.loops.Loop`."""
+
+    def __init__(self, plan: FlightPlan, law: FlownLaw) -> None:
+        ground, self._plan, self._law = GroundLoop(plan), plan, law
+        self.delivered, self.remember, self.set_point = ground.delivered, ground.remember, ground.set_point
+        self.parameters = ground.parameters
+        self._known: tuple[Vector, float] | None = None
+        self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
+
+    def law(self, lost: Sequence[bool]) -> FeedbackLaw:
+        """The law of gains that are zero: it tells the spacing errors, and who is lost."""
+        return feedback_law(self._plan.formation, (np.zeros_like(self._plan.gain),), lost)
+
+    def control(
+        self,
+        history: Reports,
+        law: FeedbackLaw,
+        blends: Sequence[Blend],
+        now: Moment,
+    ) -> list[VehicleControl]:
+        time_s, velocity_m_s, opening = now.time_s, now.nominal_velocity_m_s, now.opening
+        controls = formation_control(history, law, blends, nominal_velocity_m_s=velocity_m_s, opening=opening)
+        flown = [row for row, own in enumerate(law) if own is not None]
+        instant_ns = min((controls[row].sample_ns for row in flown), default=0)
+        if time_s < 0.0 or instant_ns == 0:  # before the flight, or a vehicle has reported nothing
+            return [control._replace(command_m_s2=(nan, nan)) for control in controls]
+        states = np.full((len(law), 4), nan)
+        for row in flown:
+            states[row] = history.at(row, instant_ns)
+        if self._known != (velocity_m_s, opening):
+            self._known = velocity_m_s, opening
+            period_s = self._plan.timing.step_s
+            self._formation = law_formation(self._plan.formation, velocity_m_s, period_s, opening)
+        commands = self._law.commands(time_s, states, self._formation)
+        return [
+            control if own is None else control._replace(command_m_s2=command, used_ns=instant_ns)
+            for control, own, command in zip(controls, law, commands, strict=True)
+        ]
+
+
+def _is_usable(command: Vector) -> bool:
+    north, east = command
+    return isfinite(north) and isfinite(east)

@@ -1,0 +1,109 @@
+"""Everything that a design can be asked for, as reached by the design of a scenario."""
+
+from math import inf
+
+import numpy as np
+
+from gains.core.errors import BadModelError
+from gains.core.requirement import plain
+from gains.criteria.bound import alpha_bound
+from gains.criteria.figures import LoopFigures
+from gains.formation.model import FormationModel
+from gains.performance.flown import FlownTiming
+from gains.performance.response import Response
+from gains.varying.jitter import Jitter, bound_covering
+from gcs.plan.at_delay import expected_loop_delay_s
+from gcs.plan.design import CriteriaPart, Design
+from gcs.plan.formation import plan_formation
+from scenarios.schema import Scenario
+
+_QUICK_STATES = 12
+"""States of one axis up to which the criteria take too little time to wait for before a flight."""
+
+
+def with_criteria(design: Design, scenario: Scenario, *, most_states: float = _QUICK_STATES) -> Design:
+    """The design with `criteria`, but for those that take long; none with prediction, or if it is unstable."""
+    try:
+        found = _found(design, scenario, most_states)
+    except BadModelError:
+        # gains so large that the delay spans too many turns of the loop
+        return design
+    return design if found is None else design.model_copy(update={"criteria": found})
+
+
+def _found(design: Design, scenario: Scenario, most_states: float) -> CriteriaPart | None:
+    figures = _figures(design, scenario)
+    if figures is None or figures.model.states > most_states or figures.decay_rate_1_s <= 0.0:
+        return None
+    return CriteriaPart(
+        at_delay_s=figures.delay_s or 0.0,
+        damping=figures.damping_min,
+        natural_frequency_rad_s=figures.natural_frequency_max_rad_s,
+        alpha_at_delay=figures.alpha_at_delay,
+        decay_rate_at_delay_1_s=figures.decay_rate_at_delay_1_s,
+        spacing_gain_s2=plain(figures.spacing_gain_max_s2),
+        noise_gain=plain(figures.noise_gain_max) if design.loop == "ground" else None,
+        weight=figures.weight or (1.0, 1.0),
+    )
+
+
+def with_bounds(design: Design, scenario: Scenario) -> Design:
+    """The design with the criteria that take long: α of any controller, and delays that vary."""
+    design = with_criteria(design, scenario, most_states=inf) if design.criteria is None else design
+    figures, found = _figures(design, scenario), design.criteria
+    if figures is None or found is None or design.loop == "onboard":
+        return design
+    more: dict[str, object] = {}
+    period_s, keys = figures.timing.period_s, scenario.control.criteria
+    if figures.weight is None and figures.responses is None:
+        # a vehicle in front that does not hear the one behind: the bound of the follower alone holds for both
+        tree = design.inclusion_gains is not None
+        keep = slice(1, None) if tree else slice(None)
+        A, B = figures.model.A[keep, keep], figures.model.B[keep, keep]
+        more["alpha_bound"] = alpha_bound(A, B, found.at_delay_s + period_s / 2.0)
+    if figures.responses is None and figures.decay_rate_at_delay_1_s > 0.0:
+        spread_s = figures.proved_spread_s(found.at_delay_s, inf)
+        more["delays_jumping_s"] = max(found.at_delay_s - spread_s, 0.0), found.at_delay_s + spread_s
+    if keys is not None and keys.delays_s is not None:
+        low_s, high_s = keys.delays_s
+        rate = inf if keys.delay_rate is None else keys.delay_rate
+        more |= _cover(figures, low_s, high_s, rate)
+    return design.model_copy(update={"criteria": found.model_copy(update=more)})
+
+
+def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> dict[str, object]:
+    """Which bound covers delays from one to another, and up to which delay it does.
+
+    On patterns only that for a spread is tried: the matrix inequalities of the others take minutes there.
+    """
+    hold_s, middle_s, spread_s = figures.timing.period_s / 2.0, (low_s + high_s) / 2.0, (high_s - low_s) / 2.0
+    if figures.model.vehicles > 2 and rate > 0.0:
+        proved_s = figures.proved_spread_s(middle_s, rate)
+        is_covered = proved_s >= spread_s
+        return {
+            "delays_covered_by": "spread" if is_covered else "none",
+            "delays_covered_to_s": middle_s + proved_s if is_covered else None,
+        }
+    jitter = Jitter(middle_s + hold_s, spread_s if rate > 0.0 else 0.0, rate)
+    cover = bound_covering(figures.model.A, figures.model.B @ figures.K, jitter)
+    return {"delays_covered_by": cover.cover, "delays_covered_to_s": plain(cover.bound_s - hold_s)}
+
+
+def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
+    """The figures of a design's fastest gains, of one axis; None where they are not those of the loop that flies."""
+    if design.prediction is not None or design.feed_forward or design.vehicles < 2 or design.margin_unknown:
+        return None
+    step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
+    timing = FlownTiming(inf, design.period_s, design.loop, step_s)
+    known = [Response(v.lag_s, v.velocity_gain_1_s) for v in (design.response.vehicles if design.response else ())]
+    formation = plan_formation(scenario).model
+    if design.inclusion_gains is not None:
+        pair = FormationModel((-1, 0), axes=1)
+        model, gain = pair, pair.overlapping_gain(*([[block[0][0]]] for block in design.inclusion_gains))
+        responses = (max(known, key=lambda own: own.lag_s),) * 2 if known else None
+    else:
+        model, gain = formation.narrowed(np.array(design.K))
+        responses = tuple(known) if known else None
+    keys = scenario.control.criteria
+    delay_s = (keys and keys.at_delay_s) or expected_loop_delay_s(scenario)
+    return LoopFigures(model, gain, timing, delay_s, keys.weight if keys else None, responses)

@@ -1,0 +1,119 @@
+"""How far a scenario's gusts, wind and errors of navigation spread the spacing errors, computed for a loop delay.
+
+Exact for a station that closes every loop with one rate (`gains.performance.disturbed`), with the fastest gains and
+links of one constant delay, if all vehicles sample at one instant. Where their clocks differ the station interpolates
+the state of the vehicle in front between two reports, which averages white noise: the errors reported are then up to
+13 % smaller. A sector and the loop on board have no such figure.
+"""
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gains.formation.model import FormationModel
+from gains.performance.disturbed import DisturbedFormation, Gusts, Sensing
+from gains.performance.predicted import fed_forward
+from gains.performance.radii import SectorLoop
+from gains.performance.response import formation_loop
+from gains.performance.robust import disturbance_bound
+from gcs.plan.at_delay import expected_loop_delay_s
+from gcs.plan.design import Design, PredictedSpread, VehicleSpread, WholeFigures
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import Formation, on_one_axis, plan_formation
+from scenarios.schema import Scenario
+
+
+def with_spread(design: Design, plan: FlightPlan) -> Design:
+    """The design with the spread expected at the loop delay of the scenario's links, and α of the whole formation."""
+    scenario = plan.scenario
+    delay_s = expected_loop_delay_s(scenario)
+    spread = predicted_spread(design, scenario, delay_s)
+    return design.model_copy(update={"spread": spread, "whole": _whole(design, plan, delay_s)})
+
+
+def predicted_spread(design: Design, scenario: Scenario, delay_s: float | None) -> PredictedSpread | None:
+    """The rms of each follower's spacing error; None if nothing disturbs them, or it is not known."""
+    formation = plan_formation(scenario)
+    flown = (
+        None if delay_s is None or design.margin_unknown else disturbed_formation(design, scenario, formation, delay_s)
+    )
+    if flown is None or delay_s is None or not (decay_1_s := flown.decay_1_s()) > 0.0:
+        return None
+    spread, model = flown.spread(), formation.model
+
+    def rms_m(deviation: FloatArray, vehicle: int) -> float:
+        own = model.spacing_slice(vehicle)
+        return float(np.sqrt((deviation[own] ** 2 + spread.mean[own] ** 2).sum()))
+
+    return PredictedSpread(
+        loop_delay_s=delay_s,
+        decay_rate_1_s=decay_1_s,
+        vehicles=tuple(
+            VehicleSpread(
+                system_id=formation.system_ids[i],
+                spacing_error_rms_m=rms_m(spread.true, i),
+                reported_rms_m=rms_m(spread.reported, i),
+            )
+            for i in model.followers
+        ),
+    )
+
+
+def disturbed_formation(
+    design: Design, scenario: Scenario, formation: Formation, delay_s: float
+) -> DisturbedFormation | None:
+    """The loop of a design at a loop delay (s), with what disturbs it."""
+    air, navigation, rates, control = scenario.disturbance, scenario.navigation, scenario.rates, scenario.control
+    K = _gain(design, formation.model)
+    if (air is None and navigation is None) or K is None or control.loop == "onboard":
+        return None
+    if (air is not None and air.sector is not None) or rates.control_hz != rates.telemetry_hz:
+        return None
+    loop = formation.model.A, formation.model.B, K
+    if design.response is not None:
+        if not (known := design.responses):
+            return None
+        loop = formation_loop(formation.model, K, [known[system_id] for system_id in formation.system_ids])
+    assumed_s = delay_s if control.prediction == "measured" else control.prediction
+    gusts = None if air is None else air.gusts
+    return DisturbedFormation(
+        formation.model,
+        *loop,
+        period_s=1.0 / rates.control_hz,
+        delay_s=delay_s,
+        gusts=None if gusts is None else Gusts(gusts.deviation_m_s2, gusts.correlation_time_s, gusts.common),
+        sensing=Sensing() if navigation is None else Sensing(**navigation.model_dump()),
+        wind_m_s2=None if air is None else np.array(air.wind_ne_m_s2),
+        assumed_s=None if isinstance(assumed_s, str) else assumed_s,
+    )
+
+
+def _gain(design: Design, model: FormationModel) -> FloatArray | None:
+    """K of u = K e; None if the design does not hold it."""
+    if design.inclusion_gains is not None:
+        own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
+        return fed_forward(model, model.overlapping_gain(own, front, spacing), design.feed_forward)
+    return None if design.K is None else np.array(design.K)
+
+
+def _whole(design: Design, plan: FlightPlan, delay_s: float) -> WholeFigures | None:
+    """α of the whole formation, where the design's own α is that of one follower."""
+    if (
+        design.margin_unknown
+        or design.inclusion_gains is None
+        or design.vehicles < 2
+        or design.loop == "onboard"
+        or design.response is not None
+    ):
+        return None
+    narrow = on_one_axis(plan.model, plan.gain)
+    if narrow is None:
+        return None
+    model, one = narrow
+    flown = DisturbedFormation(model, model.A, model.B, one, plan.timing.held_s, delay_s, assumed_s=plan.assumed_s)
+    stable = flown.decay_1_s() > 0.0
+    loop = SectorLoop(flown, tuple(range(model.states)))
+    return WholeFigures(
+        alpha=disturbance_bound(model.A + model.B @ one, np.eye(model.states)),
+        loop_delay_s=delay_s,
+        alpha_at_loop_delay=loop.complex_radius().radius_1_s if stable else 0.0,
+    )

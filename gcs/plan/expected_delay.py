@@ -1,0 +1,142 @@
+"""The loop delay that a scenario's links lead to, before it is flown.
+
+On links that only delay it is a sum. Jitter needs more than its mean: no delay is negative, a datagram that must not
+overtake waits for the one before it, and a state that arrives after a newer one is not used. Datagrams are therefore
+drawn as the links would carry them, with a seed of their own, and the median is taken, which flights report as p50 of
+the slowest vehicle. Where datagrams may overtake each other and jitter is as large as the delay, flights were up to 8 %
+faster than this.
+"""
+
+from math import ceil
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from scenarios.keys.link import Jitter, Link
+from scenarios.schema import Scenario
+
+_SECONDS = 200.0
+"""Time over which datagrams are drawn: at 50 Hz the median then has a standard error of about 1 % of the spread."""
+_MOST = 20_000
+"""Most datagrams drawn in one direction."""
+
+
+def expected_loop_delay_s(scenario: Scenario) -> float:
+    """The expected loop delay (s) over the slowest links, at the slowest of their delay points.
+
+    On links that only delay, it is the delay up and down plus half the shorter period of telemetry and control: the
+    first command computed from a state waits from nothing to a whole period, as the phases of vehicle and station
+    happen to be. With jitter or losses it is the median over drawn datagrams. With the loop on board, a state from the
+    slowest link up may be needed on the slowest link down. The time that datagrams wait for a channel is not included
+    (`waits_for_channels`).
+    """
+    links = [scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles]
+    if not any(link.jitter or link.loss_probability or link.loss_bursts for pair in links for link in pair):
+        if scenario.control.loop == "onboard":
+            around_s = max(_constant_s(up) for up, _ in links) + max(_constant_s(down) for _, down in links)
+        else:
+            around_s = max(_constant_s(up) + _constant_s(down) for up, down in links)
+        return around_s + 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
+    rng = np.random.default_rng(0)
+    ages = {up: _ages_s(scenario, up, rng) for up, _ in dict.fromkeys(links)}
+    downs = {down: _arrival_delays_s(scenario, down, rng) for _, down in dict.fromkeys(links)}
+    if scenario.control.loop == "onboard":
+        return max(_median_of_sum(age, down, rng) for age in ages.values() for down in downs.values())
+    return max(_median_of_sum(ages[up], downs[down], rng) for up, down in dict.fromkeys(links))
+
+
+def drawn_loop_delays_s(scenario: Scenario, up: Link, down: Link) -> FloatArray:
+    """Loop delays (s) drawn over one vehicle's links, at random ticks (k,), as `expected_loop_delay_s` draws them."""
+    rng = np.random.default_rng(0)
+    ages = _ages_s(scenario, up, rng)
+    return ages + rng.choice(_arrival_delays_s(scenario, down, rng), len(ages))
+
+
+def waits_for_channels(scenario: Scenario) -> bool:
+    """Whether datagrams wait for limited bandwidth, which the expected loop delay does not include."""
+    return any(
+        link.channel is not None for vehicle in scenario.vehicles for link in scenario.link_of(vehicle.system_id)
+    )
+
+
+def _constant_s(link: Link) -> float:
+    return max((point.delay_s for point in link.delay_points), default=link.delay_s)
+
+
+def _median_of_sum(age_s: FloatArray, down_s: FloatArray, rng: np.random.Generator) -> float:
+    return float(np.median(age_s + rng.choice(down_s, len(age_s))))
+
+
+def _stream(
+    link: Link, rate_hz: float, scenario: Scenario, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Datagrams of a link in order: when each enters, when it comes out, and 1.0 for those at `rate_hz`.
+
+    The others are TIMESYNC exchanges. A lost datagram never comes out; it delays nobody.
+    """
+    span_s = min(_SECONDS, _MOST / rate_hz)
+    often = np.arange(0.0, span_s, 1.0 / rate_hz)
+    exchanges = np.arange(0.37 / rate_hz, span_s, 1.0 / min(scenario.rates.timesync_hz, rate_hz))
+    enters = np.concatenate([often, exchanges])
+    order = np.argsort(enters, kind="stable")
+    enters, main = enters[order], (order < len(often)).astype(float)
+    out = enters + np.maximum(0.0, _constant_s(link) + _drawn_s(link.jitter, len(enters), rng))
+    lost = rng.random(len(enters)) < _loss(link)
+    out[lost] = -np.inf
+    if not link.reordering:
+        out = np.maximum.accumulate(out)
+    out[lost] = np.inf
+    return enters, out, main
+
+
+def _arrival_delays_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatArray:
+    """One-way delays of the datagrams that come out."""
+    enters, out, _ = _stream(link, scenario.rates.control_hz, scenario, rng)
+    return (out - enters)[np.isfinite(out)] if np.isfinite(out).any() else np.array([_constant_s(link)])
+
+
+def _ages_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatArray:
+    """Ages of the newest state at random ticks, less how long slower telemetry was repeated."""
+    rates = scenario.rates
+    enters, out, main = _stream(link, rates.telemetry_hz, scenario, rng)
+    known = (main > 0.0) & np.isfinite(out)
+    sampled, out = enters[known], out[known]
+    ticks = rng.uniform(0.0, enters[-1], _MOST // 2)
+    if not len(out):
+        return np.full(len(ticks), _constant_s(link))
+    order = np.argsort(out, kind="stable")
+    arrived, newest = out[order], np.maximum.accumulate(sampled[order])
+    place = np.searchsorted(arrived, ticks, side="right") - 1
+    ticks, place = ticks[place >= 0], place[place >= 0]
+    first = np.searchsorted(newest, newest[place], side="left")  # the arrival that brought this state
+    period_s = 1.0 / rates.control_hz
+    longest_s = (ceil(rates.control_hz / rates.telemetry_hz * (1.0 - 1e-4)) - 1) * period_s
+    repeated = np.minimum(np.floor((ticks - arrived[first]) / period_s) * period_s, longest_s)
+    ages = ticks - newest[place] - repeated
+    return np.resize(ages, _MOST // 2) if len(ages) else np.full(_MOST // 2, _constant_s(link))
+
+
+def _loss(link: Link) -> float:
+    """Mean fraction of datagrams that are lost."""
+    if (bursts := link.loss_bursts) is None:
+        return link.loss_probability
+    bad = bursts.to_bad_probability / (bursts.to_bad_probability + bursts.to_good_probability)
+    return bad * bursts.loss_bad_probability + (1.0 - bad) * bursts.loss_good_probability
+
+
+def _drawn_s(jitter: Jitter | None, count: int, rng: np.random.Generator) -> FloatArray:
+    if jitter is None:
+        return np.zeros(count)
+    scale_s, shape = jitter.scale_s or 0.0, jitter.shape or 1.0
+    match jitter.distribution:
+        case "uniform":
+            return rng.uniform(-scale_s, scale_s, count)
+        case "normal":
+            return rng.normal(0.0, scale_s, count)
+        case "exponential":
+            return rng.exponential(scale_s, count)
+        case "gamma":
+            return rng.gamma(shape, scale_s, count)
+        case "trace":
+            trace = np.array(jitter.trace_s or (0.0,))
+            return np.resize(np.roll(trace, -int(rng.integers(len(trace)))), count)

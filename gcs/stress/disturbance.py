@@ -1,0 +1,225 @@
+"""How large a disturbance w = D e breaks the formation in flight: `gcs stress --disturbance`.
+
+The stability radii of the loop as flown (`gains.performance.radii`) say how large the worst one is, and which one it
+is. The vehicles apply it to themselves, from their true errors (`sim_vehicles.motion.sector`). Its size is raised
+around the radius, and growth measured in each flight; the size at which growth passes zero is the onset.
+
+The flights are probes, as those of `gcs.stress.free_response`, in which every vehicle has an error at the start.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import inf, pi
+from typing import Literal
+
+import numpy as np
+
+from gains.performance.disturbed import DisturbedFormation
+from gains.performance.radii import SectorLoop, Worst
+from gcs.drive.flown import first_uses, fly_virtual, median_delays_s
+from gcs.errors import InputError
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.formation import on_one_axis
+from gcs.published import Published
+from gcs.stress.axes import has_constant_links
+from gcs.stress.free_response import linear_until_s, probe_scenario
+from gcs.stress.growth import GrowthPoint, Zero, fit_growth, locate_zero, motion_of
+from scenarios.keys.disturbance import Disturbance, Sector
+from scenarios.schema import Scenario
+
+Kind = Literal["dynamic", "constant"]
+KINDS: tuple[Kind, ...] = "dynamic", "constant"
+
+_ERROR_M = 5.0
+_PILOT_S = 2.0
+_SIZES = (-1.0, 0.1, 1.0)
+"""Sizes flown in a round, in tolerances from its middle."""
+_ROUNDS = 6
+_SETTLED_S, _TURNS, _SHORTEST_S, _LONGEST_S = 8.0, 2.0, 20.0, 120.0
+"""A flight lasts until the other motions, filters included, are gone, and for some turns of the one that grows."""
+_LINEAR_SHARE = 0.8
+_MODES = 12
+
+
+class DisturbanceOnset(Published):
+    """Where one kind of disturbance breaks the formation: predicted, and flown."""
+
+    kind: Kind
+    vehicles: tuple[int, ...]
+    """Whose errors cause it and are disturbed."""
+    radius_1_s: float
+    frequency_rad_s: float
+    onset_1_s: float | None
+    """None if growth did not pass zero in any flight."""
+    error_1_s: float | None
+    difference: float | None
+    flights: int
+
+
+class DisturbanceResult(Published):
+    """The onsets of a scenario at one loop delay."""
+
+    scenario: str
+    loop_delay_s: float
+    onsets: tuple[DisturbanceOnset, ...]
+    assert_onset: float | None = None
+    failure: str | None = None
+
+
+@dataclass(frozen=True)
+class Case:
+    """One onset to find: the loop of one axis, whose errors are disturbed, and the worst disturbance of them."""
+
+    kind: Kind
+    vehicles: tuple[int, ...]
+    loop: SectorLoop
+    worst: Worst
+
+    def scenario(self, probe: Scenario, size_1_s: float, *, duration_s: float) -> Scenario:
+        """A probe with the worst disturbance at a size."""
+        count, chosen = self.loop.formation.model.states, list(self.loop.errors)
+        whole = np.zeros((count, count))
+        whole[np.ix_(chosen, chosen)] = self.worst.direction
+
+        def spread(coefficients: tuple[float, ...]) -> tuple[float, ...]:
+            if not coefficients:
+                return ()
+            every = np.ones(count)
+            every[chosen] = coefficients
+            return tuple(every.tolist())
+
+        sector = Sector(
+            norm_1_s=size_1_s,
+            direction=tuple(tuple(row) for row in whole.tolist()),
+            all_pass_in=spread(self.worst.all_pass_in),
+            all_pass_out=spread(self.worst.all_pass_out),
+        )
+        return probe.model_copy(update={"disturbance": Disturbance(sector=sector), "duration_s": duration_s})
+
+
+def find_disturbance_onsets(
+    plan: FlightPlan,
+    *,
+    tolerance: float,
+    allowed: float | None = None,
+    kinds: Sequence[Kind] = KINDS,
+    counts: Sequence[int] = (),
+    ended: Callable[[], None] = lambda: None,
+) -> DisturbanceResult:
+    """Fly the worst disturbances around the stability radii, of the errors of the first `counts` vehicles.
+
+    By default these are one follower with the leader, and the whole formation. `ended` is called after each flight.
+    Raises InputError if the scenario's loop has no such radii.
+    """
+    probe, delay_s = _probe(plan)
+    onsets = tuple(
+        _onset(plan, probe, case, tolerance, ended) for case in cases(plan, delay_s, kinds=kinds, counts=counts)
+    )
+    failure = None
+    if allowed is not None:
+        off = [o for o in onsets if o.difference is None or abs(o.difference) > allowed]
+        failure = f"{len(off)} of {len(onsets)} onsets are farther than {allowed:.3%} from the radius" if off else None
+    return DisturbanceResult(
+        scenario=plan.scenario.name, loop_delay_s=delay_s, onsets=onsets, assert_onset=allowed, failure=failure
+    )
+
+
+def refusal(scenario: Scenario) -> str | None:
+    """Why no disturbance of this scenario is flown, as key, read and wanted; None if it can be."""
+    control, links = scenario.control, {scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
+    wanted = "with --disturbance"
+    if len(scenario.vehicles) < 2:
+        return f"vehicles: read 1 vehicle, wanted two or more {wanted}"
+    if control.loop == "onboard":
+        return f"control.loop: read 'onboard', wanted ground {wanted}"
+    if scenario.rates.control_hz != scenario.rates.telemetry_hz:
+        return f"rates.telemetry_hz: read {scenario.rates.telemetry_hz:g}, wanted rates.control_hz {wanted}"
+    if len(links) > 1 or not has_constant_links(scenario):
+        return f"links: read several or random ones, wanted one constant delay for all vehicles {wanted}"
+    return None
+
+
+def cases(plan: FlightPlan, delay_s: float, *, kinds: Sequence[Kind] = KINDS, counts: Sequence[int] = ()) -> list[Case]:
+    """The onsets to find at a loop delay (s), of the errors of the first `counts` vehicles.
+
+    Raises InputError if gains differ north and east, or couple them.
+    """
+    narrow = on_one_axis(plan.model, plan.gain)
+    if narrow is None:
+        raise InputError("gains: read gains that differ north and east, wanted the same on both with --disturbance")
+    model, K = narrow
+    T = plan.timing.control_s
+    formation = DisturbedFormation(model, model.A, model.B, K, T, delay_s, assumed_s=plan.assumed_s)
+    found: list[Case] = []
+    for count in dict.fromkeys(counts or (2, model.vehicles)):
+        loop = SectorLoop(formation, tuple(range(2 * count - 1)))
+        ids = plan.formation.system_ids[:count]
+        radii = {"dynamic": loop.complex_radius, "constant": loop.real_radius}
+        found += [Case(kind, ids, loop, radii[kind]()) for kind in kinds]
+    return found
+
+
+def _probe(plan: FlightPlan) -> tuple[Scenario, float]:
+    """The flight that the disturbance is added to, and its loop delay (s)."""
+    ids = plan.formation.system_ids
+    pilot = fly_virtual(replace(plan, scenario=_calm(plan.scenario, _PILOT_S)))
+    up, down = plan.scenario.link_of(ids[0])
+    waiting_s = max(median_delays_s(first_uses(pilot.ticks), ids).values()) - up.delay_s - down.delay_s
+    probe = probe_scenario(
+        plan, ids, amplitude=_ERROR_M, links=(up, down), waiting_s=round(waiting_s, 6) % plan.timing.step_s
+    )
+    calm = fly_virtual(replace(plan, scenario=_calm(probe, _PILOT_S)))
+    return probe, round(max(median_delays_s(first_uses(calm.ticks), ids).values()), 6)
+
+
+def _calm(scenario: Scenario, duration_s: float) -> Scenario:
+    return scenario.model_copy(update={"disturbance": None, "navigation": None, "duration_s": duration_s})
+
+
+def _onset(
+    plan: FlightPlan, probe: Scenario, case: Case, tolerance: float, ended: Callable[[], None]
+) -> DisturbanceOnset:
+    radius, omega = case.worst.radius_1_s, case.worst.frequency_rad_s
+    turns_s = _TURNS * 2.0 * pi / omega if omega > 0.0 else 0.0
+    duration_s = min(max(_SETTLED_S + turns_s, _SHORTEST_S), _LONGEST_S)
+    points: list[GrowthPoint] = []
+    zero, middle, width = None, radius, tolerance * radius
+    for _ in range(_ROUNDS if radius < inf else 0):
+        for part in _SIZES:
+            size = max(0.0, middle + part * width)
+            points += _flown(plan, case.scenario(probe, size, duration_s=duration_s), size)
+            ended()
+        zero = locate_zero([point for point in points if abs(point.loop_delay_s - middle) <= 1.001 * width])
+        if zero is not None and zero.inside:
+            break
+        # nothing is known but the side: growth above zero everywhere says that the onset is at a smaller size
+        middle += _way(zero, points, middle, width)
+    inside = zero if zero is not None and zero.inside else None
+    onset = None if inside is None else inside.loop_delay_s
+    return DisturbanceOnset(
+        kind=case.kind,
+        vehicles=case.vehicles,
+        radius_1_s=radius,
+        frequency_rad_s=omega,
+        onset_1_s=onset,
+        error_1_s=None if inside is None else inside.error_s,
+        difference=None if onset is None else onset / radius - 1.0,
+        flights=len(points),
+    )
+
+
+def _way(zero: Zero | None, points: Sequence[GrowthPoint], middle: float, width: float) -> float:
+    """How far to the next middle: to where growth seems to pass zero, three widths at most."""
+    if zero is not None:
+        return float(np.clip(zero.loop_delay_s - middle, -3.0 * width, 3.0 * width))
+    return -2.0 * width if min(point.growth_1_s for point in points) > 0.0 else 2.0 * width
+
+
+def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> list[GrowthPoint]:
+    """The growth measured in one flight; `GrowthPoint.loop_delay_s` is the size here. Empty if nothing was measured."""
+    flight, ids = fly_virtual(replace(plan, scenario=scenario)), plan.formation.system_ids
+    rows = flight.ticks[flight.ticks["commanded"] & (flight.ticks["time_s"] >= 0.0)]
+    motion = motion_of(flight.ticks, ids, period_s=plan.timing.control_s)
+    until_s = linear_until_s(scenario, rows, share=_LINEAR_SHARE)
+    growth = fit_growth(motion, start_s=_SETTLED_S, end_s=until_s, modes=_MODES)
+    return [] if growth is None else [GrowthPoint(size_1_s, growth.growth_1_s, growth.error_1_s)]

@@ -1,0 +1,179 @@
+"""`gcs design --front` and `--at`: what can be had at a loop delay, by every route, with and without prediction."""
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Literal
+
+from gains.core.requirement import plain
+from gains.design.front import AIMS, Aim, FrontPoint, FrontSearch, Method, Refusal, Route, efficient
+from gcs.errors import InputError
+from gcs.plan.flight_plan import loop_timing
+from gcs.plan.formation import plan_formation
+from gcs.plan.given import with_gain, with_given
+from gcs.plan.planner import pattern_of
+from gcs.published import Published
+from gcs.views.page import figure_of, saved
+from scenarios.schema import FixedGains, Scenario
+
+METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr")
+DELAYS_S = 0.1, 0.3, 0.6, 1.5
+MOST_VEHICLES = 12
+"""The figures are those of the whole formation; of larger ones they take minutes."""
+Prediction = Literal["on", "off"]
+_COLOURS = {"inclusion": "#1f4e79", "graph-lqr": "#c1440e"}
+_AIM_NAMES: dict[Aim, str] = {"alpha_at_delay": "alpha", "decay_rate_at_delay_1_s": "decay"}
+
+
+class PointFields(Published):
+    """A point of the front, as it is printed; a route that has none says why."""
+
+    method: Method
+    prediction: bool
+    maximised: str
+    loop_delay_s: float
+    alpha: float | None = None
+    alpha_design: float | None = None
+    decay_rate_1_s: float | None = None
+    string_peak: float | None = None
+    spacing_gain_s2: float | None = None
+    noise_gain: float | None = None
+    stable_s: tuple[float, float | None] | None = None
+    is_efficient: bool = False
+    refused: str = ""
+    K: tuple[tuple[float, ...], ...] = ()
+
+
+class FrontFields(Published):
+    """A front, as --json prints it."""
+
+    scenario: str
+    tolerated: float
+    string_peak_max: float
+    points: tuple[PointFields, ...]
+
+
+def front(
+    scenario: Scenario, methods: Sequence[Method], delays_s: Sequence[float], *, ended: Callable[[int], None]
+) -> FrontFields:
+    """The front at these delays; `ended` is called after each point with the number still to come."""
+    search, routes = searched_in(scenario), list(product_of(methods, (False, True), AIMS))
+    left, points, refused = len(routes) * len(delays_s), list[FrontPoint](), list[Refusal]()
+    for found in search.points(routes, delays_s):
+        points += [found] if isinstance(found, FrontPoint) else []
+        refused += [found] if isinstance(found, Refusal) else []
+        left -= 1
+        ended(left)
+    every = [*map(fields_of, efficient(points)), *map(_refusal_fields, refused)]
+    every.sort(key=lambda own: (own.loop_delay_s, own.maximised, own.method, own.prediction))
+    return FrontFields(
+        scenario=scenario.name,
+        tolerated=search.tolerated,
+        string_peak_max=scenario.control.string_peak_max,
+        points=tuple(every),
+    )
+
+
+def product_of(methods: Sequence[Method], predicted: Sequence[bool], aims: Sequence[Aim]) -> Iterator[Route]:
+    """Every route."""
+    return (Route(*each) for each in product(methods, predicted, aims))
+
+
+def searched_in(scenario: Scenario) -> FrontSearch:
+    """The search of a scenario's formation. Raises InputError where a front is not defined."""
+    if scenario.dynamics == "autopilot" or scenario.control.loop == "onboard":
+        raise InputError(
+            f"{scenario.name}: read dynamics autopilot or loop onboard, wanted neither with --front or --at"
+        )
+    if len(scenario.vehicles) > MOST_VEHICLES:
+        wanted = f"at most {MOST_VEHICLES} with --front or --at; gains by inclusion are those of a smaller formation"
+        raise InputError(f"{scenario.name}: read {len(scenario.vehicles)} vehicles, wanted {wanted}")
+    formation = plan_formation(scenario)
+    cleared = scenario.model_copy(update={"control": scenario.control.model_copy(update={"blocks": ()})})
+    return FrontSearch(
+        formation.model,
+        pattern_of(cleared, formation),
+        loop_timing(scenario).held_s,
+        string_peak_max=scenario.control.string_peak_max,
+    )
+
+
+def point_at(
+    scenario: Scenario, delay_s: float, method: Method, aim: Aim, prediction: Prediction | None
+) -> tuple[Scenario, PointFields]:
+    """The scenario with the gains of a point of the front; with or without prediction, or else the better of both.
+
+    Raises InputError if no gains take the delay.
+    """
+    predicted = (False, True) if prediction is None else (prediction == "on",)
+    found = list(searched_in(scenario).points(list(product_of((method,), predicted, (aim,))), (delay_s,)))
+    points = [own for own in found if isinstance(own, FrontPoint)]
+    if not points:
+        reasons = "; ".join(own.reason for own in found if isinstance(own, Refusal))
+        raise InputError(f"--at: read {delay_s:g} s, wanted a loop delay that gains take: {reasons}")
+    best = max(points, key=lambda own: own.alpha if aim == "alpha_at_delay" else own.decay_rate_1_s)
+    late: float | Literal["off"] = delay_s if best.route.predicted else "off"
+    if method != "inclusion":
+        return with_gain(scenario, best.K, prediction=late), fields_of(best)
+    k1, k2, k3 = _inclusion(best)
+    return with_given(scenario, gains=FixedGains(K1=k1, K2=k2, K3=k3), prediction=late), fields_of(best)
+
+
+def _inclusion(point: FrontPoint) -> tuple[float, float, float]:
+    """K1, K2 and K3 of a gain by inclusion; a leader alone has K1 only."""
+    K = point.K
+    return (float(K[0, 0]), 0.0, 1.0) if len(K) == 1 else (float(K[1, 2]), float(K[1, 0]), float(K[1, 1]))
+
+
+def fields_of(point: FrontPoint) -> PointFields:
+    """A point as it is printed."""
+    return PointFields(
+        method=point.route.method,
+        prediction=point.route.predicted,
+        maximised=_AIM_NAMES[point.route.aim],
+        loop_delay_s=point.delay_s,
+        alpha=point.alpha,
+        alpha_design=point.alpha_design,
+        decay_rate_1_s=point.decay_rate_1_s,
+        string_peak=point.string_peak,
+        spacing_gain_s2=plain(point.spacing_gain_s2),
+        noise_gain=plain(point.noise_gain),
+        stable_s=(point.stable_s[0], plain(point.stable_s[1])),
+        is_efficient=point.is_efficient,
+        K=point.K.tolist(),
+    )
+
+
+def _refusal_fields(own: Refusal) -> PointFields:
+    return PointFields(
+        method=own.route.method,
+        prediction=own.route.predicted,
+        maximised=_AIM_NAMES[own.route.aim],
+        loop_delay_s=own.delay_s,
+        refused=own.reason,
+    )
+
+
+def picture(found: FrontFields, file: Path) -> Path:
+    """Draw a front: each figure of its points over the loop delay, as PNG, SVG or PDF by the name of the file."""
+    figures = {
+        "alpha": "α of the whole formation, 1/s",
+        "decay_rate_1_s": "decay, 1/s",
+        "string_peak": "string peak",
+        "spacing_gain_s2": "disturbance to spacing error, s²",
+    }
+    figure, plots = figure_of(2, (10.0, 7.0), (1.0, 1.0), columns=2)
+    for plot, (name, title) in zip(plots.flat, figures.items(), strict=True):
+        plot.set(title=title, xscale="log", yscale="linear" if name in {"alpha", "string_peak"} else "log")
+        for method, predicted, aim in product(METHODS, (False, True), _AIM_NAMES.values()):
+            own = [p for p in found.points if (p.method, p.prediction, p.maximised) == (method, predicted, aim)]
+            own = [p for p in own if getattr(p, name) is not None]
+            if own:
+                label = f"{method}, {'predicted' if predicted else 'not predicted'}, largest {aim}"
+                style = {"marker": "o" if aim == "alpha" else "s", "linestyle": "-" if predicted else "--"}
+                delays_s, values = [p.loop_delay_s for p in own], [getattr(p, name) for p in own]
+                plot.plot(delays_s, values, color=_COLOURS[method], label=label, markersize=4, **style)
+    for plot in plots[-1]:
+        plot.set_xlabel("loop delay, s")
+    plots[0, 0].legend(fontsize=6)
+    return saved(figure, file)

@@ -1,0 +1,171 @@
+"""report.html of a flight: its verdict, headroom, errors, links and events on one page that needs nothing else."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gcs.control.tick import Event, Mode, TickArray
+from gcs.plan.design import Design
+from gcs.runs.files import RunTail, by_tick, read_design, read_scenario, read_ticks
+from gcs.runs.record import DESIGN_FILE, SUMMARY_FILE, write_whole
+from gcs.runs.summary_record import Summary
+from gcs.views.page import rendered
+from gcs.views.report import flight_lines
+from gcs.views.svg import COLOURS, OTHERS, Level, Line, chart
+from scenarios.schema import Scenario
+
+REPORT_FILE = "report.html"
+_TEMPLATE = "flight_report.html.j2"
+_NAMED = len(COLOURS)
+"""Vehicles that get a colour of their own; of more, those with the least headroom."""
+_NAMED_OF_MANY = 3
+_MOST_EVENTS = 60
+_HEADROOM_LEAST = -1.0
+"""Headrooms below this are drawn at the lower edge."""
+_MODE_COLOURS = {
+    Mode.NOMINAL: "#2e7d32",
+    Mode.RECOVERING: "#00838f",
+    Mode.CAUTION: "#f0a020",
+    Mode.CRITICAL: "#c62828",
+    Mode.FAILSAFE: "#8e24aa",
+    Mode.LOST: "#5d1620",
+    Mode.WAITING: "#9aa3ad",
+}
+
+
+class Charted(NamedTuple):
+    """A chart with its heading and what its lines are."""
+
+    title: str
+    svg: str
+    note: str
+
+
+def leave_report(folder: Path, summary: Summary) -> Summary:
+    """Write report.html of a run that has ended; returns the summary with that file, which summary.json then names.
+
+    A report that cannot be written is named in `not_logged`.
+    """
+    file = folder / REPORT_FILE
+    scenario, design = read_scenario(folder), read_design(folder / DESIGN_FILE)
+    ticks = by_tick(read_ticks(folder), [vehicle.system_id for vehicle in scenario.vehicles])
+    page = flight_page(summary, scenario, design, ticks, RunTail(folder).events())
+    files = tuple(sorted({*summary.files, REPORT_FILE}))
+    reported = summary.model_copy(update={"files": files})
+    try:
+        write_whole(file, page.encode())
+        write_whole(folder / SUMMARY_FILE, reported.to_json().encode())
+    except OSError as error:
+        lost = (*summary.not_logged, f"{REPORT_FILE}: {error.strerror or error}")
+        return summary.model_copy(update={"not_logged": lost})
+    return reported
+
+
+def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: TickArray, events: Sequence[Event]) -> str:
+    """The page, as HTML; `ticks` have shape (ticks, vehicles)."""
+    flown = ticks[ticks["time_s"][:, 0] >= 0.0] if ticks.size else ticks
+    least = _least_headroom(flown)
+    named = _named(least)
+    labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
+    colours = [COLOURS[named.index(k) % len(COLOURS)] if k in named else OTHERS for k in range(len(labels))]
+    return rendered(
+        _TEMPLATE,
+        summary=summary,
+        lines=flight_lines(summary),
+        design=design,
+        charts=_charts(scenario, flown, labels, colours) if flown.size else [],
+        key=[(labels[k], colours[k]) for k in sorted(named)],
+        others=len(labels) - len(named),
+        modes=_mode_bars(flown, labels),
+        mode_key=[(mode.name, _MODE_COLOURS[mode]) for mode in _MODE_COLOURS if mode in flown["mode"]],
+        headroom_min={vehicle.system_id: left for vehicle, left in zip(scenario.vehicles, least, strict=True)},
+        events=[event for event in events if event.time_s >= 0.0][:_MOST_EVENTS],
+        left_out=max(0, sum(event.time_s >= 0.0 for event in events) - _MOST_EVENTS),
+    )
+
+
+def _least_headroom(flown: TickArray) -> list[float | None]:
+    """Of each vehicle, None where it is unknown."""
+    least = np.fmin.reduce(np.where(flown["commanded"], flown["headroom"], np.nan), axis=0, initial=np.nan)
+    return [float(value) if np.isfinite(value) else None for value in np.atleast_1d(least)]
+
+
+def _named(least: Sequence[float | None]) -> list[int]:
+    """The vehicles, by their places, that charts tell apart: all, or those with the least headroom."""
+    if len(least) <= _NAMED:
+        return list(range(len(least)))
+    known = [np.inf if value is None else value for value in least]
+    return np.argsort(known, kind="stable")[:_NAMED_OF_MANY].tolist()
+
+
+def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: list[str]) -> list[Charted]:
+    time_s = flown["time_s"][:, 0]
+    sent = flown["commanded"]
+
+    def lines(values: FloatArray, *, dashed: bool = False) -> list[Line]:
+        return [
+            Line(values[:, k], "" if colour == OTHERS else label, colour, dashed)
+            for k, (label, colour) in enumerate(zip(labels, colours, strict=True))
+        ]
+
+    headroom = np.where(sent, flown["headroom"], np.nan)
+    monitor = scenario.monitor
+    levels = [
+        Level(monitor.caution_headroom, "caution", _MODE_COLOURS[Mode.CAUTION]),
+        Level(monitor.critical_headroom, "critical", _MODE_COLOURS[Mode.CRITICAL]),
+    ]
+    lowest = float(np.nanmin(headroom, initial=0.0))
+    delay_ms = 1e3 * np.where(sent, flown["loop_delay_s"], np.nan)
+    margin_ms = 1e3 * np.where(np.isfinite(flown["delay_margin_s"]), flown["delay_margin_s"], np.nan)
+    error_m = np.hypot(flown["spacing_error_north_m"], flown["spacing_error_east_m"])
+    return [
+        Charted(
+            "Headroom",
+            chart(
+                time_s,
+                lines(headroom),
+                title="headroom over time",
+                unit="1 − loop delay / margin",
+                levels=levels,
+                least=max(_HEADROOM_LEAST, min(0.0, lowest)),
+                most=1.0,
+            ),
+            "At 0 the loop delay has reached the margin of the gains that are flown.",
+        ),
+        Charted(
+            "Loop delay and margin",
+            chart(
+                time_s,
+                [*lines(delay_ms), *lines(margin_ms, dashed=True)],
+                title="loop delay and delay margin over time",
+                unit="ms",
+                least=0.0,
+            ),
+            "Solid: each vehicle's loop delay. Dashed: the margin of its gains at that time; where the monitor takes "
+            "slower gains, it rises.",
+        ),
+        Charted(
+            "Spacing errors",
+            chart(time_s, lines(error_m), title="spacing errors over time", unit="m", least=0.0),
+            "Distance of each follower from its place behind the vehicle in front.",
+        ),
+    ]
+
+
+def _mode_bars(flown: TickArray, labels: list[str]) -> list[tuple[str, list[tuple[str, float, str]]]]:
+    """Of each vehicle that was ever in another mode than NOMINAL: its modes in turn, share of the time and colour."""
+    bars: list[tuple[str, list[tuple[str, float, str]]]] = []
+    for k, label in enumerate(labels):
+        mode = flown["mode"][:, k]
+        if mode.size == 0 or (mode == Mode.NOMINAL).all():
+            continue
+        starts = np.flatnonzero(np.diff(mode, prepend=-1)).tolist()
+        turns = [
+            (Mode(int(mode[start])), 100.0 * (end - start) / len(mode))
+            for start, end in zip(starts, [*starts[1:], len(mode)], strict=True)
+        ]
+        bars.append((label, [(own.name, share, _MODE_COLOURS[own]) for own, share in turns]))
+    return bars

@@ -1,0 +1,179 @@
+"""Gains for the links that one has: their loop delay and its spread from a log, and the best gains at these.
+
+The one-way delays and losses of each vehicle in the log are drawn again at the rates of the scenario. Two designs are
+compared at the least and at the worst of these delays: gains without prediction, and gains with prediction over the
+median delay. Either keeps the wanted headroom at the worst delay.
+"""
+
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+
+import numpy as np
+
+from gains.core.errors import GainsError
+from gains.core.requirement import Criteria, Requirement
+from gains.criteria.figures import LoopFigures
+from gains.criteria.predicted import PredictedFigures
+from gains.design.for_delay import criteria_gains
+from gains.design.front import Aim
+from gains.design.predicted import predicted_gains
+from gains.formation.model import FormationModel
+from gains.performance.flown import FlownLoop, FlownTiming
+from gains.performance.scalar_gains import ScalarGains
+from gcs.errors import InputError
+from gcs.plan.design import LinkGains, LinkPart
+from gcs.plan.expected_delay import drawn_loop_delays_s
+from gcs.plan.flight_plan import loop_timing
+from gcs.plan.given import with_given
+from gcs.watch.rebuild_report import found
+from gcs.watch.saved_links import recorded
+from gcs.watch.tlog import read_tlog
+from scenarios.keys.part import PREDICTION_MAX_S
+from scenarios.schema import Control, FixedGains, Scenario
+
+OPTION = "--links-of"
+LEAST_SHARE = 0.2
+"""Prediction must take a mismatch of at least this share of the delay to either side, and of a control period: the
+delays of another day are not those of the log."""
+
+
+@dataclass(frozen=True)
+class MeasuredDelays:
+    """The loop delay of a scenario over measured links: the median of the slowest vehicle, and the spread about it."""
+
+    source: str
+    vehicles: tuple[int, ...]
+    least_s: float
+    median_s: float
+    worst_s: float
+
+
+def measured_delays(run_or_file: Path, scenario: Scenario) -> MeasuredDelays:
+    """The loop delays that a scenario would have over the links in a run's folder or a telemetry log.
+
+    From the 1st to the 99th percentile, the widest of any vehicle. Raises InputError if the log shows too little.
+    """
+    log_file = found(run_or_file).log_file
+    recorder = recorded(read_tlog(log_file).frames)
+    if not recorder.measured:  # one line says what is missing
+        recorder.profile(str(log_file), option=f"{OPTION}: {log_file}")
+    spreads: list[tuple[float, float, float]] = []
+    for system_id in recorder.measured:
+        profile = recorder.profile(str(log_file), only=system_id)
+        drawn_s = drawn_loop_delays_s(scenario, profile.up, profile.down)
+        low_s, middle_s, high_s = np.percentile(drawn_s[np.isfinite(drawn_s)], [1.0, 50.0, 99.0]).tolist()
+        spreads.append((low_s, middle_s, high_s))
+    median_s = max(middle_s for _, middle_s, _ in spreads)
+    shorter_s, longer_s = (
+        max(middle - low for low, middle, _ in spreads),
+        max(high - middle for _, middle, high in spreads),
+    )
+    return MeasuredDelays(
+        source=str(run_or_file),
+        vehicles=tuple(recorder.measured),
+        least_s=max(0.0, median_s - shorter_s),
+        median_s=median_s,
+        worst_s=median_s + longer_s,
+    )
+
+
+def for_measured_links(scenario: Scenario, run_or_file: Path) -> tuple[Scenario, LinkPart]:
+    """The scenario with the gains that are best for measured links, and why these were chosen.
+
+    Raises InputError if the log shows too little, or no gains take the links.
+    """
+    return best_for(scenario, measured_delays(run_or_file, scenario))
+
+
+def best_for(scenario: Scenario, delays: MeasuredDelays) -> tuple[Scenario, LinkPart]:
+    """The same for delays that are known. Raises InputError if no gains take them."""
+    aim = _aim(scenario.control)
+    candidates = tuple(_candidate(scenario, delays, aim, predicted=predicted) for predicted in (False, True))
+    figure = "alpha" if aim == "alpha_at_delay" else "decay_rate_1_s"
+    fit = [own for own in candidates if not own.refused]
+    if not fit:
+        reasons = "; ".join(f"{_name(own)}: {own.refused}" for own in candidates)
+        worst = f"a loop delay of {1e3 * delays.worst_s:.1f} ms"
+        raise InputError(f"{OPTION}: read {worst} from {delays.source}, wanted one that gains take: {reasons}")
+    best = max(fit, key=lambda own: getattr(own, figure))
+    others = [own for own in candidates if own is not best]
+    against = [own.refused or f"{getattr(own, figure):.4g} {_name(own)}" for own in others]
+    part = LinkPart(
+        source=delays.source,
+        vehicles=delays.vehicles,
+        loop_delay_s_least=delays.least_s,
+        loop_delay_s_p50=delays.median_s,
+        loop_delay_s_worst=delays.worst_s,
+        headroom=scenario.control.link_headroom,
+        maximised=figure,
+        chosen=f"{_name(best)}: {figure} {getattr(best, figure):.4g} at the worst delay, against {'; '.join(against)}",
+        candidates=candidates,
+    )
+    assert best.K1 is not None
+    assert best.K2 is not None
+    assert best.K3 is not None
+    gains = FixedGains(K1=best.K1, K2=best.K2, K3=best.K3)
+    return with_given(scenario, gains=gains, prediction="measured" if best.prediction else "off"), part
+
+
+def _aim(control: Control) -> Aim:
+    decay = control.criteria is not None and control.criteria.maximise == "decay_rate_1_s"
+    return "decay_rate_at_delay_1_s" if decay else "alpha_at_delay"
+
+
+def _name(own: LinkGains) -> str:
+    return "with prediction" if own.prediction else "without prediction"
+
+
+def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicted: bool) -> LinkGains:
+    """The best gains of one way, with their figures."""
+    control, period_s = scenario.control, loop_timing(scenario).held_s
+    criteria = Criteria(**control.criteria.model_dump()) if control.criteria is not None else Criteria()
+    middle_s, worst_s, spare = delays.median_s, delays.worst_s, 1.0 - control.link_headroom
+    around_s = max(worst_s - middle_s, middle_s - delays.least_s)
+    window_s = max(around_s / spare, LEAST_SHARE * middle_s, period_s)
+    if predicted:
+        window = max(0.0, middle_s - window_s), middle_s + window_s
+        criteria = replace(criteria, at_delay_s=middle_s, maximise=aim, delays_s=window, delay_rate=0.0)
+    else:
+        criteria = replace(criteria, at_delay_s=worst_s, maximise=aim)
+    ends_s = delays.least_s, worst_s
+    if predicted and middle_s > PREDICTION_MAX_S:
+        return LinkGains(prediction=True, refused=f"the station predicts over at most {PREDICTION_MAX_S:g} s")
+    try:
+        margin_s = None if predicted else worst_s / spare
+        wanted = Requirement(margin_s, string_peak_max=control.string_peak_max, criteria=criteria)
+        gains = predicted_gains(wanted, period_s, ends_s) if predicted else criteria_gains(wanted, period_s)
+    except GainsError as error:
+        return LinkGains(prediction=predicted, refused=str(error))
+    return evaluated(gains, period_s, middle_s if predicted else None, ends_s)
+
+
+def evaluated(gains: ScalarGains, period_s: float, assumed_s: float | None, ends_s: tuple[float, float]) -> LinkGains:
+    """Gains with their exact figures: the worst at the ends of the delays with prediction, else at the longer one."""
+    model = FormationModel((-1, 0), axes=1)
+    K = model.overlapping_gain([[-gains.k1]], [[gains.k2]], [[gains.k3]])
+    if assumed_s is not None:
+        figures = PredictedFigures(model, K, period_s, assumed_s, ends_s, chain=gains)
+        least_s, most_s = figures.window_s
+        shorter = (assumed_s - ends_s[0]) / (assumed_s - least_s) if least_s > 0.0 else 0.0
+        headroom = 1.0 - max(shorter, (ends_s[1] - assumed_s) / (most_s - assumed_s))
+    else:
+        timing = FlownTiming(inf, period_s)
+        figures = LoopFigures(model, K, timing, ends_s[1], chain=FlownLoop(gains, timing))
+        least_s, most_s = 0.0, figures.delay_margin_s
+        headroom = 1.0 - ends_s[1] / most_s
+    return LinkGains(
+        prediction=assumed_s is not None,
+        K1=-gains.k1,
+        K2=gains.k2,
+        K3=gains.k3,
+        alpha=figures.alpha_at_delay,
+        decay_rate_1_s=figures.decay_rate_at_delay_1_s,
+        string_peak=figures.string_peak,
+        spacing_gain_s2=figures.spacing_gain_max_s2,
+        noise_gain=figures.noise_gain_max,
+        stable_s=(least_s, most_s),
+        headroom=headroom,
+    )

@@ -1,0 +1,164 @@
+"""A link profile from what was seen of real links: one-way delays in order, and runs of lost datagrams.
+
+Up: the delays of position reports and TIMESYNC replies, each from its vehicle's time stamp. Down: those of TIMESYNC
+requests; each stands for the datagrams until the next exchange. Both depend on the estimated offset of the vehicle's
+clock, which exchanges know only within half a round trip: what is wrong one way is missing the other way, so their sum
+holds. Least delays come out equal both ways, unless the clock's bound excludes that.
+
+Losses up are counted from sequence numbers. Losses down cannot be seen from here and are taken to be the same.
+"""
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from gains.core.arrays import FloatArray
+from gcs.errors import InputError
+from gcs.link import mavlink
+from gcs.watch.links import Watch
+from scenarios.files import TRACE_DELAYS
+from scenarios.keys.link import Jitter, Link, LossBursts
+from scenarios.keys.profile import Latency, LinkProfile, Measured
+from scenarios.profiles import dump_profile
+
+_SETTLED = 20
+"""Exchanges after which a clock is known well enough for one-way delays."""
+_BOOT_ROUNDING_S = 0.0005
+"""Mean of what `time_boot_ms` cuts off, which would make every delay of a position report longer."""
+_LEAST = 10
+"""Fewest delays each way from which a profile is made."""
+
+
+class _OneVehicle:
+    def __init__(self) -> None:
+        self.up_s: list[float] = []
+        self.down_s: list[float] = []
+        self.bound_s = 0.0
+        self.frames = 0
+        self.runs: list[int] = []
+        """Length of each run of lost frames."""
+        self.sequence: int | None = None
+        self.exchanges = 0
+
+
+class LinkRecorder:
+    """Watches frames as `Watch` does, and keeps each vehicle's delays and losses."""
+
+    def __init__(self, watch: Watch) -> None:
+        self._watch = watch
+        self._seen: dict[int, _OneVehicle] = {}
+
+    def note(self, frame: mavlink.Frame, received_ns: int) -> None:
+        """Note a frame that the watch has just taken in."""
+        vehicle = self._watch.vehicles.get(frame.system_id)
+        if vehicle is None:
+            return
+        own = self._seen.setdefault(frame.system_id, _OneVehicle())
+        own.frames += 1
+        gap = 0 if own.sequence is None else (frame.sequence - own.sequence) % 256
+        if gap < 128:  # else it is late
+            own.sequence = frame.sequence
+            if gap > 1:
+                own.runs.append(gap - 1)
+        clock, exchanges = vehicle.remote.clock, len(vehicle.rtt_s)
+        if exchanges > own.exchanges:
+            own.exchanges = exchanges
+            if exchanges > _SETTLED and clock.down_ns is not None:
+                own.down_s.append(clock.down_ns * 1e-9)
+                own.bound_s = max(own.bound_s, clock.down_bound_ns * 1e-9)
+        if exchanges <= _SETTLED or not clock.estimate.samples:
+            return
+        if frame.msg_id == mavlink.LOCAL_POSITION_NED:
+            sampled_ns = clock.estimate.to_station_ns(clock.boot_ns(frame.fields[0], received_ns))
+            own.up_s.append(max(0.0, (received_ns - sampled_ns) * 1e-9 - _BOOT_ROUNDING_S))
+        elif frame.msg_id == mavlink.TIMESYNC and frame.fields[0] != 0:
+            own.up_s.append(max(0.0, (received_ns - clock.estimate.to_station_ns(frame.fields[0])) * 1e-9))
+
+    @property
+    def measured(self) -> list[int]:
+        """The vehicles of which enough was seen for a profile."""
+        return sorted(k for k, own in self._seen.items() if len(own.up_s) >= _LEAST and len(own.down_s) >= _LEAST)
+
+    def profile(self, source: str, *, only: int | None = None, option: str = "--save-links") -> LinkProfile:
+        """The links seen, those of all vehicles one after the other, or of one. Raises InputError if too little was."""
+        seen = [self._seen[k] for k in self.measured if only in (None, k)]
+        if not seen:
+            wanted = f"{_LEAST} delays each way of a vehicle, after its first {_SETTLED} TIMESYNC exchanges"
+            raise InputError(f"{option}: read {sum(len(own.down_s) for own in self._seen.values())}, wanted {wanted}")
+        up, down = (np.concatenate([getattr(own, name) for own in seen]) for name in ("up_s", "down_s"))
+        each = max(1, round(len(up) / len(down)))
+        lost, received = [run for own in seen for run in own.runs], sum(own.frames for own in seen)
+        loss = _loss(lost, received)
+        bound_s = max(own.bound_s for own in seen)
+        return LinkProfile(
+            source=source,
+            licence="of whoever measured it",
+            up=_link(up, loss),
+            down=_link(np.repeat(down, each), loss),
+            measured=Measured(up=_latency(up, bound_s, lost), down=_latency(down, bound_s, [])),
+        )
+
+
+def recorded(frames: Iterable[tuple[int, mavlink.Frame]]) -> LinkRecorder:
+    """What a log of any tool shows of its links."""
+    watch = Watch()
+    recorder = LinkRecorder(watch)
+    for time_ns, frame in frames:
+        watch.take(frame, time_ns)
+        recorder.note(frame, time_ns)
+    return recorder
+
+
+def save(profile: LinkProfile, file: Path) -> None:
+    """Write a profile for `links.profile` or --links."""
+    assert profile.measured is not None
+    head = (
+        f"# Links measured by gcs: {profile.measured.up.datagrams} delays up, {profile.measured.down.datagrams} down.\n"
+    )
+    file.write_text(head + dump_profile(profile), encoding="utf-8")
+
+
+def describe(profile: LinkProfile) -> list[str]:
+    """The latencies of a measured profile in the terms of RFC 7679 and RFC 5481, a line for each direction."""
+    measured = profile.measured
+    assert measured is not None
+    return [
+        f"{name:8} one-way delay {1e3 * of.delay_s_min:.2f} ms least, {1e3 * of.delay_s_p50:.2f} p50, "
+        f"{1e3 * of.delay_s_p99:.2f} p99, calibration error {1e3 * of.calibration_error_s:.2f}; "
+        f"PDV p99 {1e3 * of.variation_s_p99:.2f}, IPDV p99 {1e3 * of.variation_next_s_p99:.2f}"
+        + (f"; {of.lost} lost in {of.loss_runs} runs, the longest {of.loss_run_longest}" if of.lost else "")
+        for name, of in (("up", measured.up), ("down", measured.down))
+    ]
+
+
+def _link(delays_s: FloatArray, loss: LossBursts | None) -> Link:
+    """A link that repeats these delays in their order."""
+    trace = tuple(round(delay_s, 6) for delay_s in delays_s[:TRACE_DELAYS].tolist())
+    return Link(jitter=Jitter(distribution="trace", trace_s=trace), loss_bursts=loss)
+
+
+def _loss(runs: list[int], received: int) -> LossBursts | None:
+    """Gilbert's model with the mean length of the runs, and one run in as many datagrams as seen."""
+    if not runs:
+        return None
+    # a burst lasts 1 / r datagrams; it begins after p of the good ones
+    to_bad, to_good = len(runs) / max(received, len(runs)), len(runs) / sum(runs)
+    return LossBursts(to_bad_probability=to_bad, to_good_probability=to_good)
+
+
+def _latency(delays_s: FloatArray, bound_s: float, runs: list[int]) -> Latency:
+    p50, p99 = np.percentile(delays_s, [50, 99]).tolist()
+    least = float(delays_s.min())
+    figures = Counter(lost=sum(runs), loss_runs=len(runs), loss_run_longest=max(runs, default=0))
+    return Latency(
+        datagrams=len(delays_s),
+        delay_s_min=round(least, 6),
+        delay_s_p50=round(p50, 6),
+        delay_s_p99=round(p99, 6),
+        calibration_error_s=round(bound_s, 6),
+        variation_s_p99=round(p99 - least, 6),
+        variation_next_s_p99=round(float(np.percentile(np.abs(np.diff(delays_s)), 99)), 6),
+        **figures,
+    )

@@ -1,0 +1,39 @@
+"""How vehicles with autopilots respond to set-points, as the file says it, and what of it contradicts itself."""
+
+from collections.abc import Iterator
+from typing import Annotated
+
+from pydantic import Field
+
+from scenarios.keys.part import NotNegative, Part, Positive
+
+DeadTime = Annotated[float, Field(ge=0, le=1)]
+
+
+class Response(Part):
+    """How every vehicle responds to set-points. The control is designed for it.
+
+    Its velocity loop wants the acceleration w = a_set + gain (v_set - v), which its acceleration a follows with one of
+    three models. Without this part, model and values are identified in a manoeuvre before the formation flight.
+
+    lag                 lag a'(t) = w(t) - a(t)
+    lag with dead time  lag a'(t) = w(t - dead time) - a(t)
+    second order        a'' / natural frequency² + lag a' = w - a
+    """
+
+    lag_s: Positive
+    """Time constant from wanted to real acceleration; of a second order, 2 damping / natural frequency."""
+    velocity_gain_1_s: NotNegative = 0.0
+    """Gain from velocity error to acceleration."""
+    dead_time_s: DeadTime = 0.0
+    """Dead time before the lag."""
+    natural_frequency_rad_s: Positive | None = None
+    """Natural frequency; makes the response one of second order."""
+
+
+def response_contradictions(
+    key: str, dead_time_s: float, natural_frequency_rad_s: float | None
+) -> Iterator[tuple[str, object, str]]:
+    """What contradicts itself in a response: key, what was read, what was wanted."""
+    if dead_time_s and natural_frequency_rad_s is not None:
+        yield f"{key}.dead_time_s", dead_time_s, "no such key with natural_frequency_rad_s: one model at a time"

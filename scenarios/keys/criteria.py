@@ -1,0 +1,91 @@
+"""What else a design is asked for, and further overlaps of information; `gains.core.requirement.Criteria` is met."""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from scenarios.keys.part import NotNegative, Part, Positive
+
+Fault = tuple[str, object, str]
+"""A key, what was read and what was wanted."""
+_AT_DELAY = "alpha_at_delay", "decay_rate_at_delay_1_s"
+
+
+class Overlap(Part):
+    """Whom every vehicle hears beside the vehicle in front and those it `hears`. Graph methods only."""
+
+    ahead: Annotated[int, Field(ge=1, le=250)] = 1
+    """How many vehicles in front, one behind the other up to the leader."""
+    behind: bool = False
+    """Also every vehicle that follows it: with `ahead = 1`, both neighbours."""
+    leader: bool = False
+    """Also the leader."""
+
+
+class Criteria(Part):
+    """Further requirements of the gains, for `loop = "ground"` and vehicles that respond at once.
+
+    Gains are then searched, at `at_delay_s` if that is given. A requirement is met, or refused with how far each part
+    alone would have to be relaxed.
+    """
+
+    at_delay_s: Positive | None = None
+    """Loop delay at which the gains are to be best; what is asked for at a delay is meant there."""
+    maximise: (
+        Literal["alpha", "decay_rate_1_s", "alpha_at_delay", "decay_rate_at_delay_1_s", "delay_margin_s"] | None
+    ) = None
+    """What is made as large as the rest allows: `alpha_at_delay` with `at_delay_s`; without it, alpha if a delay margin
+    is required, and else the delay margin."""
+    alpha_at_delay: Positive | None = None
+    """Requirement: least robustness bound at `at_delay_s`."""
+    decay_rate_at_delay_1_s: Positive | None = None
+    """Requirement: least decay rate at `at_delay_s`."""
+    damping_min: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Requirement: least damping ratio of every root, without delay."""
+    natural_frequency_max_rad_s: Positive | None = None
+    """Requirement: largest natural frequency of every root, without delay."""
+    spacing_gain_max_s2: Positive | None = None
+    """Requirement: largest gain (H∞) from disturbing accelerations (m/s²) to spacing errors (m), at `at_delay_s`, or
+    without delay."""
+    noise_gain_max: Positive | None = None
+    """Requirement: largest gain (H2) from measurement noise to commands, at `at_delay_s`, or without delay: the
+    standard deviation of the noisiest command (m/s²) where every error is measured with white noise of 1 m and
+    1 m/s."""
+    delays_s: tuple[NotNegative, NotNegative] | None = None
+    """Requirement: the least and the largest loop delay among which stability must be proved."""
+    delay_rate: NotNegative | None = None
+    """How fast the delay varies in `delays_s`, s/s: 0 for one that is constant but not known. Omitted: it may jump."""
+    weight: tuple[Positive, Positive] | None = None
+    """Diagonal of the weight W of spacing errors and of velocity errors, with which every alpha is meant: disturbances
+    up to alpha |W e|. Omitted: W = I."""
+
+
+def criteria_faults(
+    criteria: Criteria | None, overlap: Overlap | None, *, method: str, given: bool, loop: str, at_once: bool
+) -> Iterator[Fault]:
+    """What contradicts the keys of this file.
+
+    `given`: gains or blocks are. `at_once`: vehicles respond at once and no delay is predicted over.
+    """
+    if overlap is not None and (method == "inclusion" or given):
+        yield "control.overlap", overlap.model_dump(), "no such key, unless method is graph-lqr or graph-dk, designed"
+    if criteria is None:
+        return
+    if given:
+        yield "control.criteria", "requirements", "either criteria, or gains or blocks"
+    if loop == "onboard":
+        yield "control.loop", loop, "ground, with control.criteria"
+    if not at_once:
+        yield "control.criteria", "requirements", "no such key with dynamics autopilot or prediction"
+    low, high = criteria.delays_s or (0.0, 0.0)
+    if low > high:
+        yield "control.criteria.delays_s", [low, high], "the smaller delay first"
+    if criteria.delays_s is None and criteria.delay_rate is not None:
+        yield "control.criteria.delay_rate", criteria.delay_rate, "no such key without delays_s"
+    for name in _AT_DELAY:
+        value = getattr(criteria, name)
+        if criteria.at_delay_s is None and value is not None:
+            yield f"control.criteria.{name}", value, "no such key without at_delay_s"
+    if criteria.at_delay_s is None and criteria.maximise in _AT_DELAY:
+        yield "control.criteria.maximise", criteria.maximise, "what needs no delay, without at_delay_s"

@@ -1,0 +1,39 @@
+"""Code of the user's own that a scenario names: a control law, and a vehicle's dynamics. Nothing here runs it."""
+
+from hashlib import sha256
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic_core import PydanticCustomError
+
+from scenarios.keys.part import Part
+
+CodeName = Annotated[str, Field(pattern=r"^[^:]+\.py:[A-Za-z_][A-Za-z0-9_]*$")]
+"""A name in a Python file, whose path is relative to the scenario file."""
+
+
+def _one_fault(value: object, validate: ValidatorFunctionWrapHandler) -> object:
+    """One fault for a key of two types; pydantic reports one for each of them."""
+    try:
+        return validate(value)
+    except ValidationError as error:
+        raise PydanticCustomError("dynamics", "dynamics") from error
+
+
+Dynamics = Annotated[Literal["double_integrator", "autopilot"] | CodeName, WrapValidator(_one_fault)]
+NO_LAW = {"controller": None, "linear": None}
+"""What changes in `[control]` for a method other than python."""
+BUILT_IN = "double_integrator", "autopilot"
+
+
+class CodeFile(Part):
+    """A Python file that the scenario names, as it was read."""
+
+    name: str
+    """Its path, relative to the scenario file."""
+    text: str
+
+    @property
+    def sha256(self) -> str:
+        """Identifies what is in the file."""
+        return sha256(self.text.encode()).hexdigest()

@@ -1,0 +1,61 @@
+"""A formation without some of its vehicles: the others keep their places relative to each other.
+
+A follower of a vehicle that is left out follows the one in front of that, at the sum of both offsets. If the leader is
+left out, its follower with the lowest system id leads, and the others follow that one. So the scenario stays a complete
+formation, for which gains, margins and figures are computed as for any other. The alternative, to leave followers
+without anybody in front, would fly groups that do not keep their distance from each other.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from scenarios.errors import ScenarioError
+from scenarios.files import checked
+from scenarios.schema import Scenario, Vehicle
+
+OPTION = "--without"
+
+
+def without(scenario: Scenario, system_ids: Iterable[int], file: Path) -> Scenario:
+    """The scenario without these vehicles; `file` is named in errors.
+
+    Raises ScenarioError for a vehicle that is not in the scenario, if none is left, or if gains are given block by
+    block, which belong to the whole formation.
+    """
+    for system_id in dict.fromkeys(system_ids):
+        known = [vehicle.system_id for vehicle in scenario.vehicles]
+        if system_id not in known or len(known) == 1:
+            wanted = f"the system_id of one of its vehicles: {', '.join(map(str, known))}"
+            raise ScenarioError(
+                file, OPTION, system_id, wanted if len(known) > 1 else "at least one vehicle to be left"
+            )
+        if scenario.control.blocks:
+            raise ScenarioError(file, OPTION, system_id, "all vehicles, with control.blocks: they need every vehicle")
+        scenario = _without_one(scenario, system_id)
+    return checked(scenario, file)
+
+
+def _without_one(scenario: Scenario, system_id: int) -> Scenario:
+    gone = next(vehicle for vehicle in scenario.vehicles if vehicle.system_id == system_id)
+    behind = sorted((v for v in scenario.vehicles if v.follows == system_id), key=lambda vehicle: vehicle.system_id)
+    ahead, (north_m, east_m) = gone.follows, gone.offset_ne_m or (0.0, 0.0)
+    if gone.follows is None:
+        ahead, (north_m, east_m) = behind[0].system_id, (-x for x in behind[0].offset_ne_m or (0.0, 0.0))
+
+    def moved(vehicle: Vehicle) -> Vehicle:
+        follows, offset = vehicle.follows, vehicle.offset_ne_m
+        if vehicle.follows == system_id:
+            own_north_m, own_east_m = offset or (0.0, 0.0)
+            follows, offset = ahead, (own_north_m + north_m, own_east_m + east_m)
+        if vehicle.system_id == follows:
+            follows = offset = None
+        hears = tuple(other for other in vehicle.hears if other not in (system_id, follows))
+        return vehicle.model_copy(update={"follows": follows, "offset_ne_m": offset, "hears": hears})
+
+    own_links = tuple(link for link in scenario.links.vehicles if link.system_id != system_id)
+    return scenario.model_copy(
+        update={
+            "vehicles": tuple(moved(vehicle) for vehicle in scenario.vehicles if vehicle is not gone),
+            "links": scenario.links.model_copy(update={"vehicles": own_links}),
+        }
+    )

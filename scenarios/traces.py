@@ -1,0 +1,67 @@
+"""Traces of delays: files that a scenario's links name, read into the scenario."""
+
+import contextlib
+import csv
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+from scenarios.errors import ScenarioError
+from scenarios.keys.link import Link, Links
+from scenarios.keys.part import MOST
+from scenarios.schema import Scenario
+
+TRACE_DELAYS = 100_000
+"""Largest number of delays in a trace."""
+TRACE_COLUMN = "delay_s"
+
+
+def each_link(links: Links) -> Iterator[tuple[str, Link]]:
+    """Each link of the file with its key."""
+    parts = ("links", links), *((f"links.vehicles[{k}]", own) for k, own in enumerate(links.vehicles))
+    for key, part in parts:
+        for name, link in (("up", part.up), ("down", part.down)):
+            if link is not None:
+                yield f"{key}.{name}", link
+
+
+def with_traces(scenario: Scenario, file: Path) -> Scenario:
+    """The scenario with the delays in place of the names of trace files, so that it is complete without the files."""
+    traces: dict[str, tuple[float, ...]] = {}
+    for key, link in each_link(scenario.links):
+        if link.jitter is not None and (name := link.jitter.trace_file) is not None:
+            traces[name] = _read_trace(file.parent / name, file, f"{key}.jitter.trace_file")
+
+    def read(link: Link) -> Link:
+        if link.jitter is None or link.jitter.trace_file is None:
+            return link
+        update = {"trace_file": None, "trace_s": traces[link.jitter.trace_file]}
+        return link.model_copy(update={"jitter": link.jitter.model_copy(update=update)})
+
+    return scenario.with_links(read, read) if traces else scenario
+
+
+def _read_trace(path: Path, file: Path, key: str) -> tuple[float, ...]:
+    """The delays of a trace file, in s."""
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ScenarioError(file, key, str(error), "a readable file with a delay in s on each line, or CSV") from None
+    cells = [cell.strip() for cell in rows[0]] if rows else []
+    first = int(TRACE_COLUMN in cells)
+    column = cells.index(TRACE_COLUMN) if first else 0
+    delays: list[float] = []
+    for number, row in enumerate(rows[first:], first + 1):
+        if not row:
+            continue
+        delay_s = math.nan
+        if first or len(row) == 1:
+            with contextlib.suppress(ValueError, IndexError):
+                delay_s = float(row[column])
+        if not 0 <= delay_s <= MOST:
+            wanted = f"a delay from 0 to {MOST:g} s on each line, or CSV with a column {TRACE_COLUMN}"
+            raise ScenarioError(file, key, f"{path.name} line {number}: {','.join(row)}", wanted)
+        delays.append(delay_s)
+    if not 1 <= len(delays) <= TRACE_DELAYS:
+        raise ScenarioError(file, key, f"{path.name}: {len(delays)} delays", f"1 to {TRACE_DELAYS}")
+    return tuple(delays)

@@ -1,0 +1,1 @@
+"""How simulated vehicles move: accelerations in, positions and velocities out; no MAVLink. See `double_integrator`."""

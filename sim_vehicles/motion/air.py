@@ -1,0 +1,139 @@
+"""What pushes a vehicle in flight beside its own acceleration: wind, gusts, and what the fleet adds.
+
+A push is constant for a while: an acceleration, and a velocity that carries the vehicle along without being its own. It
+acts as half the change of velocity before the motion of that while and half after it, which is exact for a double
+integrator within its limits, and of the second order in 10 ms where the motion depends on the velocity.
+
+Gusts are a first-order process with the exact stationary variance, drawn every `STEP_NS` and held. Their instants count
+from the start of the vehicles, so that common gusts push all of them at once.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from scenarios.keys import disturbance
+from scenarios.keys.own import BUILT_IN
+from scenarios.schema import NS_PER_S, Scenario
+from sim_vehicles.links.truth import CARRIED, PUSHED, Record, disturbance_row
+from sim_vehicles.services.clock import NEVER_NS
+
+STEP_NS = 10_000_000
+"""How long gusts are held."""
+GUST_STREAM = 8
+"""Last word of the spawn key of the random stream of a vehicle's gusts; common gusts have system id 0."""
+_BLOCK = 512
+
+Moved = TypeVar("Moved")
+
+
+class Push(NamedTuple):
+    """A constant acceleration, and a velocity with which the vehicle is carried along."""
+
+    acceleration_north_m_s2: float = 0.0
+    acceleration_east_m_s2: float = 0.0
+    carried_north_m_s: float = 0.0
+    carried_east_m_s: float = 0.0
+
+
+STILL = Push()
+
+
+class Gusts:
+    """The gusts of one vehicle, north and east, by the number of the step."""
+
+    def __init__(self, gusts: disturbance.Gusts, seed: int, system_id: int) -> None:
+        stream = np.random.SeedSequence(seed, spawn_key=(0 if gusts.common else system_id, GUST_STREAM))
+        self._draw = np.random.default_rng(stream)
+        self._fades = math.exp(-STEP_NS / NS_PER_S / gusts.correlation_time_s)
+        self._deviation_m_s2 = gusts.deviation_m_s2
+        north, east = (self._deviation_m_s2 * self._draw.standard_normal(2)).tolist()
+        self._first, self._known = 0, [(north, east)]
+
+    def at(self, number: int) -> tuple[float, float]:
+        """The gust of a step that has not been forgotten."""
+        while number - self._first >= len(self._known):
+            (north, east), spread = self._known[-1], self._deviation_m_s2 * math.sqrt(1.0 - self._fades**2)
+            for to_north, to_east in (spread * self._draw.standard_normal((_BLOCK, 2))).tolist():
+                north, east = self._fades * north + to_north, self._fades * east + to_east
+                self._known.append((north, east))
+        return self._known[number - self._first]
+
+    def forget(self, number: int) -> None:
+        """No step before this one will be asked for again."""
+        old = min(number - self._first, len(self._known) - 1)  # the newest begins the next ones
+        if old > _BLOCK:
+            del self._known[:old]
+            self._first += old
+
+
+class Air:
+    """All that pushes one vehicle. `add` sets what the fleet adds from now on."""
+
+    def __init__(self, scenario: Scenario, system_id: int, start_ns: int, record: Record | None) -> None:
+        found = scenario.disturbance or disturbance.Disturbance()
+        self._wind = found.wind_ne_m_s2
+        self._gusts = None if found.gusts is None else Gusts(found.gusts, scenario.seed, system_id)
+        self._added = STILL
+        self._system_id, self._start_ns, self._record = system_id, start_ns, record
+        self._recorded: Push | None = None
+
+    def add(self, push: Push) -> None:
+        """Push the vehicle by this, too, until the next call. Bring the vehicle up to date first."""
+        self._added = push
+
+    def moved(
+        self,
+        motion: Moved,
+        move: Callable[[Moved, float], Moved],
+        shift: Callable[[Moved, float, float, float, float], Moved],
+        from_ns: int,
+        to_ns: int,
+        *,
+        foreseen: bool = False,
+    ) -> Moved:
+        """The motion at a later instant, from how the vehicle moves by itself over a duration in s.
+
+        `shift` adds to a motion changes of position (north, east) and velocity. `foreseen`: the vehicle will be asked
+        for the same time again, so nothing is recorded and nothing forgotten.
+        """
+        while from_ns < to_ns:
+            push, until_ns = self._at(from_ns)
+            if not foreseen:
+                self._note(push, from_ns)
+            until_ns = min(until_ns, to_ns)
+            t = (until_ns - from_ns) / NS_PER_S
+            half_north, half_east = 0.5 * t * push[0], 0.5 * t * push[1]
+            motion = shift(motion, 0.0, 0.0, half_north, half_east)
+            motion = shift(move(motion, t), t * push[2], t * push[3], half_north, half_east)
+            from_ns = until_ns
+        return motion
+
+    def _at(self, time_ns: int) -> tuple[Push, int]:
+        """What pushes the vehicle from an instant on, and until when."""
+        (north, east), until_ns = self._wind, NEVER_NS
+        if self._gusts is not None:
+            number = (time_ns - self._start_ns) // STEP_NS
+            gust, until_ns = self._gusts.at(number), self._start_ns + (number + 1) * STEP_NS
+            north, east = north + gust[0], east + gust[1]
+        added = self._added
+        return Push(north + added[0], east + added[1], added[2], added[3]), until_ns
+
+    def _note(self, push: Push, time_ns: int) -> None:
+        if self._gusts is not None:
+            self._gusts.forget((time_ns - self._start_ns) // STEP_NS)
+        if self._record is None or push == self._recorded:
+            return
+        before, self._recorded = self._recorded or STILL, push
+        if push[:2] != before[:2]:
+            self._record(disturbance_row(PUSHED, self._system_id, 0, time_ns, push[0], push[1]))
+        if push[2:] != before[2:]:
+            self._record(disturbance_row(CARRIED, self._system_id, 0, time_ns, push[2], push[3]))
+
+
+def air_of(scenario: Scenario, system_id: int, start_ns: int, record: Record | None) -> Air | None:
+    """What pushes a vehicle; None in still air, unless it moves by dynamics of its own."""
+    still = scenario.disturbance is None and scenario.dynamics in BUILT_IN
+    return None if still else Air(scenario, system_id, start_ns, record)

@@ -1,0 +1,81 @@
+"""A vehicle's own dynamics: a function in Python code that the scenario names, in place of the double integrator.
+
+The function is `step(state, command, dt_s, memory)`, which returns the state `dt_s` seconds later:
+
+    state    (4,): position north and east in m, velocity north and east in m/s
+    command  (2,): the commanded acceleration north and east in m/s²
+    dt_s     at most `LONGEST_STEP_S`, and as short as the time between two messages
+    memory   a dict of this vehicle's own, empty at the start; the only thing it may remember in
+
+After a step that raises an exception or returns anything but four finite numbers of a possible size, the vehicle has
+moved at constant velocity; this is counted.
+"""
+
+import copy
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from scenarios.own_code import function_of
+from scenarios.schema import Scenario
+from sim_vehicles.motion.double_integrator import Bounds, Command, State, state_from
+
+LONGEST_STEP_S = 0.01
+FARTHEST_M, FASTEST_M_S = 1e7, 1e5
+"""A state beyond these is a fault of the model: messages carry single precision."""
+Floats = npt.NDArray[np.float64]
+
+
+class OwnMotion:
+    """The motion of one vehicle by a step function, and its memory."""
+
+    def __init__(self, scenario: Scenario, on_fault: Callable[[str], None]) -> None:
+        """`on_fault` takes each fault in one line."""
+        self._step = function_of(scenario, "dynamics")
+        self._on_fault = on_fault
+        self._memory: dict[str, Any] = {}
+
+    def advance(self, state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
+        """The state after `duration_s` with the command held, as `double_integrator.advance`."""
+        del bounds  # the model has its own limits
+        return self._moved(state, command, duration_s, self._memory, self._on_fault)
+
+    def foreseen(self, state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
+        """The same without remembering it."""
+        del bounds
+        return self._moved(state, command, duration_s, copy.deepcopy(self._memory), lambda _: None)
+
+    def _moved(
+        self, state: State, command: Command, duration_s: float, memory: dict[str, Any], on_fault: Callable[[str], None]
+    ) -> State:
+        flown: Floats = np.array([state.north_m, state.east_m, *state.velocity_ne_m_s()])
+        steps = max(1, math.ceil(duration_s / LONGEST_STEP_S))
+        dt_s = duration_s / steps
+        for _ in range(steps):
+            after = self._after(flown, command, dt_s, memory, on_fault)
+            flown = np.concatenate([flown[:2] + dt_s * flown[2:], flown[2:]]) if after is None else after
+        north, east, v_north, v_east = flown.tolist()
+        return state_from((north, east), (v_north, v_east))
+
+    def _after(
+        self, flown: Floats, command: Command, dt_s: float, memory: dict[str, Any], on_fault: Callable[[str], None]
+    ) -> Floats | None:
+        """The state a step later; None if the model gives none that can be used."""
+        wanted = np.array(command[:2]) + command.velocity_gain_1_s * (np.array(command[2:4]) - flown[2:])
+        try:
+            with np.errstate(all="ignore"):
+                answer: object = self._step(flown.copy(), wanted, dt_s, memory)
+            found: Floats = np.array(answer, dtype=np.float64)
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the user's model raises
+            on_fault(f"{type(error).__name__}: {error}")
+            return None
+        if found.shape != (4,):
+            on_fault(f"returned shape {found.shape}, wanted (4,)")
+        elif not (np.abs(found[:2]).max() <= FARTHEST_M and np.abs(found[2:]).max() <= FASTEST_M_S):
+            on_fault(f"returned {found.tolist()}")
+        else:
+            return found
+        return None

@@ -1,0 +1,50 @@
+"""Disturbed formations in flight against what is computed for them."""
+
+import numpy as np
+import pytest
+
+from gcs import fly_virtual
+from gcs.plan.planner import flight_plan
+from gcs.stress.disturbance import find_disturbance_onsets
+from scenarios.files import load
+from scenarios.keys.disturbance import Disturbance, Gusts, Navigation, Sector
+from scenarios.schema import Clocks, Scenario
+from scenarios.shipped import located
+
+AIR = Disturbance(wind_ne_m_s2=(0.2, -0.1), gusts=Gusts(deviation_m_s2=0.4, correlation_time_s=0.2))
+NOISE = Navigation(position_noise_m=0.3, velocity_noise_m_s=0.1)
+
+
+def chain(**update: object) -> Scenario:
+    return load(located("chain3")).with_calm_monitor().model_copy(update=update)
+
+
+def test_flown_spread_of_the_errors_is_the_computed_one() -> None:
+    together = Clocks(offset_max_s=0.0, drift_max_ppm=0.0)  # else noise is averaged between two reports
+    noisy = chain(disturbance=AIR, navigation=NOISE, clocks=together, duration_s=40.0)
+    flown = fly_virtual(noisy.with_link_delay(up_s=0.06, down_s=0.08))
+    assert flown.summary.spread is not None
+    ratios = [(own.reported_rms_m or 0.0) / (own.predicted_rms_m or 1.0) for own in flown.summary.spread.vehicles]
+    # three quarters of the power are white noise; the rest has about 40 independent values on each axis: 3 % together
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.08)
+
+
+def test_the_same_seed_gives_the_same_disturbed_flight() -> None:
+    first, second = (fly_virtual(chain(disturbance=AIR, navigation=NOISE, duration_s=3.0)) for _ in range(2))
+    assert first.ticks.tobytes() == second.ticks.tobytes()
+
+
+def test_a_disturbance_of_size_zero_changes_no_flight() -> None:
+    still = Sector(norm_1_s=0.0, direction=tuple(tuple(row) for row in np.eye(5).tolist()))
+    calm, pushed = (fly_virtual(chain(duration_s=3.0, disturbance=each)) for each in (None, Disturbance(sector=still)))
+    # motion is cut into other pieces, so positions differ by their rounding in telemetry: 1e-4 m at 500 m
+    error_m = calm.spacing_error_ne_m - pushed.spacing_error_ne_m
+    assert np.nanmax(np.abs(error_m)) < 1e-3
+
+
+def test_the_formation_breaks_at_its_stability_radius() -> None:
+    pair = chain(vehicles=chain().vehicles[:2]).with_link_delay(up_s=0.1, down_s=0.0844)
+    result = find_disturbance_onsets(flight_plan(pair)[1], tolerance=0.02, kinds=("dynamic",))
+    [onset] = result.onsets
+    assert onset.difference is not None
+    assert abs(onset.difference) < 5e-3

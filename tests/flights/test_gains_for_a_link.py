@@ -1,0 +1,128 @@
+"""Gains of the front and gains for measured links: their figures hold in other code and in flight."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gains.performance.scalar_gains import ScalarGains
+from gains.sampled.constant import sampled_delay_margin
+from gcs.cli.front import chosen_for
+from gcs.errors import InputError
+from gcs.plan.design import Design, LinkPart
+from gcs.plan.planner import flight_plan
+from gcs.stress.axes import at_coordinates
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import Study
+from gcs.studies.front import point_at
+from gcs.studies.prediction import compared
+from gcs.watch.for_link import MeasuredDelays, best_for, evaluated
+from scenarios.errors import ScenarioError
+from scenarios.files import checked, load
+from scenarios.schema import Control, Scenario
+from tests.support.known import known
+from tests.support.logged_flight import flown, log_bytes
+from tests.support.paths import SCENARIOS
+
+CHAIN = load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 5.0})
+LINK_S = 0.2
+PERIOD_S = 0.02
+
+
+@cache
+def logged() -> tuple[bytes, float]:
+    """A log over links of 0.2 s each way, and the loop delay that the station measured there."""
+    _, summary, _, entries = flown(at_coordinates(CHAIN, {"delay": 2.0 * LINK_S}).with_calm_monitor())
+    return log_bytes(entries), known(summary.loop_delay_s.p50)
+
+
+@pytest.fixture(scope="module")
+def chosen(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, LinkPart]:
+    file = tmp_path_factory.mktemp("log") / "flight.tlog"
+    file.write_bytes(logged()[0])
+    scenario, part = chosen_for(CHAIN, file)
+    assert part is not None
+    return scenario, part
+
+
+@pytest.mark.parametrize("predict", ["off", "on"])
+def test_a_point_of_the_front_decays_in_flight_as_it_says(predict: str) -> None:
+    delay_s = 0.4
+    way = "on" if predict == "on" else "off"
+    scenario, point = point_at(CHAIN, delay_s, "inclusion", "alpha_at_delay", way)  # fastest is a multiple root
+    plan = flight_plan(scenario.with_calm_monitor())[1]
+    assert point.stable_s is not None
+    least_s, most_s = point.stable_s
+    assert least_s <= 0.8 * delay_s
+    assert known(most_s) >= 1.2 * delay_s
+    if predict == "off":  # the margin of the whole formation, both axes
+        margin_s = float(sampled_delay_margin(plan.model.A, plan.model.B, plan.gain, period_s=PERIOD_S))
+        assert most_s == pytest.approx(margin_s, rel=1e-9)
+    study, link_s = Study(plan), delay_s - PERIOD_S / 2.0
+    beside = fly_trial(study.trial("probe", {"delay": link_s}, seed=1, probe=2))
+    outcome = fly_trial(study.trial("probe", {"delay": link_s + delay_s - known(beside.loop_delay_s)}, seed=1, probe=2))
+    assert outcome.loop_delay_s == pytest.approx(delay_s, abs=1e-4)
+    # without prediction the point's decay is that of the continuous loop, which differs in the square of the period
+    assert -known(outcome.growth_1_s) == pytest.approx(known(point.decay_rate_1_s), rel=0.03)
+
+
+def test_the_delay_of_a_log_is_that_which_the_station_measured(chosen: tuple[Scenario, LinkPart]) -> None:
+    """Within half a period: where telemetry falls between two ticks is drawn, and in a flight it stays."""
+    part = chosen[1]
+    assert part.loop_delay_s_p50 == pytest.approx(logged()[1], abs=PERIOD_S / 2.0)
+    assert part.loop_delay_s_least < part.loop_delay_s_p50 < part.loop_delay_s_worst
+    assert part.vehicles == (1, 2, 3)
+
+
+def test_what_is_chosen_for_a_link_beats_the_default_there(chosen: tuple[Scenario, LinkPart]) -> None:
+    """The default design asks for a margin of 0.3 s, less than this delay."""
+    scenario, part = chosen
+    ends_s = part.loop_delay_s_least, part.loop_delay_s_worst
+    matrices = flight_plan(CHAIN)[0].inclusion_gains
+    assert matrices is not None
+    K1, K2, K3 = (gain[0][0] for gain in matrices)
+    default = evaluated(ScalarGains(-K1, K2, K3, 0.0), PERIOD_S, None, ends_s)
+    for own in part.candidates:
+        assert known(own.alpha) > known(default.alpha)
+        assert known(own.headroom) >= part.headroom > known(default.headroom)
+    best = max(part.candidates, key=lambda own: known(own.alpha))
+    assert scenario.control.prediction == ("measured" if best.prediction else "off")
+    settled = flown(at_coordinates(scenario, {"delay": 2.0 * LINK_S}))[1]
+    assert settled.verdict == "stable"
+    assert known(settled.headroom_min) >= part.headroom
+
+
+def test_a_log_without_exchanges_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "short.tlog"
+    file.write_bytes(logged()[0][:4000])
+    with pytest.raises(InputError, match=r"--links-of: .*short.tlog: read 0, wanted 10 delays each way"):
+        chosen_for(CHAIN, file)
+
+
+def test_a_scenario_for_measured_links_wants_a_log() -> None:
+    scenario = CHAIN.model_copy(update={"control": Control(for_link="measured")})
+    with pytest.raises(InputError, match=r"control.for_link: read measured, wanted links to measure: --links-of"):
+        flight_plan(scenario)
+    control = Control(for_link="measured", delay_margin_s=0.3)
+    with pytest.raises(ScenarioError, match=r"control.for_link"):
+        checked(CHAIN.model_copy(update={"control": control}), Path("chain3.toml"))
+
+
+def test_a_delay_that_nothing_takes_is_refused() -> None:
+    """Margins are designed up to 30 s, and the station predicts over 10 s at most."""
+    with pytest.raises(InputError, match=r"--links-of: read a loop delay of 24000.0 ms from log, wanted one that"):
+        best_for(CHAIN, MeasuredDelays("log", (1,), least_s=22.0, median_s=23.0, worst_s=24.0))
+
+
+def test_prediction_takes_longer_delays_at_equal_decay() -> None:
+    """Two static gains and a delay: (2 - sqrt 2) / decay is the longest, docs/explanation/prediction.md."""
+    design = flight_plan(load(SCENARIOS / "triangle5.toml"))[0]
+    plain, *predicted = compared(design, "triangle5").ways
+    assert [way.decay_rate_1_s for way in predicted] == pytest.approx([plain.decay_rate_1_s] * len(predicted), rel=1e-3)
+    assert {way.string_peak for way in (plain, *predicted)} == {1.0}
+    assert predicted[-1].ratio > 5.0
+    assert all(way.noise_gain > plain.noise_gain for way in predicted)
+    with pytest.raises(InputError, match=r"wanted one by inclusion"):
+        compared(Design(delay_margin_s=1.0), "other")
+    assert np.isfinite([way.alpha for way in predicted]).all()

@@ -1,0 +1,93 @@
+"""Prediction with the response of autopilots: they fly at three times the delay that their gains take without it."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from gains.sampled.prediction import predicted_growth_rate
+from gcs.control.tick import TickArray
+from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.mismatch import predicted_loop
+from gcs.plan.planner import flight_plan
+from scenarios.keys.link import DelayPoint, Link
+from scenarios.schema import Control, FixedGains, Scenario
+from tests.support.flown_copters import TRUTH, Flight, fly, three
+
+ASSUMED_S = 1.2
+# what copters5 is designed to for a margin of 0.4 s with this response
+GAINS = FixedGains(K1=-1.898, K2=0.0, K3=1.642)
+
+
+def scenario(prediction: float | str, link_s: float) -> Scenario:
+    control = Control.model_validate({"gains": GAINS, "prediction": prediction})
+    flown = three(duration_s=16.0, up_down=Link(delay_s=link_s))
+    return flown.model_copy(update={"control": control, "response": TRUTH}).with_calm_monitor()
+
+
+@cache
+def planned(prediction: float | str, link_s: float) -> FlightPlan:
+    return flight_plan(scenario(prediction, link_s))[1]
+
+
+def decay_1_s(ticks: TickArray, *, from_s: float, to_s: float) -> float:
+    """Mean decay rate (1/s) of the largest spacing error."""
+    rows = ticks[(ticks["time_s"] >= from_s) & (ticks["time_s"] < to_s)]
+    error_m = np.hypot(rows["spacing_error_north_m"], rows["spacing_error_east_m"])
+    times = np.unique(rows["time_s"])
+    largest = np.array([np.nanmax(error_m[rows["time_s"] == time]) for time in times])
+    return -float(np.polyfit(times, np.log(largest), 1)[0])
+
+
+@cache
+def decay_at_once_1_s() -> float:
+    return decay_1_s(fly(planned("off", 0.0)).flown, from_s=3.0, to_s=9.0)
+
+
+@pytest.mark.parametrize("prediction", [ASSUMED_S, "measured"])
+def test_copters_settle_at_three_times_their_margin(prediction: float | str) -> None:
+    plan = planned(prediction, 0.59)
+    assert plan.delay_margin_s == pytest.approx(0.4, abs=0.001)
+    flight = fly(plan)
+    assert flight.station.end_reason == "completed: duration reached"
+    assert np.median(flight.flown["loop_delay_s"]) > 2.95 * plan.delay_margin_s
+    assert max(flight.error_m(system_id)[-1] for system_id in (2, 3)) < 0.01 * 17.0
+    # the decay without delay, within what one period of the oscillation leaves
+    assert decay_1_s(flight.flown, from_s=3.0, to_s=9.0) == pytest.approx(decay_at_once_1_s(), rel=0.1)
+
+
+def test_without_prediction_the_same_copters_drift_apart() -> None:
+    flight = fly(planned("off", 0.59))
+    assert max(flight.error_m(system_id)[-100:].max() for system_id in (2, 3)) > 2.0
+
+
+def settled_then_slower(plan: FlightPlan, aside_s: float) -> Flight:
+    """First 20 s with the assumed delay, until errors are those of telemetry; then past the end of the window.
+
+    From larger errors the limits of acceleration and jerk lead to an oscillation of constant size, here 0.3 m.
+    """
+    slower_s = (ASSUMED_S + plan.tolerance(ASSUMED_S).longer_s[0] + aside_s) / 2.0 - 0.005
+    points = tuple(DelayPoint(at_s=at_s, delay_s=delay_s) for at_s, delay_s in ((20.0, 0.595), (20.5, slower_s)))
+    link = Link(delay_points=points)
+    changes = {"links": plan.scenario.links.model_copy(update={"up": link, "down": link}), "duration_s": 70.0}
+    return fly(replace(plan, scenario=plan.scenario.model_copy(update=changes)))
+
+
+def test_copters_beyond_their_window_grow_apart_as_computed() -> None:
+    plan = planned(ASSUMED_S, 0.59)
+    flight = settled_then_slower(plan, 0.1)
+    loop, measured = predicted_loop(plan.model, plan.gains[0], plan.responses_in_order)
+    delay_s = float(np.median(flight.flown["loop_delay_s"][flight.flown["time_s"] > 30.0]))
+    growth_1_s = predicted_growth_rate(*loop, plan.timing, assumed_s=ASSUMED_S, delay_s=delay_s, measured=measured)
+    error_m = flight.error_m(2)
+    peaks_m = error_m[: error_m.size // 200 * 200].reshape(-1, 200).max(axis=1)[8:]  # of 4 s, two oscillations
+    grows = (peaks_m > 2e-4) & (peaks_m < 5e-2)  # above the noise of telemetry, below the limits
+    assert np.count_nonzero(grows) > 3
+    flown_1_s = float(np.polyfit(4.0 * np.flatnonzero(grows), np.log(peaks_m[grows]), 1)[0])
+    assert flown_1_s == pytest.approx(growth_1_s, rel=0.1)  # a peak may be missed by an eighth of an oscillation
+
+
+def test_copters_within_their_window_do_not_grow_apart() -> None:
+    flight = settled_then_slower(planned(ASSUMED_S, 0.59), -0.05)
+    assert max(flight.error_m(k)[1500:].max() for k in (2, 3)) < 2e-4

@@ -1,0 +1,1 @@
+"""What a design can be asked for beside margin, robustness and decay."""

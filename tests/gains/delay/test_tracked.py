@@ -1,0 +1,56 @@
+"""Large blocks: eigenvalues followed along the unit circle against grids, root counts and exact answers."""
+
+import numpy as np
+import pytest
+
+from gains.core.arrays import FloatArray
+from gains.core.structure import balanced
+from gains.delay._commensurate import analyse_commensurate
+from gains.delay._crossings import axis_crossings
+from gains.delay._mixed import count_unstable_roots
+from gains.delay._tracked import tracked_crossings
+from gains.delay.constant import analyse_delay
+from gains.delay.rightmost import rightmost_root
+
+
+def random_loop(n: int, seed: int, *, late: int = 1) -> list[FloatArray]:
+    """A_0, ..., A_m of a dense loop that is stable without delay and oscillates with it."""
+    rng = np.random.default_rng(seed)
+    now = rng.normal(size=(n, n)) / np.sqrt(n) - np.eye(n)
+    delayed = [(2.0 * rng.normal(size=(n, n)) / np.sqrt(n) - 2.0 * np.eye(n)) / late for _ in range(late)]
+    right = float(np.linalg.eigvals(now + sum(delayed)).real.max())
+    return [now - max(0.0, right + 0.2) * np.eye(n), *delayed]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_followed_branches_cross_where_the_pencil_says(seed: int) -> None:
+    now, late = balanced(*random_loop(12, seed))
+    exact, tracked = axis_crossings(now, late), tracked_crossings([now, late])
+    assert len(exact) == len(tracked) > 0
+    assert [c.omega_rad_s for c in tracked] == pytest.approx([c.omega_rad_s for c in exact], rel=1e-9)
+    assert [c.delay_s for c in tracked] == pytest.approx([c.delay_s for c in exact], rel=1e-9)
+    assert [c.direction for c in tracked] == [c.direction for c in exact]
+
+
+@pytest.mark.parametrize("late", [1, 2])
+def test_large_blocks_lose_stability_at_their_margin(late: int) -> None:
+    matrices = random_loop(40, 5, late=late)
+    margin_s = analyse_commensurate(matrices).delay_margin_s
+    assert 0.0 < margin_s < np.inf
+    # 1e-4 beside the margin the growth is far above what Newton's method leaves
+    for factor, stable in ((1.0 - 1e-4, True), (1.0 + 1e-4, False)):
+        pairs = [(matrix, k * factor * margin_s) for k, matrix in enumerate(matrices)]
+        assert (rightmost_root(pairs).real < 0.0) == stable
+        assert (count_unstable_roots(pairs) == 0) == stable
+
+
+def test_equal_roots_are_counted_each() -> None:
+    # x'' of 13 equal oscillators in rotated coordinates: one block, every eigenvalue thirteen times
+    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(26, 26)))[0]
+    parts: list[FloatArray] = [np.array([[0.0, 1.0], [-2.0, 0.1]]), np.array([[0.0, 0.0], [1.0, 0.0]])]
+    now, late = ((basis @ np.kron(np.eye(13), part) @ basis.T).astype(np.float64) for part in parts)
+    found = tracked_crossings([now, late])
+    assert [crossing.direction for crossing in found] == [-1] * 13 + [1] * 13
+    # 13 equal roots are known to the digits that the single one has here
+    [window] = analyse_delay(now, late).stable_intervals_s
+    assert window == pytest.approx(analyse_delay([[0, 1], [-2, 0.1]], [[0, 0], [1, 0]]).stable_intervals_s[0], rel=1e-9)

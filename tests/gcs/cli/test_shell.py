@@ -1,0 +1,60 @@
+"""What a shell and an editor get: completion, JSON that parses, a schema beside a new scenario."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+from gcs.cli.main import main
+from scenarios.files import dump, load
+from scenarios.schema import Control, FixedGains
+from tests.support.paths import SCENARIOS
+
+
+def completed(typed: str) -> list[str]:
+    """What bash offers for the last word of a command line."""
+    asks = {"COMP_WORDS": typed, "COMP_CWORD": str(typed.count(" ")), "_GCS_COMPLETE": "complete_bash"}
+    command = [sys.executable, "-c", "import sys; sys.argv[0] = 'gcs'; from gcs.cli.main import main; main()"]
+    done = subprocess.run(command, env=os.environ | asks, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_shell_completes_commands_options_and_scenarios() -> None:
+    assert completed("gcs cap") == ["capacity"]
+    assert completed("gcs fly --assert-h") == ["--assert-headroom"]
+    assert completed("gcs check triangle5") == ["triangle5", "triangle5_scattered", "triangle5_turns"]
+
+
+def test_check_of_an_unstable_loop_prints_json_that_parses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unstable = tmp_path / "unstable.toml"
+    control = Control(gains=FixedGains(K1=1.0, K2=0.0, K3=1.0))
+    unstable.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update={"control": control})), encoding="utf-8")
+    assert gcs(monkeypatch, "check", str(unstable), "--allow-unstable", "--json") == 0
+    found = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    assert (found["schema_version"], found["delay_margin_s"], found["headroom"]) == (1, 0.0, None)
+
+
+def refuse(constant: str) -> NoReturn:
+    raise AssertionError(f"{constant} is no JSON")
+
+
+def test_new_scenario_names_the_schema_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "mine.toml"
+    assert gcs(monkeypatch, "new", str(file)) == 0
+    first = file.read_text(encoding="utf-8").splitlines()[0]
+    assert first == "#:schema ./scenario.schema.json"
+    assert "properties" in json.loads((tmp_path / "scenario.schema.json").read_text(encoding="utf-8"))
+    assert load(file).name == "mine"
+
+
+def gcs(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int | str | None:
+    monkeypatch.setattr("sys.argv", ["gcs", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code

@@ -1,0 +1,30 @@
+"""What `gcs check` says of a formation that manoeuvres."""
+
+import pytest
+
+from gcs.drive.check import check
+from gcs.plan.planner import flight_plan
+from scenarios.files import load
+from scenarios.schema import Control, FixedGains, Limits
+from tests.support.paths import SCENARIOS
+
+GAINS = Control(gains=FixedGains(K1=-1.6, K2=0.8, K3=0.5))
+PATROL = load(SCENARIOS / "patrol.toml").model_copy(update={"control": GAINS})
+
+
+def test_a_check_tells_the_course_and_the_closest_places() -> None:
+    found = check(flight_plan(PATROL)[1])
+    assert found.course is not None
+    assert found.course.length_m == pytest.approx(25.0 * found.course.duration_s)
+    assert found.course.acceleration_max_m_s2 == pytest.approx(4.0, rel=2e-4)  # changes last 1.0001 times as long
+    assert (found.closest_m, found.closest_s) == (pytest.approx(15.0), pytest.approx(28.0))
+    assert [motion.beyond for motion in found.planned] == [()] * 5
+
+
+def test_vehicles_that_cannot_fly_the_plan_are_named() -> None:
+    limits = Limits(speed_min_m_s=14.0, speed_max_m_s=30.0, acceleration_max_m_s2=7.0)
+    found = check(flight_plan(PATROL.model_copy(update={"limits": limits}))[1])
+    beyond = {motion.system_id: motion.beyond for motion in found.planned if motion.beyond}
+    # the last of both platoons are farthest out
+    assert beyond.keys() >= {3, 5}
+    assert beyond[5] == ("speed_max_m_s", "acceleration_max_m_s2")

@@ -1,0 +1,55 @@
+"""Links measured, then flown: a profile saved from a flight leads to the same loop delay."""
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gcs.cli.main import app
+from gcs.runs.files import read_summary
+from gcs.runs.record import SUMMARY_FILE
+from scenarios.errors import ScenarioError
+from scenarios.files import load, with_profile
+from scenarios.profiles import load_profile, names
+from scenarios.shipped import FOLDER
+
+
+def run(*arguments: str) -> str:
+    result = CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_saved_links_lead_to_the_same_loop_delay(tmp_path: Path) -> None:
+    profile = tmp_path / "measured.toml"
+    run("fly", "chain3", "--links", "lte", "--virtual", "--out", str(tmp_path / "a"), "--json")
+    said = run("replay", str(tmp_path / "a"), "--save-links", str(profile))
+    assert "one-way delay" in said
+    run("fly", "chain3", "--links", str(profile), "--virtual", "--out", str(tmp_path / "b"), "--json")
+    first, again = (read_summary(tmp_path / name / SUMMARY_FILE).loop_delay_s for name in "ab")
+    # other draws of the same delays; the 99th percentile rests on the slowest fifty of a trace
+    assert again.p50 == pytest.approx(first.p50, rel=0.05)
+    assert again.p99 == pytest.approx(first.p99, rel=0.15)
+    measured = load_profile(str(profile), profile, "--links").measured
+    assert measured is not None
+    # the true median up is 15 ms + 1.678 * 3.79 ms; the clock splits the round trip within its bound
+    assert measured.up.delay_s_p50 == pytest.approx(0.02136, abs=measured.up.calibration_error_s)
+    assert measured.up.lost > 0
+
+
+def test_every_shipped_profile_can_be_flown_and_names_its_source() -> None:
+    assert names() == ["lte", "radio", "satellite", "wifi"]
+    for name in names():
+        profile = load_profile(name, FOLDER / "chain3.toml", "links.profile")
+        assert profile.source
+        assert profile.licence
+        scenario = with_profile(load(FOLDER / "chain3.toml"), name, FOLDER / "chain3.toml")
+        assert scenario.links.up == profile.up
+
+
+def test_unknown_profile_is_one_line(tmp_path: Path) -> None:
+    text = (FOLDER / "chain3.toml").read_text(encoding="utf-8")
+    file = tmp_path / "own.toml"
+    file.write_text(text.split("[links]")[0] + '[links]\nprofile = "nope"\n', encoding="utf-8")
+    with pytest.raises(ScenarioError, match=r"links\.profile.*one of lte, radio, satellite, wifi"):
+        load(file)
