@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.flown_fleet import copters, fleet
+from tests.support.fleets.flown_fleet import copters, fleet
 from tests.support.processes import PATIENCE_S
 
 HINT = "is not installed: python3 make.py clients"

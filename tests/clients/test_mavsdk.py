@@ -20,7 +20,7 @@ from mavsdk.plugins.telemetry import FlightMode, Telemetry
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios import files
-from tests.support.flown_fleet import SCENARIOS, copters, fleet, until
+from tests.support.fleets.flown_fleet import SCENARIOS, copters, fleet, until
 from tests.support.processes import PATIENCE_S
 from tests.support.sim_client import parse
 

@@ -16,7 +16,7 @@ from scenarios.signing.keys import make_key, read_key
 from scenarios.signing.link import SignedLink
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.services.mavlink import CRC_EXTRA
-from tests.support.flown_fleet import copters, fleet, until
+from tests.support.fleets.flown_fleet import copters, fleet, until
 
 pytestmark = [pytest.mark.realtime, pytest.mark.xdist_group("clients")]
 

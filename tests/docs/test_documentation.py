@@ -35,7 +35,7 @@ from scenarios import files
 from scenarios.keys.criteria import Criteria
 from scenarios.keys.disturbance import Navigation
 from scenarios.schema import FixedGains, Response
-from tests.support.own_code import coded
+from tests.support.fleets.own_code import coded
 
 ROOT = blocks.ROOT
 PAGES = {str(page.relative_to(ROOT)): page for page in blocks.pages()}

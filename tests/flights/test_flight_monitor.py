@@ -23,7 +23,7 @@ from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.keys.link import Jitter, Link, Links
 from scenarios.schema import Monitor, Safety
-from tests.support.delay_ramp import ramp
+from tests.support.fleets.delay_ramp import ramp
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 

@@ -26,7 +26,7 @@ from gcs.watch.tlog import read_tlog
 from scenarios.files import dump, load
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
-from tests.support.flown_fleet import until
+from tests.support.fleets.flown_fleet import until
 from tests.support.paths import ROOT
 from tests.support.processes import PATIENCE_S
 from tests.support.signed_peer import EPOCH_NS, KEY, NOW_NS, a_sender

@@ -8,7 +8,7 @@ from scenarios.errors import ScenarioError
 from scenarios.files import checked, dump, fingerprint, load
 from scenarios.own_code import LARGEST_BYTES, function_of, write_code
 from scenarios.schema import Response
-from tests.support.own_code import LAW, coded
+from tests.support.fleets.own_code import LAW, coded
 
 MARKS = "from pathlib import Path\nPath(__file__).with_name('ran').touch()\n" + LAW
 

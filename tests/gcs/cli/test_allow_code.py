@@ -13,7 +13,7 @@ from gcs.runs.files import read_ticks
 from scenarios.files import dump
 from scenarios.own_code import write_code
 from sim_vehicles.drive.cli import run as sim_vehicles
-from tests.support.own_code import LAW, coded
+from tests.support.fleets.own_code import LAW, coded
 
 MARKS = "from pathlib import Path\nPath('ran').touch()\n" + LAW
 

@@ -13,7 +13,7 @@ from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FIL
 from gcs.runs.summary import finish, summarise
 from gcs.views.observer import record_run
 from gcs.views.report import print_summary
-from tests.support.flown_run import DESIGN, line, ticks_of, write_run
+from tests.support.fleets.flown_run import DESIGN, line, ticks_of, write_run
 from tests.support.paths import ROOT
 
 CHAIN = "scenarios/chain3.toml"

@@ -9,7 +9,7 @@ from gcs.cli.main import main
 from gcs.runs.summary import finish
 from gcs.views.observer import recover_run
 from scenarios.files import dump, load
-from tests.support.flown_run import line, ticks_of, write_run
+from tests.support.fleets.flown_run import line, ticks_of, write_run
 from tests.support.paths import SCENARIOS
 
 

@@ -12,7 +12,7 @@ from gcs.station.station import Station
 from scenarios.files import load
 from scenarios.schema import FixedGains, Limits, Vehicle
 from sim_vehicles.drive.fleet import Fleet
-from tests.support.flown_copters import planned, three
+from tests.support.fleets.flown_copters import planned, three
 from tests.support.paths import SCENARIOS
 from tests.support.sim_client import parse
 

@@ -15,7 +15,7 @@ from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.summary import finish
 from gcs.stress.campaign import Store
 from gcs.stress.trial import Outcome
-from tests.support.flown_run import line, prepare, ticks_of
+from tests.support.fleets.flown_run import line, prepare, ticks_of
 
 THREE = line(3)
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from gcs.control.tick import CLOCK_JUMPED, Event
 from gcs.runs.summary import summarise
-from tests.support.flown_run import DESIGN, line, ticks_of
+from tests.support.fleets.flown_run import DESIGN, line, ticks_of
 
 
 def test_each_estimate_has_status_and_samples_unknown_is_none() -> None:

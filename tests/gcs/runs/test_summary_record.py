@@ -10,7 +10,7 @@ from gcs.errors import InputError
 from gcs.runs.files import read_summary
 from gcs.runs.record import SUMMARY_FILE
 from gcs.runs.summary import finish
-from tests.support.flown_run import line, ticks_of, write_run
+from tests.support.fleets.flown_run import line, ticks_of, write_run
 
 OLDER: dict[str, Any] = {
     "verdict": "stable",

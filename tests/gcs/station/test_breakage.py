@@ -18,8 +18,8 @@ from gcs.station.station import Station
 from scenarios.schema import Limits, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
-from tests.support.flown_copters import TRUTH, Flight, plan_for, three
-from tests.support.pilots import PILOTS_MODE, PilotsVehicle, flight_s
+from tests.support.fleets.flown_copters import TRUTH, Flight, plan_for, three
+from tests.support.fleets.pilots import PILOTS_MODE, PilotsVehicle, flight_s
 
 
 def flown(flavour: str, modes: dict[float, int], **changes: object) -> Flight:

@@ -16,8 +16,8 @@ from gcs.errors import InputError
 from gcs.stress.campaign import PARQUET_FILE, TRIALS_FILE, Store, dask_workers, local_workers, run_campaign, write_table
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
+from tests.support.fleets.stress_pair import trials
 from tests.support.paths import ROOT
-from tests.support.stress_pair import trials
 
 
 class Here:
@@ -123,7 +123,7 @@ KILLED = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from tests.support.stress_pair import trials
+from tests.support.fleets.stress_pair import trials
 from gcs.stress.campaign import Store, local_workers, run_campaign
 if __name__ == "__main__":
     store = Store(Path(sys.argv[1]))

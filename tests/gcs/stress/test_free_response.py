@@ -20,7 +20,7 @@ from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
 from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Limits
-from tests.support.stress_pair import SCENARIO, pair_plan
+from tests.support.fleets.stress_pair import SCENARIO, pair_plan
 
 PERIOD_S = 0.02
 

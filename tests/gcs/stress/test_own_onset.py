@@ -10,7 +10,7 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.study import NoOnset, Onset, Study, find_onset
 from gcs.stress.trial import Outcome, Trial
 from scenarios.schema import Response, Scenario
-from tests.support.own_code import coded, given
+from tests.support.fleets.own_code import coded, given
 
 
 def growing_from(at_s: float) -> Callable[[float], float | None]:

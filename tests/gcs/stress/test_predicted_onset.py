@@ -1,6 +1,6 @@
 """The search for the two onsets of a loop that is predicted over a fixed delay, among flights that grow as predicted.
 
-`tests/flights/test_predicted_flight.py` flies at both ends of a window.
+`tests/flights/loops/test_predicted_flight.py` flies at both ends of a window.
 """
 
 from dataclasses import replace

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from gcs.errors import InputError
 from gcs.stress.axes import at_coordinates, has_constant_links, parse_axis, split_delay
 from scenarios.keys.link import Jitter, Link
-from tests.support.stress_pair import SCENARIO
+from tests.support.fleets.stress_pair import SCENARIO
 
 
 def test_axis_is_a_range_or_a_list() -> None:

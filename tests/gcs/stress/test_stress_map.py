@@ -11,7 +11,7 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import plan_loops
 from scenarios.keys.link import Jitter, Link
-from tests.support.stress_pair import SCENARIO, pair_plan
+from tests.support.fleets.stress_pair import SCENARIO, pair_plan
 
 DELAY_JITTER = (Axis("delay", (0.02, 0.25)), Axis("jitter", (0.0, 0.05)))
 

@@ -23,8 +23,8 @@ from gcs.stress.study import Onset, Study, find_onset
 from gcs.stress.trial import Outcome
 from gcs.views.junit import write_junit
 from scenarios.files import dump
+from tests.support.fleets.stress_pair import SCENARIO, pair_plan
 from tests.support.paths import DATA
-from tests.support.stress_pair import SCENARIO, pair_plan
 
 app = typer.Typer()
 app.command()(stress)

@@ -21,8 +21,8 @@ from gcs.stress.trial import Trial, plan_of
 from scenarios.files import load
 from scenarios.keys.link import Link, VehicleLinks
 from scenarios.schema import Clocks, Control, GainBlock
+from tests.support.fleets.stress_pair import SCENARIO, pair_plan
 from tests.support.paths import SCENARIOS
-from tests.support.stress_pair import SCENARIO, pair_plan
 
 
 def pair_trial(delay_s: float = 0.1, **changes: Any) -> Trial:

@@ -13,7 +13,7 @@ from gcs.runs.files import read_summary
 from gcs.runs.summary import finish
 from gcs.views.flight_report import REPORT_FILE, leave_report
 from gcs.views.svg import Line, chart
-from tests.support.flown_run import line, ticks_of, write_run
+from tests.support.fleets.flown_run import line, ticks_of, write_run
 
 CHROMIUM = which("chromium") or which("chromium-browser") or which("google-chrome")
 

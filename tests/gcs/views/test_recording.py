@@ -18,7 +18,7 @@ from gcs.views.observer import record_run
 from gcs.views.recording import Recording
 from gcs.views.scene import vehicle_colors
 from gcs.views.viewer import find_recording, view
-from tests.support.flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
+from tests.support.fleets.flown_run import DESIGN, SPEED_M_S, line, ticks_of, write_run
 from tests.support.recordings import read_back
 
 FIVE = line(5)

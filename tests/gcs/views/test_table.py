@@ -10,7 +10,7 @@ from rich.console import Console
 from gcs.control.tick import Event, Mode, TickArray
 from gcs.views.table import FlightState, plain_line, render
 from scenarios.schema import Scenario
-from tests.support.flown_run import DESIGN, line, ticks_of
+from tests.support.fleets.flown_run import DESIGN, line, ticks_of
 
 
 def drawn(state: FlightState, *, width: int = 120, height: int = 40) -> list[str]:

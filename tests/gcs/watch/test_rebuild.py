@@ -17,9 +17,9 @@ from gcs.watch.rebuild_report import LogSource, rebuild_report
 from gcs.watch.tlog import parse_tlog
 from scenarios.files import load
 from scenarios.schema import Scenario
-from tests.support.delay_ramp import ramp
+from tests.support.fleets.delay_ramp import ramp
+from tests.support.fleets.logged_flight import EPOCH_NS, flown, log_bytes
 from tests.support.known import known
-from tests.support.logged_flight import EPOCH_NS, flown, log_bytes
 from tests.support.paths import SCENARIOS
 
 pytestmark = pytest.mark.xdist_group("rebuild")  # they share flights

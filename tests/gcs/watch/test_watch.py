@@ -18,7 +18,7 @@ from scenarios.keys.link import Jitter, Link, Links
 from scenarios.schema import Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.links.truth import SAMPLED, Row
-from tests.support.flown_copters import three
+from tests.support.fleets.flown_copters import three
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 from tests.support.sim_client import arm, guided, heartbeat, setpoint

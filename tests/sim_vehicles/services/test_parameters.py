@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.vehicles.shell import Craft, Shell
+from tests.support.fleets.vehicle_kinds import VEHICLES, copter
 from tests.support.sim_client import SECOND, START, a_vehicle, arm, heartbeat, mode, pack, parse_all, setpoint, take_off
-from tests.support.vehicle_kinds import VEHICLES, copter
 
 REAL32, INT32 = dialect.MAV_PARAM_TYPE_REAL32, dialect.MAV_PARAM_TYPE_INT32
 

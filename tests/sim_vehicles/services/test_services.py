@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.shell import Craft, Shell
+from tests.support.fleets.vehicle_kinds import VEHICLES, copter
 from tests.support.sim_client import (
     MS,
     SECOND,
@@ -28,7 +29,6 @@ from tests.support.sim_client import (
     setpoint,
     take_off,
 )
-from tests.support.vehicle_kinds import VEHICLES, copter
 
 ACCEPTED, DENIED, UNSUPPORTED = (
     dialect.MAV_RESULT_ACCEPTED,

@@ -6,8 +6,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from sim_vehicles.vehicles.shell import Craft, Shell
+from tests.support.fleets.vehicle_kinds import VEHICLES
 from tests.support.sim_client import SECOND, START, arm, command, guided, heartbeat, pack, parse_all
-from tests.support.vehicle_kinds import VEHICLES
 
 MONITOR = dialect.MAVLink(None, srcSystem=254, srcComponent=190)
 every_kind = pytest.mark.parametrize("make", VEHICLES.values(), ids=VEHICLES)

@@ -21,7 +21,7 @@ from scenarios.keys.link import Link, Outage, VehicleLinks
 from scenarios.schema import ClockJump
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
-from tests.support.flown_copters import COPTERS5, TRUTH, Flight, fly, plan_for, planned, three
+from tests.support.fleets.flown_copters import COPTERS5, TRUTH, Flight, fly, plan_for, planned, three
 from tests.support.sim_client import command
 from tests.support.station_peer import HOME, Peer, messages
 

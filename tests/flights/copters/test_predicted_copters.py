@@ -13,7 +13,7 @@ from gcs.plan.mismatch import predicted_loop
 from gcs.plan.planner import flight_plan
 from scenarios.keys.link import DelayPoint, Link
 from scenarios.schema import Control, FixedGains, Scenario
-from tests.support.flown_copters import TRUTH, Flight, fly, three
+from tests.support.fleets.flown_copters import TRUTH, Flight, fly, three
 
 ASSUMED_S = 1.2
 # what copters5 is designed to for a margin of 0.4 s with this response

@@ -13,7 +13,7 @@ from gcs.station.absence import LEFT_OUT
 from scenarios.keys.link import Link, Outage, VehicleLinks
 from scenarios.left_out import without
 from scenarios.schema import NominalVelocity, Scenario
-from tests.support.flown_copters import TRUTH, Flight, fly, plan_for, three
+from tests.support.fleets.flown_copters import TRUTH, Flight, fly, plan_for, three
 
 DEAD = Link(loss_probability=1.0)
 

@@ -21,8 +21,8 @@ from gcs.watch.for_link import MeasuredDelays, best_for, evaluated
 from scenarios.errors import ScenarioError
 from scenarios.files import checked, load
 from scenarios.schema import Control, Scenario
+from tests.support.fleets.logged_flight import flown, log_bytes
 from tests.support.known import known
-from tests.support.logged_flight import flown, log_bytes
 from tests.support.paths import SCENARIOS
 
 CHAIN = load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 5.0})

@@ -1,7 +1,7 @@
 """Hostile datagrams change nothing but counters, at both ends: a flight under fire is flown as without it.
 
-`FUZZ_DATAGRAMS=1000000 python3 make.py test tests/flights/test_fuzz.py` sends as many to each end of each flight; a
-sample is sent by default. The flight lasts as long as that takes: a step gets no more than the emulated links hold.
+`FUZZ_DATAGRAMS=1000000 python3 make.py test tests/flights/hostile/test_fuzz.py` sends as many to each end of each flight;
+a sample is sent by default. The flight lasts as long as that takes: a step gets no more than the emulated links hold.
 
 Without a key, new valid frames from the station's or a vehicle's own address, and replays older than the 128 frames
 that a sequence number can tell apart, are not meant: those cannot be told from the real ones. What they must not do is
@@ -35,7 +35,9 @@ from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.drive.guard import signed_links
-from tests.support.flown_copters import three
+from tests.support.fleets.flown_copters import three
+from tests.support.fleets.logged_flight import flown as logged
+from tests.support.fleets.logged_flight import log_bytes
 from tests.support.hostile import (
     SAID_BY_STATIONS,
     SAID_BY_VEHICLES,
@@ -47,8 +49,6 @@ from tests.support.hostile import (
     noise,
     timesync_reply,
 )
-from tests.support.logged_flight import flown as logged
-from tests.support.logged_flight import log_bytes
 from tests.support.paths import SCENARIOS
 
 COUNT = int(os.environ.get("FUZZ_DATAGRAMS", "20000"))

@@ -15,7 +15,7 @@ from gcs.station.station import Station
 from scenarios.keys.link import Link, Links
 from scenarios.schema import ClockJump, Rates, Scenario, Vehicle
 from sim_vehicles.drive.fleet import Fleet
-from tests.support.flown_copters import COPTERS5, TRUTH, Flight, fly
+from tests.support.fleets.flown_copters import COPTERS5, TRUTH, Flight, fly
 from tests.support.sim_client import parse
 
 SECOND = 1_000_000_000

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenarios.schema import Response
-from tests.support.flown_copters import fly, plan_for, three
+from tests.support.fleets.flown_copters import fly, plan_for, three
 
 LIMITS: dict[str, Any] = {"acceleration_max_m_s2": 2.5, "jerk_max_m_s3": 5.0}
 RESPONSE: dict[str, Any] = {"lag_s": 0.066, "velocity_gain_1_s": 1.88, "dead_time_s": 0.048}

@@ -6,8 +6,8 @@ from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.station.station import Station
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
-from tests.support.flown_copters import plan_for, three
-from tests.support.pilots import PilotsVehicle, flight_s, flown
+from tests.support.fleets.flown_copters import plan_for, three
+from tests.support.fleets.pilots import PilotsVehicle, flight_s, flown
 from tests.support.sim_client import SECOND
 
 

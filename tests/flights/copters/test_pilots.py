@@ -12,8 +12,8 @@ from scenarios.keys.link import Link, Outage, VehicleLinks
 from scenarios.schema import ClockJump, Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter_rules import RULES
-from tests.support.flown_copters import COPTERS5, plan_for
-from tests.support.pilots import PILOTS_MODE, POSCTL, RTL, SET_MESSAGE_INTERVAL, PilotsVehicle, flight_s, flown
+from tests.support.fleets.flown_copters import COPTERS5, plan_for
+from tests.support.fleets.pilots import PILOTS_MODE, POSCTL, RTL, SET_MESSAGE_INTERVAL, PilotsVehicle, flight_s, flown
 from tests.support.sim_client import SECOND, parse
 
 

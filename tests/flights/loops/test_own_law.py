@@ -10,7 +10,7 @@ from gcs.plan.own_law import NOT_LINEAR, OWN_DYNAMICS, LawFormation, law_formati
 from gcs.plan.planner import flight_plan
 from scenarios.keys.course import ChangedOffset, FormationChange
 from scenarios.schema import Response
-from tests.support.own_code import LAW, coded, given
+from tests.support.fleets.own_code import LAW, coded, given
 
 ROUNDING_M = 1e-9
 """Positions are single precision: of different numbers the nearest differ by 4e-6 m or more at these distances."""

@@ -4,7 +4,7 @@ from typing import Any
 
 from scenarios.keys.own import CodeFile
 from scenarios.schema import Clocks, Control, FixedGains, Rates, Scenario
-from tests.support.stress_pair import SCENARIO
+from tests.support.fleets.stress_pair import SCENARIO
 
 LAW = """
 import numpy as np

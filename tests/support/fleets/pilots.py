@@ -10,7 +10,7 @@ from gcs.station.station import Station
 from scenarios.schema import Scenario
 from sim_vehicles.drive.fleet import Fleet
 from sim_vehicles.vehicles.copter import Copter
-from tests.support.flown_copters import TRUTH, plan_for, three
+from tests.support.fleets.flown_copters import TRUTH, plan_for, three
 from tests.support.sim_client import SECOND, command, parse
 
 LOITER, RTL, POSCTL = 5, 6, 3 << 16

@@ -20,7 +20,7 @@ import pytest
 
 from gcs.control.tick import Event
 from gcs.runs.record import READY_FILE, RECORDING_FILE, TICKS_FILE, UNFINISHED_FILE
-from tests.support.flown_run import line, prepare, ticks_of
+from tests.support.fleets.flown_run import line, prepare, ticks_of
 from tests.support.recordings import read_back
 
 pytestmark = pytest.mark.realtime

@@ -13,7 +13,7 @@ from gcs.runs.summary import summarise
 from scenarios.keys.link import Link, Links
 from scenarios.keys.sitl import Sitl
 from scenarios.schema import ClockJump, Rates, Scenario
-from tests.support.flown_copters import COPTERS5, TRUTH, Flight, fly
+from tests.support.fleets.flown_copters import COPTERS5, TRUTH, Flight, fly
 
 SLOWLY = Rates(control_hz=10.0, telemetry_hz=10.0, timesync_hz=10.0)
 """TIMESYNC at its usual rate, and as little else as a stable flight needs."""

@@ -1,0 +1,1 @@
+"""Flights and fleets that test modules share."""
