@@ -1,7 +1,8 @@
 """Hostile datagrams change nothing but counters, at both ends: a flight under fire is flown as without it.
 
 `FUZZ_DATAGRAMS=1000000 python3 make.py test tests/flights/hostile/test_fuzz.py` sends as many to each end of each
-flight; a sample is sent by default. The flight lasts as long as that takes: a step gets no more than the emulated links hold.
+flight; a sample is sent by default. The flight lasts as long as that takes: a step gets no more than the emulated links
+hold.
 
 Without a key, new valid frames from the station's or a vehicle's own address, and replays older than the 128 frames
 that a sequence number can tell apart, are not meant: those cannot be told from the real ones. What they must not do is
