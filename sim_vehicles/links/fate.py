@@ -142,8 +142,8 @@ class _Delays(Protocol):
 class Stream:
     """The draws of one link, datagram by datagram."""
 
-    def __init__(self, link: link_keys.Link, seed: int, key: tuple[int, int]) -> None:
-        fates, delays = np.random.SeedSequence(seed, spawn_key=key).spawn(2)
+    def __init__(self, link: link_keys.Link, seeds: np.random.SeedSequence) -> None:
+        fates, delays = seeds.spawn(2)
         self._fates = np.random.default_rng(fates)
         self._delays = _delays_of(link.jitter, np.random.default_rng(delays))
         self._block: list[Draws] = []

@@ -14,13 +14,12 @@ from sim_vehicles.links import truth
 from sim_vehicles.links.fate import Stream, behaviour_of, constant, flipped, outcome
 from sim_vehicles.links.truth import DUPLICATE, FATES, LINK_DOWN, LINK_FULL, LINK_UP, PASSED, Record, Row
 from sim_vehicles.services.clock import NEVER_NS
+from sim_vehicles.services.draws import Use, seeds_of
 from sim_vehicles.services.mavlink import message_id
 
 CAPACITY = 10_000
 """Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
 
-UP_STREAM, DOWN_STREAM = 1, 2
-"""Last word of the spawn key of a link's random streams; see services.clock.CLOCK_STREAM."""
 SETPOINT_IDS = (82, 84, 86)
 """SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first of them begins the flight."""
 
@@ -106,7 +105,7 @@ class Link:
         self._bad = False
         self._stream = None
         if channel is not None or not constant(link):
-            self._stream = Stream(link, seed, (system_id, UP_STREAM if kind == LINK_UP else DOWN_STREAM))
+            self._stream = Stream(link, seeds_of(seed, system_id, Use.LINK_UP if kind == LINK_UP else Use.LINK_DOWN))
 
     @property
     def under_way(self) -> int:

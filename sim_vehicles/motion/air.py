@@ -12,18 +12,15 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
-import numpy as np
-
 from scenarios.keys import disturbance
 from scenarios.keys.own import BUILT_IN
 from scenarios.schema import NS_PER_S, Scenario
 from sim_vehicles.links.truth import CARRIED, PUSHED, Record, disturbance_row
 from sim_vehicles.services.clock import NEVER_NS
+from sim_vehicles.services.draws import Use, draws_of
 
 STEP_NS = 10_000_000
 """How long gusts are held."""
-GUST_STREAM = 8
-"""Last word of the spawn key of the random stream of a vehicle's gusts; common gusts have system id 0."""
 _BLOCK = 512
 
 Moved = TypeVar("Moved")
@@ -45,8 +42,7 @@ class Gusts:
     """The gusts of one vehicle, north and east, by the number of the step."""
 
     def __init__(self, gusts: disturbance.Gusts, seed: int, system_id: int) -> None:
-        stream = np.random.SeedSequence(seed, spawn_key=(0 if gusts.common else system_id, GUST_STREAM))
-        self._draw = np.random.default_rng(stream)
+        self._draw = draws_of(seed, 0 if gusts.common else system_id, Use.GUSTS)
         self._fades = math.exp(-STEP_NS / NS_PER_S / gusts.correlation_time_s)
         self._deviation_m_s2 = gusts.deviation_m_s2
         north, east = (self._deviation_m_s2 * self._draw.standard_normal(2)).tolist()

@@ -6,9 +6,7 @@ import numpy as np
 
 from scenarios.schema import NS_PER_S, Scenario
 from sim_vehicles.links.truth import POSITION_ERROR, VELOCITY_ERROR, Record, disturbance_row
-
-NAVIGATION_STREAM = 9
-"""Last word of the spawn key of the random stream of a vehicle's navigation."""
+from sim_vehicles.services.draws import Use, draws_of
 
 Pair = tuple[float, float]
 
@@ -19,8 +17,7 @@ class Navigator:
     def __init__(self, scenario: Scenario, system_id: int, record: Record | None) -> None:
         own = scenario.navigation
         assert own is not None
-        stream = np.random.SeedSequence(scenario.seed, spawn_key=(system_id, NAVIGATION_STREAM))
-        self._draw = np.random.default_rng(stream)
+        self._draw = draws_of(scenario.seed, system_id, Use.NAVIGATION)
         self._noise = np.array([own.position_noise_m] * 2 + [own.velocity_noise_m_s] * 2)
         self._drift = np.array([own.position_bias_m] * 2 + [own.velocity_bias_m_s] * 2)
         self._time_s = own.bias_time_s

@@ -3,15 +3,11 @@
 from dataclasses import dataclass
 from typing import Self
 
-import numpy as np
-
 from scenarios.schema import NS_PER_S, Clocks
+from sim_vehicles.services.draws import Use, draws_of
 
 NS_PER_MS = 1_000_000
 PARTS = 1_000_000_000
-
-CLOCK_STREAM = 0
-"""Last word of the spawn key of the clock's random stream; a vehicle's other streams have other numbers."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +22,7 @@ class BootClock:
     @classmethod
     def draw(cls, clocks: Clocks, seed: int, system_id: int, start_ns: int) -> Self:
         """Draw a vehicle's clock from the scenario's seed: offset from 0 to its bound, drift within ± its bound."""
-        stream = np.random.SeedSequence(seed, spawn_key=(system_id, CLOCK_STREAM))
-        offset, drift = np.random.default_rng(stream).random(2)
+        offset, drift = draws_of(seed, system_id, Use.CLOCK).random(2)
         offset_ns = int(offset * clocks.offset_max_s * NS_PER_S)
         return cls(start_ns, offset_ns, round((2.0 * drift - 1.0) * clocks.drift_max_ppm * 1000.0))
 

@@ -9,8 +9,6 @@ import heapq
 import math
 from collections.abc import Mapping
 
-import numpy as np
-
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.motion.air import Air
@@ -20,6 +18,7 @@ from sim_vehicles.motion.lagged import inner_of
 from sim_vehicles.motion.navigation import Navigator
 from sim_vehicles.services import mavlink, messages
 from sim_vehicles.services.clock import NEVER_NS, BootClock
+from sim_vehicles.services.draws import Use, draws_of
 from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.sitl import slips
 from sim_vehicles.vehicles.copter_rules import (
@@ -34,8 +33,6 @@ from sim_vehicles.vehicles.copter_rules import (
 from sim_vehicles.vehicles.setpoints import ABSURD, POSITION_AXES, VELOCITY_AXES, YAW_IGNORED, YAW_RATE_IGNORED
 from sim_vehicles.vehicles.shell import Answer, Radio
 
-ORIGIN_STREAM = 7
-"""Last word of the spawn key of the random stream of a vehicle's local origin."""
 TAKEN_OFF_M = 0.3
 HOME_M = 0.5
 """Distance to home at which a return becomes a landing."""
@@ -68,8 +65,8 @@ class Copter:
         self.landed = True
         self.home_ne_m = own.position_ne_m
         self.motion = Motion(*own.position_ne_m, inner=inner_of(self.settings))
-        stream = np.random.SeedSequence(scenario.seed, spawn_key=(own.system_id, ORIGIN_STREAM))
-        spread = (2.0 * np.random.default_rng(stream).random(3) - 1.0) * self.settings.origin_spread_m
+        drawn = draws_of(scenario.seed, own.system_id, Use.ORIGIN).random(3)
+        spread = (2.0 * drawn - 1.0) * self.settings.origin_spread_m
         north_m, east_m, up_m = spread.tolist()
         self.origin_neu_m: tuple[float, float, float] = (north_m, east_m, up_m)
         """Origin of its local frame, in the scenario's frame."""

@@ -14,17 +14,14 @@ stale, but the measured spacing is not, and a vehicle that only coasted would dr
 import math
 from collections.abc import Callable
 
-import numpy as np
-
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.motion.double_integrator import Command, State
+from sim_vehicles.services.draws import Use, draws_of
 from sim_vehicles.services.parameters import Parameter, Parameters
 
 STEP = -1
 """A step of this loop, as an entry of the vehicle's schedule beside the message ids."""
-SENSOR_STREAM = 4
-"""Last word of the spawn key of the sensor's random stream."""
 LARGEST_GAIN, LARGEST_OFFSET_M = 1e4, 1e6
 _AXES = "NE"
 _NAMES_P, _NAMES_V = ([f"FORM_{kind}_{i}{j}" for i in _AXES for j in _AXES] for kind in ("KP", "KV"))
@@ -50,8 +47,7 @@ class VehicleLoop:
         self.on = False
         self._look_every = round(own.rate_hz / own.sensor_hz)
         self._state_of = state_of
-        stream = np.random.SeedSequence(scenario.seed, spawn_key=(system_id, SENSOR_STREAM))
-        self._draw = np.random.default_rng(stream)
+        self._draw = draws_of(scenario.seed, system_id, Use.SENSOR)
         self._noise = own.position_noise_m, own.velocity_noise_m_s
         self._ahead = 0
         self._offset_m = 0.0, 0.0
