@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray
-from gains.core.errors import DisagreementError, SolverError
+from gains.core.errors import DisagreementError, InfeasibleError
 from gains.core.requirement import ALPHA_MIN, Requirement, plain
 from gains.core.structure import positive_seconds
 from gains.delay.constant import delay_margin
@@ -68,8 +68,8 @@ class Design:
     """The continuous margin block by block."""
     behaviour: Behaviour
     certificate: Certificate | None
-    """Lyapunov proof of 0.9999 α; None if the loop is unstable, its α is below 5e-4, or the solver finds none for given
-    gains."""
+    """Lyapunov proof of 0.9999 α; None if the loop is unstable, its α is below 5e-4, or badly scaled given gains have
+    none."""
     requirement: Requirement | None = None
     method: Literal["inclusion", "given"] = "inclusion"
     loop: Literal["ground"] = "ground"
@@ -227,12 +227,12 @@ def _assess(formation: FormationModel, gains: Gains, *, period_s: float, require
 
 
 def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | None:
-    """The proof of α. Given gains, which may be badly scaled, do without one where the solver finds none."""
+    """The proof of α. Given gains may be badly scaled: they do without one where none is found."""
     if alpha < ALPHA_MIN:
         return None
     try:
         return certify(*gains, _CERTIFIED_SHARE * alpha)
-    except SolverError:
+    except InfeasibleError:
         if given:
             return None
         raise

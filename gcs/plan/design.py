@@ -62,7 +62,6 @@ class Proof(Published):
     P_eigenvalue_min: float
     s_procedure_eigenvalue_max: float | None = None
     inequality_eigenvalue_max: float | None = None
-    solver: SolverFacts | None = None
 
 
 class Block(Published):

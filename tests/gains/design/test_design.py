@@ -52,7 +52,6 @@ def test_default_design_is_proved_and_reported(default_design: Design) -> None:
     assert certificate is not None
     assert 0.999 * default_design.alpha < certificate.alpha < default_design.alpha
     assert certificate.P_eigenvalue_min > 0 > certificate.s_procedure_eigenvalue_max
-    assert certificate.solver.status == "optimal"
     assert (default_design.loop, default_design.method, default_design.vehicles) == ("ground", "inclusion", 5)
 
 

@@ -48,12 +48,11 @@ def test_exact_bound_is_the_least_singular_value_over_all_frequencies(k1: float,
 
 
 @pytest.mark.parametrize("gains", [(-3.5, 3.5, 6.0), (-1.0, 1.0, 1.0), (-20.0, 22.0, 216.0), (-0.7, 0.7, 0.24)])
-def test_lmi_and_frequency_response_agree_on_the_bound(gains: tuple[float, float, float]) -> None:
+def test_proof_and_frequency_response_agree_on_the_bound(gains: tuple[float, float, float]) -> None:
     """Two independent ways: just below the exact bound a certificate exists, just above there is none."""
     alpha = robustness(*gains)
     certificate = certify(*gains, alpha * (1 - 1e-4))
     assert certificate.P_eigenvalue_min > 0 > certificate.s_procedure_eigenvalue_max
-    assert certificate.solver.status == "optimal"
     with pytest.raises(InfeasibleError, match="lower alpha"):
         certify(*gains, alpha * (1 + 1e-4))
 
