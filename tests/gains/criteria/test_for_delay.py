@@ -70,7 +70,6 @@ def test_a_criterion_is_met(method: str, margin_s: float | None, criteria: dict[
 @pytest.mark.parametrize(
     ("method", "criteria"),
     [
-        ("inclusion", {"spacing_gain_max_s2": 0.3, "noise_gain_max": 3.0}),
         ("inclusion", {"at_delay_s": 0.3, "alpha_at_delay": 0.6, "decay_rate_at_delay_1_s": 1.7}),
         ("graph-lqr", {"natural_frequency_max_rad_s": 1.0, "spacing_gain_max_s2": 0.5, "damping_min": 0.5}),
     ],
