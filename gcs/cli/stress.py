@@ -149,20 +149,24 @@ def stress(
 def _study(
     file: Path, loop: options.LoopPlace | None, links: str | None, *, real_time: bool, allow_code: bool
 ) -> "tuple[Study, Design]":
+    from gcs.drive.flown import identified_in_flight
     from gcs.drive.preflight import bad_start, unstable_loop
-    from gcs.plan.planner import flight_plan
+    from gcs.plan.planner import described, flight_plan
     from gcs.stress.study import Study
 
     scenario = options.load_scenario(file, loop, links=links, allow_code=allow_code)
-    if scenario.dynamics == "autopilot":
-        wanted = "double_integrator: gcs stress flies no vehicles that have to take off"
+    if scenario.dynamics == "autopilot" and real_time:
+        wanted = "double_integrator with --real-time: gcs stress flies autopilots in virtual time"
         raise InputError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
     if scenario.control.prediction == "measured":
         wanted = "off, or a number of seconds: gcs stress tests an assumed delay that is fixed"
         raise InputError(f"{file}: control.prediction: read 'measured', wanted {wanted}")
     # a campaign does not fly the slower gains of the schedule, so they need not be designed
     options.refuse(file, bad_start(scenario))
-    design, plan = flight_plan(scenario.with_calm_monitor())
+    design, planned = flight_plan(scenario.with_calm_monitor())
+    plan = identified_in_flight(planned)
+    if plan is not planned:
+        design = described(design, plan)
     options.refuse(file, unstable_loop(plan))
     return Study(plan, real_time=real_time), design
 
