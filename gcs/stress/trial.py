@@ -54,9 +54,9 @@ class Trial:
     def id(self) -> str:
         """A hash of the inputs: the same trial has the same id anywhere."""
         inputs = [self.scenario.model_dump(mode="json"), self.gain, self.delay_margin_s, self.kind, self.probe]
-        if self.responses is not None and self.responses.source == "identified":
-            inputs.append([asdict(response) for _, response in sorted(self.responses.of.items())])
-        text = json.dumps([*inputs, self.real_time], sort_keys=True)
+        known = self.responses
+        found = [] if known is None or known.source == "given" else [{k: asdict(own) for k, own in known.of.items()}]
+        text = json.dumps([*inputs, self.real_time, *found], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
