@@ -127,8 +127,6 @@ def refusal(scenario: Scenario) -> str | None:
     """Why no disturbance of this scenario is flown, as key, read and wanted; None if it can be."""
     control, links = scenario.control, {scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles}
     wanted = "with --disturbance"
-    if scenario.dynamics == "autopilot":
-        return f"dynamics: read 'autopilot', wanted double_integrator {wanted}"
     if len(scenario.vehicles) < 2:
         return f"vehicles: read 1 vehicle, wanted two or more {wanted}"
     if control.loop == "onboard":
