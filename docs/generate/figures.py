@@ -377,6 +377,32 @@ def copters(runner: Runner) -> str:
     )
 
 
+_RESPONSES = {
+    "lag": "lag_s = 0.125\nvelocity_gain_1_s = 2.78",
+    "lag with dead time": "lag_s = 0.066\nvelocity_gain_1_s = 1.88\ndead_time_s = 0.048",
+    "second order": "lag_s = 0.11\nvelocity_gain_1_s = 1.71\nnatural_frequency_rad_s = 14.0",
+}
+"""Three models of one ArduCopter's response, fitted to the same measurement."""
+_LIMITS = "acceleration_max_m_s2 = 2.5\njerk_max_m_s3 = 5.0"
+
+
+def copters_onset(runner: Runner) -> str:
+    """Where copters of each response model break, beside the margin computed with the response identified in flight."""
+    rows: list[tuple[str, ...]] = []
+    for model, keys in _RESPONSES.items():
+        shown, name = f"`{keys}`".replace("\n", "`, `"), model.replace(" ", "-")
+        file = _changed(runner, "copters5", name, r"^lag_s = .*\nvelocity_gain_1_s = .*$", f"{keys}\n{_LIMITS}")
+        found = runner.json(f"gcs stress {file} --onset")
+        onset, vehicles = found["onset"], found["response"]["vehicles"]
+        assert {own["model"] for own in vehicles} == {model}
+        lags, margin_s = _range((own["lag_s"] for own in vehicles), ".4f", " s"), onset["predicted_s"]
+        flown_s = onset["loop_delay_s"]
+        rows.append((f"`{file}`", shown, lags, _ms(margin_s), _ms(flown_s), f"{flown_s / margin_s:.3f}"))
+    head = ("file", "`[autopilot]`", "lag identified", "margin computed with it", "onset in flight", "ratio")
+    limits = f"`{_LIMITS}`".replace("\n", "` and `")
+    return f"Each file is `copters5.toml` with other keys under `[autopilot]`, and {limits}:\n\n{table(head, rows)}"
+
+
 def signing(runner: Runner) -> str:
     """What signing costs on a link that reorders, and in computing time."""
     runner.run("gcs key formation.key")
@@ -430,6 +456,8 @@ _EXACT = (
     *(onset_chain3, string_limit, compare, prediction_windows, prediction_price, prediction_flights),
     *(onsets, thesis_flights, maps, capacity),
 )
+_SLOW = (copters_onset,)
+"""Exact, but of minutes: compared only if they are named."""
 _TIMED = (readme_fly, flights, too_late, punctuality, copters, signing, design_time, speed, onset_real_time)
 _COMPILED = (speed_compiled,)
 """With the hot path compiled, which none of the others wants."""

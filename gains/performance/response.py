@@ -158,6 +158,17 @@ def formation_loop(
     return A, B, np.hstack([K, np.zeros((model.inputs, n - model.states))])
 
 
+def response_states(model: FormationModel, responses: Sequence[Response]) -> list[slice]:
+    """Which states of `formation_loop` are those of each vehicle's response.
+
+    >>> response_states(FormationModel((-1, 0), axes=1), [Response(0.5, 0.0), Response(0.5, 2.0)])
+    [slice(3, 4, None), slice(4, 6, None)]
+    """
+    sizes = [model.axes * len(own_dynamics(response)[0]) for response in responses]
+    ends = model.states + np.cumsum(sizes)
+    return [slice(end - size, end) for end, size in zip(ends.tolist(), sizes, strict=True)]
+
+
 def sampled_margin(
     model: FormationModel, K: FloatArray, responses: Sequence[Response] | None, *, timing: Timing
 ) -> float:

@@ -13,12 +13,16 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.delay.constant import delay_margin
 from gains.delay.rightmost import rightmost_root
-from gains.delay.several import late_by_vehicle
 from gains.formation.model import FormationModel
-from gains.sampled._loop import matrix_exponentials
+from gains.sampled._loop import carry
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
 from gains.sampled.onboard import OnboardTiming, onboard_loop
-from gains.sampled.prediction import mismatch_window, mismatch_window_continuous, predicted_growth_rate
+from gains.sampled.prediction import (
+    checked_mask,
+    mismatch_window,
+    mismatch_window_continuous,
+    predicted_growth_rate,
+)
 
 
 class ClosedLoop(Protocol):
@@ -65,29 +69,33 @@ class GroundLoop:
 
 @dataclass(frozen=True, eq=False)
 class PredictedGroundLoop:
-    """The same by a station that predicts over `assumed_s` (`gains.sampled.prediction`)."""
+    """The same by a station that predicts over `assumed_s`; `measured` as in `gains.sampled.prediction`."""
 
     A: FloatArray
     B: FloatArray
     K: FloatArray
     timing: Timing
     assumed_s: float
+    measured: Sequence[bool] | None = None
 
     def window_s(self) -> tuple[float, float]:
-        return mismatch_window(self.A, self.B, self.K, self.timing, assumed_s=self.assumed_s)
+        loop = self.A, self.B, self.K, self.timing
+        return mismatch_window(*loop, assumed_s=self.assumed_s, measured=self.measured)
 
     def window_continuous_s(self) -> tuple[float, float]:
         half_s = self.timing.held_s / 2.0
-        least_s, most_s = mismatch_window_continuous(self.A, self.B, self.K, assumed_s=self.assumed_s + half_s)
+        loop, assumed_s = (self.A, self.B, self.K), self.assumed_s + half_s
+        least_s, most_s = mismatch_window_continuous(*loop, assumed_s=assumed_s, measured=self.measured)
         return max(0.0, least_s - half_s), most_s - half_s
 
     def growth_1_s(self, delay_s: float) -> float:
         loop = self.A, self.B, self.K, self.timing
-        return predicted_growth_rate(*loop, assumed_s=self.assumed_s, delay_s=delay_s)
+        return predicted_growth_rate(*loop, assumed_s=self.assumed_s, delay_s=delay_s, measured=self.measured)
 
     def continuous_terms(self) -> tuple[list[tuple[FloatArray, float]], FloatArray]:
         assumed_s = self.assumed_s + self.timing.held_s / 2.0
-        late = self.B @ (self.K @ matrix_exponentials(self.A[np.newaxis] * assumed_s)[0])
+        mask = checked_mask((self.A, self.B, self.K), self.measured)
+        late = self.B @ (self.K @ carry(self.A, mask, np.array([assumed_s]))[0])
         return [(self.A + self.B @ self.K, 0.0), (-late, assumed_s)], late
 
 
@@ -123,10 +131,9 @@ class CoupledBlock:
     def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
         """The same where each vehicle's command has a loop delay of its own (`gains.delay.several`)."""
         known, late = self.loop.continuous_terms()
-        axes = self.B.shape[1] // len(self.system_ids)
-        places = [slice(axes * k, axes * (k + 1)) for k in range(len(self.system_ids))]
+        driven = (self.B != 0.0).reshape(len(self.B), len(self.system_ids), -1).any(axis=2)
         delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
-        own = late_by_vehicle(self.B, self.B.T @ late, places)
+        own = [late * driven[:, [k]] for k in range(len(delays_s))]
         return rightmost_root([*known, *zip(own, delays_s, strict=True)]).real
 
     def growth_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
@@ -160,11 +167,15 @@ def coupled_blocks(
     timing: Timing,
     onboard: OnboardTiming | None = None,
     assumed_s: float | None = None,
+    responding: tuple[FloatArray, FloatArray, FloatArray] | None = None,
+    response_states: Sequence[slice] = (),
 ) -> list[CoupledBlock]:
     """The blocks of a formation flown with the gain K (inputs, states) of u = K e, those ahead first.
 
     `system_ids` has one for each vehicle, in the order of `model`. Without `onboard`, the timing of the onboard loop,
-    the station closes every loop, and predicts over `assumed_s` if that is given.
+    the station closes every loop, and predicts over `assumed_s` if that is given. `responding` is A, B and K of the
+    formation with the vehicles' responses, and `response_states` which of its states are those of each vehicle's
+    (`gains.performance.response`); without them the vehicles respond at once.
 
     A chain of three: each vehicle is a block, and the two followers are alike. Sampling at 50 Hz costs half a period:
 
@@ -177,17 +188,18 @@ def coupled_blocks(
     [((1,), 1.561), ((2,), 0.701), ((3,), 0.701)]
     """
     whole = None if onboard is None else onboard_loop(model, K, onboard)
-    A, B = model.A, model.B
+    A, B, gain = (model.A, model.B, K) if responding is None else responding
     blocks: list[CoupledBlock] = []
     for members in model.coupled_vehicles(K):
-        own = np.concatenate([np.r_[model.output_slice(i)] for i in members])
+        errors = np.concatenate([np.r_[model.output_slice(i)] for i in members])
+        own = np.concatenate([errors, *(np.r_[response_states[i]] for i in members if response_states)])
         inputs = np.concatenate([np.r_[model.input_slice(i)] for i in members])
-        matrices = A[np.ix_(own, own)], B[np.ix_(own, inputs)], K[np.ix_(inputs, own)]
+        matrices = A[np.ix_(own, own)], B[np.ix_(own, inputs)], gain[np.ix_(inputs, own)]
         loop: ClosedLoop = GroundLoop(*matrices, timing)
         if whole is not None:
             loop = whole.part(own)
         elif assumed_s is not None:
-            loop = PredictedGroundLoop(*matrices, timing, assumed_s)
+            loop = PredictedGroundLoop(*matrices, timing, assumed_s, [state < model.states for state in own.tolist()])
         blocks.append(CoupledBlock(tuple(system_ids[i] for i in members), *matrices, timing, loop, assumed_s))
     return blocks
 

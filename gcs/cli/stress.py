@@ -81,6 +81,8 @@ def stress(
     With --disturbance and --onset, the vehicles disturb themselves by w = D e, and the size of the worst D is raised at
     one link delay: that of the scenario, or one --delay. The onset is compared with the stability radii.
 
+    Simulated autopilots fly in virtual time, after they have shown their response, which the margin includes.
+
     Exit code 1 if --assert-onset is missed, a trial failed, or a trial flown again differs.
     """
     texts_of = {"--delay": [delay], "--delay-of": delay_of, "--jitter": [jitter], "--loss": [loss], "--rate": [rate]}
@@ -104,7 +106,7 @@ def stress(
         if not onset or any(others.values()):
             read = next((f"and {option}" for option, value in others.items() if value), "without --onset")
             raise InputError(f"read --disturbance {read}, wanted --disturbance with --onset and at most one --delay")
-        study, _ = _study(scenario_file, loop, links, real_time=False, allow_code=allow_code)
+        study, _ = _study(scenario_file, loop, links, disturbance=True, allow_code=allow_code)
         _disturb(scenario_file, study.plan, delay, tolerance=tolerance, allowed=assert_onset, out=out, as_json=as_json)
     if junit is not None:
         options.out_file("--junit", junit)
@@ -147,22 +149,32 @@ def stress(
 
 
 def _study(
-    file: Path, loop: options.LoopPlace | None, links: str | None, *, real_time: bool, allow_code: bool
+    file: Path,
+    loop: options.LoopPlace | None,
+    links: str | None,
+    *,
+    allow_code: bool,
+    real_time: bool = False,
+    disturbance: bool = False,
 ) -> "tuple[Study, Design]":
+    from gcs.drive.flown import identified_in_flight
     from gcs.drive.preflight import bad_start, unstable_loop
-    from gcs.plan.planner import flight_plan
+    from gcs.plan.planner import described, flight_plan
     from gcs.stress.study import Study
 
     scenario = options.load_scenario(file, loop, links=links, allow_code=allow_code)
-    if scenario.dynamics == "autopilot":
-        wanted = "double_integrator: gcs stress flies no vehicles that have to take off"
-        raise InputError(f"{file}: dynamics: read 'autopilot', wanted {wanted}")
+    if scenario.dynamics == "autopilot" and (real_time or disturbance):
+        option = "--disturbance" if disturbance else "--real-time"
+        raise InputError(f"{file}: dynamics: read 'autopilot', wanted double_integrator with {option}")
     if scenario.control.prediction == "measured":
         wanted = "off, or a number of seconds: gcs stress tests an assumed delay that is fixed"
         raise InputError(f"{file}: control.prediction: read 'measured', wanted {wanted}")
     # a campaign does not fly the slower gains of the schedule, so they need not be designed
     options.refuse(file, bad_start(scenario))
-    design, plan = flight_plan(scenario.with_calm_monitor())
+    design, planned = flight_plan(scenario.with_calm_monitor())
+    plan = identified_in_flight(planned)
+    if plan is not planned:
+        design = described(design, plan)
     options.refuse(file, unstable_loop(plan))
     return Study(plan, real_time=real_time), design
 

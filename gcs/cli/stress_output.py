@@ -16,6 +16,7 @@ from gcs.stress.trial import Outcome
 from gcs.views.console import UNKNOWN, ms_text, plain_console, table_of
 from gcs.views.console import number_text as _number
 from gcs.views.junit import Check
+from gcs.views.report import response_text
 
 _ms = partial(ms_text, form=".2f")
 _FILE_WIDTH = 120
@@ -40,6 +41,7 @@ def print_result(result: CampaignResult, folder: Path) -> None:
         console.print(f"margin   unknown: {result.gains.margin_unknown}")
     else:
         console.print(f"margin   {'no limit' if margin_s is None else f'{_ms(margin_s)} of loop delay'}, sampled")
+    console.print(response_text(result.response), end="")
     kinds = ", ".join(f"{count} {_KINDS[kind]}" for kind, count in sorted(result.trials_of_kind.items(), reverse=True))
     console.print(f"trials   {result.trials}: {kinds}")
     for onset in (found for found in (result.onset, result.onset_shorter) if found is not None):

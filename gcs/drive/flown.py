@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from gains.core.arrays import IntArray
+from gcs.control.phases import Phase
 from gcs.control.tick import Event, TickArray
 from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
+from gcs.errors import InputError
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.own_law import why_unknown
@@ -72,6 +74,21 @@ def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: boo
             writer.event(event)
         writer.close()
     return Flight(np.concatenate(rows), events, truth_of(records) if with_truth else None)
+
+
+def identified_in_flight(plan: FlightPlan) -> FlightPlan:
+    """The plan with the responses that its simulated autopilots show in virtual time, and the margins with these.
+
+    A plan whose responses are given, or whose vehicles respond at once, stays as it is. InputError says why the
+    vehicles did not come as far as the formation flight.
+    """
+    if plan.responses is not None or plan.scenario.dynamics != "autopilot":
+        return plan
+    station = Station(plan, start_ns=START_NS)
+    for _ in fly_lockstep(plan, station=station):
+        if station.phase is Phase.FLYING:
+            return station.plan
+    raise InputError(f"{plan.scenario.name}: {station.end_reason}")
 
 
 def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flight:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.delay.several import boundary_of_two_delays, late_by_vehicle
+from gains.performance.response import formation_loop
 from gains.sampled.coupled_block import unlike_blocks
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
@@ -112,8 +113,9 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     if any(system_id in loop.system_ids and len(loop.system_ids) > 1 for loop in plan_loops(plan) for system_id in ids):
         return []
     model, places = plan.model, [plan.formation.row(system_id) for system_id in ids]
-    late = late_by_vehicle(model.B, plan.gain, [model.input_slice(k) for k in range(model.vehicles)])
-    others = sum((late[k] for k in range(model.vehicles) if k not in places), model.A)
+    A, B, K = formation_loop(model, plan.gain, plan.responses_in_order)
+    late = late_by_vehicle(B, K, [model.input_slice(k) for k in range(model.vehicles)])
+    others = sum((late[k] for k in range(model.vehicles) if k not in places), A)
     # the link delay is the model's delay less the hold and the waiting for the control tick
     less_s = np.array([plan.timing.held_s / 2.0 + _waiting_s(outcomes, system_id) for system_id in ids])
     longest_s = (axes[0].values[-1] + float(less_s[0]), axes[1].values[-1] + float(less_s[1]))

@@ -22,7 +22,7 @@ from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import on_one_axis
 from gcs.published import Published
 from gcs.stress.axes import has_constant_links
-from gcs.stress.free_response import linear_until_s, probe_scenario
+from gcs.stress.free_response import LINEAR_COMMAND_M_S2, linear_error_m_s, linear_until_s, probe_scenario
 from gcs.stress.growth import GrowthPoint, Zero, fit_growth, locate_zero, motion_of
 from scenarios.keys.disturbance import Disturbance, Sector
 from scenarios.schema import Scenario
@@ -37,7 +37,6 @@ _SIZES = (-1.0, 0.1, 1.0)
 _ROUNDS = 6
 _SETTLED_S, _TURNS, _SHORTEST_S, _LONGEST_S = 8.0, 2.0, 20.0, 120.0
 """A flight lasts until the other motions, filters included, are gone, and for some turns of the one that grows."""
-_LINEAR_SHARE = 0.8
 _MODES = 12
 
 
@@ -220,6 +219,6 @@ def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> list[Growth
     flight, ids = fly_virtual(replace(plan, scenario=scenario)), plan.formation.system_ids
     rows = flight.ticks[flight.ticks["commanded"] & (flight.ticks["time_s"] >= 0.0)]
     motion = motion_of(flight.ticks, ids, period_s=plan.timing.control_s)
-    until_s = linear_until_s(scenario, rows, share=_LINEAR_SHARE)
+    until_s = linear_until_s(rows, linear_error_m_s(scenario), LINEAR_COMMAND_M_S2)
     growth = fit_growth(motion, start_s=_SETTLED_S, end_s=until_s, modes=_MODES)
     return [] if growth is None else [GrowthPoint(size_1_s, growth.growth_1_s, growth.error_1_s)]

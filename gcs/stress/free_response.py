@@ -21,7 +21,10 @@ A probe removes everything that would mask this response:
 * The scenario's limit on the spacing error: a growing error must be seen for long enough to be measured.
 * The vehicles' limits. A small error stays within them, where the loop is the same. But links that lose or delay at
   random push vehicles by more than an error of a millimetre, and a response clipped by limits is not linear.
-  `past_limits` says when that happens.
+  `past_limits` says when that happens. Autopilots keep their limits; their flight counts while it is far from them.
+* With autopilots, the offsets between local frames (up to 5 mm each, the last digit of a latitude), clocks that jump,
+  and the start from rest: the formation hovers in place, where the loop is the same as at any velocity. Take-off and
+  identification come before scenario time zero and are not part of the response.
 
 On constant links one flight is enough. Links that lose or delay at random push the vehicles all the time, because the
 station's estimates of clocks and instants are wrong, and errors travel down the chain. But the loops are linear, and
@@ -46,10 +49,12 @@ from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
 from gcs.stress.trial import is_modelled
 from scenarios.keys.link import Link
-from scenarios.schema import Limits, Safety, Scenario, Vehicle
+from scenarios.keys.sitl import Sitl
+from scenarios.schema import Limits, NominalVelocity, Safety, Scenario, Vehicle
 
-PROBE_S = 20.0
-"""How long a probe is flown on constant links."""
+PROBE_S, _HIDDEN_MODE_S = 20.0, 60.0
+"""How long a probe is flown on constant links; the second with prediction for autopilots. At the longer end of their
+window these break in a mode that an error of position hardly excites and that takes long to outgrow the others."""
 _RANDOM_LOOP_DELAYS, _LONGEST_S = 66.0, 120.0
 """On links that lose or delay at random, a probe shows a mean growth rate, whose error falls with the number of loop
 delays flown. It lasts this many loop delays, but at most this long."""
@@ -60,8 +65,11 @@ _DIRECTION_NE = np.array([1.0, -0.8])
 because two nearly equal modes are hard to separate where both are large."""
 _LINEAR_SHARE = 0.8
 """Share of the nominal speed that a velocity error may reach: the linearisation is exact at any speed but zero."""
+LINEAR_COMMAND_M_S2 = 0.9 * LARGEST_COMMAND_M_S2
 _SMALL_M_S = 1.0
 """Velocity error up to which a law or dynamics of one's own are taken for linear."""
+_LIMIT_SHARE = 0.25
+"""Share of an autopilot's acceleration that a command may reach. The jerk limit and the velocity loop need the rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +102,7 @@ def response_alone(
     # where loop delays differ from command to command, their mean counts: only the truth has it exactly
     flight = fly_plan(probe, real_time=real_time, folder=folder, with_truth=plan.timing.commands > 1)
     errors = _rows_of(flight.ticks, system_ids)
-    return FreeResponse(probe, flight, errors, linear_until_s(scenario, errors, share=_linear_share(plan)))
+    return FreeResponse(probe, flight, errors, linear_until_s(errors, *_linear_range(plan)))
 
 
 def fly_calm(plan: FlightPlan, folder: Path | None) -> Flight:
@@ -111,9 +119,7 @@ def response_paired(
     rows, calm_rows = _rows_of(flight.ticks, system_ids), _rows_of(calm.ticks, system_ids)
     count = _alike(rows, calm_rows)
     rows, calm_rows = rows[:count], calm_rows[:count]
-    until_s, calm_until_s = (
-        linear_until_s(disturbed.scenario, each, share=_linear_share(plan)) for each in (rows, calm_rows)
-    )
+    until_s, calm_until_s = (linear_until_s(each, *_linear_range(plan)) for each in (rows, calm_rows))
     errors = rows.copy()
     for name in CHANNELS:
         errors[name] -= calm_rows[name]
@@ -136,9 +142,17 @@ def effective_delays_s(
     return {system_id: effective_delay_s(commands(system_id), held_s=held_s) for system_id in system_ids}
 
 
-def _linear_share(plan: FlightPlan) -> float:
-    speed_m_s = float(np.hypot(*plan.scenario.nominal_velocity_at(0.0)))
-    return _LINEAR_SHARE if is_modelled(plan) else min(_LINEAR_SHARE, _SMALL_M_S / speed_m_s)
+def _linear_range(plan: FlightPlan) -> tuple[float, float]:
+    """The velocity error (m/s) and the command (m/s²) up to which the loop is linear."""
+    if plan.scenario.dynamics == "autopilot":
+        return np.inf, _LIMIT_SHARE * plan.scenario.autopilot.acceleration_max_m_s2
+    error_m_s = linear_error_m_s(plan.scenario)
+    return error_m_s if is_modelled(plan) else min(error_m_s, _SMALL_M_S), LINEAR_COMMAND_M_S2
+
+
+def linear_error_m_s(scenario: Scenario) -> float:
+    """The velocity error at which a vehicle without autopilot comes near the singularity at speed zero."""
+    return _LINEAR_SHARE * float(np.hypot(*scenario.nominal_velocity_at(0.0)))
 
 
 def _rows_of(ticks: TickArray, system_ids: tuple[int, ...]) -> TickArray:
@@ -159,9 +173,12 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
 
     No vehicle enters its failsafe or meets a limit. The error is in the position of a follower (m), and in the velocity
     of the leader (m/s), whose position is not controlled. It points in `_DIRECTION_NE` and differs from vehicle to
-    vehicle.
+    vehicle. Vehicles with autopilots begin at rest: their nominal velocity is zero, or the reverse of the leader's
+    error, which disturbs the followers, too; those outside the loop do not act on it.
     """
     scenario, place, duration_s = plan.scenario.in_steady_flight(), plan.formation.place_ne_m(), PROBE_S
+    if scenario.dynamics == "autopilot":
+        scenario, duration_s = _at_rest(scenario), PROBE_S if plan.assumed_s is None else _HIDDEN_MODE_S
     if not has_constant_links(scenario) and isfinite(plan.delay_margin_s):
         duration_s = max(PROBE_S, min(ceil(_RANDOM_LOOP_DELAYS * plan.delay_margin_s), _LONGEST_S))
     row = {system_id: k for k, system_id in enumerate(plan.formation.system_ids)}
@@ -173,7 +190,10 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         if vehicle.system_id in system_ids:
             k = system_ids.index(vehicle.system_id)
             error = amplitude * (1.0 + 0.3 * k) * (-1.0) ** k * _DIRECTION_NE
-            if vehicle is leader:
+            if vehicle is leader and scenario.dynamics == "autopilot":
+                still = NominalVelocity(from_s=0.0, velocity_ne_m_s=(-float(error[0]), -float(error[1])))
+                scenario = scenario.model_copy(update={"nominal_velocity": (still,)})
+            elif vehicle is leader:
                 velocity += error
             else:
                 position += error
@@ -193,6 +213,14 @@ def in_place(plan: FlightPlan, system_ids: tuple[int, ...], *, amplitude: float)
         ),
     }
     return scenario.model_copy(update=update)
+
+
+def _at_rest(scenario: Scenario) -> Scenario:
+    """The scenario with autopilots that hover, in frames of one origin and with clocks that do not jump."""
+    still = NominalVelocity(from_s=0.0, velocity_ne_m_s=(0.0, 0.0))
+    exact = {"origin_spread_m": 0.0, "clock_jumps": (), "sitl": Sitl()}
+    changes = {"nominal_velocity": (still,), "autopilot": scenario.autopilot.model_copy(update=exact)}
+    return scenario.model_copy(update=changes)
 
 
 def probe_scenario(
@@ -231,15 +259,13 @@ def with_waiting(up: Link, down: Link, *, period_s: float, waiting_s: float) -> 
     return moved(up, -from_up_s), moved(down, to_down_s)
 
 
-def linear_until_s(scenario: Scenario, own: TickArray, *, share: float) -> float:
-    """Time from the first row until the singularity at speed zero or the largest command is near; infinity if neither.
+def linear_until_s(own: TickArray, most_m_s: float, most_m_s2: float) -> float:
+    """Time from the first row until a velocity error or a command is larger than this; infinity if neither ever is.
 
-    `own` are rows of the probed vehicles, in order of time. `share` is the share of the nominal speed that a velocity
-    error may reach.
+    `own` are rows of the probed vehicles, in order of time.
     """
-    speed = float(np.hypot(*scenario.nominal_velocity_at(0.0)))
     error_m_s, size_m_s2 = _sizes(own)
-    beyond = np.flatnonzero((error_m_s > share * speed) | (size_m_s2 > 0.9 * LARGEST_COMMAND_M_S2))
+    beyond = np.flatnonzero((error_m_s > most_m_s) | (size_m_s2 > most_m_s2))
     return float(own["time_s"][beyond[0]] - own["time_s"][0]) if beyond.size else np.inf
 
 
@@ -250,8 +276,13 @@ def past_limits(scenario: Scenario, own: TickArray) -> bool:
         return False
     speed_m_s = np.hypot(own["velocity_north_m_s"], own["velocity_east_m_s"])
     _, size_m_s2 = _sizes(own)
-    most_m_s2 = np.minimum(limits.acceleration_max_m_s2 or np.inf, (limits.turn_rate_max_rad_s or np.inf) * speed_m_s)
-    slow, fast = speed_m_s < limits.speed_min_m_s, speed_m_s > (limits.speed_max_m_s or np.inf)
+    most_m_s2 = np.minimum(
+        limits.acceleration_max_m_s2 or np.inf, (limits.turn_rate_max_rad_s or np.inf) * np.maximum(speed_m_s, 1e-9)
+    )
+    slow, fast = (
+        speed_m_s < limits.speed_min_m_s * (scenario.dynamics != "autopilot"),
+        speed_m_s > (limits.speed_max_m_s or np.inf),
+    )
     return bool((slow | fast | (size_m_s2 > most_m_s2)).any())
 
 

@@ -138,8 +138,8 @@ def _pair(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
 
 
 def _amplitudes(plan: FlightPlan) -> Sequence[float]:
-    """Initial errors of a probe, in order; a law of one's own may be linear for small ones only."""
-    return AMPLITUDES if is_modelled(plan) else AMPLITUDES[1:]
+    """Initial errors of a probe, in order; a law of one's own or an autopilot may be linear for small ones only."""
+    return AMPLITUDES if is_modelled(plan) and plan.scenario.dynamics != "autopilot" else AMPLITUDES[1:]
 
 
 def _folder_of(folder: Path | None, amplitude: float) -> Path | None:

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import PlainSerializer
 
 from gcs.errors import extra_wanted
-from gcs.plan.design import Design
+from gcs.plan.design import Design, ResponsePart
 from gcs.published import Published
 from gcs.runs.record import write_whole
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
@@ -89,6 +89,8 @@ class CampaignResult(Published):
     onset: Onset | None
     onset_shorter: Onset | None = None
     """Where a loop that is predicted over a fixed delay breaks because the true delay is too short."""
+    response: ResponsePart | None = None
+    """How the vehicles respond to set-points, which the margin includes; None if they do so at once."""
     onset_missing: str
     onset_missing_as_predicted: bool
     curve_error: float | None
@@ -146,6 +148,7 @@ def result_of(
         axes={axis.name: tuple(axis.values) for axis in axes},
         onset=onset,
         **({} if onset_shorter is None else {"onset_shorter": onset_shorter}),
+        response=design.response,
         onset_missing=str(missing or ""),
         onset_missing_as_predicted=missing is not None and missing.as_predicted,
         curve_error=curve_error([*(sweep if exact(study, axes) else ()), *searched]),

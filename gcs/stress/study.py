@@ -51,6 +51,7 @@ class Study:
             probe=probe,
             real_time=self.real_time,
             coordinates=tuple(coordinates.items()),
+            responses=self.plan.responses,
         )
 
     def sweep(self, axes: Sequence[Axis], *, seeds: int) -> list[Trial]:

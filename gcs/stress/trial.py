@@ -14,10 +14,11 @@ from typing import Literal
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gains.performance.response import formation_loop, response_states
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
 from gcs.control.tick import TickArray
 from gcs.drive.flown import Flight, margins_of
-from gcs.plan.flight_plan import FlightPlan, given_responses
+from gcs.plan.flight_plan import FlightPlan, Responses
 from gcs.plan.formation import plan_formation
 from gcs.plan.onboard import timing_of
 from gcs.plan.own_law import law_of
@@ -37,7 +38,7 @@ class Trial:
     """Everything a trial depends on, and its `coordinates` in the campaign, which do not affect the flight.
 
     `gain` holds the nonzero entries (row, column, value) of K. `probe` is the system id of a vehicle in the loop to be
-    probed, or `CRITICAL`.
+    probed, or `CRITICAL`. `responses` are those that were identified before the campaign, or given.
     """
 
     scenario: Scenario
@@ -47,12 +48,15 @@ class Trial:
     probe: int = CRITICAL
     real_time: bool = False
     coordinates: tuple[tuple[str, float], ...] = ()
+    responses: Responses | None = None
 
     @cached_property
     def id(self) -> str:
         """A hash of the inputs: the same trial has the same id anywhere."""
         inputs = [self.scenario.model_dump(mode="json"), self.gain, self.delay_margin_s, self.kind, self.probe]
-        text = json.dumps([*inputs, self.real_time], sort_keys=True)
+        known = self.responses
+        found = [] if known is None or known.source == "given" else [{k: asdict(own) for k, own in known.of.items()}]
+        text = json.dumps([*inputs, self.real_time, *found], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
@@ -129,8 +133,8 @@ def plan_of(trial: Trial) -> FlightPlan:
     for row, column, value in trial.gain:
         K[row, column] = value
     scenario = trial.scenario.with_calm_monitor()
-    responses, law = given_responses(scenario), law_of(scenario)
-    return FlightPlan(scenario, formation, K, trial.delay_margin_s, responses=responses, law=law)
+    law = law_of(scenario)
+    return FlightPlan(scenario, formation, K, trial.delay_margin_s, responses=trial.responses, law=law)
 
 
 def is_modelled(plan: FlightPlan) -> bool:
@@ -140,15 +144,17 @@ def is_modelled(plan: FlightPlan) -> bool:
 
 
 def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
-    """The coupled blocks of a plan."""
-    onboard = timing_of(plan.scenario)
+    """The coupled blocks of a plan, with the vehicles' responses if they are known."""
+    responses = plan.responses_in_order if is_modelled(plan) else None
     return coupled_blocks(
         plan.model,
         plan.gain,
         plan.formation.system_ids,
         timing=plan.timing,
-        onboard=onboard,
+        onboard=timing_of(plan.scenario),
         assumed_s=plan.assumed_s,
+        responding=None if responses is None else formation_loop(plan.model, plan.gain, responses),
+        response_states=() if responses is None else response_states(plan.model, responses),
     )
 
 

@@ -38,7 +38,7 @@ def print_design(design: Design, console: Console | None = None) -> None:
         law = f"u_i = K1 e_i^v + K2 e_(i-1)^v + K3 e_i^p{fed}, the leader u_1 = K1 e_1^v, north and east alike"
         console.print(f"         {law}")
         _print_margins(design, console)
-        console.print(_response(design.response), end="")
+        console.print(response_text(design.response), end="")
         bound, decay_1_s = "robustness bound", design.behaviour.decay_rate_1_s
     else:
         console.print(table_of(design.blocks, _BLOCK_COLUMNS))
@@ -233,7 +233,7 @@ def print_flight(summary: Summary, console: Console) -> None:
     for name in ("delay", "alpha"):
         if name in lines:
             console.print(f"{name:<9}{lines[name]}")
-    console.print(_response(summary.response), end="")
+    console.print(response_text(summary.response), end="")
     for name in ("spread", "control", "law", "code"):
         if name in lines:
             console.print(f"{name:<9}{lines[name]}")
@@ -285,7 +285,7 @@ def delay_text(summary: Summary) -> str:
     )
 
 
-def _response(response: ResponsePart | None) -> str:
+def response_text(response: ResponsePart | None) -> str:
     """A line on how the vehicles respond to set-points; empty if they respond at once."""
     if response is None:
         return ""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gains.formation.model import FormationModel
+from gains.performance.response import Response, continuous_margin, formation_loop, response_states, sampled_margin
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks, critical_block, unlike_blocks
 from gains.sampled.multirate import Timing
 
@@ -33,6 +34,20 @@ def test_vehicles_that_act_on_each_other_are_one_block() -> None:
     K[model.input_slice(1), model.velocity_slice(2)] = 0.1 * np.eye(2)  # vehicle 2 looks back as well
     blocks = coupled_blocks(model, K, (7, 8, 9), timing=Timing(0.02, 0.02))
     assert [block.system_ids for block in blocks] == [(7,), (8, 9)]
+
+
+def test_blocks_of_responding_vehicles_have_the_margin_of_the_whole() -> None:
+    model, timing = FormationModel((-1, 0, 1)), Timing(0.02, 0.02)
+    K = model.overlapping_gain(-1.778 * np.eye(2), 0.549 * np.eye(2), 1.43 * np.eye(2))
+    responses = [Response(0.125, 2.78), Response(0.066, 1.88, 0.048), Response(0.11, 1.71, 0.0, 14.0)]
+    loop, states = formation_loop(model, K, responses), response_states(model, responses)
+    blocks = coupled_blocks(model, K, (1, 2, 3), timing=timing, responding=loop, response_states=states)
+    assert [len(block.A) for block in blocks] == [2 + 4, 4 + 12, 4 + 6]
+    assert min(block.margin_s() for block in blocks) == pytest.approx(
+        sampled_margin(model, K, responses, timing=timing), abs=1e-8
+    )
+    at_s = continuous_margin(model, K, responses) - 0.01
+    assert max(block.growth_continuous_1_s(at_s) for block in blocks) == pytest.approx(0.0, abs=1e-8)
 
 
 def test_models_meet_the_closed_formulas_at_a_short_period() -> None:

@@ -73,3 +73,11 @@ def test_bad_options_are_one_line_and_exit_code_2(arguments: tuple[str, ...], wa
     assert done.returncode == 2, done.stdout
     assert wanted in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("option", ["--real-time", "--disturbance"])
+def test_autopilots_are_refused_where_they_do_not_fly(option: str) -> None:
+    done = stress(SCENARIOS / "copters5.toml", "--onset", option)
+    wanted = f"dynamics: read 'autopilot', wanted double_integrator with {option}\n"
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert done.stderr.endswith(wanted)
