@@ -94,6 +94,9 @@ class Rates(Part):
     """LOCAL_POSITION_NED messages from each vehicle."""
     timesync_hz: Annotated[float, Field(ge=0.01, le=50)] = 10.0
     """TIMESYNC exchanges with each vehicle. At most `control_hz`, because each control tick logs one round trip."""
+    target_hz: Annotated[float, Field(ge=0, le=500)] = 50.0
+    """POSITION_TARGET_LOCAL_NED messages from each vehicle, with `control.prediction` only: which set-points acted. 0:
+    none; every set-point is then assumed to act."""
 
 
 class FixedGains(Part):
@@ -395,6 +398,11 @@ class Scenario(Part):
     def altitude_of(self, vehicle: Vehicle) -> float:
         """The altitude at which a vehicle flies, in m above the origin."""
         return self.altitude_m if vehicle.altitude_m is None else vehicle.altitude_m
+
+    @property
+    def target_hz(self) -> float:
+        """How often each vehicle is asked for its active target."""
+        return 0.0 if self.control.prediction == "off" else self.rates.target_hz
 
     @property
     def has_altitude_slots(self) -> bool:
