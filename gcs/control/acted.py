@@ -16,22 +16,21 @@ a smaller one, the vehicle clips. Set-points under way are then assumed to be cl
 to do more.
 """
 
+import struct
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Iterable
 from math import inf, isfinite
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from gcs.link.mavlink import VELOCITY_IGNORED
 
-_SAME = 1e-6
-"""Values this close, relatively, are the same: float32 resolves 6e-8."""
-_AGES = 16
+_AGES = 8
 """The least age is that of the last reports: with half of all set-points lost, one of them is as young as can be."""
 _EARLY = 0.05
 """A set-point counts as lost from the least age on, less this share of a period: clocks err by as much."""
 _VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
-"""North and east among the fields of SET_POSITION_TARGET_LOCAL_NED and of POSITION_TARGET_LOCAL_NED."""
+"""Places among the fields of SET_POSITION_TARGET_LOCAL_NED and of POSITION_TARGET_LOCAL_NED."""
+_ON_THE_WIRE = struct.Struct("<2f")
 
 
 class Alterable(Protocol):
@@ -40,17 +39,9 @@ class Alterable(Protocol):
     def alter(self, due_ns: int, by_m_s2: complex) -> None: ...
 
 
-class _SetPoint(NamedTuple):
-    velocity: complex
-    acceleration: complex
-
-
 def _vector(fields: tuple[Any, ...], place: slice) -> complex:
-    return complex(*fields[place])
-
-
-def _same(a: complex, b: complex) -> bool:
-    return abs(a - b) <= _SAME * (1.0 + abs(b))
+    """North + 1j * east as the link carries it."""
+    return complex(*_ON_THE_WIRE.unpack(_ON_THE_WIRE.pack(*fields[place])))
 
 
 class ActiveTargets:
@@ -59,7 +50,8 @@ class ActiveTargets:
     def __init__(self, history: Alterable, *, period_ns: int, held_ns: int) -> None:
         self._history, self._period_ns, self._held_ns = history, period_ns, held_ns
         self._due_ns: list[int] = []
-        self._sent: list[_SetPoint] = []
+        self._velocity: list[complex] = []
+        self._acceleration: list[complex] = []
         self._off: list[complex] = []
         """What the acceleration of each is corrected by."""
         self._ages_ns = deque[int](maxlen=_AGES)
@@ -69,57 +61,58 @@ class ActiveTargets:
     def sent(self, due_ns: int, fields: tuple[Any, ...]) -> None:
         """Remember a set-point as it was sent, after `history` has."""
         self._due_ns.append(due_ns)
-        self._sent.append(_SetPoint(_vector(fields, _VELOCITY), _vector(fields, _ACCELERATION)))
+        self._velocity.append(_vector(fields, _VELOCITY))
+        self._acceleration.append(_vector(fields, _ACCELERATION))
         self._off.append(0j)
-        self._clip([len(self._sent) - 1])
+        self._clip_from(len(self._off) - 1)
         old = bisect_left(self._due_ns, due_ns - 9 * self._held_ns)
-        if 2 * old > len(self._sent):
-            del self._due_ns[:old], self._sent[:old], self._off[:old]
+        if 2 * old > len(self._off):
+            del self._due_ns[:old], self._velocity[:old], self._acceleration[:old], self._off[:old]
 
     def reported(self, at_ns: int, fields: tuple[Any, ...]) -> None:
         """Take in the fields of a report, of an instant on the station's clock."""
-        acceleration = _vector(fields, _ACCELERATION)
-        velocity = None if fields[_TYPE_MASK] & VELOCITY_IGNORED else _vector(fields, _VELOCITY)
+        acceleration, only = _vector(fields, _ACCELERATION), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
         expected, least_age_ns = self._expected(at_ns), min(self._ages_ns, default=0)
         oldest = bisect_left(self._due_ns, at_ns - least_age_ns - self._held_ns)
-        newest = bisect_right(self._due_ns, at_ns)
-        places = *range(expected, oldest - 1, -1), *range(expected + 1, newest)
-        active = self._recognised(places, velocity, acceleration)
-        if active is not None:
-            self._ages_ns.append(at_ns - self._due_ns[active])
+        recent = range(oldest, bisect_right(self._due_ns, at_ns))
+        value, same = acceleration, [place for place in recent if self._acceleration[place] == acceleration]
+        if not same and not only:
+            value = _vector(fields, _VELOCITY)
+            same = [place for place in recent if self._velocity[place] == value]
+        if len(same) == 1 and value:  # a vehicle that has stopped reports zeros of its own
+            self._ages_ns.append(at_ns - self._due_ns[same[0]])
             expected = self._expected(at_ns)
-            held = self._sent[active].acceleration
-            self._correct(active, 0j)
-            for lost in range(active + 1, expected + 1):
-                self._correct(lost, held - self._sent[lost].acceleration)
-            if self._largest_m_s2 < inf:
-                if abs(held) > self._largest_m_s2:
-                    self._largest_m_s2 = inf  # what limited it, such as its speed, no longer does
-                self._clip(range(max(active, expected) + 1, len(self._sent)))
-        elif velocity is None and self._ages_ns and expected >= 0 and isfinite(abs(acceleration)):
-            self._correct(expected, acceleration - self._sent[expected].acceleration)
-            if 0.0 < abs(acceleration) < abs(self._sent[expected].acceleration):
+        if not self._ages_ns or expected < 0:
+            return
+        if same:
+            self._hold(min(same, key=lambda place: abs(place - expected)), expected)
+        elif only and isfinite(abs(acceleration)):
+            self._correct(expected, acceleration - self._acceleration[expected])
+            if 0.0 < abs(acceleration) < abs(self._acceleration[expected]):
                 self._largest_m_s2 = abs(acceleration)
-            self._clip(range(expected + 1, len(self._sent)))
+                self._clip_from(expected + 1)
 
     def _expected(self, at_ns: int) -> int:
         """The set-point that acts at an instant if none is lost."""
         least_age_ns = min(self._ages_ns, default=0)
         return bisect_right(self._due_ns, at_ns - least_age_ns + round(_EARLY * self._period_ns)) - 1
 
-    def _recognised(self, places: Iterable[int], velocity: complex | None, acceleration: complex) -> int | None:
-        """The first of these set-points that has the values reported."""
-        for place in places:
-            sent = self._sent[place]
-            if _same(acceleration, sent.acceleration) or (velocity is not None and _same(velocity, sent.velocity)):
-                return place
-        return None
+    def _hold(self, active: int, expected: int) -> None:
+        """The vehicle follows a set-point, where another one was expected."""
+        held = self._acceleration[active]
+        self._correct(active, 0j)
+        for lost in range(active + 1, expected + 1):
+            self._correct(lost, held - self._acceleration[lost])
+        if abs(held) > self._largest_m_s2:
+            self._largest_m_s2 = inf  # what limited it, such as its speed, no longer does
+            self._clip_from(max(active, expected) + 1)
 
-    def _clip(self, places: Iterable[int]) -> None:
-        for place in places:
-            wanted = self._sent[place].acceleration
+    def _clip_from(self, place: int) -> None:
+        """Assume that this set-point and those after it are clipped as the last one was."""
+        for later in range(place, len(self._off)):
+            wanted = self._acceleration[later]
             over = abs(wanted) / self._largest_m_s2
-            self._correct(place, wanted / over - wanted if over > 1.0 else 0j)
+            self._correct(later, wanted / over - wanted if over > 1.0 else 0j)
 
     def _correct(self, place: int, off: complex) -> None:
         if off != self._off[place]:

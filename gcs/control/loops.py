@@ -133,9 +133,7 @@ class PredictingGroundLoop:
         prediction, vehicles = plan.scenario.control.prediction, range(plan.model.vehicles)
         every = plan.responses_in_order
         held_ns = round(plan.scenario.safety.setpoint_timeout_s * NS_PER_S)
-        self._sent = [
-            CommandHistory(held_ns, None if every is None else Responding(every[row])) for row in vehicles
-        ]
+        self._sent = [CommandHistory(held_ns, None if every is None else Responding(every[row])) for row in vehicles]
         period_ns = round(NS_PER_S / plan.scenario.rates.control_hz)
         self._targets = [ActiveTargets(own, period_ns=period_ns, held_ns=held_ns) for own in self._sent]
         self._deliveries: list[Delivery] = [

@@ -15,7 +15,7 @@ OPTIONAL = mavlink.POSITION_TARGET_LOCAL_NED
 
 
 def message_rates(rates_hz: dict[int, float]) -> dict[float, float]:
-    """The interval in µs of each message that is to be sent, as parameters of a command; vehicles take whole numbers."""
+    """The interval in µs of each message that is sent, as parameters of a command; vehicles take whole numbers."""
     return {float(message): float(round(1e6 / hz)) for message, hz in rates_hz.items() if hz}
 
 

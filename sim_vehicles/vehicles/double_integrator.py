@@ -258,7 +258,9 @@ class DoubleIntegrator:
         if not flight.flying or flight.mode != mavlink.MODE_GUIDED or flight.failsafe:
             return None
         followed = limited(self._state, self._command, self._bounds)
-        return self._radio.encoder.pack(messages.position_target(boot_ms, _ACCELERATION_ONLY, (0.0, 0.0, 0.0), followed))
+        return self._radio.encoder.pack(
+            messages.position_target(boot_ms, _ACCELERATION_ONLY, (0.0, 0.0, 0.0), followed)
+        )
 
     def _condition(self, boot_ms: int) -> messages.Condition:
         """What it reports to other ground stations; in flight its roll is that of a coordinated turn."""
