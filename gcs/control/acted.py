@@ -24,8 +24,8 @@ from typing import Any, Protocol
 
 from gcs.link.mavlink import VELOCITY_IGNORED
 
-_AGES = 8
-"""The least age is that of the last reports: with half of all set-points lost, one of them is as young as can be."""
+_AGES = 3
+"""Set-points over which the least age is taken. Few, because a delay that grows looks like loss until all are new."""
 _EARLY = 0.05
 """A set-point counts as lost from the least age on, less this share of a period: clocks err by as much."""
 _VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
@@ -54,7 +54,7 @@ class ActiveTargets:
         self._acceleration: list[complex] = []
         self._off: list[complex] = []
         """What the acceleration of each is corrected by."""
-        self._ages_ns = deque[int](maxlen=_AGES)
+        self._ages_ns, self._aged_ns = deque[int](maxlen=_AGES), 0
         self._largest_m_s2 = inf
         """The size to which the vehicle clips."""
 
@@ -79,8 +79,10 @@ class ActiveTargets:
         if not same and not only:
             value = _vector(fields, _VELOCITY)
             same = [place for place in recent if self._velocity[place] == value]
-        if len(same) == 1 and value:  # a vehicle that has stopped reports zeros of its own
-            self._ages_ns.append(at_ns - self._due_ns[same[0]])
+        if len(same) == 1 and value and self._due_ns[same[0]] != self._aged_ns:
+            # a vehicle that has stopped reports zeros of its own; one that repeats itself, an age that only grows
+            self._aged_ns = self._due_ns[same[0]]
+            self._ages_ns.append(at_ns - self._aged_ns)
             expected = self._expected(at_ns)
         if not self._ages_ns or expected < 0:
             return
