@@ -94,6 +94,9 @@ class Rates(Part):
     """LOCAL_POSITION_NED messages from each vehicle."""
     timesync_hz: Annotated[float, Field(ge=0.01, le=50)] = 10.0
     """TIMESYNC exchanges with each vehicle. At most `control_hz`, because each control tick logs one round trip."""
+    target_hz: Annotated[float, Field(ge=0, le=500)] = 10.0
+    """POSITION_TARGET_LOCAL_NED messages from each vehicle, which show what acted; with `control.prediction` only, and
+    never more than `telemetry_hz`. 0: none, and every set-point is assumed to act as it was sent."""
 
 
 class FixedGains(Part):
@@ -395,6 +398,11 @@ class Scenario(Part):
     def altitude_of(self, vehicle: Vehicle) -> float:
         """The altitude at which a vehicle flies, in m above the origin."""
         return self.altitude_m if vehicle.altitude_m is None else vehicle.altitude_m
+
+    @property
+    def target_hz(self) -> float:
+        """How often each vehicle is asked for its active target; 0 for never."""
+        return 0.0 if self.control.prediction == "off" else min(self.rates.target_hz, self.rates.telemetry_hz)
 
     @property
     def has_altitude_slots(self) -> bool:

@@ -37,7 +37,11 @@ class AutopilotFleet:
         self.plan = plan
         self.loop = loop_of(plan)
         self.starts = [
-            AutopilotStartup(altitude_m=scenario.altitude_of(vehicle), telemetry_hz=scenario.rates.telemetry_hz)
+            AutopilotStartup(
+                altitude_m=scenario.altitude_of(vehicle),
+                telemetry_hz=scenario.rates.telemetry_hz,
+                target_hz=scenario.target_hz,
+            )
             for vehicle in scenario.leader_first()
         ]
         self.vehicles = [

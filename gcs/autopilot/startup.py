@@ -11,6 +11,7 @@ from gcs.autopilot.kinds import ARM, Seen, kind_of, next_step
 from gcs.autopilot.vehicle_limits import ToldLimits
 from gcs.link import mavlink
 from gcs.link.kinds import ARM_DISARM, SET_MESSAGE_INTERVAL, TAKE_OFF, UNRECOGNISED, Kind, Step
+from gcs.link.startup import OPTIONAL, message_rates
 from gcs.link.vehicle import ARMED
 
 EARTH_RADIUS_M = 6_378_137.0
@@ -81,7 +82,7 @@ class _Ground:
 class AutopilotStartup:
     """Start-up of one vehicle, which takes off to `altitude_m`; see `gcs.link.startup.Startup`."""
 
-    def __init__(self, *, altitude_m: float, telemetry_hz: float) -> None:
+    def __init__(self, *, altitude_m: float, telemetry_hz: float, target_hz: float = 0.0) -> None:
         self.kind = UNRECOGNISED
         self.refusal = ""
         self.altitude_m = altitude_m
@@ -98,7 +99,7 @@ class AutopilotStartup:
         self._local: tuple[int, float, float, float, float, float] | None = None
         """Newest local position: boot time in ms, north, east, down, and velocities north and east."""
         self._took_off_ns: int | None = None
-        self._telemetry_interval_us = round(1e6 / telemetry_hz)
+        self._asked_hz = {mavlink.LOCAL_POSITION_NED: telemetry_hz, OPTIONAL: target_hz}
         self._rates: dict[float, float] = {}
         self._accepted: set[float] = set()
 
@@ -111,7 +112,7 @@ class AutopilotStartup:
             return self.kind
         self.kind = found
         self._rates = {
-            float(mavlink.LOCAL_POSITION_NED): self._telemetry_interval_us,
+            **message_rates(self._asked_hz),
             float(mavlink.GLOBAL_POSITION_INT): _SLOW_US,
             float(found.estimator_message): 2.0 * _SLOW_US,
             float(mavlink.GPS_GLOBAL_ORIGIN): 5.0 * _SLOW_US,
@@ -163,12 +164,12 @@ class AutopilotStartup:
             self._took_off_ns = now_ns
 
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
-        """A message rate for the origin may be refused: other messages show it too.
+        """A message rate for the origin may be refused: other messages show it too. So may that of the active target.
 
         Refusals to arm are counted. A vehicle that refuses a repeated take-off is taking off already, and its first
         answer was lost.
         """
-        if command == SET_MESSAGE_INTERVAL and parameters[0] == mavlink.GPS_GLOBAL_ORIGIN:
+        if command == SET_MESSAGE_INTERVAL and parameters[0] in (mavlink.GPS_GLOBAL_ORIGIN, OPTIONAL):
             self._accepted.add(parameters[0])
         elif command == ARM_DISARM:
             self._ground.arming_refusals += 1

@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
 from gains.sampled.onboard import own_part
+from gcs.control.acted import ActiveTargets
 from gcs.control.history import Reports
 from gcs.control.law import Blend, FeedbackLaw, VehicleControl, VehicleLaw, command_at, feedback_law, formation_control
-from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates, Sent
-from gcs.control.responding import RespondingHistory
+from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates
+from gcs.control.responding import Responding
 from gcs.link import mavlink
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.onboard import own_parameters
@@ -68,6 +69,14 @@ class Loop(Protocol):
         """Take in the acceleration that a vehicle is sent."""
         ...
 
+    def sent(self, row: int, due_ns: int, fields: tuple[Any, ...]) -> None:
+        """Take in the fields of a set-point as it was sent."""
+        ...
+
+    def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None:
+        """Take in the fields of a POSITION_TARGET_LOCAL_NED: what a vehicle followed at an instant."""
+        ...
+
     def parameters(self, system_id: int) -> dict[str, float]:
         """The parameters that a vehicle must hold before it is armed."""
         ...
@@ -101,6 +110,9 @@ class GroundLoop:
     def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
         """Nothing to do either."""
 
+    def sent(self, row: int, due_ns: int, fields: tuple[Any, ...]) -> None: ...
+    def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None: ...
+
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
         north, east = order.control.command_m_s2
         return mavlink.acceleration_set_point(
@@ -121,9 +133,9 @@ class PredictingGroundLoop:
         prediction, vehicles = plan.scenario.control.prediction, range(plan.model.vehicles)
         every = plan.responses_in_order
         held_ns = round(plan.scenario.safety.setpoint_timeout_s * NS_PER_S)
-        self._sent: list[Sent] = [
-            CommandHistory(held_ns) if every is None else RespondingHistory(held_ns, every[row]) for row in vehicles
-        ]
+        self._sent = [CommandHistory(held_ns, None if every is None else Responding(every[row])) for row in vehicles]
+        period_ns = round(NS_PER_S / plan.scenario.rates.control_hz)
+        self._targets = [ActiveTargets(own, period_ns=period_ns, held_ns=held_ns) for own in self._sent]
         self._deliveries: list[Delivery] = [
             MeasuredDelivery() if isinstance(prediction, str) else FixedDelivery(prediction) for _ in vehicles
         ]
@@ -148,6 +160,12 @@ class PredictingGroundLoop:
 
     def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
         self._sent[row].add(due_ns, acceleration_m_s2)
+
+    def sent(self, row: int, due_ns: int, fields: tuple[Any, ...]) -> None:
+        self._targets[row].sent(due_ns, fields)
+
+    def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None:
+        self._targets[row].reported(at_ns, fields)
 
 
 class StreamedLoop:
@@ -187,6 +205,9 @@ class StreamedLoop:
 
     def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
         """Nothing to do either."""
+
+    def sent(self, row: int, due_ns: int, fields: tuple[Any, ...]) -> None: ...
+    def active(self, row: int, at_ns: int, fields: tuple[Any, ...]) -> None: ...
 
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
         return mavlink.velocity_set_point(

@@ -48,6 +48,7 @@ class ManoeuvringLoop:
         self._planned: list[tuple[Vector, Vector]] = [((0.0, 0.0), (0.0, 0.0)) for _ in vehicles]
         """Planned velocity and acceleration of each vehicle while the set-point of the newest tick acts."""
         self.law, self.parameters = inner.law, inner.parameters
+        self.sent, self.active = inner.sent, inner.active  # what another set-point changes is the same in both
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
         still = now._replace(nominal_velocity_m_s=(0.0, 0.0))  # the nominal velocity is part of the planned motion

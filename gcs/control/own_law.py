@@ -101,7 +101,7 @@ class OwnLawLoop:
     def __init__(self, plan: FlightPlan, law: FlownLaw) -> None:
         ground, self._plan, self._law = GroundLoop(plan), plan, law
         self.delivered, self.remember, self.set_point = ground.delivered, ground.remember, ground.set_point
-        self.parameters = ground.parameters
+        self.parameters, self.sent, self.active = ground.parameters, ground.sent, ground.active
         self._known: tuple[Vector, float] | None = None
         self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
 

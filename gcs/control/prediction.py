@@ -14,7 +14,7 @@ the cost does not grow with the delay.
 The assumed loop delay is the age of a state when it is first used, plus D.
 """
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from math import exp
@@ -34,13 +34,49 @@ _AHEAD_S = 5.0
 """How long the trend of the measured delivery delays is extrapolated without a new measurement."""
 
 
+Motion = tuple[complex, complex, tuple[complex, ...]]
+"""V, P and what else the motion of a vehicle depends on; vectors are north + 1j * east."""
+
+
+class Responds(Protocol):
+    """How a vehicle moves under the accelerations that it is sent: `AtOnce` or `gcs.control.responding.Responding`."""
+
+    @property
+    def rest(self) -> Motion: ...
+
+    def moved(self, motion: Motion, u: complex, duration_s: float) -> Motion:
+        """The motion after a time under an acceleration."""
+        ...
+
+    def returned(self, motion: Motion, astray_m_s: complex) -> Motion:
+        """The motion once the vehicle takes a set-point again, of which it had gone astray by this velocity."""
+        ...
+
+
+class AtOnce:
+    """V' = u: a velocity that was not gained is not made up for."""
+
+    rest: Motion = 0j, 0j, ()
+
+    def moved(self, motion: Motion, u: complex, duration_s: float) -> Motion:
+        velocity, position, none = motion
+        return velocity + u * duration_s, position + (velocity + 0.5 * u * duration_s) * duration_s, none
+
+    def returned(self, motion: Motion, astray_m_s: complex) -> Motion:
+        del astray_m_s
+        return motion
+
+
 class _Sent(NamedTuple):
-    """A set-point, with V and P at the time it is due; vectors are north + 1j * east."""
+    """A set-point, with the motion at the time it is due."""
 
     due_ns: int
     u: complex
-    V: complex
-    P: complex
+    motion: Motion
+    off: complex = 0j
+    """What u was altered by."""
+    astray_m_s: complex = 0j
+    """The integral of `off` since the vehicle took a set-point last."""
 
 
 class CommandHistory:
@@ -49,40 +85,58 @@ class CommandHistory:
     Without set-points for that long a vehicle enters its failsafe, in which it holds its velocity.
     """
 
-    def __init__(self, held_ns: int) -> None:
-        self._held_ns = held_ns
-        self._sent: list[_Sent] = [_Sent(0, 0j, 0j, 0j)]
+    def __init__(self, held_ns: int, responds: Responds | None = None) -> None:
+        self._held_ns, self._responds = held_ns, responds or AtOnce()
+        self._sent: list[_Sent] = [_Sent(0, 0j, self._responds.rest)]
         self._due_ns = [0]
+        self._known = 1
+        """How many of them have their motion as it follows from those before."""
 
     def add(self, due_ns: int, acceleration_m_s2: tuple[float, float]) -> None:
         """Remember the set-point of a tick; ticks come in order."""
-        velocity, position = self.sums(due_ns)
-        self._sent.append(_Sent(due_ns, complex(*acceleration_m_s2), velocity, position))
+        self._settle()
+        self._sent.append(self._after(self._sent[-1], _Sent(due_ns, complex(*acceleration_m_s2), self._responds.rest)))
         self._due_ns.append(due_ns)
         long_ago = bisect_right(self._due_ns, due_ns - round(KEPT_S * NS_PER_S)) - 1
         if 2 * long_ago > len(self._sent):  # in bulk: deleting from the front moves all the rest
             del self._sent[:long_ago], self._due_ns[:long_ago]
+        self._known = len(self._sent)
+
+    def alter(self, due_ns: int, by_m_s2: complex) -> None:
+        """Change the acceleration of the set-point due then, if there is one: another one acted."""
+        place = bisect_left(self._due_ns, due_ns)
+        if place < len(self._sent) and self._due_ns[place] == due_ns:
+            own = self._sent[place]
+            self._sent[place] = own._replace(u=own.u + by_m_s2, off=own.off + by_m_s2)
+            self._known = min(self._known, max(1, place))
 
     def sums(self, time_ns: int) -> tuple[complex, complex]:
         """V (m/s) and P (m) at a time."""
-        last = self._sent[max(0, bisect_right(self._due_ns, time_ns) - 1)]
+        self._settle()
+        velocity, position, _ = self._moved(self._sent[max(0, bisect_right(self._due_ns, time_ns) - 1)], time_ns)
+        return velocity, position
+
+    def _settle(self) -> None:
+        for place in range(self._known, len(self._sent)):
+            self._sent[place] = self._after(self._sent[place - 1], self._sent[place])
+        self._known = len(self._sent)
+
+    def _after(self, last: _Sent, own: _Sent) -> _Sent:
+        motion, astray_m_s = self._moved(last, own.due_ns), 0j
+        if last.off or last.astray_m_s:
+            astray_m_s = last.astray_m_s + last.off * ((own.due_ns - last.due_ns) * 1e-9)
+            if not own.off:
+                motion, astray_m_s = self._responds.returned(motion, astray_m_s), 0j
+        return own._replace(motion=motion, astray_m_s=astray_m_s)
+
+    def _moved(self, last: _Sent, time_ns: int) -> Motion:
         since_ns = max(0, time_ns - last.due_ns)
-        flown_s = min(since_ns, self._held_ns) * 1e-9
-        velocity = last.V + last.u * flown_s
-        position = last.P + (last.V + 0.5 * last.u * flown_s) * flown_s
-        return velocity, position + velocity * (max(0, since_ns - self._held_ns) * 1e-9)
+        motion = self._responds.moved(last.motion, last.u, min(since_ns, self._held_ns) * 1e-9)
+        beyond_ns = since_ns - self._held_ns
+        return self._responds.moved(motion, 0j, beyond_ns * 1e-9) if beyond_ns > 0 else motion
 
 
-class Sent(Protocol):
-    """The set-points sent to one vehicle, and the motion that follows from them: `CommandHistory` or
-    `gcs.control.responding.RespondingHistory`."""
-
-    def add(self, due_ns: int, acceleration_m_s2: tuple[float, float]) -> None: ...
-
-    def sums(self, time_ns: int) -> tuple[complex, complex]: ...
-
-
-def carried(sent: Sent, state: State, from_ns: int, to_ns: int) -> State:
+def carried(sent: CommandHistory, state: State, from_ns: int, to_ns: int) -> State:
     """The state propagated under the set-points due between two times."""
     (velocity, position), (later_velocity, later_position) = sent.sums(from_ns), sent.sums(to_ns)
     north, east, v_north, v_east = state
@@ -180,7 +234,7 @@ class FirstUses:
 class PredictedStates:
     """States predicted beyond the newest reports: `gcs.control.history.States` as of the last `look`."""
 
-    def __init__(self, sent: Sequence[Sent], deliveries: Sequence[Delivery], commands: int) -> None:
+    def __init__(self, sent: Sequence[CommandHistory], deliveries: Sequence[Delivery], commands: int) -> None:
         self.deliveries, self._sent = deliveries, sent
         self._first_uses = [FirstUses(commands) for _ in sent]
         self._delivery_ns: list[int | None] = [None] * len(sent)

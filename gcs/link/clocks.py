@@ -217,6 +217,12 @@ class VehicleClock:
         turns = (self.estimate.offset_at_ns(near_ns) + near_ns - boot_ns + _WRAP_NS // 2) // _WRAP_NS
         return boot_ns + turns * _WRAP_NS
 
+    def station_ns(self, boot_ms: int, received_ns: int) -> int | None:
+        """The station's time of a time_boot_ms that proves nothing of the clock; None while the clock is unknown."""
+        if self.estimate.samples == 0:
+            return None
+        return min(received_ns, self.estimate.to_station_ns(self.boot_ns(boot_ms, received_ns)))
+
     def sampled_ns(self, boot_ms: int, received_ns: int, *, newest: bool) -> int | None:
         """The station's time at which a state was sampled; None if it is unknown or impossible.
 

@@ -6,10 +6,17 @@
 from typing import Any, Protocol
 
 from gcs.link import mavlink
-from gcs.link.kinds import ARM_DISARM, LAUNCHED, SET_MESSAGE_INTERVAL, Command, Kind, Step, mode_command
+from gcs.link.kinds import ARM_DISARM, LAUNCHED, SET_MESSAGE_INTERVAL, Kind, Step, mode_command
 from gcs.link.upload import Upload
 
 _READY = Step("")
+OPTIONAL = mavlink.POSITION_TARGET_LOCAL_NED
+"""The message without which a vehicle can be flown: prediction then assumes that every set-point acts."""
+
+
+def message_rates(rates_hz: dict[int, float]) -> dict[float, float]:
+    """The interval in µs of each message that is sent, as parameters of a command; vehicles take whole numbers."""
+    return {float(message): float(round(1e6 / hz)) for message, hz in rates_hz.items() if hz}
 
 
 class Startup(Protocol):
@@ -69,10 +76,12 @@ class LaunchedStartup:
     is_half_way_up = has_landed = False
     arming_refusals = 0
 
-    def __init__(self, telemetry_hz: float, parameters: dict[str, float] | None = None) -> None:
-        interval_us = round(1e6 / telemetry_hz)  # vehicles take whole numbers
-        self._rate_command: Command = SET_MESSAGE_INTERVAL, (float(mavlink.LOCAL_POSITION_NED), interval_us)
-        self._rate_set = False
+    def __init__(
+        self, telemetry_hz: float, parameters: dict[str, float] | None = None, *, target_hz: float = 0.0
+    ) -> None:
+        self._rates = message_rates({mavlink.LOCAL_POSITION_NED: telemetry_hz, OPTIONAL: target_hz})
+        self._set = set[float]()
+        """The messages whose rates are settled."""
         self._upload = Upload(parameters or {})
 
     @property
@@ -91,17 +100,18 @@ class LaunchedStartup:
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:  # noqa: ARG002
         guided, uploaded = custom_mode == LAUNCHED.guided_mode, self._upload.done
-        if self._rate_set and clock_known and uploaded and guided and armed:
+        due = next(((m, us) for m, us in self._rates.items() if m not in self._set), None)
+        if due is None and clock_known and uploaded and guided and armed:
             return _READY
         command = None
-        if not self._rate_set:
-            command = self._rate_command
+        if due is not None:
+            command = SET_MESSAGE_INTERVAL, due
         elif not guided:
             command = mode_command(LAUNCHED, LAUNCHED.guided_mode)
         elif uploaded and not armed:
             command = ARM_DISARM, (1.0,)
         lacks = (
-            ("does not accept the telemetry rate", not self._rate_set),
+            ("does not accept the telemetry rate", due is not None),
             ("does not answer TIMESYNC", not clock_known),
             (self._upload.missing, not uploaded),
             ("does not enter GUIDED", not guided),
@@ -113,13 +123,16 @@ class LaunchedStartup:
         return self._upload.next(now_ns, target_system=target_system, rtt_ns=rtt_ns)
 
     def accepted(self, command: int, parameters: tuple[float, ...], now_ns: int) -> None:  # noqa: ARG002
-        self._rate_set = self._rate_set or command == SET_MESSAGE_INTERVAL
+        if command == SET_MESSAGE_INTERVAL:
+            self._set.add(parameters[0])
 
-    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:
-        """Nothing to note: the same step is tried again."""
+    def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:  # noqa: ARG002
+        """Without its active target a vehicle can be flown; any other step is tried again."""
+        if command == SET_MESSAGE_INTERVAL and parameters[0] == OPTIONAL:
+            self._set.add(parameters[0])
 
     def begin_anew(self) -> None:
-        self._rate_set = False
+        self._set.clear()
         self._upload.begin_anew()
 
 

@@ -96,7 +96,9 @@ class LaunchedFleet:
         self.vehicles = [
             RemoteVehicle(
                 system_id,
-                startup=LaunchedStartup(scenario.rates.telemetry_hz, self.loop.parameters(system_id)),
+                startup=LaunchedStartup(
+                    scenario.rates.telemetry_hz, self.loop.parameters(system_id), target_hz=scenario.target_hz
+                ),
                 report=report,
                 land=scenario.at_end == "land",
                 external=system_id == scenario.external_id,

@@ -172,6 +172,10 @@ class Station:
         match frame.msg_id:
             case mavlink.LOCAL_POSITION_NED:
                 self._position(row, vehicle, frame, datagram, outgoing)
+            case mavlink.POSITION_TARGET_LOCAL_NED:
+                at_ns = vehicle.clock.station_ns(fields[0], datagram.received_ns)
+                if at_ns is not None:
+                    self._fleet.loop.active(row, at_ns, fields)
             case mavlink.TIMESYNC:
                 tc1_ns, ts1_ns = fields
                 if tc1_ns == 0:
@@ -258,6 +262,7 @@ class Station:
             fields = self._fleet.set_point(row, order, self.phase)
             if fields is not None:
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
+                self._fleet.loop.sent(row, due_ns, fields)
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
             tolerated = self.plan.tolerance(control.assumed_s)
             self._monitor.margins_s[row] = tolerated.longer_s

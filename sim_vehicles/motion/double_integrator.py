@@ -128,6 +128,15 @@ def _free_flight(state: State, u_north: float, u_east: float, t: float) -> State
     )
 
 
+def limited(state: State, command: Command, bounds: Bounds) -> tuple[float, float]:
+    """The acceleration (north, east) that a command causes; the commanded one to the last digit if no limit binds."""
+    _, _, yaw, speed = state
+    _, _, turn_rate, along = rates(yaw, speed, command, bounds)
+    cosine, sine, across = math.cos(yaw), math.sin(yaw), turn_rate * max(speed, bounds[0])
+    found = cosine * along - sine * across, sine * along + cosine * across
+    return command[:2] if math.dist(found, command[:2]) <= 1e-9 * (1.0 + math.hypot(*found)) else found
+
+
 def _limited_step(state: State, command: Command, bounds: Bounds, h: float) -> State:
     """A Runge-Kutta step with all limits."""
     north, east, yaw, speed = state

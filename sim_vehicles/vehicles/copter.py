@@ -290,10 +290,16 @@ class Copter:
         return self.mode == self.rules.guided_mode and not self.landed and self._takeoff_m is None
 
     def _active_target(self, boot_ms: int) -> messages.Message:
-        """What it steers to now: the velocity of the set-point, grown by the acceleration since, and the latter."""
-        target = self._target
+        """What it steers to now: the velocity of the set-point, and its acceleration.
+
+        With ArduCopter the velocity has grown since. PX4 reports the acceleration that its velocity loop wants.
+        """
+        target, (north, east) = self._target, self._target[0:2]
+        if not self.rules.velocity_grows:
+            north += target.velocity_gain_1_s * (target.velocity_north_m_s - self.motion.velocity_north_m_s)
+            east += target.velocity_gain_1_s * (target.velocity_east_m_s - self.motion.velocity_east_m_s)
         mask = POSITION_AXES | YAW_IGNORED | YAW_RATE_IGNORED | (0 if target.velocity_gain_1_s else VELOCITY_AXES)
-        return messages.position_target(boot_ms, mask, (*target[2:4], -target.climb_m_s), target[0:2])
+        return messages.position_target(boot_ms, mask, (*target[2:4], -target.climb_m_s), (north, east))
 
     def _condition(self, boot_ms: int, *, has_position: bool) -> messages.Condition:
         """What it reports to other ground stations; it tilts to accelerate."""

@@ -18,6 +18,7 @@ from sim_vehicles.motion.double_integrator import (
     State,
     advance,
     bounds_of,
+    limited,
     rates,
     shifted,
     state_from,
@@ -30,11 +31,24 @@ from sim_vehicles.services.parameters import ARDUPILOT_SETUP, Parameters, fixed,
 from sim_vehicles.services.services import whole
 from sim_vehicles.vehicles.flight_mode import MODE_NAMES, FlightMode
 from sim_vehicles.vehicles.onboard import STEP, VehicleLoop, formation_parameters
-from sim_vehicles.vehicles.setpoints import ACCELERATION, AXES, VELOCITY, VELOCITY_ACCELERATION, fault, to_local
+from sim_vehicles.vehicles.setpoints import (
+    ACCELERATION,
+    AXES,
+    POSITION_AXES,
+    VELOCITY,
+    VELOCITY_ACCELERATION,
+    VELOCITY_AXES,
+    YAW_IGNORED,
+    YAW_RATE_IGNORED,
+    fault,
+    to_local,
+)
 from sim_vehicles.vehicles.shell import Answer, Radio
 
 CANNOT_LAND: Answer = mavlink.DENIED, "cannot land or return, LOITER holds the course"
 """Also sent as STATUSTEXT: a person who asks for this may not see the result code."""
+
+_ACCELERATION_ONLY = POSITION_AXES | VELOCITY_AXES | YAW_IGNORED | YAW_RATE_IGNORED
 
 
 class DoubleIntegrator:
@@ -47,6 +61,7 @@ class DoubleIntegrator:
         mavlink.LOCAL_POSITION: 250_000,
         mavlink.GLOBAL_POSITION: 1_000_000,
         mavlink.HOME_POSITION: 0,
+        mavlink.POSITION_TARGET: 0,
     }
     """Slow defaults, as on an autopilot's telemetry port; MAV_CMD_SET_MESSAGE_INTERVAL changes them."""
 
@@ -233,7 +248,19 @@ class DoubleIntegrator:
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
             return encoder.local_position(boot_ms, (*place, -self._altitude_m), (*velocity, 0.0))
+        if message_id == mavlink.POSITION_TARGET:
+            return self._active_target(boot_ms)
         return encoder.pack(messages.report(message_id, self._condition(boot_ms)))
+
+    def _active_target(self, boot_ms: int) -> bytes | None:
+        """The acceleration that it follows within its limits, while it takes set-points."""
+        flight = self.flight
+        if not flight.flying or flight.mode != mavlink.MODE_GUIDED or flight.failsafe:
+            return None
+        followed = limited(self._state, self._command, self._bounds)
+        return self._radio.encoder.pack(
+            messages.position_target(boot_ms, _ACCELERATION_ONLY, (0.0, 0.0, 0.0), followed)
+        )
 
     def _condition(self, boot_ms: int) -> messages.Condition:
         """What it reports to other ground stations; in flight its roll is that of a coordinated turn."""

@@ -107,7 +107,7 @@ def _margin_experiment(rng: Rng, name: str) -> Experiment:
     control_hz = one_of(rng, 10.0, 25.0, 50.0, 50.0, 100.0)
     telemetry_hz = control_hz * one_of(rng, 1.0, 1.0, 0.2, 0.4, 0.5, 2.0, 2.5)
     slower_hz = min(control_hz, telemetry_hz)
-    rates = whole(schema.Rates, control_hz=control_hz, telemetry_hz=telemetry_hz, timesync_hz=10.0)
+    rates = whole(schema.Rates, control_hz=control_hz, telemetry_hz=telemetry_hz, timesync_hz=10.0, target_hz=10.0)
     speed_m_s, pitch_m = 100.0, 100.0
     vehicles = random_vehicles(rng, count, pitch_m, speed_m_s, autopilot=False)
     for vehicle in vehicles:

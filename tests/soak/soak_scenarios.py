@@ -167,6 +167,7 @@ def _rates(rng: Rng, *, onboard: bool, autopilot: bool) -> Part:
         control_hz=control_hz,
         telemetry_hz=one_of(rng, control_hz, control_hz, control_hz, 5.0, 20.0, any_hz),
         timesync_hz=one_of(rng, 10.0, 10.0, 10.0, spread(rng, 0.5, 50.0)),
+        target_hz=one_of(rng, 10.0, 10.0, 0.0, control_hz),
     )
 
 

@@ -22,7 +22,7 @@ from gcs.control.prediction import (
     PredictedStates,
     carried,
 )
-from gcs.control.responding import RespondingHistory
+from gcs.control.responding import Responding
 
 MS, S = 1_000_000, 1_000_000_000
 START = 10 * S
@@ -162,7 +162,7 @@ def test_jitter_is_smoothed() -> None:
 def test_a_response_moves_as_its_differential_equation_says(response: Response) -> None:
     """Also where its two modes coincide, at four times the lag times the gain, and where they oscillate."""
     rng = np.random.default_rng(7)
-    history, held_ns = RespondingHistory(S, response), 20 * MS
+    history, held_ns = CommandHistory(S, Responding(response)), 20 * MS
     A, B, _ = formation_loop(FormationModel((-1,), axes=1), np.array([[-1.0]]), [response])
     state, position = np.zeros((len(A), 2)), np.zeros(2)
     fine = 40

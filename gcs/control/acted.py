@@ -1,0 +1,122 @@
+"""Which set-points acted: those that a vehicle reports as its active target, POSITION_TARGET_LOCAL_NED.
+
+The prediction assumes that every set-point acts, each a delivery delay after it was due. One that was lost never does:
+the vehicle holds the one before. A vehicle that reports its active target says which one it holds at an instant. A
+report carries the vehicle's own time, not the key of a set-point, so it is recognised by its values, float32 on both
+ways: those of ArduPilot by the acceleration, as the velocity grows with it; those of PX4 by the velocity, as the
+acceleration is that of its velocity loop; those of our own vehicles, which report an acceleration only, by that.
+
+The *age* of a report is its instant minus the time at which the recognised set-point was due. If none is lost it lies
+between the delivery delay and a control period more. So set-points that are older than the least age lately, and newer
+than the one recognised, were lost, or are late by as much. They are replaced by the recognised one. No assumed delay
+enters: a delay mismatch changes nothing.
+
+A vehicle that reports nothing but an acceleration reports what it does. If that is none of the accelerations sent, but
+a smaller one, the vehicle clips. Set-points under way are then assumed to be clipped to the same size, until it is seen
+to do more.
+"""
+
+import struct
+from bisect import bisect_left, bisect_right
+from collections import deque
+from math import inf, isfinite
+from typing import Any, Protocol
+
+from gcs.link.mavlink import VELOCITY_IGNORED
+
+_AGES = 3
+"""Set-points over which the least age is taken. Few, because a delay that grows looks like loss until all are new."""
+_EARLY = 0.05
+"""A set-point counts as lost from the least age on, less this share of a period: clocks err by as much."""
+_VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
+"""Places among the fields of SET_POSITION_TARGET_LOCAL_NED and of POSITION_TARGET_LOCAL_NED."""
+_ON_THE_WIRE = struct.Struct("<2f")
+
+
+class Alterable(Protocol):
+    """A history of set-points: `gcs.control.prediction.CommandHistory`."""
+
+    def alter(self, due_ns: int, by_m_s2: complex) -> None: ...
+
+
+def _vector(fields: tuple[Any, ...], place: slice) -> complex:
+    """North + 1j * east as the link carries it."""
+    return complex(*_ON_THE_WIRE.unpack(_ON_THE_WIRE.pack(*fields[place])))
+
+
+class ActiveTargets:
+    """The set-points sent to one vehicle, and what its reports say of them; corrects the history of its prediction."""
+
+    def __init__(self, history: Alterable, *, period_ns: int, held_ns: int) -> None:
+        self._history, self._period_ns, self._held_ns = history, period_ns, held_ns
+        self._due_ns: list[int] = []
+        self._velocity: list[complex] = []
+        self._acceleration: list[complex] = []
+        self._off: list[complex] = []
+        """What the acceleration of each is corrected by."""
+        self._ages_ns, self._aged_ns = deque[int](maxlen=_AGES), 0
+        self._largest_m_s2 = inf
+        """The size to which the vehicle clips."""
+
+    def sent(self, due_ns: int, fields: tuple[Any, ...]) -> None:
+        """Remember a set-point as it was sent, after `history` has."""
+        self._due_ns.append(due_ns)
+        self._velocity.append(_vector(fields, _VELOCITY))
+        self._acceleration.append(_vector(fields, _ACCELERATION))
+        self._off.append(0j)
+        self._clip_from(len(self._off) - 1)
+        old = bisect_left(self._due_ns, due_ns - 9 * self._held_ns)
+        if 2 * old > len(self._off):
+            del self._due_ns[:old], self._velocity[:old], self._acceleration[:old], self._off[:old]
+
+    def reported(self, at_ns: int, fields: tuple[Any, ...]) -> None:
+        """Take in the fields of a report, of an instant on the station's clock."""
+        acceleration, only = _vector(fields, _ACCELERATION), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
+        expected, least_age_ns = self._expected(at_ns), min(self._ages_ns, default=0)
+        oldest = bisect_left(self._due_ns, at_ns - least_age_ns - self._held_ns)
+        recent = range(oldest, bisect_right(self._due_ns, at_ns))
+        value, same = acceleration, [place for place in recent if self._acceleration[place] == acceleration]
+        if not same and not only:
+            value = _vector(fields, _VELOCITY)
+            same = [place for place in recent if self._velocity[place] == value]
+        if len(same) == 1 and value and self._due_ns[same[0]] != self._aged_ns:
+            # a vehicle that has stopped reports zeros of its own; one that repeats itself, an age that only grows
+            self._aged_ns = self._due_ns[same[0]]
+            self._ages_ns.append(at_ns - self._aged_ns)
+            expected = self._expected(at_ns)
+        if not self._ages_ns or expected < 0:
+            return
+        if same:
+            self._hold(min(same, key=lambda place: abs(place - expected)), expected)
+        elif only and isfinite(abs(acceleration)):
+            self._correct(expected, acceleration - self._acceleration[expected])
+            if 0.0 < abs(acceleration) < abs(self._acceleration[expected]):
+                self._largest_m_s2 = abs(acceleration)
+                self._clip_from(expected + 1)
+
+    def _expected(self, at_ns: int) -> int:
+        """The set-point that acts at an instant if none is lost."""
+        least_age_ns = min(self._ages_ns, default=0)
+        return bisect_right(self._due_ns, at_ns - least_age_ns + round(_EARLY * self._period_ns)) - 1
+
+    def _hold(self, active: int, expected: int) -> None:
+        """The vehicle follows a set-point, where another one was expected."""
+        held = self._acceleration[active]
+        self._correct(active, 0j)
+        for lost in range(active + 1, expected + 1):
+            self._correct(lost, held - self._acceleration[lost])
+        if abs(held) > self._largest_m_s2:
+            self._largest_m_s2 = inf  # what limited it, such as its speed, no longer does
+            self._clip_from(max(active, expected) + 1)
+
+    def _clip_from(self, place: int) -> None:
+        """Assume that this set-point and those after it are clipped as the last one was."""
+        for later in range(place, len(self._off)):
+            wanted = self._acceleration[later]
+            over = abs(wanted) / self._largest_m_s2
+            self._correct(later, wanted / over - wanted if over > 1.0 else 0j)
+
+    def _correct(self, place: int, off: complex) -> None:
+        if off != self._off[place]:
+            self._history.alter(self._due_ns[place], off - self._off[place])
+            self._off[place] = off
