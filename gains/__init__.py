@@ -59,10 +59,11 @@ __all__ = [
     "BadModelError", "CoupledBlock", "DelayAnalysis", "Design", "DisagreementError", "FormationModel", "GainsError",
     "InfeasibleError", "Jitter", "LoopMargin", "OnboardTiming", "Pattern", "PredictedLoop", "Requirement", "Response",
     "SolverError", "Timing", "all_to_all", "analyse_delay", "bidirectional", "bound_covering",
-    "boundary_of_two_delays", "checked_delay_margin", "coupled_blocks", "delay_box", "delay_margin", "delayed_feedback", "design",
-    "evaluate_gains", "fixed_modes", "formation_plant", "leader_follower", "loop_margin", "mismatch_window",
+    "boundary_of_two_delays", "checked_delay_margin", "coupled_blocks", "delay_box", "delay_margin", "delayed_feedback",
+    "design", "evaluate_gains", "fixed_modes", "formation_plant", "leader_follower", "loop_margin", "mismatch_window",
     "mismatch_window_continuous", "multirate_delay_margin", "onboard_loop", "parse_model", "predicted_growth_rate",
-    "rightmost_root", "rightmost_roots", "robustness", "sampled_delay_margin", "spread_bound", "trade_off", "varying_delay_bound",
+    "rightmost_root", "rightmost_roots", "robustness", "sampled_delay_margin", "spread_bound", "trade_off",
+    "varying_delay_bound",
 ]  # fmt: skip
 
 _NAMES = {

@@ -1,7 +1,7 @@
 """The ground station: flies formations over MAVLink and compares measured loop delay with the delay margin.
 
-From Python, `load_scenario` reads a scenario, `with_gain` gives it gains of one's own, `fly_virtual` flies it in virtual
-time, `front` searches what can be had at a loop delay, and `plot_front`, `plot_growth` and `plot_root_locus` draw.
+From Python, `load_scenario` reads a scenario, `with_gain` gives it gains of one's own, and `fly_virtual` flies it in
+virtual time. `front` searches what can be had at loop delays; `plot_front`, `plot_growth` and `plot_root_locus` draw.
 `LawFormation` is what a control law of one's own is called with. Importing a name loads what it needs.
 """
 

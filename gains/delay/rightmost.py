@@ -82,7 +82,9 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
     near = int(np.count_nonzero(upper.real > upper[0].real - band))
     if count > 1:
         # approximations farther left may be of no root at all, or several of one
-        return _apart(matrices, delays, [_upper(_newton(matrices, delays, s)) for s in upper[: 2 * count + 12].tolist()])
+        return _apart(
+            matrices, delays, [_upper(_newton(matrices, delays, s)) for s in upper[: 2 * count + 12].tolist()]
+        )
     return [_upper(_newton(matrices, delays, root)) for root in upper[: min(near, 12)].tolist()]
 
 

@@ -71,7 +71,9 @@ def feedback_of_polynomials(num: Any, den: Any) -> tuple[FloatArray, FloatArray]
 
     above, below = _polynomial("num", num), _polynomial("den", den)
     if above.size >= below.size:
-        raise BadModelError(f"num has degree {above.size - 1} and den {below.size - 1}; more poles than zeros are wanted")
+        raise BadModelError(
+            f"num has degree {above.size - 1} and den {below.size - 1}; more poles than zeros are wanted"
+        )
     return feedback_of_matrices(*tf2ss(above, below))
 
 

@@ -34,7 +34,9 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
     model, ids, gain = formation.model, formation.system_ids, real_matrix("K", K)
     wanted = model.B.shape[1] // model.axes, model.B.shape[0] // model.axes
     if gain.shape != wanted:
-        raise InputError(f"K: read shape {gain.shape}, wanted {wanted}: a row for each vehicle, a column for each error")
+        raise InputError(
+            f"K: read shape {gain.shape}, wanted {wanted}: a row for each vehicle, a column for each error"
+        )
     whole = np.kron(gain, np.eye(model.axes))
     blocks = tuple(
         GainBlock(vehicle=ids[i], of=ids[j], gain=(tuple(block[0].tolist()), tuple(block[1].tolist())))

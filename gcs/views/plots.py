@@ -31,7 +31,9 @@ def plot_growth(A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: A
     return plot
 
 
-def plot_root_locus(A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: Any = None, *, roots: int = 4) -> Any:
+def plot_root_locus(
+    A0: ArrayLike, A1: ArrayLike, delays_s: Sequence[float], axes: Any = None, *, roots: int = 4
+) -> Any:
     """The `roots` rightmost roots with imaginary part >= 0 at each delay, coloured by delay; crossings are ringed.
 
     Raises what `gains.analyse_delay` and `gains.rightmost_roots` raise.

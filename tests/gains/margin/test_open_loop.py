@@ -82,7 +82,7 @@ def test_model_and_matlab_files_hold_the_same_systems(tmp_path: Path, keys: str)
     ("text", "said"),
     [
         ('{"num": 1, "den": [1, 2]}', r"num: read 1, wanted coefficients as a list"),
-        ('{"num": [1, "a"], "den": [1, 2]}', r'num, row 1, column 2: read \'a\', wanted a finite number'),
+        ('{"num": [1, "a"], "den": [1, 2]}', r"num, row 1, column 2: read \'a\', wanted a finite number"),
         ('{"A": [[1]], "B": [[1]], "C": [[1]], "D": [[1]]}', "D is not zero"),
     ],
 )
