@@ -1,5 +1,6 @@
 """The plots for scripts and notebooks show the numbers that the analyses give."""
 
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -9,7 +10,7 @@ import pytest
 from gains import analyse_delay
 from gcs import plot_front, plot_growth, plot_root_locus
 from gcs.errors import InputError
-from gcs.studies.front import FrontFields, PointFields
+from gcs.studies.front import FrontFields, PointFields, picture
 from gcs.views.page import figure_of
 
 # stable for delays between 0.1002 and 1.7179 s only
@@ -49,7 +50,7 @@ def test_plots_without_axes_go_into_the_current_ones() -> None:
     plt.close(figure)
 
 
-def test_front_has_a_line_for_each_route() -> None:
+def test_front_has_a_line_for_each_route(tmp_path: Path) -> None:
     points = [
         PointFields(method="inclusion", prediction=on, maximised="alpha", loop_delay_s=at_s, alpha=1.0 / (1.0 + at_s))
         for on in (False, True)
@@ -64,3 +65,4 @@ def test_front_has_a_line_for_each_route() -> None:
     assert plot.lines[0].get_ydata().tolist() == [1.0 / 1.1, 1.0 / 1.3]
     with pytest.raises(InputError, match=r"figure: read 'beta', wanted one of alpha"):
         plot_front(found, "beta", axes())
+    assert picture(found, tmp_path / "front.png").stat().st_size > 10_000
