@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from gains.core.errors import BadModelError, DisagreementError, GainsError, InfeasibleError, SolverError
     from gains.core.requirement import Requirement
     from gains.delay.constant import DelayAnalysis, analyse_delay, delay_margin
-    from gains.delay.rightmost import rightmost_root
+    from gains.delay.rightmost import rightmost_root, rightmost_roots
     from gains.delay.several import boundary_of_two_delays, delay_box
     from gains.design.design import Design, design, evaluate_gains, trade_off
     from gains.formation.fixed_modes import fixed_modes
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from gains.formation.pattern import Pattern, all_to_all, bidirectional, formation_plant, leader_follower
     from gains.margin.loop_margin import LoopMargin, loop_margin
     from gains.margin.model_file import parse_model
+    from gains.margin.open_loop import delayed_feedback
     from gains.margin.opinions import checked_delay_margin
     from gains.performance.predicted import PredictedLoop
     from gains.performance.response import Response
@@ -58,17 +59,18 @@ __all__ = [
     "BadModelError", "CoupledBlock", "DelayAnalysis", "Design", "DisagreementError", "FormationModel", "GainsError",
     "InfeasibleError", "Jitter", "LoopMargin", "OnboardTiming", "Pattern", "PredictedLoop", "Requirement", "Response",
     "SolverError", "Timing", "all_to_all", "analyse_delay", "bidirectional", "bound_covering",
-    "boundary_of_two_delays", "checked_delay_margin", "coupled_blocks", "delay_box", "delay_margin", "design",
-    "evaluate_gains", "fixed_modes", "formation_plant", "leader_follower", "loop_margin", "mismatch_window",
+    "boundary_of_two_delays", "checked_delay_margin", "coupled_blocks", "delay_box", "delay_margin", "delayed_feedback",
+    "design", "evaluate_gains", "fixed_modes", "formation_plant", "leader_follower", "loop_margin", "mismatch_window",
     "mismatch_window_continuous", "multirate_delay_margin", "onboard_loop", "parse_model", "predicted_growth_rate",
-    "rightmost_root", "robustness", "sampled_delay_margin", "spread_bound", "trade_off", "varying_delay_bound",
+    "rightmost_root", "rightmost_roots", "robustness", "sampled_delay_margin", "spread_bound", "trade_off",
+    "varying_delay_bound",
 ]  # fmt: skip
 
 _NAMES = {
     "core.errors": "BadModelError DisagreementError GainsError InfeasibleError SolverError",
     "core.requirement": "Requirement",
     "delay.constant": "DelayAnalysis analyse_delay delay_margin",
-    "delay.rightmost": "rightmost_root",
+    "delay.rightmost": "rightmost_root rightmost_roots",
     "delay.several": "boundary_of_two_delays delay_box",
     "design.design": "Design design evaluate_gains trade_off",
     "formation.fixed_modes": "fixed_modes",
@@ -76,6 +78,7 @@ _NAMES = {
     "formation.pattern": "Pattern all_to_all bidirectional formation_plant leader_follower",
     "margin.loop_margin": "LoopMargin loop_margin",
     "margin.model_file": "parse_model",
+    "margin.open_loop": "delayed_feedback",
     "margin.opinions": "checked_delay_margin",
     "performance.predicted": "PredictedLoop",
     "performance.response": "Response",

@@ -1,7 +1,8 @@
 """The ground station: flies formations over MAVLink and compares measured loop delay with the delay margin.
 
-From Python, `fly_virtual` flies a scenario in virtual time, and `LawFormation` is what a control law of one's own is
-called with; importing a name loads what it needs.
+From Python, `load_scenario` reads a scenario, `with_gain` gives it gains of one's own, and `fly_virtual` flies it in
+virtual time. `front` searches what can be had at loop delays; `plot_front`, `plot_growth` and `plot_root_locus` draw.
+`LawFormation` is what a control law of one's own is called with. Importing a name loads what it needs.
 """
 
 import os
@@ -11,15 +12,30 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from gcs.drive.virtual import VirtualFlight, fly_virtual
+    from gcs.drive.virtual import VirtualFlight, fly_virtual, load_scenario
+    from gcs.plan.given import with_gain
     from gcs.plan.own_law import LawFormation
+    from gcs.studies.front import front, plot_front
+    from gcs.views.plots import plot_growth, plot_root_locus
 
-__all__ = ["LawFormation", "VirtualFlight", "fly_virtual"]
+__all__ = [
+    "LawFormation", "VirtualFlight", "fly_virtual", "front", "load_scenario", "plot_front", "plot_growth",
+    "plot_root_locus", "with_gain",
+]  # fmt: skip
+
+_NAMES = {
+    "drive.virtual": "VirtualFlight fly_virtual load_scenario",
+    "plan.given": "with_gain",
+    "plan.own_law": "LawFormation",
+    "studies.front": "front plot_front",
+    "views.plots": "plot_growth plot_root_locus",
+}
+_HOME = {name: f"gcs.{module}" for module, names in _NAMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> object:
-    if name not in __all__:
+    if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module("gcs.plan.own_law" if name == "LawFormation" else "gcs.drive.virtual"), name)
+    return getattr(import_module(_HOME[name]), name)

@@ -38,40 +38,78 @@ def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
     >>> round(rightmost.real, 6), round(rightmost.imag, 6), round(later.imag, 6)
     (-0.318132, 1.337236, 1.0)
     """
+    return complex(_roots_of(terms, 1)[0])
+
+
+def rightmost_roots(terms: Sequence[tuple[ArrayLike, float]], count: int) -> ComplexArray:
+    """The `count` rightmost of these roots (1/s) with imaginary part >= 0, from the right; fewer if there are fewer.
+
+    Arguments and exceptions as of `rightmost_root`. A root of several equal loops in the matrices comes once.
+
+    Of x'(t) = -x(t - 1) these are the branches of Lambert's W(-1):
+
+    >>> from gains import rightmost_roots
+    >>> rightmost_roots([([[-1]], 1.0)], 3).round(3).tolist()
+    [(-0.318+1.337j), (-2.062+7.589j), (-2.653+13.949j)]
+    """
+    return _roots_of(terms, count)
+
+
+def _roots_of(terms: Sequence[tuple[ArrayLike, float]], count: int) -> ComplexArray:
     if len(terms) == 0:
         raise BadModelError("terms is empty; at least one pair (matrix, delay) is wanted")
     delays = np.array([float(delay_s) for _, delay_s in terms])
     if not (np.isfinite(delays).all() and (delays >= 0.0).all()):
         raise BadModelError(f"terms have the delays {delays.tolist()}; finite numbers of seconds >= 0 are wanted")
     matrices = square_matrices(**{f"terms[{k}]": matrix for k, (matrix, _) in enumerate(terms)})
-    roots = [_rightmost_of_block(block, delays) for block in distinct_blocks(*matrices)]
-    return max(roots, key=lambda root: root.real)
+    roots = [root for block in distinct_blocks(*matrices) for root in _roots_of_block(block, delays, count)]
+    return np.array(sorted(roots, key=lambda root: -root.real)[:count])
 
 
-def _rightmost_of_block(block: Block, delays: FloatArray) -> complex:
+def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[complex]:
     matrices = np.array(balanced(*block.matrices))
     late = np.array([bool(matrix.any()) for matrix in matrices]) & (delays > 0.0)
     if not late.any():
-        return _upper(max(np.linalg.eigvals(matrices.sum(axis=0)).astype(np.complex128), key=lambda root: root.real))
+        found = np.linalg.eigvals(matrices.sum(axis=0)).astype(np.complex128).tolist()
+        return [root for root in found if root.imag >= 0.0]
     matrices = np.concatenate([matrices[~late].sum(axis=0)[np.newaxis], matrices[late]])
     delays = np.concatenate([[0.0], delays[late]])
-    approximations = _pseudospectral_roots(matrices, delays)
+    approximations = _pseudospectral_roots(matrices, delays, count - 1)
+    upper = approximations[approximations.imag >= 0.0]
+    upper = upper[np.argsort(-upper.real)]
     # the rightmost approximation need not belong to the rightmost root: all within its error band are refined
-    order = np.argsort(-approximations.real)
-    best = approximations[order[0]]
-    band = 0.05 * (abs(best) + 1.0 / delays.max())
-    near = [root for root in approximations[order].tolist() if root.real > best.real - band and root.imag >= 0.0]
-    refined = [_newton(matrices, delays, root) for root in near[:12]]
-    return _upper(max(refined, key=lambda root: root.real))
+    band = 0.05 * (abs(upper[0]) + 1.0 / delays.max())
+    near = int(np.count_nonzero(upper.real > upper[0].real - band))
+    if count > 1:
+        # approximations farther left may be of no root at all, or several of one
+        return _apart(
+            matrices, delays, [_upper(_newton(matrices, delays, s)) for s in upper[: 2 * count + 12].tolist()]
+        )
+    return [_upper(_newton(matrices, delays, root)) for root in upper[: min(near, 12)].tolist()]
 
 
-def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray) -> ComplexArray:
-    """Eigenvalues of the discretised generator; block row 0 is the equation, the others differentiate."""
+def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -> list[complex]:
+    """Those that are roots, each once."""
+    kept: list[complex] = []
+    for s in found:
+        terms = np.exp(-s * delays)[:, np.newaxis, np.newaxis] * matrices
+        left = np.linalg.svd(s * np.eye(matrices.shape[1]) - terms.sum(axis=0), compute_uv=False)[-1]
+        size = abs(s) + float(np.abs(terms).sum())
+        if left <= 1e-9 * size and all(abs(s - other) > 1e-6 * size for other in kept):
+            kept.append(s)
+    return kept
+
+
+def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray, further: int) -> ComplexArray:
+    """Eigenvalues of the discretised generator; block row 0 is the equation, the others differentiate.
+
+    Of `further` chains of roots to the left each turns once more over the longest delay.
+    """
     n, longest = matrices.shape[1], float(delays.max())
     # roots near or right of the axis have |Im s| below this bound
     turning = float(np.linalg.norm((matrices[0] - matrices[0].T) / 2.0, 2))
     highest = turning + float(np.linalg.norm(matrices[1:], 2, axis=(1, 2)).sum())
-    points = _POINTS + highest * longest / 2.0
+    points = _POINTS + highest * longest / 2.0 + 4.0 * further
     if not n * (points + 1.0) <= _LARGEST_MATRIX:
         raise BadModelError(
             f"the longest delay is {longest} s and a block of {n} states may oscillate at {highest:.3g} rad/s, "

@@ -1,9 +1,11 @@
-"""The JSON model of a linear loop with delays that `gcs margin` reads, in one of four forms::
+"""The JSON model of a linear loop with delays that `gcs margin` reads, in one of these forms::
 
     {"A0": [[..]], "A1": [[..]]}                                   x'(t) = A0 x(t) + A1 x(t - tau)
     {"terms": [{"A": [[..]], "delay": 0.1}, {"A": [[..]], "delay": "2*tau"}, ...]}   x'(t) = sum A x(t - delay)
     {"A": [[..]], "B": [[..]], "K": [[..]], "hold": true}          x' = A x + B u, u = K x sampled and held: any period
     {"A": [[..]], "B": [[..]], "K": [[..]], "hold": true, "period": 0.02}      the same every 0.02 s, tau late
+    {"A": [[..]], "B": [[..]], "C": [[..]]}                        x' = A x + B u, y = C x, u(t) = -y(t - tau)
+    {"num": [..], "den": [..]}                                     the same of y = num/den u, highest power first
 
 A delay is a number of seconds, a multiple of one unknown ("tau", "2*tau", "tau/3", "1.5*tau"), or a sum of both
 ("0.1 + tau"). Multiples are exact decimal fractions: "0.1*tau" is exactly a tenth.
@@ -20,6 +22,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
+from gains.margin.open_loop import feedback_of_matrices, feedback_of_polynomials
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _MULTIPLE = re.compile(
@@ -29,7 +32,15 @@ _MULTIPLE = re.compile(
 _PLAIN = re.compile(_NUMBER)
 # a plus sign that is not part of an exponent
 _PLUS = re.compile(r"(?<![0-9.][eE])\+")
-_FORMS = (("A0", "A1"), ("terms",), ("A", "B", "K", "hold"), ("A", "B", "K", "hold", "period"))
+_FORMS = (
+    ("A0", "A1"),
+    ("terms",),
+    ("A", "B", "K", "hold"),
+    ("A", "B", "K", "hold", "period"),
+    ("A", "B", "C"),
+    ("A", "B", "C", "D"),
+    ("num", "den"),
+)
 _DELAY_WANTED = 'a number of seconds >= 0 or a multiple of the unknown, as "tau" or "2*tau"'
 # products and squares of entries up to this do not overflow, and the square of a product of two least ones is normal
 _LARGEST, _LEAST = 1e30, 1e-60
@@ -85,9 +96,23 @@ def parse_model(text: str) -> DelayModel | HeldModel:
         return _terms_model(data["terms"])
     if keys == ("A0", "A1"):
         now = _square("A0", data["A0"])
-        late = _square("A1", data["A1"], size=len(now))
-        return DelayModel((Term(now, 0.0, Fraction(0)), Term(late, 0.0, Fraction(1))), "tau")
+        return _pair(now, _square("A1", data["A1"], size=len(now)))
+    if keys == ("num", "den"):
+        return _pair(*feedback_of_polynomials(*(_polynomial(key, data[key]) for key in keys)))
+    if "C" in keys:
+        return _pair(*feedback_of_matrices(*(_matrix(key, data[key]) for key in keys)))
     return _held_model(data)
+
+
+def _pair(now: FloatArray, late: FloatArray) -> DelayModel:
+    return DelayModel((Term(now, 0.0, Fraction(0)), Term(late, 0.0, Fraction(1))), "tau")
+
+
+def _polynomial(key: str, value: Any) -> FloatArray:
+    """Coefficients; MATLAB writes them as a row, a matrix."""
+    if not isinstance(value, list) or not value:
+        _bad(key, value, "coefficients as a list, [1, 2, 3]")
+    return _matrix(key, value if isinstance(value[0], list) else [value])
 
 
 def _parsed(text: str) -> Any:

@@ -93,6 +93,11 @@ class VirtualFlight:
         return np.stack([self.ticks[name.format(axis)] for axis in ("north", "east")], axis=-1)
 
 
+def load_scenario(scenario: Path | str) -> Scenario:
+    """The scenario in a file, or that ships by this name. Raises scenarios.errors.ScenarioError if there is none."""
+    return load(located(str(scenario)))
+
+
 def fly_virtual(
     scenario: Scenario | Path | str, *, allow_unstable: bool = False, allow_code: bool = False
 ) -> VirtualFlight:
@@ -123,7 +128,7 @@ def fly_virtual(
     ('stable', (3, 2))
     """
     if not isinstance(scenario, Scenario):
-        scenario = load(located(str(scenario)))
+        scenario = load_scenario(scenario)
     if not allow_code and (refused := refusal(scenario, Path(scenario.name))):
         raise InputError(refused)
     _refuse(scenario, bad_start(scenario) or endless_link(scenario))

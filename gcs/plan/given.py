@@ -1,8 +1,10 @@
-"""A scenario with the gains that a search found for it, so that they can be written, checked and flown."""
+"""A scenario with gains that are given to it, found by a search or by a user, to be written, checked and flown."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray
+from gains.core.structure import real_matrix
+from gcs.errors import InputError
 from gcs.plan.formation import plan_formation
 from scenarios.keys.part import Prediction
 from scenarios.schema import Control, FixedGains, GainBlock, Scenario
@@ -20,10 +22,22 @@ def with_given(
     return scenario.model_copy(update={"control": control, "vehicles": vehicles})
 
 
-def with_gain(scenario: Scenario, K: FloatArray, *, prediction: Prediction) -> Scenario:
-    """The same with the gain (inputs, states) of one axis, block by block, for both axes."""
+def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off") -> Scenario:
+    """The scenario with the gain K of u = +K e given, for north and east alike; other requirements are dropped.
+
+    K has a row for each vehicle and a column for each error of one axis, in the order of
+    `gains.FormationModel(..., axes=1)`: the leader's velocity error, then for each follower its spacing error and its
+    velocity error. `gains.design` and its like find K; so does any LQR of A and B of this model, whose u = -K e is
+    another sign. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite numbers.
+    """
     formation = plan_formation(scenario)
-    model, ids, whole = formation.model, formation.system_ids, np.kron(K, np.eye(formation.model.axes))
+    model, ids, gain = formation.model, formation.system_ids, real_matrix("K", K)
+    wanted = model.B.shape[1] // model.axes, model.B.shape[0] // model.axes
+    if gain.shape != wanted:
+        raise InputError(
+            f"K: read shape {gain.shape}, wanted {wanted}: a row for each vehicle, a column for each error"
+        )
+    whole = np.kron(gain, np.eye(model.axes))
     blocks = tuple(
         GainBlock(vehicle=ids[i], of=ids[j], gain=(tuple(block[0].tolist()), tuple(block[1].tolist())))
         for i in range(model.vehicles)

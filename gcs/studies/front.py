@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from gains.core.requirement import plain
 from gains.design.front import AIMS, Aim, FrontPoint, FrontSearch, Method, Refusal, Route, efficient
@@ -22,6 +22,13 @@ MOST_VEHICLES = 12
 """The figures are those of the whole formation; of larger ones they take minutes."""
 Prediction = Literal["on", "off"]
 _COLOURS = {"inclusion": "#1f4e79", "graph-lqr": "#c1440e"}
+_FIGURES = {
+    "alpha": "α of the whole formation, 1/s",
+    "decay_rate_1_s": "decay, 1/s",
+    "string_peak": "string peak",
+    "spacing_gain_s2": "disturbance to spacing error, s²",
+    "noise_gain": "noise to command",
+}
 _AIM_NAMES: dict[Aim, str] = {"alpha_at_delay": "alpha", "decay_rate_at_delay_1_s": "decay"}
 
 
@@ -54,9 +61,16 @@ class FrontFields(Published):
 
 
 def front(
-    scenario: Scenario, methods: Sequence[Method], delays_s: Sequence[float], *, ended: Callable[[int], None]
+    scenario: Scenario,
+    methods: Sequence[Method] = METHODS,
+    delays_s: Sequence[float] = DELAYS_S,
+    *,
+    ended: Callable[[int], None] = lambda _: None,
 ) -> FrontFields:
-    """The front at these delays; `ended` is called after each point with the number still to come."""
+    """The front at these delays (s); `ended` is called after each point with the number still to come.
+
+    Raises InputError where a front is not defined.
+    """
     search, routes = searched_in(scenario), list(product_of(methods, (False, True), AIMS))
     left, points, refused = len(routes) * len(delays_s), list[FrontPoint](), list[Refusal]()
     for found in search.points(routes, delays_s):
@@ -154,26 +168,30 @@ def _refusal_fields(own: Refusal) -> PointFields:
     )
 
 
+def plot_front(found: FrontFields, figure: str, axes: Any) -> Any:
+    """Draw one figure of a front's points over the loop delay into matplotlib's `axes`, which are returned.
+
+    `figure` is `alpha`, `decay_rate_1_s`, `string_peak`, `spacing_gain_s2` or `noise_gain`.
+    """
+    if figure not in _FIGURES:
+        raise InputError(f"figure: read {figure!r}, wanted one of {', '.join(_FIGURES)}")
+    scale = "linear" if figure in {"alpha", "string_peak"} else "log"
+    axes.set(title=_FIGURES[figure], xlabel="loop delay, s", xscale="log", yscale=scale)
+    for method, predicted, aim in product(METHODS, (False, True), _AIM_NAMES.values()):
+        own = [p for p in found.points if (p.method, p.prediction, p.maximised) == (method, predicted, aim)]
+        own = [p for p in own if getattr(p, figure) is not None]
+        if own:
+            label = f"{method}, {'predicted' if predicted else 'not predicted'}, largest {aim}"
+            style = {"marker": "o" if aim == "alpha" else "s", "linestyle": "-" if predicted else "--"}
+            delays_s, values = [p.loop_delay_s for p in own], [getattr(p, figure) for p in own]
+            axes.plot(delays_s, values, color=_COLOURS[method], label=label, markersize=4, **style)
+    return axes
+
+
 def picture(found: FrontFields, file: Path) -> Path:
-    """Draw a front: each figure of its points over the loop delay, as PNG, SVG or PDF by the name of the file."""
-    figures = {
-        "alpha": "α of the whole formation, 1/s",
-        "decay_rate_1_s": "decay, 1/s",
-        "string_peak": "string peak",
-        "spacing_gain_s2": "disturbance to spacing error, s²",
-    }
+    """Draw a front: figures of its points over the loop delay, as PNG, SVG or PDF by the name of the file."""
     figure, plots = figure_of(2, (10.0, 7.0), (1.0, 1.0), columns=2)
-    for plot, (name, title) in zip(plots.flat, figures.items(), strict=True):
-        plot.set(title=title, xscale="log", yscale="linear" if name in {"alpha", "string_peak"} else "log")
-        for method, predicted, aim in product(METHODS, (False, True), _AIM_NAMES.values()):
-            own = [p for p in found.points if (p.method, p.prediction, p.maximised) == (method, predicted, aim)]
-            own = [p for p in own if getattr(p, name) is not None]
-            if own:
-                label = f"{method}, {'predicted' if predicted else 'not predicted'}, largest {aim}"
-                style = {"marker": "o" if aim == "alpha" else "s", "linestyle": "-" if predicted else "--"}
-                delays_s, values = [p.loop_delay_s for p in own], [getattr(p, name) for p in own]
-                plot.plot(delays_s, values, color=_COLOURS[method], label=label, markersize=4, **style)
-    for plot in plots[-1]:
-        plot.set_xlabel("loop delay, s")
+    for plot, name in zip(plots.flat, _FIGURES, strict=False):
+        plot_front(found, name, plot)
     plots[0, 0].legend(fontsize=6)
     return saved(figure, file)

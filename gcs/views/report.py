@@ -197,8 +197,10 @@ def print_summary(summary: Summary, folder: Path, console: Console | None = None
     console = console or plain_console()
     print_flight(summary, console)
     console.print(f"files    {folder}: {', '.join(summary.files)}")
-    if RECORDING_FILE in summary.files:
-        console.print(f"look     gcs view {folder}")
+    looks = [f"gcs view {folder}"] if RECORDING_FILE in summary.files else []
+    looks += [f"{folder / file} in a browser" for file in summary.files if file.endswith(".html")]
+    if looks:
+        console.print(f"look     {', or '.join(looks)}", markup=False)
 
 
 def flight_lines(summary: Summary) -> dict[str, str]:

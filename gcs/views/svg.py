@@ -14,8 +14,8 @@ from gains.core.arrays import FloatArray
 
 COLOURS = "#1f4e79", "#c1440e", "#2e7d32", "#6a3d9a", "#b8860b", "#00838f", "#ad1457", "#5d4037"
 OTHERS = "#b9c2cc"
-_WIDTH, _HEIGHT = 560, 236
-_LEFT, _RIGHT, _TOP, _BOTTOM = 50, 12, 12, 34
+_WIDTH, _HEIGHT = 560, 240
+_LEFT, _RIGHT, _TOP, _BOTTOM = 50, 12, 12, 38
 _COLUMNS = 250
 """Columns to which a line is thinned."""
 
@@ -79,7 +79,7 @@ def chart(
     for mark in (mark for mark in _ticks(start_s, end_s) if start_s <= mark <= end_s):
         parts.append(_straight(x(mark), _HEIGHT - _BOTTOM, x(mark), _HEIGHT - _BOTTOM + 4, "#5a6572"))
         # the last one ends at the edge: no tick is cut off
-        parts.append(_text(x(mark), _HEIGHT - _BOTTOM + 17, f"{mark:g}", anchor="end" if mark == end_s else "middle"))
+        parts.append(_text(x(mark), _HEIGHT - _BOTTOM + 18, f"{mark:g}", anchor="end" if mark == end_s else "middle"))
     parts.append(_straight(_LEFT, _HEIGHT - _BOTTOM, _WIDTH - _RIGHT, _HEIGHT - _BOTTOM, "#5a6572"))
     parts.append(_text(_WIDTH - _RIGHT, _HEIGHT - 3, "time, s", anchor="end"))
     parts.append(_text(_LEFT, _HEIGHT - 3, unit, anchor="start"))

@@ -8,6 +8,7 @@ import pytest
 from gcs.cli.main import main
 from gcs.runs.summary import finish
 from gcs.views.observer import recover_run
+from gcs.views.report import print_summary
 from scenarios.files import dump, load
 from tests.support.fleets.flown_run import line, ticks_of, write_run
 from tests.support.paths import SCENARIOS
@@ -46,6 +47,15 @@ def test_run_without_rerun_is_whole_but_for_its_recording(
     assert finish(run, unwritten=()).not_logged == ()
     wanted = "no flight.rrd: the package rerun is not installed; wanted pip install 'formation-gcs[viewer]'\n"
     assert capsys.readouterr().err == wanted
+
+
+def test_last_line_names_the_page_where_no_viewer_is(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    without(monkeypatch, "rerun")
+    print_summary(recover_run(run), run)
+    said = " ".join(capsys.readouterr().out.replace("\n", "").split())
+    assert said.endswith(f"look {run / 'report.html'} in a browser")
 
 
 @pytest.mark.parametrize(
