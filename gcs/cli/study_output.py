@@ -82,6 +82,9 @@ def print_benchmark(result: Benchmark) -> None:
         f"station alone   {1e6 * result.station_s_per_tick:.0f} µs a tick, "
         f"{100 * result.station_share_of_period:.1f} % of its period"
     )
+    print(
+        f"                {result.tick_over_parse:.2f} times what pymavlink takes to parse one LOCAL_POSITION_NED of each"
+    )
     if (cost := result.signed) is not None:
         print(
             f"signed          takes {cost.time_ratio:.2f} times as long (median {cost.time_ratio_p50:.2f}), "

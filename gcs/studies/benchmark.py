@@ -5,7 +5,7 @@ import tempfile
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import NamedTuple
 
 from gcs.drive.flown import fly_real_time
@@ -17,6 +17,7 @@ from gcs.published import Published
 from gcs.runs.grade import Grade, grade
 from gcs.runs.summary_record import Control
 from gcs.station import station
+from gcs.studies.codec import position_frames, pymavlink_parse_s
 from scenarios.keys.course import Course
 from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
@@ -24,6 +25,8 @@ from scenarios.signing.keys import KEY_BYTES, Key
 _COLUMN = 10
 """Vehicles behind one another in a large formation, whose columns follow one leader."""
 _SPACING_M = 100.0
+_PARSES = 20
+"""Times that pymavlink parses the frames of a tick after each flight."""
 
 
 class SigningCost(Published):
@@ -38,7 +41,9 @@ class SigningCost(Published):
 class Benchmark(Published):
     """How fast flights of a scenario are computed: the figures of the fastest, and the median of the speed.
 
-    `core_share` is the share of one processor that the fastest flight had.
+    `core_share` is the share of one processor that the fastest flight had. `pymavlink_parse_s` is the time that
+    pymavlink takes in the same run to parse one LOCAL_POSITION_NED of each vehicle, and `tick_over_parse` is a whole
+    tick of the station over that: a ratio that says on any machine how fast the station is.
     """
 
     vehicles: int
@@ -49,6 +54,8 @@ class Benchmark(Published):
     core_share: float
     station_s_per_tick: float
     station_share_of_period: float
+    pymavlink_parse_s: float
+    tick_over_parse: float
     ticks: int
     flights: int
     signed: SigningCost | None
@@ -112,11 +119,14 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool =
 
     With `signed`, unsigned and signed flights alternate, and the result has the cost of signing.
     """
-    _, plan = flight_plan(_without_solver(scenario, seconds))
+    _, plan = flight_plan(without_solver(scenario, seconds))
     flights: list[_Flown] = []
     signed_flights: list[_Flown] = []
+    parse_s: list[float] = []
+    frames = position_frames(len(scenario.vehicles))
     for _ in range(repeat):
         flights.append(_flight(plan))
+        parse_s.append(mean(pymavlink_parse_s(frames) for _ in range(_PARSES)))
         if signed:
             signed_flights.append(_flight(plan, key=Key(os.urandom(KEY_BYTES))))
     fastest = min(flights, key=lambda flight: flight.s_per_tick)
@@ -130,6 +140,8 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool =
         core_share=fastest.core_share,
         station_s_per_tick=fastest.station_s_per_tick,
         station_share_of_period=fastest.station_s_per_tick / period_s,
+        pymavlink_parse_s=min(parse_s),
+        tick_over_parse=fastest.station_s_per_tick / min(parse_s),
         ticks=fastest.ticks,
         flights=repeat,
         signed=_cost(signed_flights, flights) if signed else None,
@@ -153,7 +165,7 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchm
     """Fly `seconds` of a scenario over UDP."""
     from gcs.runs.summary import finish
 
-    designed, plan = flight_plan(_without_solver(scenario, seconds))
+    designed, plan = flight_plan(without_solver(scenario, seconds))
     with raised(), tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name) / "run"
         flight = fly_real_time(plan, designed, folder)
@@ -172,7 +184,8 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchm
     )
 
 
-def _without_solver(scenario: Scenario, seconds: float) -> Scenario:
+def without_solver(scenario: Scenario, seconds: float) -> Scenario:
+    """The scenario for so many seconds with given gains, whose design needs no solver."""
     gains = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
     requirement = dict.fromkeys(("alpha", "delay_margin_s", "decay_rate_1_s"))
     given = {"method": "inclusion", "gains": gains, "blocks": ()}
