@@ -22,6 +22,8 @@ from scenarios.keys.course import Course
 from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
 
+GAINS = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
+"""The gains that all flights of benchmarks are flown with."""
 _COLUMN = 10
 """Vehicles behind one another in a large formation, whose columns follow one leader."""
 _SPACING_M = 100.0
@@ -186,11 +188,23 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchm
 
 def without_solver(scenario: Scenario, seconds: float) -> Scenario:
     """The scenario for so many seconds with given gains, whose design needs no solver."""
-    gains = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
     requirement = dict.fromkeys(("alpha", "delay_margin_s", "decay_rate_1_s"))
-    given = {"method": "inclusion", "gains": gains, "blocks": ()}
+    given = {"method": "inclusion", "gains": GAINS, "blocks": ()}
     control = scenario.control.model_copy(update=requirement | given)
     return scenario.model_copy(update={"duration_s": seconds, "control": control})
+
+
+def not_plain(scenario: Scenario) -> str | None:
+    """What of a scenario a plain station would not fly; None if nothing."""
+    for key, read, wanted in (
+        ("dynamics", scenario.dynamics, "double_integrator"),
+        ("control.loop", scenario.control.loop, "ground"),
+        ("control.prediction", scenario.control.prediction, "off"),
+        ("control.feed_forward", scenario.control.feed_forward, 0.0),
+    ):
+        if read != wanted:
+            return f"{key}: read {read!r}, wanted {wanted!r} for this benchmark"
+    return None
 
 
 def _flight(plan: FlightPlan, key: Key | None = None) -> _Flown:
