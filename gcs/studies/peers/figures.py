@@ -1,4 +1,4 @@
-"""The figures that a script leaves for the process that started it, in a file: foreign libraries print what they like."""
+"""The figures that a script leaves for the process that started it, in a file: foreign libraries print, too."""
 
 import json
 from pathlib import Path
