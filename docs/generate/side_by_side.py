@@ -20,7 +20,7 @@ def peers(runner: Runner) -> str:
 
 def cluster(runner: Runner) -> str:
     """What a map costs on Dask, and what that means for many cores."""
-    found = runner.json("gcs bench scenarios/chain3.toml --cluster 60 --seconds 15")
+    found = runner.json("gcs bench scenarios/chain3.toml --cluster 40 --seconds 8")
     trial_s, central_s, overhead_s = found["trial_s"], found["central_s"], max(0.0, found["worker_overhead_s"])
     rows = [
         ("efficiency", f"{found['efficiency']:.2f} with {found['workers']} workers, {found['trials']} trials"),

@@ -117,7 +117,7 @@ def bench(
         scenario = benchmark.with_vehicles(scenario, vehicles)
     options.refuse(scenario_file, bad_start(scenario), endless_link(scenario))
     if peers:
-        from gcs.studies.peers.rows import SIZES, side_by_side
+        from gcs.studies.peers import SIZES, side_by_side
         from gcs.views.console import progress
 
         options.refuse(scenario_file, benchmark.not_plain(scenario))

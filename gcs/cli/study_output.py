@@ -10,7 +10,7 @@ from gcs.studies.capacity import FEWEST, Capacity, Load
 from gcs.studies.cluster import ClusterMap
 from gcs.studies.compare import Route, rows
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
-from gcs.studies.peers.rows import Row, SideBySide
+from gcs.studies.peers import Row, SideBySide
 from gcs.views.console import ms_text, plain_console, table_of
 from scenarios.schema import Scenario
 

@@ -27,14 +27,6 @@ def position_frames(count: int) -> list[bytes]:
     return [mavlink.encode(position, state, sequence=0, system_id=k + 1) for k, state in enumerate(states)]
 
 
-def pymavlink_set_point(key_ms: int, target_system: int, north_m_s2: float, east_m_s2: float) -> Any:
-    """pymavlink's message of an acceleration only, as `mavlink.acceleration_set_point`."""
-    return dialect.MAVLink_set_position_target_local_ned_message(
-        key_ms, target_system, 1, dialect.MAV_FRAME_LOCAL_NED, mavlink.IGNORE_ALL_BUT_ACCELERATION,
-        0.0, 0.0, 0.0, 0.0, 0.0, 0.0, north_m_s2, east_m_s2, 0.0, 0.0, 0.0,
-    )  # fmt: skip
-
-
 def pymavlink_parse_s(frames: Sequence[bytes]) -> float:
     """The time that pymavlink's parser takes for the frames, each a datagram of its own."""
     parser: Any = dialect.MAVLink(None)
@@ -52,16 +44,24 @@ def decode_s() -> Seconds:
 
 def encode_s() -> Seconds:
     """The time to encode one set-point, SET_POSITION_TARGET_LOCAL_NED: the least of several runs."""
-    packer: Any = dialect.MAVLink(None, srcSystem=mavlink.STATION_SYSTEM_ID, srcComponent=mavlink.STATION_COMPONENT_ID)
-
-    def encoded(k: int) -> bytes:
-        fields = mavlink.acceleration_set_point(key_ms=k, target_system=1, north_m_s2=0.5, east_m_s2=-0.25)
-        return mavlink.encode(mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, sequence=0)
-
+    packer: Any = dialect.MAVLink(None, mavlink.STATION_SYSTEM_ID, mavlink.STATION_COMPONENT_ID)
     return _least(
-        lambda: _taken_s(lambda: [encoded(k) for k in range(_FRAMES)]),
-        lambda: _taken_s(lambda: [pymavlink_set_point(k, 1, 0.5, -0.25).pack(packer) for k in range(_FRAMES)]),
+        lambda: _taken_s(lambda: [station_set_point(k) for k in range(_FRAMES)]),
+        lambda: _taken_s(lambda: [pymavlink_set_point(packer, k) for k in range(_FRAMES)]),
     )
+
+
+def station_set_point(key_ms: int) -> bytes:
+    """A set-point with an acceleration only, by the station."""
+    fields = mavlink.acceleration_set_point(key_ms=key_ms, target_system=1, north_m_s2=0.5, east_m_s2=-0.25)
+    return mavlink.encode(mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, sequence=0)
+
+
+def pymavlink_set_point(packer: Any, key_ms: int) -> bytes:
+    """The same set-point by pymavlink."""
+    numbers = key_ms, 1, 1, dialect.MAV_FRAME_LOCAL_NED, mavlink.IGNORE_ALL_BUT_ACCELERATION
+    fields = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, -0.25, 0.0, 0.0, 0.0
+    return dialect.MAVLink_set_position_target_local_ned_message(*numbers, *fields).pack(packer)
 
 
 def _taken_s(work: Callable[[], object]) -> float:

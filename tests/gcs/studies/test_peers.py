@@ -9,15 +9,14 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from typer.testing import CliRunner
 
+from examples.peers.plain import Law
 from gcs.cli.main import app
 from gcs.errors import InputError
-from gcs.link import mavlink
 from gcs.plan.planner import flight_plan
 from gcs.studies.benchmark import GAINS, with_vehicles, without_solver
-from gcs.studies.codec import position_frames, pymavlink_set_point
-from gcs.studies.peers.closed_loop import PeerError, run_script
-from gcs.studies.peers.plain import Law
-from gcs.studies.peers.rows import side_by_side
+from gcs.studies.codec import position_frames, pymavlink_set_point, station_set_point
+from gcs.studies.peer_loops import PeerError, run_script
+from gcs.studies.peers import side_by_side
 from scenarios.files import load
 from tests.support.paths import SCENARIOS
 
@@ -47,9 +46,7 @@ def test_absent_peers_are_named_and_skipped() -> None:
 
 def test_both_codecs_are_timed_on_the_same_bytes() -> None:
     packer = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-    fields = mavlink.acceleration_set_point(key_ms=7, target_system=3, north_m_s2=0.5, east_m_s2=-0.25)
-    ours = mavlink.encode(mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, sequence=0)
-    assert bytes(pymavlink_set_point(7, 3, 0.5, -0.25).pack(packer)) == ours
+    assert bytes(pymavlink_set_point(packer, 7)) == station_set_point(7)
     parser = dialect.MAVLink(None)
     messages = [parser.parse_char(frame) for frame in position_frames(3)]
     assert [(m.get_type(), m.get_srcSystem()) for m in messages if m] == [("LOCAL_POSITION_NED", k) for k in (1, 2, 3)]

@@ -1,4 +1,4 @@
-"""A plain ground station: pymavlink's dialect and one UDP socket, started with the arguments of `plain.ordered`.
+"""A plain ground station: pymavlink's dialect and one UDP socket, started with the arguments of `plain`.
 
 It does not use pymavlink's own UDP connection, which would send every set-point to every vehicle.
 """
@@ -10,14 +10,15 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from plain import Law, fly, ordered
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from gcs.studies.codec import pymavlink_set_point
-from gcs.studies.peers.plain import Law, fly, ordered
 from scenarios.schema import NS_PER_S
 
 _GUIDED = 4
 _STATION = 255, 190
+_ACCELERATION = 0x0C3F
+"""type_mask: all but the acceleration is ignored."""
 
 
 class _Vehicle:
@@ -89,7 +90,9 @@ class _Station:
         """Send each vehicle its acceleration."""
         now_ms = time.monotonic_ns() // 1_000_000 & 0xFFFFFFFF
         for system_id, (north_m_s2, east_m_s2) in zip(self.vehicles, commands, strict=True):
-            self._send(system_id, pymavlink_set_point(now_ms, system_id, north_m_s2, east_m_s2))
+            head = now_ms, system_id, 1, dialect.MAV_FRAME_LOCAL_NED, _ACCELERATION
+            fields = 0, 0, 0, 0, 0, 0, north_m_s2, east_m_s2, 0, 0, 0
+            self._send(system_id, dialect.MAVLink_set_position_target_local_ned_message(*head, *fields))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,9 @@
-"""The law and the clockwork of a plain station, whose MAVLink another library speaks."""
+"""The law and the clockwork of a plain station, whose MAVLink another library speaks; used by the scripts beside it.
 
+`gcs bench --peers` starts each script with a scenario, a UDP port on loopback and the file for its figures.
+"""
+
+import json
 import sys
 import time  # noqa: TID251 - a station of its own, with its own clock
 from collections.abc import Callable, Sequence
@@ -10,23 +14,21 @@ import numpy as np
 
 from gains.core.arrays import FloatArray, IntArray
 from gcs.plan.formation import plan_formation
-from gcs.studies.peers.figures import write_figures
 from scenarios.files import load
 from scenarios.schema import NS_PER_S, Scenario
 
 
 class Order(NamedTuple):
-    """What a station script is started for."""
+    """The arguments of a station's script."""
 
     scenario: Scenario
     port: int
-    folder: Path
+    out: Path
 
 
 def ordered() -> Order:
-    """The arguments of a station script: scenario file, UDP port on loopback, folder to write to."""
-    file, port, folder = sys.argv[1:]
-    return Order(load(Path(file)), int(port), Path(folder))
+    file, port, out = sys.argv[1:]
+    return Order(load(Path(file)), int(port), Path(out))
 
 
 class Law:
@@ -44,7 +46,7 @@ class Law:
         self._nominal_m_s: FloatArray = np.array(scenario.nominal_velocity_at(0.0))
 
     def spacing_errors_m(self) -> FloatArray:
-        """e_i^p (n, 2), zero for the leader, which is in front."""
+        """e_i^p (n, 2), zero for the leader."""
         position = self.states[:, :2]
         errors = position[self._ahead] - position + self._offset_m
         errors[self._ahead < 0] = 0.0
@@ -57,11 +59,11 @@ class Law:
         return self._gains.K1 * velocity_error + self._gains.K2 * ahead + self._gains.K3 * self.spacing_errors_m()
 
 
-def report(folder: Path, lateness_s: Sequence[float] | FloatArray, due: int, used_s: float, error_m: float) -> None:
-    """Leave what `closed_loop` reads: lateness of each tick, ticks that were due, processor time, spacing error."""
+def report(out: Path, lateness_s: Sequence[float] | FloatArray, due: int, used_s: float, error_m: float) -> None:
+    """Leave the lateness of the ticks flown, their share of those due, the processor time and the spacing error."""
     p50, p99 = np.percentile(lateness_s, [50, 99]).tolist()
     figures = {"late_p50_s": p50, "late_p99_s": p99, "flown": len(lateness_s) / due, "used_s": used_s}
-    write_figures(folder, figures | {"error_m": error_m})
+    out.write_text(json.dumps(figures | {"error_m": error_m}), encoding="utf-8")
 
 
 def fly(order: Order, law: Law, wait: Callable[[int], None], send: Callable[[Sequence[Sequence[float]]], None]) -> None:
@@ -70,10 +72,9 @@ def fly(order: Order, law: Law, wait: Callable[[int], None], send: Callable[[Seq
     `wait` takes telemetry until an instant of the monotonic clock in ns, `send` sends one set-point to each vehicle.
     A tick that is due before the one before it has been sent is skipped.
     """
-    scenario = order.scenario
-    period_ns = round(NS_PER_S / scenario.rates.control_hz)
-    used_s, begun_ns, tick = time.process_time(), time.monotonic_ns(), 0
-    ticks, late_s = round(scenario.duration_s * scenario.rates.control_hz), list[float]()
+    rate_hz = order.scenario.rates.control_hz
+    period_ns, ticks = round(NS_PER_S / rate_hz), round(order.scenario.duration_s * rate_hz)
+    used_s, begun_ns, tick, late_s = time.process_time(), time.monotonic_ns(), 0, list[float]()
     while tick < ticks:
         due_ns = begun_ns + tick * period_ns
         wait(due_ns)
@@ -82,4 +83,4 @@ def fly(order: Order, law: Law, wait: Callable[[int], None], send: Callable[[Seq
         late_s.append((sent_ns - due_ns) / NS_PER_S)
         tick = max(tick + 1, (sent_ns - begun_ns) // period_ns)
     error_m = float(np.abs(law.spacing_errors_m()).max())
-    report(order.folder, late_s, ticks, time.process_time() - used_s, error_m)
+    report(order.out, late_s, ticks, time.process_time() - used_s, error_m)

@@ -1,4 +1,4 @@
-"""This station in real time, without the observer beside it, started with the arguments of `plain.ordered`.
+"""This station in real time, without the observer beside it, started with the arguments of `plain`.
 
 It logs and measures what it does in every flight; a plain station does neither.
 """
@@ -7,6 +7,7 @@ import sys
 import time  # noqa: TID251 - the driver of a station
 
 import numpy as np
+from plain import ordered, report
 
 from gcs.control.phases import Phase
 from gcs.drive.udp import StationSocket, clock_ns, drive, prepare_real_time
@@ -14,14 +15,13 @@ from gcs.plan.planner import flight_plan
 from gcs.runs.files import read_ticks
 from gcs.runs.record import RunWriter
 from gcs.station.station import Station
-from gcs.studies.peers.plain import ordered, report
 from scenarios.schema import NS_PER_S
 
 
 def main() -> None:
-    scenario, port, folder = ordered()
+    scenario, port, out = ordered()
     _, plan = flight_plan(scenario)
-    writer, used_s = RunWriter(folder), list[float]()
+    writer, used_s = RunWriter(out.parent), list[float]()
     with StationSocket("127.0.0.1", port) as link:
         prepare_real_time()
         station = Station(plan, start_ns=clock_ns(), stopwatch_ns=time.perf_counter_ns)
@@ -33,7 +33,7 @@ def main() -> None:
 
         drive(station, link, writer, stop, lambda _: None)
     writer.close()
-    rows = read_ticks(folder)
+    rows = read_ticks(out.parent)
     rows = rows[rows["commanded"]]
     if not rows.size:
         sys.exit(station.end_reason)
@@ -41,7 +41,7 @@ def main() -> None:
     late_s = (rows["sent_ns"][first] - rows["due_ns"][first]) / NS_PER_S
     last = rows[rows["tick"] == ticks[-1]]
     error_m = np.nanmax(np.abs([last["spacing_error_north_m"], last["spacing_error_east_m"]]))
-    report(folder, late_s, int(ticks[-1] - ticks[0] + 1), used_s[-1] - used_s[0], float(error_m))
+    report(out, late_s, int(ticks[-1] - ticks[0] + 1), used_s[-1] - used_s[0], float(error_m))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A plain ground station on MAVSDK, started with the arguments of `plain.ordered`.
+"""A plain ground station on MAVSDK, started with the arguments of `plain`.
 
 MAVSDK sends a set-point whenever one is set, as here in each tick, and would repeat it at 20 Hz by itself.
 """
@@ -9,8 +9,8 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+from plain import Law, fly, ordered
 
-from gcs.studies.peers.plain import Law, fly, ordered
 from scenarios.schema import NS_PER_S
 
 _POLL_S = 0.05

@@ -17,11 +17,12 @@ from gcs.published import Published
 from gcs.studies import codec
 from gcs.studies.benchmark import GAINS, benchmark, with_vehicles
 from gcs.studies.compare_cost import timed
-from gcs.studies.peers.closed_loop import ClosedLoop, PeerError, fly_closed_loop, run_script
+from gcs.studies.peer_loops import PeerError, fly_closed_loop, run_script
 from scenarios.schema import Scenario
 
 SIZES = (5, 20, 100)
-_STATIONS = {"pymavlink": "pymavlink_station", "MAVSDK": "mavsdk_station"}
+_OURS = "this station"
+_STATIONS = {_OURS: "own_station", "pymavlink": "pymavlink_station", "MAVSDK": "mavsdk_station"}
 _PACKAGES = {
     "pymavlink": "pymavlink",
     "MAVSDK": "mavsdk",
@@ -110,20 +111,17 @@ def _closed_loops(
     scenario: Scenario, vehicles: int, seconds: float, absent: Sequence[str], skipped: list[Skipped]
 ) -> Iterator[Row]:
     """Fly the same formation with this station and with each plain one; those that fail are added to `skipped`."""
-    flown: dict[str, ClosedLoop] = {}
-    for peer, script in {"this station": "own_station", **_STATIONS}.items():
+    flown: dict[str, dict[str, tuple[float, str]]] = {}
+    for peer, script in _STATIONS.items():
         if peer not in absent:
             try:
                 flown[peer] = fly_closed_loop(script, scenario, vehicles, seconds)
             except PeerError as error:
                 skipped.append(Skipped(peer=peer, why=f"closed loop of {vehicles} vehicles: {error}"))
-    ours = flown.pop("this station", None)
-    if ours is None:
-        return
+    ours = flown.pop(_OURS, {})
     for peer, theirs in flown.items():
-        for name, unit in ClosedLoop.UNITS.items():
-            work = f"closed loop of {vehicles} vehicles: {name.replace('_', ' ')}"
-            yield _row(peer, work, unit, getattr(ours, name), getattr(theirs, name))
+        for name, (figure, unit) in ours.items():
+            yield _row(peer, f"closed loop of {vehicles} vehicles: {name}", unit, figure, theirs[name][0])
 
 
 def _aircraft(scenario: Scenario) -> Iterator[Row]:
