@@ -12,7 +12,12 @@ def peers(runner: Runner) -> str:
     """A row for each figure of the same work, and the peers that were left out."""
     found = runner.json(PEERS)
     rows = [
-        (row["peer"], row["work"], row["unit"], *(f"{row[name]:.3g}" for name in ("ours", "theirs", "ratio")))
+        (
+            row["peer"],
+            row["work"],
+            row["unit"],
+            *("" if row[name] is None else f"{row[name]:.3g}" for name in ("ours", "theirs", "ratio")),
+        )
         for row in found["rows"]
     ]
     head = ("peer", "work", "unit", "ours", "theirs", "theirs / ours")

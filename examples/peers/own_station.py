@@ -40,7 +40,7 @@ def main() -> None:
     ticks, first = np.unique(rows["tick"], return_index=True)
     late_s = (rows["sent_ns"][first] - rows["due_ns"][first]) / NS_PER_S
     last = rows[rows["tick"] == ticks[-1]]
-    error_m = np.nanmax(np.abs([last["spacing_error_north_m"], last["spacing_error_east_m"]]))
+    error_m = np.abs(np.nan_to_num([last["spacing_error_north_m"], last["spacing_error_east_m"]])).max()
     report(out, late_s, int(ticks[-1] - ticks[0] + 1), used_s[-1] - used_s[0], float(error_m))
 
 

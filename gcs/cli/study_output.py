@@ -106,7 +106,7 @@ def print_peers(found: SideBySide) -> None:
         "unit": lambda row: row.unit,
         "ours": lambda row: f"{row.ours:.3g}",
         "theirs": lambda row: f"{row.theirs:.3g}",
-        "ratio": lambda row: f"{row.ratio:.3g}",
+        "ratio": lambda row: "" if row.ratio is None else f"{row.ratio:.3g}",
     }
     console.print(
         table_of(

@@ -39,14 +39,14 @@ _MARGINS = 20
 
 
 class Row(Published):
-    """A figure of the same work; `ratio` is `theirs` over `ours`."""
+    """A figure of the same work; `ratio` is `theirs` over `ours`, None if that is 0."""
 
     peer: str
     work: str
     unit: str
     ours: float
     theirs: float
-    ratio: float
+    ratio: float | None
 
 
 class Skipped(Published):
@@ -96,7 +96,7 @@ def side_by_side(
 
 
 def _row(peer: str, work: str, unit: str, ours: float, theirs: float) -> Row:
-    return Row(peer=peer, work=work, unit=unit, ours=ours, theirs=theirs, ratio=theirs / ours if ours else np.inf)
+    return Row(peer=peer, work=work, unit=unit, ours=ours, theirs=theirs, ratio=theirs / ours if ours else None)
 
 
 def _codecs() -> Iterator[Row]:
