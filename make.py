@@ -41,6 +41,10 @@ JOBS: dict[str, tuple[str, list[str]]] = {
         "fly the vehicles under MAVProxy and MAVSDK's server, which it installs (1.2 GB)",
         ["uv pip install --quiet --group clients", "python -m pytest -n 0 -rs tests/clients/test_clients.py"],
     ),
+    "peers": (
+        "do the same work with other people's tools, which it installs, and print ratios: gcs bench --peers",
+        ["uv pip install --quiet --group peers", "gcs bench scenarios/triangle5.toml --peers"],
+    ),
     "lint": (
         "check format, style, types and import contracts",
         ["ruff format --check .", "ruff check .", "pyright", "lint-imports"],

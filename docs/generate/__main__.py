@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from docs.generate import measurements, reference
-from docs.generate.figures import FIGURES
+from docs.generate.registry import FIGURES
 
 
 def main() -> int:
@@ -25,14 +25,14 @@ def main() -> int:
         parser.error(f"read {', '.join(sorted(unknown))}, wanted names from {', '.join(FIGURES)}")
     if not chosen.check:
         return min(1, measurements.measure(chosen.names or _unless_named(timed=chosen.timed)))
-    names = chosen.names or [name for name, figure in FIGURES.items() if not figure.quick]
+    names = chosen.names or [name for name, figure in FIGURES.items() if figure.kind == "exact"]
     differences = measurements.stale(name for name in names if FIGURES[name].exact)
     print("\n".join(differences), end="")
     return min(1, len(differences))
 
 
 def _unless_named(*, timed: bool) -> list[str]:
-    return [name for name, figure in FIGURES.items() if not figure.compiled and not (timed and figure.exact)]
+    return [name for name, figure in FIGURES.items() if figure.kind != "compiled" and not (timed and figure.exact)]
 
 
 def _reference(*, check: bool) -> int:

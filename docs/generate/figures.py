@@ -1,14 +1,12 @@
 """What the figures of the documentation are, and the commands that they come from.
 
-Each function runs commands and returns Markdown. One whose figures are the same on every machine, for a flight in
-virtual time is the same to the last bit, is `exact`: the tests and CI compare it with what is committed. `quick` ones
-take a few seconds and are compared by the default tests. All others are measured, and printed as ranges.
+Each function runs commands and returns Markdown. Figures that differ from run to run are printed as ranges.
+`docs.generate.registry` lists the functions and says when their figures are compared.
 """
 
 import json
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -17,16 +15,6 @@ import numpy as np
 from docs.generate.blocks import ROOT, table
 from docs.generate.runner import CommandError, Runner
 from docs.generate.sessions import steps_of
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A block of figures: how it is made, and how it may be compared."""
-
-    make: Callable[[Runner], str]
-    exact: bool
-    quick: bool
-    compiled: bool
 
 
 def _output(text: str) -> str:
@@ -449,27 +437,3 @@ def speed(runner: Runner) -> str:
 
 def speed_compiled(runner: Runner) -> str:
     return _speed(runner, compiled=True)
-
-
-_QUICK = (design, margin_held, margin_thesis, readme_onset)
-_EXACT = (
-    *(onset_chain3, string_limit, compare, prediction_windows, prediction_price, prediction_flights),
-    *(onsets, thesis_flights, maps, capacity),
-)
-_SLOW = (copters_onset,)
-"""Exact, but of minutes: compared only if they are named."""
-_TIMED = (readme_fly, flights, too_late, punctuality, copters, signing, design_time, speed, onset_real_time)
-_COMPILED = (speed_compiled,)
-"""With the hot path compiled, which none of the others wants."""
-
-
-def _name(make: Callable[[Runner], str]) -> str:
-    return make.__name__.replace("_", "-")
-
-
-FIGURES = {
-    _name(make): Figure(make, exact=makers in {_QUICK, _EXACT}, quick=makers is _QUICK, compiled=makers is _COMPILED)
-    for makers in (_QUICK, _EXACT, _TIMED, _COMPILED)
-    for make in makers
-}
-"""Every block of figures, by its name in the pages: that of its function."""

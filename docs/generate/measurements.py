@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterable
 
 from docs.generate.blocks import differing, fill, pages_with
-from docs.generate.figures import FIGURES
+from docs.generate.registry import FIGURES
 from docs.generate.runner import CommandError, measured_on, runner
 
 _EXACT = "Exact: computed, or flown in virtual time, and the same on every machine to the digits printed."

@@ -1,6 +1,7 @@
 """`gcs compare`, `thesis`, `bench` and `capacity`; what they print is in `gcs.cli.study_output`."""
 
 import contextlib
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -79,22 +80,59 @@ def bench(
         typer.Option("--real-time", help="fly once over UDP; shows punctuality and the errors of measured latencies"),
     ] = False,
     signed: Annotated[bool, typer.Option("--signed", help="also measure what signing costs")] = False,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="do the same work with other people's tools and print ratios")
+    ] = False,
+    cluster: Annotated[
+        int, typer.Option(metavar="TRIALS", min=0, show_default=False, help="fly a map of so many trials on Dask")
+    ] = 0,
+    workers: Annotated[
+        int,
+        typer.Option(
+            metavar="N", min=0, show_default=False, help="with --cluster: local workers; default one per processor"
+        ),
+    ] = 0,
     allow_code: options.AllowCode = False,
     as_json: options.AsJson = False,
 ) -> None:
     """Measure how much faster than real time flights are computed.
 
-    Also measures how much of its control period the station needs.
+    Also measures how much of its control period the station needs, and compares a whole tick of it with what pymavlink
+    takes to parse the positions.
+
+    With --peers, the same work is done by this station and by pymavlink, MAVSDK, JSBSim, python-control and solvers, as
+    far as they are installed. Formations of 5, 20 and 100 vehicles fly over UDP, or those of --vehicles.
+
+    With --cluster, the map is flown twice on Dask: by one local worker and by all. Each trial flies for --seconds.
     """
-    from gcs.cli.study_output import print_benchmark, print_real_time
+    from gcs.cli.study_output import print_benchmark, print_cluster, print_peers, print_real_time
     from gcs.drive.preflight import bad_start, endless_link
     from gcs.studies import benchmark
 
+    given = [name for name, on in (("--peers", peers), ("--cluster", cluster), ("--real-time", real_time)) if on]
+    if len(given) > 1:
+        raise InputError(f"read {' and '.join(given)}, wanted one of them")
     scenario = options.load_scenario(scenario_file, allow_code=allow_code)
     if vehicles:
         scenario = benchmark.with_vehicles(scenario, vehicles)
     options.refuse(scenario_file, bad_start(scenario), endless_link(scenario))
-    if real_time:
+    if peers:
+        from gcs.studies.peers import SIZES, side_by_side
+        from gcs.views.console import progress
+
+        options.refuse(scenario_file, benchmark.not_plain(scenario))
+        sizes = (vehicles,) if vehicles else SIZES
+        with progress(shown=not as_json) as begin:
+            table = side_by_side(scenario, seconds=seconds, sizes=sizes, ended=begin("peers"))
+        options.answer(table, print_peers, as_json=as_json)
+    elif cluster:
+        from gcs.studies.cluster import map_on_cluster
+
+        options.refuse(scenario_file, benchmark.not_plain(scenario))
+        at_once = workers or len(os.sched_getaffinity(0))
+        found = map_on_cluster(scenario, trials=cluster, workers=at_once, seconds=seconds)
+        options.answer(found, print_cluster, as_json=as_json)
+    elif real_time:
         options.answer(benchmark.benchmark_real_time(scenario, seconds=seconds), print_real_time, as_json=as_json)
     else:
         result = benchmark.benchmark(scenario, seconds=seconds, repeat=repeat, signed=signed)

@@ -7,8 +7,10 @@ from shutil import which
 from gcs.cli.runs import print_grade
 from gcs.studies.benchmark import Benchmark, RealTimeBenchmark
 from gcs.studies.capacity import FEWEST, Capacity, Load
+from gcs.studies.cluster import ClusterMap
 from gcs.studies.compare import Route, rows
 from gcs.studies.compare_cost import RATIO, DesignCost, left_out, ratios
+from gcs.studies.peers import Row, SideBySide
 from gcs.views.console import ms_text, plain_console, table_of
 from scenarios.schema import Scenario
 
@@ -82,6 +84,10 @@ def print_benchmark(result: Benchmark) -> None:
         f"station alone   {1e6 * result.station_s_per_tick:.0f} µs a tick, "
         f"{100 * result.station_share_of_period:.1f} % of its period"
     )
+    print(
+        f"                {result.tick_over_parse:.2f} times what pymavlink takes "
+        "to parse one LOCAL_POSITION_NED of each vehicle"
+    )
     if (cost := result.signed) is not None:
         print(
             f"signed          takes {cost.time_ratio:.2f} times as long (median {cost.time_ratio_p50:.2f}), "
@@ -90,6 +96,40 @@ def print_benchmark(result: Benchmark) -> None:
     if not result.compiled:
         first = "" if which(os.environ.get("CC", "cc")) else "install a C compiler, then "
         print(f"twice as fast:  {first}python3 make.py compile")
+
+
+def print_peers(found: SideBySide) -> None:
+    """Print a row for each figure, and the peers that are not compared with."""
+    console = plain_console()
+    columns: dict[str, Callable[[Row], str]] = {
+        "": lambda row: f"{row.peer}: {row.work}",
+        "unit": lambda row: row.unit,
+        "ours": lambda row: f"{row.ours:.3g}",
+        "theirs": lambda row: f"{row.theirs:.3g}",
+        "ratio": lambda row: "" if row.ratio is None else f"{row.ratio:.3g}",
+    }
+    console.print(
+        table_of(
+            found.rows, columns, title=f"the same work by this station and by others; load {found.load_average:.1f}"
+        )
+    )
+    for skipped in found.skipped:
+        console.print(f"{skipped.peer}: {skipped.why}")
+
+
+def print_cluster(found: ClusterMap) -> None:
+    """Print the efficiency of a map on Dask, and what each trial costs beside its flight."""
+    print(f"map             {found.trials} trials of {found.seconds:g} s on Dask, {1e3 * found.trial_s:.0f} ms each")
+    print(
+        f"{found.workers} workers       {found.all_workers_s:.1f} s; one takes {found.one_worker_s:.1f} s: "
+        f"efficiency {found.efficiency:.2f}"
+    )
+    print(
+        f"each trial      {1e3 * found.worker_overhead_s:.1f} ms of its worker beside the flight, "
+        f"{1e3 * found.central_s:.2f} ms of scheduler and client, "
+        f"{found.trial_bytes:.0f} bytes there, {found.outcome_bytes:.0f} back"
+    )
+    print(f"at most         {found.cores_served:.0f} workers for one scheduler and client, with trials of this length")
 
 
 def print_real_time(result: RealTimeBenchmark) -> None:

@@ -190,10 +190,11 @@ def local_workers(count: int) -> Generator[Fly]:
 
 
 @contextlib.contextmanager
-def dask_workers(address: str) -> Generator[Fly]:
+def dask_workers(address: str, run: Callable[[Trial], Outcome] = fly_trial) -> Generator[Fly]:
     """While entered, fly trials on the workers of a Dask cluster, where this package is installed.
 
-    Raises InputError if `distributed` is not installed or there is no scheduler at the address.
+    `run` is what a worker does with a trial. Raises InputError if `distributed` is not installed or there is no
+    scheduler at the address.
     """
     try:
         from distributed import Client
@@ -207,7 +208,7 @@ def dask_workers(address: str) -> Generator[Fly]:
 
     def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
         # the id as key: a scheduler that still has the result for an earlier client returns it without a flight
-        futures = [client.submit(fly_trial, trial, key=f"trial-{trial.id}", pure=True) for trial in trials]
+        futures = [client.submit(run, trial, key=f"trial-{trial.id}", pure=True) for trial in trials]
         for _, outcome in dask_as_completed(futures, with_results=True):
             yield outcome
 

@@ -5,7 +5,7 @@ import tempfile
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import NamedTuple
 
 from gcs.drive.flown import fly_real_time
@@ -17,13 +17,18 @@ from gcs.published import Published
 from gcs.runs.grade import Grade, grade
 from gcs.runs.summary_record import Control
 from gcs.station import station
+from gcs.studies.codec import position_frames, pymavlink_parse_s
 from scenarios.keys.course import Course
 from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
 
+GAINS = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
+"""The gains that all flights of benchmarks are flown with."""
 _COLUMN = 10
 """Vehicles behind one another in a large formation, whose columns follow one leader."""
 _SPACING_M = 100.0
+_PARSES = 20
+"""Times that pymavlink parses the frames of a tick after each flight."""
 
 
 class SigningCost(Published):
@@ -38,7 +43,9 @@ class SigningCost(Published):
 class Benchmark(Published):
     """How fast flights of a scenario are computed: the figures of the fastest, and the median of the speed.
 
-    `core_share` is the share of one processor that the fastest flight had.
+    `core_share` is the share of one processor that the fastest flight had. `pymavlink_parse_s` is the time that
+    pymavlink takes in the same run to parse one LOCAL_POSITION_NED of each vehicle, and `tick_over_parse` is a whole
+    tick of the station over that: a ratio that says on any machine how fast the station is.
     """
 
     vehicles: int
@@ -49,6 +56,8 @@ class Benchmark(Published):
     core_share: float
     station_s_per_tick: float
     station_share_of_period: float
+    pymavlink_parse_s: float
+    tick_over_parse: float
     ticks: int
     flights: int
     signed: SigningCost | None
@@ -112,11 +121,14 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool =
 
     With `signed`, unsigned and signed flights alternate, and the result has the cost of signing.
     """
-    _, plan = flight_plan(_without_solver(scenario, seconds))
+    _, plan = flight_plan(without_solver(scenario, seconds))
     flights: list[_Flown] = []
     signed_flights: list[_Flown] = []
+    parse_s: list[float] = []
+    frames = position_frames(len(scenario.vehicles))
     for _ in range(repeat):
         flights.append(_flight(plan))
+        parse_s.append(mean(pymavlink_parse_s(frames) for _ in range(_PARSES)))
         if signed:
             signed_flights.append(_flight(plan, key=Key(os.urandom(KEY_BYTES))))
     fastest = min(flights, key=lambda flight: flight.s_per_tick)
@@ -130,6 +142,8 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool =
         core_share=fastest.core_share,
         station_s_per_tick=fastest.station_s_per_tick,
         station_share_of_period=fastest.station_s_per_tick / period_s,
+        pymavlink_parse_s=min(parse_s),
+        tick_over_parse=fastest.station_s_per_tick / min(parse_s),
         ticks=fastest.ticks,
         flights=repeat,
         signed=_cost(signed_flights, flights) if signed else None,
@@ -153,7 +167,7 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchm
     """Fly `seconds` of a scenario over UDP."""
     from gcs.runs.summary import finish
 
-    designed, plan = flight_plan(_without_solver(scenario, seconds))
+    designed, plan = flight_plan(without_solver(scenario, seconds))
     with raised(), tempfile.TemporaryDirectory(prefix="bench-") as name:
         folder = Path(name) / "run"
         flight = fly_real_time(plan, designed, folder)
@@ -172,12 +186,25 @@ def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchm
     )
 
 
-def _without_solver(scenario: Scenario, seconds: float) -> Scenario:
-    gains = FixedGains(K1=-3.4, K2=0.6, K3=5.6)
+def without_solver(scenario: Scenario, seconds: float) -> Scenario:
+    """The scenario for so many seconds with given gains, whose design needs no solver."""
     requirement = dict.fromkeys(("alpha", "delay_margin_s", "decay_rate_1_s"))
-    given = {"method": "inclusion", "gains": gains, "blocks": ()}
+    given = {"method": "inclusion", "gains": GAINS, "blocks": ()}
     control = scenario.control.model_copy(update=requirement | given)
     return scenario.model_copy(update={"duration_s": seconds, "control": control})
+
+
+def not_plain(scenario: Scenario) -> str | None:
+    """What of a scenario a plain station would not fly; None if nothing."""
+    for key, read, wanted in (
+        ("dynamics", scenario.dynamics, "double_integrator"),
+        ("control.loop", scenario.control.loop, "ground"),
+        ("control.prediction", scenario.control.prediction, "off"),
+        ("control.feed_forward", scenario.control.feed_forward, 0.0),
+    ):
+        if read != wanted:
+            return f"{key}: read {read!r}, wanted {wanted!r} for this benchmark"
+    return None
 
 
 def _flight(plan: FlightPlan, key: Key | None = None) -> _Flown:

@@ -49,19 +49,11 @@ def design_costs(ended: Callable[[int], None] = lambda _: None) -> list[DesignCo
     """
     found: list[DesignCost] = []
     _inclusion(3)  # imports at first use are not part of a design
-    methods: dict[str, Callable[[int], int]] = {
-        "inclusion": _inclusion,
-        "graph-lqr": lambda vehicles: _graph(vehicles, "graph-lqr", two_way=False),
-        "graph-lqr, bidirectional": lambda vehicles: _graph(vehicles, "graph-lqr", two_way=True),
-        "graph-dk": lambda vehicles: _graph(vehicles, "graph-dk", two_way=False),
-        "centralised LQR": _centralised_lqr,
-        "centralised LMI": _centralised_lmi,
-    }
-    for left, (label, method) in zip(reversed(range(len(methods))), methods.items(), strict=True):
+    for left, label in zip(reversed(range(len(_METHODS))), _METHODS, strict=True):
         for vehicles, following in zip(_SIZES, (*_SIZES[1:], _SIZES[-1]), strict=True):
             if _too_large(label, vehicles):
                 break
-            taken_s, free = _timed(method, vehicles)
+            taken_s, free = timed(label, vehicles)
             found.append(DesignCost(label, vehicles, taken_s, free))
             if taken_s * (following / vehicles) ** 3 > _LONGEST_S:
                 break
@@ -90,11 +82,12 @@ def _too_large(method: str, vehicles: int) -> bool:
     return method == "graph-dk" and 2 * vehicles - 1 > _DK_STATES
 
 
-def _timed(method: Callable[[int], int], vehicles: int) -> tuple[float, int]:
+def timed(method: str, vehicles: int) -> tuple[float, int]:
+    """The time (s) of a design for a chain by a method of `design_costs`, and its free gains per axis."""
     taken_s: list[float] = []
     while True:
         begun_s = time.perf_counter()
-        free = method(vehicles)
+        free = _METHODS[method](vehicles)
         taken_s.append(time.perf_counter() - begun_s)
         if len(taken_s) == _REPEATS or taken_s[0] > _REPEATED_BELOW_S:
             return median(taken_s), free
@@ -126,3 +119,13 @@ def _centralised_lmi(vehicles: int) -> int:
     # one axis: the two are independent, and both at once would have four times the unknowns for the same gains
     plant = formation_plant(_chain(vehicles, axes=1))
     return centralised_lmi(plant, gain_bound=_GAIN_BOUND, lyapunov_bound=_GAIN_BOUND).K.size
+
+
+_METHODS: dict[str, Callable[[int], int]] = {
+    "inclusion": _inclusion,
+    "graph-lqr": lambda vehicles: _graph(vehicles, "graph-lqr", two_way=False),
+    "graph-lqr, bidirectional": lambda vehicles: _graph(vehicles, "graph-lqr", two_way=True),
+    "graph-dk": lambda vehicles: _graph(vehicles, "graph-dk", two_way=False),
+    "centralised LQR": _centralised_lqr,
+    "centralised LMI": _centralised_lmi,
+}

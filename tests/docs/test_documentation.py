@@ -14,9 +14,10 @@ from typing import Any
 
 import pytest
 
-from docs.generate import blocks, figures, measurements, reference
+from docs.generate import blocks, measurements, reference
 from docs.generate.fields import described, found_fields
 from docs.generate.keys import schema
+from docs.generate.registry import FIGURES
 from docs.generate.runner import CommandError, Runner
 from docs.generate.sessions import Step, steps_of
 from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario
@@ -48,7 +49,7 @@ def test_the_reference_and_the_schema_follow_from_the_code() -> None:
     assert reference.stale() == [], "python3 make.py reference"
 
 
-@pytest.mark.parametrize("name", [name for name, figure in figures.FIGURES.items() if figure.quick])
+@pytest.mark.parametrize("name", [name for name, figure in FIGURES.items() if figure.kind == "quick"])
 def test_quick_exact_figures_are_those_that_the_commands_give(name: str) -> None:
     assert measurements.stale([name]) == [], f"python3 make.py measurements {name}"
 
@@ -63,7 +64,7 @@ def test_a_figure_that_was_changed_by_hand_is_noticed() -> None:
 
 
 def test_generated_blocks_have_a_maker_and_figures_a_page() -> None:
-    known = {*reference.MAKERS, *figures.FIGURES, *(f"{name}-bare" for name in figures.FIGURES)}
+    known = {*reference.MAKERS, *FIGURES, *(f"{name}-bare" for name in FIGURES)}
     assert {name for page in PAGES.values() for name in blocks.blocks_of(page)} <= known
     assert measurements.unused() == []
 

@@ -20,6 +20,7 @@ def test_a_large_formation_is_flown_by_its_station() -> None:
     assert result.vehicles == 23
     assert result.ticks > 10
     assert 0.0 < result.station_s_per_tick < 0.02 / result.real_time_factor
+    assert result.tick_over_parse == result.station_s_per_tick / result.pymavlink_parse_s > 0.0
     assert result.real_time_factor >= result.real_time_factor_p50 > 0.0
 
 

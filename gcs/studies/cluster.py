@@ -1,0 +1,121 @@
+"""A map of trials on Dask with one local worker and with several: what distribution costs, and how far it goes."""
+
+import pickle
+import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gcs.errors import InputError
+from gcs.interrupts import raised
+from gcs.plan.planner import flight_plan
+from gcs.published import Published
+from gcs.stress.campaign import dask_workers
+from gcs.stress.study import Study
+from gcs.stress.trial import Outcome, Trial
+from gcs.studies.benchmark import without_solver
+from scenarios.schema import Scenario
+
+_DELAYS_S, _JITTERS_S = np.linspace(0.15, 0.375, 10).round(9).tolist(), (0.0, 0.02, 0.04, 0.06, 0.08)
+"""Link delays, up + down, and scales of the jitter: the map of docs/how-to/cluster.md."""
+
+
+class ClusterMap(Published):
+    """A map flown by one local worker and by all; each worker is a process with one thread.
+
+    `efficiency` is the time with one worker over `workers` times the time with all. `trial_s` is the mean run time of a
+    trial with one worker, and `worker_overhead_s` what that worker took beside it, for each trial. `central_s` is the
+    processor time of scheduler and client for each trial, from a map of trials that are not flown. Both are one Python
+    process here, which no number of workers makes faster. `cores_served` is `trial_s` / `central_s`, the number of
+    workers that would keep it busy all the time. Sizes are those of pickled trials and outcomes.
+    """
+
+    trials: int
+    workers: int
+    seconds: float
+    one_worker_s: float
+    all_workers_s: float
+    efficiency: float
+    trial_s: float
+    worker_overhead_s: float
+    central_s: float
+    cores_served: float
+    trial_bytes: float
+    outcome_bytes: float
+
+
+_TRACE = 120
+"""Values in the trace of a flight of 30 s."""
+_UNFLOWN = 500
+"""Trials of the map from which the cost of scheduler and client is found."""
+
+
+class _Flown(NamedTuple):
+    """The outcomes of a map, the time it took, and the processor time of this process for a trial not flown."""
+
+    outcomes: list[Outcome]
+    taken_s: float
+    central_s: float
+
+
+def map_on_cluster(scenario: Scenario, *, trials: int, workers: int, seconds: float) -> ClusterMap:
+    """Fly a map over link delay and jitter by one worker and by `workers`; each trial flies for `seconds`.
+
+    Raises InputError if `distributed` is not installed.
+    """
+    _, plan = flight_plan(without_solver(scenario.with_calm_monitor(), seconds))
+    study, points = Study(plan), list(product(_DELAYS_S, _JITTERS_S))
+    wanted: list[Trial] = []
+    for k in range(trials + _UNFLOWN):
+        delay_s, jitter_s = points[k % len(points)]
+        seed = scenario.seed + k // len(points)
+        wanted.append(study.trial("own", {"delay": delay_s, "jitter": jitter_s}, seed=seed))
+    with raised():
+        one, several = (_flown(wanted[:trials], wanted[trials:], count) for count in (1, workers))
+    trial_s = sum(outcome.elapsed_s for outcome in one.outcomes) / trials
+    central_s = min(one.central_s, several.central_s)
+    return ClusterMap(
+        trials=trials,
+        workers=workers,
+        seconds=seconds,
+        one_worker_s=one.taken_s,
+        all_workers_s=several.taken_s,
+        efficiency=one.taken_s / several.taken_s / workers,
+        trial_s=trial_s,
+        worker_overhead_s=one.taken_s / trials - trial_s,
+        central_s=central_s,
+        cores_served=trial_s / central_s,
+        trial_bytes=_bytes(wanted[:trials]),
+        outcome_bytes=_bytes(several.outcomes),
+    )
+
+
+def _flown(wanted: list[Trial], unflown: list[Trial], workers: int) -> _Flown:
+    """Fly trials by so many workers, which have started with a map of others that they do not fly."""
+    try:
+        from distributed import LocalCluster
+    except ImportError:
+        raise InputError("--cluster: the package distributed is not installed, wanted the extra [cluster]") from None
+    make: Any = LocalCluster  # its types allow neither no dashboard nor a cluster that is there at once
+    with make(n_workers=workers, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+        with dask_workers(cluster.scheduler_address, _not_flown) as answer:
+            for _ in answer(unflown[:1]):  # the workers' imports
+                pass
+            used_s = time.process_time()
+            for _ in answer(unflown[1:]):
+                pass
+            central_s = (time.process_time() - used_s) / (len(unflown) - 1)
+        with dask_workers(cluster.scheduler_address) as fly:
+            begun_s = time.perf_counter()
+            outcomes = list(fly(wanted))
+            return _Flown(outcomes, time.perf_counter() - begun_s, central_s)
+
+
+def _not_flown(trial: Trial) -> Outcome:
+    """An outcome of the usual size."""
+    return Outcome(trial.id, trial.kind, trial.scenario.seed, {}, real_time=False, trace_m=[0.5] * _TRACE)
+
+
+def _bytes(records: list[Any]) -> float:
+    return sum(len(pickle.dumps(record)) for record in records) / len(records)

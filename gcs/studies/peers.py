@@ -1,0 +1,164 @@
+"""The table of `gcs bench --peers`: one row for each figure, and the peers that are not installed or failed."""
+
+import os
+import tempfile
+import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gains.delay.constant import delay_margin
+from gains.formation.model import FormationModel
+from gcs.published import Published
+from gcs.studies import codec
+from gcs.studies.benchmark import GAINS, benchmark, with_vehicles
+from gcs.studies.compare_cost import timed
+from gcs.studies.peer_loops import PeerError, fly_closed_loop, run_script
+from scenarios.schema import Scenario
+
+SIZES = (5, 20, 100)
+_OURS = "this station"
+_STATIONS = {_OURS: "own_station", "pymavlink": "pymavlink_station", "MAVSDK": "mavsdk_station"}
+_PACKAGES = {
+    "pymavlink": "pymavlink",
+    "MAVSDK": "mavsdk",
+    "JSBSim": "jsbsim",
+    "python-control": "control",
+    "CVXPY": "cvxpy",
+    "SciPy": "scipy",
+}
+"""The package of each peer."""
+_GROWTH = {"SciPy": ("centralised LQR", 80), "CVXPY": ("centralised LMI", 10)}
+"""Method and largest chain of the designs whose growth is compared."""
+_SMALLEST = 5
+_MARGINS = 20
+
+
+class Row(Published):
+    """A figure of the same work; `ratio` is `theirs` over `ours`, None if that is 0."""
+
+    peer: str
+    work: str
+    unit: str
+    ours: float
+    theirs: float
+    ratio: float | None
+
+
+class Skipped(Published):
+    """A peer that is not compared with, in all or in one work."""
+
+    peer: str
+    why: str
+
+
+class SideBySide(Published):
+    """All rows of one run, and the load of the machine after it."""
+
+    rows: tuple[Row, ...]
+    skipped: tuple[Skipped, ...]
+    load_average: float
+
+
+def side_by_side(
+    scenario: Scenario,
+    *,
+    seconds: float,
+    sizes: Sequence[int] = SIZES,
+    ended: Callable[[int], None] = lambda _: None,
+) -> SideBySide:
+    """Compare with every peer that is installed; stations fly formations of `sizes` for `seconds` each.
+
+    `ended` is called after each part with the number of parts still to come.
+    """
+    absent = [peer for peer, package in _PACKAGES.items() if find_spec(package) is None]
+    skipped = [Skipped(peer=peer, why="not installed: python3 make.py peers") for peer in absent]
+    rows: list[Row] = []
+    parts: list[tuple[str, Callable[[], Iterator[Row]]]] = [
+        ("pymavlink", _codecs),
+        *(("", lambda n=n: _closed_loops(scenario, n, seconds, absent, skipped)) for n in sizes),
+        ("JSBSim", lambda: _aircraft(scenario)),
+        ("python-control", _margins),
+        *((peer, lambda peer=peer: _growth(peer)) for peer in _GROWTH),
+    ]
+    for left, (peer, part) in zip(reversed(range(len(parts))), parts, strict=True):
+        if peer not in absent:
+            try:
+                rows += part()
+            except PeerError as error:
+                skipped.append(Skipped(peer=peer, why=str(error)))
+        ended(left)
+    return SideBySide(rows=tuple(rows), skipped=tuple(skipped), load_average=os.getloadavg()[0])
+
+
+def _row(peer: str, work: str, unit: str, ours: float, theirs: float) -> Row:
+    return Row(peer=peer, work=work, unit=unit, ours=ours, theirs=theirs, ratio=theirs / ours if ours else None)
+
+
+def _codecs() -> Iterator[Row]:
+    for work, each in (
+        ("decode a LOCAL_POSITION_NED", codec.decode_s()),
+        ("encode a SET_POSITION_TARGET_LOCAL_NED", codec.encode_s()),
+    ):
+        yield _row("pymavlink", work, "µs", 1e6 * each.ours, 1e6 * each.theirs)
+
+
+def _closed_loops(
+    scenario: Scenario, vehicles: int, seconds: float, absent: Sequence[str], skipped: list[Skipped]
+) -> Iterator[Row]:
+    """Fly the same formation with this station and with each plain one; those that fail are added to `skipped`."""
+    flown: dict[str, dict[str, tuple[float, str]]] = {}
+    for peer, script in _STATIONS.items():
+        if peer not in absent:
+            try:
+                flown[peer] = fly_closed_loop(script, scenario, vehicles, seconds)
+            except PeerError as error:
+                skipped.append(Skipped(peer=peer, why=f"closed loop of {vehicles} vehicles: {error}"))
+    ours = flown.pop(_OURS, {})
+    for peer, theirs in flown.items():
+        for name, (figure, unit) in ours.items():
+            yield _row(peer, f"closed loop of {vehicles} vehicles: {name}", unit, figure, theirs[name][0])
+
+
+def _aircraft(scenario: Scenario) -> Iterator[Row]:
+    flight = benchmark(with_vehicles(scenario, _SMALLEST), seconds=2.0, repeat=3)
+    whole_s = 1.0 / flight.control_hz / flight.real_time_factor
+    vehicle_s = (whole_s - flight.station_s_per_tick) * flight.control_hz / _SMALLEST
+    with tempfile.TemporaryDirectory(prefix="peers-") as name:
+        found = run_script("aircraft", folder=Path(name))
+    work = "a vehicle for a second: ours with links and MAVLink, theirs an aircraft without"
+    yield _row("JSBSim", work, "ms", 1e3 * vehicle_s, 1e3 * found["step_run_s"] / found["step_s"])
+
+
+def _margins() -> Iterator[Row]:
+    """The delay margin of a follower's loop L(s) = (K3 - K1 s) / s²: phase margin over crossover frequency."""
+    control: Any = import_module("control")
+    loop = control.tf([-GAINS.K1, GAINS.K3], [1.0, 0.0, 0.0])
+    A0, A1 = FormationModel((-1, 0), axes=1).ground_loop([[GAINS.K1]], [[GAINS.K2]], [[GAINS.K3]])
+
+    def theirs() -> float:
+        _, phase_deg, _, _, crossover_rad_s, _ = control.stability_margins(loop, returnall=True)
+        return float((np.radians(phase_deg) / crossover_rad_s).min())
+
+    figures = [(*_timed(lambda: delay_margin(A0, A1)), *_timed(theirs)) for _ in range(_MARGINS)]
+    own_s, _, other_s, _ = figures[0]
+    work = "delay margin of a follower's continuous loop"
+    yield _row("python-control", work, "ms", 1e3 * own_s, 1e3 * other_s)
+    taken = min(figure[1] for figure in figures), min(figure[3] for figure in figures)
+    yield _row("python-control", f"time of the {work}", "ms", 1e3 * taken[0], 1e3 * taken[1])
+
+
+def _timed(margin: Callable[[], float]) -> tuple[float, float]:
+    begun_s = time.perf_counter()
+    return margin(), time.perf_counter() - begun_s
+
+
+def _growth(peer: str) -> Iterator[Row]:
+    method, largest = _GROWTH[peer]
+    ours, theirs = (timed(name, largest)[0] / timed(name, _SMALLEST)[0] for name in ("inclusion", method))
+    work = f"design of a chain of {largest} over one of {_SMALLEST}: inclusion, {method}"
+    yield _row(peer, work, "times as long", ours, theirs)
