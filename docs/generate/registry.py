@@ -9,8 +9,9 @@ from docs.generate.runner import Runner
 from docs.generate.side_by_side import cluster, peers, tick_ratio
 
 Kind = Literal["quick", "exact", "slow", "timed", "compiled"]
-"""`quick` ones are compared by the tests, `exact` ones by CI, `slow` ones only if they are named: all three are the same
-on every machine. `timed` ones are measured in real time, `compiled` ones too, with the hot path compiled.
+"""Figures that are the same on every machine are `quick`, compared by the tests, `exact`, compared by CI, or `slow`,
+compared only if they are named. `timed` ones are measured in real time; so are `compiled` ones, with the hot path
+compiled.
 """
 
 
