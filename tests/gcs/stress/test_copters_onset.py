@@ -12,7 +12,7 @@ from gcs.plan.planner import flight_plan
 from gcs.stress.growth import GrowthPoint, locate_zero
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from tests.support.flown_copters import TRUTH, plan_for, three
+from tests.support.fleets.flown_copters import TRUTH, plan_for, three
 
 LIMITS: dict[str, Any] = {"acceleration_max_m_s2": 2.5, "jerk_max_m_s3": 5.0}
 MODELS: dict[str, dict[str, Any]] = {

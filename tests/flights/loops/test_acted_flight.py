@@ -15,7 +15,7 @@ from scenarios.files import load
 from scenarios.keys.link import Link, Links
 from scenarios.schema import Control, FixedGains, NominalVelocity, Rates, Scenario
 from sim_vehicles.drive.fleet import Fleet
-from tests.support.flown_copters import TRUTH, three
+from tests.support.fleets.flown_copters import TRUTH, three
 from tests.support.paths import SCENARIOS
 
 FAST, SLOW = FixedGains(K1=-3.408, K2=0.631, K3=5.608), FixedGains(K1=-1.898, K2=0.0, K3=1.642)
