@@ -233,6 +233,8 @@ class _Rates:
         """Angle and delay with det(I - N) = 0 next to a starting point; the assumed delay if there is none."""
         for _ in range(_STEPS):
             aside, aside_s = _DIFFERENCE * angle, _DIFFERENCE * self.tick_s
+            if aside == 0.0:
+                break
             grid = self._grid(np.array([angle, angle + aside]))
             value, turned = self.determinant(grid, delay_s).tolist()
             by_angle = (turned - value) / aside

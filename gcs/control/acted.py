@@ -12,8 +12,9 @@ than the one recognised, were lost, or are late by as much. They are replaced by
 enters: a delay mismatch changes nothing.
 
 A vehicle that reports nothing but an acceleration reports what it does. If that is none of the accelerations sent, but
-a smaller one, the vehicle clips. Set-points under way are then assumed to be clipped to the same size, until it is seen
-to do more.
+a smaller one in the same direction, the vehicle clips. Set-points under way are then assumed to be clipped to the same
+size, until it is seen to do more. In another direction, as where a limit of speed takes away what is along the
+velocity, the report says nothing of the set-points under way.
 """
 
 import struct
@@ -28,6 +29,8 @@ _AGES = 3
 """Set-points over which the least age is taken. Few, because a delay that grows looks like loss until all are new."""
 _EARLY = 0.05
 """A set-point counts as lost from the least age on, less this share of a period: clocks err by as much."""
+_ASIDE = 0.02
+"""Tangent of the angle up to which two accelerations have the same direction."""
 _VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
 """Places among the fields of SET_POSITION_TARGET_LOCAL_NED and of POSITION_TARGET_LOCAL_NED."""
 _ON_THE_WIRE = struct.Struct("<2f")
@@ -42,6 +45,12 @@ class Alterable(Protocol):
 def _vector(fields: tuple[Any, ...], place: slice) -> complex:
     """North + 1j * east as the link carries it."""
     return complex(*_ON_THE_WIRE.unpack(_ON_THE_WIRE.pack(*fields[place])))
+
+
+def _is_shortened(reported: complex, sent: complex) -> bool:
+    """Whether an acceleration is one that was sent, in the same direction but smaller."""
+    share = reported / sent if sent else 0j
+    return 0.0 < share.real < 1.0 and abs(share.imag) < _ASIDE * share.real
 
 
 class ActiveTargets:
@@ -90,7 +99,7 @@ class ActiveTargets:
             self._hold(min(same, key=lambda place: abs(place - expected)), expected)
         elif only and isfinite(abs(acceleration)):
             self._correct(expected, acceleration - self._acceleration[expected])
-            if 0.0 < abs(acceleration) < abs(self._acceleration[expected]):
+            if _is_shortened(acceleration, self._acceleration[expected]):
                 self._largest_m_s2 = abs(acceleration)
                 self._clip_from(expected + 1)
 

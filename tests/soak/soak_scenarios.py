@@ -67,7 +67,9 @@ def random_scenario(rng: Rng, name: str) -> Part:
     drawn |= _disturbed(np.random.default_rng((drawn["seed"], 1)))
     if not onboard and (not autopilot or "response" in drawn):
         fast = max(rates.values()) > 100.0  # the windows of a whole schedule take half a minute
-        _predict(np.random.default_rng(drawn["seed"]), control, measured=0.5 if fast else "measured", fed=not autopilot)
+        own = np.random.default_rng(drawn["seed"])
+        _predict(own, control, measured=0.5 if fast else "measured", fed=not autopilot)
+        rates["target_hz"] = one_of(own, 10.0, 10.0, 0.0, rates["control_hz"])
     return drawn
 
 
@@ -167,7 +169,7 @@ def _rates(rng: Rng, *, onboard: bool, autopilot: bool) -> Part:
         control_hz=control_hz,
         telemetry_hz=one_of(rng, control_hz, control_hz, control_hz, 5.0, 20.0, any_hz),
         timesync_hz=one_of(rng, 10.0, 10.0, 10.0, spread(rng, 0.5, 50.0)),
-        target_hz=one_of(rng, 10.0, 10.0, 0.0, control_hz),
+        target_hz=None,  # see _predict
     )
 
 

@@ -299,6 +299,19 @@ def test_every_multirate_window_ends_where_its_map_has_radius_one() -> None:
     )
 
 
+def test_a_search_that_begins_at_angle_zero_finds_the_window() -> None:
+    """Telemetry at a quarter of the control rate and 10 s assumed: a starting angle is too small for a difference."""
+    model, rates = FormationModel((-1, 0), axes=1), Timing(0.05, 0.2)
+    K = model.overlapping_gain([[-2.707704873573067]], [[0.3321720783944292]], [[3.418066695822439]])
+    window = mismatch_window(model.A, model.B, K, rates, assumed_s=10.0)
+    for end_s, outwards in zip(window, (-1.0, 1.0), strict=True):
+        for aside_s in (-1e-4, 1e-4):
+            growth_1_s = predicted_growth_rate(
+                model.A, model.B, K, rates, assumed_s=10.0, delay_s=end_s + outwards * aside_s
+            )
+            assert (growth_1_s > 0.0) == (aside_s > 0.0)
+
+
 def test_the_whole_formation_is_stable_exactly_where_each_vehicle_is() -> None:
     """triangle5 in one matrix: the spectrum is the union of those of the blocks, inside and beyond their windows."""
     model = FormationModel((-1, 0, 1, 0, 3), axes=1)

@@ -146,6 +146,17 @@ def test_set_points_under_way_are_clipped_as_the_last_one_was() -> None:
     assert link.gained_m_s(9) == pytest.approx(link.wanted_m_s2(9), abs=1e-6)
 
 
+def test_a_limit_of_speed_changes_nothing_under_way() -> None:
+    """It takes away what is along the velocity: what is left has another direction than the set-point."""
+    link = Link()
+    link.report(3, active(link.of(3)[0]))
+    aside = 0.01j * link.wanted_m_s2(4)
+    link.report(4, active((aside.real, aside.imag)))
+    assert link.gained_m_s(4) == pytest.approx(aside, abs=1e-6)
+    for tick in range(5, 19):
+        assert link.gained_m_s(tick) == pytest.approx(link.wanted_m_s2(tick), abs=1e-6)
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 0.0])
 def test_no_reported_number_spoils_the_history(value: float) -> None:
     link = Link()
