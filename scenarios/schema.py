@@ -33,6 +33,7 @@ from scenarios.keys.part import (
     SystemId,
     Velocity,
 )
+from scenarios.keys.rates import Rates
 from scenarios.keys.sitl import Sitl
 from scenarios.smooth import Bounds, SmoothCourse, course_by_steps, course_by_waypoints
 
@@ -83,20 +84,6 @@ class Limits(Part):
     """Maximum horizontal acceleration."""
     turn_rate_max_rad_s: Positive | None = None
     """Maximum rate at which the heading changes."""
-
-
-class Rates(Part):
-    """Rates of control, telemetry and clock exchanges."""
-
-    control_hz: Rate = 50.0
-    """Control ticks of the station; every vehicle is sent one set-point per tick."""
-    telemetry_hz: Rate = 50.0
-    """LOCAL_POSITION_NED messages from each vehicle."""
-    timesync_hz: Annotated[float, Field(ge=0.01, le=50)] = 10.0
-    """TIMESYNC exchanges with each vehicle. At most `control_hz`, because each control tick logs one round trip."""
-    target_hz: Annotated[float, Field(ge=0, le=500)] = 10.0
-    """POSITION_TARGET_LOCAL_NED messages from each vehicle, which show what acted; with `control.prediction` only, and
-    never more than `telemetry_hz`. 0: none, and every set-point is assumed to act as it was sent."""
 
 
 class FixedGains(Part):
