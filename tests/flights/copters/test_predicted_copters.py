@@ -90,5 +90,7 @@ def test_copters_beyond_their_window_grow_apart_as_computed() -> None:
 
 def test_copters_within_their_window_do_not_grow_apart() -> None:
     flight = settled_then_slower(planned(ASSUMED_S, 0.59), -0.05)
-    # 0.32 mm are left by the noise of telemetry and the change of the delay, with reports of what acted or without
-    assert max(flight.error_m(k)[1500:].max() for k in (2, 3)) < 5e-4
+    # what the change of the delay excites depends on when the flight began, up to 0.32 mm; it dies away
+    for vehicle in (2, 3):
+        error_m = flight.error_m(vehicle)
+        assert error_m[2000:].max() < min(2e-4, error_m[1500:2000].max())
