@@ -69,7 +69,7 @@ def thesis(
 
 
 def bench(
-    scenario_file: options.ScenarioFile,
+    scenario_file: options.ScenarioFile = Path("triangle5"),
     vehicles: Annotated[
         int, typer.Option(metavar="N", min=0, max=250, help="number of vehicles, in columns behind a leader")
     ] = 0,

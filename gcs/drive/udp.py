@@ -30,6 +30,8 @@ _TIMESPEC = struct.Struct("qq")
 _ANCILLARY_BYTES = 64
 _LARGEST_DATAGRAM = 2048
 _DATAGRAMS_A_STEP = 4096
+_TOGETHER_NS = 1_000_000
+"""The station wakes for datagrams at most once in this time. Their stamps say when they came."""
 _PR_SET_TIMERSLACK = 29
 
 
@@ -67,7 +69,7 @@ class StationSocket:
             self._socket.close()
             raise
         self._socket.setblocking(False)
-        self.bound_ns = self._emptied_ns = clock_ns()
+        self.bound_ns = self._emptied_ns = self._woken_ns = clock_ns()
         self.send_errors = 0
 
     def __enter__(self) -> Self:
@@ -82,9 +84,11 @@ class StationSocket:
         return host, port
 
     def wait(self, until_ns: int) -> None:
-        """Wait until a datagram arrives or a time is reached."""
+        """Wait until a datagram arrives or a time is reached; datagrams that follow closely are awaited together."""
         left_s = max(0, until_ns - clock_ns()) * 1e-9
         select.select([self._socket], [], [], left_s)
+        time.sleep(max(0, min(until_ns, self._woken_ns + _TOGETHER_NS) - clock_ns()) * 1e-9)
+        self._woken_ns = clock_ns()
 
     def receive(
         self, refused: Counter[str] | None = None, is_another: Callable[[int, Datagram], bool] | None = None

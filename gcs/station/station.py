@@ -11,7 +11,7 @@ from math import isfinite, nan
 import numpy as np
 
 from gcs.control.history import StateHistory
-from gcs.control.law import distances_m
+from gcs.control.law import VehicleControl, distances_m
 from gcs.control.limits import SetPointLimits
 from gcs.control.loop_delay import Repetitions
 from gcs.control.loops import Moment, Order
@@ -73,8 +73,9 @@ class Station:
         self._flight_start_ns: int | None = None
         self._next_tick_ns = start_ns
         self._next_heartbeat_ns = start_ns
-        # Requests are spread evenly, half a period off the ticks, so that they do not wait behind set-points.
-        self._next_timesync_ns = start_ns + self._period_ns // 2
+        # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. At most three times a
+        # period the station wakes for them.
+        self._next_timesync_ns = self._next_requests_ns = start_ns + self._period_ns // 2
         self._timesync_spacing_ns = max(1, self._timesync_ns // n)
         self._timesync_row = 0
         self._tick_count = 0
@@ -90,7 +91,7 @@ class Station:
     @property
     def next_event_ns(self) -> int:
         """When `step` next has something to do even if nothing is received."""
-        return min(self._next_tick_ns, self._next_heartbeat_ns, self._next_timesync_ns)
+        return min(self._next_tick_ns, self._next_heartbeat_ns, self._next_requests_ns)
 
     def request_stop(self, reason: str) -> None:
         """End the flight at the next tick: command the vehicles to hold, and wait until they do."""
@@ -115,8 +116,10 @@ class Station:
             self._next_heartbeat_ns = now_ns + _HEARTBEAT_NS
             for vehicle in self.vehicles:
                 self._send(vehicle, mavlink.HEARTBEAT, mavlink.heartbeat(), outgoing)
-        while now_ns >= self._next_timesync_ns:
-            self._request_timesync(outgoing)
+        if now_ns >= self._next_requests_ns:
+            while now_ns >= self._next_timesync_ns:
+                self._request_timesync(outgoing)
+            self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._period_ns // 3)
         return outgoing, tick
 
     def complete(self, tick: Tick, sent_ns: int) -> TickArray:
@@ -244,7 +247,7 @@ class Station:
         now = Moment(due_ns, time_s, nominal_m_s, self._monitor.opening)
         controls = self._fleet.loop.control(self._history, self._law, blends, now)
         controls = self._fleet.bounded(controls, blends)
-        controls = [c._replace(command_m_s2=self._limits.command(c.command_m_s2)) for c in controls]
+        controls = [self._limited(control) for control in controls]
         slots_m = [reported.down_m for reported in self._reported] if self._has_slots else None
         distance_m = distances_m(controls, due_ns, slots_m)
         nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
@@ -279,6 +282,10 @@ class Station:
         tick = Tick(self._tick_count, time_s, due_ns, key_ms, seen)
         self._tick_count += 1 + behind
         return tick
+
+    def _limited(self, control: VehicleControl) -> VehicleControl:
+        command_m_s2 = self._limits.command(control.command_m_s2)
+        return control if command_m_s2 is control.command_m_s2 else control._replace(command_m_s2=command_m_s2)
 
     def _decide(self, due_ns: int, outgoing: list[Outgoing]) -> None:
         """Modes, lost vehicles and the flight's phase."""
