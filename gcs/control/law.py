@@ -13,7 +13,6 @@ from math import nan
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 from gcs.control.history import Report, Reports, State, States
@@ -205,16 +204,16 @@ def distances_m(controls: Sequence[VehicleControl], now_ns: int, down_m: Sequenc
     Positions are brought to `now_ns` along the reported velocities. `down_m` are the vehicles' altitudes, if they fly
     at different ones; the distances are horizontal without it.
     """
-    positions: list[complex] = []
-    for sample_ns, (north, east, v_north, v_east), *_ in controls:
-        age_s = (now_ns - sample_ns) * 1e-9
-        positions.append(complex(north + v_north * age_s, east + v_east * age_s))
-    position: NDArray[np.complex128] = np.array(positions)
-    away = position[:, None] - position
-    to_north, to_east = away.real, away.imag
-    distance = np.sqrt(to_north * to_north + to_east * to_east)  # not abs(away), which rounds as each processor can
+    age_s = (now_ns - np.array([control.sample_ns for control in controls])) * 1e-9
+    north, east, v_north, v_east = np.array([control.state for control in controls]).T
+    north, east = north + v_north * age_s, east + v_east * age_s
+    square, more = north[:, None] - north, east[:, None] - east
+    square *= square  # in place: these are the largest arrays of a tick
+    more *= more
+    square += more
+    distance = np.sqrt(square, out=square)
     if down_m is not None:
         below = np.array(down_m)
         distance = np.sqrt(distance * distance + np.square(below[:, None] - below))
-    distance.flat[:: len(positions) + 1] = nan  # to itself
+    distance.flat[:: len(controls) + 1] = nan  # to itself
     return distance
