@@ -7,6 +7,7 @@ from typing import Literal
 from docs.generate import figures
 from docs.generate.runner import Runner
 from docs.generate.side_by_side import cluster, peers, tick_ratio
+from docs.generate.stages import stages
 
 Kind = Literal["quick", "exact", "slow", "timed", "compiled"]
 """Figures that are the same on every machine are `quick`, compared by the tests, `exact`, compared by CI, or `slow`,
@@ -38,6 +39,7 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
     "timed": (
         *(figures.readme_fly, figures.flights, figures.too_late, figures.punctuality, figures.copters),
         *(figures.signing, figures.design_time, figures.speed, figures.onset_real_time, tick_ratio, peers, cluster),
+        stages,
     ),
     "compiled": (figures.speed_compiled,),
 }
