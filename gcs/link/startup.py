@@ -100,9 +100,10 @@ class LaunchedStartup:
 
     def next(self, *, custom_mode: int, armed: bool, clock_known: bool, now_ns: int) -> Step:  # noqa: ARG002
         guided, uploaded = custom_mode == LAUNCHED.guided_mode, self._upload.done
-        due = next(((m, us) for m, us in self._rates.items() if m not in self._set), None)
-        if due is None and clock_known and uploaded and guided and armed:
+        asked = len(self._set) == len(self._rates)
+        if asked and clock_known and uploaded and guided and armed:
             return _READY
+        due = None if asked else next((m, us) for m, us in self._rates.items() if m not in self._set)
         command = None
         if due is not None:
             command = SET_MESSAGE_INTERVAL, due

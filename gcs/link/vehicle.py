@@ -153,9 +153,7 @@ class RemoteVehicle:
         return self.address not in {None, address} and received_ns - self.heard_ns <= SILENCE_S * _NS
 
     def may_speak_from(self, address: Address, msg_id: int, received_ns: int) -> bool:
-        """Whether a frame from an address can be from this vehicle; a heartbeat sets it at first and after silence."""
-        if self.address == address:
-            return True
+        """Whether a frame from another address can be from this vehicle: a heartbeat, at first and after silence."""
         return msg_id == mavlink.HEARTBEAT and not self.is_elsewhere(address, received_ns)
 
     def is_replay(self, frame: mavlink.Frame, now_ns: int) -> bool:

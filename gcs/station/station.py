@@ -152,10 +152,10 @@ class Station:
                 self.counters["unknown system id"] += 1
                 continue
             vehicle = self.vehicles[row]
-            if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
-                self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
-                continue
             if vehicle.address != datagram.address:
+                if not vehicle.may_speak_from(datagram.address, frame.msg_id, datagram.received_ns):
+                    self.counters["before a first heartbeat" if vehicle.address is None else ANOTHER_ADDRESS] += 1
+                    continue
                 vehicle.address = datagram.address
                 self._report("vehicle", "found", vehicle.system_id)
             vehicle.heard_ns = datagram.received_ns
