@@ -1,7 +1,7 @@
 """What the figures of the documentation are, and the commands that they come from.
 
 Each function runs commands and returns Markdown. Figures that differ from run to run are printed as ranges.
-`docs.generate.registry` lists the functions and says when their figures are compared.
+`docs.generate.measurements` lists the functions and says when their figures are compared.
 """
 
 import json
@@ -11,10 +11,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from docs.generate.sessions import steps_of
 
 from docs.generate.blocks import ROOT, table
 from docs.generate.runner import CommandError, Runner
-from docs.generate.sessions import steps_of
 
 
 def _output(text: str) -> str:
