@@ -11,10 +11,10 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from docs.generate.sessions import steps_of
 
 from docs.generate.blocks import ROOT, table
 from docs.generate.runner import CommandError, Runner
+from docs.generate.sessions import steps_of
 
 
 def _output(text: str) -> str:

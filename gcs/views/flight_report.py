@@ -1,7 +1,6 @@
 """report.html of a flight: its verdict, headroom, errors, links and events on one page that needs nothing else."""
 
-from collections.abc import Iterator, Sequence
-from itertools import groupby
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ from gcs.runs.summary_record import Summary
 from gcs.views.page import rendered
 from gcs.views.report import flight_lines
 from gcs.views.svg import COLOURS, OTHERS, Level, Line, chart
+from gcs.views.table import at_once
 from scenarios.schema import Scenario
 
 REPORT_FILE = "report.html"
@@ -73,7 +73,7 @@ def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: Tic
     labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
     modes = _mode_bars(flown, labels)
     shown = {name for _, bar in modes for name, _, _ in bar}
-    rows = list(_event_rows(events))
+    said = at_once(event for event in events if event.time_s >= 0.0)
     colours = [COLOURS[named.index(k) % len(COLOURS)] if k in named else OTHERS for k in range(len(labels))]
     return rendered(
         _TEMPLATE,
@@ -86,16 +86,9 @@ def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: Tic
         modes=modes,
         mode_key=[(mode.name, colour) for mode, colour in _MODE_COLOURS.items() if mode.name in shown],
         headroom_min={vehicle.system_id: left for vehicle, left in zip(scenario.vehicles, least, strict=True)},
-        events=rows[:_MOST_EVENTS],
-        left_out=max(0, len(rows) - _MOST_EVENTS),
+        events=said[:_MOST_EVENTS],
+        left_out=max(0, len(said) - _MOST_EVENTS),
     )
-
-
-def _event_rows(events: Sequence[Event]) -> Iterator[tuple[float, str, str]]:
-    """Time, vehicles and text of what happened from 0 s on; what several vehicles did at once is one row."""
-    flown = (event for event in events if event.time_s >= 0.0)
-    for (time_s, text), same in groupby(flown, key=lambda event: (event.time_s, event.text)):
-        yield time_s, " ".join(str(event.system_id) for event in same if event.system_id is not None), text
 
 
 def _least_headroom(flown: TickArray) -> list[float | None]:

@@ -15,10 +15,11 @@ from typing import Any
 import pytest
 
 from docs.generate import blocks, measurements, reference
-from docs.generate.fields import described, found_fields
 from docs.generate.keys import schema
 from docs.generate.measurements import FIGURES
+from docs.generate.reference import described, found_fields
 from docs.generate.runner import CommandError, Runner
+from docs.generate.sessions import Step, steps_of
 from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.drive.virtual import fly_virtual
@@ -35,7 +36,6 @@ from scenarios import files
 from scenarios.keys.criteria import Criteria
 from scenarios.keys.disturbance import Navigation
 from scenarios.schema import FixedGains, Response
-from tests.docs.sessions import Step, steps_of
 from tests.support.fleets.own_code import coded
 
 ROOT = blocks.ROOT

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from docs.generate.sessions import steps_of
 from scenarios.files import load
-from tests.docs.sessions import steps_of
 from tests.support.paths import ROOT, SCENARIOS
 
 [SCRIPT] = [step.text for step in steps_of(ROOT / "docs/how-to/sitl-in-ci.md") if step.file == "with-sitl.sh"]

@@ -48,4 +48,4 @@ def _step(what: str, text: str) -> Step:
             code = int(rest[rest.index("exit") + 1]) if "exit" in rest else 0
             return Step(text, realtime=how == "realtime", server="server" in rest, exit_code=code)
         case _:
-            raise ValueError(f"read <!-- test: {what} -->, wanted one that tests/docs/sessions.py describes")
+            raise ValueError(f"read <!-- test: {what} -->, wanted one that docs/generate/sessions.py describes")
