@@ -1,7 +1,7 @@
 """Control mathematics of formations: gains for an information pattern, and how much delay their loops take.
 
-The names below are what a user imports; importing one loads only what it needs. The rooms that they come from hold
-more, each room using those below it:
+The two dozen names below are what most users import; importing one loads only what it needs. The rest is imported from
+the rooms, for example `from gains.formation.pattern import leader_follower`. Each room uses those below it:
 
 * `core`: requirements, errors, array types, and the splitting of a matrix into blocks that interact.
 * `formation`: formation models and information patterns, the inclusion principle, partitions, fixed modes.
@@ -33,63 +33,47 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from gains.core.errors import BadModelError, DisagreementError, GainsError, InfeasibleError, SolverError
     from gains.core.requirement import Requirement
-    from gains.delay.constant import DelayAnalysis, analyse_delay, delay_margin
-    from gains.delay.rightmost import rightmost_root, rightmost_roots
-    from gains.delay.several import boundary_of_two_delays, delay_box
-    from gains.design.design import Design, design, evaluate_gains, trade_off
-    from gains.formation.fixed_modes import fixed_modes
+    from gains.delay.constant import analyse_delay, delay_margin
+    from gains.delay.rightmost import rightmost_root
+    from gains.delay.several import delay_box
+    from gains.design.design import design, evaluate_gains, trade_off
     from gains.formation.model import FormationModel
-    from gains.formation.pattern import Pattern, all_to_all, bidirectional, formation_plant, leader_follower
-    from gains.margin.loop_margin import LoopMargin, loop_margin
+    from gains.margin.loop_margin import loop_margin
     from gains.margin.model_file import parse_model
     from gains.margin.open_loop import delayed_feedback
     from gains.margin.opinions import checked_delay_margin
-    from gains.performance.predicted import PredictedLoop
     from gains.performance.response import Response
     from gains.performance.robust import robustness
     from gains.sampled.constant import sampled_delay_margin
-    from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
     from gains.sampled.multirate import Timing, multirate_delay_margin
-    from gains.sampled.onboard import OnboardTiming, onboard_loop
-    from gains.sampled.prediction import mismatch_window, mismatch_window_continuous, predicted_growth_rate
+    from gains.sampled.prediction import mismatch_window
     from gains.varying.bounds import varying_delay_bound
-    from gains.varying.jitter import Jitter, bound_covering, spread_bound
 
 __all__ = [
-    "BadModelError", "CoupledBlock", "DelayAnalysis", "Design", "DisagreementError", "FormationModel", "GainsError",
-    "InfeasibleError", "Jitter", "LoopMargin", "OnboardTiming", "Pattern", "PredictedLoop", "Requirement", "Response",
-    "SolverError", "Timing", "all_to_all", "analyse_delay", "bidirectional", "bound_covering",
-    "boundary_of_two_delays", "checked_delay_margin", "coupled_blocks", "delay_box", "delay_margin", "delayed_feedback",
-    "design", "evaluate_gains", "fixed_modes", "formation_plant", "leader_follower", "loop_margin", "mismatch_window",
-    "mismatch_window_continuous", "multirate_delay_margin", "onboard_loop", "parse_model", "predicted_growth_rate",
-    "rightmost_root", "rightmost_roots", "robustness", "sampled_delay_margin", "spread_bound", "trade_off",
-    "varying_delay_bound",
+    "BadModelError", "DisagreementError", "FormationModel", "GainsError", "InfeasibleError", "Requirement",
+    "Response", "SolverError", "Timing", "analyse_delay", "checked_delay_margin", "delay_box", "delay_margin",
+    "delayed_feedback", "design", "evaluate_gains", "loop_margin", "mismatch_window", "multirate_delay_margin",
+    "parse_model", "rightmost_root", "robustness", "sampled_delay_margin", "trade_off", "varying_delay_bound",
 ]  # fmt: skip
 
 _NAMES = {
     "core.errors": "BadModelError DisagreementError GainsError InfeasibleError SolverError",
     "core.requirement": "Requirement",
-    "delay.constant": "DelayAnalysis analyse_delay delay_margin",
-    "delay.rightmost": "rightmost_root rightmost_roots",
-    "delay.several": "boundary_of_two_delays delay_box",
-    "design.design": "Design design evaluate_gains trade_off",
-    "formation.fixed_modes": "fixed_modes",
+    "delay.constant": "analyse_delay delay_margin",
+    "delay.rightmost": "rightmost_root",
+    "delay.several": "delay_box",
+    "design.design": "design evaluate_gains trade_off",
     "formation.model": "FormationModel",
-    "formation.pattern": "Pattern all_to_all bidirectional formation_plant leader_follower",
-    "margin.loop_margin": "LoopMargin loop_margin",
+    "margin.loop_margin": "loop_margin",
     "margin.model_file": "parse_model",
     "margin.open_loop": "delayed_feedback",
     "margin.opinions": "checked_delay_margin",
-    "performance.predicted": "PredictedLoop",
     "performance.response": "Response",
     "performance.robust": "robustness",
     "sampled.constant": "sampled_delay_margin",
-    "sampled.coupled_block": "CoupledBlock coupled_blocks",
     "sampled.multirate": "Timing multirate_delay_margin",
-    "sampled.onboard": "OnboardTiming onboard_loop",
-    "sampled.prediction": "mismatch_window mismatch_window_continuous predicted_growth_rate",
+    "sampled.prediction": "mismatch_window",
     "varying.bounds": "varying_delay_bound",
-    "varying.jitter": "Jitter bound_covering spread_bound",
 }
 _HOME = {name: f"gains.{module}" for module, names in _NAMES.items() for name in names.split()}
 

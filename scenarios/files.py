@@ -23,12 +23,11 @@ from scenarios.keys.criteria import criteria_faults
 from scenarios.keys.disturbance import disturbance_contradictions
 from scenarios.keys.link import Jitter, Link, Links
 from scenarios.keys.sitl import sitl_contradictions
+from scenarios.link_files import TRACE_DELAYS, each_link, load_profile, with_traces
 from scenarios.manoeuvres import contradictions as manoeuvre_contradictions
 from scenarios.own_code import as_flown, own_code_faults, with_code
 from scenarios.places import line_of, location_of, named, wanted_of
-from scenarios.profiles import load_profile
 from scenarios.schema import Scenario
-from scenarios.traces import TRACE_DELAYS, each_link, with_traces
 
 _A_VEHICLE = "the system_id of a vehicle of this scenario"
 _Fault = tuple[str, object, str]

@@ -5,7 +5,7 @@ A page is written by hand and holds blocks, which are filled in between two comm
     <!-- generated: NAME -->
     <!-- end -->
 
-`blocks` finds and fills them. `reference` makes those of the reference (with `keys`, `fields`, `api`), and
-`measurements` those with figures, listed in `registry`. `__main__` is the command behind `python3 make.py reference`
+`blocks` finds and fills them. `reference` makes those of the reference (with `keys` and `api`), and
+`measurements` those with figures, which it lists. `__main__` is the command behind `python3 make.py reference`
 and `measurements`. `pictures` makes the pictures.
 """

@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from docs.generate import measurements, reference
-from docs.generate.registry import FIGURES
+from docs.generate.measurements import FIGURES
 
 
 def main() -> int:

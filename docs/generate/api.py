@@ -1,4 +1,4 @@
-"""The `gains` API: what `gains` exports, and every other function and class whose docstring has an example.
+"""The `gains` API: what `gains` exports, every function and class whose docstring has an example, and their types.
 
 An example in a docstring finds the names of its module; on the page it begins with the imports that it needs.
 """
@@ -9,7 +9,8 @@ import importlib
 import inspect
 import pkgutil
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import cache
 from types import ModuleType
 
 import gains
@@ -17,9 +18,13 @@ import gains
 
 def api_page() -> str:
     """A section for each module, with the signatures and the docstrings of what it offers."""
-    found = pkgutil.walk_packages(gains.__path__, "gains.")
-    modules = [importlib.import_module(module.name) for module in found if "._" not in module.name]
-    return "\n\n".join(text for module in modules if (text := _module(module)))
+    return "\n\n".join(text for module in _modules() if (text := _module(module)))
+
+
+def _modules() -> Iterator[ModuleType]:
+    for module in pkgutil.walk_packages(gains.__path__, "gains."):
+        if "._" not in module.name:
+            yield importlib.import_module(module.name)
 
 
 def documented(module: ModuleType) -> dict[str, str]:
@@ -36,14 +41,36 @@ def _module(module: ModuleType) -> str:
 
 
 def _offered(module: ModuleType) -> list[ast.FunctionDef | ast.ClassDef]:
-    implemented = {
-        node.name: node  # of an overloaded function the last, which has the docstring
+    return [
+        node
+        for node in _implemented(module)
+        if _explained(node) or (isinstance(node, ast.ClassDef) and node.name in _types())
+    ]
+
+
+def _implemented(module: ModuleType) -> Iterable[ast.FunctionDef | ast.ClassDef]:
+    """The public functions and classes; of an overloaded function the last, which has the docstring."""
+    return {
+        node.name: node
         for node in ast.parse(inspect.getsource(module)).body
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
-    }
-    return [
-        node for name, node in implemented.items() if name in gains.__all__ or ">>> " in (ast.get_docstring(node) or "")
-    ]
+    }.values()
+
+
+def _explained(node: ast.FunctionDef | ast.ClassDef) -> bool:
+    return node.name in gains.__all__ or ">>> " in (ast.get_docstring(node) or "")
+
+
+@cache
+def _types() -> set[str]:
+    """The names in the signatures of the functions that are explained."""
+    nodes = [node for module in _modules() for node in _implemented(module) if _explained(node)]
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    return set(re.findall(r"\w+", " ".join(f"{ast.unparse(each.args)} {_result(each)}" for each in functions)))
+
+
+def _result(node: ast.FunctionDef) -> str:
+    return f" -> {ast.unparse(node.returns)}" if node.returns else ""
 
 
 def _with_imports(module: ModuleType, docstring: str) -> str:
@@ -69,8 +96,7 @@ def _entry(node: ast.FunctionDef | ast.ClassDef, docstring: str) -> str:
         signature = "\n    ".join([f"class {node.name}:", *(ast.unparse(each) for each in fields)])
         described = [f"* `{name}`: {' '.join(about.split())}" for name, about in _described_fields(node)]
     else:
-        result = f" -> {ast.unparse(node.returns)}" if node.returns else ""
-        signature, described = f"{node.name}({_arguments(node.args)}){result}", []
+        signature, described = f"{node.name}({_arguments(node.args)}){_result(node)}", []
     signature = signature.replace("'", '"')  # as ruff formats it, in Markdown too
     text = "\n\n".join([_markdown(docstring), *(["\n".join(described)] if described else [])])
     return f"### `{node.name}`\n\n```python\n{signature}\n```\n\n{text}"

@@ -1,7 +1,7 @@
 """What the figures of the documentation are, and the commands that they come from.
 
 Each function runs commands and returns Markdown. Figures that differ from run to run are printed as ranges.
-`docs.generate.registry` lists the functions and says when their figures are compared.
+`docs.generate.measurements` lists the functions and says when their figures are compared.
 """
 
 import json

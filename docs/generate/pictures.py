@@ -1,4 +1,4 @@
-"""Make the pictures in README and docs anew, by the commands that a user has; some minutes, on an idle machine.
+"""Make the pictures in README and docs anew, by the commands that a user has; some minutes.
 
     python3 make.py pictures
 
@@ -28,7 +28,7 @@ def gcs(*arguments: str | Path) -> None:
 def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        gcs("fly", SCENARIOS / "triangle5.toml", "--listen", "127.0.0.1:0", "--out", folder / "flight")
+        gcs("fly", SCENARIOS / "triangle5.toml", "--virtual", "--out", folder / "flight")
         gcs("view", folder / "flight", "--picture", folder / "flight.png", "--at", "1.2")
         gcs("fly", SCENARIOS / "delay_ramp.toml", "--virtual", "--out", folder / "ramp")
         gcs("view", folder / "ramp", "--picture", folder / "monitor.png", "--at", "45")

@@ -3,13 +3,14 @@
 MAVSDK sends a set-point whenever one is set, as here in each tick, and would repeat it at 20 Hz by itself.
 """
 
+import atexit
 import time  # noqa: TID251 - MAVSDK has threads and a clock of its own
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
 import numpy as np
-from plain import Law, fly, ordered
+from plain import Law, fly
 
 from scenarios.schema import NS_PER_S
 
@@ -28,6 +29,7 @@ class _Station:
         self._mavsdk = mavsdk.Mavsdk(
             mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION)
         )
+        atexit.register(self._mavsdk.destroy)
         self._mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
         while self._mavsdk.system_count() < len(law.system_ids):
             time.sleep(_POLL_S)
@@ -38,8 +40,6 @@ class _Station:
         self._action = [plugins["action"].Action(system) for system in ordered]
 
     def start(self, telemetry_hz: float) -> None:
-        """Command all until each has armed in GUIDED mode and reports its state."""
-
         def keep(state: Any, row: int) -> None:
             at, moves = state.position, state.velocity
             self._law.states[row] = at.north_m, at.east_m, moves.north_m_s, moves.east_m_s
@@ -59,18 +59,9 @@ class _Station:
         time.sleep(max(0, until_ns - time.monotonic_ns()) / NS_PER_S)
 
     def send(self, commands: Sequence[Sequence[float]]) -> None:
-        """Send each vehicle its acceleration."""
         for offboard, (north_m_s2, east_m_s2) in zip(self._offboard, commands, strict=True):
             offboard.set_acceleration_ned(self._acceleration(north_m_s2, east_m_s2, 0.0))
 
-    def close(self) -> None:
-        self._mavsdk.destroy()
-
 
 if __name__ == "__main__":
-    order = ordered()
-    law = Law(order.scenario)
-    station = _Station(law, order.port)
-    station.start(order.scenario.rates.telemetry_hz)
-    fly(order, law, station.wait, station.send)
-    station.close()
+    fly(_Station)

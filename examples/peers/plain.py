@@ -8,7 +8,7 @@ import sys
 import time  # noqa: TID251 - a station of its own, with its own clock
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -66,19 +66,38 @@ def report(out: Path, lateness_s: Sequence[float] | FloatArray, due: int, used_s
     out.write_text(json.dumps(figures | {"error_m": error_m}), encoding="utf-8")
 
 
-def fly(order: Order, law: Law, wait: Callable[[int], None], send: Callable[[Sequence[Sequence[float]]], None]) -> None:
-    """Fly the scenario's duration from now and report.
+class Station(Protocol):
+    """The MAVLink of a plain station: another library's."""
 
-    `wait` takes telemetry until an instant of the monotonic clock in ns, `send` sends one set-point to each vehicle.
+    def start(self, telemetry_hz: float) -> None:
+        """Command all until each has armed in GUIDED mode and reports its state."""
+        ...
+
+    def wait(self, until_ns: int) -> None:
+        """Take telemetry until an instant of the monotonic clock."""
+        ...
+
+    def send(self, commands: Sequence[Sequence[float]]) -> None:
+        """Send each vehicle its acceleration."""
+        ...
+
+
+def fly(station_of: Callable[[Law, int], Station]) -> None:
+    """Fly the scenario's duration with the station of a law and a port, and report.
+
     A tick that is due before the one before it has been sent is skipped.
     """
+    order = ordered()
+    law = Law(order.scenario)
+    station = station_of(law, order.port)
+    station.start(order.scenario.rates.telemetry_hz)
     rate_hz = order.scenario.rates.control_hz
     period_ns, ticks = round(NS_PER_S / rate_hz), round(order.scenario.duration_s * rate_hz)
     used_s, begun_ns, tick, late_s = time.process_time(), time.monotonic_ns(), 0, list[float]()
     while tick < ticks:
         due_ns = begun_ns + tick * period_ns
-        wait(due_ns)
-        send(law.commands().tolist())
+        station.wait(due_ns)
+        station.send(law.commands().tolist())
         sent_ns = time.monotonic_ns()
         late_s.append((sent_ns - due_ns) / NS_PER_S)
         tick = max(tick + 1, (sent_ns - begun_ns) // period_ns)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from plain import Law, fly, ordered
+from plain import Law, fly
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from scenarios.schema import NS_PER_S
@@ -71,7 +71,6 @@ class _Station:
             vehicle.link.seq = (vehicle.link.seq + 1) % 256
 
     def start(self, telemetry_hz: float) -> None:
-        """Command all until each has armed in GUIDED mode and reports its state."""
         wanted = (
             (dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 1e6 / telemetry_hz),
             (dialect.MAV_CMD_DO_SET_MODE, 1, _GUIDED),
@@ -87,7 +86,6 @@ class _Station:
             self.wait(time.monotonic_ns() + NS_PER_S // 2)
 
     def send(self, commands: Sequence[Sequence[float]]) -> None:
-        """Send each vehicle its acceleration."""
         now_ms = time.monotonic_ns() // 1_000_000 & 0xFFFFFFFF
         for system_id, (north_m_s2, east_m_s2) in zip(self.vehicles, commands, strict=True):
             head = now_ms, system_id, 1, dialect.MAV_FRAME_LOCAL_NED, _ACCELERATION
@@ -96,8 +94,4 @@ class _Station:
 
 
 if __name__ == "__main__":
-    order = ordered()
-    law = Law(order.scenario)
-    station = _Station(law, order.port)
-    station.start(order.scenario.rates.telemetry_hz)
-    fly(order, law, station.wait, station.send)
+    fly(_Station)

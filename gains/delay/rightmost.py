@@ -48,7 +48,7 @@ def rightmost_roots(terms: Sequence[tuple[ArrayLike, float]], count: int) -> Com
 
     Of x'(t) = -x(t - 1) these are the branches of Lambert's W(-1):
 
-    >>> from gains import rightmost_roots
+    >>> from gains.delay.rightmost import rightmost_roots
     >>> rightmost_roots([([[-1]], 1.0)], 3).round(3).tolist()
     [(-0.318+1.337j), (-2.062+7.589j), (-2.653+13.949j)]
     """

@@ -133,7 +133,7 @@ def boundary_of_two_delays(
 
     Without tau_2 the loop x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) takes tau_1 up to acos(-0.5) / sqrt(0.75) = 2.4184:
 
-    >>> from gains import boundary_of_two_delays
+    >>> from gains.delay.several import boundary_of_two_delays
     >>> edge = boundary_of_two_delays([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
     >>> at_once = min((pair for line in edge for pair in line.delays_s.tolist()), key=lambda pair: pair[1])
     >>> round(at_once[0], 4), at_once[1]

@@ -82,7 +82,8 @@ def partition_by_input(pattern: Pattern) -> Partition:
 
     The pattern (4.6) gives {K11}, {K21, K22}, {K32, K33}.
 
-    >>> from gains import FormationModel, leader_follower
+    >>> from gains import FormationModel
+    >>> from gains.formation.pattern import leader_follower
     >>> [graph.links for graph in partition_by_input(leader_follower(FormationModel((-1, 0, 1)))).subgraphs]
     [((0, 0),), ((1, 0), (1, 1)), ((2, 1), (2, 2))]
     """
@@ -124,7 +125,8 @@ def expanded_gain(pattern: Pattern, partition: Partition) -> ExpandedGain:
 
     The sizes of (4.7), and φ1 = I:
 
-    >>> from gains import FormationModel, leader_follower
+    >>> from gains import FormationModel
+    >>> from gains.formation.pattern import leader_follower
     >>> pattern = leader_follower(FormationModel((-1, 0, 1)))
     >>> expanded = expanded_gain(pattern, partition_by_input(pattern))
     >>> expanded.mask.shape, expanded.phi2.shape, np.array_equal(expanded.phi1, np.eye(6))

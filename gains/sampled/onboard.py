@@ -223,7 +223,8 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
     A follower uses its own errors at once, and its leader needs nobody: no delay destabilises the pair.
 
     >>> import numpy as np
-    >>> from gains import FormationModel, OnboardTiming, onboard_loop
+    >>> from gains import FormationModel
+    >>> from gains.sampled.onboard import OnboardTiming, onboard_loop
     >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
     >>> loop = onboard_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
     >>> loop.late.tolist(), loop.continuous_margin_s(), loop.sampled_margin_s()

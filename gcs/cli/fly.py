@@ -15,8 +15,8 @@ from gcs.errors import InputError
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
+    from gcs.runs.junit import Check
     from gcs.runs.summary_record import Summary
-    from gcs.views.junit import Check
 
 LISTEN = "127.0.0.1:14550"
 
@@ -157,7 +157,7 @@ class Gate(NamedTuple):
 
     def passed(self, summary: "Summary") -> bool:
         """Check the flight, and print one line for each assertion that fails; the summary tells the rest."""
-        from gcs.views.junit import Check, write_junit
+        from gcs.runs.junit import Check, write_junit
 
         stable = "" if summary.verdict == "stable" else f"{summary.verdict}: {summary.reason}"
         checks = [Check("the flight is stable", stable), Check("the log is whole", "; ".join(summary.not_logged))]
@@ -170,8 +170,8 @@ class Gate(NamedTuple):
         return not any(check.failure for check in [*checks, *asserted])
 
     def _asserted(self, summary: "Summary") -> "Iterator[Check]":
+        from gcs.runs.junit import Check
         from gcs.views.console import number_text
-        from gcs.views.junit import Check
 
         least, after_s = summary.headroom_min, summary.settling_time_s
         if self.least_headroom is not None:

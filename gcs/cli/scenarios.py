@@ -28,9 +28,9 @@ def scenarios(
     from scenarios.shipped import description, names
 
     if links:
-        from scenarios import profiles
+        from scenarios import link_files
 
-        key, found = "links", {name: description(name, profiles.FOLDER) for name in profiles.names()}
+        key, found = "links", {name: description(name, link_files.FOLDER) for name in link_files.names()}
     else:
         key, found = "scenarios", {name: description(name) for name in names()}
     if as_json:

@@ -112,9 +112,9 @@ def stress(
         options.out_file("--junit", junit)
     from gcs.cli.stress_output import checks_of, print_reflown, print_result
     from gcs.drive.preflight import endless_link
+    from gcs.runs.junit import write_junit
     from gcs.stress.axes import parse_axis
     from gcs.stress.campaign import dask_workers, local_workers, refly
-    from gcs.views.junit import write_junit
 
     study, design = _study(scenario_file, loop, links, real_time=real_time, allow_code=allow_code)
     if assert_onset is not None and design.margin_unknown:

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
+from gcs.runs.junit import Check
 from gcs.stress.axes import place_text
 from gcs.stress.campaign import Reflown
 from gcs.stress.disturbance import DisturbanceOnset, DisturbanceResult
@@ -15,7 +16,6 @@ from gcs.stress.study import Onset
 from gcs.stress.trial import Outcome
 from gcs.views.console import UNKNOWN, ms_text, plain_console, table_of
 from gcs.views.console import number_text as _number
-from gcs.views.junit import Check
 from gcs.views.report import response_text
 
 _ms = partial(ms_text, form=".2f")

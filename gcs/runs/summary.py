@@ -7,24 +7,27 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gcs.control.own_law import BAD, BUDGET_SHARE, CALLS, LAW, OVER
 from gcs.control.tick import CLOCK_JUMPED, TICK, Event, Mode, TickArray
 from gcs.errors import InputError
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.plan.disturbed import predicted_spread
+from gcs.plan.own_law import code_records
 from gcs.runs import record
 from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
-from gcs.runs.own_code import own_code
 from gcs.runs.refusals import REFUSED, counted_by_vehicles, counts_of, refused_by_vehicles
 from gcs.runs.summary_record import (
     Clock,
     Control,
     Estimate,
     FlownSpread,
+    LawRecord,
     MarginRange,
     OneWayDelay,
     Spread,
@@ -142,7 +145,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         refused=counts_of(events, REFUSED),
         mirror=counts_of(events, record.MIRROR),
         mode_changes=tuple(event for event in events if event.kind == "mode" and event.time_s >= 0),
-        **own_code(scenario, design, events),
+        **_own_code(scenario, design, events),
     )
 
 
@@ -317,3 +320,20 @@ def _spread(values: FloatArray) -> Spread:
         return Spread(p50=None, p95=None, p99=None, max=None)
     p50, p95, p99 = np.percentile(known, [50, 95, 99]).tolist()
     return Spread(p50=p50, p95=p95, p99=p99, max=known.max())
+
+
+def _own_code(scenario: Scenario, design: Design, events: Sequence[Event]) -> dict[str, Any]:
+    """What a summary says about code of the user's own; empty for a scenario that names none."""
+    if not scenario.code:
+        return {}
+    fields: dict[str, Any] = {"code": code_records(scenario)}
+    if design.margin_unknown:
+        fields["margin_unknown"] = design.margin_unknown
+    if counts := counts_of(events, LAW):
+        fields["law"] = LawRecord(
+            calls=counts[CALLS],
+            unusable=counts[BAD],
+            over_budget=counts.get(OVER),
+            budget_s=BUDGET_SHARE / scenario.rates.control_hz,
+        )
+    return fields

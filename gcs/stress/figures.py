@@ -98,16 +98,20 @@ def worst_figure(file: Path, outcomes: Sequence[Outcome]) -> Path | None:
     worst = worst_of(outcomes)
     if not worst:
         return None
-    figure, (plot,) = figure_of(1, (9.0, 4.2))
+    from matplotlib.ticker import LogFormatter
+
+    figure, (plot,) = figure_of(1, (9.0, 5.0))
     for outcome in worst:
         error_m = np.maximum(np.array(outcome.trace_m), 1e-6)
         time_s = outcome.trace_period_s * (np.arange(error_m.size) + 0.5)
         flight = _FLIGHTS[outcome.kind]
         label = f"{place_text(outcome.coordinates)}: {outcome.verdict or 'failed'}; {flight}, trial {outcome.id[:8]}"
         plot.semilogy(time_s, error_m, linewidth=1.3, label=label)
+    plot.yaxis.set_major_formatter("{x:g}")
+    plot.yaxis.set_minor_formatter(LogFormatter())
     plot.set(xlabel="scenario time [s]", ylabel="largest spacing error of all vehicles [m]")
     plot.set_xlim(0.0, max(outcome.trace_period_s * len(outcome.trace_m) for outcome in worst))
-    plot.legend(frameon=False, fontsize=8)
+    plot.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 1.0))
     return saved(figure, file)
 
 

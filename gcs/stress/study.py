@@ -1,6 +1,6 @@
 """Which trials a campaign flies: over its axes, and in search of the onset."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -13,10 +13,12 @@ from gains.sampled.coupled_block import unlike_blocks
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.mismatch import Window
 from gcs.stress.axes import Axis, at_coordinates, has_constant_links
-from gcs.stress.bracket import bracketed
 from gcs.stress.growth import GrowthPoint, Zero, locate_zero
 from gcs.stress.trial import CRITICAL, Kind, Outcome, Run, Trial, is_modelled, plan_loops, sparse_gain
 
+_BRACKET_LINKS_S = (0.0, 0.05, 0.1, 0.2), (0.4, 0.8, 1.6)
+"""Link delays (s), up plus down, that are flown to find out where errors begin to grow: the second if they do not in
+the first."""
 _ROUNDS = 8
 _FLIGHTS_A_ROUND = 5
 _LIMITLESS_LINKS_S = (0.0, 0.5, 1.0, 1.5, 2.0)
@@ -117,7 +119,7 @@ def find_onset(study: Study, run: Run, *, tolerance: float, shorter: bool = Fals
 
     The flights of the first round are spread evenly over three tolerances to either side, those of the next over one,
     and those of later rounds over a fraction of one if no smooth curve fits. The search follows the measured growth;
-    the prediction only tells it where to start. Where there is none, flights do (`gcs.stress.bracket`). `shorter` looks
+    the prediction only tells it where to start. Where there is none, flights do (`bracketed`). `shorter` looks
     for the onset below the assumed delay of a station that predicts, where growth falls as the delay rises. Raises
     NoOnset with the reason.
     """
@@ -270,3 +272,19 @@ def _found(
         checks=tuple(checks),
         own=tuple(own),
     )
+
+
+def bracketed(trial_at: Callable[[float], Trial], run: Run) -> tuple[float, float] | str:
+    """The link delays between which errors begin to grow; or why there are none, in one line."""
+    before_s = None
+    for links_s in _BRACKET_LINKS_S:
+        outcomes = run([trial_at(link_s) for link_s in links_s])
+        for link_s, growth_1_s in zip(links_s, (outcome.growth_1_s for outcome in outcomes), strict=True):
+            if growth_1_s is None:
+                return f"the margin is unknown, and no growth rate could be measured at {link_s:g} s of link delay"
+            if growth_1_s > 0.0:
+                if before_s is None:
+                    return f"errors grow at {growth_1_s:+.4g} 1/s with the shortest link delay: no delay is stable"
+                return before_s, link_s
+            before_s = link_s
+    return f"the margin is unknown, and errors decay in flights with up to {before_s:g} s of link delay"

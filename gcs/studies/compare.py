@@ -36,7 +36,7 @@ Method = Literal["inclusion", "graph-lqr", "graph-dk"]
 METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr", "graph-dk")
 REPORT_FILE, RESULT_FILE = "compare.html", "compare.json"
 _COLOURS = ("#1f4e79", "#c1440e", "#5b8c3a", "#8a5a9c", "#777777", "#b8860b")
-_FLOOR_M = 1e-3
+_FLOOR = 1e-3
 """Smaller values are rounding of the telemetry."""
 
 
@@ -228,8 +228,11 @@ def errors_figure(file: Path, flights: Iterable[tuple[str, TickArray]]) -> Path:
         spacing = np.hypot(flown["spacing_error_north_m"], flown["spacing_error_east_m"])
         np.fmax.at(error, place, spacing)
         np.fmax.at(command, place, np.hypot(flown["command_north_m_s2"], flown["command_east_m_s2"]))
-        above.semilogy(time_s, np.maximum(error, _FLOOR_M), color=colour, linewidth=1.4, label=method)
-        below.semilogy(time_s, np.maximum(command, _FLOOR_M), color=colour, linewidth=1.4)
+        above.semilogy(time_s, error, color=colour, linewidth=1.4, label=method)
+        below.semilogy(time_s, command, color=colour, linewidth=1.4)
+    for plot in (above, below):
+        plot.set_ylim(bottom=_FLOOR)
+        plot.margins(x=0.0)
     above.set(ylabel="largest spacing error [m]")
     below.set(xlabel="time of flight [s]", ylabel="largest command [m/s²]")
     above.legend(frameon=False)

@@ -1,6 +1,10 @@
 """The table of `gcs bench --peers`: one row for each figure, and the peers that are not installed or failed."""
 
+import json
 import os
+import socket
+import subprocess
+import sys
 import tempfile
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from collections.abc import Callable, Iterator, Sequence
@@ -13,14 +17,18 @@ import numpy as np
 
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
+from gcs.drive.sitl import VehicleProcess
 from gcs.published import Published
 from gcs.studies import codec
-from gcs.studies.benchmark import GAINS, benchmark, with_vehicles
+from gcs.studies.benchmark import GAINS, benchmark, with_vehicles, without_solver
 from gcs.studies.compare_cost import timed
-from gcs.studies.peer_loops import PeerError, fly_closed_loop, run_script
+from scenarios.files import dump
 from scenarios.schema import Scenario
 
 SIZES = (5, 20, 100)
+SCRIPTS = Path(__file__).parents[2] / "examples" / "peers"
+_PATIENCE_S = 60.0
+"""How long a script may take beside its flight."""
 _OURS = "this station"
 _STATIONS = {_OURS: "own_station", "pymavlink": "pymavlink_station", "MAVSDK": "mavsdk_station"}
 _PACKAGES = {
@@ -36,6 +44,10 @@ _GROWTH = {"SciPy": ("centralised LQR", 80), "CVXPY": ("centralised LMI", 10)}
 """Method and largest chain of the designs whose growth is compared."""
 _SMALLEST = 5
 _MARGINS = 20
+
+
+class PeerError(Exception):
+    """A peer did not do what it was started for; the text is one line."""
 
 
 class Row(Published):
@@ -115,7 +127,7 @@ def _closed_loops(
     for peer, script in _STATIONS.items():
         if peer not in absent:
             try:
-                flown[peer] = fly_closed_loop(script, scenario, vehicles, seconds)
+                flown[peer] = _fly_closed_loop(script, scenario, vehicles, seconds)
             except PeerError as error:
                 skipped.append(Skipped(peer=peer, why=f"closed loop of {vehicles} vehicles: {error}"))
     ours = flown.pop(_OURS, {})
@@ -162,3 +174,41 @@ def _growth(peer: str) -> Iterator[Row]:
     ours, theirs = (timed(name, largest)[0] / timed(name, _SMALLEST)[0] for name in ("inclusion", method))
     work = f"design of a chain of {largest} over one of {_SMALLEST}: inclusion, {method}"
     yield _row(peer, work, "times as long", ours, theirs)
+
+
+def _fly_closed_loop(script: str, scenario: Scenario, vehicles: int, seconds: float) -> dict[str, tuple[float, str]]:
+    """Fly `seconds` of so many vehicles by the station of a script: figures with their units, by name.
+
+    Lateness is from when a tick was due until all its set-points were sent. Raises PeerError if it does not fly them.
+    """
+    flown = without_solver(with_vehicles(scenario, vehicles), seconds)
+    with tempfile.TemporaryDirectory(prefix="peers-") as name:
+        folder = Path(name)
+        file = folder / "flown.toml"
+        file.write_text(dump(flown), encoding="utf-8")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            host, port = probe.getsockname()
+        with VehicleProcess(file, station=(host, port), folder=folder):
+            found = run_script(script, str(file), str(port), folder=folder, patience_s=_PATIENCE_S + seconds)
+    return {
+        "processor share per vehicle": (100.0 * found["used_s"] / seconds / vehicles, "% of a core"),
+        "median lateness": (1e3 * found["late_p50_s"], "ms"),
+        "p99 lateness": (1e3 * found["late_p99_s"], "ms"),
+        "ticks flown": (100.0 * found["flown"], "%"),
+        "last spacing error": (found["error_m"], "m"),
+    }
+
+
+def run_script(script: str, *arguments: str, folder: Path, patience_s: float = _PATIENCE_S) -> dict[str, float]:
+    """The figures that a script leaves in a file of the folder, its last argument."""
+    out = folder / "figures.json"
+    command = [sys.executable, str(SCRIPTS / f"{script}.py"), *arguments, str(out)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=patience_s, check=False)
+    except subprocess.TimeoutExpired:
+        raise PeerError(f"no result after {patience_s:g} s") from None
+    if not out.exists():
+        last = [line for line in done.stderr.splitlines() if line.strip()][-1:]
+        raise PeerError(last[0] if last else f"exit code {done.returncode} without a word")
+    return json.loads(out.read_text(encoding="utf-8"))

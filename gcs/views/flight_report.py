@@ -15,6 +15,7 @@ from gcs.runs.summary_record import Summary
 from gcs.views.page import rendered
 from gcs.views.report import flight_lines
 from gcs.views.svg import COLOURS, OTHERS, Level, Line, chart
+from gcs.views.table import at_once
 from scenarios.schema import Scenario
 
 REPORT_FILE = "report.html"
@@ -70,6 +71,9 @@ def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: Tic
     least = _least_headroom(flown)
     named = _named(least)
     labels = [str(vehicle.system_id) for vehicle in scenario.vehicles]
+    modes = _mode_bars(flown, labels)
+    shown = {name for _, bar in modes for name, _, _ in bar}
+    said = at_once(event for event in events if event.time_s >= 0.0)
     colours = [COLOURS[named.index(k) % len(COLOURS)] if k in named else OTHERS for k in range(len(labels))]
     return rendered(
         _TEMPLATE,
@@ -79,11 +83,11 @@ def flight_page(summary: Summary, scenario: Scenario, design: Design, ticks: Tic
         charts=_charts(scenario, flown, labels, colours) if flown.size else [],
         key=[(labels[k], colours[k]) for k in sorted(named)],
         others=len(labels) - len(named),
-        modes=_mode_bars(flown, labels),
-        mode_key=[(mode.name, _MODE_COLOURS[mode]) for mode in _MODE_COLOURS if mode in flown["mode"]],
+        modes=modes,
+        mode_key=[(mode.name, colour) for mode, colour in _MODE_COLOURS.items() if mode.name in shown],
         headroom_min={vehicle.system_id: left for vehicle, left in zip(scenario.vehicles, least, strict=True)},
-        events=[event for event in events if event.time_s >= 0.0][:_MOST_EVENTS],
-        left_out=max(0, sum(event.time_s >= 0.0 for event in events) - _MOST_EVENTS),
+        events=said[:_MOST_EVENTS],
+        left_out=max(0, len(said) - _MOST_EVENTS),
     )
 
 
@@ -156,11 +160,15 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
 
 
 def _mode_bars(flown: TickArray, labels: list[str]) -> list[tuple[str, list[tuple[str, float, str]]]]:
-    """Of each vehicle that was ever in another mode than NOMINAL: its modes in turn, share of the time and colour."""
+    """Of each vehicle that did not fly in NOMINAL throughout: its modes in turn, share of the time and colour.
+
+    Before its first command and after its last a vehicle is WAITING; that is drawn, but does not count.
+    """
     bars: list[tuple[str, list[tuple[str, float, str]]]] = []
     for k, label in enumerate(labels):
         mode = flown["mode"][:, k]
-        if mode.size == 0 or (mode == Mode.NOMINAL).all():
+        flying = np.flatnonzero(mode != Mode.WAITING)
+        if mode.size == 0 or (flying.size and (mode[flying[0] : flying[-1] + 1] == Mode.NOMINAL).all()):
             continue
         starts = np.flatnonzero(np.diff(mode, prepend=-1)).tolist()
         turns = [

@@ -14,7 +14,6 @@ about as much as a tick of two.
 """
 
 import errno
-import itertools
 import math
 import os
 import warnings
@@ -34,7 +33,7 @@ from gcs.plan.design import Design
 from gcs.runs.record import RECORDING_FILE, UNFINISHED_FILE
 from gcs.views import scene
 from gcs.views.scene import Color, Floats
-from gcs.views.table import event_text
+from gcs.views.table import at_once, event_text
 from scenarios.schema import Scenario
 
 TIMELINE = "sim_time"
@@ -219,12 +218,10 @@ class Recording:
 
     def _send_events(self, events: list[Event]) -> None:
         """One entry for what one tick says of several vehicles."""
-        same = itertools.groupby(events, key=lambda event: (event.time_s, event.kind, event.text))
-        groups = [list(group) for _, group in same]
-        times_s = np.array([max(group[0].time_s, 0.0) for group in groups])
-        about = [[system_id for event in group for system_id in event.about] for group in groups]
-        texts = [event_text(group[0], ids, self._before_s) for group, ids in zip(groups, about, strict=True)]
-        levels = [_event_level(group[0]) for group in groups]
+        said = at_once(events)
+        times_s = np.array([max(event.time_s, 0.0) for event, _ in said])
+        texts = [event_text(event, system_ids, self._before_s) for event, system_ids in said]
+        levels = [_event_level(event) for event, _ in said]
         self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
 
     def _log_scene_styles(self) -> None:

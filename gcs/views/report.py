@@ -8,6 +8,7 @@ from rich.text import Text
 
 from gcs.plan.design import (
     Block,
+    CodeRecord,
     CriteriaPart,
     Design,
     FiguresAtDelay,
@@ -18,16 +19,19 @@ from gcs.plan.design import (
 )
 from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
-from gcs.runs.summary_record import FlownSpread, Summary, VehicleSummary
+from gcs.runs.summary_record import FlownSpread, LawRecord, Summary, VehicleSummary
 from gcs.views.console import UNKNOWN, ms_text, number_text, plain_console, table_of
-from gcs.views.own_code import code_text, law_text, print_code
+
+_HASH = 12
+"""Digits of a hash that are shown."""
 
 
 def print_design(design: Design, console: Console | None = None) -> None:
     """Gains, robustness, both margins, and the trade-off between robustness and margin."""
     console = console or plain_console()
     console.print(f"design   {design.method}, loop {design.loop}, period {design.period_s * 1e3:g} ms")
-    print_code(design.code, console)
+    if design.code:
+        console.print(f"code     {_code_text(design.code)}", markup=False)
     if design.margin_unknown:
         console.print(f"margin   unknown: {design.margin_unknown}")
         return
@@ -210,9 +214,9 @@ def flight_lines(summary: Summary) -> dict[str, str]:
     if summary.at_loop_delay.alpha is not None:
         lines["alpha"] = figures_text(summary.at_loop_delay)
     if summary.code:
-        lines["code"] = code_text(summary.code)
+        lines["code"] = _code_text(summary.code)
     if summary.law is not None:
-        lines["law"] = law_text(summary.law)
+        lines["law"] = _law_text(summary.law)
     if summary.spread is not None and summary.spread.vehicles:
         lines["spread"] = _spread_text(summary.spread)
     if (control := summary.control) is not None:
@@ -308,3 +312,14 @@ def response_text(response: ResponsePart | None) -> str:
         f"response {response.source} ({', '.join(models)}): lag {lag} s{dead}, velocity gain {gain} 1/s; included in "
         f"the margin, which would be {ms_text(response.delay_margin_at_once_s)} without it{grows}\n"
     )
+
+
+def _code_text(code: tuple[CodeRecord, ...]) -> str:
+    """The files of code with their hashes."""
+    return ", ".join(f"{each.file}, sha256 {each.sha256[:_HASH]}" for each in code)
+
+
+def _law_text(law: LawRecord) -> str:
+    """How often a law was called, and how often in vain or too long."""
+    slow = "" if law.over_budget is None else f", {law.over_budget} over {1e3 * law.budget_s:g} ms"
+    return f"{law.calls} calls, {law.unusable} without a usable command{slow}"

@@ -4,8 +4,10 @@
 terminal, and `Display` chooses between the two.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -266,6 +268,13 @@ def time_text(time_s: float, before_s: float, form: str = "8.2f") -> str:
     return f"start {time_s + before_s:+.2f} s" if time_s < 0.0 else f"{number_text(time_s, form)} s"
 
 
+def at_once(events: Iterable[Event]) -> list[tuple[Event, list[int]]]:
+    """The events with the vehicles that each is about: what a tick says of several vehicles is one event."""
+    same = groupby(events, key=lambda event: (event.time_s, event.kind, event.text))
+    groups = [list(group) for _, group in same]
+    return [(group[0], [system_id for event in group for system_id in event.about]) for group in groups]
+
+
 def event_text(event: Event, system_ids: list[int], before_s: float) -> str:
     """One line of text for an event that concerns these vehicles; `before_s` as in `time_text`."""
     named = " ".join(str(system_id) for system_id in system_ids[:NAMED_MAX])
@@ -287,8 +296,8 @@ class Display:
 
     def events(self, events: list[Event]) -> None:
         """Print each event once, where there is no live table to show it."""
-        for event in events if self._says_lines else ():
-            print(event_text(event, event.about, self._state.before_s), flush=True)
+        for event, system_ids in at_once(events) if self._says_lines else ():
+            print(event_text(event, system_ids, self._state.before_s), flush=True)
 
     def show(self, *, last: bool = False) -> None:
         """Show the flight as it is now; as text, every `PLAIN_EVERY_S` of scenario time and if `last`."""

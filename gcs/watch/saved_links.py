@@ -21,7 +21,7 @@ from gcs.watch.links import Watch
 from scenarios.files import TRACE_DELAYS
 from scenarios.keys.link import Jitter, Link, LossBursts
 from scenarios.keys.profile import Latency, LinkProfile, Measured
-from scenarios.profiles import dump_profile
+from scenarios.link_files import dump_profile
 
 _SETTLED = 20
 """Exchanges after which a clock is known well enough for one-way delays."""

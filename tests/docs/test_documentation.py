@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from docs.generate import blocks, measurements, reference
-from docs.generate.fields import described, found_fields
 from docs.generate.keys import schema
-from docs.generate.registry import FIGURES
+from docs.generate.measurements import FIGURES
+from docs.generate.reference import described, found_fields
 from docs.generate.runner import CommandError, Runner
 from docs.generate.sessions import Step, steps_of
 from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario

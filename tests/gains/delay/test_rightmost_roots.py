@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import lambertw
 
-from gains import rightmost_roots
+from gains.delay.rightmost import rightmost_roots
 
 
 @pytest.mark.parametrize("delay_s", [0.01, 0.3, 5.0])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from gains import FormationModel, PredictedLoop, Response, Timing, mismatch_window
+from gains import FormationModel, Response, Timing, mismatch_window
 from gains.performance.flown import FlownLoop, FlownTiming
-from gains.performance.predicted import fed_forward
+from gains.performance.predicted import PredictedLoop, fed_forward
 from gains.performance.scalar_gains import ScalarGains
 
 # triangle5

@@ -6,22 +6,14 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from gains import (
-    BadModelError,
-    FormationModel,
-    Response,
-    Timing,
-    mismatch_window,
-    mismatch_window_continuous,
-    predicted_growth_rate,
-    rightmost_root,
-)
+from gains import BadModelError, FormationModel, Response, Timing, mismatch_window, rightmost_root
 from gains.core.arrays import FloatArray
 from gains.performance.response import formation_loop
 from gains.sampled._loop import HeldPlant
 from gains.sampled._mismatch import block_window
 from gains.sampled._nyquist import rates_window
 from gains.sampled.multirate import Predictor, lifted_radius
+from gains.sampled.prediction import mismatch_window_continuous, predicted_growth_rate
 
 Loop = tuple[FloatArray, FloatArray, FloatArray]
 

@@ -28,6 +28,26 @@ def test_python_and_the_command_fly_the_same_bits(tmp_path: Path, monkeypatch: p
     assert flight.table().num_rows == flight.ticks.size
 
 
+def test_the_tutorial_names_every_array() -> None:
+    page = (SCENARIOS.parent / "docs/tutorial/from-python.md").read_text()
+    arrays = [name for name, value in vars(gcs.VirtualFlight).items() if isinstance(value, property)]
+    assert [name for name in arrays if f"`{name}`" not in page] == []
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_table_becomes_a_data_frame_with_the_types_of_the_record(library: str) -> None:
+    frames = pytest.importorskip(library)
+    flight = gcs.fly_virtual(load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0}))
+    table = flight.table()
+    frame = table.to_pandas() if library == "pandas" else frames.from_arrow(table)
+    assert isinstance(frame, frames.DataFrame)
+    assert list(frame.columns) == list(flight.ticks.dtype.names or ())
+    for name in frame.columns:
+        values = frame[name].to_numpy()
+        assert values.dtype == flight.ticks.dtype[name]
+        np.testing.assert_array_equal(values, flight.ticks[name].ravel())
+
+
 def test_arrays_have_ticks_by_vehicles_and_agree_with_the_summary() -> None:
     flight = gcs.fly_virtual("triangle5")
     shape = flight.ticks.shape

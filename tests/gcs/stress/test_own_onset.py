@@ -5,9 +5,8 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from gcs.plan.planner import flight_plan
-from gcs.stress.bracket import bracketed
 from gcs.stress.measure import fly_trial
-from gcs.stress.study import NoOnset, Onset, Study, find_onset
+from gcs.stress.study import NoOnset, Onset, Study, bracketed, find_onset
 from gcs.stress.trial import Outcome, Trial
 from scenarios.schema import Response, Scenario
 from tests.support.fleets.own_code import coded, given

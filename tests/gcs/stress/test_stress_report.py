@@ -16,12 +16,12 @@ from gcs.cli.stress import stress
 from gcs.cli.stress_output import checks_of
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
+from gcs.runs.junit import write_junit
 from gcs.runs.record import SUMMARY_FILE
 from gcs.stress.campaign import TRIALS_FILE, Store, local_workers, run_campaign
 from gcs.stress.report import CampaignResult
 from gcs.stress.study import Onset, Study, find_onset
 from gcs.stress.trial import Outcome
-from gcs.views.junit import write_junit
 from scenarios.files import dump
 from tests.support.fleets.stress_pair import SCENARIO, pair_plan
 from tests.support.paths import DATA

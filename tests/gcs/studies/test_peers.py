@@ -15,8 +15,7 @@ from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.studies.benchmark import GAINS, with_vehicles, without_solver
 from gcs.studies.codec import position_frames, pymavlink_set_point, station_set_point
-from gcs.studies.peer_loops import PeerError, run_script
-from gcs.studies.peers import side_by_side
+from gcs.studies.peers import PeerError, run_script, side_by_side
 from scenarios.files import load
 from tests.support.paths import SCENARIOS
 

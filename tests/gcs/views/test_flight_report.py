@@ -8,12 +8,12 @@ from shutil import which
 import numpy as np
 import pytest
 
-from gcs.control.tick import Mode
+from gcs.control.tick import Event, Mode
 from gcs.runs.files import read_summary
 from gcs.runs.summary import finish
-from gcs.views.flight_report import REPORT_FILE, leave_report
+from gcs.views.flight_report import REPORT_FILE, flight_page, leave_report
 from gcs.views.svg import Line, chart
-from tests.support.fleets.flown_run import line, ticks_of, write_run
+from tests.support.fleets.flown_run import DESIGN, line, ticks_of, write_run
 
 CHROMIUM = which("chromium") or which("chromium-browser") or which("google-chrome")
 
@@ -36,8 +36,30 @@ def test_report_has_verdict_charts_modes_links_and_events(tmp_path: Path) -> Non
     for heading in ("Headroom", "Loop delay and margin", "Spacing errors", "Modes", "Vehicles and links", "Events"):
         assert f"<h2>{heading}</h2>" in page
     assert page.count("<svg") == 3
-    assert "CRITICAL" in page
     assert "duration reached" in page
+
+
+def test_modes_are_of_vehicles_that_left_nominal_in_flight(tmp_path: Path) -> None:
+    scenario = line(3)
+    ticks = ticks_of(scenario, start_s=-0.2, count=260)
+    ticks["mode"][:11] = ticks["mode"][-1:] = Mode.WAITING  # before the first command, and after the last
+    ticks["mode"][130:180, 1] = Mode.CRITICAL
+    write_run(tmp_path, scenario, ticks)
+    leave_report(tmp_path, finish(tmp_path))
+    page = (tmp_path / REPORT_FILE).read_text(encoding="utf-8")
+    modes = page[page.index("<h2>Modes</h2>") :].split("</section>")[0]
+    assert re.findall(r"<span>(\d+)</span>", modes) == ["2"]
+    assert re.findall(r"</i>(\w+)</span>", modes) == ["NOMINAL", "CRITICAL", "WAITING"]
+
+
+def test_what_vehicles_do_at_once_is_one_row(tmp_path: Path) -> None:
+    report(tmp_path, 3)
+    turned = [Event(time_s=0.02, kind="mode", system_id=k, text="WAITING -> NOMINAL") for k in (1, 2, 3)]
+    ended = Event(time_s=5.0, kind="end", text="completed")
+    scenario, ticks = line(3), ticks_of(line(3), start_s=0.0, count=250)
+    page = flight_page(read_summary(tmp_path / "summary.json"), scenario, DESIGN, ticks, [*turned, ended])
+    rows = re.findall(r"<td>([\d.]+)</td><td class=\"text ids\">([\d ]*)</td>", page)
+    assert rows == [("0.02", "1 2 3"), ("5.00", "")]
 
 
 def test_report_needs_nothing_from_elsewhere(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from gcs.runs.files import read_summary
 from gcs.runs.record import SUMMARY_FILE
 from scenarios.errors import ScenarioError
 from scenarios.files import load, with_profile
-from scenarios.profiles import load_profile, names
+from scenarios.link_files import load_profile, names
 from scenarios.shipped import FOLDER
 
 
