@@ -114,7 +114,7 @@ def load_scenario(
     if allow_code is not True and (refused := refusal(scenario, file, allow_code or "")):
         raise InputError(refused)
     if links is not None:
-        scenario = with_profile(scenario, links, Path(links).parent / "--links", "--links")
+        scenario = with_profile(scenario, links, Path("--links"), "profile")
     scenario = scenario if loop is None else with_loop(scenario, loop, file)
     return without(scenario, left_out, file) if left_out else scenario
 

@@ -65,10 +65,11 @@ class _UsageError(Exception):
 def _run(options: argparse.Namespace, signals: list[int], opened: contextlib.ExitStack) -> None:
     from scenarios.files import load
     from scenarios.own_code import refusal
+    from scenarios.shipped import located
     from sim_vehicles.links.truth import TruthLog
 
-    scenario, log = load(options.scenario), None
-    refused = None if options.allow_code or options.links_only else refusal(scenario, options.scenario)
+    scenario, log = load(located(options.scenario)), None
+    refused = None if options.allow_code or options.links_only else refusal(scenario, Path(options.scenario))
     if refused is not None:
         raise _UsageError(refused)
     if options.truth:
@@ -266,7 +267,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = _OneLineParser(
         prog="sim-vehicles", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scenario", type=Path, metavar="SCENARIO", help="scenario file (TOML)")
+    parser.add_argument("scenario", metavar="SCENARIO", help="scenario file (TOML), or the name of one that ships")
     silence = "end when no station has commanded a vehicle for this long (never)"
     parent = "the parent process; with --stop-after-silence: silence counts only after it has ended"
     for name, kind, default, metavar, text in (

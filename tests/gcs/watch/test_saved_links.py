@@ -10,6 +10,7 @@ from gcs.runs.files import read_summary
 from gcs.runs.record import SUMMARY_FILE
 from scenarios.errors import ScenarioError
 from scenarios.files import load, with_profile
+from scenarios.link_files import FOLDER as PROFILES
 from scenarios.link_files import load_profile, names
 from scenarios.shipped import FOLDER
 
@@ -35,6 +36,15 @@ def test_saved_links_lead_to_the_same_loop_delay(tmp_path: Path) -> None:
     # the true median up is 15 ms + 1.678 * 3.79 ms; the clock splits the round trip within its bound
     assert measured.up.delay_s_p50 == pytest.approx(0.02136, abs=measured.up.calibration_error_s)
     assert measured.up.lost > 0
+
+
+def test_links_are_found_relative_to_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "measured").mkdir()
+    (tmp_path / "measured" / "links.toml").write_text((PROFILES / "lte.toml").read_text(encoding="utf-8"))
+    monkeypatch.chdir(tmp_path)
+    assert run("check", "chain3", "--links", "measured/links.toml") == run("check", "chain3", "--links", "lte")
+    with pytest.raises(ScenarioError, match=r"^--links: profile: read 'measured/none.toml: No such file"):
+        run("check", "chain3", "--links", "measured/none.toml")
 
 
 def test_every_shipped_profile_can_be_flown_and_names_its_source() -> None:

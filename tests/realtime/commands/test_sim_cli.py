@@ -197,6 +197,13 @@ def test_wrong_input_is_answered_in_one_line(
     assert named in errors
 
 
+def test_a_scenario_that_ships_is_flown_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    from sim_vehicles.drive.cli import run
+
+    assert run(["chain3", "--duration", "0.1"]) == 0
+    assert "3 vehicles of chain3, to 127.0.0.1:14550" in capsys.readouterr().out
+
+
 def test_help_loads_nothing_slow() -> None:
     """numpy, pydantic and pymavlink take half a second together."""
     program = (
