@@ -303,7 +303,7 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         if vehicle.flavour is not None:
             yield f"vehicles[{k}].flavour", vehicle.flavour, "no such key without dynamics autopilot"
     if scenario.response is not None and scenario.dynamics == "double_integrator":
-        wanted = "no such key, unless dynamics is autopilot or of your own"
+        wanted = "no such key with dynamics double_integrator, which respond at once"
         yield "response", scenario.response.model_dump(), wanted
 
 

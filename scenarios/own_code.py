@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 from scenarios.errors import ScenarioError
-from scenarios.keys.own import BUILT_IN, CodeFile
+from scenarios.keys.own import BUILT_IN, CodeFile, names_code
 from scenarios.schema import Scenario
 
 Fault = tuple[str, object, str]
@@ -31,7 +31,7 @@ def code_names(scenario: Scenario) -> dict[str, str]:
     named = {
         "control.controller": control.controller,
         "control.linear": control.linear,
-        "dynamics": None if scenario.dynamics in BUILT_IN else scenario.dynamics,
+        "dynamics": scenario.dynamics if names_code(scenario.dynamics) else None,
     }
     return {key: name for key, name in named.items() if name is not None}
 
@@ -54,9 +54,9 @@ def own_code_faults(scenario: Scenario) -> Iterator[Fault]:
         if any(vehicle.hears for vehicle in scenario.vehicles):
             yield "vehicles.hears", "system ids", "no such key with method python: the law knows every vehicle"
     if control.loop == "onboard" and (own_law or own_dynamics):
-        key = "method python" if own_law else "dynamics of your own"
+        key = "method python" if own_law else f"dynamics {scenario.dynamics}"
         yield "control.loop", control.loop, f"ground, with {key}"
-    if own_dynamics and scenario.response is not None and scenario.response.velocity_gain_1_s:
+    if names_code(scenario.dynamics) and scenario.response is not None and scenario.response.velocity_gain_1_s:
         wanted = "0, with dynamics of your own: set-points carry accelerations only"
         yield "response.velocity_gain_1_s", scenario.response.velocity_gain_1_s, wanted
 

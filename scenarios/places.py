@@ -77,7 +77,7 @@ _WANTED = {
     "model_type": "a table of keys",
     "model_attributes_type": "a table of keys",
     "dict_type": "a table of keys",
-    "dynamics": "double_integrator, autopilot, or FILE.py:NAME",
+    "dynamics": "double_integrator, autopilot, jsbsim, jsbsim:MODEL, or FILE.py:NAME",
     "prediction": "off, measured, or a number of seconds greater than 0, at most {most:g}",
 }
 """What was wanted, by the type of pydantic's error."""

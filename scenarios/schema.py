@@ -322,7 +322,9 @@ class Scenario(Part):
     dynamics: Dynamics = "double_integrator"
     """`double_integrator`: the UAVs of the thesis, which follow an acceleration at once and are launched in the air.
     `autopilot`: multicopters with an autopilot, which start on the ground. A function in a Python file, such as
-    `"my_model.py:step"`: vehicles launched in the air that move as it says; run only with `--allow-code`."""
+    `"my_model.py:step"`: vehicles launched in the air that move as it says; run only with `--allow-code`. `jsbsim`:
+    aircraft with six degrees of freedom and an autopilot, launched in the air; `"jsbsim:f16"` names another model of
+    that package than its T-6 Texan II."""
     autopilot: Autopilot = Autopilot()
     """The simulated multicopters, with `dynamics = "autopilot"`."""
     response: Response | None = None

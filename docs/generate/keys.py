@@ -134,6 +134,7 @@ def _default(given: Node, node: Node, *, required: bool) -> str:
 _PATTERNS = {
     r"^[A-Za-z0-9_-]+$": "letters, digits, `_` and `-`",
     r"^[^:]+\.py:[A-Za-z_][A-Za-z0-9_]*$": "FILE.py:NAME",
+    r"^jsbsim(:[A-Za-z0-9_-]+)?$": "jsbsim or jsbsim:MODEL",
     r"^[0-9a-f]{64}$": "64 hexadecimal digits",
 }
 """What a pattern of the schema asks for."""

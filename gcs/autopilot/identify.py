@@ -28,7 +28,7 @@ MISFIT_MAX = 0.1
 LEAST_RATE_HZ = 10.0
 _FEWEST_SAMPLES = 42
 """Of the sixty at 10 Hz, so that some may be lost."""
-_BOUNDS = np.log([(0.01, 3.0), (0.02, 10.0), (0.002, 0.5), (2.0, 200.0)])
+_BOUNDS = np.log([(0.01, 3.0), (0.001, 10.0), (0.002, 0.5), (0.5, 200.0)])
 """Lag, velocity gain, dead time, natural frequency."""
 _USED = {"lag": [0, 1], "lag with dead time": [0, 1, 2], "second order": [0, 1, 3]}
 _STEPS, _NUDGE, _STEPS_A_TICK = 24, 1e-4, 2

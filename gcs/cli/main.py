@@ -14,7 +14,7 @@ from gcs.cli.fly import fly, key
 from gcs.cli.runs import export, grade, recover, view
 from gcs.cli.scenarios import check, design, margin, new, scenarios
 from gcs.cli.stress import stress
-from gcs.cli.studies import bench, capacity, compare, thesis
+from gcs.cli.studies import bench, capacity, compare, identify, thesis
 from gcs.cli.watch import monitor, replay
 from gcs.errors import InputError, extra_wanted
 from gcs.output import DISK_FULL
@@ -47,8 +47,8 @@ def help_without_command(
 
 
 _COMMANDS = (
-    scenarios, new, check, fly, design, compare, margin, thesis, bench, capacity, grade, view, export, recover, key,
-    stress, monitor, replay,
+    scenarios, new, check, identify, fly, design, compare, margin, thesis, bench, capacity, grade, view, export,
+    recover, key, stress, monitor, replay,
 )  # fmt: skip
 for _command in _COMMANDS:
     app.command()(_command)

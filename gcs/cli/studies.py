@@ -47,6 +47,16 @@ def compare(
     raise typer.Exit(0 if flights else FAILED)
 
 
+def identify(scenario_file: options.ScenarioFile, allow_code: options.AllowCode = False) -> None:
+    """Find how the vehicles of a scenario respond, in a short flight in virtual time, and print it as [response].
+
+    For dynamics = "jsbsim" and dynamics in a Python file; autopilots are identified in flight.
+    """
+    from gcs.studies.identification import as_toml, responses_of
+
+    typer.echo(as_toml(responses_of(options.load_scenario(scenario_file, allow_code=allow_code))))
+
+
 def thesis(
     out: options.OutFolder = None,
     as_json: options.AsJson = False,

@@ -32,7 +32,7 @@ from scenarios.own_code import code_names, function_of
 from scenarios.schema import GainBlock, Scenario
 
 NOT_LINEAR = "law is not linear; measure it with gcs stress --onset"
-OWN_DYNAMICS = "dynamics of your own without [response]; measure it with gcs stress --onset"
+OWN_DYNAMICS = "dynamics without [response], which gcs identify finds; or measure it with gcs stress --onset"
 TOLERANCE = 1e-6
 """Largest difference between a law and its matrices, relative to the largest entry of K."""
 _STEP = 1e-3

@@ -1,4 +1,4 @@
-"""Code of the user's own that a scenario names: a control law, and a vehicle's dynamics. Nothing here runs it."""
+"""Code of others that a scenario names: a control law, a vehicle's dynamics, an aircraft. Nothing here runs it."""
 
 from hashlib import sha256
 from typing import Annotated, Literal
@@ -12,6 +12,10 @@ CodeName = Annotated[str, Field(pattern=r"^[^:]+\.py:[A-Za-z_][A-Za-z0-9_]*$")]
 """A name in a Python file, whose path is relative to the scenario file."""
 
 
+AircraftName = Annotated[str, Field(pattern=r"^jsbsim(:[A-Za-z0-9_-]+)?$")]
+"""A model of the package jsbsim."""
+
+
 def _one_fault(value: object, validate: ValidatorFunctionWrapHandler) -> object:
     """One fault for a key of two types; pydantic reports one for each of them."""
     try:
@@ -20,10 +24,26 @@ def _one_fault(value: object, validate: ValidatorFunctionWrapHandler) -> object:
         raise PydanticCustomError("dynamics", "dynamics") from error
 
 
-Dynamics = Annotated[Literal["double_integrator", "autopilot"] | CodeName, WrapValidator(_one_fault)]
+Dynamics = Annotated[Literal["double_integrator", "autopilot"] | AircraftName | CodeName, WrapValidator(_one_fault)]
 NO_LAW = {"controller": None, "linear": None}
 """What changes in `[control]` for a method other than python."""
 BUILT_IN = "double_integrator", "autopilot"
+"""Dynamics whose response is known, or identified by the station."""
+
+
+def names_code(dynamics: str) -> bool:
+    """Whether dynamics are a function in a Python file."""
+    return ".py:" in dynamics
+
+
+def aircraft_of(dynamics: str) -> str:
+    """The model of the package jsbsim that dynamics name; empty if they name none.
+
+    >>> aircraft_of("jsbsim"), aircraft_of("jsbsim:f16"), aircraft_of("my_model.py:step")
+    ('t6texan2', 'f16', '')
+    """
+    package, _, model = dynamics.partition(":")
+    return (model or "t6texan2") if package == "jsbsim" else ""
 
 
 class CodeFile(Part):

@@ -8,9 +8,10 @@ import math
 from collections.abc import Mapping
 
 from scenarios import schema
-from scenarios.keys.own import BUILT_IN
+from scenarios.keys.own import aircraft_of, names_code
 from scenarios.schema import NS_PER_S
 from sim_vehicles.motion.air import Air, Push, air_of
+from sim_vehicles.motion.aircraft import Aircraft, Attitude
 from sim_vehicles.motion.double_integrator import (
     COAST,
     VELOCITY_GAIN_1_S,
@@ -85,7 +86,8 @@ class DoubleIntegrator:
         self._state_ns = radio.start_ns
         self._command = COAST
         self._air = air_of(scenario, own.system_id, radio.start_ns, radio.record)
-        self._own = None if scenario.dynamics in BUILT_IN else OwnMotion(scenario, self._note_fault)
+        self._aircraft = Aircraft(scenario, own) if aircraft_of(scenario.dynamics) else None
+        self._own = OwnMotion(scenario, self._note_fault) if names_code(scenario.dynamics) else self._aircraft
         """Dynamics of its own, which replace the double integrator's; `_air` is there, too, then."""
         self._navigator = None if scenario.navigation is None else Navigator(scenario, own.system_id, radio.record)
         if onboard is not None:
@@ -247,7 +249,8 @@ class DoubleIntegrator:
             place, velocity = state[0:2], state.velocity_ne_m_s()
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
-            return encoder.local_position(boot_ms, (*place, -self._altitude_m), (*velocity, 0.0))
+            climbed_m, climb_m_s = (0.0, 0.0) if self._aircraft is None else self._aircraft.climbed()
+            return encoder.local_position(boot_ms, (*place, -self._altitude_m - climbed_m), (*velocity, -climb_m_s))
         if message_id == mavlink.POSITION_TARGET:
             return self._active_target(boot_ms)
         return encoder.pack(messages.report(message_id, self._condition(boot_ms)))
@@ -262,18 +265,25 @@ class DoubleIntegrator:
             messages.position_target(boot_ms, _ACCELERATION_ONLY, (0.0, 0.0, 0.0), followed)
         )
 
-    def _condition(self, boot_ms: int) -> messages.Condition:
-        """What it reports to other ground stations; in flight its roll is that of a coordinated turn."""
+    def _attitude(self) -> Attitude:
+        """Height, climb rate and angles; in flight a double integrator has the roll of a coordinated turn."""
+        if self._aircraft is not None:
+            return self._aircraft.attitude()
         state, roll_rad = self._state, 0.0
         if self.flight.flying:
             _, _, turn_rate_rad_s, _ = rates(state.yaw_rad, state.speed_m_s, self._command, self._bounds)
             roll_rad = math.atan2(state.speed_m_s * turn_rate_rad_s, GRAVITY_M_S2)
+        return Attitude(0.0, 0.0, roll_rad, 0.0, math.remainder(state.yaw_rad, math.tau))
+
+    def _condition(self, boot_ms: int) -> messages.Condition:
+        """What it reports to other ground stations."""
+        state, attitude = self._state, self._attitude()
         return messages.Condition(
             boot_ms,
             degrees(state.north_m, state.east_m),
-            ORIGIN_ALTITUDE_M + self._altitude_m,
-            (*state.velocity_ne_m_s(), 0.0),
-            (roll_rad, 0.0, math.remainder(state.yaw_rad, math.tau)),
+            ORIGIN_ALTITUDE_M + self._altitude_m + attitude.climbed_m,
+            (*state.velocity_ne_m_s(), -attitude.climb_m_s),
+            (attitude.roll_rad, attitude.pitch_rad, math.remainder(attitude.heading_rad, math.tau)),
             flying=self.flight.flying,
             has_position=True,
         )

@@ -61,7 +61,11 @@ def test_a_copy_in_another_folder_is_the_same_experiment(tmp_path: Path) -> None
         ('method = "python"', 'method = "inclusion"', "wanted no such key, unless method is python"),
         ('controller = "own.py:soft"', "", "control.controller (line 33): read 'nothing', wanted FILE.py:NAME"),
         ('loop = "ground"', 'loop = "onboard"', "wanted ground, with method python"),
-        ('dynamics = "double_integrator"', 'dynamics = "bird"', "double_integrator, autopilot, or FILE.py:NAME"),
+        (
+            'dynamics = "double_integrator"',
+            'dynamics = "bird"',
+            "double_integrator, autopilot, jsbsim, jsbsim:MODEL, or FILE.py:NAME",
+        ),
     ],
 )
 def test_contradictions_are_refused(was: str, becomes: str, wanted: str, tmp_path: Path) -> None:
