@@ -181,13 +181,14 @@ def _study(
 
 def _say_how_long(study: "Study", axes: "list[Axis]", seeds: int, workers: int) -> None:
     """Say how many flights a sweep has and how long they will take, by the speed of one second of such a flight."""
-    from gcs.stress.free_response import PROBE_S
-    from gcs.studies.benchmark import benchmark
+    from gcs.stress.free_response import in_place
+    from gcs.studies.benchmark import start_and_speed
 
-    scenario, trials = study.plan.scenario, study.sweep(axes, seeds=seeds)
-    flown_s = sum(PROBE_S if trial.kind == "probe" else scenario.duration_s for trial in trials)
-    factor = 1.0 if study.real_time else benchmark(scenario, seconds=1.0, repeat=1).real_time_factor
-    expected = _duration_text(flown_s / factor / workers)
+    trials = study.sweep(axes, seeds=seeds)
+    start_s, factor = start_and_speed(study.plan, seconds=1.0)
+    probe_s = in_place(study.plan, (), amplitude=0.0).duration_s
+    flown_s = sum(start_s + (probe_s if trial.kind == "probe" else trial.scenario.duration_s) for trial in trials)
+    expected = _duration_text(flown_s / (1.0 if study.real_time else factor) / workers)
     typer.echo(f"flights  {len(trials)}, {flown_s:.0f} s in all: about {expected} with {workers} at a time", err=True)
 
 

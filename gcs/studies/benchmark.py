@@ -3,7 +3,7 @@
 import os
 import tempfile
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
 from typing import NamedTuple
@@ -148,6 +148,13 @@ def benchmark(scenario: Scenario, *, seconds: float, repeat: int, signed: bool =
         flights=repeat,
         signed=_cost(signed_flights, flights) if signed else None,
     )
+
+
+def start_and_speed(plan: FlightPlan, *, seconds: float) -> tuple[float, float]:
+    """How long a plan's vehicles take to start, in s with the take-off, and the seconds flown in one of run time."""
+    flown = _flight(replace(plan, scenario=plan.scenario.model_copy(update={"duration_s": seconds})))
+    period_s = 1.0 / plan.scenario.rates.control_hz
+    return flown.ticks * period_s - seconds, period_s / flown.s_per_tick
 
 
 def _cost(signed: list[_Flown], plain: list[_Flown]) -> SigningCost:

@@ -17,6 +17,7 @@ from gcs.plan.planner import described, flight_plan
 from gcs.runs.summary import verdict
 from gcs.station.absence import TAKEN_OVER
 from gcs.station.station import Station
+from gcs.studies.benchmark import start_and_speed
 from scenarios.keys.link import Link, Outage, VehicleLinks
 from scenarios.schema import ClockJump
 from sim_vehicles.drive.fleet import Fleet
@@ -40,6 +41,12 @@ def test_copters_start_on_the_ground_fly_the_formation_and_hold(flavour: str) ->
         copter = flight.copter(system_id)
         assert copter.mode == copter.rules.hold_mode
         assert copter.motion.altitude_m == pytest.approx(20.0, abs=0.3)
+
+
+def test_the_announced_time_of_a_sweep_has_the_take_off() -> None:
+    flight = fly(planned("ardupilot"))
+    start_s = flight.flown["due_ns"].min() * 1e-9 - START_NS * 1e-9
+    assert start_and_speed(planned("ardupilot"), seconds=1.0)[0] == pytest.approx(start_s, abs=0.1)
 
 
 def test_distances_are_true_though_each_vehicle_has_its_own_origin() -> None:

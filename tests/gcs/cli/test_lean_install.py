@@ -93,7 +93,7 @@ def test_campaign_without_matplotlib_has_a_report_without_figures(
     assert gcs(monkeypatch, "stress", file, "--delay", "0.1", "--workers", "1", "--out", out) == 0
     told = capsys.readouterr().err
     assert "no figures: the package matplotlib is not installed" in told
-    assert "flights  2, 23 s in all: about " in told
+    assert "flights  2, 24 s in all: about " in told
     page = (out / "report.html").read_text(encoding="utf-8")
     assert "<img" not in page
     assert "All points" in page
