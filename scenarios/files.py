@@ -208,8 +208,6 @@ def _control_contradictions(scenario: Scenario) -> Iterator[_Fault]:
     if control.feed_forward and (control.gains is None or control.loop == "onboard"):
         wanted = "0, unless gains are given and loop is ground: no design method provides for it"
         yield "control.feed_forward", control.feed_forward, wanted
-    if control.prediction != "off" and control.loop == "onboard":
-        yield "control.prediction", control.prediction, "off, with loop onboard: vehicles feed back their own errors"
     if control.prediction != "off" and scenario.dynamics != "double_integrator" and scenario.response is None:
         wanted = f"off, with dynamics {scenario.dynamics} and no [response]: a response must be known to be predicted"
         yield "control.prediction", control.prediction, wanted

@@ -156,8 +156,9 @@ class Control(Part):
     prediction: Prediction = "off"
     """The loop delay over which the station predicts each vehicle from its newest state and the set-points that act
     after it. A number: that many seconds. `measured`: the delay measured for each vehicle, smoothed; the assumed delay
-    changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. Only with `loop = "ground"`;
-    with `dynamics = "autopilot"` the file must give the `response`, which is part of the prediction."""
+    changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. With `loop = "onboard"` what
+    the station streams is predicted. With `dynamics = "autopilot"` the file must give the `response`, which is part of
+    the prediction."""
     for_link: Literal["off", "measured"] = "off"
     """`measured`: gains of the inclusion principle, and whether to predict, are chosen for links that were measured
     before (`--links-of`). `criteria` and `string_peak_max` are met at the delays of these links."""
@@ -391,7 +392,9 @@ class Scenario(Part):
     @property
     def target_hz(self) -> float:
         """How often each vehicle is asked for its active target; 0 for never."""
-        return 0.0 if self.control.prediction == "off" else min(self.rates.target_hz, self.rates.telemetry_hz)
+        if self.control.prediction == "off" or self.control.loop == "onboard":
+            return 0.0  # on board, targets do not show which set-point acted
+        return min(self.rates.target_hz, self.rates.telemetry_hz)
 
     @property
     def has_altitude_slots(self) -> bool:

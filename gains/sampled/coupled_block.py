@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.linalg import pinv
 
 from gains.core.arrays import FloatArray
 from gains.delay.constant import delay_margin
@@ -16,7 +17,7 @@ from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
 from gains.sampled._loop import carry
 from gains.sampled.multirate import Timing, multirate_delay_margin, multirate_growth_rate
-from gains.sampled.onboard import OnboardTiming, onboard_loop
+from gains.sampled.onboard import OnboardTiming, onboard_loop, streamed_loop
 from gains.sampled.prediction import (
     checked_mask,
     mismatch_window,
@@ -68,8 +69,8 @@ class GroundLoop:
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedGroundLoop:
-    """The same by a station that predicts over `assumed_s`; `measured` as in `gains.sampled.prediction`."""
+class PredictedLoop:
+    """A station predicts over `assumed_s`; `measured` as in `gains.sampled.prediction`."""
 
     A: FloatArray
     B: FloatArray
@@ -131,9 +132,11 @@ class CoupledBlock:
     def growth_continuous_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
         """The same where each vehicle's command has a loop delay of its own (`gains.delay.several`)."""
         known, late = self.loop.continuous_terms()
-        driven = (self.B != 0.0).reshape(len(self.B), len(self.system_ids), -1).any(axis=2)
         delays_s = [loop_delay_s[system_id] + self.timing.held_s / 2.0 for system_id in self.system_ids]
-        own = [late * driven[:, [k]] for k in range(len(delays_s))]
+        entries, commands = (
+            np.split(part, len(delays_s), axis) for part, axis in ((self.B, 1), (pinv(self.B) @ late, 0))
+        )
+        own = [B @ command for B, command in zip(entries, commands, strict=True)]
         return rightmost_root([*known, *zip(own, delays_s, strict=True)]).real
 
     def growth_at_1_s(self, loop_delay_s: Mapping[int, float]) -> float:
@@ -173,7 +176,7 @@ def coupled_blocks(
     """The blocks of a formation flown with the gain K (inputs, states) of u = K e, those ahead first.
 
     `system_ids` has one for each vehicle, in the order of `model`. Without `onboard`, the timing of the onboard loop,
-    the station closes every loop, and predicts over `assumed_s` if that is given. `responding` is A, B and K of the
+    the station closes every loop. It predicts over `assumed_s` if that is given. `responding` is A, B and K of the
     formation with the vehicles' responses, and `response_states` which of its states are those of each vehicle's
     (`gains.performance.response`); without them the vehicles respond at once.
 
@@ -188,8 +191,10 @@ def coupled_blocks(
     >>> [(block.system_ids, round(block.margin_s(), 3)) for block in blocks]
     [((1,), 1.561), ((2,), 0.701), ((3,), 0.701)]
     """
-    whole = None if onboard is None else onboard_loop(model, K, onboard)
+    whole = None if onboard is None or assumed_s is not None else onboard_loop(model, K, onboard)
     A, B, gain = (model.A, model.B, K) if responding is None else responding
+    if onboard is not None and assumed_s is not None:
+        A, B, gain = streamed_loop(model, K, onboard)
     blocks: list[CoupledBlock] = []
     for members in model.coupled_vehicles(K):
         errors = np.concatenate([np.r_[model.output_slice(i)] for i in members])
@@ -200,7 +205,7 @@ def coupled_blocks(
         if whole is not None:
             loop = whole.part(own)
         elif assumed_s is not None:
-            loop = PredictedGroundLoop(*matrices, timing, assumed_s, [state < model.states for state in own.tolist()])
+            loop = PredictedLoop(*matrices, timing, assumed_s, [state < model.states for state in own.tolist()])
         blocks.append(CoupledBlock(tuple(system_ids[i] for i in members), *matrices, timing, loop, assumed_s))
     return blocks
 

@@ -233,7 +233,9 @@ def multirate_map(
                     state[computed] = by_now[computed]
                 if predictor:
                     acts_s = max(taken_s, acting_s[-1])
-                    state = predictor.carried(state, samples, acting_s, from_s=taken_s, to_s=acts_s, first=-earlier)
+                    state = predictor.carried(
+                        state[:on], samples, acting_s, from_s=taken_s, to_s=acts_s, first=-earlier
+                    )
                 samples[i] = plant.K @ state[:on]
         command = max(i for acts_s, i in acting if acts_s <= instant + close_s)
         x = Phi @ x + hold @ samples[command]

@@ -2,8 +2,8 @@
 
 `gcs.control.manoeuvring.loop_of` chooses once; nothing else in the station asks for the scenario's `loop`. With the
 loop on board, a vehicle feeds back its own errors and the station streams the rest: K_ij e_j of the other vehicles. All
-errors streamed to a vehicle are taken at one instant, that of the oldest among the newest states it needs. Nothing is
-extrapolated, and the loop delay counts from that instant.
+errors streamed to a vehicle are taken at one instant, that of the oldest among the newest states it needs. The loop
+delay counts from that instant; nothing is extrapolated, unless the station predicts.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from gains.sampled.onboard import own_part
 from gcs.control.acted import ActiveTargets
 from gcs.control.history import Reports
 from gcs.control.law import Blend, FeedbackLaw, VehicleControl, VehicleLaw, command_at, feedback_law, formation_control
+from gcs.control.predicted_stream import StreamPrediction
 from gcs.control.prediction import CommandHistory, Delivery, FixedDelivery, MeasuredDelivery, PredictedStates
 from gcs.control.responding import Responding
 from gcs.link import mavlink
@@ -86,7 +87,7 @@ def steady_loop(plan: FlightPlan) -> Loop:
     """The loop of a formation that keeps its shape and whose nominal velocity changes in steps."""
     control = plan.scenario.control
     if control.loop == "onboard":
-        return StreamedLoop(plan)
+        return StreamedLoop(plan) if control.prediction == "off" else PredictingStreamedLoop(plan)
     return GroundLoop(plan) if control.prediction == "off" else PredictingGroundLoop(plan)
 
 
@@ -130,15 +131,13 @@ class PredictingGroundLoop:
     def __init__(self, plan: FlightPlan) -> None:
         self._ground, self._row = GroundLoop(plan), plan.formation.row
         self.law, self.parameters = self._ground.law, self._ground.parameters
-        prediction, vehicles = plan.scenario.control.prediction, range(plan.model.vehicles)
+        vehicles = range(plan.model.vehicles)
         every = plan.responses_in_order
         held_ns = round(plan.scenario.safety.setpoint_timeout_s * NS_PER_S)
         self._sent = [CommandHistory(held_ns, None if every is None else Responding(every[row])) for row in vehicles]
         period_ns = round(NS_PER_S / plan.scenario.rates.control_hz)
         self._targets = [ActiveTargets(own, period_ns=period_ns, held_ns=held_ns) for own in self._sent]
-        self._deliveries: list[Delivery] = [
-            MeasuredDelivery() if isinstance(prediction, str) else FixedDelivery(prediction) for _ in vehicles
-        ]
+        self._deliveries = _deliveries(plan)
         self._states = PredictedStates(self._sent, self._deliveries, plan.timing.commands)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
@@ -194,11 +193,14 @@ class StreamedLoop:
             if own is not None and used_ns not in (0, control.sample_ns):
                 command = command_at(history, own, row, used_ns, blend, nominal_m_s, opening)
                 control = control._replace(command_m_s2=command, used_ns=used_ns)
-            north, east = control.command_m_s2
-            more_north, more_east = self._opened_m_s2[row]
-            command = north + (opening - 1.0) * more_north, east + (opening - 1.0) * more_east
-            controls[row] = control._replace(command_m_s2=command)
+            controls[row] = self.opened(row, control, control.command_m_s2, opening)
         return controls
+
+    def opened(self, row: int, control: VehicleControl, command_m_s2: Vector, opening: float) -> VehicleControl:
+        """The control with this command and what a wider spacing adds, of which the vehicle knows nothing."""
+        (north, east), (more_north, more_east) = command_m_s2, self._opened_m_s2[row]
+        command = north + (opening - 1.0) * more_north, east + (opening - 1.0) * more_east
+        return control._replace(command_m_s2=command)
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
         """Nothing to do: nothing is predicted."""
@@ -220,6 +222,47 @@ class StreamedLoop:
     def parameters(self, system_id: int) -> dict[str, float]:
         formation = self._plan.formation
         return own_parameters(formation, self._plan.gain, formation.row(system_id))
+
+
+class PredictingStreamedLoop:
+    """The same, fed with the errors at the instant at which each set-point acts (`gcs.control.predicted_stream`)."""
+
+    def __init__(self, plan: FlightPlan) -> None:
+        self._streamed, self._row = StreamedLoop(plan), plan.formation.row
+        self.law, self.parameters = self._streamed.law, self._streamed.parameters
+        self.sent, self.active = self._streamed.sent, self._streamed.active
+        self._prediction = StreamPrediction(plan, _deliveries(plan))
+
+    def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
+        controls = self._streamed.control(history, law, blends, now)
+        nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
+        self._prediction.look(history, law, now.due_ns, nominal_m_s)
+        for row, own in enumerate(law):
+            found = None if own is None else self._prediction.states(row)
+            if own is not None and found is not None:
+                acts_ns, assumed_s, states = found
+                command = command_at(states, own, row, acts_ns, blends[row], nominal_m_s, opening)
+                control = controls[row]._replace(used_ns=self._prediction.used_ns(row), assumed_s=assumed_s)
+                controls[row] = self._streamed.opened(row, control, command, opening)
+        return controls
+
+    def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
+        self._prediction.deliveries[row].measured(down_ns, sent_ns)
+
+    def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
+        self.remember(self._row(system_id), order.due_ns, order.control.command_m_s2)
+        return self._streamed.set_point(system_id, order)
+
+    def remember(self, row: int, due_ns: int, acceleration_m_s2: Vector) -> None:
+        del due_ns  # that of the tick begun
+        self._prediction.remember(row, acceleration_m_s2)
+
+
+def _deliveries(plan: FlightPlan) -> list[Delivery]:
+    assumed = plan.scenario.control.prediction
+    return [
+        MeasuredDelivery() if isinstance(assumed, str) else FixedDelivery(assumed) for _ in range(plan.model.vehicles)
+    ]
 
 
 def _gains(plan: FlightPlan, lost: Sequence[bool]) -> tuple[Any, ...]:

@@ -16,9 +16,8 @@ from gains.sampled.constant import growth_rate
 from gains.sampled.onboard import onboard_loop
 from gcs.link.clocks import REQUEST_LIFETIME_NS
 from gcs.plan.course import nearest_planned
-from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.formation import plan_formation
-from gcs.plan.onboard import timing_of
 from scenarios.schema import NS_PER_S, Scenario
 
 
@@ -63,7 +62,7 @@ def _rightmost_root(plan: FlightPlan) -> tuple[complex, list[int]]:
 
 
 def _sampled_growth_1_s(plan: FlightPlan) -> float:
-    timing = timing_of(plan.scenario)
+    timing = onboard_timing(plan.scenario)
     if timing is not None:
         return onboard_loop(plan.model, plan.gain, timing).growth_1_s(0.0)
     return growth_rate(*_matrices(plan), period_s=1.0 / plan.scenario.rates.control_hz, delay_s=0.0)

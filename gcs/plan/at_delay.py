@@ -67,9 +67,10 @@ def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDel
         fixed_s = design.prediction.assumed_delay_s
         assumed_s = delay_s if fixed_s is None else fixed_s
     entry = _gain_set(design, gain_set)
+    has_chain = design.inclusion_gains is not None and design.loop == "ground"
     loops = [
         PredictedLoop(chain.gains, design.period_s, assumed_s, chain.response, design.feed_forward)
-        for chain in (_follower_loops(design, entry) if design.inclusion_gains is not None else [])
+        for chain in (_follower_loops(design, entry) if has_chain else [])
     ]
     if not loops:
         return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)

@@ -13,6 +13,7 @@ from gains.formation.model import FormationModel
 from gains.performance.lone_margin import lone_margin
 from gains.performance.response import Response, sampled_margin
 from gains.sampled.multirate import Timing
+from gains.sampled.onboard import OnboardTiming
 from gcs.plan.formation import Formation
 from gcs.plan.mismatch import TABULATED_S, Tabulated, Tolerated, Window, distances, window
 from scenarios.schema import Scenario
@@ -73,13 +74,13 @@ class FlightPlan:
     @cached_property
     def tolerance(self) -> Callable[[float], Tolerated]:
         """By how much the loop delay may miss the one that the station assumes, at that one."""
-        prediction, responses = self.scenario.control.prediction, self.responses_in_order
+        prediction = self.scenario.control.prediction
         if prediction == "off":
             without = Tolerated((inf,) * len(self.margins_s), self.margins_s)
             return lambda _: without
 
         def windows(K: FloatArray, *assumed_s: float) -> list[Window]:
-            return [window(self.model, K, self.timing, at_s, responses) for at_s in assumed_s]
+            return [window(self.model, K, self.timing, at_s, *self.vehicles_own) for at_s in assumed_s]
 
         if isinstance(prediction, str):
             return Tabulated([windows(K, *TABULATED_S) for K in self.gains])
@@ -91,6 +92,11 @@ class FlightPlan:
     def responses_in_order(self) -> list[Response] | None:
         """The vehicles' responses in the model's order; None if they are immediate or unknown."""
         return None if self.responses is None else self.responses.in_order(self.formation.system_ids)
+
+    @property
+    def vehicles_own(self) -> tuple[list[Response] | None, OnboardTiming | None]:
+        """What vehicles do by themselves: their responses, and the timing of their own loops."""
+        return self.responses_in_order, onboard_timing(self.scenario)
 
     @property
     def assumed_s(self) -> float | None:
@@ -117,6 +123,19 @@ class FlightPlan:
 def loop_timing(scenario: Scenario) -> Timing:
     """The periods at which states and commands of a scenario are sent."""
     return Timing(1.0 / scenario.rates.control_hz, 1.0 / scenario.rates.telemetry_hz)
+
+
+def onboard_timing(scenario: Scenario) -> OnboardTiming | None:
+    """The timing of the onboard loop; None if the station closes every loop."""
+    if scenario.control.loop != "onboard":
+        return None
+    own, control_hz = scenario.onboard, scenario.rates.control_hz
+    return OnboardTiming(
+        1.0 / control_hz,
+        steps=round(own.rate_hz / control_hz),
+        steps_per_sample=round(own.rate_hz / own.sensor_hz),
+        telemetry_s=1.0 / scenario.rates.telemetry_hz,
+    )
 
 
 def given_responses(scenario: Scenario) -> Responses | None:

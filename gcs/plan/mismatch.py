@@ -15,6 +15,7 @@ from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
 from gains.sampled.multirate import Timing
+from gains.sampled.onboard import OnboardTiming, streamed_loop
 from gains.sampled.prediction import mismatch_window, mismatch_window_continuous
 from scenarios.keys.part import PREDICTION_MAX_S
 
@@ -93,16 +94,18 @@ def window(
     timing: Timing,
     assumed_s: float,
     responses: Sequence[Response] | None = None,
+    onboard: OnboardTiming | None = None,
 ) -> Window:
     """The mismatch window of a sampled formation that is predicted over `assumed_s`.
 
-    `responses` are those of the vehicles in the model's order; without them they respond at once. The map of one period
+    `responses` are those of the vehicles in the model's order; without them they respond at once. `onboard` is the
+    timing of the vehicles' own loops, if they have one. The map of one period
     has a state for each command on its way. Where these are too many, the window is that of the continuous model, which
     differs by less than a period of both rates at either end, less such a period at both.
     """
     if assumed_s <= _MOST_ON_THE_WAY * timing.faster_s:
-        return _window(model, K.tobytes(), timing, assumed_s, None if responses is None else tuple(responses))
-    least_s, most_s = continuous_window(model, K, timing, assumed_s, responses)
+        return _window(model, K.tobytes(), timing, assumed_s, None if responses is None else tuple(responses), onboard)
+    least_s, most_s = continuous_window(model, K, timing, assumed_s, responses, onboard)
     return min(assumed_s, least_s + timing.common_s), max(assumed_s, most_s - timing.common_s)
 
 
@@ -112,28 +115,39 @@ def continuous_window(
     timing: Timing,
     assumed_s: float,
     responses: Sequence[Response] | None = None,
+    onboard: OnboardTiming | None = None,
 ) -> Window:
     """The mismatch window of the continuous model, in which the hold counts as half a period of delay."""
     half_s = timing.held_s / 2.0
-    loop, measured = predicted_loop(model, K, responses)
+    loop, measured = predicted_loop(model, K, responses, onboard)
     least_s, most_s = mismatch_window_continuous(*loop, assumed_s=assumed_s + half_s, measured=measured)
     return max(0.0, least_s - half_s), most_s - half_s
 
 
 @lru_cache(maxsize=1024)
 def _window(
-    model: FormationModel, gain: bytes, timing: Timing, assumed_s: float, responses: tuple[Response, ...] | None
+    model: FormationModel,
+    gain: bytes,
+    timing: Timing,
+    assumed_s: float,
+    responses: tuple[Response, ...] | None,
+    onboard: OnboardTiming | None,
 ) -> Window:
     """Cached: all flights of a campaign use the same windows."""
     K = np.frombuffer(gain).reshape(model.inputs, model.states)
-    loop, measured = predicted_loop(model, K, responses)
+    loop, measured = predicted_loop(model, K, responses, onboard)
     return mismatch_window(*loop, timing, assumed_s=assumed_s, measured=measured)
 
 
 def predicted_loop(
-    model: FormationModel, K: FloatArray, responses: Sequence[Response] | None
+    model: FormationModel,
+    K: FloatArray,
+    responses: Sequence[Response] | None,
+    onboard: OnboardTiming | None = None,
 ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], list[bool] | None]:
     """A, B and K, and which states are measured: the errors, not what is computed of the responses."""
+    if onboard is not None:
+        return streamed_loop(model, K, onboard), None
     if responses is None:
         return (model.A, model.B, K), None
     loop = formation_loop(model, K, responses)

@@ -13,26 +13,15 @@ import numpy as np
 from gains.core.arrays import FloatArray
 from gains.core.requirement import plain
 from gains.performance.behaviour import behaviour
-from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
+from gains.sampled.onboard import onboard_loop, own_part, streamed_loop
+from gcs.errors import InputError
 from gcs.plan.design import Behaviour, Design, GainSet, OnboardPart
-from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.formation import Formation
-from scenarios.schema import Scenario
 
 AXES = "NE"
-
-
-def timing_of(scenario: Scenario) -> OnboardTiming | None:
-    """The timing of the onboard loop; None if the station closes every loop."""
-    if scenario.control.loop != "onboard":
-        return None
-    own, control_hz = scenario.onboard, scenario.rates.control_hz
-    return OnboardTiming(
-        1.0 / control_hz,
-        steps=round(own.rate_hz / control_hz),
-        steps_per_sample=round(own.rate_hz / own.sensor_hz),
-        telemetry_s=1.0 / scenario.rates.telemetry_hz,
-    )
+_STILL_1_S = 1e-6
+"""Own loops may hold an error, to rounding: what the station computes of them must not grow."""
 
 
 def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
@@ -42,7 +31,7 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     entries of the schedule keep the vehicles' own gains and reduce the share of the stream. Without any of it the
     formation is stable at every delay: where vehicles act on each other both ways, that is flown around a lost one.
     """
-    timing = timing_of(plan.scenario)
+    timing = onboard_timing(plan.scenario)
     assert timing is not None
     own = own_part(plan.model, plan.gain).astype(np.float32).astype(np.float64)
     others = plan.gain - own_part(plan.model, plan.gain)
@@ -50,6 +39,13 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     gains = [own + share * others for share in shares]
     loops = [onboard_loop(plan.model, gain, timing) for gain in gains]
     sampled_s = [loop.sampled_margin_s() for loop in loops]
+    if plan.scenario.control.prediction != "off":
+        A, _, _ = streamed_loop(plan.model, gains[0], timing)
+        if (fastest_1_s := float(np.linalg.eigvals(A).real.max())) > _STILL_1_S:
+            raise InputError(
+                f"{plan.scenario.name}: control.prediction: read own loops whose errors grow at {fastest_1_s:.3g} 1/s "
+                "without the stream, wanted stable ones with loop onboard"
+            )
     onboard = OnboardPart(
         rate_hz=plan.scenario.onboard.rate_hz,
         sensor_hz=plan.scenario.onboard.sensor_hz,

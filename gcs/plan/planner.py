@@ -34,10 +34,10 @@ from gcs.plan.design import (
     VehicleResponse,
     WindowAt,
 )
-from gcs.plan.flight_plan import FlightPlan, Responses, given_responses, loop_timing, margins_with
+from gcs.plan.flight_plan import FlightPlan, Responses, given_responses, loop_timing, margins_with, onboard_timing
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.mismatch import continuous_window, window
-from gcs.plan.onboard import onboard_plan, timing_of
+from gcs.plan.onboard import onboard_plan
 from gcs.plan.own_law import OWN_DYNAMICS, code_records, own_plan, with_unknown_margin
 from scenarios.keys.own import BUILT_IN
 from scenarios.schema import Scenario
@@ -138,7 +138,7 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
 
 
 def _window_at(plan: FlightPlan, assumed_s: float) -> WindowAt:
-    flown = plan.model, plan.gain, plan.timing, assumed_s, plan.responses_in_order
+    flown = plan.model, plan.gain, plan.timing, assumed_s, *plan.vehicles_own
     return WindowAt(
         assumed_delay_s=assumed_s,
         mismatch_window_s=window(*flown),
@@ -275,7 +275,7 @@ def _graph_plan(scenario: Scenario, formation: Formation) -> tuple[Design, Fligh
     else:
         assert control.method not in ("inclusion", "python")
         wanted = _requirement(scenario)
-        onboard = timing_of(scenario)
+        onboard = onboard_timing(scenario)
         found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s, onboard=onboard)
         short_s = (wanted.delay_margin_s or 0.0) - sampled_margin(model, found.K, None, timing=timing)
         if onboard is None and timing.commands > 1 and short_s > 0.0:

@@ -18,9 +18,8 @@ from gains.performance.response import formation_loop, response_states
 from gains.sampled.coupled_block import CoupledBlock, coupled_blocks
 from gcs.control.tick import TickArray
 from gcs.drive.flown import Flight, margins_of
-from gcs.plan.flight_plan import FlightPlan, Responses
+from gcs.plan.flight_plan import FlightPlan, Responses, onboard_timing
 from gcs.plan.formation import plan_formation
-from gcs.plan.onboard import timing_of
 from gcs.plan.own_law import law_of
 from gcs.runs.summary import summarise
 from scenarios.keys.own import BUILT_IN
@@ -151,7 +150,7 @@ def plan_loops(plan: FlightPlan) -> list[CoupledBlock]:
         plan.gain,
         plan.formation.system_ids,
         timing=plan.timing,
-        onboard=timing_of(plan.scenario),
+        onboard=onboard_timing(plan.scenario),
         assumed_s=plan.assumed_s,
         responding=None if responses is None else formation_loop(plan.model, plan.gain, responses),
         response_states=() if responses is None else response_states(plan.model, responses),

@@ -23,9 +23,8 @@ from gcs.control.loops import Moment
 from gcs.control.tick import CLOCK_JUMPED, GAIN_SET, TICK, Event, Mode, TickArray
 from gcs.link import mavlink
 from gcs.link.vehicle import SILENCE_S, ignored
-from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.formation import plan_formation
-from gcs.plan.onboard import timing_of
 from gcs.plan.planner import flight_plan
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.monitor import VehicleState
@@ -125,7 +124,7 @@ def _announced(frame: mavlink.Frame) -> tuple[int, str] | None:
 def _plan(scenario: Scenario, margins_s: tuple[float, ...]) -> FlightPlan:
     """The plan that defines the errors; it has gains only where the latencies depend on them."""
     # the states that a streamed command needs depend on the gains, and so does the window of a predicted loop
-    if timing_of(scenario) is not None or scenario.control.prediction != "off":
+    if onboard_timing(scenario) is not None or scenario.control.prediction != "off":
         return flight_plan(scenario)[1]
     formation = plan_formation(scenario)
     K = np.zeros((formation.model.inputs, formation.model.states))

@@ -9,7 +9,7 @@ from gains.sampled.multirate import lifted_radius
 from gains.sampled.onboard import onboard_loop
 from gcs.control.tick import Mode
 from gcs.drive.flown import fly_virtual, margins_of
-from gcs.plan.onboard import timing_of
+from gcs.plan.flight_plan import onboard_timing
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
 from gcs.stress.measure import fly_trial
@@ -91,7 +91,7 @@ def test_the_two_onboard_loop_models_agree_where_both_hold() -> None:
     """Telemetry at a fifth of the control rate: the map from step to step, and that from event to event."""
     scenario = scenario_at(10.0, name="thesis_delay")
     _, plan = flight_plan(scenario)
-    timing = timing_of(scenario)
+    timing = onboard_timing(scenario)
     assert timing is not None
     loop = onboard_loop(plan.model, plan.gain, timing)
     for delay_s in (0.0, 0.313, 0.9):

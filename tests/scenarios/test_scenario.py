@@ -110,12 +110,6 @@ BAD = {
         "control.prediction",
         "off, measured, or a number",
     ),
-    "prediction on board": (
-        'loop = "ground"',
-        'loop = "onboard"\nprediction = "measured"',
-        "control.prediction",
-        "off, with loop onboard",
-    ),
     "feed-forward of a design": (
         'loop = "ground"',
         'loop = "ground"\nfeed_forward = 0.5',

@@ -13,7 +13,7 @@ from gains.performance.flown import FlownLoop, FlownTiming
 from gains.performance.scalar_gains import ScalarGains, onboard_front_gain_limit
 from gains.sampled.constant import growth_rate, sampled_delay_margin
 from gains.sampled.onboard import OnboardTiming, onboard_loop, own_part
-from gcs.plan.onboard import timing_of
+from gcs.plan.flight_plan import onboard_timing
 from gcs.plan.planner import flight_plan
 from scenarios.files import load, with_loop
 from scenarios.schema import Control, FixedGains
@@ -138,7 +138,7 @@ def test_behaviour_at_a_delay_is_that_of_the_onboard_loop() -> None:
     assert told.decay_rate_delayed_1_s is not None
     assert told.string_peak_delayed is not None
     gains, delay_s = ScalarGains(3.4, 0.9, 5.6, 0.0), told.delay_s
-    timing = timing_of(scenario)
+    timing = onboard_timing(scenario)
     assert timing is not None
     sampled = onboard_loop(plan.model, plan.gain, timing).growth_1_s(delay_s)
     assert told.decay_rate_delayed_1_s == pytest.approx(-sampled, rel=0.02)
