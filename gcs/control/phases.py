@@ -40,13 +40,13 @@ def next_phase(
 START_PATIENCE_S = 360.0
 """How long vehicles with autopilots may take until all are ready."""
 _LAUNCHED_PATIENCE_S = 20.0
-"""The same, of vehicles that are launched in the air."""
+"""The same for vehicles that are launched in the air."""
 _ROUND_TRIPS = 40.0
 """On slow links a start-up may take this many round trips: commands await each other's answers and are repeated."""
 
 
 def patience_s(scenario: Scenario) -> float:
-    """How long a flight may take to begin. Until it does, scenario time is the time since the start minus this."""
+    """How long a flight may take to begin. Until it begins, scenario time is the time since the start minus this."""
     least_s = START_PATIENCE_S if scenario.dynamics == "autopilot" else _LAUNCHED_PATIENCE_S
     return max(least_s, _ROUND_TRIPS * longest_round_trip_s(scenario))
 
