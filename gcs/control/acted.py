@@ -2,9 +2,9 @@
 
 The prediction assumes that every set-point acts, one delivery delay after it was due. A lost one never acts: the
 vehicle holds the one before. A report says which set-point the vehicle holds at an instant. It carries the vehicle's
-own time and no key of a set-point, so the set-point is recognised by its values, float32 in both directions:
-ArduPilot's by the acceleration, because the reported velocity grows with it; PX4's by the velocity, because the reported
-acceleration is that of its velocity loop; those of our own vehicles by the acceleration, the only value they report.
+own time and no key of a set-point, so the set-point is recognised by its values, float32 in both directions. From
+ArduPilot it is the acceleration, because the reported velocity grows with it; from PX4 the velocity, because the
+reported acceleration is that of its velocity loop; from our own vehicles the acceleration, which is all they report.
 
 The *age* of a report is its instant minus the time at which the recognised set-point was due. If none is lost, it lies
 between the delivery delay and one control period more. So a set-point older than the least recent age but newer than
@@ -26,7 +26,7 @@ from typing import Any, Protocol
 from gcs.link.mavlink import VELOCITY_IGNORED
 
 _AGES = 3
-"""Set-points over which the least age is taken. Few, because a longer delay looks like loss until all of them show it."""
+"""Set-points over which the least age is taken; few, as a longer delay looks like loss until all of them show it."""
 _EARLY = 0.05
 """A set-point is expected to act this share of a period before it reaches the least age: clocks err by as much."""
 _ASIDE = 0.02
@@ -89,7 +89,7 @@ class ActiveTargets:
             value = _vector(fields, _VELOCITY)
             same = [place for place in recent if self._velocity[place] == value]
         if len(same) == 1 and value and self._due_ns[same[0]] != self._aged_ns:
-            # not the zeros of a vehicle that has stopped; and only the first report of a set-point, as its age then grows
+            # a vehicle that has stopped reports zeros of its own; repeated reports only add growing ages
             self._aged_ns = self._due_ns[same[0]]
             self._ages_ns.append(at_ns - self._aged_ns)
             expected = self._expected(at_ns)

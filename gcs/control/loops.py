@@ -175,7 +175,7 @@ class StreamedLoop:
         self._plan = plan
         own, model = own_part(plan.model, plan.gain), plan.model
         self._opened_m_s2 = [(0.0, 0.0)] * model.vehicles
-        """K_ii^p times the offset: to add when the spacing is doubled, of which the vehicle's own loop knows nothing."""
+        """K_ii^p times the offset: added when the spacing is doubled, which the vehicle's own loop does not know."""
         for i in model.followers:
             on_spacing = own[model.input_slice(i), model.spacing_slice(i)]
             north, east = (on_spacing @ plan.formation.offset_ne_m[i]).tolist()

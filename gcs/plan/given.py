@@ -1,4 +1,4 @@
-"""A scenario with gains that are given to it, found by a search or by a user, to be written, checked and flown."""
+"""Puts gains, found by a search or by a user, into a scenario that can be written, checked and flown."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,8 +27,8 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
 
     K has a row for each vehicle and a column for each error of one axis, in the order of
     `gains.FormationModel(..., axes=1)`: the leader's velocity error, then for each follower its spacing error and its
-    velocity error. `gains.design` and its like find K; so does any LQR of A and B of this model, whose u = -K e is
-    another sign. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite numbers.
+    velocity error. `gains.design` finds such a K; so does any LQR for A and B of this model, whose u = -K e has the
+    opposite sign. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite numbers.
     """
     formation = plan_formation(scenario)
     model, ids, gain = formation.model, formation.system_ids, real_matrix("K", K)

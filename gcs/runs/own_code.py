@@ -1,4 +1,4 @@
-"""What a summary says about code of the user's own."""
+"""What a summary says about the user's own code."""
 
 from collections.abc import Sequence
 from typing import Any

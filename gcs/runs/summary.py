@@ -187,7 +187,7 @@ def _error(flown: TickArray, system_id: int, column: str) -> Errors:
 def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown: TickArray) -> float | None:
     """When the last follower came within a fraction of its spacing for good; None if one has not.
 
-    A vehicle without followers settles within the same fraction of its speed, of at least 1 m/s.
+    A single vehicle has settled when its velocity error is within that fraction of its speed, or of 1 m/s if slower.
     """
     whole = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
     if not whole:
