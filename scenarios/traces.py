@@ -7,12 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from scenarios.errors import ScenarioError
-from scenarios.keys.link import Link, Links
+from scenarios.keys.link import TRACE_DELAYS, Link, Links
 from scenarios.keys.part import MOST
 from scenarios.schema import Scenario
 
-TRACE_DELAYS = 100_000
-"""Largest number of delays in a trace."""
 TRACE_COLUMN = "delay_s"
 
 

@@ -2,7 +2,6 @@
 
 from enum import StrEnum
 
-from scenarios.keys.link import Link
 from scenarios.schema import Scenario
 
 
@@ -54,11 +53,7 @@ def patience_s(scenario: Scenario) -> float:
 def longest_round_trip_s(scenario: Scenario) -> float:
     """The longest round trip on the links of a scenario, without jitter."""
     links = (scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles)
-    return max(_longest_s(up) + _longest_s(down) for up, down in links)
-
-
-def _longest_s(link: Link) -> float:
-    return max([link.delay_s, *(point.delay_s for point in link.delay_points)])
+    return max(up.delay_max_s + down.delay_max_s for up, down in links)
 
 
 END_PATIENCE_S = 6.0

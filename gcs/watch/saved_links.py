@@ -18,8 +18,7 @@ from gains.core.arrays import FloatArray
 from gcs.errors import InputError
 from gcs.link import mavlink
 from gcs.watch.links import Watch
-from scenarios.files import TRACE_DELAYS
-from scenarios.keys.link import Jitter, Link, LossBursts
+from scenarios.keys.link import TRACE_DELAYS, Jitter, Link, LossBursts
 from scenarios.keys.profile import Latency, LinkProfile, Measured
 from scenarios.profiles import dump_profile
 

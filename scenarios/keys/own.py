@@ -1,4 +1,4 @@
-"""Code of the user's own that a scenario names: a control law, and a vehicle's dynamics. Nothing here runs it."""
+"""The user's own code that a scenario names: a control law, and a vehicle's dynamics. Nothing here runs it."""
 
 from hashlib import sha256
 from typing import Annotated, Literal
@@ -35,5 +35,5 @@ class CodeFile(Part):
 
     @property
     def sha256(self) -> str:
-        """Identifies what is in the file."""
+        """Identifies the contents of the file."""
         return sha256(self.text.encode()).hexdigest()
