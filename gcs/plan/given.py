@@ -3,9 +3,10 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core.arrays import FloatArray
 from gains.core.structure import real_matrix
 from gcs.errors import InputError
-from gcs.plan.formation import plan_formation
+from gcs.plan.formation import Formation, plan_formation
 from scenarios.keys.part import Prediction
 from scenarios.schema import Control, FixedGains, GainBlock, Scenario
 
@@ -31,17 +32,21 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
     opposite sign. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite numbers.
     """
     formation = plan_formation(scenario)
-    model, ids, gain = formation.model, formation.system_ids, real_matrix("K", K)
+    model, gain = formation.model, real_matrix("K", K)
     wanted = model.B.shape[1] // model.axes, model.B.shape[0] // model.axes
     if gain.shape != wanted:
         raise InputError(
             f"K: read shape {gain.shape}, wanted {wanted}: a row for each vehicle, a column for each error"
         )
-    whole = np.kron(gain, np.eye(model.axes))
-    blocks = tuple(
+    return with_given(scenario, blocks=gain_blocks(np.kron(gain, np.eye(model.axes)), formation), prediction=prediction)
+
+
+def gain_blocks(K: FloatArray, formation: Formation) -> tuple[GainBlock, ...]:
+    """K block by block, as a scenario gives it, without those that are zero, except each vehicle's own."""
+    model, ids = formation.model, formation.system_ids
+    return tuple(
         GainBlock(vehicle=ids[i], of=ids[j], gain=(tuple(block[0].tolist()), tuple(block[1].tolist())))
         for i in range(model.vehicles)
         for j in range(model.vehicles)
-        if (block := whole[model.input_slice(i), model.output_slice(j)]).any()
+        if (block := K[model.input_slice(i), model.output_slice(j)]).any() or i == j
     )
-    return with_given(scenario, blocks=blocks, prediction=prediction)

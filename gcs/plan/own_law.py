@@ -27,9 +27,10 @@ from gcs.errors import InputError
 from gcs.plan.design import CodeRecord, Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation, plan_formation
+from gcs.plan.given import gain_blocks
 from scenarios.keys.own import BUILT_IN
 from scenarios.own_code import code_names, function_of
-from scenarios.schema import GainBlock, Scenario
+from scenarios.schema import Scenario
 
 NOT_LINEAR = "law is not linear; measure it with gcs stress --onset"
 OWN_DYNAMICS = "dynamics of your own without [response]; measure it with gcs stress --onset"
@@ -144,7 +145,7 @@ def own_plan(
         return design, plan
     _check(scenario, law, given, known)
     control = scenario.control.model_copy(
-        update={"method": "inclusion", "controller": None, "linear": None, "blocks": _blocks(given, formation)}
+        update={"method": "inclusion", "controller": None, "linear": None, "blocks": gain_blocks(given, formation)}
     )
     monitor = scenario.monitor.model_copy(update={"time_scales": (1.0,)})  # a law cannot be slowed down
     design, plan = given_plan(scenario.model_copy(update={"control": control, "monitor": monitor}))
@@ -249,15 +250,3 @@ def _linearised(law: Law, formation: LawFormation) -> FloatArray:
     # differences leave noise, which would couple all vehicles and make equal ones differ
     scale = TOLERANCE * float(np.abs(K).max(initial=0.0))
     return scale * np.round(K / scale) if scale else K
-
-
-def _blocks(K: FloatArray, formation: Formation) -> tuple[GainBlock, ...]:
-    """K block by block, as a scenario gives it."""
-    model, ids = formation.model, formation.system_ids
-    pairs = ((i, j) for i in range(model.vehicles) for j in range(model.vehicles))
-    found = ((i, j, K[model.input_slice(i), model.output_slice(j)]) for i, j in pairs)
-    return tuple(
-        GainBlock(vehicle=ids[i], of=ids[j], gain=tuple(tuple(row) for row in block.tolist()))  # pyright: ignore[reportArgumentType]
-        for i, j, block in found
-        if block.any() or i == j
-    )
