@@ -1,1 +1,2 @@
-"""What an experiment is. `schema` has its keys, `files` reads and checks them, `signing` signs links."""
+"""What an experiment is. `schema` and `keys` have its keys, `files` reads and checks them, `shipped` finds the
+scenarios that ship, `signing` signs links."""

@@ -21,17 +21,16 @@ from scenarios.for_link import contradictions as for_link_contradictions
 from scenarios.keys.autopilot import response_contradictions
 from scenarios.keys.criteria import criteria_faults
 from scenarios.keys.disturbance import disturbance_contradictions
-from scenarios.keys.link import Jitter, Link, Links
+from scenarios.keys.link import Link, Links
+from scenarios.keys.part import Fault
 from scenarios.keys.sitl import sitl_contradictions
-from scenarios.link_files import TRACE_DELAYS, each_link, load_profile, with_traces
+from scenarios.link_files import each_link, load_profile, with_traces
 from scenarios.manoeuvres import contradictions as manoeuvre_contradictions
 from scenarios.own_code import as_flown, own_code_faults, with_code
 from scenarios.places import line_of, location_of, named, wanted_of
 from scenarios.schema import Scenario
 
 _A_VEHICLE = "the system_id of a vehicle of this scenario"
-_Fault = tuple[str, object, str]
-"""A key, what was read and what was wanted."""
 
 
 def load(path: Path) -> Scenario:
@@ -81,7 +80,7 @@ def with_profile(scenario: Scenario, name: str, file: Path, key: str = "links.pr
 
 
 def with_loop(scenario: Scenario, loop: Literal["ground", "onboard"], file: Path) -> Scenario:
-    """The scenario with its loop closed elsewhere; `file` is named in errors.
+    """The scenario with its loop closed on the ground or on board; `file` is named in errors.
 
     Raises ScenarioError if the scenario cannot be flown with this loop.
     """
@@ -158,7 +157,7 @@ def _value_at(data: Any, location: tuple[int | str, ...]) -> object:
     return data
 
 
-def _contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _contradictions(scenario: Scenario) -> Iterator[Fault]:
     """Faults that no single key shows."""
     yield from _formation_contradictions(scenario)
     yield from manoeuvre_contradictions(scenario)
@@ -192,7 +191,7 @@ def _contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield "limits.speed_max_m_s", limits.speed_max_m_s, f"more than speed_min_m_s = {limits.speed_min_m_s:g}"
 
 
-def _control_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _control_contradictions(scenario: Scenario) -> Iterator[Fault]:
     control = scenario.control
     requirements = ("alpha", "delay_margin_s", "decay_rate_1_s")
     required, wanted = any(getattr(control, name) is not None for name in requirements), ", ".join(requirements)
@@ -213,7 +212,7 @@ def _control_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield "control.prediction", control.prediction, wanted
 
 
-def _hearing_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _hearing_contradictions(scenario: Scenario) -> Iterator[Fault]:
     control, known = scenario.control, {vehicle.system_id for vehicle in scenario.vehicles}
     for k, vehicle in enumerate(scenario.vehicles):
         for other in vehicle.hears:
@@ -224,7 +223,7 @@ def _hearing_contradictions(scenario: Scenario) -> Iterator[_Fault]:
             yield f"vehicles[{k}].hears", list(vehicle.hears), wanted
 
 
-def _block_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _block_contradictions(scenario: Scenario) -> Iterator[Fault]:
     columns = {vehicle.system_id: 2 if vehicle.follows is None else 4 for vehicle in scenario.vehicles}
     seen: set[tuple[int, int]] = set()
     for k, block in enumerate(scenario.control.blocks):
@@ -240,7 +239,7 @@ def _block_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         seen.add((block.vehicle, block.of))
 
 
-def _monitor_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _monitor_contradictions(scenario: Scenario) -> Iterator[Fault]:
     monitor = scenario.monitor
     if monitor.critical_headroom >= monitor.caution_headroom:
         wanted = f"less than caution_headroom = {monitor.caution_headroom:g}"
@@ -250,7 +249,7 @@ def _monitor_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield "monitor.time_scales", list(scales), "1 first, then increasing factors"
 
 
-def _onboard_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _onboard_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if scenario.control.loop != "onboard":
         return
     own, control_hz = scenario.onboard, scenario.rates.control_hz
@@ -263,7 +262,7 @@ def _onboard_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield "onboard.rate_hz", own.rate_hz, f"a whole multiple of onboard.sensor_hz = {own.sensor_hz:g}"
 
 
-def _formation_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _formation_contradictions(scenario: Scenario) -> Iterator[Fault]:
     vehicles = scenario.vehicles
     system_ids = [v.system_id for v in vehicles]
     leaders = [v.system_id for v in vehicles if v.follows is None]
@@ -286,7 +285,7 @@ def _formation_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield "vehicles.follows", f"vehicles without it: {leaders}", "exactly one vehicle without it, the leader"
 
 
-def _autopilot_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
     times_s = [jump.at_s for jump in scenario.autopilot.clock_jumps]
     if times_s != sorted(times_s):
         yield "autopilot.clock_jumps", times_s, "times that do not decrease"
@@ -305,7 +304,7 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield "response", scenario.response.model_dump(), wanted
 
 
-def _velocity_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _velocity_contradictions(scenario: Scenario) -> Iterator[Fault]:
     on_ground = scenario.dynamics == "autopilot"
     lowest = 0.0 if on_ground else scenario.limits.speed_min_m_s  # multicopters can stand
     highest = scenario.limits.speed_max_m_s or math.inf
@@ -324,7 +323,7 @@ def _velocity_contradictions(scenario: Scenario) -> Iterator[_Fault]:
             yield f"vehicles[{k}].velocity_ne_m_s", vehicle.velocity_ne_m_s, wanted
 
 
-def _links_contradictions(scenario: Scenario) -> Iterator[_Fault]:
+def _links_contradictions(scenario: Scenario) -> Iterator[Fault]:
     links = scenario.links
     if links.profile is not None and (given := {"up", "down", "vehicles", "channels"} & links.model_fields_set):
         yield "links.profile", links.profile, f"either a profile, or {', '.join(sorted(given))}"
@@ -344,14 +343,14 @@ def _links_contradictions(scenario: Scenario) -> Iterator[_Fault]:
         yield from _link_contradictions(key, link)
 
 
-def _repeated(part: str, name: str, values: Sequence[object], wanted: str) -> Iterator[_Fault]:
+def _repeated(part: str, name: str, values: Sequence[object], wanted: str) -> Iterator[Fault]:
     """The values of a key that an earlier entry of a list already has."""
     for k, value in enumerate(values):
         if value in values[:k]:
             yield f"{part}[{k}].{name}", value, wanted
 
 
-def _link_contradictions(key: str, link: Link) -> Iterator[_Fault]:
+def _link_contradictions(key: str, link: Link) -> Iterator[Fault]:
     times_s = [point.at_s for point in link.delay_points]
     if times_s and link.delay_s:
         yield f"{key}.delay_s", link.delay_s, "either delay_s or delay_points"
@@ -371,18 +370,4 @@ def _link_contradictions(key: str, link: Link) -> Iterator[_Fault]:
             yield f"{key}.outages[{k}].from_s", outage.from_s, wanted
         before_s = outage.until_s
     if link.jitter is not None:
-        yield from _jitter_contradictions(f"{key}.jitter", link.jitter)
-
-
-def _jitter_contradictions(key: str, jitter: Jitter) -> Iterator[_Fault]:
-    given = [name for name in ("scale_s", "shape", "trace_file", "trace_s") if getattr(jitter, name) is not None]
-    if jitter.distribution == "trace":
-        if given not in (["trace_file"], ["trace_s"]):
-            yield key, ", ".join(given) or "neither", "either trace_file or trace_s with distribution trace"
-        if jitter.trace_s is not None and not 1 <= len(jitter.trace_s) <= TRACE_DELAYS:
-            yield f"{key}.trace_s", f"{len(jitter.trace_s)} delays", f"1 to {TRACE_DELAYS}"
-        return
-    wanted = ["scale_s", "shape"] if jitter.distribution == "gamma" else ["scale_s"]
-    if given != wanted:
-        text = f"{' and '.join(wanted)} and nothing else with distribution {jitter.distribution}"
-        yield key, ", ".join(given) or "nothing", text
+        yield from link.jitter.contradictions(f"{key}.jitter")

@@ -1,8 +1,8 @@
-"""What contradicts `control.for_link`, which has gains chosen for measured links."""
+"""What contradicts `control.for_link`, with which gains are chosen for measured links."""
 
 from collections.abc import Iterator
 
-from scenarios.keys.criteria import Fault
+from scenarios.keys.part import Fault
 from scenarios.schema import Scenario
 
 _MEASURED = "at_delay_s", "delays_s", "delay_rate"

@@ -2,8 +2,8 @@
 
 A follower of a vehicle that is left out follows the one in front of that, at the sum of both offsets. If the leader is
 left out, its follower with the lowest system id leads, and the others follow that one. So the scenario stays a complete
-formation, for which gains, margins and figures are computed as for any other. The alternative, to leave followers
-without anybody in front, would fly groups that do not keep their distance from each other.
+formation, for which gains, margins and figures are computed as for any other. Followers left without anybody in front
+would instead make groups that keep no distance from each other.
 """
 
 from collections.abc import Iterable

@@ -11,14 +11,12 @@ from pydantic import ValidationError
 from pydantic_core import to_json
 
 from scenarios.errors import ScenarioError
-from scenarios.keys.link import Link, Links
+from scenarios.keys.link import TRACE_DELAYS, Link, Links
 from scenarios.keys.part import MOST
 from scenarios.keys.profile import LinkProfile
 from scenarios.schema import Scenario
 
 FOLDER = Path(__file__).parent / "profiles"
-TRACE_DELAYS = 100_000
-"""Largest number of delays in a trace."""
 TRACE_COLUMN = "delay_s"
 
 

@@ -1,14 +1,12 @@
-"""What courses and formation changes contradict in a scenario."""
+"""What contradicts the course and the formation changes of a scenario."""
 
 import math
 from collections.abc import Iterator
 from itertools import pairwise
 
+from scenarios.keys.part import Fault
 from scenarios.schema import Scenario
 from scenarios.smooth import TooShortError
-
-Fault = tuple[str, object, str]
-"""A key, what was read and what was wanted."""
 
 
 def contradictions(scenario: Scenario) -> Iterator[Fault]:

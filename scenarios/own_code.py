@@ -1,4 +1,4 @@
-"""Files of Python code that a scenario names: read with it, written beside it, and run only where that was allowed.
+"""Files of Python code that a scenario names: read with it, written beside it, and run only if the user allows it.
 
 A scenario holds the text of its code, so that it is complete without the files: in another process, on another machine,
 and in the folder of its run. `function_of` is the only place that runs it.
@@ -15,10 +15,9 @@ from typing import Any
 
 from scenarios.errors import ScenarioError
 from scenarios.keys.own import BUILT_IN, CodeFile, names_code
+from scenarios.keys.part import Fault
 from scenarios.schema import Scenario
 
-Fault = tuple[str, object, str]
-"""A key, what was read and what was wanted."""
 LARGEST_BYTES = 1_000_000
 """Largest file of code."""
 ALLOW = "--allow-code"
@@ -37,7 +36,7 @@ def code_names(scenario: Scenario) -> dict[str, str]:
 
 
 def own_code_faults(scenario: Scenario) -> Iterator[Fault]:
-    """What contradicts a controller or dynamics of one's own."""
+    """What contradicts the user's own controller or dynamics."""
     control, own_law = scenario.control, scenario.control.method == "python"
     own_dynamics = scenario.dynamics not in BUILT_IN
     if own_law != (control.controller is not None):
@@ -84,11 +83,11 @@ def _read(name: str, file: Path, key: str) -> str:
 
 
 def as_flown(scenario: Scenario) -> Scenario:
-    """The scenario with names of its code that fit files beside it, as `write_code` writes them."""
+    """The scenario with its code renamed to files in its own folder, as `write_code` writes them."""
     if not scenario.code:
         return scenario
     here = {code.name: Path(code.name).name for code in scenario.code}
-    if len(set(here.values())) < len(here):  # two folders have a file of one name
+    if len(set(here.values())) < len(here):  # files of one name from two folders
         here = {code.name: f"{k}_{Path(code.name).name}" for k, code in enumerate(scenario.code, 1)}
     moved = {
         key: f"{here[name.rpartition(':')[0]]}:{name.rpartition(':')[2]}" for key, name in code_names(scenario).items()

@@ -1,4 +1,4 @@
-"""Where in a scenario file a key stands, and what its value must be, in words for the author of the file."""
+"""For errors in a scenario file: the line of a key, and what its value must be, in plain words."""
 
 import re
 from collections import Counter

@@ -3,8 +3,8 @@
 Units are part of each key's name. Positions and velocities are in the horizontal plane of one local NED frame,
 as pairs (north, east): the formation control is planar. Each vehicle keeps an altitude of its own.
 
-The docstring below a key is its description in `scenario.schema.json` and in the reference. `scenarios.keys.link` has
-the keys of `[links]`, `scenarios.keys.autopilot` those of `[response]`.
+The docstring below a key is its description in `scenario.schema.json` and in the reference. Larger parts are files in
+`scenarios.keys`, such as `link` for `[links]`.
 """
 
 from collections.abc import Callable
@@ -282,7 +282,7 @@ class Autopilot(Part):
     clock_jumps: tuple[ClockJump, ...] = ()
     """Jumps of the boot clock."""
     sitl: Sitl = Sitl()
-    """Clocks that lie a little, as those of autopilots in SITL."""
+    """Clock errors as those of autopilots in SITL."""
 
 
 class Scenario(Part):
@@ -382,7 +382,7 @@ class Scenario(Part):
 
     @property
     def manoeuvres(self) -> bool:
-        """Whether the motion planned for a vehicle is more than steps of the nominal velocity in one shape."""
+        """Whether the planned motion is more than steps of the nominal velocity in one shape."""
         return self.course.is_smooth or self.course.leader == "external" or bool(self.formation_changes)
 
     def altitude_of(self, vehicle: Vehicle) -> float:

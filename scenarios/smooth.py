@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 Vector = tuple[float, float]
 _SAMPLES = 400
-"""Points at which the largest acceleration and jerk of a change are looked for."""
+"""Points of a change at which its acceleration and jerk are evaluated to find the largest."""
 _SPARE = 1.0001
-"""Changes last this much longer than the largest values at these points need: between them values are larger by less
-than one part in 10 000."""
+"""Factor on the duration of a change: between these points values are larger by less than one part in 10 000."""
 
 
 def smooth_step(x: float) -> tuple[float, float, float]:
@@ -114,7 +113,7 @@ class SmoothCourse:
 
 
 class Bounds(NamedTuple):
-    """What changes of the nominal velocity may ask for; None is no bound."""
+    """Bounds on changes of the nominal velocity; None is no bound."""
 
     acceleration_m_s2: float
     jerk_m_s3: float | None = None

@@ -1,1 +1,1 @@
-"""Simulated UAVs behind emulated links, as MAVLink systems of their own. Begin at `drive.fleet`."""
+"""Simulated UAVs behind emulated links; each is a MAVLink system. Begin at `drive.fleet`."""

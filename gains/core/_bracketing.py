@@ -1,7 +1,7 @@
 """Roots and peaks of scalar functions within brackets.
 
-Most functions here evaluate all abscissae (k,) at once, one batch of eigenvalue problems for each step, as nearly all
-the time is spent there.
+Most functions here evaluate all abscissae (k,) at once: nearly all the time is spent in eigenvalue problems, which each
+step then solves in one batch.
 """
 
 from collections.abc import Callable

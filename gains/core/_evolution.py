@@ -1,7 +1,7 @@
 """Search for the best point of a function that has kinks, by the adaptation of a normal distribution (CMA-ES).
 
 Points are only compared, never differentiated: a peak over frequencies, a rightmost root or a limit that is just met
-has no slope where it matters. Draws are seeded, so that the same search finds the same point.
+has no derivative at the optimum. Draws are seeded, so that the same search finds the same point.
 
 Source: N. Hansen, "The CMA Evolution Strategy: A Tutorial", arXiv:1604.00772, with its default constants.
 """

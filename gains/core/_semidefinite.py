@@ -1,8 +1,8 @@
 """Semidefinite programs: modelled with cvxpy, solved by Clarabel, and proved by plain linear algebra.
 
-A status is not a proof. `solved` takes "optimal" alone for a solution, and its callers check the certificate again.
-`positive_definite_solution` checks what it finds by itself, whatever the status. Clarabel without cvxpy gives the same
-bounds of `gains.varying` to the last bit, a set of seven in 11 s in place of 21 s: not worth a second path.
+A status is not a proof. `solved` accepts only "optimal", and its callers check the certificate again.
+`positive_definite_solution` checks its solution itself, whatever the status. Calling Clarabel without cvxpy gives the
+same bounds of `gains.varying` to the last bit, seven of them in 11 s instead of 21 s: not worth a second path.
 """
 
 import warnings
@@ -17,8 +17,8 @@ from gains.core.errors import SolverError
 
 Inequalities = Callable[[Sequence[FloatArray]], Sequence[FloatArray]]
 
-# With Clarabel's own tolerance of 1e-8 and its longest step, larger synthesis problems (bounds of 300 on two axes) now
-# and then end "optimal_inaccurate". Feasibility problems need more digits: 1e-8 costs a per cent of some delay bounds.
+# With Clarabel's own tolerance of 1e-8 and its longest step, larger synthesis problems (bounds of 300 on two axes)
+# sometimes end "optimal_inaccurate". Feasibility problems need more digits: 1e-8 costs a per cent of some delay bounds.
 _SYNTHESIS_TOLERANCE, _SYNTHESIS_STEP, _FEASIBILITY_TOLERANCE = 1e-7, 0.9, 1e-11
 # eigenvalues of a symmetric matrix of size n are known to n eps times its norm
 _EPS = float(np.finfo(np.float64).eps)
@@ -101,9 +101,9 @@ def negative(matrix: Any, slack: Any) -> Any:
 def positive_definite_solution(unknowns: Sequence[Unknown], inequalities: Inequalities) -> list[FloatArray] | None:
     """Values of the unknowns, entries up to 1, that make every matrix positive definite; None if none were found.
 
-    The least eigenvalue is made as large as the solver can. Its solution counts if numpy finds the matrices positive
-    definite there; None is not a proof that there is none. `inequalities` takes the unknown matrices, in the order of
-    `unknowns`, to symmetric matrices, linear and homogeneous.
+    The solver maximises the least eigenvalue. Its solution counts if numpy finds the matrices positive definite there;
+    None does not prove that there is no solution. `inequalities` maps the unknown matrices, in the order of `unknowns`,
+    to symmetric matrices; it is linear and homogeneous.
     """
     import cvxpy as cp
 

@@ -31,7 +31,7 @@ Objective = Literal["alpha", "decay_rate_1_s", "alpha_at_delay", "decay_rate_at_
 
 @dataclass(frozen=True)
 class Criteria:
-    """What a design must reach beside the parts of `Requirement`; what is None is not asked for.
+    """What a design must reach besides the parts of `Requirement`; None is no requirement.
 
     A figure at a delay is that of the loop as flown (`gains.performance.flown`): late by the delay and half a control
     period. BadModelError if a number is out of its range, or a figure at a delay is asked for without the delay.
@@ -44,8 +44,8 @@ class Criteria:
     at_delay_s: float | None = None
     """Loop delay (s) of the figures at a delay. Gains are then searched for this delay."""
     maximise: Objective | None = None
-    """What gains are best in, of all that meet the rest; `alpha_at_delay` if there is a delay, and else what
-    `Requirement` says."""
+    """The figure that is made best among the gains that meet the rest. If None: `alpha_at_delay` if there is a delay,
+    otherwise as `Requirement` says."""
     alpha_at_delay: float | None = None
     """Least α (1/s) at the delay."""
     decay_rate_at_delay_1_s: float | None = None
@@ -61,11 +61,11 @@ class Criteria:
     """Largest H2 gain from measurement noise to commands: the standard deviation of the noisiest command (m/s²) where
     every error is measured with white noise of standard deviation 1 (m, m/s), at the delay."""
     delays_s: tuple[float, float] | None = None
-    """The loop delays (least, largest) among which the loop must be proved stable."""
+    """The loop delays (least, largest) between which the loop must be proved stable."""
     delay_rate: float | None = None
-    """How fast the delay varies among them, s/s: 0 for one that is constant but not known, None for one that jumps."""
+    """How fast the delay varies between them, s/s: 0 if it is constant but not known, None if it jumps."""
     weight: tuple[float, float] | None = None
-    """Diagonal of W on spacing errors and on velocity errors, with which every α is meant: |w| ≤ α |W E|."""
+    """Weights of spacing errors and of velocity errors, the diagonal of W: every α then bounds |w| ≤ α |W E|."""
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:
@@ -87,7 +87,7 @@ class Criteria:
 
     @property
     def objective(self) -> Objective | None:
-        """What gains are best in; None if that is for the rest of the requirement to say."""
+        """The figure to make best; None if the rest of the requirement decides it."""
         return self.maximise or ("alpha_at_delay" if self.at_delay_s is not None else None)
 
 

@@ -1,4 +1,4 @@
-"""Splitting of a linear model into the blocks that really interact.
+"""Splits a linear model into its blocks of states that interact.
 
 A leader-follower tree is block triangular. Its identical followers share one defective eigenvalue, whose multiplicity
 N is the depth of the tree, and rounding spreads it over a circle of radius eps^(1/N): from about eight vehicles on,
@@ -223,7 +223,7 @@ def _moving_part(block: list[FloatArray]) -> list[FloatArray]:
 
 
 def _labels_by_closure(pattern: NDArray[np.bool_]) -> IntArray:
-    """Component number of each state, from who reaches whom: quick for small models, without the graph library."""
+    """Component number of each state, by transitive closure: quick for small models, without the graph library."""
     size = pattern.shape[0]
     reach = pattern | np.eye(size, dtype=bool)
     # paths double in length with every squaring

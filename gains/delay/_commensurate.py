@@ -67,7 +67,7 @@ _EXPANSION = 1.3717
 _ANGLES, _ANGLES_A_TURN, _PAST_HALF = 400, 40, 1.01 * pi
 # Newton's method starts at grid angles whose first step is at most this many grid steps; each step doubles the digits
 _REACH, _NEWTON_STEPS = 1.5, 3
-# below this share of the highest frequency a root may be one that passes zero, which a look this far (rad) beside tells
+# below this share of the highest frequency a root may be one that passes zero: angles this far (rad) beside it tell
 _SLOW, _BESIDE = 1e-6, 0.05
 # a local extremum of a real part is refined when its sample is this close to the axis, relative to the norm
 _NEAR_AXIS = 0.1
@@ -140,7 +140,7 @@ def _is_passage(terms: Sequence[FloatArray], crossing: Crossing) -> bool:
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
-    """The same from the n eigenvalues s of A(theta), however many delays there are.
+    """Crossings of one block from the n eigenvalues s of A(theta), however many delays there are.
 
     With theta = omega tau, a root j omega moves right with growing tau where omega d(Re s) / d theta > 0.
     """

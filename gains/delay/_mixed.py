@@ -141,9 +141,9 @@ def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) 
     """Roots with positive real part at tau = 0: turns of det(j omega I - A(j omega)) / det(j omega I - H).
 
     H is the loop without delay, shifted to the left until it is Hurwitz, so the quotient is analytic in the right half
-    plane and turns little. Above the bound of all crossings, where the omega of the eigenvalues of A stay below that of
-    the argument, no angle of j omega - s leaves (0, pi): there the phase is known without steps. If `at_zero`, a simple
-    root at zero is divided out.
+    plane and turns little. Above the bound of all crossings the eigenvalues s of A have imaginary parts below omega, so
+    no angle of j omega - s leaves (0, pi): there the phase is known without steps. If `at_zero`, a simple root at zero
+    is divided out.
     """
     identity, highest = np.eye(parts.size), parts.highest()
     hurwitz = np.linalg.eigvals(parts.matrices.sum(axis=0))

@@ -1,6 +1,6 @@
 """Crossings of the imaginary axis of large blocks: the eigenvalues of A(theta) followed along the unit circle.
 
-For A(theta) = sum_k A_k e^{-j k theta} of more than two dozen states, one eigenvalue problem is dear. The eigenvalues
+For A(theta) = sum_k A_k e^{-j k theta} of more than two dozen states, an eigenvalue problem is costly. The eigenvalues
 and their derivatives at few angles say, by cubic interpolation, which branches come near the axis; only there are
 angles added. Newton's method on a bordered matrix, which takes factorisations only, then finds each crossing.
 """
@@ -16,13 +16,13 @@ from numpy.polynomial import Polynomial
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.delay._crossings import Crossing
 
-# angles on the upper half of the circle to begin with, which they exceed a little on both sides
+# first angles: at least this many over the upper half of the circle, and this far (rad) beyond both of its ends
 _ANGLES, _BEYOND = 25, 0.02
-# and for each multiple of the delay
+# and this many for each multiple of the delay
 _ANGLES_A_TURN = 12
 # intervals are halved down to this width (rad); a branch that is still unclear there touches the axis
 _NARROWEST = 1e-7
-# of the interpolation: its error is far below the difference of the two straight lines at the middle
+# bound of the error of the interpolation, as a share of the difference of the two straight lines at the middle
 _MARGIN = 1.0
 # a crossing that Newton's method finds lies in its interval up to this share of the width
 _OUTSIDE = 0.05
@@ -32,7 +32,7 @@ _SAME, _ZERO_ANGLE = 1e-9, 1e-11
 
 
 class UnclearError(Exception):
-    """Branches could not be told apart, as of multiple eigenvalues at all angles."""
+    """Branches cannot be told apart, for example because eigenvalues coincide at all angles."""
 
 
 @dataclass(frozen=True, eq=False)

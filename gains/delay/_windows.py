@@ -182,7 +182,7 @@ def stability_windows(
     change = np.array([crossing.direction * crossing.roots for crossing in crossings])
     # a real root passes zero once only
     period_s = np.divide(2.0 * pi, omega, out=np.full(omega.size, inf), where=omega > 0.0)
-    # roots that leave the axis at zero delay to the right are unstable from there on, to the left they always were
+    # of the roots on the axis at zero delay, those that leave it to the right are unstable from there on
     at_zero = first == 0.0
     unstable += int(change[at_zero & (change > 0)].sum())
     first = np.where(at_zero, period_s, first)

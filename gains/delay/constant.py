@@ -1,4 +1,4 @@
-"""How much constant delay a linear loop x'(t) = A0 x(t) + A1 x(t - tau) takes: exact, without a grid.
+"""How much constant delay a linear loop x'(t) = A0 x(t) + A1 x(t - tau) tolerates: exact, without a grid.
 
 The roots of det(sI - A0 - A1 e^{-s tau}) move continuously with tau and change half plane only through the imaginary
 axis. The crossings are found in `_crossings` and counted in `_windows`; strongly connected blocks are analysed one by

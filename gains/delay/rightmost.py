@@ -42,9 +42,9 @@ def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
 
 
 def rightmost_roots(terms: Sequence[tuple[ArrayLike, float]], count: int) -> ComplexArray:
-    """The `count` rightmost of these roots (1/s) with imaginary part >= 0, from the right; fewer if there are fewer.
+    """The `count` rightmost roots (1/s) with imaginary part >= 0, from right to left; fewer if there are fewer.
 
-    Arguments and exceptions as of `rightmost_root`. A root of several equal loops in the matrices comes once.
+    Equation, arguments and exceptions as of `rightmost_root`. A root that equal loops in the matrices share comes once.
 
     Of x'(t) = -x(t - 1) these are the branches of Lambert's W(-1):
 
@@ -89,7 +89,7 @@ def _roots_of_block(block: Block, delays: FloatArray, count: int) -> list[comple
 
 
 def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -> list[complex]:
-    """Those that are roots, each once."""
+    """The numbers that are roots, each once."""
     kept: list[complex] = []
     for s in found:
         terms = np.exp(-s * delays)[:, np.newaxis, np.newaxis] * matrices
@@ -103,7 +103,7 @@ def _apart(matrices: FloatArray, delays: FloatArray, found: Sequence[complex]) -
 def _pseudospectral_roots(matrices: FloatArray, delays: FloatArray, further: int) -> ComplexArray:
     """Eigenvalues of the discretised generator; block row 0 is the equation, the others differentiate.
 
-    Of `further` chains of roots to the left each turns once more over the longest delay.
+    Each of the `further` chains of roots on the left turns once more over the longest delay.
     """
     n, longest = matrices.shape[1], float(delays.max())
     # roots near or right of the axis have |Im s| below this bound

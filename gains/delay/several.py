@@ -41,12 +41,12 @@ class Polyline:
 
 @dataclass(frozen=True)
 class DelayBox:
-    """The delays tau_1, ..., tau_m that the loop takes independently of each other.
+    """The delays tau_1, ..., tau_m that the loop tolerates independently of each other.
 
-    `limits_s` is the limit that blocks with one delay alone set to it: `inf` without limit, and all zero if a block is
-    unstable without delay. `coupled` lists the sets of delays (by index) that meet in one block, where the limit of one
-    depends on the others. If it is empty, the box is exact: the loop is stable at every delay inside, and loses
-    stability on its faces.
+    `limits_s` holds, for each delay, the limit set by the blocks in which it is the only one: `inf` for no limit, and
+    all zero if a block is unstable without delay. `coupled` lists the sets of delays (by index) that meet in one block,
+    where the limit of one depends on the others. If it is empty, the box is exact: the loop is stable at every delay
+    inside, and loses stability on its faces.
     """
 
     limits_s: tuple[float, ...]
@@ -59,7 +59,7 @@ class DelayBox:
 
 
 def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
-    """The rectangle of delays that x'(t) = A0 x(t) + sum_k late[k] x(t - tau_k) takes, block by block.
+    """The rectangle of delays that x'(t) = A0 x(t) + sum_k late[k] x(t - tau_k) tolerates, block by block.
 
     Couplings between strongly connected blocks do not matter: in a leader-follower tree with one delay for each vehicle
     every block has one delay, and the box is exact. A0 acts at once and late[k] tau_k late, real matrices (n, n) in

@@ -1,6 +1,6 @@
 """Delays that vary: how large may tau(t) become in x'(t) = A0 x(t) + A1 x(t - tau(t))?
 
-No exact bound is known. `varying_delay_bound` proves a lower one, which never exceeds the margin for constant delays:
+No exact bound is known. `varying_delay_bound` proves a smaller one, at most the margin for constant delays:
 
 * |tau'| <= mu, 0 <= tau(t) <= h: a Lyapunov-Krasovskii functional and Wirtinger's inequality. A. Seuret and
   F. Gouaisbaut, "Wirtinger-based integral inequality: application to time-delay systems", Automatica 49(9), 2013,
@@ -26,7 +26,7 @@ from gains.delay.constant import delay_margin
 
 # bisection stops at this relative accuracy
 _ACCURACY = 1e-4
-# no bound beyond this many time constants 1 / (||A0|| + ||A1||) is looked for
+# the search for a bound ends at this many time constants 1 / (||A0|| + ||A1||)
 _LONGEST = 1e3
 # states of one block; the unknowns grow with the square and the work with the sixth power
 _LARGEST_BLOCK = 8

@@ -1,8 +1,8 @@
-"""The stability bound that covers the delay of a real link, be it constant, slowly varying or jumping.
+"""The stability bound that covers the delay of a real link: constant, slowly varying or jumping.
 
 The margin for constant delays is exact but says nothing about a delay that varies; the bounds for varying delays are
-proved but lower. For an observed delay (mean, spread, rate of change) `bound_covering` reports the first bound that
-covers it, from the least to the most demanding one.
+proved but smaller. For an observed delay (mean, spread, rate of change) `bound_covering` tries the bounds from the
+least to the most demanding and returns the first that covers it.
 """
 
 from collections.abc import Sequence
@@ -103,11 +103,11 @@ def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBoun
 
 
 def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = inf, scaled: bool = True) -> float:
-    """The spread (s) that the loop takes on both sides of a constant delay, however the delay varies within it.
+    """The spread (s) that the loop tolerates on both sides of a constant delay, however the delay varies within it.
 
-    A0 and A1 are real matrices (n, n) in 1/s. `rate` is the largest tau'(t), inf if the delay may jump upwards; jumps
-    downwards are free, so the sawtooth of a loop that samples and holds has the rate 1. BadModelError if the matrices
-    do not fit, the mean is negative or not finite, or the rate negative.
+    A0 and A1 are real matrices (n, n) in 1/s. `rate` is the largest tau'(t), inf if the delay may jump upwards. Jumps
+    downwards do not count, so the sawtooth of a loop that samples and holds has the rate 1. BadModelError if the
+    matrices do not fit, the mean is negative or not finite, or the rate negative.
 
     With v(t) = C (x(t - mean) - x(t - tau(t))), A1 = B C, the loop is G(s) = C s (sI - A0 - A1 e^{-s mean})^{-1} B
     closed by the integral of C x' between t - mean and t - tau(t), whose gain is at most g times the spread: g = 1 if

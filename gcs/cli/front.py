@@ -29,13 +29,13 @@ Front = Annotated[
 At = Annotated[
     float | None, typer.Option("--at", metavar="SECONDS", help="use the point of the front at this loop delay")
 ]
-Maximise = Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: what is largest at this point")]
+Maximise = Annotated[Literal["alpha", "decay"], typer.Option(help="with --at: what to maximise there")]
 Predict = Annotated[
-    Literal["on", "off"] | None, typer.Option(help="with --at: over that delay; default whichever is better")
+    Literal["on", "off"] | None, typer.Option(help="with --at: predict over that delay or not; default the better")
 ]
 ComparePrediction = Annotated[
     bool,
-    typer.Option("--compare-prediction", help="show the loop delay these gains take with prediction, and its price"),
+    typer.Option("--compare-prediction", help="show the loop delay tolerated with prediction, and its price"),
 ]
 Picture = Annotated[Path | None, typer.Option(metavar="FILE.svg|png", help="with --front: draw it into this file")]
 Save = Annotated[

@@ -46,7 +46,9 @@ def view(
         typer.Option(metavar="SECONDS", help="scenario time of the picture; default 10, or the end if sooner"),
     ] = None,
 ) -> None:
-    """Open a recording in Rerun or a browser, or write a picture of it, which needs no screen.
+    """Open a recording in Rerun or a browser, or make a picture.
+
+    A picture needs no screen.
 
     Exit code 1 if the viewer reports a fault in the picture.
     """

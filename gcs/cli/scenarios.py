@@ -24,7 +24,7 @@ def scenarios(
     links: Annotated[bool, typer.Option("--links", help="list the link profiles that ship")] = False,
     as_json: options.AsJson = False,
 ) -> None:
-    """List the scenarios that ship, by the names that commands accept."""
+    """List the scenarios that ship; commands accept their names."""
     from scenarios.shipped import description, names
 
     if links:
@@ -56,7 +56,7 @@ def new(
 ) -> None:
     """Write a scenario to start from, by default a chain of three.
 
-    Writes also scenario.schema.json beside it, from which editors know the keys.
+    Also writes scenario.schema.json beside it, with which editors complete and check the keys.
     """
     from scenarios import shipped
     from scenarios.files import parse
@@ -106,7 +106,7 @@ def check(
     allow_code: options.AllowCode = False,
     as_json: options.AsJson = False,
 ) -> None:
-    """Validate a scenario, design its gains and show its start, without flying.
+    """Check a scenario before a flight: its keys, design and start.
 
     Exit code 2 if `gcs fly` would refuse it.
     """

@@ -78,8 +78,8 @@ def stress(
     One of them makes a sweep, two make a map. The loop delay is the link delay plus the wait for the control tick. The
     measured onset is compared with the delay margin.
 
-    With --disturbance and --onset, the vehicles disturb themselves by w = D e, and the size of the worst D is raised at
-    one link delay: that of the scenario, or one --delay. The onset is compared with the stability radii.
+    With --disturbance and --onset, every vehicle is disturbed by w = D e, where e are the errors, at one link delay:
+    that of the scenario, or one --delay. The worst D is scaled up, and the onset compared with the stability radii.
 
     Simulated autopilots fly in virtual time, after they have shown their response, which the margin includes.
 

@@ -23,7 +23,7 @@ def compare(
 ) -> None:
     """Design and fly a scenario by every method, side by side.
 
-    Exit code 1 if no route could be designed.
+    Exit code 1 if no method gives a design.
     """
     from gcs.cli.study_output import print_comparison
     from gcs.drive.preflight import bad_start, endless_link
@@ -61,7 +61,7 @@ def thesis(
     out: options.OutFolder = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Reproduce the thesis: published and computed figures side by side."""
+    """Reproduce the thesis: published beside computed figures."""
     from gcs.studies import thesis as source
     from gcs.views.console import progress
 

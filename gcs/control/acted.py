@@ -1,20 +1,20 @@
 """Which set-points acted: those that a vehicle reports as its active target, POSITION_TARGET_LOCAL_NED.
 
-The prediction assumes that every set-point acts, each a delivery delay after it was due. One that was lost never does:
-the vehicle holds the one before. A vehicle that reports its active target says which one it holds at an instant. A
-report carries the vehicle's own time, not the key of a set-point, so it is recognised by its values, float32 on both
-ways: those of ArduPilot by the acceleration, as the velocity grows with it; those of PX4 by the velocity, as the
-acceleration is that of its velocity loop; those of our own vehicles, which report an acceleration only, by that.
+The prediction assumes that every set-point acts, one delivery delay after it was due. A lost one never acts: the
+vehicle holds the one before. A report says which set-point the vehicle holds at an instant. It carries the vehicle's
+own time and no key of a set-point, so the set-point is recognised by its values, float32 in both directions. From
+ArduPilot it is the acceleration, because the reported velocity grows with it; from PX4 the velocity, because the
+reported acceleration is that of its velocity loop; from our own vehicles the acceleration, which is all they report.
 
-The *age* of a report is its instant minus the time at which the recognised set-point was due. If none is lost it lies
-between the delivery delay and a control period more. So set-points that are older than the least age lately, and newer
-than the one recognised, were lost, or are late by as much. They are replaced by the recognised one. No assumed delay
-enters: a delay mismatch changes nothing.
+The *age* of a report is its instant minus the time at which the recognised set-point was due. If none is lost, it lies
+between the delivery delay and one control period more. So a set-point older than the least recent age but newer than
+the recognised one was lost, or is that late; the recognised one replaces it. The assumed delay is not used, so a delay
+mismatch has no effect here.
 
-A vehicle that reports nothing but an acceleration reports what it does. If that is none of the accelerations sent, but
-a smaller one in the same direction, the vehicle clips. Set-points under way are then assumed to be clipped to the same
-size, until it is seen to do more. In another direction, as where a limit of speed takes away what is along the
-velocity, the report says nothing of the set-points under way.
+A vehicle that reports only an acceleration reports what it does. If this is none of the accelerations sent, but smaller
+than the expected one and in the same direction, the vehicle clips. Set-points under way are then assumed to be clipped
+to the same size until the vehicle exceeds it. An acceleration in another direction, as when a speed limit removes the
+part along the velocity, says nothing about the set-points under way.
 """
 
 import struct
@@ -26,9 +26,9 @@ from typing import Any, Protocol
 from gcs.link.mavlink import VELOCITY_IGNORED
 
 _AGES = 3
-"""Set-points over which the least age is taken. Few, because a delay that grows looks like loss until all are new."""
+"""Set-points over which the least age is taken; few, as a longer delay looks like loss until all of them show it."""
 _EARLY = 0.05
-"""A set-point counts as lost from the least age on, less this share of a period: clocks err by as much."""
+"""A set-point is expected to act this share of a period before it reaches the least age: clocks err by as much."""
 _ASIDE = 0.02
 """Tangent of the angle up to which two accelerations have the same direction."""
 _VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
@@ -62,13 +62,13 @@ class ActiveTargets:
         self._velocity: list[complex] = []
         self._acceleration: list[complex] = []
         self._off: list[complex] = []
-        """What the acceleration of each is corrected by."""
+        """Correction of each acceleration."""
         self._ages_ns, self._aged_ns = deque[int](maxlen=_AGES), 0
         self._largest_m_s2 = inf
         """The size to which the vehicle clips."""
 
     def sent(self, due_ns: int, fields: tuple[Any, ...]) -> None:
-        """Remember a set-point as it was sent, after `history` has."""
+        """Remember a set-point as it was sent; `history` must hold it already."""
         self._due_ns.append(due_ns)
         self._velocity.append(_vector(fields, _VELOCITY))
         self._acceleration.append(_vector(fields, _ACCELERATION))
@@ -79,7 +79,7 @@ class ActiveTargets:
             del self._due_ns[:old], self._velocity[:old], self._acceleration[:old], self._off[:old]
 
     def reported(self, at_ns: int, fields: tuple[Any, ...]) -> None:
-        """Take in the fields of a report, of an instant on the station's clock."""
+        """Take in the fields of a report; `at_ns` is its instant on the station's clock."""
         acceleration, only = _vector(fields, _ACCELERATION), bool(fields[_TYPE_MASK] & VELOCITY_IGNORED)
         expected, least_age_ns = self._expected(at_ns), min(self._ages_ns, default=0)
         oldest = bisect_left(self._due_ns, at_ns - least_age_ns - self._held_ns)
@@ -89,7 +89,7 @@ class ActiveTargets:
             value = _vector(fields, _VELOCITY)
             same = [place for place in recent if self._velocity[place] == value]
         if len(same) == 1 and value and self._due_ns[same[0]] != self._aged_ns:
-            # a vehicle that has stopped reports zeros of its own; one that repeats itself, an age that only grows
+            # a vehicle that has stopped reports zeros of its own; repeated reports only add growing ages
             self._aged_ns = self._due_ns[same[0]]
             self._ages_ns.append(at_ns - self._aged_ns)
             expected = self._expected(at_ns)
@@ -109,7 +109,7 @@ class ActiveTargets:
         return bisect_right(self._due_ns, at_ns - least_age_ns + round(_EARLY * self._period_ns)) - 1
 
     def _hold(self, active: int, expected: int) -> None:
-        """The vehicle follows a set-point, where another one was expected."""
+        """The vehicle follows the set-point `active`; those after it, up to `expected`, were lost."""
         held = self._acceleration[active]
         self._correct(active, 0j)
         for lost in range(active + 1, expected + 1):

@@ -51,7 +51,7 @@ class StateHistory:
         self._reports[vehicle].clear()
 
     def of(self, vehicles: Sequence[int]) -> "StateHistory":
-        """The same reports of some of the vehicles, which are counted anew."""
+        """The same reports of some of the vehicles, whose rows count from 0 again."""
         some = StateHistory(0)
         some._reports = [self._reports[vehicle] for vehicle in vehicles]
         return some

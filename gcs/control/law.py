@@ -182,7 +182,7 @@ def _followed(
     flown, former, share = blend
     for source, (offset_north, offset_east), gains in law.terms:
         other = history.at(source, sample_ns) or _UNKNOWN.state
-        # Positions are taken against the vehicle's own: sums of large numbers would lose digits.
+        # Positions are relative to the vehicle's own: sums of large numbers would lose digits.
         x, y = other[0] - north - opening * offset_north, other[1] - east - opening * offset_east
         v_north, v_east = other[2] - nominal_north, other[3] - nominal_east
         g = gains[flown] if share >= 1.0 else _blended(gains[flown], gains[former], share)
@@ -199,10 +199,10 @@ def _blended(new: Gain, old: Gain, share: float) -> Gain:
 
 
 def distances_m(controls: Sequence[VehicleControl], now_ns: int, down_m: Sequence[float] | None = None) -> FloatArray:
-    """Distances (n, n) between vehicles in m, NaN where unknown and to itself.
+    """Distances (n, n) between vehicles in m; NaN where unknown and on the diagonal.
 
-    Positions are brought to `now_ns` along the reported velocities. `down_m` are the vehicles' altitudes, if they fly
-    at different ones; the distances are horizontal without it.
+    Positions are brought to `now_ns` along the reported velocities. `down_m` holds the vehicles' positions down if they
+    fly at different altitudes; without it, distances are horizontal.
     """
     age_s = (now_ns - np.array([control.sample_ns for control in controls])) * 1e-9
     north, east, v_north, v_east = np.array([control.state for control in controls]).T
@@ -215,5 +215,5 @@ def distances_m(controls: Sequence[VehicleControl], now_ns: int, down_m: Sequenc
     if down_m is not None:
         below = np.array(down_m)
         distance = np.sqrt(distance * distance + np.square(below[:, None] - below))
-    distance.flat[:: len(controls) + 1] = nan  # to itself
+    distance.flat[:: len(controls) + 1] = nan  # the diagonal
     return distance

@@ -27,11 +27,11 @@ class SetPointLimits:
         return cls(limits.acceleration_max_m_s2 or LARGEST_COMMAND_M_S2, limits.speed_max_m_s or LARGEST_COMMAND_M_S2)
 
     def command(self, wanted_m_s2: Vector) -> Vector:
-        """A wanted acceleration, shortened to the limit in its own direction; the very same if it is within."""
+        """A wanted acceleration, shortened to the limit in its own direction; the same object if it is within."""
         return _shortened(wanted_m_s2, self.acceleration_m_s2)
 
     def set_point(self, fields: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The fields of a set-point, with velocity and acceleration within the limits; the very same if they are."""
+        """The fields of a set-point, velocity and acceleration within the limits; the same object if they were."""
         wanted_m_s, wanted_m_s2 = fields[_VELOCITY], fields[_ACCELERATION]
         velocity_m_s, acceleration_m_s2 = _shortened(wanted_m_s, self.speed_m_s), self.command(wanted_m_s2)
         if velocity_m_s is wanted_m_s and acceleration_m_s2 is wanted_m_s2:

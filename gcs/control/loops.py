@@ -79,7 +79,7 @@ class Loop(Protocol):
         ...
 
     def parameters(self, system_id: int) -> dict[str, float]:
-        """The parameters that a vehicle must hold before it is armed."""
+        """The parameters that must be set on a vehicle before it is armed."""
         ...
 
 
@@ -174,7 +174,7 @@ class StreamedLoop:
         self._plan = plan
         own, model = own_part(plan.model, plan.gain), plan.model
         self._opened_m_s2 = [(0.0, 0.0)] * model.vehicles
-        """K_ii^p times the offset: what the vehicle's own loop commands too much of when the spacing is doubled."""
+        """K_ii^p times the offset: added when the spacing is doubled, which the vehicle's own loop does not know."""
         for i in model.followers:
             on_spacing = own[model.input_slice(i), model.spacing_slice(i)]
             north, east = (on_spacing @ plan.formation.offset_ne_m[i]).tolist()

@@ -5,10 +5,10 @@ With the planned motion r_k of vehicle k (`gcs.plan.course`), the inner loop see
     x~_k = x_k - (place_k(t) - place_k(0), r_k'(t)),   each at the instant t of the state,
 
 and computes from it as if the formation flew straight on in the shape it has at the start: its law, its gains and its
-margins do not change. What the plan accelerates is added to its command: r_k'' in the middle of the time over which the
+margins do not change. The planned acceleration is added to its command: r_k'' in the middle of the time over which the
 set-point acts, one-way delay included. So a vehicle that follows the plan has no errors, however long the delay.
 
-Behind a leader that somebody else flies v_d is the velocity this vehicle reports. Its acceleration is not known, so
+Behind a leader flown by somebody else, v_d is the velocity that the leader reports. Its acceleration is not known, so
 none is added for it, and errors grow in its turns.
 """
 
@@ -48,7 +48,7 @@ class ManoeuvringLoop:
         self._planned: list[tuple[Vector, Vector]] = [((0.0, 0.0), (0.0, 0.0)) for _ in vehicles]
         """Planned velocity and acceleration of each vehicle while the set-point of the newest tick acts."""
         self.law, self.parameters = inner.law, inner.parameters
-        self.sent, self.active = inner.sent, inner.active  # what another set-point changes is the same in both
+        self.sent, self.active = inner.sent, inner.active  # they look at differences, in which the plan cancels
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
         still = now._replace(nominal_velocity_m_s=(0.0, 0.0))  # the nominal velocity is part of the planned motion
@@ -87,7 +87,7 @@ class ManoeuvringLoop:
         self._inner.remember(row, due_ns, (north - more_north, east - more_east))
 
     def set_point(self, system_id: int, order: Order) -> tuple[Any, ...]:
-        """The inner loop's set-point, as it knows its own part of the command only, with the planned part added."""
+        """The inner loop's set-point, made from its own part of the command, with the planned part added."""
         velocity, (more_north, more_east) = self._planned[self._row(system_id)]
         north, east = order.control.command_m_s2
         own = order.control._replace(command_m_s2=(north - more_north, east - more_east))

@@ -1,9 +1,9 @@
-"""A control law of one's own in flight: called once a tick, timed, and never trusted.
+"""The user's own control law in flight: called once per tick, timed, and never trusted.
 
 The law gets the states of all vehicles at one instant, that of the oldest among their newest states, so that nothing is
-extrapolated; the loop delay counts from that instant. A vehicle for which it gives no usable command, because it raised
-an exception or returned another shape, NaN or infinity, is sent zero acceleration: it holds its velocity. After
-`BAD_IN_A_ROW` such calls in a row the flight ends, and the vehicles hold.
+extrapolated; the loop delay counts from that instant. If it raises an exception or returns another shape, NaN or
+infinity, each vehicle concerned is sent zero acceleration: it holds its velocity. After `BAD_IN_A_ROW` such calls in a
+row the flight ends, and the vehicles hold.
 """
 
 from collections import Counter
@@ -24,7 +24,7 @@ from gcs.plan.own_law import LawFormation, accelerations, law_formation
 BUDGET_SHARE = 0.2
 """Share of the control period that a call of a law may take."""
 BAD_IN_A_ROW = 25
-"""So many calls in a row without a usable command for every vehicle end the flight."""
+"""This many calls in a row without a usable command for every vehicle end the flight."""
 LAW = "law"
 """Kind of the events about a law: its first bad call, and its counts at the end."""
 CALLS, BAD, OVER = "calls", "bad", "over budget"
@@ -39,7 +39,7 @@ class LawHooks:
     stop: Callable[[str], None] = lambda _: None
     """Ends the flight for a reason."""
     note: Callable[[str, dict[str, int] | None], None] = lambda _text, _counts: None
-    """Takes the text of an event, and what it counts."""
+    """Records an event: its text and its counts."""
     clock_ns: Callable[[], int] | None = None
     """Measures how long calls take; None in virtual time, in which nothing may depend on the machine."""
 
@@ -72,7 +72,7 @@ class FlownLaw:
         return [command if _is_usable(command) else _HOLD for command in found]
 
     def report(self) -> None:
-        """Note what has been counted: the flight ends."""
+        """Record the counts as an event, at the end of the flight."""
         texts = (f"{count} {name}" for name, count in self._counts.items())
         self._hooks.note(", ".join(texts), dict(self._counts))
 
@@ -96,7 +96,7 @@ class FlownLaw:
 
 
 class OwnLawLoop:
-    """The ground loop whose commands a law of one's own computes. See `gcs.control.loops.Loop`."""
+    """The ground loop with commands from the user's own law. See `gcs.control.loops.Loop`."""
 
     def __init__(self, plan: FlightPlan, law: FlownLaw) -> None:
         ground, self._plan, self._law = GroundLoop(plan), plan, law
@@ -106,7 +106,7 @@ class OwnLawLoop:
         self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
 
     def law(self, lost: Sequence[bool]) -> FeedbackLaw:
-        """The law of gains that are zero: it tells the spacing errors, and who is lost."""
+        """The law with zero gains: it gives the spacing errors and says who is lost."""
         return feedback_law(self._plan.formation, (np.zeros_like(self._plan.gain),), lost)
 
     def control(

@@ -2,7 +2,6 @@
 
 from enum import StrEnum
 
-from scenarios.keys.link import Link
 from scenarios.schema import Scenario
 
 
@@ -40,13 +39,13 @@ def next_phase(
 START_PATIENCE_S = 360.0
 """How long vehicles with autopilots may take until all are ready."""
 _LAUNCHED_PATIENCE_S = 20.0
-"""The same, of vehicles that are launched in the air."""
+"""The same for vehicles that are launched in the air."""
 _ROUND_TRIPS = 40.0
 """On slow links a start-up may take this many round trips: commands await each other's answers and are repeated."""
 
 
 def patience_s(scenario: Scenario) -> float:
-    """How long a flight may take to begin. Until it does, scenario time is the time since the start minus this."""
+    """How long a flight may take to begin. Until it begins, scenario time is the time since the start minus this."""
     least_s = START_PATIENCE_S if scenario.dynamics == "autopilot" else _LAUNCHED_PATIENCE_S
     return max(least_s, _ROUND_TRIPS * longest_round_trip_s(scenario))
 
@@ -54,11 +53,7 @@ def patience_s(scenario: Scenario) -> float:
 def longest_round_trip_s(scenario: Scenario) -> float:
     """The longest round trip on the links of a scenario, without jitter."""
     links = (scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles)
-    return max(_longest_s(up) + _longest_s(down) for up, down in links)
-
-
-def _longest_s(link: Link) -> float:
-    return max([link.delay_s, *(point.delay_s for point in link.delay_points)])
+    return max(up.delay_max_s + down.delay_max_s for up, down in links)
 
 
 END_PATIENCE_S = 6.0

@@ -49,12 +49,12 @@ class Responds(Protocol):
         ...
 
     def returned(self, motion: Motion, astray_m_s: complex) -> Motion:
-        """The motion once the vehicle takes a set-point again, of which it had gone astray by this velocity."""
+        """The motion when the vehicle takes a set-point again, after its velocity had strayed from the set-points'."""
         ...
 
 
 class AtOnce:
-    """V' = u: a velocity that was not gained is not made up for."""
+    """V' = u: velocity that a lost set-point would have brought is never made up."""
 
     rest: Motion = 0j, 0j, ()
 
@@ -74,9 +74,9 @@ class _Sent(NamedTuple):
     u: complex
     motion: Motion
     off: complex = 0j
-    """What u was altered by."""
+    """How much u has been altered."""
     astray_m_s: complex = 0j
-    """The integral of `off` since the vehicle took a set-point last."""
+    """The integral of `off` since the vehicle last took a set-point."""
 
 
 class CommandHistory:
@@ -90,7 +90,7 @@ class CommandHistory:
         self._sent: list[_Sent] = [_Sent(0, 0j, self._responds.rest)]
         self._due_ns = [0]
         self._known = 1
-        """How many of them have their motion as it follows from those before."""
+        """How many set-points, from the oldest on, have an up-to-date motion."""
 
     def add(self, due_ns: int, acceleration_m_s2: tuple[float, float]) -> None:
         """Remember the set-point of a tick; ticks come in order."""
@@ -103,7 +103,7 @@ class CommandHistory:
         self._known = len(self._sent)
 
     def alter(self, due_ns: int, by_m_s2: complex) -> None:
-        """Change the acceleration of the set-point due then, if there is one: another one acted."""
+        """Change the acceleration of the set-point due at a time, if it is remembered: another one acted."""
         place = bisect_left(self._due_ns, due_ns)
         if place < len(self._sent) and self._due_ns[place] == due_ns:
             own = self._sent[place]

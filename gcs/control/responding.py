@@ -1,12 +1,12 @@
-"""The motion that a vehicle with a response has from the set-points sent to it: prediction with an autopilot.
+"""The motion of a vehicle that follows its set-points with a response, such as an autopilot's lag; for prediction.
 
 The acceleration a follows the commands u by a response (`gains.performance.response`), linear with constant
 coefficients. In modes m it is
 
     m_k' = lambda_k m_k + beta_k u,   a = sum_k gamma_k m_k,   V' = a,   P' = V.
 
-Telemetry holds position and velocity, not a: that is computed from the commands alone. What was wrong at the start
-decays with the response.
+Telemetry holds position and velocity but not a, which is computed from the commands alone. Its initial error decays
+with the response.
 """
 
 from cmath import exp
@@ -20,7 +20,7 @@ from gains.performance.response import Response, formation_loop
 from gcs.control.prediction import Motion
 
 _APART = 1e-3
-"""Modes that coincide are parted by changing the lag by this share, below what identification resolves."""
+"""Relative change of the lag that separates coinciding modes; smaller than identification resolves."""
 
 
 class _Mode(NamedTuple):
@@ -31,14 +31,14 @@ class _Mode(NamedTuple):
     share: complex
     """gamma."""
     owed: complex
-    """What a velocity owed of 1 m/s adds to m; 0 if the response has none."""
+    """What 1 m/s of velocity owed adds to m; 0 if the response owes no velocity."""
 
 
 class Responding:
     """The motion of a vehicle with a response, for `gcs.control.prediction.CommandHistory`; it holds V, P and the m.
 
-    The velocity that a set-point brings is the integral of all accelerations sent. A vehicle that holds an earlier one
-    goes astray from it, and the next set-point that it takes brings it back at once: its velocity owed jumps.
+    The velocity in a set-point is the integral of all accelerations sent. A vehicle that holds an earlier set-point
+    strays from this velocity, and makes up for it when it takes the next: the velocity that it owes jumps.
     """
 
     def __init__(self, response: Response) -> None:
@@ -51,7 +51,7 @@ class Responding:
         position += velocity * t
         after: list[complex] = []
         for m, (decay, entry, share, _) in zip(modes, self._modes, strict=True):
-            # m approaches `aim`; the integrals of m - aim and of that once more
+            # m approaches `aim`; m - aim is integrated once for the velocity, twice for the position
             aim = -entry * u / decay
             grown = exp(decay * t)
             off = share * (m - aim)

@@ -93,7 +93,7 @@ TICK = np.dtype(
         ("loop_delay_bound_s", "<f8"),  # error that clocks bring into it; NaN if others' states were used
         ("repeated_s", "<f8"),  # how long the set-point has repeated an earlier one, as far as telemetry is slower
         ("assumed_delay_s", "<f8"),  # loop delay over which the vehicle was predicted; 0 without prediction
-        ("delay_margin_s", "<f8"),  # longest delay that the gains flown take, as known at the time; infinite: any
+        ("delay_margin_s", "<f8"),  # longest delay that the gains flown tolerate, as known then; infinite: any
         ("headroom", "<f8"),  # 1 - loop delay / margin; with prediction 1 - mismatch / distance to the window's end
         ("rtt_s", "<f8"),  # a TIMESYNC round trip that has ended and is in no earlier row; NaN if there is none
         ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock, at sent_ns

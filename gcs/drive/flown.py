@@ -77,10 +77,10 @@ def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: boo
 
 
 def identified_in_flight(plan: FlightPlan) -> FlightPlan:
-    """The plan with the responses that its simulated autopilots show in virtual time, and the margins with these.
+    """The plan with the responses of its simulated autopilots, identified in virtual time, and the margins with them.
 
-    A plan whose responses are given, or whose vehicles respond at once, stays as it is. InputError says why the
-    vehicles did not come as far as the formation flight.
+    A plan whose responses are given, or whose vehicles respond at once, is returned unchanged. Raises InputError with
+    the reason if the formation flight does not begin.
     """
     if plan.responses is not None or plan.scenario.dynamics != "autopilot":
         return plan
@@ -127,7 +127,7 @@ def _processor_times() -> IntArray:
 
 
 def margins_of(plan: FlightPlan) -> Design:
-    """The part of a design that a run's files need; the campaign's report has the margins of the continuous model."""
+    """The part of a design that a run's files need; the margin of the continuous model is in the campaign's report."""
     if why := why_unknown(plan):
         return Design(delay_margin_s=None, margin_unknown=why)
     return Design(delay_margin_s=plan.delay_margin_s, delay_margin_continuous_s=None)
@@ -144,6 +144,6 @@ def median_delays_s(ticks: TickArray, system_ids: tuple[int, ...]) -> dict[int, 
 
 
 def first_uses(ticks: TickArray) -> TickArray:
-    """The rows that use a state for the first time: all rows, unless telemetry is slower than control or lost."""
+    """The rows that use a state for the first time: all rows, unless telemetry is slower than control, or lost."""
     _, first = np.unique(ticks[["system_id", "sample_boot_ms"]], return_index=True)
     return ticks[np.sort(first)]

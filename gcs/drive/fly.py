@@ -47,7 +47,7 @@ def fly(
     """Fly a designed scenario in real time, write the run to the folder, and return its summary.
 
     `show_table` shows the live table, or plain lines without a terminal. `fleet` says who provides the vehicles; if it
-    is empty, this flight starts simulated ones. Those sign with `key_file`; with `outlive_station` they wait to be
+    is empty, this flight starts simulated ones. These sign with `key_file`; with `outlive_station` they wait to be
     taken over if this process is killed. `viewer` is the URL of a Rerun viewer that shows the flight.
     """
     with stop_signals() as asked_to_stop:
@@ -79,7 +79,7 @@ def fly(
 
             try:
                 drive(station, link, writer, stop, new_plan, mirror)
-                if station.plan is not plan:  # now with the figures that take too long to compute in flight
+                if station.plan is not plan:  # now add the figures that take too long to compute in flight
                     _write_design(writer, folder, described(design, station.plan))
                 writer.event(
                     Event(time_s=station.scenario_time_s(clock_ns()), kind=record.END, text=station.end_reason)

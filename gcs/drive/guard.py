@@ -51,7 +51,7 @@ class Guard:
 
 
 def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:
-    """The guard with the key in a file; the timestamps it has seen are kept beside that, separately for each role.
+    """The guard with the key in a file; the timestamps it has seen are kept beside that file, one file for each role.
 
     Raises KeyFileError if one of the files cannot be used.
     """

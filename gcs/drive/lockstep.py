@@ -61,7 +61,7 @@ def vehicles_of(plan: FlightPlan, *, record: Record | None = None) -> Vehicles:
 
 
 class RecordedVehicles:
-    """The simulated vehicles of a plan, which log what they log in real time: their truth and what was sent to them."""
+    """The simulated vehicles of a plan, logged as in real time: their truth, and the frames sent to them."""
 
     def __init__(self, plan: FlightPlan, truth_file: Path) -> None:
         self._truth = TruthLog(truth_file)

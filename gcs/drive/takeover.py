@@ -1,4 +1,4 @@
-"""Takes over vehicles that are already there before the flight, if they fly the same experiment.
+"""Takes over vehicles that are in the air before the flight begins, if they fly the same experiment.
 
 Simulated vehicles whose station was killed fly on for a while. Only a flight with the same scenario, links and seed may
 take them over: otherwise its verdict would be about another experiment. Each vehicle names its scenario in the extended
@@ -21,8 +21,8 @@ TAKEN_OVER = "taken over: they were there already"
 CONNECTED = "not started here (--connect)"
 _SCENARIO = "SCENARIO"
 _SHUTDOWN, _KEEP, _SHUT_DOWN = 246, 0.0, 2.0
-"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: do nothing, and shut down. Even the former
-restarts the minute for which vehicles without a station fly on."""
+"""MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN and two values of its first parameter: do nothing, and shut down. Even doing
+nothing restarts the minute for which vehicles fly on without a station."""
 _HEARTBEAT_PERIOD_S = 1.2
 """Vehicles already in flight are heard within this time."""
 _ASK_AGAIN_NS = NS_PER_S // 4
@@ -106,7 +106,7 @@ class Presence:
         now_ns = 0
         while now_ns < until_ns:
             self._link.wait(until_ns)
-            now_ns = clock_ns()  # before the socket is read: what came by then is among what is received
+            now_ns = clock_ns()  # before reading, so that everything that arrived by then is received
             for datagram in self._link.receive():
                 for frame in mavlink.decode_either(datagram.data, Counter()):
                     if frame.system_id in self._wanted:
@@ -115,7 +115,7 @@ class Presence:
         return frames
 
     def _flown(self, text: str) -> str:
-        """What vehicles fly that gave this answer, in words."""
+        """In words, what the vehicles fly that gave this answer."""
         _, _, name = text.partition(" ")
         if not name:
             return "do not say which scenario they fly"

@@ -31,7 +31,7 @@ _ANCILLARY_BYTES = 64
 _LARGEST_DATAGRAM = 2048
 _DATAGRAMS_A_STEP = 4096
 _TOGETHER_NS = 3_000_000
-"""The station wakes for datagrams at most once in this time. Their stamps say when they came."""
+"""The station wakes for datagrams at most once in this time. Their stamps say when they arrived."""
 _PR_SET_TIMERSLACK = 29
 
 

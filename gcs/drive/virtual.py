@@ -94,7 +94,7 @@ class VirtualFlight:
 
 
 def load_scenario(scenario: Path | str) -> Scenario:
-    """The scenario in a file, or that ships by this name. Raises scenarios.errors.ScenarioError if there is none."""
+    """The scenario in a file, or the shipped one of this name. Raises scenarios.errors.ScenarioError if neither is."""
     return load(located(str(scenario)))
 
 

@@ -12,14 +12,15 @@ DRIFT_BOUND. The line is kept between them, and the bound is the distance to the
 loss and asymmetry as long as the clock drifts by less than DRIFT_BOUND and has not jumped since the newest exchange.
 
 Limits that contradict each other show that the clock has jumped, or that replies carry wrong stamps: an autopilot may
-date them back by the time that their bytes take on a serial port, and a simulator's clock slips. By more than
-STAMPS_OFF_NS it is a jump. Less is in doubt, and until it is decided the bound covers the limits before and since. If
-later exchanges fit the limits before, the contradiction was an error of stamps: `stamp_error_ns` is the largest seen
-so far, and from then on no contradiction up to that size counts. The eighth doubtful exchange in a row is a jump.
+date them back by the time that their bytes take on a serial port, and a simulator's clock slips. A contradiction by
+more than STAMPS_OFF_NS is a jump. A smaller one is in doubt; until it is decided, the bound covers the limits from
+before it and since. If later exchanges fit the limits from before, the contradiction was an error of stamps:
+`stamp_error_ns` is the largest seen so far, and later contradictions up to that size do not count. The eighth doubtful
+exchange in a row is a jump.
 
-A jump shorter than a round trip may not contradict the limits, but makes exchanges differ from the line by more than
-their round trips, the earlier residuals and the known error of the stamps explain. They are doubtful, too; the third in
-a row that is off by more than STAMPS_OFF_NS is a jump.
+A jump shorter than a round trip may not contradict the limits. But exchanges then lie farther from the line than their
+round trips, the earlier residuals and the known error of the stamps explain. They are doubtful, too; the third in a row
+that is off by more than STAMPS_OFF_NS is a jump.
 
 An error of all stamps by the same time cannot be seen: it acts as an asymmetric link. `expected_error_ns` holds what is
 known beforehand of the errors of a kind of vehicle. To an error that exchanges have shown, the bound adds the least
@@ -116,7 +117,7 @@ class _Limits(NamedTuple):
     high_at_ns: int
 
     def gap_ns(self, other: "_Limits") -> float:
-        """How far these limits exclude others, however the clock has drifted in between; not above 0 if they do not."""
+        """By how much these limits exclude others, whatever the drift in between; 0 or less if they do not."""
         return max(
             other.low_ns - self.high_ns - DRIFT_BOUND * abs(other.low_at_ns - self.high_at_ns),
             self.low_ns - other.high_ns - DRIFT_BOUND * abs(other.high_at_ns - self.low_at_ns),
@@ -176,7 +177,7 @@ class VehicleClock:
         self._fastest_ns, self._queued_ns, self._fitted_ns = LATEST_NS, 0.0, _LONG_AGO_NS
         """Least round trip since the last jump; the time that the exchanges of the line queued; when it was fitted."""
         self._tilt = _TILT
-        """The largest error of its rate."""
+        """The largest error of the line's rate."""
         self._known = _Limits(0, 0, 0, 0)
         """Limits of the offset."""
         self._doubtful: _Limits | None = None
@@ -218,7 +219,7 @@ class VehicleClock:
         return boot_ns + turns * _WRAP_NS
 
     def station_ns(self, boot_ms: int, received_ns: int) -> int | None:
-        """The station's time of a time_boot_ms that proves nothing of the clock; None while the clock is unknown."""
+        """The station's time of a time_boot_ms, not used to judge the clock; None while the clock is unknown."""
         if self.estimate.samples == 0:
             return None
         return min(received_ns, self.estimate.to_station_ns(self.boot_ns(boot_ms, received_ns)))
@@ -250,7 +251,7 @@ class VehicleClock:
         return sample_ns
 
     def _is_ahead(self, beyond_ns: float, received_ns: int, *, newest: bool) -> None:
-        """Note a state from the future. One that was overtaken may be of the clock before a jump: it proves nothing."""
+        """Note a state from the future. An overtaken one may bear a stamp from before a jump: it proves nothing."""
         if newest and beyond_ns > STAMPS_OFF_NS:
             self.lost, self._since_ns, self._count = True, received_ns, 0
             self.estimate = UNKNOWN._replace(skew=self.estimate.skew)

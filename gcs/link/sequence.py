@@ -1,15 +1,16 @@
 """Loss, lateness and duplication from MAVLink's 8-bit sequence numbers."""
 
+from scenarios.schema import NS_PER_S
+
 _KEPT = 128
 """How far back the sequence counter remembers which frames arrived."""
 _SEEN = (1 << _KEPT) - 1
 NEW, LATE, DUPLICATE = 0, 1, 2
-_NS_PER_S = 1_000_000_000
-_NO_DOUBT = 100.0 * _NS_PER_S
+_NO_DOUBT = 100.0 * NS_PER_S
 """While fewer than 100 frames are expected, the next number is the next frame."""
-_STEADY_NS = _NS_PER_S // 2
+_STEADY_NS = NS_PER_S // 2
 """A pause longer than this says nothing about the rate."""
-_RATE_NS = _NS_PER_S
+_RATE_NS = NS_PER_S
 """The rate is measured over intervals of this length, each weighted less than the next by the factor below. To count
 the losses of a minute's outage correctly, the rate must be known to about half a per cent, whatever the jitter."""
 _OLDER = 0.9
@@ -63,7 +64,7 @@ class SequenceCounter:
                 self._note_rate(time_ns)
             self._newest_ns = time_ns
             return NEW
-        passed = int(expected) // _NS_PER_S
+        passed = int(expected) // NS_PER_S
         most = passed + max(_LEAST_AHEAD, _AHEAD - int(self._lag))
         ahead = most - ((most - sequence + self._newest) & 0xFF)
         if ahead <= 0 and 0 < step <= _RUN_STEP:
@@ -107,5 +108,5 @@ class SequenceCounter:
         if steady:
             self._steady_frames = _OLDER * self._steady_frames + (self._newest - self._rate_count)
             self._steady_ns = _OLDER * self._steady_ns + since_ns
-            self._rate_hz = self._steady_frames / self._steady_ns * _NS_PER_S
+            self._rate_hz = self._steady_frames / self._steady_ns * NS_PER_S
         self._rate_count, self._rate_ns = self._newest, time_ns

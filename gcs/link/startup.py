@@ -128,7 +128,7 @@ class LaunchedStartup:
             self._set.add(parameters[0])
 
     def refused(self, command: int, parameters: tuple[float, ...], now_ns: int, *, repeated: bool) -> None:  # noqa: ARG002
-        """Without its active target a vehicle can be flown; any other step is tried again."""
+        """Go on without the active target, which is optional; any other step is tried again."""
         if command == SET_MESSAGE_INTERVAL and parameters[0] == OPTIONAL:
             self._set.add(parameters[0])
 

@@ -21,6 +21,7 @@ from gcs.link.kinds import (
 )
 from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter
 from gcs.link.startup import ExternalStartup, Startup
+from scenarios.schema import NS_PER_S
 
 ARMED = 0x80
 STATE_CRITICAL = 5
@@ -28,12 +29,11 @@ STATE_CRITICAL = 5
 _ORDER_TEXT = {LATE: "its frames arrive out of order", DUPLICATE: "its frames arrive more than once"}
 RESULTS = ("ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS", "CANCELLED")
 _ACCEPTED, _IN_PROGRESS = 0, 5
-_NS = 1_000_000_000
-_FORGET_NUMBERS_NS = 3 * _NS
+_FORGET_NUMBERS_NS = 3 * NS_PER_S
 SILENCE_S = 1.5
 """A vehicle without telemetry for this long is lost: it is sent no more set-points, and the others fly without it. One
 that sends nothing at all for this long may be accepted from another address."""
-_SILENT_NS = 3 * _NS
+_SILENT_NS = 3 * NS_PER_S
 """A vehicle that sends nothing for this long, not even heartbeats, is not ready."""
 
 
@@ -150,7 +150,7 @@ class RemoteVehicle:
 
     def is_elsewhere(self, address: Address, received_ns: int) -> bool:
         """Whether the vehicle is known to send from another address and has been heard lately."""
-        return self.address not in {None, address} and received_ns - self.heard_ns <= SILENCE_S * _NS
+        return self.address not in {None, address} and received_ns - self.heard_ns <= SILENCE_S * NS_PER_S
 
     def may_speak_from(self, address: Address, msg_id: int, received_ns: int) -> bool:
         """Whether a frame from another address can be from this vehicle: a heartbeat, at first and after silence."""
@@ -182,7 +182,7 @@ class RemoteVehicle:
         """Take in a HEARTBEAT. One made before the vehicle carried out a command does not undo what its ACK said."""
         custom_mode, vehicle_type, autopilot, base_mode, system_status, _ = fields
         armed, critical = bool(base_mode & ARMED), system_status == STATE_CRITICAL
-        recent_ns = now_ns - _NS - 2 * (self.clock.rtt_ns or 0)
+        recent_ns = now_ns - NS_PER_S - 2 * (self.clock.rtt_ns or 0)
         self._outdated = [before for before in self._outdated if before[0] > recent_ns]
         if any((custom_mode, armed) == (mode, was_armed) for _, mode, was_armed in self._outdated):
             return
@@ -219,7 +219,7 @@ class RemoteVehicle:
         elif (armed or self.armed) and not critical:
             self.taken_over = not self._takes_off_by(mode)
         if self.taken_over:
-            self._command = None  # repeated, it would take the vehicle back
+            self._command = None  # repeating it would take the vehicle back
 
     def _takes_off_by(self, mode: int) -> bool:
         """Whether a mode is part of the take-off that was commanded: its own mode at first, hold at the top."""
@@ -244,7 +244,7 @@ class RemoteVehicle:
             if command != ARM_DISARM or not self.startup.arming_refusals:  # repeated ones are counted
                 self._report("vehicle", f"answered {name} to command {command}", self.system_id)
             self.startup.refused(command, waiting.parameters, now_ns, repeated=waiting.confirmation > 0)
-            self._not_before_ns = now_ns + _NS
+            self._not_before_ns = now_ns + NS_PER_S
             return
         if command == ARM_DISARM and self.startup.arming_refusals > 1:
             self._report("vehicle", f"arms after {self.startup.arming_refusals} refusals", self.system_id)
@@ -277,7 +277,7 @@ class RemoteVehicle:
             return None
         waiting = self._command
         if waiting is not None:
-            if now_ns - waiting.sent_ns < max(_NS, 3 * (self.clock.rtt_ns or 0)):
+            if now_ns - waiting.sent_ns < max(NS_PER_S, 3 * (self.clock.rtt_ns or 0)):
                 return None
             waiting.sent_ns = now_ns
             waiting.confirmation = (waiting.confirmation + 1) & 0xFF

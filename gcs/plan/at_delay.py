@@ -56,12 +56,12 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
 
 
 def _is_predicted(design: Design) -> bool:
-    """Whether the loop is that of `gains.performance.predicted`, and not only its newest states are fed back."""
+    """Whether more than the newest states is fed back: a loop of `gains.performance.predicted`."""
     return design.prediction is not None or design.feed_forward > 0.0
 
 
 def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDelay:
-    """The figures of a loop that is predicted, or whose commands are fed forward; known of inclusion gains."""
+    """The figures of a loop with prediction or feed-forward; known for inclusion gains only."""
     assumed_s = 0.0
     if design.prediction is not None:
         fixed_s = design.prediction.assumed_delay_s

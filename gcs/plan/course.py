@@ -1,4 +1,4 @@
-"""The planned motion: where each vehicle of a manoeuvring formation is to be, how fast, and what that accelerates.
+"""The planned motion of a manoeuvring formation: place, velocity and acceleration of each vehicle over time.
 
 With the nominal velocity v_d(t) of heading psi(t), and places b_k(t) relative to the leader that change with formation
 changes, vehicle k is to fly
@@ -23,7 +23,7 @@ from scenarios.smooth import smooth_step
 
 Vector = tuple[float, float]
 _MOMENTS = 200
-"""Instants in each change at which planned motions are looked at."""
+"""Instants in each change at which planned motions are evaluated."""
 
 
 class Reference(NamedTuple):
@@ -56,7 +56,7 @@ class _Span(NamedTuple):
 class PlannedMotion:
     """The motion that a scenario asks of its vehicles, rows in the order of the formation.
 
-    Relative to the leader if somebody else flies it.
+    If somebody else flies the leader, velocities are relative to the leader's.
     """
 
     def __init__(self, scenario: Scenario, formation: Formation) -> None:
@@ -104,7 +104,7 @@ class PlannedMotion:
         return np.array([self.reference(row, time_s).place_m for row in range(len(self._spans[0].before))])
 
     def changes(self) -> list[tuple[float, FloatArray, FloatArray]]:
-        """Of each formation change the time, and the places (n, 2) before and after it in the frame of the offsets."""
+        """The time of each formation change, with the places (n, 2) before and after it in the frame of the offsets."""
         return [(span.from_s, _array(span.before), _array(span.after)) for span in self._spans[1:]]
 
     def largest(self, row: int) -> Largest:
@@ -118,7 +118,7 @@ class PlannedMotion:
         return Largest(slowest, fastest, most, fastest_turn)
 
     def _moments_s(self) -> list[float]:
-        """Instants at which the motion is looked at: the start, and many in every change; else it is steady."""
+        """Instants at which the motion is evaluated: the start and many in every change; in between it is steady."""
         changes = [(span.from_s, span.duration_s) for span in self._spans[1:]]
         if self._course is not None:
             changes += [(change.from_s, change.duration_s) for change in self._course.changes]
@@ -161,8 +161,8 @@ class Nearest(NamedTuple):
 def nearest_planned(scenario: Scenario) -> Nearest | None:
     """The least distance between any two vehicles in their places, over the whole flight, altitudes included.
 
-    None for a single vehicle. The places of two vehicles move along a line relative to each other during a change, and
-    turn together, so that the least distance has a closed form.
+    None for a single vehicle. During a change two places move along a line relative to each other, and all places turn
+    together, so the least distance has a closed form.
     """
     formation = plan_formation(scenario)
     motion = PlannedMotion(scenario, formation)

@@ -1,4 +1,4 @@
-"""Everything that a design can be asked for, as reached by the design of a scenario."""
+"""What the design of a scenario reaches for every criterion."""
 
 from math import inf
 
@@ -12,17 +12,17 @@ from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
 from gains.performance.response import Response
 from gains.varying.jitter import Jitter, bound_covering
-from gcs.plan.at_delay import expected_loop_delay_s
 from gcs.plan.design import CriteriaPart, Design
+from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.formation import plan_formation
 from scenarios.schema import Scenario
 
 _QUICK_STATES = 12
-"""States of one axis up to which the criteria take too little time to wait for before a flight."""
+"""Most states of one axis for which the criteria are computed before a flight: with more they take too long."""
 
 
 def with_criteria(design: Design, scenario: Scenario, *, most_states: float = _QUICK_STATES) -> Design:
-    """The design with `criteria`, but for those that take long; none with prediction, or if it is unstable."""
+    """The design with `criteria`, except those that take long; without any if it predicts or is unstable."""
     try:
         found = _found(design, scenario, most_states)
     except BadModelError:
@@ -48,7 +48,7 @@ def _found(design: Design, scenario: Scenario, most_states: float) -> CriteriaPa
 
 
 def with_bounds(design: Design, scenario: Scenario) -> Design:
-    """The design with the criteria that take long: α of any controller, and delays that vary."""
+    """The design with the criteria that take long: the bound on α of any controller, and varying delays."""
     design = with_criteria(design, scenario, most_states=inf) if design.criteria is None else design
     figures, found = _figures(design, scenario), design.criteria
     if figures is None or found is None or design.loop == "onboard":
@@ -72,9 +72,9 @@ def with_bounds(design: Design, scenario: Scenario) -> Design:
 
 
 def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> dict[str, object]:
-    """Which bound covers delays from one to another, and up to which delay it does.
+    """Which bound proves stability for all delays from `low_s` to `high_s`, and up to which delay.
 
-    On patterns only that for a spread is tried: the matrix inequalities of the others take minutes there.
+    On patterns only the bound for a spread is tried: the matrix inequalities of the others take minutes there.
     """
     hold_s, middle_s, spread_s = figures.timing.period_s / 2.0, (low_s + high_s) / 2.0, (high_s - low_s) / 2.0
     if figures.model.vehicles > 2 and rate > 0.0:
@@ -90,7 +90,7 @@ def _cover(figures: LoopFigures, low_s: float, high_s: float, rate: float) -> di
 
 
 def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
-    """The figures of a design's fastest gains, of one axis; None where they are not those of the loop that flies."""
+    """The figures of a design's fastest gains, of one axis; None where the loop that flies is another one."""
     if design.prediction is not None or design.feed_forward or design.vehicles < 2 or design.margin_unknown:
         return None
     step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0

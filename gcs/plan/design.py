@@ -201,9 +201,9 @@ class CriteriaPart(Published):
     noise_gain: float | None
     weight: tuple[float, float] = (1.0, 1.0)
     alpha_bound: float | None = None
-    """α that no controller exceeds at the delay; by `gcs design` only, as what follows."""
+    """α that no controller exceeds at the delay. Only `gcs design` computes this and the fields below."""
     delays_jumping_s: tuple[float, float] | None = None
-    """Among which delays about the one at hand it may jump at will."""
+    """Around `at_delay_s`: the loop delay may jump between these delays in any way."""
     delays_covered_by: str | None = None
     delays_covered_to_s: float | None = None
 
@@ -286,7 +286,7 @@ class Design(Published):
     prediction: PredictionPart | None = None
     at_loop_delay: FiguresAtExpectedDelay | None = None
     whole: WholeFigures | None = None
-    """Only of `gcs design`; so is the spread."""
+    """Only `gcs design` computes this and the spread."""
     spread: PredictedSpread | None = None
     criteria: CriteriaPart | None = None
     margin_unknown: str = ""

@@ -3,7 +3,7 @@
 Exact for a station that closes every loop with one rate (`gains.performance.disturbed`), with the fastest gains and
 links of one constant delay, if all vehicles sample at one instant. Where their clocks differ the station interpolates
 the state of the vehicle in front between two reports, which averages white noise: the errors reported are then up to
-13 % smaller. A sector and the loop on board have no such figure.
+13 % smaller. Not computed for the loop on board, nor for a disturbance that depends on the errors (a sector).
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ from gains.performance.predicted import fed_forward
 from gains.performance.radii import SectorLoop
 from gains.performance.response import formation_loop
 from gains.performance.robust import disturbance_bound
-from gcs.plan.at_delay import expected_loop_delay_s
 from gcs.plan.design import Design, PredictedSpread, VehicleSpread, WholeFigures
+from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation, on_one_axis, plan_formation
 from scenarios.schema import Scenario

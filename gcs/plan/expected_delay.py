@@ -12,7 +12,7 @@ from math import ceil
 import numpy as np
 
 from gains.core.arrays import FloatArray
-from scenarios.keys.link import Jitter, Link
+from scenarios.keys.link import Link
 from scenarios.schema import Scenario
 
 _SECONDS = 200.0
@@ -33,9 +33,9 @@ def expected_loop_delay_s(scenario: Scenario) -> float:
     links = [scenario.link_of(vehicle.system_id) for vehicle in scenario.vehicles]
     if not any(link.jitter or link.loss_probability or link.loss_bursts for pair in links for link in pair):
         if scenario.control.loop == "onboard":
-            around_s = max(_constant_s(up) for up, _ in links) + max(_constant_s(down) for _, down in links)
+            around_s = max(up.delay_max_s for up, _ in links) + max(down.delay_max_s for _, down in links)
         else:
-            around_s = max(_constant_s(up) + _constant_s(down) for up, down in links)
+            around_s = max(up.delay_max_s + down.delay_max_s for up, down in links)
         return around_s + 0.5 / max(scenario.rates.telemetry_hz, scenario.rates.control_hz)
     rng = np.random.default_rng(0)
     ages = {up: _ages_s(scenario, up, rng) for up, _ in dict.fromkeys(links)}
@@ -59,10 +59,6 @@ def waits_for_channels(scenario: Scenario) -> bool:
     )
 
 
-def _constant_s(link: Link) -> float:
-    return max((point.delay_s for point in link.delay_points), default=link.delay_s)
-
-
 def _median_of_sum(age_s: FloatArray, down_s: FloatArray, rng: np.random.Generator) -> float:
     return float(np.median(age_s + rng.choice(down_s, len(age_s))))
 
@@ -80,7 +76,8 @@ def _stream(
     enters = np.concatenate([often, exchanges])
     order = np.argsort(enters, kind="stable")
     enters, main = enters[order], (order < len(often)).astype(float)
-    out = enters + np.maximum(0.0, _constant_s(link) + _drawn_s(link.jitter, len(enters), rng))
+    jitter_s = 0.0 if link.jitter is None else link.jitter.drawn_s(len(enters), rng)
+    out = enters + np.maximum(0.0, link.delay_max_s + jitter_s)
     lost = rng.random(len(enters)) < _loss(link)
     out[lost] = -np.inf
     if not link.reordering:
@@ -92,7 +89,7 @@ def _stream(
 def _arrival_delays_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatArray:
     """One-way delays of the datagrams that come out."""
     enters, out, _ = _stream(link, scenario.rates.control_hz, scenario, rng)
-    return (out - enters)[np.isfinite(out)] if np.isfinite(out).any() else np.array([_constant_s(link)])
+    return (out - enters)[np.isfinite(out)] if np.isfinite(out).any() else np.array([link.delay_max_s])
 
 
 def _ages_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatArray:
@@ -103,7 +100,7 @@ def _ages_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatAr
     sampled, out = enters[known], out[known]
     ticks = rng.uniform(0.0, enters[-1], _MOST // 2)
     if not len(out):
-        return np.full(len(ticks), _constant_s(link))
+        return np.full(len(ticks), link.delay_max_s)
     order = np.argsort(out, kind="stable")
     arrived, newest = out[order], np.maximum.accumulate(sampled[order])
     place = np.searchsorted(arrived, ticks, side="right") - 1
@@ -113,7 +110,7 @@ def _ages_s(scenario: Scenario, link: Link, rng: np.random.Generator) -> FloatAr
     longest_s = (ceil(rates.control_hz / rates.telemetry_hz * (1.0 - 1e-4)) - 1) * period_s
     repeated = np.minimum(np.floor((ticks - arrived[first]) / period_s) * period_s, longest_s)
     ages = ticks - newest[place] - repeated
-    return np.resize(ages, _MOST // 2) if len(ages) else np.full(_MOST // 2, _constant_s(link))
+    return np.resize(ages, _MOST // 2) if len(ages) else np.full(_MOST // 2, link.delay_max_s)
 
 
 def _loss(link: Link) -> float:
@@ -122,21 +119,3 @@ def _loss(link: Link) -> float:
         return link.loss_probability
     bad = bursts.to_bad_probability / (bursts.to_bad_probability + bursts.to_good_probability)
     return bad * bursts.loss_bad_probability + (1.0 - bad) * bursts.loss_good_probability
-
-
-def _drawn_s(jitter: Jitter | None, count: int, rng: np.random.Generator) -> FloatArray:
-    if jitter is None:
-        return np.zeros(count)
-    scale_s, shape = jitter.scale_s or 0.0, jitter.shape or 1.0
-    match jitter.distribution:
-        case "uniform":
-            return rng.uniform(-scale_s, scale_s, count)
-        case "normal":
-            return rng.normal(0.0, scale_s, count)
-        case "exponential":
-            return rng.exponential(scale_s, count)
-        case "gamma":
-            return rng.gamma(shape, scale_s, count)
-        case "trace":
-            trace = np.array(jitter.trace_s or (0.0,))
-            return np.resize(np.roll(trace, -int(rng.integers(len(trace)))), count)

@@ -31,8 +31,8 @@ class Responses:
     def in_order(self, system_ids: Sequence[int]) -> list[Response]:
         """The responses of these vehicles.
 
-        One that was left out of the flight has none. In its place stands that of the last vehicle flown, so that it
-        makes no margin smaller: on a tree, all followers have the same gains.
+        A vehicle that was left out of the flight has none. The response of the last vehicle flown stands in for it,
+        which makes no margin smaller: on a tree, all followers have the same gains.
         """
         flown = [system_id for system_id in system_ids if system_id in self.of]
         return [self.of[system_id if system_id in self.of else flown[-1]] for system_id in system_ids]
@@ -73,7 +73,7 @@ class FlightPlan:
 
     @cached_property
     def tolerance(self) -> Callable[[float], Tolerated]:
-        """By how much the loop delay may miss the one that the station assumes, at that one."""
+        """How far the loop delay may be from the assumed one, as a function of the assumed one (s)."""
         prediction = self.scenario.control.prediction
         if prediction == "off":
             without = Tolerated((inf,) * len(self.margins_s), self.margins_s)
@@ -158,10 +158,10 @@ def margins_with(plan: FlightPlan, responses: Responses) -> list[float]:
 
 
 def margin_steps(plan: FlightPlan, responses: Responses) -> Generator[None, None, list[float]]:
-    """The same, in steps.
+    """What `margins_with` returns, computed in steps between control ticks.
 
     Where every vehicle's loop has a margin of its own and both axes are alike, a step is one vehicle, some milliseconds
-    (`gains.performance.lone_margin`). Other gains take `sampled_margin`, of all vehicles together.
+    (`gains.performance.lone_margin`). Otherwise it is `sampled_margin` of all vehicles together.
     """
     of, margins_s = responses.in_order(plan.formation.system_ids), list[float]()
     for K in plan.gains:
@@ -178,7 +178,7 @@ def margin_steps(plan: FlightPlan, responses: Responses) -> Generator[None, None
 
 
 def own_gains(plan: FlightPlan, K: FloatArray) -> list[tuple[float, float]] | None:
-    """k1 and k3 of each vehicle's own loop; None unless it is one of these."""
+    """k1 and k3 of each vehicle's own loop; None unless every loop has this form."""
     model, found = plan.model, list[tuple[float, float]]()
     if not plan.separable or plan.timing.commands > 1:
         return None

@@ -52,6 +52,5 @@ def _in_north_east(scenario: Scenario, offset_m: FloatArray) -> FloatArray:
 
 def on_one_axis(model: FormationModel, K: FloatArray) -> tuple[FormationModel, FloatArray] | None:
     """The formation and the gain of one axis; None if K does not act on every axis alike."""
-    one = K[:: model.axes, :: model.axes]
-    alike = np.array_equal(K, np.kron(one, np.eye(model.axes)))
-    return (FormationModel(model.predecessors, axes=1), one) if alike else None
+    narrow, one = model.narrowed(K)
+    return (narrow, one) if narrow.axes == 1 else None

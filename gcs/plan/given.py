@@ -1,11 +1,12 @@
-"""A scenario with gains that are given to it, found by a search or by a user, to be written, checked and flown."""
+"""Puts gains, found by a search or by a user, into a scenario that can be written, checked and flown."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gains.core.arrays import FloatArray
 from gains.core.structure import real_matrix
 from gcs.errors import InputError
-from gcs.plan.formation import plan_formation
+from gcs.plan.formation import Formation, plan_formation
 from scenarios.keys.part import Prediction
 from scenarios.schema import Control, FixedGains, GainBlock, Scenario
 
@@ -27,21 +28,25 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
 
     K has a row for each vehicle and a column for each error of one axis, in the order of
     `gains.FormationModel(..., axes=1)`: the leader's velocity error, then for each follower its spacing error and its
-    velocity error. `gains.design` and its like find K; so does any LQR of A and B of this model, whose u = -K e is
-    another sign. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite numbers.
+    velocity error. `gains.design` finds such a K; so does any LQR for A and B of this model, whose u = -K e has the
+    opposite sign. Raises InputError if K has another shape, and BadModelError if it is not a matrix of finite numbers.
     """
     formation = plan_formation(scenario)
-    model, ids, gain = formation.model, formation.system_ids, real_matrix("K", K)
+    model, gain = formation.model, real_matrix("K", K)
     wanted = model.B.shape[1] // model.axes, model.B.shape[0] // model.axes
     if gain.shape != wanted:
         raise InputError(
             f"K: read shape {gain.shape}, wanted {wanted}: a row for each vehicle, a column for each error"
         )
-    whole = np.kron(gain, np.eye(model.axes))
-    blocks = tuple(
+    return with_given(scenario, blocks=gain_blocks(np.kron(gain, np.eye(model.axes)), formation), prediction=prediction)
+
+
+def gain_blocks(K: FloatArray, formation: Formation) -> tuple[GainBlock, ...]:
+    """K block by block, as a scenario gives it, without those that are zero, except each vehicle's own."""
+    model, ids = formation.model, formation.system_ids
+    return tuple(
         GainBlock(vehicle=ids[i], of=ids[j], gain=(tuple(block[0].tolist()), tuple(block[1].tolist())))
         for i in range(model.vehicles)
         for j in range(model.vehicles)
-        if (block := whole[model.input_slice(i), model.output_slice(j)]).any()
+        if (block := K[model.input_slice(i), model.output_slice(j)]).any() or i == j
     )
-    return with_given(scenario, blocks=blocks, prediction=prediction)

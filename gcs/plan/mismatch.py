@@ -37,9 +37,9 @@ class Tolerated(NamedTuple):
     longer_s: tuple[float, ...]
 
     def used_s(self, gain_set: int, mismatch_s: float) -> float:
-        """The mismatch (loop delay minus assumed) on the scale of `longer_s`: at -`shorter_s` it is `longer_s`.
+        """How much of `longer_s` a mismatch (loop delay minus assumed) uses; one of -`shorter_s` uses all of it.
 
-        Infinite if the loop delay is shorter than assumed and none that is shorter is tolerated.
+        Infinite if the loop delay is shorter than assumed and no shorter one is tolerated.
 
         >>> half = Tolerated((0.1,), (0.2,))
         >>> half.used_s(0, 0.05), half.used_s(0, -0.05)
@@ -73,7 +73,7 @@ class Tabulated:
             before, after = self._reciprocal[:, int(place)], self._reciprocal[:, -(-int(1e9 * place) // 10**9)]
             share = place - int(place)
             mixed = np.where((before == 0.0) | (after == 0.0), np.maximum(before, after), 0.0)
-            # infinite where nothing is tolerated, also at the place itself, where its neighbour has no share
+            # a reciprocal is infinite where nothing is tolerated; times a share of 0 it would be NaN
             between = before if share == 0.0 else (1.0 - share) * before + share * after
             mixed = np.where(mixed > 0.0, mixed, between)
             with np.errstate(divide="ignore"):
@@ -99,9 +99,9 @@ def window(
     """The mismatch window of a sampled formation that is predicted over `assumed_s`.
 
     `responses` are those of the vehicles in the model's order; without them they respond at once. `onboard` is the
-    timing of the vehicles' own loops, if they have one. The map of one period
-    has a state for each command on its way. Where these are too many, the window is that of the continuous model, which
-    differs by less than a period of both rates at either end, less such a period at both.
+    timing of the vehicles' own loops, if they have one. The map of one period has a state for each command on its way.
+    Where these are too many, the window is that of the continuous model, narrowed at either end by a common period of
+    both rates, which is more than the models differ.
     """
     if assumed_s <= _MOST_ON_THE_WAY * timing.faster_s:
         return _window(model, K.tobytes(), timing, assumed_s, None if responses is None else tuple(responses), onboard)

@@ -28,8 +28,8 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
     """Design and plan of the onboard loop, from those of a ground loop with the same gains.
 
     Own gains are rounded to the float32 in which they are uploaded, so that what is analysed is what is flown. Slower
-    entries of the schedule keep the vehicles' own gains and reduce the share of the stream. Without any of it the
-    formation is stable at every delay: where vehicles act on each other both ways, that is flown around a lost one.
+    entries of the schedule keep the vehicles' own gains and reduce the share of the stream. Without any stream the
+    formation is stable at every delay; where vehicles act on each other both ways, it flies so while one is lost.
     """
     timing = onboard_timing(plan.scenario)
     assert timing is not None
@@ -68,7 +68,7 @@ def onboard_plan(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
 
 
 def _with_behaviour(design: Design, step_s: float) -> Design:
-    """The design with the behaviour of inclusion gains in the loop that is flown, at the delay of the ground loop's."""
+    """The design with the behaviour of inclusion gains in the onboard loop, at the delay used for the ground loop."""
     if design.inclusion_gains is None or design.behaviour is None:
         return design
     own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)

@@ -1,7 +1,7 @@
-"""A control law of one's own: what it is called with, and the design and plan of a scenario that names one.
+"""The user's own control law: what it is called with, and the design and plan of a scenario that names one.
 
 A law is a function `law(t_s, states, formation, memory)` that returns the acceleration of each vehicle, (N, 2) in m/s²
-north and east, or None for a row of no use. Its arguments:
+north and east. Its arguments:
 
     t_s        scenario time in s
     states     (N, 4): position north and east in m, velocity north and east in m/s, all at one instant
@@ -27,16 +27,17 @@ from gcs.errors import InputError
 from gcs.plan.design import CodeRecord, Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import Formation, plan_formation
+from gcs.plan.given import gain_blocks
 from scenarios.keys.own import BUILT_IN
 from scenarios.own_code import code_names, function_of
-from scenarios.schema import GainBlock, Scenario
+from scenarios.schema import Scenario
 
 NOT_LINEAR = "law is not linear; measure it with gcs stress --onset"
 OWN_DYNAMICS = "dynamics without [response], which gcs identify finds; or measure it with gcs stress --onset"
 TOLERANCE = 1e-6
 """Largest difference between a law and its matrices, relative to the largest entry of K."""
 _STEP = 1e-3
-"""Error (m, m/s) with which a law is linearised in place."""
+"""Error (m, m/s) of the differences by which a law is linearised."""
 _CALLS = 3
 """How often a law must give the same answer to the same errors to be called linear."""
 _SIZES = 1.0, -1.0, 50.0
@@ -122,8 +123,8 @@ def own_plan(
 ) -> tuple[Design, FlightPlan]:
     """Design and plan of a scenario whose controller is code; `given_plan` makes those of gains given as blocks.
 
-    A law with matrices has the margin of these, after a check that it agrees with them. Any other is flown with an
-    unknown margin; its gain is the law linearised in place, from which only the search for the onset takes something:
+    A law that states its K (`control.linear`) has the margin of K, after a check that the two agree. Any other is flown
+    with an unknown margin. Its gain is the law linearised at zero error; only the search for the onset uses it, to see
     which vehicles are coupled.
     """
     law, formation = law_of(scenario), plan_formation(scenario)
@@ -144,7 +145,7 @@ def own_plan(
         return design, plan
     _check(scenario, law, given, known)
     control = scenario.control.model_copy(
-        update={"method": "inclusion", "controller": None, "linear": None, "blocks": _blocks(given, formation)}
+        update={"method": "inclusion", "controller": None, "linear": None, "blocks": gain_blocks(given, formation)}
     )
     monitor = scenario.monitor.model_copy(update={"time_scales": (1.0,)})  # a law cannot be slowed down
     design, plan = given_plan(scenario.model_copy(update={"control": control, "monitor": monitor}))
@@ -206,7 +207,7 @@ def _given_gain(scenario: Scenario, formation: LawFormation) -> FloatArray:
 
 
 def _check(scenario: Scenario, law: Law, K: FloatArray, formation: LawFormation) -> None:
-    """Refuse a law that is not u = K e: in place, and at errors of each kind, small and large, whatever its memory."""
+    """Refuse a law that is not u = K e: without errors, and at small and large errors of each kind, call after call."""
     scale = float(np.abs(K).max())
     for size in (0.0, *_SIZES):
         for k in range(K.shape[1] if size else 1):
@@ -231,7 +232,7 @@ def _refused(scenario: Scenario, read: str) -> InputError:
 
 
 def _linearised(law: Law, formation: LawFormation) -> FloatArray:
-    """K of the law for small errors in place, by central differences; zero where it has no derivative or fails."""
+    """K of the law for small errors, by central differences; zero where it has no derivative or fails."""
     model = formation.model
     K = np.zeros((model.inputs, model.states))
 
@@ -249,15 +250,3 @@ def _linearised(law: Law, formation: LawFormation) -> FloatArray:
     # differences leave noise, which would couple all vehicles and make equal ones differ
     scale = TOLERANCE * float(np.abs(K).max(initial=0.0))
     return scale * np.round(K / scale) if scale else K
-
-
-def _blocks(K: FloatArray, formation: Formation) -> tuple[GainBlock, ...]:
-    """K block by block, as a scenario gives it."""
-    model, ids = formation.model, formation.system_ids
-    pairs = ((i, j) for i in range(model.vehicles) for j in range(model.vehicles))
-    found = ((i, j, K[model.input_slice(i), model.output_slice(j)]) for i, j in pairs)
-    return tuple(
-        GainBlock(vehicle=ids[i], of=ids[j], gain=tuple(tuple(row) for row in block.tolist()))  # pyright: ignore[reportArgumentType]
-        for i, j, block in found
-        if block.any() or i == j
-    )

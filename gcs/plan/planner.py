@@ -101,7 +101,7 @@ def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
 
 
 def _flown(scenario: Scenario, model: FormationModel, K: FloatArray) -> FloatArray:
-    """The gain with the share of the command in front that the scenario adds; margins stay the same."""
+    """The gain with the scenario's feed-forward of the command in front added; margins stay the same."""
     share = scenario.control.feed_forward
     return fed_forward(model, K, share) if share else K
 
@@ -129,7 +129,7 @@ def _flown_loop(design: Design, plan: FlightPlan) -> tuple[Design, FlightPlan]:
 
 
 def _prediction(plan: FlightPlan) -> PredictionPart:
-    """The mismatch windows of the fastest gains; computes the tolerance of the plan, which no tick can wait for."""
+    """The mismatch windows of the fastest gains. Also computes the plan's tolerance, which no tick can wait for."""
     assumed_s = plan.assumed_s
     plan.tolerance(assumed_s or 0.0)
     found = {at_s: _window_at(plan, at_s) for at_s in sorted({assumed_s or _SHOWN_S[0], *_SHOWN_S})}
@@ -150,7 +150,7 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
     """Design and plan with the margins of given responses."""
     if responses is None and plan.scenario.dynamics == "autopilot":
         whole = whole.model_copy(update={"response": ResponsePart(source=NOT_YET_KNOWN)})
-    if responses is None and plan.timing.commands == 1:  # what the design was found with
+    if responses is None and plan.timing.commands == 1:  # the design was found for these
         return whole, plan
     margins_s = (
         tuple(margins_with(plan, responses))

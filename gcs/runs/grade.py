@@ -1,4 +1,6 @@
-"""Latencies by the truth that vehicles and emulated links recorded: `gcs grade`, and what varying delays amount to.
+"""Measured latencies against the truth that vehicles and emulated links recorded, for `gcs grade`.
+
+`effective_delay_s` gives the constant delay that varying delays amount to.
 
 A round trip is that of one TIMESYNC exchange: the request's time in the down link plus the reply's in the up link. A
 loop delay is the time from the sampling of the newest state used to the instant at which the set-point computed from it
@@ -101,8 +103,8 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
     """TIMESYNC requests that the vehicle answered at once: when each reply was due (ns), and its round trip (s)."""
     own = truth[(truth["system_id"] == system_id) & (truth["key"] == _TIMESYNC) & (truth["fate"] & DROPPED == 0)]
     asked, answered = own[own["kind"] == LINK_DOWN], own[own["kind"] == LINK_UP]
-    # Where none may overtake, several come at one instant and are answered in their order. Not all are requests: where
-    # the station's answer to the vehicle is among them, it is not known which is which.
+    # Without reordering, several may arrive at one instant, and are answered in their order. If one of them is not a
+    # request but the station's answer to the vehicle, it is not known which, and none of them counts.
     sent_ns: dict[int, list[int]] = defaultdict(list)
     left_ns: dict[int, list[int]] = defaultdict(list)
     for entered_ns, due_ns in sorted(asked[["entered_ns", "due_ns"]].tolist()):
@@ -111,7 +113,7 @@ def true_round_trips(truth: Truth, system_id: int) -> tuple[NDArray[np.int64], F
         left_ns[entered_ns].append(due_ns)
     replies: list[tuple[int, int]] = []
     for at_ns, dues_ns in left_ns.items():
-        if len(sent_ns[at_ns]) in (1, len(dues_ns)):  # of one request there may be two replies, the second a copy
+        if len(sent_ns[at_ns]) in (1, len(dues_ns)):  # one request may have two replies, the second a copy
             replies += zip(dues_ns, itertools.cycle(sent_ns[at_ns]), strict=False)
     replies.sort()
     due = np.array([due_ns for due_ns, _ in replies], dtype=np.int64)
@@ -145,14 +147,14 @@ def _rows_used(ticks: TickArray) -> NDArray[np.int64]:
     used_s = (ticks["loop_delay_s"] + ticks["repeated_s"] - ticks["down_delay_s"]).reshape(-1, vehicles)
     apart_s = np.abs(age_s[:, np.newaxis, :] - used_s[:, :, np.newaxis])
     own = np.arange(vehicles)
-    apart_s[:, own, own] -= 1e-9  # its own, where another one is as old
+    apart_s[:, own, own] -= 1e-9  # prefer its own, where another one is as old
     nearest = np.argmin(np.where(np.isnan(apart_s), np.inf, apart_s), axis=2)
     return (np.arange(len(age_s))[:, np.newaxis] * vehicles + nearest).ravel()
 
 
 def instants(truth: Truth, kind: int) -> dict[tuple[int, int], int]:
     """The first instant (ns) of each (system id, time_boot_ms)."""
-    own = truth[truth["kind"] == kind][::-1]  # of several records the first is the last to be set
+    own = truth[truth["kind"] == kind][::-1]  # reversed, so that the first of several records is kept
     return {(system_id, key): time_ns for system_id, key, time_ns in own[["system_id", "key", "time_ns"]].tolist()}
 
 
@@ -182,7 +184,7 @@ def commands_of(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.in
 
 
 def commands_on_board(ticks: TickArray, truth: Truth, system_id: int) -> NDArray[np.int64]:
-    """The same with loops on board: what was streamed, and when the oldest state that it needed was sampled.
+    """As `commands_of`, with loops on board: the states are the oldest that each streamed command needed.
 
     `ticks` are whole: a row for every vehicle.
     """

@@ -147,7 +147,7 @@ def write_parquet(file: Path, columns: Mapping[str, Any]) -> None:
 
 @contextlib.contextmanager
 def replacing(file: Path) -> Generator[Path]:
-    """A file to be written while entered, which then takes the place of another in one step."""
+    """A new file to write inside the `with` block, which then replaces `file` in one step."""
     part = file.with_name(file.name + ".new")
     try:
         yield part

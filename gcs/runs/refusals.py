@@ -19,7 +19,7 @@ _COUNTERS = TypeAdapter(dict[str, int])
 
 
 class Refusals:
-    """Remembers what was reported."""
+    """Remembers which refusals have been reported."""
 
     def __init__(self) -> None:
         self._told: dict[str, int] = {}

@@ -190,7 +190,7 @@ def _error(flown: TickArray, system_id: int, column: str) -> Errors:
 def _settling_time_s(scenario: Scenario, errors: dict[int, Errors], flown: TickArray) -> float | None:
     """When the last follower came within a fraction of its spacing for good; None if one has not.
 
-    A vehicle without followers settles within the same fraction of its speed, of at least 1 m/s.
+    A single vehicle has settled when its velocity error is within that fraction of its speed, or of 1 m/s if slower.
     """
     whole = {v.system_id: float(np.hypot(*v.offset_ne_m)) for v in scenario.vehicles if v.offset_ne_m is not None}
     if not whole:
@@ -323,7 +323,7 @@ def _spread(values: FloatArray) -> Spread:
 
 
 def _own_code(scenario: Scenario, design: Design, events: Sequence[Event]) -> dict[str, Any]:
-    """What a summary says about code of the user's own; empty for a scenario that names none."""
+    """What a summary says about the user's own code; empty for a scenario that names none."""
     if not scenario.code:
         return {}
     fields: dict[str, Any] = {"code": code_records(scenario)}

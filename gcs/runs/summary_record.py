@@ -114,7 +114,7 @@ class FlownSpread(Published):
 
 
 class LawRecord(Published):
-    """The calls of a control law of one's own."""
+    """The calls of the user's own control law."""
 
     calls: int
     unusable: int

@@ -1,6 +1,6 @@
 """Ends a flight whose formation is broken: after a collision, or a spacing error beyond the limit.
 
-One that is broken before it begins is `not_formed` and does not begin.
+A flight whose vehicles are that far from their places at the start does not begin (`not_formed`).
 
 A vehicle that returns from its pilot, its failsafe or silence may be far from its place, and the vehicles behind it,
 whose places are relative to it, as far from theirs. Their errors say nothing about the loop until they have had time to
@@ -127,7 +127,7 @@ def recovery_time_s(plan: FlightPlan, decay_1_s: float, way_m: float, speed_m_s:
 
     Three time constants of the slowest gains, plus the time in which the error decays to the spacing error limit.
     Limits of acceleration and speed add twice the time that the distance takes under them alone: to speed up and slow
-    down, and to cover it with the speed that the formation's own speed leaves. 0 for gains that do not decay.
+    down, and to cover it at the speed in excess of the formation's own. 0 for gains that do not decay.
     """
     if decay_1_s <= 0:
         return 0.0

@@ -74,7 +74,7 @@ class FleetKind(Protocol):
 def fleet_of(plan: FlightPlan, report: Report, hooks: LawHooks | None = None) -> FleetKind:
     """The fleet that a plan is made for; `report` takes events of its vehicles as (kind, text, system id).
 
-    `hooks` are those of a control law of one's own.
+    `hooks` are those of the user's own control law.
     """
     if plan.scenario.dynamics == "autopilot":
         return AutopilotFleet(plan, report)

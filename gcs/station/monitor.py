@@ -73,7 +73,7 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
     any                 not guided                                            FAILSAFE
     LOST, FAILSAFE      heard and guided again                                RECOVERING, slowest set
     WAITING             guided                                                NOMINAL, fastest set
-    any                 h < critical for hold, slower set there               CRITICAL, next slower set
+    any                 h < critical for hold, a slower set exists            CRITICAL, next slower set
     any                 h < critical for hold, slowest set                    CRITICAL
     CRITICAL            h < 0 for hold, slowest set                           FAILSAFE, released
     any, released       h > caution + hysteresis for ease                     FAILSAFE, no longer released

@@ -39,7 +39,7 @@ _HEARTBEAT_NS = NS_PER_S
 class Station:
     """Flies one formation. `start_ns` is the time of the first control tick.
 
-    With `stopwatch_ns`, the calls of a control law of one's own are timed: in real time.
+    `stopwatch_ns` is a clock that times the calls of the user's own control law; None in virtual time.
     """
 
     def __init__(self, plan: FlightPlan, *, start_ns: int, stopwatch_ns: Callable[[], int] | None = None) -> None:
@@ -215,7 +215,7 @@ class Station:
         origin_north, origin_east, origin_down = self._fleet.frame_ned_m[row]
         if not self._history.add(row, sample_ns, (north + origin_north, east + origin_east, v_north, v_east)):
             return
-        self._telemetry_ns[row] = datagram.received_ns  # only what is new: a replay does not make up for silence
+        self._telemetry_ns[row] = datagram.received_ns  # new states only: a replay does not end a silence
         bound_s = clock.estimate.bound_at_ns(sample_ns) * 1e-9
         queue_s, received_ns = datagram.queued_ns * 1e-9, datagram.received_ns
         self._reported[row] = Reported(boot_ms, down + origin_down, v_down, queue_s, received_ns, bound_s)
@@ -359,7 +359,7 @@ class Station:
                 vehicle.goal = None if alone else Goal.END
         self._report("phase", str(phase))
 
-    # -- small things ----------------------------------------------------------------------------------------------
+    # -- sending and reporting -------------------------------------------------------------------------------------
 
     def _request_timesync(self, outgoing: list[Outgoing]) -> None:
         vehicle = self.vehicles[self._timesync_row]

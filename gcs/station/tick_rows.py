@@ -43,7 +43,7 @@ class VehicleTick(NamedTuple):
     """NaN while unknown."""
     commanded: bool
     tolerated: Tolerated
-    """By how much the loop delay may miss the assumed one."""
+    """How far the loop delay may be from the assumed one."""
     repeated_s: float
     """See `gcs.control.loop_delay.Repetitions`."""
 

@@ -1,4 +1,4 @@
-"""Gains for the links that one has: their loop delay and its spread from a log, and the best gains at these.
+"""Gains for measured links: the loop delay and its spread from a log, and the best gains for these.
 
 The one-way delays and losses of each vehicle in the log are drawn again at the rates of the scenario. Two designs are
 compared at the least and at the worst of these delays: gains without prediction, and gains with prediction over the
@@ -34,8 +34,8 @@ from scenarios.schema import Control, FixedGains, Scenario
 
 OPTION = "--links-of"
 LEAST_SHARE = 0.2
-"""Prediction must take a mismatch of at least this share of the delay to either side, and of a control period: the
-delays of another day are not those of the log."""
+"""Prediction must tolerate a mismatch of at least this share of the delay to either side, and of a control period:
+delays will differ from those in the log."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +81,13 @@ def measured_delays(run_or_file: Path, scenario: Scenario) -> MeasuredDelays:
 def for_measured_links(scenario: Scenario, run_or_file: Path) -> tuple[Scenario, LinkPart]:
     """The scenario with the gains that are best for measured links, and why these were chosen.
 
-    Raises InputError if the log shows too little, or no gains take the links.
+    Raises InputError if the log shows too little, or no gains tolerate the delays.
     """
     return best_for(scenario, measured_delays(run_or_file, scenario))
 
 
 def best_for(scenario: Scenario, delays: MeasuredDelays) -> tuple[Scenario, LinkPart]:
-    """The same for delays that are known. Raises InputError if no gains take them."""
+    """The scenario with the gains that are best for these delays, and why. Raises InputError if none tolerate them."""
     aim = _aim(scenario.control)
     candidates = tuple(_candidate(scenario, delays, aim, predicted=predicted) for predicted in (False, True))
     figure = "alpha" if aim == "alpha_at_delay" else "decay_rate_1_s"
@@ -127,7 +127,7 @@ def _name(own: LinkGains) -> str:
 
 
 def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicted: bool) -> LinkGains:
-    """The best gains of one way, with their figures."""
+    """The best gains with or without prediction, and their figures."""
     control, period_s = scenario.control, loop_timing(scenario).held_s
     criteria = Criteria(**control.criteria.model_dump()) if control.criteria is not None else Criteria()
     middle_s, worst_s, spare = delays.median_s, delays.worst_s, 1.0 - control.link_headroom
@@ -151,7 +151,7 @@ def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicte
 
 
 def evaluated(gains: ScalarGains, period_s: float, assumed_s: float | None, ends_s: tuple[float, float]) -> LinkGains:
-    """Gains with their exact figures: the worst at the ends of the delays with prediction, else at the longer one."""
+    """Gains with their exact figures: at the worse end of the delays with prediction, else at the longer delay."""
     model = FormationModel((-1, 0), axes=1)
     K = model.overlapping_gain([[-gains.k1]], [[gains.k2]], [[gains.k3]])
     if assumed_s is not None:

@@ -30,14 +30,14 @@ SYSTEM_ID = 254
 SILENT_NS = 3 * NS_PER_S
 """A vehicle not heard for this long counts as silent."""
 SAMPLE_NS = NS_PER_S // 10
-"""Mean time between two looks at how old the newest states are."""
+"""Mean time between two looks, each of which notes how old the newest states are."""
 LOWER_BOUND = "lower bound"
-"""Status of a delay measured against the fastest frame, for want of an exchange."""
+"""Status of a delay measured against the fastest frame, because there was no exchange."""
 _GOLDEN = 0.6180339887498949
 _ASKED = 4096
 """Requests remembered: those of 250 vehicles at 10 Hz over 1.6 s, of five over 80 s."""
 _LEAST_NS = 10 * NS_PER_S
-"""The fastest frame is that of the last one to two such spans. A drift of 20 ppm adds up to 0.4 ms in two."""
+"""The fastest frame is that of the last one to two spans of this length. A drift of 20 ppm adds 0.4 ms in two."""
 _AUTOPILOT, _NO_AUTOPILOT, _STATION = 1, 8, 6
 """Component id of an autopilot; MAV_AUTOPILOT_INVALID; MAV_TYPE_GCS."""
 ASK_AGAIN_NS = 2 * NS_PER_S
@@ -79,7 +79,7 @@ class WatchReport(Published):
 
 
 class WatchedVehicle:
-    """One vehicle as an onlooker sees it: what it sent, and how late that was."""
+    """One vehicle as an onlooker sees it: what it sent, and how late it arrived."""
 
     def __init__(self, system_id: int) -> None:
         self.remote = RemoteVehicle(system_id, startup=LaunchedStartup(1.0))
@@ -112,7 +112,7 @@ class WatchedVehicle:
             return  # overtaken
         self.remote.clock.sampled_ns(frame.fields[0], received_ns, newest=self.remote.newest)  # notices a jump
         if boot_ns < self.boot_ns:
-            self._least_ns = (1 << 62, 1 << 62)  # started anew
+            self._least_ns = (1 << 62, 1 << 62)  # its clock has started anew
         if self.states and received_ns - self.state_ns > SILENT_NS:
             for looks in (self.age_s, self.loop_delay_s):
                 looks[self._judged :] = array("d", [nan]) * (len(looks) - self._judged)

@@ -1,7 +1,7 @@
 """`gcs monitor`: the driver that watches the links of a socket and commands nothing.
 
 It sends only TIMESYNC requests and, if told to, requests for positions, under a system id that is not a station's. It
-sends no heartbeat: a vehicle whose station is gone has to notice.
+sends no heartbeat, so that a vehicle notices when its station is gone.
 """
 
 import math
@@ -38,8 +38,8 @@ def watch_links(
     """Watch for the time asked or until there is a reason to stop; returns the figures of the whole time.
 
     `margin_of` says where the margin is from. `timesync_hz` is the rate of requests to each address, 0 to send nothing.
-    Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder`
-    notes every frame that `watch` takes.
+    Vehicles that send no position are asked for it at `position_hz`, unless that is 0. `recorder` notes every frame
+    that `watch` takes.
     """
     requests = Requests(timesync_hz, position_hz)
     start_ns = now_ns = clock_ns()

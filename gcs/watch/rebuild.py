@@ -1,8 +1,8 @@
 """Rebuilds the ticks of a flight, with their latencies, errors and modes, from its telemetry log alone.
 
 The frames of the log are fed in order to the station's own code for clocks, sequence numbers and states at one instant.
-A log of this station shows its ticks by the time_boot_ms of its set-points; any other log is sampled at the scenario's
-control rate.
+A log of this station shows its ticks by the time_boot_ms of its set-points; in any other log, ticks are placed at the
+scenario's control rate.
 
 A log does not say how long telemetry waited in the station's socket. Nor does it say by how much the monitor had opened
 the formation, so errors are relative to the formation as designed. Lateness is relative to the most punctual tick.
@@ -123,7 +123,7 @@ def _announced(frame: mavlink.Frame) -> tuple[int, str] | None:
 
 def _plan(scenario: Scenario, margins_s: tuple[float, ...]) -> FlightPlan:
     """The plan that defines the errors; it has gains only where the latencies depend on them."""
-    # the states that a streamed command needs depend on the gains, and so does the window of a predicted loop
+    # which states a streamed command needs depends on the gains, and so does the window of a predicted loop
     if onboard_timing(scenario) is not None or scenario.control.prediction != "off":
         return flight_plan(scenario)[1]
     formation = plan_formation(scenario)
@@ -183,7 +183,7 @@ class _Rebuilding:
     def finished(self) -> Rebuilt:
         """What was found, once the log has been read."""
         self._close_tick()
-        self._look(self._newest_ns + self._period_ns)  # what came after the last tick
+        self._look(self._newest_ns + self._period_ns)  # takes in what came after the last tick
         rows = np.concatenate(self._rows) if self._rows else np.empty(0, TICK)
         rows = rows[np.argsort(rows["tick"], kind="stable")]
         return Rebuilt(rows, self._events, self.watch, bool(self._outline.keys))
@@ -203,7 +203,7 @@ class _Rebuilding:
             self._open = None
 
     def _look(self, time_ns: int) -> None:
-        """Add the ticks without set-points: before and after those of this station, or all in a log of another."""
+        """Add the ticks without set-points: those before and after this station's, or all if another wrote the log."""
         if time_ns - self._grid_ns > _LONGEST_GAP_NS:
             behind = (time_ns - self._outline.base_ns) // self._period_ns
             self._grid_ns = self._outline.base_ns + behind * self._period_ns
@@ -282,7 +282,7 @@ class _Rebuilding:
         self._rows.append(rows)
 
     def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:
-        """The oldest round trip that is in no earlier tick, NaN if there is none."""
+        """The oldest round trip that no earlier tick holds; NaN if there is none."""
         taken = self._exchanges[row]
         if taken == len(vehicle.rtt_s):
             return nan

@@ -30,7 +30,7 @@ _Found = TypeVar("_Found")
 
 @dataclass(frozen=True)
 class LogSource:
-    """A log, and what is known of its flight: None where there is nothing beside it."""
+    """A log, and what the files beside it say of its flight; None for each that is not there."""
 
     log_file: Path
     scenario: Scenario | None
@@ -40,7 +40,7 @@ class LogSource:
 
 
 def found(run_or_file: Path) -> LogSource:
-    """The log, and the files beside it if it is that of a run's folder."""
+    """The log, and the files beside it if it lies in a run's folder."""
     log_file = run_or_file / TLOG_FILE if run_or_file.is_dir() else run_or_file
 
     def beside(name: str, read: Callable[[Path], _Found]) -> _Found | None:

@@ -2,8 +2,8 @@
 
 Up: the delays of position reports and TIMESYNC replies, each from its vehicle's time stamp. Down: those of TIMESYNC
 requests; each stands for the datagrams until the next exchange. Both depend on the estimated offset of the vehicle's
-clock, which exchanges know only within half a round trip: what is wrong one way is missing the other way, so their sum
-holds. Least delays come out equal both ways, unless the clock's bound excludes that.
+clock, which exchanges show only within half a round trip. An error of it adds to one direction what it takes from the
+other, so their sum is right. The least delays come out equal both ways, unless the clock's bound excludes that.
 
 Losses up are counted from sequence numbers. Losses down cannot be seen from here and are taken to be the same.
 """
@@ -18,15 +18,14 @@ from gains.core.arrays import FloatArray
 from gcs.errors import InputError
 from gcs.link import mavlink
 from gcs.watch.links import Watch
-from scenarios.files import TRACE_DELAYS
-from scenarios.keys.link import Jitter, Link, LossBursts
+from scenarios.keys.link import TRACE_DELAYS, Jitter, Link, LossBursts
 from scenarios.keys.profile import Latency, LinkProfile, Measured
 from scenarios.link_files import dump_profile
 
 _SETTLED = 20
 """Exchanges after which a clock is known well enough for one-way delays."""
 _BOOT_ROUNDING_S = 0.0005
-"""Mean of what `time_boot_ms` cuts off, which would make every delay of a position report longer."""
+"""Mean of what `time_boot_ms` cuts off; subtracted, because it lengthens every delay of a position report."""
 _LEAST = 10
 """Fewest delays each way from which a profile is made."""
 
@@ -78,11 +77,11 @@ class LinkRecorder:
 
     @property
     def measured(self) -> list[int]:
-        """The vehicles of which enough was seen for a profile."""
+        """The vehicles with enough delays for a profile."""
         return sorted(k for k, own in self._seen.items() if len(own.up_s) >= _LEAST and len(own.down_s) >= _LEAST)
 
     def profile(self, source: str, *, only: int | None = None, option: str = "--save-links") -> LinkProfile:
-        """The links seen, those of all vehicles one after the other, or of one. Raises InputError if too little was."""
+        """The links of all vehicles, their delays one after the other, or of one. Raises InputError with too few."""
         seen = [self._seen[k] for k in self.measured if only in (None, k)]
         if not seen:
             wanted = f"{_LEAST} delays each way of a vehicle, after its first {_SETTLED} TIMESYNC exchanges"
@@ -140,7 +139,7 @@ def _link(delays_s: FloatArray, loss: LossBursts | None) -> Link:
 
 
 def _loss(runs: list[int], received: int) -> LossBursts | None:
-    """Gilbert's model with the mean length of the runs, and one run in as many datagrams as seen."""
+    """Gilbert's model: its bursts have the mean length of the runs, and begin as often."""
     if not runs:
         return None
     # a burst lasts 1 / r datagrams; it begins after p of the good ones

@@ -1,4 +1,4 @@
-"""What `gcs monitor` shows: the figures of links, as a table or as a line."""
+"""The display of `gcs monitor`: the figures of links, as a table or as a line."""
 
 from collections.abc import Sequence
 

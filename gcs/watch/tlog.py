@@ -1,6 +1,6 @@
-"""Telemetry logs (.tlog) of any tool: big-endian µs since 1970, then a MAVLink 1 or 2 frame, and so on.
+"""Reads telemetry logs (.tlog) of any tool: repeatedly, big-endian µs since 1970 and a MAVLink 1 or 2 frame.
 
-What is damaged is left out and counted: reading goes on at the next frame with a good checksum.
+Damaged parts are left out and counted: reading goes on at the next frame with a good checksum.
 """
 
 import re

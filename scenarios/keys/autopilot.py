@@ -1,11 +1,11 @@
-"""How vehicles with autopilots respond to set-points, as the file says it, and what of it contradicts itself."""
+"""How vehicles with autopilots respond to set-points, as the file describes it, and its contradictions."""
 
 from collections.abc import Iterator
 from typing import Annotated
 
 from pydantic import Field
 
-from scenarios.keys.part import NotNegative, Part, Positive
+from scenarios.keys.part import Fault, NotNegative, Part, Positive
 
 DeadTime = Annotated[float, Field(ge=0, le=1)]
 
@@ -31,9 +31,7 @@ class Response(Part):
     """Natural frequency; makes the response one of second order."""
 
 
-def response_contradictions(
-    key: str, dead_time_s: float, natural_frequency_rad_s: float | None
-) -> Iterator[tuple[str, object, str]]:
-    """What contradicts itself in a response: key, what was read, what was wanted."""
+def response_contradictions(key: str, dead_time_s: float, natural_frequency_rad_s: float | None) -> Iterator[Fault]:
+    """What contradicts itself in a response."""
     if dead_time_s and natural_frequency_rad_s is not None:
         yield f"{key}.dead_time_s", dead_time_s, "no such key with natural_frequency_rad_s: one model at a time"

@@ -1,14 +1,12 @@
-"""What else a design is asked for, and further overlaps of information; `gains.core.requirement.Criteria` is met."""
+"""Further requirements of a design, and who hears whom; `gains.core.requirement.Criteria` is the design's side."""
 
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from scenarios.keys.part import NotNegative, Part, Positive
+from scenarios.keys.part import Fault, NotNegative, Part, Positive
 
-Fault = tuple[str, object, str]
-"""A key, what was read and what was wanted."""
 _AT_DELAY = "alpha_at_delay", "decay_rate_at_delay_1_s"
 
 
@@ -31,7 +29,7 @@ class Criteria(Part):
     """
 
     at_delay_s: Positive | None = None
-    """Loop delay at which the gains are to be best; what is asked for at a delay is meant there."""
+    """Loop delay at which the gains are to be best; requirements "at a delay" refer to it."""
     maximise: (
         Literal["alpha", "decay_rate_1_s", "alpha_at_delay", "decay_rate_at_delay_1_s", "delay_margin_s"] | None
     ) = None
@@ -53,12 +51,12 @@ class Criteria(Part):
     standard deviation of the noisiest command (m/s²) where every error is measured with white noise of 1 m and
     1 m/s."""
     delays_s: tuple[NotNegative, NotNegative] | None = None
-    """Requirement: the least and the largest loop delay among which stability must be proved."""
+    """Requirement: the least and the largest loop delay between which stability must be proved."""
     delay_rate: NotNegative | None = None
     """How fast the delay varies in `delays_s`, s/s: 0 for one that is constant but not known. Omitted: it may jump."""
     weight: tuple[Positive, Positive] | None = None
-    """Diagonal of the weight W of spacing errors and of velocity errors, with which every alpha is meant: disturbances
-    up to alpha |W e|. Omitted: W = I."""
+    """Weights of spacing errors and of velocity errors, the diagonal of W: every alpha then bounds disturbances by
+    alpha |W e|. Omitted: W = I."""
 
 
 def criteria_faults(

@@ -5,10 +5,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from scenarios.keys.part import NotNegative, Number, Part, Positive
+from scenarios.keys.part import Fault, NotNegative, Number, Part, Positive
 
-Fault = tuple[str, object, str]
-"""A key, what was read and what was wanted."""
 AllPass = Annotated[float, Field(gt=-1, le=1)]
 
 
@@ -75,7 +73,7 @@ class Navigation(Part):
 def disturbance_contradictions(
     disturbance: Disturbance | None, *, vehicles: int, steady: bool, dynamics: str
 ) -> Iterator[Fault]:
-    """What the sector contradicts in a scenario with so many vehicles; `steady`: one velocity, one shape."""
+    """What contradicts the sector in a scenario with this many vehicles; `steady`: one velocity, one shape."""
     sector = None if disturbance is None else disturbance.sector
     if sector is None:
         return

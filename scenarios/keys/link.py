@@ -1,10 +1,19 @@
-"""The emulated radio links of a scenario, as the file describes them; `sim_vehicles.links` implements them."""
+"""The emulated radio links of a scenario, as the file describes them; `sim_vehicles.links` implements them.
 
-from typing import Annotated, Literal
+A distribution of jitter is whole in `Jitter`: its keys, its draws and its least value.
+"""
 
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
-from scenarios.keys.part import NotNegative, Part, Positive, Probability, SystemId
+from scenarios.keys.part import MOST, Fault, NotNegative, Part, Positive, Probability, SystemId
+
+TRACE_DELAYS = 100_000
+"""Largest number of delays in a trace."""
 
 
 class Jitter(Part):
@@ -28,6 +37,49 @@ class Jitter(Part):
     It is read once, with the scenario, which then holds the delays themselves in `trace_s`."""
     trace_s: tuple[NotNegative, ...] | None = None
     """The measured delays, in place of `trace_file`."""
+
+    def drawn_s(self, size: int | tuple[int, int], rng: np.random.Generator) -> npt.NDArray[Any]:
+        """Random delays (s) in an array of this size; a trace is repeated in its order, from a random start."""
+        scale_s = self.scale_s or 0.0
+        match self.distribution:
+            case "uniform":
+                return rng.uniform(-scale_s, scale_s, size)
+            case "normal":
+                return rng.normal(0.0, scale_s, size)
+            case "exponential":
+                return rng.exponential(scale_s, size)
+            case "gamma":
+                return rng.gamma(self.shape or 1.0, scale_s, size)
+            case "trace":
+                trace = np.array(self.trace_s or (0.0,))
+                return np.resize(np.roll(trace, -int(rng.integers(len(trace)))), size)
+
+    @property
+    def least_s(self) -> float:
+        """A lower bound of the delays (s)."""
+        match self.distribution:
+            case "uniform":
+                return -(self.scale_s or 0.0)
+            case "normal":
+                return -MOST  # no bound: no link delays by more
+            case "exponential" | "gamma":
+                return 0.0
+            case "trace":
+                return min(self.trace_s or (0.0,))
+
+    def contradictions(self, key: str) -> Iterator[Fault]:
+        """What contradicts itself in these keys; `key` is where they stand in the file."""
+        given = [name for name in ("scale_s", "shape", "trace_file", "trace_s") if getattr(self, name) is not None]
+        if self.distribution == "trace":
+            if given not in (["trace_file"], ["trace_s"]):
+                yield key, ", ".join(given) or "neither", "either trace_file or trace_s with distribution trace"
+            if self.trace_s is not None and not 1 <= len(self.trace_s) <= TRACE_DELAYS:
+                yield f"{key}.trace_s", f"{len(self.trace_s)} delays", f"1 to {TRACE_DELAYS}"
+            return
+        wanted = ["scale_s", "shape"] if self.distribution == "gamma" else ["scale_s"]
+        if given != wanted:
+            text = f"{' and '.join(wanted)} and nothing else with distribution {self.distribution}"
+            yield key, ", ".join(given) or "nothing", text
 
 
 class LossBursts(Part):
@@ -91,6 +143,11 @@ class Link(Part):
     """Times during which everything is lost."""
     channel: str | None = None
     """Name of the entry of `links.channels` that this link uses; without it the bandwidth is unlimited."""
+
+    @property
+    def delay_max_s(self) -> float:
+        """The largest delay, without jitter."""
+        return max((point.delay_s for point in self.delay_points), default=self.delay_s)
 
 
 class VehicleLinks(Part):

@@ -1,4 +1,4 @@
-"""Code of others that a scenario names: a control law, a vehicle's dynamics, an aircraft. Nothing here runs it."""
+"""Code that a scenario names: a control law, a vehicle's dynamics, an aircraft of jsbsim. Nothing here runs it."""
 
 from hashlib import sha256
 from typing import Annotated, Literal
@@ -55,5 +55,5 @@ class CodeFile(Part):
 
     @property
     def sha256(self) -> str:
-        """Identifies what is in the file."""
+        """Identifies the contents of the file."""
         return sha256(self.text.encode()).hexdigest()

@@ -21,6 +21,8 @@ Headroom = Annotated[float, Field(ge=-1000, lt=1)]
 Rate = Annotated[float, Field(ge=1, le=500)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Flavour = Literal["ardupilot", "px4"]
+Fault = tuple[str, object, str]
+"""What is wrong with a scenario: a key, what was read, and what was wanted."""
 PREDICTION_MAX_S = 10.0
 """Longest loop delay that the station predicts over."""
 

@@ -1,11 +1,11 @@
-"""What a simulated copter shares with autopilots in SITL besides the way it flies: clocks that lie a little."""
+"""The clock errors that simulated copters share with autopilots in SITL."""
 
 from collections.abc import Iterator
 from typing import Annotated
 
 from pydantic import Field
 
-from scenarios.keys.part import Part
+from scenarios.keys.part import Fault, Part
 
 
 class Sitl(Part):
@@ -20,7 +20,7 @@ class Sitl(Part):
     """Mean time between two such slips; exponential. Only with `slip_s`."""
 
 
-def sitl_contradictions(sitl: Sitl, dynamics: str) -> Iterator[tuple[str, object, str]]:
-    """Keys that have no effect."""
+def sitl_contradictions(sitl: Sitl, dynamics: str) -> Iterator[Fault]:
+    """Keys that would have no effect."""
     if sitl != Sitl() and dynamics != "autopilot":
         yield "autopilot.sitl", sitl.model_dump(), "no such key without dynamics autopilot"

@@ -48,7 +48,7 @@ _FLAG_IN_CHECKSUM = tuple(mcrf4xx(b"\0\1" + bytes(8 + n)) ^ mcrf4xx(bytes(10 + n
 class SignedLink:
     """One system's end of one link.
 
-    `crc_extra` is the byte that ends the checksummed data of each message id, and `epoch_ns` the time, in ns since
+    `crc_extra` gives, for each message id, the byte that ends the checksummed data; `epoch_ns` is the time, in ns since
     1970, at which the clock of `now_ns` is 0. Where several ends share one memory of timestamps, `owner` is the system
     id of this end.
     """
@@ -82,8 +82,8 @@ class SignedLink:
     ) -> bytes:
         """The valid frames of a datagram, without their signatures; the others are counted by reason.
 
-        `unwanted` may give another reason to refuse genuine frames of a system id, for example that they are copies: a
-        copy that came first would make the frame itself count as a replay.
+        `unwanted` may give a reason to refuse genuine frames of a system id, for example that they are copies: if a
+        copy arrived first and were accepted, the frame itself would count as a replay.
         """
         good: list[bytes] = []
         at, end = 0, len(datagram)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
 NS_PER_S = 1_000_000_000
 GOODBYE_NS = NS_PER_S
-"""Time between the shut-down of the last vehicle and the end: answers are still under way."""
+"""Time between the shut-down of the last vehicle and the end, in which the last answers leave the links."""
 
 DESCRIPTION = """\
 Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
@@ -210,7 +210,7 @@ class _Lines:
                 self.line(f"warning: {host}:{port} is open: {why}")
 
     def news(self, changes: list["Change"], sockets: "Sockets", log: "TruthLog | None") -> None:
-        """What has happened since the last call; the truth of that time is written out."""
+        """Print what has happened since the last call, and write out the truth log."""
         self.changes(changes)
         self.lateness(sockets)
         if log:

@@ -29,7 +29,7 @@ Datagram = tuple[int, bytes, int]
 """(system id of the vehicle, bytes, host time in ns)"""
 
 _SECTOR = 0
-"""In place of a system id: the disturbance that depends on the errors of all vehicles."""
+"""Stands in for a system id where the disturbance that depends on the errors of all vehicles acts."""
 _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 
@@ -49,10 +49,10 @@ class Fleet:
     """The vehicles and links of a scenario.
 
     Vehicles do not affect each other, so each is brought up to date only when one of its datagrams can leave, in order
-    of that time and of system id. Nothing comes too late for it, since everything it does has its exact instant. There
-    are three exceptions: in a shared channel one vehicle's datagrams delay another's, a sensor sees another vehicle,
-    and a disturbance may depend on the errors of all. Then events run in order of time, at the same instant first that
-    disturbance, then the station's datagrams and then the vehicles by system id.
+    of that time and of system id. This is not too late for anything, as all that a vehicle does has its exact instant.
+    There are three exceptions: in a shared channel one vehicle's datagrams delay another's, a sensor sees another
+    vehicle, and a disturbance may depend on the errors of all. Then events run in order of time; at one instant, first
+    the disturbance, then the station's datagrams, then the vehicles by system id.
 
     `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and the vehicles
     get only what could be verified.
@@ -242,7 +242,7 @@ class Fleet:
         crafts = {system_id: member.vehicle.craft for system_id, member in self._members.items()}
         for system_id, push in self._sector.pushes(lambda system_id: crafts[system_id].state_at(now_ns)).items():
             craft = crafts[system_id]
-            assert isinstance(craft, DoubleIntegrator)  # the scenario's check sees to it
+            assert isinstance(craft, DoubleIntegrator)  # checked when the scenario was read
             craft.push(push, now_ns)
         heapq.heappush(self._acts, (now_ns + self._sector.period_ns, _SECTOR))
 

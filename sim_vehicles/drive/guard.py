@@ -23,7 +23,7 @@ def signed_links(key: Key, system_ids: Iterable[int], *, epoch_ns: int, stamps: 
 
 
 def open_links(key_file: Path, system_ids: Iterable[int], *, epoch_ns: int) -> dict[int, SignedLink]:
-    """The same with the key in a file; the newest timestamps are kept in a file beside it.
+    """The vehicles' ends with the key in a file; the newest timestamps are kept in a file beside it.
 
     Raises KeyFileError if one of the files cannot be used.
     """

@@ -19,18 +19,18 @@ from scenarios.schema import NS_PER_S
 from sim_vehicles.drive.fleet import Datagram
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
-"""How long the loop polls the clock instead of sleeping before a due time: with few vehicles, waking up is most of the
-error. The second figure bounds it for all vehicles together, to a tenth of a core at 50 Hz."""
+"""How long the loop polls the clock before a due time instead of sleeping, because with few vehicles the wake-up is
+most of the error. The second figure bounds the sum over all vehicles, to a tenth of a core at 50 Hz."""
 TOGETHER_NS = 1_000
-"""Of many vehicles, what happens close together is done together: the loop wakes at most once in this time per vehicle.
-250 vehicles act and receive about 30,000 times a second."""
+"""The loop wakes at most once in this time per vehicle, and handles what is close together at once: 250 vehicles act
+and receive about 30,000 times a second."""
 LONGEST_WAIT_NS = NS_PER_S // 10
 """The loop checks at least this often whether to stop."""
 DATAGRAM_BYTES = 2048
 READS_PER_WAKE = 1000
 """Datagrams read from one socket before the others, so that a flood into it cannot block them."""
 LATE_NS = 5_000_000
-"""A datagram that leaves later than this is counted: the emulated link is then not the scenario's."""
+"""A datagram that leaves later than this is counted: the emulated link then differs from the scenario's."""
 CLOCK_GAP_NS = 3_000
 """A reading of both clocks that took longer than this was interrupted, and is discarded."""
 
@@ -104,7 +104,7 @@ class Sockets:
         for file_number, _ in self._epoll.poll(0):
             read = 0
             for data, stamp_ns, address in self._read(self._sockets[file_number]):
-                # Stamps jump if the wall clock is set; but nothing is older than when the sockets were last empty.
+                # Stamps jump if the wall clock is set, but nothing arrived before the sockets were last empty.
                 latest_ns = time.monotonic_ns()
                 time_ns = latest_ns if stamp_ns is None else stamp_ns + to_monotonic_ns
                 time_ns = min(max(time_ns, self._emptied_ns), latest_ns)

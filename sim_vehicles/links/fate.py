@@ -72,10 +72,10 @@ class LinkBehaviour:
 def behaviour_of(link: link_keys.Link) -> LinkBehaviour:
     points = [(point.at_s, point.delay_s) for point in link.delay_points] or [(0.0, link.delay_s)]
     points_ns = tuple((_ns(time_s), _ns(delay_s)) for time_s, delay_s in points)
-    bursts = link.loss_bursts
+    bursts, least_jitter_ns = link.loss_bursts, 0 if link.jitter is None else _ns(link.jitter.least_s)
     return LinkBehaviour(
         points_ns=points_ns,
-        least_delay_ns=max(0, min(delay_ns for _, delay_ns in points_ns) + _least_jitter_ns(link.jitter)),
+        least_delay_ns=max(0, min(delay_ns for _, delay_ns in points_ns) + least_jitter_ns),
         outages_ns=tuple((_ns(outage.from_s), _ns(outage.until_s)) for outage in link.outages),
         reordering=link.reordering,
         to_bad=bursts.to_bad_probability if bursts else 0.0,
@@ -165,22 +165,7 @@ def _delays_of(jitter: link_keys.Jitter | None, rng: np.random.Generator) -> _De
         return lambda count: [(0.0, 0.0)] * count
     if jitter.distribution == "trace":
         return _in_trace_order(jitter.trace_s or (0.0,), rng)
-    scale_s, shape = jitter.scale_s or 0.0, jitter.shape or 1.0
-
-    def drawn(count: int) -> list[tuple[float, float]]:
-        size = (count, 2)
-        match jitter.distribution:
-            case "uniform":
-                values = rng.uniform(-scale_s, scale_s, size)
-            case "normal":
-                values = rng.normal(0.0, scale_s, size)
-            case "exponential":
-                values = rng.exponential(scale_s, size)
-            case "gamma" | "trace":
-                values = rng.gamma(shape, scale_s, size)
-        return [(first, second) for first, second in values.tolist()]
-
-    return drawn
+    return lambda count: [(first, second) for first, second in jitter.drawn_s((count, 2), rng).tolist()]
 
 
 def _in_trace_order(trace_s: tuple[float, ...], rng: np.random.Generator) -> _Delays:
@@ -194,18 +179,6 @@ def _in_trace_order(trace_s: tuple[float, ...], rng: np.random.Generator) -> _De
         return [(trace_s[k], trace_s[then]) for k, then in pairwise(places)]
 
     return drawn
-
-
-def _least_jitter_ns(jitter: link_keys.Jitter | None) -> int:
-    match jitter:
-        case link_keys.Jitter(distribution="uniform", scale_s=float(scale_s)):
-            return -_ns(scale_s)
-        case link_keys.Jitter(distribution="normal"):
-            return -(2**63)
-        case link_keys.Jitter(distribution="trace", trace_s=(_, *_) as trace_s):
-            return _ns(min(trace_s))
-        case _:
-            return 0
 
 
 def _ns(time_s: float) -> int:

@@ -1,11 +1,11 @@
-"""What pushes a vehicle in flight beside its own acceleration: wind, gusts, and what the fleet adds.
+"""What pushes a vehicle in flight besides its own acceleration: wind, gusts, and what the fleet adds.
 
-A push is constant for a while: an acceleration, and a velocity that carries the vehicle along without being its own. It
-acts as half the change of velocity before the motion of that while and half after it, which is exact for a double
-integrator within its limits, and of the second order in 10 ms where the motion depends on the velocity.
+A push is constant for an interval: an acceleration, and a velocity that carries the vehicle along without being its
+own. Half of the change of velocity is applied before the vehicle's own motion in that interval and half after it. This
+is exact for a double integrator within its limits, and of second order in 10 ms where motion depends on velocity.
 
 Gusts are a first-order process with the exact stationary variance, drawn every `STEP_NS` and held. Their instants count
-from the start of the vehicles, so that common gusts push all of them at once.
+from the start of the vehicles, so common gusts push all of them at once.
 """
 
 import math
@@ -58,8 +58,8 @@ class Gusts:
         return self._known[number - self._first]
 
     def forget(self, number: int) -> None:
-        """No step before this one will be asked for again."""
-        old = min(number - self._first, len(self._known) - 1)  # the newest begins the next ones
+        """Forget the steps before this one."""
+        old = min(number - self._first, len(self._known) - 1)  # the next gusts continue from the newest
         if old > _BLOCK:
             del self._known[:old]
             self._first += old
@@ -77,7 +77,7 @@ class Air:
         self._recorded: Push | None = None
 
     def add(self, push: Push) -> None:
-        """Push the vehicle by this, too, until the next call. Bring the vehicle up to date first."""
+        """Add a push until the next call; the vehicle must be up to date."""
         self._added = push
 
     def moved(
@@ -90,10 +90,10 @@ class Air:
         *,
         foreseen: bool = False,
     ) -> Moved:
-        """The motion at a later instant, from how the vehicle moves by itself over a duration in s.
+        """The motion at a later instant; `move` is the vehicle's own motion over a duration in s.
 
-        `shift` adds to a motion changes of position (north, east) and velocity. `foreseen`: the vehicle will be asked
-        for the same time again, so nothing is recorded and nothing forgotten.
+        `shift` adds changes of position (north, east) and velocity to a motion. `foreseen`: this time will be asked
+        for again, so nothing is recorded and nothing forgotten.
         """
         while from_ns < to_ns:
             push, until_ns = self._at(from_ns)
@@ -130,6 +130,6 @@ class Air:
 
 
 def air_of(scenario: Scenario, system_id: int, start_ns: int, record: Record | None) -> Air | None:
-    """What pushes a vehicle; None in still air, unless it moves by dynamics of its own."""
+    """What pushes a vehicle; None in still air, unless the scenario names the vehicle's dynamics."""
     still = scenario.disturbance is None and scenario.dynamics in BUILT_IN
     return None if still else Air(scenario, system_id, start_ns, record)

@@ -109,7 +109,7 @@ def _step(motion: Motion, target: Target, limits: schema.Autopilot, h: float) ->
 
 
 def _after(motion: Motion, plane: tuple[float, ...], target: Target, limits: schema.Autopilot, h: float) -> Motion:
-    """The motion with another one in the plane, its speed limited, and a step later in altitude and yaw."""
+    """The motion after a step: `plane` with its speed limited, and the new altitude and yaw."""
     north, east, v_n, v_e, a_n, a_e = plane
     speed = math.hypot(v_n, v_e)
     if speed > limits.speed_max_m_s:
@@ -120,7 +120,7 @@ def _after(motion: Motion, plane: tuple[float, ...], target: Target, limits: sch
 
 
 def _step_remembering(motion: Motion, inner: Inner, target: Target, limits: schema.Autopilot, h: float) -> Motion:
-    """A step of a response with a memory: what is wanted in the middle of the step is held for it."""
+    """A step of a response with a memory: the acceleration wanted in the middle of the step is held during it."""
     north, east, v_n, v_e, a_n, a_e, *_ = motion
     half, gain = 0.5 * h, target.velocity_gain_1_s
     w_n, w_e = target.acceleration_north_m_s2, target.acceleration_east_m_s2

@@ -1,11 +1,11 @@
-"""What a multicopter's acceleration does with the one its velocity loop wants: limits, dead time, lag or second order.
+"""How a multicopter's acceleration follows the one its velocity loop wants: limits, dead time, lag or second order.
 
     lag                 lag a'(t) = w(t) - a(t)
     lag with dead time  lag a'(t) = w(t - T) - a(t)
     second order        a'' / omega_n^2 + lag a' = w - a
 
-for north and east. |w| is clipped to the acceleration limit, and then follows at no more than the jerk limit. Within a
-step w is held at its mean; `sim_vehicles.motion.copter`, which flies the plain lag, needs none of this.
+for north and east. |w| is clipped to the acceleration limit, and then its change to the jerk limit. Within a step w is
+held at its mean. The plain lag without these is in `sim_vehicles.motion.copter`.
 """
 
 import math
@@ -36,7 +36,7 @@ def inner_of(settings: schema.Autopilot) -> Inner | None:
 
 
 def longest_step_s(settings: schema.Autopilot, usual_s: float) -> float:
-    """The longest step: nothing that is aimed at in a step may act within it."""
+    """The longest step: an acceleration that is aimed at in a step must not act within that step."""
     fastest_s = math.inf if settings.natural_frequency_rad_s is None else 0.3 / settings.natural_frequency_rad_s
     return max(min(usual_s, settings.dead_time_s or usual_s, fastest_s, settings.lag_s), 1e-3)
 

@@ -1,4 +1,4 @@
-"""What a vehicle believes of its position and velocity: the true ones, wrong by noise and a slow bias."""
+"""The position and velocity that a vehicle reports: the true ones plus noise and a slowly varying bias."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""A vehicle's own dynamics: a function in Python code that the scenario names, in place of the double integrator.
+"""The user's own dynamics of a vehicle: a Python function that the scenario names, in place of the double integrator.
 
 The function is `step(state, command, dt_s, memory)`, which returns the state `dt_s` seconds later:
 
@@ -44,7 +44,7 @@ class OwnMotion:
         return self._moved(state, command, duration_s, self._memory, self._on_fault)
 
     def foreseen(self, state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
-        """The same without remembering it."""
+        """As `advance`, but the memory stays as it is."""
         del bounds
         return self._moved(state, command, duration_s, copy.deepcopy(self._memory), lambda _: None)
 
@@ -63,7 +63,7 @@ class OwnMotion:
     def _after(
         self, flown: Floats, command: Command, dt_s: float, memory: dict[str, Any], on_fault: Callable[[str], None]
     ) -> Floats | None:
-        """The state a step later; None if the model gives none that can be used."""
+        """The state a step later; None if the model returns none that can be used."""
         wanted = np.array(command[:2]) + command.velocity_gain_1_s * (np.array(command[2:4]) - flown[2:])
         try:
             with np.errstate(all="ignore"):

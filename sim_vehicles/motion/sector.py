@@ -1,9 +1,9 @@
 """A disturbance that depends on the true errors of the formation: w = D e, every control period (thesis eq. 3.20).
 
 e is in the order of `scenarios.schema.Scenario.leader_first`: the leader's velocity error, then spacing error and
-velocity error of each other vehicle. w is added to the rates of e. A rate of a velocity error is an acceleration. The
-spacing error grows with the velocity of the vehicle in front less the own one, so a vehicle is carried along at the
-velocity at which the one in front is, less w.
+velocity error of each other vehicle. w is added to the rates of e. The rate of a velocity error is an acceleration. The
+rate of a spacing error is the velocity of the vehicle in front minus its own, so a vehicle is carried along at the
+velocity at which the one in front is carried, minus w.
 """
 
 from collections.abc import Callable

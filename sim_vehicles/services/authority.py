@@ -15,9 +15,9 @@ _QUESTIONS = frozenset(
 class Authority:
     """Remembers the station of a vehicle: the first system that commands it, until that has been silent for a time.
 
-    A system that only asks, listens or sends heartbeats does not become the station, and is always answered. Report
-    rates are set by the station, or by any system while there is none; that does not make it the station, since display
-    programs set rates as soon as they start.
+    A system that only asks, listens or sends heartbeats does not become the station, and is always answered. While
+    there is no station, any system may set report rates; this does not make it the station, because display programs
+    set rates as soon as they start.
     """
 
     def __init__(self, silence_s: float) -> None:

@@ -34,9 +34,8 @@ STREAMS: dict[int, tuple[int, ...]] = {
 """MAV_DATA_STREAM: the messages of each group, as ArduPilot groups them."""
 
 SCENARIO = "SCENARIO"
-"""The extended parameter that says, as text, which experiment a simulated vehicle belongs to: the fingerprint of its
-scenario, links and seed included, and the scenario's name. It is sent only on request, so stations that do not know it
-never see it."""
+"""Extended parameter with the experiment that a simulated vehicle belongs to, as text: the fingerprint of its scenario
+(links and seed included) and the scenario's name. Sent on request only, so other stations never see it."""
 LONGEST_TEXT = 128
 KEEP, SHUT_DOWN = 0.0, 2.0
 """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, parameter 1: do nothing, shut down."""

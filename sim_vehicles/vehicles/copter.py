@@ -302,7 +302,7 @@ class Copter:
         return messages.position_target(boot_ms, mask, (*target[2:4], -target.climb_m_s), (north, east))
 
     def _condition(self, boot_ms: int, *, has_position: bool) -> messages.Condition:
-        """What it reports to other ground stations; it tilts to accelerate."""
+        """What it reports to other ground stations; its tilt follows from its acceleration."""
         motion = self.motion
         cosine, sine = math.cos(motion.yaw_rad), math.sin(motion.yaw_rad)
         north, east = motion.acceleration_north_m_s2 / GRAVITY_M_S2, motion.acceleration_east_m_s2 / GRAVITY_M_S2

@@ -88,7 +88,7 @@ class DoubleIntegrator:
         self._air = air_of(scenario, own.system_id, radio.start_ns, radio.record)
         self._aircraft = Aircraft(scenario, own) if aircraft_of(scenario.dynamics) else None
         self._own = OwnMotion(scenario, self._note_fault) if names_code(scenario.dynamics) else self._aircraft
-        """Dynamics of its own, which replace the double integrator's; `_air` is there, too, then."""
+        """Dynamics in place of the double integrator's; `_air` is then set, too."""
         self._navigator = None if scenario.navigation is None else Navigator(scenario, own.system_id, radio.record)
         if onboard is not None:
             radio.schedule.set_interval(STEP, onboard.interval_us, radio.start_ns)
@@ -297,7 +297,7 @@ class DoubleIntegrator:
             self._state_ns = time_ns
 
     def push(self, push: Push, time_ns: int) -> None:
-        """Be pushed by this from now on, beside wind and gusts."""
+        """Set the push that acts from now on, in addition to wind and gusts."""
         assert self._air is not None
         self._advance(time_ns)
         self._air.add(push)
@@ -313,7 +313,7 @@ class DoubleIntegrator:
         return air.moved(self._state, move, shifted, self._state_ns, time_ns, foreseen=foreseen)
 
     def _note_fault(self, text: str) -> None:
-        """Count a step that its own dynamics could not make, and say so once."""
+        """Count a step in which the user's own dynamics failed, and report the first."""
         counters = self._radio.counters
         counters["model_faults"] += 1
         if counters["model_faults"] == 1:

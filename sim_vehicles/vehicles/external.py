@@ -1,4 +1,4 @@
-"""A simulated leader that somebody else flies: a vehicle with a pilot on board who flies the scenario's course.
+"""A simulated leader flown by somebody else: a vehicle whose pilot flies the scenario's course.
 
 The pilot takes off, waits until the station's first set-point for another vehicle begins the flight, and then flies the
 nominal velocity. The station may ask for messages; whatever else it commands is denied.
@@ -78,7 +78,7 @@ class ExternallyFlown:
         copter.command(_command(mavlink.COMMAND_TAKEOFF, altitude_m=self._altitude_m + above_m), time_ns)
 
     def _steer(self, time_ns: int) -> None:
-        """Ask for the velocity in the middle of the step, and for the acceleration there."""
+        """Command the course's velocity and acceleration in the middle of the step."""
         craft, middle_s = self.craft, (time_ns - self.begin_ns + STEP_NS // 2) / NS_PER_S
         velocity, acceleration = self._scenario.nominal_velocity_at(middle_s), (0.0, 0.0)
         if self._scenario.course.is_smooth:
@@ -134,5 +134,5 @@ class ExternallyFlown:
 
 
 def _command(number: int, param1: float = 0.0, *, altitude_m: float = 0.0) -> mavlink.Command:
-    """A command of the pilot; NaN as latitude and longitude is where the vehicle is."""
+    """A command of the pilot; NaN as latitude and longitude means where the vehicle is."""
     return mavlink.Command(_PILOT, 0, 0, number, param1, 0.0, 0.0, math.nan, math.nan, altitude_m)
