@@ -43,9 +43,17 @@ _STAGES = {
     "vehicles: passing on": ("sim_vehicles/", "scenarios/"),
 }
 """Each stage with the modules that it consists of; the first that fits counts."""
-_CRC = np.arange(256, dtype=np.uint16)
-for _ in range(8):
-    _CRC = np.where(_CRC & 1, _CRC >> 1 ^ 0x8408, _CRC >> 1)
+
+
+def _crc_table() -> Any:
+    """The checksum's remainder for each byte."""
+    table = np.arange(256, dtype=np.uint16)
+    for _ in range(8):
+        table = np.where(table & 1, table >> 1 ^ 0x8408, table >> 1)
+    return table
+
+
+_CRC = _crc_table()
 
 
 def stages(runner: Runner) -> str:

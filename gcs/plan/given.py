@@ -38,7 +38,8 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
         raise InputError(
             f"K: read shape {gain.shape}, wanted {wanted}: a row for each vehicle, a column for each error"
         )
-    return with_given(scenario, blocks=gain_blocks(np.kron(gain, np.eye(model.axes)), formation), prediction=prediction)
+    both_axes: FloatArray = np.kron(gain, np.eye(model.axes))
+    return with_given(scenario, blocks=gain_blocks(both_axes, formation), prediction=prediction)
 
 
 def gain_blocks(K: FloatArray, formation: Formation) -> tuple[GainBlock, ...]:
