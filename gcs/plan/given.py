@@ -38,7 +38,7 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
         raise InputError(
             f"K: read shape {gain.shape}, wanted {wanted}: a row for each vehicle, a column for each error"
         )
-    both_axes: FloatArray = np.kron(gain, np.eye(model.axes))
+    both_axes = np.kron(gain, np.eye(model.axes)).astype(np.float64)
     return with_given(scenario, blocks=gain_blocks(both_axes, formation), prediction=prediction)
 
 
