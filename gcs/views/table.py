@@ -132,7 +132,8 @@ class FlightState:
     def figures(self) -> "Figures":
         """The figures to be shown; NaN where unknown."""
         now = self.newest
-        loop_delay_s = self._window["loop_delay_s"]
+        heard = self._window["mode"] != Mode.LOST  # the age of a lost vehicle's last state is no loop delay
+        loop_delay_s, headroom = (np.where(heard, self._window[name], np.nan) for name in ("loop_delay_s", "headroom"))
         spacings_m = [np.hypot(*(vehicle.offset_ne_m or (np.nan, np.nan))) for vehicle in self.scenario.vehicles]
         late_s = (self._window["sent_ns"][:, :1] - self._window["due_ns"][:, :1]) / 1e9
         return Figures(
@@ -141,7 +142,7 @@ class FlightState:
             rtt_s=self.rtt_s,
             loop_delay_s_p50=_quantile(loop_delay_s, 0.5),
             loop_delay_s_p99=_quantile(loop_delay_s, 0.99),
-            headroom=_quantile(self._window["headroom"], 0.0),
+            headroom=_quantile(headroom, 0.0),
             lost=now["lost"],
             late=now["late"],
             modes=[Mode(int(mode)) for mode in now["mode"]],

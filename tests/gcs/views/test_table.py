@@ -55,6 +55,15 @@ def test_the_figures_forget_what_was_before_the_last_seconds() -> None:
     assert row_of(drawn(state), 1)[8] == "80"
 
 
+def test_the_age_of_a_lost_vehicle_is_no_loop_delay() -> None:
+    ticks = ticks_of(line(3), start_s=0.0, count=50)
+    ticks["loop_delay_s"], ticks["headroom"] = 0.05, 0.8
+    ticks["loop_delay_s"][:, 2], ticks["headroom"][:, 2], ticks["mode"][:, 2] = 9.0, -8.0, Mode.LOST
+    text = plain_line(flown(line(3), ticks))
+    assert "loop delay p99 max 50.0 ms  headroom min 80 %" in text
+    assert "LOST 1" in text
+
+
 def test_what_is_unknown_is_a_dash_and_never_a_zero() -> None:
     lines = drawn(FlightState(line(3), DESIGN))
     for system_id, front in ((3, "–"), (2, "3"), (1, "2")):
