@@ -1,4 +1,4 @@
-"""Takes over vehicles that are in the air before the flight begins, if they fly the same experiment.
+"""Takes over vehicles that already send to the station before its flight, if they fly the same experiment.
 
 Simulated vehicles whose station was killed fly on for a while. Only a flight with the same scenario, links and seed may
 take them over: otherwise its verdict would be about another experiment. Each vehicle names its scenario in the extended

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import RealArray
 from gains.core.structure import real_matrix
 from gcs.errors import InputError
 from gcs.plan.formation import Formation, plan_formation
@@ -42,7 +42,7 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
     return with_given(scenario, blocks=gain_blocks(both_axes, formation), prediction=prediction)
 
 
-def gain_blocks(K: FloatArray, formation: Formation) -> tuple[GainBlock, ...]:
+def gain_blocks(K: RealArray, formation: Formation) -> tuple[GainBlock, ...]:
     """K block by block, as a scenario gives it, without those that are zero, except each vehicle's own."""
     model, ids = formation.model, formation.system_ids
     return tuple(
