@@ -34,7 +34,8 @@ class Criteria:
     """What a design must reach beside the parts of `Requirement`; what is None is not asked for.
 
     A figure at a delay is that of the loop as flown (`gains.performance.flown`): late by the delay and half a control
-    period. BadModelError if a number is out of its range, or a figure at a delay is asked for without the delay.
+    period, or with `discrete` held for one. BadModelError if a number is out of its range, or a figure at a delay is
+    asked for without the delay.
 
     >>> from gains.core.requirement import Criteria
     >>> Criteria(at_delay_s=0.3, alpha_at_delay=0.5).objective, Criteria(damping_min=0.7).objective
@@ -64,6 +65,8 @@ class Criteria:
     """The loop delays (least, largest) among which the loop must be proved stable."""
     delay_rate: float | None = None
     """How fast the delay varies among them, s/s: 0 for one that is constant but not known, None for one that jumps."""
+    discrete: bool = False
+    """Whether decay rate and α at the delay are those of the sampled and held loop itself, at any control period."""
     weight: tuple[float, float] | None = None
     """Diagonal of W on spacing errors and on velocity errors, with which every α is meant: |w| ≤ α |W E|."""
 
@@ -77,6 +80,8 @@ class Criteria:
         for name in AT_DELAY:
             if self.at_delay_s is None and (getattr(self, name) is not None or self.maximise == name):
                 raise BadModelError(f"{name} is asked for without a delay; wanted at_delay_s")
+        if self.discrete and self.at_delay_s is None:
+            raise BadModelError("discrete is asked for without a delay; wanted at_delay_s")
         low, high = self.delays_s or (0.0, 0.0)
         if not 0.0 <= low <= high < inf:
             raise BadModelError(f"delays_s = {self.delays_s}; wanted two numbers of seconds, the smaller one first")
