@@ -34,7 +34,8 @@ class Criteria:
     """What a design must reach besides the parts of `Requirement`; None is no requirement.
 
     A figure at a delay is that of the loop as flown (`gains.performance.flown`): late by the delay and half a control
-    period. BadModelError if a number is out of its range, or a figure at a delay is asked for without the delay.
+    period, or with `discrete` held for one. BadModelError if a number is out of its range, or a figure at a delay is
+    asked for without the delay.
 
     >>> from gains.core.requirement import Criteria
     >>> Criteria(at_delay_s=0.3, alpha_at_delay=0.5).objective, Criteria(damping_min=0.7).objective
@@ -64,6 +65,8 @@ class Criteria:
     """The loop delays (least, largest) between which the loop must be proved stable."""
     delay_rate: float | None = None
     """How fast the delay varies between them, s/s: 0 if it is constant but not known, None if it jumps."""
+    discrete: bool = False
+    """Whether decay rate and α at the delay are those of the sampled and held loop itself, at any control period."""
     weight: tuple[float, float] | None = None
     """Weights of spacing errors and of velocity errors, the diagonal of W: every α then bounds |w| ≤ α |W E|."""
 
@@ -77,6 +80,8 @@ class Criteria:
         for name in AT_DELAY:
             if self.at_delay_s is None and (getattr(self, name) is not None or self.maximise == name):
                 raise BadModelError(f"{name} is asked for without a delay; wanted at_delay_s")
+        if self.discrete and self.at_delay_s is None:
+            raise BadModelError("discrete is asked for without a delay; wanted at_delay_s")
         low, high = self.delays_s or (0.0, 0.0)
         if not 0.0 <= low <= high < inf:
             raise BadModelError(f"delays_s = {self.delays_s}; wanted two numbers of seconds, the smaller one first")

@@ -13,10 +13,12 @@ from gains.criteria.poles import pole_region, roots_of
 from gains.delay.constant import analyse_delay, delay_margin
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
+from gains.performance.disturbed import DisturbedFormation
 from gains.performance.flown import FlownFormation, FlownLoop, FlownTiming
+from gains.performance.radii import SectorLoop
 from gains.performance.response import Response, formation_loop
 from gains.performance.robust import disturbance_bound
-from gains.sampled.constant import sampled_delay_margin
+from gains.sampled.constant import growth_rate, sampled_delay_margin
 from gains.sampled.onboard import own_part
 from gains.varying.jitter import spread_bound
 
@@ -43,6 +45,8 @@ class LoopFigures:
     weight: tuple[float, float] | None = None
     responses: tuple[Response, ...] | None = None
     chain: FlownLoop | None = None
+    discrete: bool = False
+    """Whether decay rate and α at the delay are those of the map of one period, in place of half a hold of delay."""
     thinned: int = 1
     """In a search figures may be rougher: only every so-manieth frequency is looked at first; 1 is exact."""
 
@@ -92,6 +96,8 @@ class LoopFigures:
         if self.delay_s is None:
             return self.decay_rate_1_s
         A, B, K = formation_loop(self.model, self.K, self.responses)
+        if self.discrete:
+            return -growth_rate(A, B, K, period_s=self.timing.period_s, delay_s=self.delay_s)
         own = np.zeros_like(K)
         own[:, : self.model.states] = own_part(self.model, self.K)
         own_s, late_s = self.timing.delays_s(self.delay_s)
@@ -104,6 +110,10 @@ class LoopFigures:
             return self.alpha
         if self.decay_rate_at_delay_1_s <= 0.0:
             return 0.0
+        if self.discrete:
+            loop = formation_loop(self.model, self.K, self.responses)
+            flown = DisturbedFormation(self.model, *loop, self.timing.period_s, self.delay_s)
+            return SectorLoop(flown, tuple(range(self.model.states)), self.W).complex_radius().radius_1_s
         return 1.0 / peak_gain(self._characteristic, np.eye(self.model.states), self.W, self._frequencies)
 
     @cached_property

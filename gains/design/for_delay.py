@@ -73,7 +73,7 @@ def criteria_gains(wanted: Requirement, period_s: float) -> ScalarGains:
     criteria = wanted.criteria
     assert criteria is not None
     timing = FlownTiming(inf, positive_seconds("period_s", period_s))
-    tree = TreeGains(criteria.at_delay_s, timing, criteria.weight)
+    tree = TreeGains(criteria.at_delay_s, timing, criteria.weight, criteria.discrete)
     point, figures = searched(tree, wanted)
     return replace(tree.gains(point), alpha=figures.alpha_at_delay)
 
@@ -107,6 +107,7 @@ class TreeGains:
     delay_s: float | None
     timing: FlownTiming
     weight: tuple[float, float] | None = None
+    discrete: bool = False
     step: float = 0.3
 
     @property
@@ -128,7 +129,9 @@ class TreeGains:
     def figures(self, point: FloatArray) -> LoopFigures:
         gains = self.gains(point)
         chain = FlownLoop(gains, self.timing)
-        return LoopFigures(PAIR, gains.K, self.timing, self.delay_s, self.weight, chain=chain, thinned=_THINNED)
+        return LoopFigures(
+            PAIR, gains.K, self.timing, self.delay_s, self.weight, chain=chain, discrete=self.discrete, thinned=_THINNED
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +145,7 @@ class PatternGains:
     delay_s: float | None
     timing: FlownTiming
     weight: tuple[float, float] | None = None
+    discrete: bool = False
     step: float = 0.05
 
     @cached_property
@@ -174,7 +178,8 @@ class PatternGains:
         return K * self._units
 
     def figures(self, point: FloatArray) -> LoopFigures:
-        return LoopFigures(self.model, self.gain(point), self.timing, self.delay_s, self.weight, thinned=_THINNED)
+        K, discrete = self.gain(point), self.discrete
+        return LoopFigures(self.model, K, self.timing, self.delay_s, self.weight, discrete=discrete, thinned=_THINNED)
 
 
 def searched(family: GainFamily, wanted: Requirement, *, evaluations: int = _EVALUATIONS) -> tuple[FloatArray, Figures]:

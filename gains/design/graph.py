@@ -129,7 +129,7 @@ def _searched(
     assert criteria is not None
     timing = FlownTiming(inf, period_s)
     starts = tuple(base.K for base in bases)
-    family = PatternGains(single, narrow.mask, starts, criteria.at_delay_s, timing, criteria.weight)
+    family = PatternGains(single, narrow.mask, starts, criteria.at_delay_s, timing, criteria.weight, criteria.discrete)
     point, _ = searched(family, replace(wanted, string_peak_max=None))
     return family.gain(point)
 

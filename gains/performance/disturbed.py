@@ -85,6 +85,9 @@ class DisturbedFormation:
     wind_m_s2: FloatArray | None = None
     """Steady acceleration of every vehicle, one for each axis."""
     assumed_s: float | None = None
+    pushed: FloatArray | None = None
+    """What accelerations from outside do to the rates of all states, (n, inputs), as of
+    `gains.performance.response.pushed_states`; None where there are no further states."""
 
     def spread(self) -> Spread:
         """The stationary spread. Raises BadModelError if the loop is not stable."""
@@ -125,9 +128,12 @@ class DisturbedFormation:
         model, gusts = self.model, self.gusts
         if gusts is None or gusts.deviation_m_s2 == 0.0:
             return np.zeros((len(self.A), 0))
-        each = np.zeros((len(self.A), model.inputs))
-        each[: model.states] = model.B
+        each = self._acts
         return each @ np.kron(np.ones((model.vehicles, 1)), np.eye(model.axes)) if gusts.common else each
+
+    @property
+    def _acts(self) -> FloatArray:
+        return self.model.B if self.pushed is None else self.pushed
 
     @cached_property
     def _pushed(self) -> HeldPlant:
@@ -209,8 +215,7 @@ class DisturbedFormation:
             seen = np.hstack([seen, self._bias])
         steady = np.zeros(len(step))
         if self.wind_m_s2 is not None:
-            acts = np.zeros((n, model.inputs))
-            acts[: model.states] = model.B
+            acts = self._acts
             hold = HeldPlant(self.A, acts, acts.T, T).transition(np.array([T]))[1][0]
             steady[:n] = hold @ np.tile(self.wind_m_s2, model.vehicles)
         return step, added, steady, seen

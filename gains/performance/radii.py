@@ -68,12 +68,15 @@ class SectorLoop:
 
     formation: DisturbedFormation
     errors: tuple[int, ...]
+    weight: FloatArray | None = None
+    """W of w = Δ W e, (errors, errors); None for the identity."""
 
     def response(self, omega_rad_s: FloatArray) -> ComplexArray:
-        """M at frequencies (k,): from a held w to e, (k, errors, errors)."""
+        """M at frequencies (k,): from a held w to e, weighted, (k, errors, errors)."""
         z = np.exp(1j * omega_rad_s * self.formation.period_s)[:, np.newaxis, np.newaxis].astype(np.complex128)
         chosen = list(self.errors)
-        return (self.formation.closed(z)[:, chosen] @ self._entry).astype(np.complex128)
+        M = (self.formation.closed(z)[:, chosen] @ self._entry).astype(np.complex128)
+        return M if self.weight is None else self.weight @ M
 
     def complex_radius(self) -> Worst:
         """The least size of a disturbance that may be any stable filter."""

@@ -169,6 +169,23 @@ def response_states(model: FormationModel, responses: Sequence[Response]) -> lis
     return [slice(end - size, end) for end, size in zip(ends.tolist(), sizes, strict=True)]
 
 
+def pushed_states(model: FormationModel, responses: Sequence[Response]) -> FloatArray:
+    """What accelerations of the vehicles from outside (inputs,) do to the rates of the states of `formation_loop`.
+
+    They act on the velocity errors, and on the velocity still owed: v' = a + w and d' = u − a − w.
+
+    >>> pushed_states(FormationModel((-1,), axes=1), [Response(0.5, 2.0)]).tolist()
+    [[1.0], [0.0], [-1.0]]
+    """
+    places = response_states(model, responses)
+    pushed = np.zeros((places[-1].stop, model.inputs))
+    pushed[: model.states] = model.B
+    for vehicle, (place, response) in enumerate(zip(places, responses, strict=True)):
+        if response.velocity_gain_1_s:
+            pushed[place.stop - model.axes : place.stop, model.input_slice(vehicle)] = -np.eye(model.axes)
+    return pushed
+
+
 def sampled_margin(
     model: FormationModel, K: FloatArray, responses: Sequence[Response] | None, *, timing: Timing
 ) -> float:

@@ -55,7 +55,7 @@ def with_bounds(design: Design, scenario: Scenario) -> Design:
         return design
     more: dict[str, object] = {}
     period_s, keys = figures.timing.period_s, scenario.control.criteria
-    if figures.weight is None and figures.responses is None:
+    if figures.weight is None and figures.responses is None and not figures.discrete:
         # a vehicle in front that does not hear the one behind: the bound of the follower alone holds for both
         tree = design.inclusion_gains is not None
         keep = slice(1, None) if tree else slice(None)
@@ -106,4 +106,5 @@ def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
         responses = tuple(known) if known else None
     keys = scenario.control.criteria
     delay_s = (keys and keys.at_delay_s) or expected_loop_delay_s(scenario)
-    return LoopFigures(model, gain, timing, delay_s, keys.weight if keys else None, responses)
+    weight, discrete = (keys.weight, keys.discrete) if keys else (None, False)
+    return LoopFigures(model, gain, timing, delay_s, weight, responses, discrete=discrete)

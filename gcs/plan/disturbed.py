@@ -13,7 +13,7 @@ from gains.formation.model import FormationModel
 from gains.performance.disturbed import DisturbedFormation, Gusts, Sensing
 from gains.performance.predicted import fed_forward
 from gains.performance.radii import SectorLoop
-from gains.performance.response import formation_loop
+from gains.performance.response import formation_loop, pushed_states
 from gains.performance.robust import disturbance_bound
 from gcs.plan.design import Design, PredictedSpread, VehicleSpread, WholeFigures
 from gcs.plan.expected_delay import expected_loop_delay_s
@@ -68,11 +68,12 @@ def disturbed_formation(
         return None
     if (air is not None and air.sector is not None) or rates.control_hz != rates.telemetry_hz:
         return None
-    loop = formation.model.A, formation.model.B, K
+    loop, pushed = (formation.model.A, formation.model.B, K), None
     if design.response is not None:
         if not (known := design.responses):
             return None
-        loop = formation_loop(formation.model, K, [known[system_id] for system_id in formation.system_ids])
+        every = [known[system_id] for system_id in formation.system_ids]
+        loop, pushed = formation_loop(formation.model, K, every), pushed_states(formation.model, every)
     assumed_s = delay_s if control.prediction == "measured" else control.prediction
     gusts = None if air is None else air.gusts
     return DisturbedFormation(
@@ -84,6 +85,7 @@ def disturbed_formation(
         sensing=Sensing() if navigation is None else Sensing(**navigation.model_dump()),
         wind_m_s2=None if air is None else np.array(air.wind_ne_m_s2),
         assumed_s=None if isinstance(assumed_s, str) else assumed_s,
+        pushed=pushed,
     )
 
 

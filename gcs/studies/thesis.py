@@ -33,6 +33,7 @@ from gcs.studies.thesis_flights import (
     PERIOD_S,
     SINGLE,
     SPEED_M_S,
+    disturbance_onset,
     flown,
     fly_with_late_neighbours,
     formation_figure,
@@ -62,7 +63,7 @@ class Claim:
 
 def claims(ended: Callable[[int], None] = lambda _: None) -> list[Claim]:
     """All claims, in the order of the source; `ended` is called after each part with the number still to come."""
-    parts = (_modelling, _inclusion, _expansion, _graph, _sweep_algorithm, _delay, _subsets, _comparison)
+    parts = (_modelling, _inclusion, _disturbance, _expansion, _graph, _sweep_algorithm, _delay, _subsets, _comparison)
     found: list[Claim] = []
     for left, part in zip(reversed(range(len(parts))), parts, strict=True):
         found += part()
@@ -135,6 +136,18 @@ def _inclusion() -> Iterator[Claim]:
         f"delay margin {1e3 * found.delay_margin_s:.0f} ms sampled at 50 Hz, all feedback late",
         f"{1e3 * frequency_sweep_margin(CHAIN.A, CHAIN.B @ K):.0f} ms continuous by the frequency sweep",
         "not checkable",
+    )  # fmt: skip
+
+
+def _disturbance() -> Iterator[Claim]:
+    delay_s, onset = disturbance_onset()
+    assert onset.onset_1_s is not None
+    yield Claim(
+        "(3.20)-(3.24)", "disturbance w: stable under every |w| ≤ α |e| of a follower and the vehicle in front",
+        f"{ALPHA}, not flown",
+        f"the worst w makes the formation unstable from {onset.onset_1_s:.4f} 1/s on in flight, at "
+        f"{1e3 * delay_s:.0f} ms of loop delay",
+        f"complex stability radius of the sampled loop {onset.radius_1_s:.4f} 1/s", "agrees",
     )  # fmt: skip
 
 

@@ -14,8 +14,11 @@ from gains.formation.model import FormationModel
 from gains.sampled.onboard import own_part
 from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_virtual
+from gcs.plan.design import Design
+from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
+from gcs.stress.disturbance import DisturbanceOnset, find_disturbance_onsets
 from gcs.views.page import figure_of, saved
 from scenarios.files import load
 from scenarios.schema import Scenario
@@ -67,19 +70,30 @@ def nonlinear_response(delay_s: float) -> tuple[float, float]:
 
 
 def flown(name: str, method: str) -> tuple[TickArray, float | None]:
-    """Fly one of the triangle scenarios without link delay; returns its ticks and settling time.
+    """Fly one of the triangle scenarios without link delay; returns its ticks and settling time."""
+    designed, plan = _planned(name, method)
+    flight = fly_virtual(plan)
+    return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events).settling_time_s
 
-    The gains are those of inclusion at α = 0.93, or of a graph method at the same delay margin.
-    """
+
+def disturbance_onset() -> tuple[float, DisturbanceOnset]:
+    """The loop delay (s) of triangle5 at α = 0.93 without link delay, and the worst w of one follower that it takes."""
+    found = find_disturbance_onsets(
+        _planned("triangle5", "inclusion")[1], tolerance=0.01, kinds=("dynamic",), counts=(2,)
+    )
+    return found.loop_delay_s, found.onsets[0]
+
+
+def _planned(name: str, method: str) -> tuple[Design, FlightPlan]:
+    """The plan of a scenario without link delay, with gains of inclusion at α = 0.93, or of a graph method at the same
+    delay margin."""
     scenario = _scenario(name)
     control = scenario.control.model_copy(update={"delay_margin_s": None, "alpha": ALPHA})
     if method != "inclusion":
         margin_s = design(CHAIN, Requirement(alpha=ALPHA), period_s=PERIOD_S).delay_margin_s
         control = control.model_copy(update={"alpha": None, "delay_margin_s": margin_s, "method": method})
     scenario = scenario.with_link_delay(up_s=0.0, down_s=0.0).with_calm_monitor()
-    designed, plan = flight_plan(scenario.model_copy(update={"control": control}))
-    flight = fly_virtual(plan)
-    return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events).settling_time_s
+    return flight_plan(scenario.model_copy(update={"control": control}))
 
 
 def fly_with_late_neighbours(

@@ -54,6 +54,10 @@ class Criteria(Part):
     """Requirement: the least and the largest loop delay between which stability must be proved."""
     delay_rate: NotNegative | None = None
     """How fast the delay varies in `delays_s`, s/s: 0 for one that is constant but not known. Omitted: it may jump."""
+    discrete: bool = False
+    """Whether decay rate and alpha at `at_delay_s` are those of the loop in discrete time, whose period is a map of the
+    states and of the commands on their way. Otherwise a control period counts as half a period of delay, which is
+    nearly the same at 50 Hz, but not at 5 Hz."""
     weight: tuple[Positive, Positive] | None = None
     """Weights of spacing errors and of velocity errors, the diagonal of W: every alpha then bounds disturbances by
     alpha |W e|. Omitted: W = I."""
@@ -85,5 +89,7 @@ def criteria_faults(
         value = getattr(criteria, name)
         if criteria.at_delay_s is None and value is not None:
             yield f"control.criteria.{name}", value, "no such key without at_delay_s"
+    if criteria.discrete and criteria.at_delay_s is None:
+        yield "control.criteria.discrete", True, "no such key without at_delay_s"
     if criteria.at_delay_s is None and criteria.maximise in _AT_DELAY:
         yield "control.criteria.maximise", criteria.maximise, "what needs no delay, without at_delay_s"

@@ -9,7 +9,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.formation.model import FormationModel
 from gains.performance.disturbed import DisturbedFormation, Gusts, Sensing
-from gains.performance.response import Response, formation_loop
+from gains.performance.response import Response, formation_loop, pushed_states
 
 CHAIN = FormationModel((-1, 0, 1), axes=1)
 GAIN = CHAIN.overlapping_gain([[-3.408]], [[0.631]], [[5.608]])
@@ -22,6 +22,8 @@ def spread_by_frequency(flown: DisturbedFormation) -> FloatArray:
     assert gusts is not None
     n, states = len(flown.A), model.states
     entry = np.vstack([model.B, np.zeros((n - states, model.inputs))])
+    if n > states:  # of a vehicle's acceleration and of the velocity that it owes, the second falls as it is pushed
+        entry[states + 1 :: 2] = -np.eye(model.vehicles)
     if gusts.common:
         entry = entry @ np.ones((model.inputs, 1))
     count = entry.shape[1]
@@ -70,7 +72,8 @@ def test_lyapunov_equation_and_spectrum_give_the_same_spread(
 
 def test_vehicles_with_a_lag_have_the_same_spread_both_ways() -> None:
     loop = formation_loop(CHAIN, GAIN / 3.0, [Response(0.15, 2.0)] * 3)
-    flown = DisturbedFormation(CHAIN, *loop, 0.02, 0.06, Gusts(0.5, 2.0), EVERYTHING)
+    pushed = pushed_states(CHAIN, [Response(0.15, 2.0)] * 3)
+    flown = DisturbedFormation(CHAIN, *loop, 0.02, 0.06, Gusts(0.5, 2.0), EVERYTHING, pushed=pushed)
     assert spread_by_frequency(flown) == pytest.approx(flown.spread().true, rel=1e-9)
 
 
