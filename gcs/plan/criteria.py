@@ -10,7 +10,6 @@ from gains.criteria.bound import alpha_bound
 from gains.criteria.figures import LoopFigures
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
-from gains.performance.response import Response
 from gains.varying.jitter import Jitter, bound_covering
 from gcs.plan.design import CriteriaPart, Design
 from gcs.plan.expected_delay import expected_loop_delay_s
@@ -95,7 +94,7 @@ def _figures(design: Design, scenario: Scenario) -> LoopFigures | None:
         return None
     step_s = 1.0 / design.onboard.rate_hz if design.onboard is not None else 0.0
     timing = FlownTiming(inf, design.period_s, design.loop, step_s)
-    known = [Response(v.lag_s, v.velocity_gain_1_s) for v in (design.response.vehicles if design.response else ())]
+    known = [own.response for own in design.response.vehicles] if design.response else []
     formation = plan_formation(scenario).model
     if design.inclusion_gains is not None:
         pair = FormationModel((-1, 0), axes=1)
