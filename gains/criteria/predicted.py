@@ -25,9 +25,9 @@ from gains.performance.flown import FlownTiming
 from gains.performance.predicted import PredictedLoop
 from gains.performance.scalar_gains import ScalarGains
 from gains.performance.string_stability import largest_value
-from gains.sampled._loop import HeldPlant, split_delay
+from gains.sampled._loop import HeldPlant, carry, radius_of, rate_of, split_delay
 from gains.sampled.multirate import Timing
-from gains.sampled.prediction import mismatch_window, mismatch_window_continuous, predicted_growth_rate
+from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 
 _FREQUENCIES, _LOWEST = 1600, 1e-3
 # of the integral of the noise over the unit circle, which converges like a power of the number
@@ -105,10 +105,7 @@ class PredictedFigures:
         if self.thinned == 1:
             return mismatch_window(A, B, K, Timing(self.period_s, self.period_s), assumed_s=self.assumed_s)
         half_s = self.period_s / 2.0
-        if self.chain is not None:
-            least_s, most_s = _rough_window(self.chain, self.assumed_s + half_s)
-        else:
-            least_s, most_s = mismatch_window_continuous(A, B, K, assumed_s=self.assumed_s + half_s)
+        least_s, most_s = _rough_window((A, B, K), self.assumed_s + half_s, _FREQUENCIES // self.thinned)
         return max(0.0, least_s - half_s), most_s - half_s
 
     def proved_spread_s(self, mean_s: float, rate: float) -> float:
@@ -129,9 +126,10 @@ class PredictedFigures:
         def decay(delay_s: float) -> float:
             if self.decay_rate_1_s <= 0.0:
                 return self.decay_rate_1_s
-            loop = A, self.model.B, self.K, Timing(self.period_s, self.period_s)
             if delay_s == self.assumed_s:  # the loop behind the delay is that without
-                return -predicted_growth_rate(*loop, assumed_s=0.0, delay_s=0.0)
+                Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
+                return -rate_of(radius_of(Phi + G @ self.K), self.period_s)
+            loop = A, self.model.B, self.K, Timing(self.period_s, self.period_s)
             if self.thinned == 1:
                 return -predicted_growth_rate(*loop, assumed_s=self.assumed_s, delay_s=delay_s)
             late = BK @ self._ahead
@@ -198,7 +196,7 @@ class PredictedFigures:
 
     def _noise(self, angles: FloatArray, delay_s: float) -> float:
         z = np.exp(1j * angles)[:, np.newaxis, np.newaxis]
-        plant, K = HeldPlant(self.model.A, self.model.B, self.K, self.period_s), self.K
+        plant, K = self._plant, self.K
         Phi, G = (maps[0] for maps in plant.transition(np.array([self.period_s])))
 
         def entry(late_s: float) -> Complex:
@@ -214,32 +212,39 @@ class PredictedFigures:
     @cached_property
     def _ahead(self) -> FloatArray:
         """L."""
-        return HeldPlant(self.model.A, self.model.B, self.K, self.period_s).carry(np.array([self.assumed_s]))[0]
+        return self._plant.carry(np.array([self.assumed_s]))[0]
+
+    @cached_property
+    def _plant(self) -> HeldPlant:
+        return HeldPlant(self.model.A, self.model.B, self.K, self.period_s)
 
     @cached_property
     def _slowest(self) -> float:
         return float(np.abs(np.linalg.eigvals(self.at_once.closed_loop)).min())
 
 
-def _rough_window(gains: ScalarGains, assumed_s: float) -> tuple[float, float]:
-    """The window of the continuous loop of a leader and its follower, from crossings between frequencies on a grid.
+def _rough_window(
+    loop: tuple[FloatArray, FloatArray, FloatArray], assumed_s: float, frequencies: int
+) -> tuple[float, float]:
+    """The window of the continuous loop, from crossings between frequencies on a grid.
 
-    e^{-s tau} = e^{-s tau^} - q with q = (s + k1) / k1 for the leader and, for the follower,
-    q = (s^2 + k1 s + k3) / ((k1 + k3 tau^) s + k3).
+    It is at its edge where e^{-s tau} = e^{-s tau^} + 1 / m, m an eigenvalue of K L (s I - A - B K)^{-1} B.
     """
-    k1, k3 = gains.k1, gains.k3
-    highest = 4.0 * (k1 + k3 * assumed_s) + 4.0 * abs(k3) ** 0.5
-    omega = highest * np.geomspace(1e-4, 1.0, _FREQUENCIES)
-    s, least_s, most_s = 1j * omega, 0.0, inf
-    for q in ((s + k1) / k1, (s**2 + k1 * s + k3) / ((k1 + k3 * assumed_s) * s + k3)):
-        turn = np.exp(-s * assumed_s) - q
-        spare = np.abs(turn) - 1.0
-        at = np.flatnonzero(spare[:-1] * spare[1:] < 0.0)
-        part = spare[at] / (spare[at] - spare[at + 1])
-        crossing = omega[at] + part * (omega[at + 1] - omega[at])
-        phase = np.angle(turn[at]) + part * np.angle(turn[at + 1] / turn[at])
-        around_s = 2.0 * pi / crossing
-        longer_s = np.mod(-phase / crossing - assumed_s, around_s)
-        most_s = min([most_s, *(assumed_s + longer_s)])
-        least_s = max([least_s, *(assumed_s + longer_s - around_s)])
-    return least_s, most_s
+    A, B, K = loop
+    closed, onto = A + B @ K, K @ carry(A, None, np.array([assumed_s]))[0]
+    highest = 4.0 * float(np.linalg.norm(onto @ B, 2)) + 2.0 * float(np.abs(np.linalg.eigvals(closed)).max())
+    omega = highest * np.geomspace(1e-3, 1.0, frequencies)
+    s = 1j * omega
+    M = onto @ np.linalg.solve(s[:, np.newaxis, np.newaxis] * np.eye(len(A)) - closed, B.astype(np.complex128))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.exp(-s * assumed_s)[:, np.newaxis] + 1.0 / np.linalg.eigvals(M)
+    turn = np.take_along_axis(turn, np.argsort(np.abs(turn), axis=1), 1)
+    spare = np.abs(turn) - 1.0
+    at, rank = np.nonzero(spare[:-1] * spare[1:] < 0.0)
+    part = spare[at, rank] / (spare[at, rank] - spare[at + 1, rank])
+    crossing = omega[at] + part * (omega[at + 1] - omega[at])
+    phase = np.angle(turn[at, rank]) + part * np.angle(turn[at + 1, rank] / turn[at, rank])
+    around_s = 2.0 * pi / crossing
+    longer_s = np.mod(-phase / crossing - assumed_s, around_s)
+    longest_s = float(longer_s.min(initial=inf))
+    return assumed_s + float((longer_s - around_s).max(initial=-assumed_s)), assumed_s + longest_s

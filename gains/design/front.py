@@ -5,8 +5,9 @@ fastest decay, with prediction over the delay and without. All are asked for sta
 share of the delay to either side, so that neither way counts on a delay that is known exactly.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf
 from typing import Literal, NamedTuple
 
@@ -83,20 +84,20 @@ class FrontSearch:
     tolerated: float = 0.2
     string_peak_max: float | None = 1.0
 
-    def points(self, routes: Sequence[Route], delays_s: Sequence[float]) -> Iterator[FrontPoint | Refusal]:
-        """The points of each route, one delay after the other; those of a delay do not depend on the others."""
-        methods: dict[Method, None] = dict.fromkeys(route.method for route in routes)
-        for method in methods:
-            graph = lqr_bases(self.formation, self.pattern)[1] if method == "graph-lqr" else None
-            for route in (route for route in routes if route.method == method):
-                for delay_s in delays_s:
-                    family = self._family(route, delay_s, graph)
-                    try:
-                        point, found = searched(family, self.wanted(route, delay_s), evaluations=_EVALUATIONS[method])
-                    except GainsError as error:
-                        yield Refusal(route, delay_s, str(error))
-                        continue
-                    yield self._point(route, delay_s, family, point, found)
+    def point(self, at: tuple[Route, float]) -> FrontPoint | Refusal:
+        """The point of a route at a loop delay (s)."""
+        route, delay_s = at
+        family = self._family(route, delay_s)
+        try:
+            point, found = searched(family, self.wanted(route, delay_s), evaluations=_EVALUATIONS[route.method])
+        except GainsError as error:
+            return Refusal(route, delay_s, str(error))
+        return self._point(route, delay_s, family, point, found)
+
+    @cached_property
+    def _graph(self) -> PatternGains:
+        """Gains on the pattern, with the LQR gains from which searches start."""
+        return lqr_bases(self.formation, self.pattern)[1]
 
     def wanted(self, route: Route, delay_s: float) -> Requirement:
         """What is asked of the gains at a delay."""
@@ -104,10 +105,10 @@ class FrontSearch:
         criteria = Criteria(delay_s, route.aim, delays_s=around_s, delay_rate=0.0)
         return Requirement(criteria=criteria, string_peak_max=self.string_peak_max)
 
-    def _family(self, route: Route, delay_s: float, graph: PatternGains | None) -> GainFamily:
+    def _family(self, route: Route, delay_s: float) -> GainFamily:
         timing = FlownTiming(inf, self.period_s)
-        if graph is not None:
-            gains = replace(graph, delay_s=delay_s, timing=timing)
+        if route.method == "graph-lqr":
+            gains = replace(self._graph, delay_s=delay_s, timing=timing)
             return PredictedPattern(gains) if route.predicted else gains
         if route.predicted:
             return PredictedTree(delay_s, self.period_s, tolerated=self.tolerated)

@@ -99,25 +99,31 @@ def show_front(scenario: "Scenario", method: str | None, picture_file: Path | No
 
 
 def _print_front(found: "FrontFields") -> None:
-    from gcs.views.console import ms_text, number_text, plain_console, table_of
+    from gcs.views.console import number_text, plain_console, table_of
 
     console = plain_console()
     around = f"stable at every constant delay within {found.tolerated:.0%} of the loop delay"
     console.print(f"front    each {around}; string peak at most {found.string_peak_max:g} by inclusion")
+    for line in (
+        "ms of loop delay; what is best there; method; predicted or not; alpha as the method reports it and",
+        "of the whole formation; decay in 1/s; string peak; gain from disturbance to spacing error in s²;",
+        "noise from measurements to commands; whether on the front",
+    ):
+        console.print(f"         {line}")
     columns: dict[str, Callable[[PointFields], str]] = {
-        "loop delay": lambda p: ms_text(p.loop_delay_s, ".0f"),
-        "largest": lambda p: p.maximised,
+        "ms": lambda p: f"{1e3 * p.loop_delay_s:.0f}",
+        "best": lambda p: p.maximised,
         "method": lambda p: p.method,
-        "prediction": lambda p: "on" if p.prediction else "off",
+        "pred": lambda p: "on" if p.prediction else "off",
         "alpha": lambda p: number_text(p.alpha_design, ".3f"),
         "whole": lambda p: number_text(p.alpha, ".3f"),
-        "decay, 1/s": lambda p: number_text(p.decay_rate_1_s, ".3f"),
-        "string peak": lambda p: number_text(p.string_peak, ".2f"),
-        "disturbance, s²": lambda p: number_text(p.spacing_gain_s2, ".3f"),
-        "noise": lambda p: number_text(p.noise_gain, ".2f"),
-        "on the front": lambda p: "refused" if p.refused else "yes" if p.is_efficient else "",
+        "decay": lambda p: number_text(p.decay_rate_1_s, ".2f"),
+        "peak": lambda p: number_text(p.string_peak, ".2f"),
+        "gain": lambda p: number_text(p.spacing_gain_s2, ".2g"),
+        "noise": lambda p: number_text(p.noise_gain, ".3g"),
+        "front": lambda p: "refused" if p.refused else "yes" if p.is_efficient else "",
     }
-    console.print(table_of(found.points, columns))
+    console.print(table_of(found.points, columns, dense=True))
     for point in (point for point in found.points if point.refused):
         console.print(
             f"refused  {point.method}, largest {point.maximised} at {point.loop_delay_s:g} s: {point.refused}"

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 from gcs.errors import InputError
 from gcs.interrupts import FROM_TERMINAL, held_back
@@ -161,15 +162,17 @@ def refly(study: Study, folder: Path, wanted: str) -> Reflown:
 
 
 @contextlib.contextmanager
-def local_workers(count: int) -> Generator[Fly]:
-    """While entered, fly trials in `count` processes; if one, in this process."""
+def local_workers(
+    count: int, run: Callable[[Any], Any] = fly_trial
+) -> Generator[Callable[[Sequence[Any]], Iterator[Any]]]:
+    """While entered, fly trials in `count` processes; if one, in this process. `run` is what is done with a trial."""
     if count == 1:
-        yield partial(map, fly_trial)
+        yield partial(map, run)
         return
     with contextlib.ExitStack() as stack:
         pools: list[ProcessPoolExecutor] = []
 
-        def fly(trials: Sequence[Trial]) -> Iterator[Outcome]:
+        def fly(trials: Sequence[Any]) -> Iterator[Any]:
             if not pools:
                 # spawn: a fork would copy the threads' locks of whatever the user's process has loaded
                 spawn = get_context("spawn")
@@ -178,7 +181,7 @@ def local_workers(count: int) -> Generator[Fly]:
                 stack.callback(pools[0].shutdown, cancel_futures=True)
             try:
                 with held_back():  # workers that are starting leave Ctrl-C to this process
-                    futures = [pools[0].submit(fly_trial, trial) for trial in trials]
+                    futures = [pools[0].submit(run, trial) for trial in trials]
                 for future in as_completed(futures):
                     yield future.result()
             except BrokenProcessPool:

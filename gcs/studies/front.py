@@ -1,5 +1,6 @@
 """`gcs design --front` and `--at`: what can be had at a loop delay, by every route, with and without prediction."""
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -13,6 +14,7 @@ from gcs.plan.formation import plan_formation
 from gcs.plan.given import with_gain, with_given
 from gcs.plan.planner import pattern_of
 from gcs.published import Published
+from gcs.stress.campaign import local_workers
 from gcs.views.page import figure_of, saved
 from scenarios.schema import FixedGains, Scenario
 
@@ -51,6 +53,9 @@ class PointFields(Published):
     K: tuple[tuple[float, ...], ...] = ()
 
 
+_OF_POINT = set(PointFields.model_fields)
+
+
 class FrontFields(Published):
     """A front, as --json prints it."""
 
@@ -72,13 +77,14 @@ def front(
     Raises InputError where a front is not defined.
     """
     search, routes = searched_in(scenario), list(product_of(methods, (False, True), AIMS))
-    left, points, refused = len(routes) * len(delays_s), list[FrontPoint](), list[Refusal]()
-    for found in search.points(routes, delays_s):
-        points += [found] if isinstance(found, FrontPoint) else []
-        refused += [found] if isinstance(found, Refusal) else []
-        left -= 1
-        ended(left)
-    every = [*map(fields_of, efficient(points)), *map(_refusal_fields, refused)]
+    left, found = len(routes) * len(delays_s), list[FrontPoint | Refusal]()
+    with local_workers(os.cpu_count() or 1, search.point) as each:
+        for one in each([(route, delay_s) for delay_s in delays_s for route in routes]):
+            found.append(one)
+            left -= 1
+            ended(left)
+    points = efficient([one for one in found if isinstance(one, FrontPoint)])
+    every = [fields_of(one) for one in (*points, *(one for one in found if isinstance(one, Refusal)))]
     every.sort(key=lambda own: (own.loop_delay_s, own.maximised, own.method, own.prediction))
     return FrontFields(
         scenario=scenario.name,
@@ -120,7 +126,8 @@ def point_at(
     Raises InputError if no gains take the delay.
     """
     predicted = (False, True) if prediction is None else (prediction == "on",)
-    found = list(searched_in(scenario).points(list(product_of((method,), predicted, (aim,))), (delay_s,)))
+    search = searched_in(scenario)
+    found = [search.point((route, delay_s)) for route in product_of((method,), predicted, (aim,))]
     points = [own for own in found if isinstance(own, FrontPoint)]
     if not points:
         reasons = "; ".join(own.reason for own in found if isinstance(own, Refusal))
@@ -139,33 +146,13 @@ def _inclusion(point: FrontPoint) -> tuple[float, float, float]:
     return (float(K[0, 0]), 0.0, 1.0) if len(K) == 1 else (float(K[1, 2]), float(K[1, 0]), float(K[1, 1]))
 
 
-def fields_of(point: FrontPoint) -> PointFields:
-    """A point as it is printed."""
-    return PointFields(
-        method=point.route.method,
-        prediction=point.route.predicted,
-        maximised=_AIM_NAMES[point.route.aim],
-        loop_delay_s=point.delay_s,
-        alpha=point.alpha,
-        alpha_design=point.alpha_design,
-        decay_rate_1_s=point.decay_rate_1_s,
-        string_peak=point.string_peak,
-        spacing_gain_s2=plain(point.spacing_gain_s2),
-        noise_gain=plain(point.noise_gain),
-        stable_s=(point.stable_s[0], plain(point.stable_s[1])),
-        is_efficient=point.is_efficient,
-        K=point.K.tolist(),
-    )
-
-
-def _refusal_fields(own: Refusal) -> PointFields:
-    return PointFields(
-        method=own.route.method,
-        prediction=own.route.predicted,
-        maximised=_AIM_NAMES[own.route.aim],
-        loop_delay_s=own.delay_s,
-        refused=own.reason,
-    )
+def fields_of(found: FrontPoint | Refusal) -> PointFields:
+    """A point as it is printed, or why there is none."""
+    method, prediction, aim = found.route
+    named = {"method": method, "prediction": prediction, "maximised": _AIM_NAMES[aim], "loop_delay_s": found.delay_s}
+    if isinstance(found, Refusal):
+        return PointFields.model_validate(named | {"refused": found.reason})
+    return PointFields.model_validate(named | plain({k: v for k, v in vars(found).items() if k in _OF_POINT}))
 
 
 def plot_front(found: FrontFields, figure: str, axes: Any) -> Any:
