@@ -30,6 +30,8 @@ from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 
 _FREQUENCIES, _LOWEST = 1600, 1e-3
+# assumed delays, in periods, below which the continuous loop tells too little of the sampled one
+_SHORT = 4.0
 # of the integral of the noise over the unit circle, which converges like a power of the number
 _ANGLES = 4096
 
@@ -42,7 +44,7 @@ class PredictedFigures:
 
     Figures at a delay are the worst at the true loop delays `delays_s`. Vehicles respond at once. `chain` has k1, k2
     and k3 where errors run down a chain of equal followers. `thinned` is as of `LoopFigures`, and the window of a
-    search is that of the continuous loop.
+    search that of the continuous loop, unless the delay is short.
 
     The gains of `triangle5`, assumed and true delay 0.6 s:
 
@@ -102,7 +104,7 @@ class PredictedFigures:
     def window_s(self) -> tuple[float, float]:
         """The least and the largest true loop delay (s), see `gains.sampled.prediction.mismatch_window`."""
         A, B, K = self.model.A, self.model.B, self.K
-        if self.thinned == 1:
+        if self.thinned == 1 or self.assumed_s < _SHORT * self.period_s:
             return mismatch_window(A, B, K, Timing(self.period_s, self.period_s), assumed_s=self.assumed_s)
         half_s = self.period_s / 2.0
         least_s, most_s = _rough_window((A, B, K), self.assumed_s + half_s, _FREQUENCIES // self.thinned)

@@ -1,5 +1,6 @@
 """The options of `gcs design --front`, `--at` and of `--links-of`, and what they print."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -89,7 +90,7 @@ def show_front(scenario: "Scenario", method: str | None, picture_file: Path | No
             raise InputError(f"--picture: read {picture_file}, wanted a file name that ends in .svg, .png or .pdf")
     methods: Sequence[Method] = [own for own in METHODS if method in (None, own)]
     with progress(shown=not as_json) as begin:
-        found = front(scenario, methods, DELAYS_S, ended=begin("front"))
+        found = front(scenario, methods, DELAYS_S, workers=os.cpu_count() or 1, ended=begin("front"))
     if picture_file is not None:
         picture(found, picture_file)
     if as_json:

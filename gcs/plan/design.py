@@ -142,6 +142,8 @@ class PredictionPart(Published):
     mismatch_window_s: tuple[float, Margin] | None = None
     mismatch_window_continuous_s: tuple[float, Margin] | None = None
     windows: tuple[WindowAt, ...] = ()
+    assumes: str = ""
+    """What is assumed of the set-points sent."""
 
 
 class FiguresAtDelay(Published):

@@ -18,6 +18,7 @@ from gains.sampled.multirate import Timing
 from gains.sampled.onboard import OnboardTiming, streamed_loop
 from gains.sampled.prediction import mismatch_window, mismatch_window_continuous
 from scenarios.keys.part import PREDICTION_MAX_S
+from scenarios.schema import Scenario
 
 Window = tuple[float, float]
 """The shortest and the longest loop delay (s) between which a loop is stable."""
@@ -137,6 +138,17 @@ def _window(
     K = np.frombuffer(gain).reshape(model.inputs, model.states)
     loop, measured = predicted_loop(model, K, responses, onboard)
     return mismatch_window(*loop, timing, assumed_s=assumed_s, measured=measured)
+
+
+def assumption(scenario: Scenario) -> str:
+    """What prediction assumes of the set-points sent, as a line; empty without prediction."""
+    as_sent, on_board = "every set-point acts as it was sent", scenario.control.loop == "onboard"
+    if scenario.control.prediction == "off":
+        return ""
+    if scenario.target_hz > 0.0:
+        return f"where vehicles do not report their active targets, {as_sent}"
+    why = "those of own loops do not show it" if on_board else "rates.target_hz is 0"
+    return f"{as_sent}: no active targets are asked for, as {why}"
 
 
 def predicted_loop(

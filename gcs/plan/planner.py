@@ -36,7 +36,7 @@ from gcs.plan.design import (
 )
 from gcs.plan.flight_plan import FlightPlan, Responses, given_responses, loop_timing, margins_with, onboard_timing
 from gcs.plan.formation import Formation, plan_formation
-from gcs.plan.mismatch import continuous_window, window
+from gcs.plan.mismatch import assumption, continuous_window, window
 from gcs.plan.onboard import onboard_plan
 from gcs.plan.own_law import OWN_DYNAMICS, code_records, own_plan, with_unknown_margin
 from scenarios.keys.own import BUILT_IN
@@ -134,7 +134,7 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
     plan.tolerance(assumed_s or 0.0)
     found = {at_s: _window_at(plan, at_s) for at_s in sorted({assumed_s or _SHOWN_S[0], *_SHOWN_S})}
     own = dict.fromkeys(WindowAt.model_fields) if assumed_s is None else found[assumed_s].model_dump()
-    return PredictionPart.model_validate(own | {"windows": tuple(found.values())})
+    return PredictionPart.model_validate(own | {"windows": tuple(found.values()), "assumes": assumption(plan.scenario)})
 
 
 def _window_at(plan: FlightPlan, assumed_s: float) -> WindowAt:

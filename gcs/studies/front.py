@@ -1,6 +1,5 @@
 """`gcs design --front` and `--at`: what can be had at a loop delay, by every route, with and without prediction."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -70,15 +69,17 @@ def front(
     methods: Sequence[Method] = METHODS,
     delays_s: Sequence[float] = DELAYS_S,
     *,
+    workers: int = 1,
     ended: Callable[[int], None] = lambda _: None,
 ) -> FrontFields:
     """The front at these delays (s); `ended` is called after each point with the number still to come.
+    `workers` is the number of processes.
 
     Raises InputError where a front is not defined.
     """
     search, routes = searched_in(scenario), list(product_of(methods, (False, True), AIMS))
     left, found = len(routes) * len(delays_s), list[FrontPoint | Refusal]()
-    with local_workers(os.cpu_count() or 1, search.point) as each:
+    with local_workers(workers, search.point) as each:
         for one in each([(route, delay_s) for delay_s in delays_s for route in routes]):
             found.append(one)
             left -= 1

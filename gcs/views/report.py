@@ -114,6 +114,8 @@ def _print_margins(design: Design, console: Console) -> None:
         assumed_s = design.prediction.assumed_delay_s
         over = "the measured loop delay" if assumed_s is None else f"{ms_text(assumed_s)} of loop delay"
         console.print(f"         without prediction; the station predicts over {over}")
+        if design.prediction.assumes:
+            console.print(f"         and assumes: {design.prediction.assumes}")
         console.print(table_of(design.prediction.windows, _WINDOW_COLUMNS, title="stable between, with prediction"))
     if design.vehicles == 1:
         console.print("         of the one vehicle's own velocity loop, as nobody follows it")

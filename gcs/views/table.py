@@ -19,6 +19,7 @@ from gcs.control.phases import patience_s
 from gcs.control.tick import TICK, Event, Mode, TickArray
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
+from gcs.plan.mismatch import assumption
 from gcs.runs.refusals import REFUSED
 from gcs.views.console import UNKNOWN, FittedColumn, draw, fitted_table, ms_text, not_shown, number_text
 from gcs.views.scene import Floats, Newest
@@ -242,7 +243,8 @@ def _footer(state: FlightState, figures: Figures) -> list[Text]:
         line.append(f"   {state.skipped} ticks skipped", style="yellow")
     refused = [Text(f"refused: {state.refused}", style="yellow", no_wrap=True)] if state.refused else []
     flown = [Text(at_delay, no_wrap=True)] if (at_delay := state.at_delay(figures)) else []
-    return [line, *flown, *refused, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
+    assumed = [Text(f"assumed: {text}", style="dim", no_wrap=True)] if (text := assumption(state.scenario)) else []
+    return [line, *flown, *refused, *assumed, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
 
 
 def plain_line(state: FlightState) -> str:

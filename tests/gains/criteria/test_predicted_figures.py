@@ -14,7 +14,7 @@ from gains.performance.flown import FlownTiming
 from gains.performance.predicted import PredictedLoop
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.multirate import Timing
-from gains.sampled.prediction import predicted_growth_rate
+from gains.sampled.prediction import mismatch_window_continuous, predicted_growth_rate
 
 PERIOD_S = 0.02
 PAIR = FormationModel((-1, 0), axes=1)
@@ -64,3 +64,15 @@ def test_gains_with_prediction_decay_faster_within_a_mismatch() -> None:
     for delay_s in (0.48, 0.72):
         timing = Timing(PERIOD_S, PERIOD_S)
         assert predicted_growth_rate(PAIR.A, PAIR.B, gain, timing, assumed_s=0.6, delay_s=delay_s) < 0.0
+
+
+@pytest.mark.parametrize("predecessors", [(-1, 0), (-1, 0, 1, 0, 3)])
+@pytest.mark.parametrize("assumed_s", [0.1, 0.6, 1.5])
+def test_the_window_of_a_search_is_near_the_exact_one(assumed_s: float, predecessors: tuple[int, ...]) -> None:
+    model = FormationModel(predecessors, axes=1)
+    gain = model.overlapping_gain([[-3.408]], [[0.631]], [[5.608]])
+    rough = PredictedFigures(model, gain, PERIOD_S, assumed_s, (assumed_s,), thinned=10)
+    half_s = PERIOD_S / 2.0
+    least_s, most_s = mismatch_window_continuous(model.A, model.B, gain, assumed_s=assumed_s + half_s)
+    # 160 frequencies over three decades
+    assert rough.window_s == pytest.approx((max(0.0, least_s - half_s), most_s - half_s), abs=4e-3)
