@@ -191,9 +191,8 @@ def coupled_blocks(
     [((1,), 1.561), ((2,), 0.701), ((3,), 0.701)]
     """
     whole = None if onboard is None or assumed_s is not None else onboard_loop(model, K, onboard)
-    A, B, gain = (model.A, model.B, K) if responding is None else responding
-    if onboard is not None and assumed_s is not None:
-        A, B, gain = streamed_loop(model, K, onboard)
+    streamed = streamed_loop(model, K, onboard) if onboard is not None and assumed_s is not None else responding
+    A, B, gain = streamed or (model.A, model.B, K)
     blocks: list[CoupledBlock] = []
     for members in model.coupled_vehicles(K):
         errors = np.concatenate([np.r_[model.output_slice(i)] for i in members])

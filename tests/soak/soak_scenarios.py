@@ -65,10 +65,10 @@ def random_scenario(rng: Rng, name: str) -> Part:
         at_end=one_of(rng, "hold", "land"),
     )
     drawn |= _disturbed(np.random.default_rng((drawn["seed"], 1)))
-    if not onboard and (not autopilot or "response" in drawn):
+    if not autopilot or "response" in drawn:
         fast = max(rates.values()) > 100.0  # the windows of a whole schedule take half a minute
         own = np.random.default_rng(drawn["seed"])
-        _predict(own, control, measured=0.5 if fast else "measured", fed=not autopilot)
+        _predict(own, control, measured=0.5 if fast else "measured", fed=not autopilot and not onboard)
         rates["target_hz"] = one_of(own, 10.0, 10.0, 0.0, rates["control_hz"])
     return drawn
 
