@@ -8,19 +8,15 @@ each block is analysed on its own, and equal blocks once.
 """
 
 import heapq
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from graphlib import TopologicalSorter
 from math import log2
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from gains.core.arrays import FloatArray, IntArray, RealArray
 from gains.core.errors import BadModelError
-
-# states up to which the components are found by squaring the pattern
-_LARGEST_CLOSURE = 64
 
 
 @dataclass(frozen=True)
@@ -84,20 +80,20 @@ def strongly_connected_blocks(*matrices: RealArray) -> list[IntArray]:
     >>> [block.tolist() for block in strongly_connected_blocks(np.array([[-1, 0, 0], [1, 0, 1], [0, 1, 0]]))]
     [[0], [1, 2]]
     """
-    pattern = np.any([matrix != 0.0 for matrix in matrices], axis=0)
-    if pattern.shape[0] <= _LARGEST_CLOSURE:
-        label = _labels_by_closure(pattern)
-    else:
-        from scipy.sparse import csgraph, csr_array  # takes longer to import than a small model to analyse
-
-        label = csgraph.connected_components(csr_array(pattern), directed=True, connection="strong")[1]
-    count = int(label.max()) + 1
-    if count == 1:
+    pattern = matrices[0] != 0.0
+    for matrix in matrices[1:]:
+        pattern |= matrix != 0.0
+    # all drive the first state, which drives all: dense loops
+    if bool(pattern[0].all() and pattern[:, 0].all()):
+        return [np.arange(len(pattern))]
+    driven, driver = np.nonzero(pattern)
+    label = _components(len(pattern), driven, driver)
+    if not label.any():
         return [np.arange(label.size)]
     order = np.argsort(label, kind="stable")
     members = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
-    driven, driver = np.nonzero(pattern & (label[:, np.newaxis] != label))
-    edges = set(zip(label[driver].tolist(), label[driven].tolist(), strict=True))
+    across = label[driver] != label[driven]
+    edges = set(zip(label[driver[across]].tolist(), label[driven[across]].tolist(), strict=True))
     return [members[k] for k in _drivers_first([int(block[0]) for block in members], edges)]
 
 
@@ -135,19 +131,23 @@ def without_equilibria(*matrices: ArrayLike) -> tuple[tuple[FloatArray, ...], in
     back) stays as it is. BadModelError unless the matrices are square, finite and of one size.
     """
     checked = square_matrices(**{f"A{k}": matrix for k, matrix in enumerate(matrices)})
-    size = checked[0].shape[0]
-    kept = [np.zeros((size, size)) for _ in checked]
-    filled = 0
-    for indices in strongly_connected_blocks(*checked):
-        block = _moving_part([matrix[np.ix_(indices, indices)] for matrix in checked])
-        place = slice(filled, filled + block[0].shape[0])
-        for target, matrix in zip(kept, block, strict=True):
-            target[place, place] = matrix
-        filled = place.stop
-    if filled == size:
+    moving = [(block.copies, _moving_part(list(block.matrices))) for block in distinct_blocks(*checked)]
+    left = sum(copies * len(part[0]) for copies, part in moving)
+    if left == len(checked[0]):
         # with the couplings between blocks, which a reader of the matrices expects
         return tuple(checked), 0
-    return tuple(matrix[:filled, :filled] for matrix in kept), size - filled
+    return block_diagonal([part for copies, part in moving for _ in range(copies)]), len(checked[0]) - left
+
+
+def block_diagonal(blocks: Sequence[Sequence[FloatArray]]) -> tuple[FloatArray, ...]:
+    """The matrices, in their order, with the blocks of each one after the other on its diagonal."""
+    ends = np.cumsum([len(block[0]) for block in blocks])
+    whole = tuple(np.zeros((ends[-1], ends[-1])) for _ in blocks[0])
+    for block, end in zip(blocks, ends.tolist(), strict=True):
+        place = slice(end - len(block[0]), end)
+        for target, matrix in zip(whole, block, strict=True):
+            target[place, place] = matrix
+    return whole
 
 
 def balanced(*matrices: FloatArray) -> tuple[FloatArray, ...]:
@@ -222,29 +222,56 @@ def _moving_part(block: list[FloatArray]) -> list[FloatArray]:
     return block
 
 
-def _labels_by_closure(pattern: NDArray[np.bool_]) -> IntArray:
-    """Component number of each state, by transitive closure: quick for small models, without the graph library."""
-    size = pattern.shape[0]
-    reach = pattern | np.eye(size, dtype=bool)
-    # paths double in length with every squaring
-    for _ in range((size - 1).bit_length()):
-        reach = (reach.astype(np.float64) @ reach) > 0.0
-    # the lowest state of each component stands for it
-    lowest = np.argmax(reach & reach.T, axis=1)
-    return np.unique(lowest, return_inverse=True)[1]
+def _components(size: int, driven: IntArray, driver: IntArray) -> IntArray:
+    """Number of the strongly connected component of each state, from edges in ascending order of the driven state.
+
+    R. Tarjan, "Depth-first search and linear graph algorithms", SIAM J. Comput. 1 (1972), 146-160, without recursion.
+    """
+    ends = np.cumsum(np.bincount(driven, minlength=size)).tolist()
+    following, drivers = [0, *ends[:-1]], driver.tolist()
+    number, lowest, label = [0] * size, [0] * size, [-1] * size
+    visited, found = 0, 0
+    unlabelled: list[int] = []
+    for start in range(size):
+        path = [] if number[start] else [start]
+        while path:
+            state = path[-1]
+            if not number[state]:
+                visited += 1
+                number[state] = lowest[state] = visited
+                unlabelled.append(state)
+            if following[state] < ends[state]:
+                towards = drivers[following[state]]
+                following[state] += 1
+                if not number[towards]:
+                    path.append(towards)
+                elif label[towards] < 0:
+                    lowest[state] = min(lowest[state], number[towards])
+                continue
+            path.pop()
+            if path:
+                lowest[path[-1]] = min(lowest[path[-1]], lowest[state])
+            if lowest[state] == number[state]:
+                while label[state] < 0:
+                    label[unlabelled.pop()] = found
+                found += 1
+    return np.array(label)
 
 
 def _drivers_first(lowest_index: list[int], edges: Iterable[tuple[int, int]]) -> list[int]:
     """Topological order of components, the component of the lowest state index first in a tie."""
-    sorter = TopologicalSorter[int](dict.fromkeys(range(len(lowest_index)), ()))
+    waiting_for = [0] * len(lowest_index)
+    drives: list[list[int]] = [[] for _ in lowest_index]
     for driver, driven in edges:
-        sorter.add(driven, driver)
-    sorter.prepare()
-    ready: list[tuple[int, int]] = []
+        waiting_for[driven] += 1
+        drives[driver].append(driven)
+    ready = [(lowest, k) for k, lowest in enumerate(lowest_index) if not waiting_for[k]]
+    heapq.heapify(ready)
     order: list[int] = []
-    while sorter.is_active():
-        for k in sorter.get_ready():
-            heapq.heappush(ready, (lowest_index[k], k))
+    while ready:
         order.append(heapq.heappop(ready)[1])
-        sorter.done(order[-1])
+        for k in drives[order[-1]]:
+            waiting_for[k] -= 1
+            if not waiting_for[k]:
+                heapq.heappush(ready, (lowest_index[k], k))
     return order

@@ -82,12 +82,20 @@ def analyse_commensurate(
     `gains.delay.constant.analyse_delay`; BadModelError also without a matrix or if m n is too large.
     """
     check_horizon(horizon_s)
-    blocks = distinct_blocks(*_checked(matrices))
+    if len(matrices) == 0:
+        raise BadModelError("matrices is empty; at least A_0 is wanted")
+    blocks = distinct_blocks(*square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)}))
     return combined_analysis([analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
 
 
 def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
-    """One block of x'(t) = sum_k A_k x(t - k tau), its matrices being A_0, A_1, ..."""
+    """One block of x'(t) = sum_k A_k x(t - k tau), its matrices being A_0, A_1, ...; BadModelError if too large."""
+    longest, states = len(block.matrices) - 1, len(block.indices)
+    if longest > 1 and longest * states > _LARGEST_PRODUCT:
+        raise BadModelError(
+            f"the longest delay is {longest} times their common divisor, with {states} states; "
+            f"a product of at most {_LARGEST_PRODUCT} is wanted"
+        )
     terms = balanced(*block.matrices)
     delayed = [DelayedTerm(matrix, 0.0, k) for k, matrix in enumerate(terms)]
     roots = np.linalg.eigvals(sum(terms, np.zeros_like(terms[0]))).astype(np.complex128)
@@ -178,19 +186,6 @@ def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
             if np.linalg.svd(matrices, compute_uv=False)[:, -1].max() < 1e-12 * scale:
                 return True
     return False
-
-
-def _checked(matrices: Sequence[ArrayLike]) -> list[FloatArray]:
-    if len(matrices) == 0:
-        raise BadModelError("matrices is empty; at least A_0 is wanted")
-    checked = square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)})
-    size = checked[0].shape[0] * (len(checked) - 1)
-    if len(checked) > 2 and size > _LARGEST_PRODUCT:
-        raise BadModelError(
-            f"the longest delay is {len(checked) - 1} times their common divisor, with {checked[0].shape[0]} states; "
-            f"a product of at most {_LARGEST_PRODUCT} is wanted"
-        )
-    return checked
 
 
 def companion_loci(terms_at: Callable[[FloatArray], ComplexArray], B: FloatArray) -> Loci:

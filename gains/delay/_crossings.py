@@ -12,7 +12,7 @@ from math import inf
 
 import numpy as np
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.structure import balanced, distinct_blocks
 from gains.delay._loci import (
     Loci,
@@ -58,10 +58,8 @@ class DelayedTerm:
 
 def by_multiple(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
     """A_0, A_1, ..., A_m of x' = sum_k A_k x(t - k tau), from terms without known delays."""
-    matrices = [np.zeros_like(terms[0].matrix) for _ in range(max(term.multiple for term in terms) + 1)]
-    for term in terms:
-        matrices[term.multiple] = matrices[term.multiple] + term.matrix
-    return matrices
+    alike = [[term.matrix for term in terms if term.multiple == k] for k in range(max(t.multiple for t in terms) + 1)]
+    return [sum(rest, first) for first, *rest in (each or [np.zeros_like(terms[0].matrix)] for each in alike)]
 
 
 @dataclass(frozen=True)
@@ -200,18 +198,28 @@ def polish(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> Crossing:
     return Crossing(omega, theta / omega, crossing.outward, roots=2)
 
 
-def crossing_error(terms: Sequence[DelayedTerm], omega: float, tau_s: float) -> tuple[float, float]:
-    """Estimated errors of the frequency omega (rad/s) and of the delay tau (s) of a crossing, by its sensitivity.
+def crossing_errors(terms: Sequence[DelayedTerm], places: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Estimated errors of the frequency omega (rad/s) and the delay tau (s) of crossings, by their sensitivity.
 
-    Let u, v be the singular vectors of the least singular value of M(j omega, tau). A change E of M, of norm epsilon,
-    moves the crossing by the solution of a d omega + b d tau = -u*E v with a = u*(dM/d omega) v, b = u*(dM/d tau) v:
-    two real equations. Near a multiple root a and b become small; the estimate is capped by epsilon^(1/n), which no
-    multiplicity exceeds.
+    `places` are their pairs (omega, tau). Let u, v be the singular vectors of the least singular value of
+    M(j omega, tau). A change E of M, of norm epsilon, moves the crossing by the solution of
+    a d omega + b d tau = -u*E v with a = u*(dM/d omega) v, b = u*(dM/d tau) v: two real equations. Near a multiple root
+    a and b become small; the estimate is capped by epsilon^(1/n), which no multiplicity exceeds.
     """
-    delays_s, multiples = np.array([term.delay_s(tau_s) for term in terms]), np.array([t.multiple for t in terms])
+    blocks = [np.array(balanced(*block.matrices)) for block in distinct_blocks(*(term.matrix for term in terms))]
+    multiples = np.array([term.multiple for term in terms])
+    return [
+        _error(blocks, np.array([term.delay_s(tau_s) for term in terms]), multiples, omega, tau_s)
+        for omega, tau_s in places
+    ]
+
+
+def _error(
+    blocks: Sequence[FloatArray], delays_s: FloatArray, multiples: IntArray, omega: float, tau_s: float
+) -> tuple[float, float]:
+    """The errors of one crossing; the block whose M is the nearest to singular has it."""
     worst, least = (0.0, 0.0), inf
-    for block in distinct_blocks(*(term.matrix for term in terms)):
-        matrices = np.array(balanced(*block.matrices))
+    for matrices in blocks:
         n = matrices.shape[1]
         turned = np.exp(-1j * omega * delays_s)[:, np.newaxis, np.newaxis] * matrices
         M = 1j * omega * np.eye(n) - turned.sum(axis=0)

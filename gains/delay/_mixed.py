@@ -7,6 +7,7 @@ d_i} and refines extrema near one. The argument principle counts the roots that 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import pi
 
 import numpy as np
@@ -17,7 +18,7 @@ from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 from gains.delay._commensurate import column_space, companion_loci
 from gains.delay._crossings import Crossing, DelayedTerm
-from gains.delay._loci import highest_frequency, near_unit_extrema, unit_crossings, without_limits_at_zero
+from gains.delay._loci import near_unit_extrema, unit_crossings, without_limits_at_zero
 from gains.delay._windows import (
     BlockAnalysis,
     DelayAnalysis,
@@ -27,19 +28,20 @@ from gains.delay._windows import (
     zero_passage,
 )
 
-# rad by which e^{-j omega d} turns between neighbouring frequencies
-_TURN = 0.1
-_POINTS_PER_DECADE, _DECADES = 60, 9
+# rad by which e^{-j omega d} turns between neighbouring frequencies, and frequencies a decade: of a sweep, of a count
+_TURN, _COUNT_TURN = 0.1, 0.5
+_POINTS_PER_DECADE, _COUNT_GRID, _DECADES = 60, 20, 9
 # more frequencies than this take more than a few seconds
 _MOST_POINTS = 60_000
 # the Hurwitz reference of a count of roots is this far left of the axis, relative to the norm
 _SHIFT = 0.02
 # points around a frequency at which roots are near the axis, relative to it
-_BESIDE = np.logspace(-7.0, -1.0, 25)
-# entries of a stack of matrices: 32 MB
-_LARGEST_STACK = 2_000_000
-# largest turn (rad) of the determinant between neighbouring frequencies, and how often the grid may be halved for it
-_DETERMINANT_TURN, _HALVINGS = 0.5, 40
+_BESIDE = np.logspace(-7.0, -1.0, 7)
+# entries of a stack of matrices: 3 MB
+_LARGEST_STACK = 200_000
+# largest turn (rad) of the determinant between neighbouring frequencies, by how much its slopes may miss it, and how
+# often the grid may be halved for that
+_MOST_TURN, _MISSED, _HALVINGS = 1.0, 0.2, 40
 # least frequency of that grid if there is a root at zero, as a share of the highest
 _LEAST_FREQUENCY = 1e-7
 
@@ -56,12 +58,13 @@ def analyse_mixed(
     """
     matrices = _checked(terms)
     check_horizon(horizon_s)
-    known_s, multiples = np.array([t.known_s for t in terms]), np.array([t.multiple for t in terms])
     blocks = distinct_blocks(*matrices)
-    return combined_analysis([_analyse_block(block, known_s, multiples, leave_out_zero) for block in blocks], horizon_s)
+    return combined_analysis([analyse_mixed_block(block, terms, leave_out_zero) for block in blocks], horizon_s)
 
 
-def _analyse_block(block: Block, known_s: FloatArray, multiples: IntArray, leave_out_zero: bool) -> BlockAnalysis:
+def analyse_mixed_block(block: Block, terms: Sequence[DelayedTerm], leave_out_zero: bool) -> BlockAnalysis:
+    """One block of x'(t) = sum A x(t - known_s - multiple tau), with the delays of `terms`. Exceptions as above."""
+    known_s, multiples = np.array([t.known_s for t in terms]), np.array([t.multiple for t in terms])
     parts = _Parts(np.array(balanced(*block.matrices)), known_s, multiples)
     delayed = [DelayedTerm(*part) for part in zip(parts.matrices, known_s.tolist(), multiples.tolist(), strict=True)]
     passage = zero_passage(parts.matrices, known_s, multiples) if leave_out_zero else None
@@ -113,14 +116,32 @@ class _Parts:
         turned = np.exp(-1j * omega[:, np.newaxis] * self.known_s)[:, :, np.newaxis, np.newaxis] * self.matrices
         return np.stack([turned[:, self.multiples == k].sum(axis=1) for k in range(self.degree + 1)], axis=1)
 
-    def highest(self) -> float:
-        """Bound (rad/s) of every root on the imaginary axis."""
-        at_once = (self.known_s == 0.0) & (self.multiples == 0)
-        return highest_frequency([self.matrices[at_once].sum(axis=0), *self.matrices[~at_once]])
+    def sum_at(self, omega: FloatArray, matrices: FloatArray) -> ComplexArray:
+        """The sum of all M_i e^{-j omega d_i}, `matrices` M (terms, n, n), shape (frequencies, n, n)."""
+        return np.tensordot(np.exp(-1j * np.outer(omega, self.known_s)), matrices, axes=1)
 
-    def frequencies(self, highest: float) -> FloatArray:
-        turning = np.linspace(0.0, highest, int(highest * float(self.known_s.max()) / _TURN) + 200)
-        decades = highest * np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE)
+    def highest(self) -> float:
+        """Bound (rad/s) of every root on the imaginary axis, in spectral norms."""
+        at_once = (self.known_s == 0.0) & (self.multiples == 0)
+        now = self.matrices[at_once].sum(axis=0)
+        return 1.01 * float(np.linalg.norm((now - now.T) / 2.0, 2) + self.norms[~at_once].sum())
+
+    @cached_property
+    def norms(self) -> FloatArray:
+        """Spectral norms (terms,)."""
+        return np.linalg.norm(self.matrices, 2, axis=(1, 2))
+
+    def frequencies(self, highest: float, turn: float = _TURN, per_decade: int = _POINTS_PER_DECADE) -> FloatArray:
+        """Frequencies up to the highest that resolve the turning of e^{-j omega d}; BadModelError for too many."""
+        longest_s = float(self.known_s.max())
+        points = highest * longest_s / turn
+        if points > _MOST_POINTS:
+            raise BadModelError(
+                f"the longest known delay is {longest_s} s, which takes {points:.3g} frequencies; "
+                f"at most {_MOST_POINTS} are wanted"
+            )
+        turning = np.linspace(0.0, highest, int(points) + 3 * per_decade)
+        decades = highest * np.logspace(-_DECADES, 0.0, _DECADES * per_decade)
         # away from poles of the resolvent on the axis at round numbers
         return np.union1d(turning[1:], decades) * (1.0 + 1e-9)
 
@@ -138,51 +159,68 @@ def _crossings(parts: _Parts) -> list[Crossing]:
 
 
 def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) -> int:
-    """Roots with positive real part at tau = 0: turns of det(j omega I - A(j omega)) / det(j omega I - H).
+    """Roots with positive real part at tau = 0: turns of det M(j omega) / det(j omega I - H), M(s) = sI - A(s).
 
     H is the loop without delay, shifted to the left until it is Hurwitz, so the quotient is analytic in the right half
     plane and turns little. Above the bound of all crossings the eigenvalues s of A have imaginary parts below omega, so
     no angle of j omega - s leaves (0, pi): there the phase is known without steps. If `at_zero`, a simple root at zero
-    is divided out.
+    is divided out. The phase is added up over steps short enough for its slope, tr(M^{-1} M'), to tell it.
     """
-    identity, highest = np.eye(parts.size), parts.highest()
+    highest = parts.highest()
     hurwitz = np.linalg.eigvals(parts.matrices.sum(axis=0))
     hurwitz = hurwitz - max(0.0, float(hurwitz.real.max()) + _SHIFT * (highest + float(np.abs(hurwitz).max())))
-
-    def angles(omega: FloatArray) -> FloatArray:
-        return np.angle(1j * omega[:, np.newaxis] - hurwitz).sum(axis=1)
-
-    def phase(omega: FloatArray) -> ComplexArray:
-        shares = np.array_split(omega, max(1, omega.size * parts.size**2 // _LARGEST_STACK))
-        return np.concatenate([phase_of_share(share) for share in shares])
-
-    def phase_of_share(omega: FloatArray) -> ComplexArray:
-        matrix = 1j * omega[:, np.newaxis, np.newaxis] * identity - parts.at(omega).sum(axis=1)
-        return np.linalg.slogdet(matrix)[0] * np.exp(-1j * angles(omega))
-
-    omega = np.union1d(0.0, parts.frequencies(highest))
+    # M(j omega) = M(0) (I + E) with the norm of E below 1 / 4n: nothing turns there
+    slowest = float(np.linalg.svd(parts.matrices.sum(axis=0), compute_uv=False)[-1])
+    still = slowest / (4.0 * parts.size * (1.0 + float(parts.known_s @ parts.norms)))
+    # nearer to zero than the least frequency, with a root there, the determinant is rounding, and it is real up to it
+    omega = parts.frequencies(highest, _COUNT_TURN, _COUNT_GRID)
+    omega = omega[omega > (_LEAST_FREQUENCY * highest if at_zero else still)]
     near = np.outer(np.array(beside), np.concatenate([1.0 - _BESIDE, [1.0], 1.0 + _BESIDE])).ravel()
-    omega = np.union1d(omega, near[near < omega[-1]])
-    if at_zero:
-        # nearer to zero the determinant is rounding, and it is real there up to the frequency itself
-        omega = omega[omega > _LEAST_FREQUENCY * highest]
-    values = phase(omega)
-    # roots beside the axis turn the phase by half a turn each: the more states, the more of them between two points
-    most_turn = _DETERMINANT_TURN / (1.0 + parts.size / 25.0)
+    omega = np.union1d(omega, near[(near > omega[0]) & (near < omega[-1])])
+    omega = omega if at_zero else np.append(0.0, omega)
+    phase, slope = _turning(parts, hurwitz, omega)
     for _ in range(_HALVINGS):
-        turns = np.angle(values[1:] / values[:-1])
-        coarse = np.flatnonzero(np.abs(turns) > most_turn)
+        expected = np.diff(omega) * (slope[1:] + slope[:-1]) / 2.0
+        missed = np.angle(np.exp(1j * (np.diff(phase) - expected)))
+        coarse = np.flatnonzero((np.abs(missed) > _MISSED) | (np.abs(expected) > _MOST_TURN))
         if coarse.size == 0:
             break
         between = (omega[coarse] + omega[coarse + 1]) / 2.0
+        at_between = _turning(parts, hurwitz, between)
         omega = np.insert(omega, coarse + 1, between)
-        values = np.insert(values, coarse + 1, phase(between))
+        phase, slope = (np.insert(old, coarse + 1, new) for old, new in zip((phase, slope), at_between, strict=True))
     else:
         raise DisagreementError("a root is too close to the imaginary axis at tau = 0 to count it on either side")
-    turned = float(np.sum(np.angle(values[1:] / values[:-1]))) + float(np.diff(angles(omega[[0, -1]]))[0])
-    last = np.linalg.eigvals(parts.at(omega[-1:])[0].sum(axis=0))
+    angles = np.angle(1j * omega[[0, -1], np.newaxis] - hurwitz).sum(axis=1)
+    turned = float((expected + missed).sum()) + float(angles[1] - angles[0])
+    last = np.linalg.eigvals(parts.sum_at(omega[-1:], parts.matrices)[0])
     beyond = float(np.angle(1j * omega[-1] - last).sum())
     return round((beyond - turned) / pi - (0.5 if at_zero else 0.0))
+
+
+def _turning(parts: _Parts, hurwitz: ComplexArray, omega: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The phase of det M(j omega) / prod (j omega - hurwitz), modulo 2 pi, and its derivative by omega."""
+    phases: list[FloatArray] = []
+    slopes: list[FloatArray] = []
+    delayed = parts.known_s[:, np.newaxis, np.newaxis] * parts.matrices
+    for share in np.array_split(omega, max(1, omega.size * parts.size**2 // _LARGEST_STACK)):
+        matrix, change = -parts.sum_at(share, parts.matrices), parts.sum_at(share, delayed)
+        np.einsum("kii->ki", matrix)[:] += 1j * share[:, np.newaxis]
+        np.einsum("kii->ki", change)[:] += 1.0
+        reference = 1j * share[:, np.newaxis] - hurwitz
+        phases.append(np.angle(np.linalg.slogdet(matrix)[0]) - np.angle(reference).sum(axis=1))
+        # a matrix that is singular to rounding is on a root: its neighbours tell
+        trace = (_inverse(matrix) * change.swapaxes(1, 2)).sum(axis=(1, 2))
+        slopes.append(trace.real - (1.0 / reference).real.sum(axis=1))
+    return np.concatenate(phases), np.concatenate(slopes)
+
+
+def _inverse(matrices: ComplexArray) -> ComplexArray:
+    """The inverses; large numbers in place of one that is not there, so that the frequency is looked at closely."""
+    try:
+        return np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:
+        return np.broadcast_to(np.eye(matrices.shape[1]) / _LEAST_FREQUENCY, matrices.shape)
 
 
 def _checked(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
@@ -193,12 +231,4 @@ def _checked(terms: Sequence[DelayedTerm]) -> list[FloatArray]:
             raise BadModelError(f"terms[{i}].known_s is {term.known_s}; a number of seconds >= 0 is wanted")
         if term.multiple < 0:
             raise BadModelError(f"terms[{i}].multiple is {term.multiple}; a whole number >= 0 is wanted")
-    matrices = square_matrices(**{f"terms[{i}].matrix": term.matrix for i, term in enumerate(terms)})
-    longest_s = max(term.known_s for term in terms)
-    points = longest_s * sum(float(np.linalg.norm(matrix)) for matrix in matrices) / _TURN
-    if points > _MOST_POINTS:
-        raise BadModelError(
-            f"the longest known delay is {longest_s} s, which takes {points:.3g} frequencies; "
-            f"at most {_MOST_POINTS} are wanted"
-        )
-    return matrices
+    return square_matrices(**{f"terms[{i}].matrix": term.matrix for i, term in enumerate(terms)})

@@ -1,32 +1,42 @@
 """Crossings of the imaginary axis of large blocks: the eigenvalues of A(theta) followed along the unit circle.
 
 For A(theta) = sum_k A_k e^{-j k theta} of more than two dozen states, an eigenvalue problem is costly. The eigenvalues
-and their derivatives at few angles say, by cubic interpolation, which branches come near the axis; only there are
-angles added. Newton's method on a bordered matrix, which takes factorisations only, then finds each crossing.
+and their first two derivatives at few angles tell each branch between them (a quintic), and how far it may be from
+that; angles are added only where a branch may reach the axis unseen. Newton's method on a bordered matrix, which takes
+factorisations only, then finds each crossing.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import inf, pi
+from math import pi
 
 import numpy as np
-from numpy.polynomial import Polynomial
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.delay._crossings import Crossing
 
-# first angles: at least this many over the upper half of the circle, and this far (rad) beyond both of its ends
-_ANGLES, _BEYOND = 25, 0.02
-# and this many for each multiple of the delay
-_ANGLES_A_TURN = 12
-# intervals are halved down to this width (rad); a branch that is still unclear there touches the axis
+# intervals for each multiple of the delay on the upper half of the circle, which they exceed a little on both sides
+_INTERVALS, _BEYOND = 8, 0.02
+# they are halved down to this width (rad); a branch that is still unclear there touches the axis
 _NARROWEST = 1e-7
-# bound of the error of the interpolation, as a share of the difference of the two straight lines at the middle
-_MARGIN = 1.0
-# a crossing that Newton's method finds lies in its interval up to this share of the width
+# places in an interval, 0 to 1, at which branches are looked at
+_PLACES = np.linspace(0.0, 1.0, 41)[:, np.newaxis]
+_FREE = (_PLACES * (1.0 - _PLACES)) ** 2
+# error of a quintic in units of its difference from the cubic: that of a branch with a kink amid the interval, which is
+# what two eigenvalues that avoid each other make
+_KINK = 4.0
+# above the largest slope of t^2 (1 - t)^2, 0.19: an error may have that slope in units of its bound
+_STEEP = 0.3
+# relative to the norm: eigenvalues that differ by less are equal, an eigenvalue is known to less, one on the axis
+_EQUAL, _KNOWN, _ON_AXIS = 1e-12, 1e-9, 1e-11
+# two branches that lead to one crossing but are this far apart (relative to the norm) have another one each
+_APART = 1e-7
+# a crossing lies in its interval up to this share of the width
 _OUTSIDE = 0.05
-_NEWTON_STEPS = 12
+# steps of Newton's method (rad, relative to the norm): at most so many, until the next would be below this, or with
+# rounding the last one below that
+_NEWTON_STEPS, _DONE, _DONE_BY_ROUNDING = 12, 1e-15, 1e-10
 # rad; an angle this close to 0 or pi is there, and one this close to 0 is 0
 _SAME, _ZERO_ANGLE = 1e-9, 1e-11
 
@@ -37,19 +47,23 @@ class UnclearError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class _Sample:
-    """The eigenvalues (n,) of A(theta) and their derivatives by theta."""
+    """The eigenvalues (n,) of A(theta) and their first and second derivatives by theta."""
 
     theta: float
     roots: ComplexArray
     slopes: ComplexArray
+    bends: ComplexArray
+    vectors: ComplexArray
+    """(n, n), one in a column."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Found:
-    theta: float
-    omega: float
-    rising: int
-    """Sign of the derivative by theta of the real part; 0 where the branch touches the axis."""
+    """Crossings, each an array (k,); `rising` is the sign of the derivative by theta of the real part, 0 at a touch."""
+
+    theta: FloatArray
+    omega: FloatArray
+    rising: IntArray
 
 
 def tracked_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
@@ -57,143 +71,191 @@ def tracked_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
 
     Raises UnclearError where eigenvalues coincide at all angles.
     """
-    stacked = np.array(terms)
+    stacked = np.array(terms, dtype=np.complex128)
     scale = float(np.linalg.norm(stacked, axis=(1, 2)).sum())
-    found: list[_Found] = []
-    angles = np.linspace(-_BEYOND, pi + _BEYOND, max(_ANGLES, _ANGLES_A_TURN * len(terms)))
-    samples = [_sample(stacked, float(theta)) for theta in angles]
-    for left, right in pairwise(samples):
-        found += _between(stacked, left, right, scale)
+    angles = np.linspace(-_BEYOND, pi + _BEYOND, _INTERVALS * (len(terms) - 1) + 1)
+    samples = [_sample(stacked, float(theta), scale) for theta in angles]
     crossings: list[Crossing] = []
-    for each in found:
-        # angles below 0 and beyond pi mirror others with negative frequencies; at 0 and pi the pair is seen twice
-        inside = _SAME < each.theta < pi - _SAME
-        if inside or (-_SAME <= each.theta <= pi + _SAME and each.omega > 0.0):
-            turn, way = (each.theta, 1) if each.omega >= 0.0 else (-each.theta, -1)
-            omega, turn = abs(each.omega), turn % (2.0 * pi)
-            turn = 0.0 if min(turn, 2.0 * pi - turn) < _ZERO_ANGLE else turn
-            crossings.append(Crossing(omega, turn / omega if omega > 0.0 else 0.0, way * each.rising, roots=2))
+    for found in (each for left, right in pairwise(samples) for each in _between(stacked, left, right, scale)):
+        for theta, omega, rising in zip(*(part.tolist() for part in vars(found).values()), strict=True):
+            # angles below 0 and beyond pi mirror others with negative frequencies; at 0 and pi the pair is seen twice
+            inside = _SAME < theta < pi - _SAME
+            if inside or (-_SAME <= theta <= pi + _SAME and omega > 0.0):
+                turn, way = (theta, 1) if omega >= 0.0 else (-theta, -1)
+                turn = turn % (2.0 * pi)
+                turn = 0.0 if min(turn, 2.0 * pi - turn) < _ZERO_ANGLE else turn
+                delay_s = turn / abs(omega) if omega != 0.0 else 0.0
+                crossings.append(Crossing(abs(omega), delay_s, way * rising, roots=2))
     return sorted(crossings, key=lambda crossing: crossing.omega_rad_s)
 
 
-def _sample(terms: FloatArray, theta: float) -> _Sample:
-    matrix, change = _at(terms, theta)
-    roots, right = np.linalg.eig(matrix)
+def _sample(terms: ComplexArray, theta: float, scale: float) -> _Sample:
+    """With V^{-1} A V = diag(s), W = V^{-1} A' V and X = V^{-1} A'' V the derivatives of s_i are W_ii and
+    X_ii + 2 sum_j W_ij W_ji / (s_i - s_j).
+    """
+    roots, right = np.linalg.eig(_at(terms, theta, 0))
     try:
-        slopes = np.einsum("ij,ji->i", np.linalg.inv(right), change @ right)
+        left = np.linalg.inv(right)
     except np.linalg.LinAlgError as error:
         raise UnclearError from error
-    return _Sample(theta, roots.astype(np.complex128), slopes.astype(np.complex128))
+    by_theta = left @ _at(terms, theta, 1) @ right
+    gaps = roots[:, np.newaxis] - roots
+    gaps[np.abs(gaps) < _EQUAL * scale] = np.inf
+    coupling = 2.0 * (by_theta * by_theta.T / gaps).sum(axis=1)
+    bends = np.einsum("ij,ji->i", left, _at(terms, theta, 2) @ right) + coupling
+    return _Sample(theta, roots, np.diag(by_theta), bends, right)
 
 
-def _at(terms: FloatArray, theta: float) -> tuple[ComplexArray, ComplexArray]:
-    """A(theta) and its derivative."""
-    k = np.arange(len(terms))
-    turns = np.exp(-1j * k * theta)
-    return np.tensordot(turns, terms, axes=1), np.tensordot(-1j * k * turns, terms, axes=1)
+def _at(terms: ComplexArray, theta: FloatArray | float, order: int) -> ComplexArray:
+    """The derivative of this order of A by theta, shape (n, n) for each angle."""
+    multiples = -1j * np.arange(len(terms))
+    return np.tensordot(np.exp(np.multiply.outer(theta, multiples)) * multiples**order, terms, axes=1)
 
 
-def _between(terms: FloatArray, left: _Sample, right: _Sample, scale: float) -> Iterator[_Found]:
+def _between(terms: ComplexArray, left: _Sample, right: _Sample, scale: float) -> Iterator[_Found]:
     """Crossings between two angles, which are halved until each branch is clear."""
-    # scipy.optimize takes longer to import than a small model to analyse
-    from scipy.optimize import linear_sum_assignment
-
-    width = right.theta - left.theta
-    ahead, back = left.roots + width / 2.0 * left.slopes, right.roots - width / 2.0 * right.slopes
-    apart = np.abs(ahead[:, np.newaxis] - back)
-    # a branch whose neighbours were mixed up is unclear, and the interval is halved
-    _, partner = linear_sum_assignment(np.minimum(apart, 1e100))
-    found: list[_Found] = []
-    for i, j in enumerate(partner.tolist()):
-        crossings = _of_branch(terms, left, right, (i, j), float(apart[i, j]), scale)
-        if crossings is None:
-            break
-        found += crossings
-    else:
-        yield from found
+    found = _of_branches(terms, left, right, scale)
+    if found is not None:
+        yield found
         return
-    if width < _NARROWEST:
+    if right.theta - left.theta < _NARROWEST:
         raise UnclearError
-    middle = _sample(terms, (left.theta + right.theta) / 2.0)
+    middle = _sample(terms, (left.theta + right.theta) / 2.0, scale)
     yield from _between(terms, left, middle, scale)
     yield from _between(terms, middle, right, scale)
 
 
-def _of_branch(  # noqa: PLR0911 - each way to be clear ends it
-    terms: FloatArray, left: _Sample, right: _Sample, branch: tuple[int, int], apart: float, scale: float
-) -> list[_Found] | None:
-    """Crossings of one branch in an interval; None if the interval is too wide to tell."""
-    i, j = branch
+def _of_branches(terms: ComplexArray, left: _Sample, right: _Sample, scale: float) -> _Found | None:
+    """Crossings of all branches in an interval; None if it is too wide to tell."""
     width = right.theta - left.theta
-    begin, end = complex(left.roots[i]), complex(right.roots[j])
-    start, finish = width * complex(left.slopes[i]), width * complex(right.slopes[j])
-    reach = _MARGIN * apart
-    real = _cubic(begin.real, end.real, start.real, finish.real)
-    turning = [float(t.real) for t in real.deriv().roots() if abs(t.imag) < 1e-12 and 0.0 < t.real < 1.0]
-    values = [begin.real, *(float(real(t)) for t in sorted(turning)), end.real]
-    if min(abs(value) for value in values) > reach and all(value * values[0] > 0.0 for value in values):
-        return []
-    touches = width < _NARROWEST * 2.0
-    if begin.real * end.real > 0.0 and not touches:
-        return None
-    if begin.real * end.real > 0.0:
+    partner = _partners(left.roots + width / 2.0 * left.slopes, right.roots - width / 2.0 * right.slopes)
+    quintics, bound = _quintics(left, right, partner)
+    real = _values(quintics, _PLACES).real
+    # a branch may turn between two places, by up to an eighth of its second difference
+    turn = np.abs(np.diff(real, 2, axis=0)).max(axis=0) / 8.0
+    positive, sure = real > 0.0, np.abs(real) > bound * _FREE + turn
+    # at the ends the eigenvalues are known
+    sure[[0, -1]] = True
+    # the sign at the nearest sure place before and after each place
+    order = np.arange(len(real))[:, np.newaxis]
+    last = np.maximum.accumulate(np.where(sure, order, 0), axis=0)
+    following = np.minimum.accumulate(np.where(sure, order, len(real) - 1)[::-1], axis=0)[::-1]
+    before, after = (np.take_along_axis(positive, at, axis=0) for at in (last, following))
+    flips = positive[1:] != positive[:-1]
+    touches = np.any(~sure & (before == after), axis=0)
+    unclear = flips.sum(axis=0) != np.count_nonzero(before[1:] != before[:-1], axis=0)
+    # a branch that is not steep where it passes may pass three times
+    steep = np.abs(np.gradient(real, _PLACES[:, 0], axis=0)) > _STEEP * bound
+    unclear |= flips.any(axis=0) & np.any(~sure & ~steep, axis=0)
+    if width < 2.0 * _NARROWEST:
         # closer to the axis than rounding tells: it touches, if it is on it at all
-        place = min((t for t in (0.0, *turning, 1.0)), key=lambda t: abs(float(real(t))))
-        if abs(float(real(place))) > 1e-11 * scale:
-            return []
-        omega = _cubic(begin.imag, end.imag, start.imag, finish.imag)(place)
-        return [_Found(left.theta + place * width, float(omega), 0)]
-    inside = [float(t.real) for t in real.roots() if abs(t.imag) < 1e-9 and -_OUTSIDE <= t.real <= 1.0 + _OUTSIDE]
-    if len(inside) != 1 or apart > max(abs(begin.real), abs(end.real)):
+        unclear &= ~touches
+        flips[:, touches] = False
+        touches &= np.abs(real).min(axis=0) < _ON_AXIS * scale
+    elif touches.any():
         return None
-    omega = float(_cubic(begin.imag, end.imag, start.imag, finish.imag)(inside[0]))
-    crossing = _newton(terms, left.theta + inside[0] * width, omega, scale)
-    if crossing is None or crossing.rising != int(np.sign(end.real - begin.real)):
+    if unclear.any():
         return None
-    beside = max(left.theta - crossing.theta, crossing.theta - right.theta)
-    return [crossing] if beside <= _OUTSIDE * width and abs(crossing.omega - omega) <= apart + 1e-9 * scale else None
+    place, branch = np.nonzero(flips)
+    begin, end = real[place, branch], real[place + 1, branch]
+    at = _PLACES[place, 0] + begin / (begin - end) * (_PLACES[1, 0] - _PLACES[0, 0])
+    vectors = np.where(at < 0.5, left.vectors[:, branch], right.vectors[:, partner[branch]]).T
+    on_axis = _newton(terms, left.theta + at * width, _values(quintics[:, branch], at).imag, vectors, scale)
+    if on_axis is None or not _belong(on_axis, quintics[:, branch], bound[branch], at, left.theta, width, scale):
+        return None
+    if np.any(on_axis.rising != np.sign(end - begin)):
+        return None
+    nearest = np.abs(real).argmin(axis=0)[touches]
+    omega = np.diag(_values(quintics[:, touches], _PLACES[nearest]).imag)
+    return _Found(
+        np.append(on_axis.theta, left.theta + _PLACES[nearest, 0] * width),
+        np.append(on_axis.omega, omega),
+        np.append(on_axis.rising, np.zeros(omega.size, dtype=np.intp)),
+    )
 
 
-def _cubic(begin: float, end: float, start: float, finish: float) -> Polynomial:
-    """The cubic on [0, 1] with these values and slopes at its ends."""
-    return Polynomial([begin, start, 3.0 * (end - begin) - 2.0 * start - finish, 2.0 * (begin - end) + start + finish])
+def _partners(ahead: ComplexArray, back: ComplexArray) -> IntArray:
+    """For each of the eigenvalues `ahead` its own one `back`: again and again the two nearest to each other."""
+    apart = np.abs(ahead[:, np.newaxis] - back)
+    apart = np.where(np.isfinite(apart), apart, np.finfo(np.float64).max)
+    partner = np.full(len(apart), -1)
+    while (partner < 0).any():
+        nearest = apart.argmin(axis=1)
+        mutual = np.flatnonzero((apart.argmin(axis=0)[nearest] == np.arange(len(apart))) & (partner < 0))
+        partner[mutual] = nearest[mutual]
+        apart[mutual], apart[:, nearest[mutual]] = np.inf, np.inf
+    return partner
 
 
-def _newton(terms: FloatArray, theta: float, omega: float, scale: float) -> _Found | None:
-    """The crossing near (theta, omega), by Newton's method on g in [[M, b], [c*, 0]] [v; g] = [0; 1].
+def _quintics(left: _Sample, right: _Sample, partner: IntArray) -> tuple[ComplexArray, FloatArray]:
+    """The quintics (6, n) on [0, 1] with these values and derivatives at its ends, and the bounds of their errors.
 
-    M = j omega I - A(theta) is singular exactly where g = 0, and dg = -u* dM v with u from the adjoint equation.
+    An error is below its bound (n,) times t^2 (1 - t)^2.
     """
-    from scipy.linalg import lu_factor, lu_solve
+    width = right.theta - left.theta
+    begin, start, finish = left.roots, width * left.slopes, width * right.slopes[partner]
+    rise = right.roots[partner] - begin
+    # of the cubic with these values and slopes, and what its second derivatives lack at the ends
+    square, cube = 3.0 * rise - 2.0 * start - finish, start + finish - 2.0 * rise
+    at_left = (width**2 * left.bends - 2.0 * square) / 2.0
+    at_right = (width**2 * right.bends[partner] - 2.0 * square - 6.0 * cube) / 2.0
+    # t^2 (1 - t)^2 (at_left (1 - t) + at_right t) beside the cubic
+    extra = [at_left, at_right - 3.0 * at_left, 3.0 * at_left - 2.0 * at_right, at_right - at_left]
+    quintics = np.array([begin, start, square + extra[0], cube + extra[1], *extra[2:]])
+    return quintics, _KINK * np.maximum(np.abs(at_left), np.abs(at_right))
 
-    n = terms.shape[1]
-    rng = np.random.default_rng(n)
-    right, left = (rng.standard_normal((2, n)) + 0j) / np.sqrt(n)
-    bordered = np.zeros((n + 1, n + 1), dtype=np.complex128)
-    unit = np.zeros(n + 1)
-    unit[n] = 1.0
-    slope, step_omega, step_theta = 0j, inf, inf
+
+def _values(quintics: ComplexArray, t: FloatArray) -> ComplexArray:
+    value = quintics[-1]
+    for coefficients in quintics[-2::-1]:
+        value = coefficients + t * value
+    return value
+
+
+def _belong(
+    found: _Found, quintics: ComplexArray, bound: FloatArray, at: FloatArray, begin: float, width: float, scale: float
+) -> bool:
+    """Whether each crossing is in the interval and on its branch, and no two branches lead to one crossing."""
+    t = (found.theta - begin) / width
+    predicted = _values(quintics, t)
+    near = np.abs(predicted - 1j * found.omega) <= bound / 16.0 + _KNOWN * scale
+    if not np.all(near & (np.abs(t - 0.5) <= 0.5 + _OUTSIDE)):
+        return False
+    order = np.lexsort((found.omega, found.theta))
+    same = (np.diff(found.theta[order]) < _SAME) & (np.abs(np.diff(found.omega[order])) < _SAME * scale)
+    return not bool(np.any(same & (np.abs(np.diff(_values(quintics, at)[order])) > _APART * scale)))
+
+
+def _newton(terms: ComplexArray, theta: FloatArray, omega: FloatArray, v: ComplexArray, scale: float) -> _Found | None:
+    """The crossings near these (k,) and near their vectors v (k, n), by Newton's method; None unless all are found.
+
+    It solves M v = 0, c*v = 1 for v, omega and theta, M = j omega I - A(theta). With omega taken as complex, one
+    factorisation gives its step a + b d(theta), and d(theta) leaves it real. At the crossing ds/d(theta) = j b.
+    """
+    n = v.shape[1]
+    v = v / np.linalg.norm(v, axis=1, keepdims=True)
+    bordered = np.zeros((theta.size, n + 1, n + 1), dtype=np.complex128)
+    bordered[:, n, :n] = v.conj()
+    right = np.zeros((theta.size, n + 1, 2), dtype=np.complex128)
+    size = 0.0
     for _ in range(_NEWTON_STEPS):
-        matrix, change = _at(terms, theta)
-        bordered[:n, :n] = 1j * omega * np.eye(n) - matrix
-        bordered[:n, n], bordered[n, :n] = left, right.conj()
-        factors = lu_factor(bordered, check_finite=False)
-        solution = lu_solve(factors, unit, check_finite=False)
-        adjoint = lu_solve(factors, unit, trans=2, check_finite=False)
-        v, g, u = solution[:n], complex(solution[n]), adjoint[:n].conj()
-        by_omega, by_theta = -1j * complex(u @ v), complex(u @ (change @ v))
-        slope = by_theta / complex(u @ v) if u @ v != 0.0 else 0j
-        right, left = v / np.linalg.norm(v), u.conj() / np.linalg.norm(u)
-        determinant = by_omega.real * by_theta.imag - by_omega.imag * by_theta.real
-        if determinant == 0.0:
+        bordered[:, :n, :n] = 1j * omega[:, np.newaxis, np.newaxis] * np.eye(n) - _at(terms, theta, 0)
+        bordered[:, :n, n] = 1j * v
+        right[:, :n, 0] = -(bordered[:, :n, :n] @ v[..., np.newaxis])[..., 0]
+        right[:, :n, 1] = (_at(terms, theta, 1) @ v[..., np.newaxis])[..., 0]
+        try:
+            step = np.linalg.solve(bordered, right)
+        except np.linalg.LinAlgError:
             return None
-        step_omega = (-g.real * by_theta.imag + g.imag * by_theta.real) / determinant
-        step_theta = (-g.imag * by_omega.real + g.real * by_omega.imag) / determinant
-        omega, theta = omega + step_omega, theta + step_theta
-        if abs(step_omega) <= 1e-14 * scale and abs(step_theta) <= 1e-14:
-            break
-    else:
-        # rounding may keep the last steps from shrinking further
-        if not (abs(step_omega) <= 1e-10 * scale and abs(step_theta) <= 1e-10):
-            return None
-    return _Found(theta, omega, int(np.sign(slope.real)))
+        a, b = step[:, n, 0], step[:, n, 1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            by_theta = -a.imag / b.imag
+            by_omega = a.real + by_theta * b.real
+            v = v + step[:, :n, 0] + by_theta[:, np.newaxis] * step[:, :n, 1]
+        theta, omega = theta + by_theta, omega + by_omega
+        size, before = float(np.maximum(np.abs(by_omega) / scale, np.abs(by_theta)).max(initial=0.0)), size
+        # the next step is to this one as the square of this one is to that of the last
+        if size <= _KNOWN and size**3 <= _DONE * before**2:
+            return _Found(theta, omega, -np.sign(b.imag).astype(np.intp))
+    # rounding may keep the last steps from shrinking further
+    return _Found(theta, omega, -np.sign(b.imag).astype(np.intp)) if size <= _DONE_BY_ROUNDING else None

@@ -14,7 +14,7 @@ import numpy as np
 from gains.core.arrays import ComplexArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import is_singular_for_any_delay
-from gains.delay._crossings import Crossing, DelayedTerm, crossing_error
+from gains.delay._crossings import Crossing, DelayedTerm, crossing_errors
 
 # more critical delays than this are not listed: a near-tangent pair of crossings can have millions
 _MOST_EVENTS = 200_000
@@ -122,11 +122,10 @@ def _windows(
     except DisagreementError:
         # more roots come out than went in: perhaps the order is wrong
         pass
-    errors = {
-        (crossing.omega_rad_s, crossing.delay_s): crossing_error(block.terms, crossing.omega_rad_s, crossing.delay_s)
-        for block in blocks
-        for crossing in block.crossings
-    }
+    errors: dict[tuple[float, float], tuple[float, float]] = {}
+    for block in blocks:
+        places = [(crossing.omega_rad_s, crossing.delay_s) for crossing in block.crossings]
+        errors.update(zip(places, crossing_errors(block.terms, places), strict=True))
     blurred = [errors[crossing.omega_rad_s, crossing.delay_s] for crossing in crossings]
     return stability_windows(crossings, unstable, horizon_s, errors=blurred)
 

@@ -6,17 +6,26 @@ if there are known delays beside it, `gains.sampled.constant` for a held loop of
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
+from itertools import zip_longest
 from math import ceil, floor, gcd, inf, log10, pi
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
-from gains.core.structure import balanced, distinct_blocks, is_singular_for_any_delay, without_equilibria
-from gains.delay._crossings import DelayedTerm, by_multiple, crossing_error
+from gains.core.structure import (
+    Block,
+    balanced,
+    block_diagonal,
+    distinct_blocks,
+    is_singular_for_any_delay,
+    without_equilibria,
+)
+from gains.delay._crossings import DelayedTerm, by_multiple, crossing_errors
 from gains.delay._loci import factor_rank
+from gains.delay._windows import DelayAnalysis, combined_analysis
 from gains.delay.constant import Crossing
 from gains.margin.model_file import DelayModel, HeldModel
 from gains.margin.opinions import second_opinions
@@ -127,10 +136,6 @@ def _at_given_delays(model: DelayModel) -> LoopAtGivenDelays:
 
 
 def _with_unknown_delay(model: DelayModel) -> LoopMargin:
-    from gains.delay._commensurate import analyse_commensurate
-    from gains.delay._mixed import analyse_mixed
-
-    matrices, taken_out = without_equilibria(*(term.matrix for term in model.terms))
     unit = _common_divisor([term.multiple for term in model.terms])
     steps = [int(term.multiple / unit) for term in model.terms]
     if max(steps) > _MOST_STEPS:
@@ -138,32 +143,31 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
             f"terms: read delays up to {max(steps)} times their common divisor {unit}*{model.unknown}, "
             f"wanted at most {_MOST_STEPS} times"
         )
-    known_s = [term.fixed_s for term in model.terms]
-    terms = [DelayedTerm(*parts) for parts in zip(matrices, known_s, steps, strict=True)]
     # in the common divisor of the delays; the unknown is that divided by `unit`
-    if any(known_s):
-        analysis = analyse_mixed(terms, leave_out_zero=True)
-    else:
-        analysis = analyse_commensurate(by_multiple(terms), leave_out_zero=True)
+    parts = zip((term.matrix for term in model.terms), (term.fixed_s for term in model.terms), steps, strict=True)
+    terms, analysis, taken_out = _analysed([DelayedTerm(*part) for part in parts])
     checked_by, margin_error_s = second_opinions(analysis, terms)
     scale = 1.0 / float(unit)
     fixed = taken_out + analysis.roots_fixed_at_zero
     if fixed:
         notes = _fixed_note(fixed, "0 at every delay")
     elif not analysis.stable_intervals_s and any(
-        is_singular_for_any_delay(balanced(*block.matrices)) for block in distinct_blocks(*matrices)
+        is_singular_for_any_delay(balanced(*block.matrices))
+        for block in distinct_blocks(*(term.matrix for term in terms))
     ):
         notes = ("a root stays at 0 at every delay, so the loop is asymptotically stable at none",)
     else:
         notes = ()
+    places = [(crossing.omega_rad_s, crossing.delay_s) for crossing in analysis.crossings[:_ERRORS_OF]]
+    errors_s = [by_delay_s * scale for _, by_delay_s in crossing_errors(terms, places)]
     return LoopMargin(
         unknown=model.unknown,
         stable_intervals_s=tuple((start_s * scale, end_s * scale) for start_s, end_s in analysis.stable_intervals_s),
         delay_margin_s=analysis.delay_margin_s * scale,
         delay_margin_error_s=margin_error_s * scale,
         crossings=tuple(
-            _scaled(c, crossing_error(terms, c.omega_rad_s, c.delay_s)[1] if i < _ERRORS_OF else np.nan, scale)
-            for i, c in enumerate(analysis.crossings)
+            _scaled(crossing, error_s, scale)
+            for crossing, error_s in zip_longest(analysis.crossings, errors_s, fillvalue=np.nan)
         ),
         unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_delay,
         roots_fixed_at_zero=fixed,
@@ -171,6 +175,26 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
         checked_by=checked_by,
         notes=notes,
     )
+
+
+def _analysed(terms: list[DelayedTerm]) -> tuple[list[DelayedTerm], DelayAnalysis, int]:
+    """The terms with each of their distinct blocks once, the analysis of all, and the number of equilibria left out."""
+    from gains.delay._commensurate import analyse_block
+    from gains.delay._mixed import analyse_mixed_block
+
+    mixed = any(term.known_s for term in terms)
+    if not mixed:
+        terms = [DelayedTerm(matrix, 0.0, k) for k, matrix in enumerate(by_multiple(terms))]
+    blocks: list[Block] = []
+    taken_out = 0
+    for block in distinct_blocks(*(term.matrix for term in terms)):
+        moving, fixed = without_equilibria(*block.matrices)
+        taken_out += block.copies * fixed
+        blocks += [replace(part, copies=part.copies * block.copies) for part in distinct_blocks(*moving)]
+    once = block_diagonal([block.matrices for block in blocks])
+    found = [analyse_mixed_block(block, terms, True) if mixed else analyse_block(block, True) for block in blocks]
+    terms = [replace(term, matrix=matrix) for term, matrix in zip(terms, once, strict=True)]
+    return terms, combined_analysis(found, None), taken_out
 
 
 def _fixed_note(fixed: int, where: str) -> tuple[str, ...]:
@@ -194,7 +218,7 @@ def _scaled(crossing: Crossing, error_s: float, scale: float) -> MarginCrossing:
     omega = crossing.omega_rad_s
     repeats_every_s = 2.0 * pi / omega * scale if omega > 0.0 else None
     delay_s = crossing.delay_s * scale
-    return MarginCrossing(omega, delay_s, crossing.direction, crossing.roots, repeats_every_s, error_s * scale)
+    return MarginCrossing(omega, delay_s, crossing.direction, crossing.roots, repeats_every_s, error_s)
 
 
 def _with_unknown_period(model: HeldModel) -> LoopMargin:

@@ -11,8 +11,11 @@ A delay is a number of seconds, a multiple of one unknown ("tau", "2*tau", "tau/
 ("0.1 + tau"). Multiples are exact decimal fractions: "0.1*tau" is exactly a tenth.
 """
 
+import gc
 import json
 import re
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from math import isfinite, isnan
@@ -44,6 +47,8 @@ _FORMS = (
 _DELAY_WANTED = 'a number of seconds >= 0 or a multiple of the unknown, as "tau" or "2*tau"'
 # products and squares of entries up to this do not overflow, and the square of a product of two least ones is normal
 _LARGEST, _LEAST = 1e30, 1e-60
+# strings that stand for so many zeros in a row, the most first; nobody writes a zero byte
+_ZEROS = {"\0 512 zeros": 512, "\0 64 zeros": 64, "\0 8 zeros": 8}
 # longer texts are cut in messages
 _SHOWN = 60
 
@@ -104,6 +109,17 @@ def parse_model(text: str) -> DelayModel | HeldModel:
     return _held_model(data)
 
 
+def with_short_zeros(text: str) -> str:
+    """The text of a model, or a part of it, with one string for many zeros in a row.
+
+    `parse_model` reads either, but spends most of its time on zeros in a model of many states.
+    """
+    for name, count in _ZEROS.items():
+        for zero in (" 0.0,", " 0,"):
+            text = text.replace(count * zero, f" {json.dumps(name)},")
+    return text
+
+
 def _pair(now: FloatArray, late: FloatArray) -> DelayModel:
     return DelayModel((Term(now, 0.0, Fraction(0)), Term(late, 0.0, Fraction(1))), "tau")
 
@@ -123,8 +139,11 @@ def _parsed(text: str) -> Any:
                 raise BadModelError(f"{key}: read twice, wanted once")
         return dict(items)
 
+    # the collector would look at the rows again and again, in vain: numbers form no cycles
+    collecting = gc.isenabled()
+    gc.disable()
     try:
-        return json.loads(text, object_pairs_hook=pairs)
+        return json.loads(with_short_zeros(text), object_pairs_hook=pairs)
     except json.JSONDecodeError as error:
         line = text.split("\n")[error.lineno - 1].strip()
         read = f"read {_shown(line)}" if line else "read nothing more" if text.strip() else "read nothing"
@@ -136,6 +155,9 @@ def _parsed(text: str) -> Any:
     # Python refuses to convert numbers of thousands of digits
     except ValueError as error:
         raise BadModelError(f"{error}; wanted finite numbers") from None
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def _form(data: dict[str, Any]) -> tuple[str, ...]:
@@ -203,15 +225,43 @@ def _square(key: str, value: Any, size: int | None = None) -> FloatArray:
 def _matrix(key: str, value: Any) -> FloatArray:
     if not isinstance(value, list) or not value or not all(isinstance(row, list) for row in value):
         _bad(key, value, "a matrix as a list of rows, [[1, 2], [3, 4]]")
-    lengths = {len(row) for row in value}
+    rows = [_written_out(row) for row in value]
+    lengths = {length for *_, length in rows}
     if lengths == {0}:
         _bad(key, value, "at least one number in a row")
     if len(lengths) > 1:
         raise BadModelError(f"{key}: read rows of {sorted(lengths)} numbers, wanted rows of equal length")
-    for i, row in enumerate(value):
-        for j, entry in enumerate(row):
+    [length] = lengths
+    entries = [entry for _, written, _ in rows for entry in written]
+    if {int, float}.issuperset(map(type, entries)):
+        with suppress(OverflowError):
+            numbers = np.array(entries, dtype=np.float64)
+            size = np.abs(numbers)
+            if np.all((size <= _LARGEST) & ((size >= _LEAST) | (size == 0.0))):
+                matrix = np.zeros(len(rows) * length)
+                matrix[[i * length + place for i, (places, *_) in enumerate(rows) for place in places]] = numbers
+                return matrix.reshape(len(rows), length)
+    # one entry is not as wanted: which?
+    for i, (places, written, _) in enumerate(rows):
+        for j, entry in zip(places, written, strict=True):
             _finite(f"{key}, row {i + 1}, column {j + 1}", entry, "a finite number")
-    return np.array(value, dtype=np.float64)
+    raise AssertionError("every entry is a finite number")
+
+
+def _written_out(row: list[Any]) -> tuple[Sequence[int], list[Any], int]:
+    """The places and the entries of a row that are written out, and the length of the row."""
+    if str not in set(map(type, row)):
+        return range(len(row)), row, len(row)
+    places: list[int] = []
+    written: list[Any] = []
+    place = 0
+    for entry in row:
+        count = _ZEROS.get(entry, 0) if isinstance(entry, str) else 0
+        if not count:
+            places.append(place)
+            written.append(entry)
+        place += count or 1
+    return places, written, place
 
 
 def _finite(key: str, value: Any, wanted: str) -> float:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import balanced, distinct_blocks, square_matrices
-from gains.delay._crossings import DelayedTerm, by_multiple, crossing_error
+from gains.delay._crossings import DelayedTerm, by_multiple, crossing_errors
 from gains.delay.constant import Crossing, DelayAnalysis, analyse_delay
 
 # sum of n^3 over blocks of n states: a sweep takes 0.2 s here, and 0.08 s for one block of 12 states
@@ -23,8 +23,8 @@ _SWEEP_BUDGET = 14_000
 _SPECTRUM_BUDGET = 200
 # turns of the longest delay up to the highest frequency, for a count of roots: 0.1 s
 _COUNT_BUDGET = 1000.0
-# frequencies of a count at delay zero; frequencies times n^3 for determinants of n states: 3 s
-_COUNT_POINTS, _DETERMINANT_BUDGET = 840, 1e10
+# frequencies of a count at delay zero; frequencies times n^3 for inverses of n states: 4 s
+_COUNT_POINTS, _INVERSE_BUDGET = 400, 1e10
 # rad; a root that crosses within this turn of its frequency may be near the axis
 _NEAR_TURN = 0.2
 # the spectrum is computed this far inside and outside a window, relative to its end
@@ -67,8 +67,8 @@ def second_opinions(
     """
     margin_s, error_s = analysis.delay_margin_s, 0.0
     if margin_s != 0.0 and isfinite(margin_s):
-        ends = [crossing for crossing in analysis.crossings if crossing.delay_s == margin_s]
-        error_s = max((crossing_error(terms, c.omega_rad_s, c.delay_s)[1] for c in ends), default=0.0)
+        ends = [(c.omega_rad_s, margin_s) for c in analysis.crossings if c.delay_s == margin_s]
+        error_s = max((by_delay_s for _, by_delay_s in crossing_errors(terms, ends)), default=0.0)
     checks: list[str] = []
     swept_s = _swept_margin(analysis, terms, thorough)
     if swept_s is not None and _agrees(analysis, swept_s, error_s, terms):
@@ -170,7 +170,7 @@ def _counted_growth(
     """A number of the sign of the growth, from a count of roots; nan where it would take long or is too close."""
     from gains.delay._mixed import count_unstable_roots
 
-    if turns > _COUNT_BUDGET or (_COUNT_POINTS + 10.0 * turns) * largest**3 > _DETERMINANT_BUDGET:
+    if turns > _COUNT_BUDGET or (_COUNT_POINTS + 10.0 * turns) * largest**3 > _INVERSE_BUDGET:
         return nan
     try:
         return rate if count_unstable_roots(pairs, leave_out_zero=leave_out_zero, beside=beside) > 0 else -rate

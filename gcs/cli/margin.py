@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ from pydantic_core import to_jsonable_python
 
 from gains.core.errors import BadModelError
 from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
-from gains.margin.model_file import DelayModel, Term, parse_model
+from gains.margin.model_file import DelayModel, Term, parse_model, with_short_zeros
 
 _ROWS = 20
 """Most rows of a table."""
+_PART = 1 << 18
+"""Characters of a file that are read at once."""
 
 
 class ModelFileError(BadModelError):
@@ -42,7 +45,7 @@ def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
     independent methods give different answers.
     """
     try:
-        text = _mat_as_json(file) if file.suffix == ".mat" else file.read_text(encoding="utf-8-sig")
+        text = _mat_as_json(file) if file.suffix == ".mat" else _json_of(file)
         return loop_margin(parse_model(text))
     except OSError as error:
         raise ModelFileError(f"{file}: {error.strerror}; wanted a JSON model") from None
@@ -50,6 +53,12 @@ def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
         raise ModelFileError(f"{file}: read bytes that are not UTF-8, wanted a JSON model") from None
     except BadModelError as error:
         raise ModelFileError(f"{file}: {error}") from None
+
+
+def _json_of(file: Path) -> str:
+    """The text without its many zeros: that of 1,000 vehicles has 40 MB."""
+    with file.open(encoding="utf-8-sig") as text:
+        return "".join(with_short_zeros(part) for part in iter(partial(text.read, _PART), ""))
 
 
 def _mat_as_json(file: Path) -> str:

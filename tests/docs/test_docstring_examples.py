@@ -21,6 +21,7 @@ PUBLIC_MODULES = [name for name in MODULES if "._" not in name]
 INTERNAL_FUNCTIONS = {
     "gains.core.requirement.plain",
     "gains.core.structure.balanced",
+    "gains.core.structure.block_diagonal",
     "gains.core.structure.distinct_blocks",
     "gains.core.structure.is_singular_for_any_delay",
     "gains.core.structure.positive_seconds",
@@ -49,6 +50,7 @@ INTERNAL_FUNCTIONS = {
     "gains.formation.model.checked_gain",
     "gains.formation.pattern.check_fits",
     "gains.formation.pattern.checked_pattern_gain",
+    "gains.margin.model_file.with_short_zeros",
     "gains.margin.opinions.second_opinions",
     "gains.performance.behaviour.block_margin",
     "gains.performance.behaviour.diagonal_blocks",

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gains.core.structure import is_singular_for_any_delay
-from gains.delay._crossings import DelayedTerm, crossing_error
+from gains.delay._crossings import DelayedTerm, crossing_errors
 from gains.delay._mixed import count_unstable_roots
 from gains.delay._windows import ZeroPassage, zero_passage
 from gains.delay.constant import delay_margin
@@ -28,7 +28,7 @@ def test_a_pair_of_roots_is_unstable_beyond_the_margin() -> None:
 
 
 def test_a_simple_crossing_is_known_to_rounding() -> None:
-    _, delay_error_s = crossing_error([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], 1.0, np.pi / 2.0)
+    [(_, delay_error_s)] = crossing_errors([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], [(1.0, np.pi / 2.0)])
     assert 0.0 < delay_error_s < 1e-14
 
 

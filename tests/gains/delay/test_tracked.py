@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gains.core.arrays import FloatArray
-from gains.core.structure import balanced
+from gains.core.structure import balanced, block_diagonal
 from gains.delay._commensurate import analyse_commensurate
 from gains.delay._crossings import axis_crossings
 from gains.delay._mixed import count_unstable_roots
@@ -54,3 +54,39 @@ def test_equal_roots_are_counted_each() -> None:
     # 13 equal roots are known to the digits that the single one has here
     [window] = analyse_delay(now, late).stable_intervals_s
     assert window == pytest.approx(analyse_delay([[0, 1], [-2, 0.1]], [[0, 0], [1, 0]]).stable_intervals_s[0], rel=1e-9)
+
+
+@pytest.mark.parametrize(("n", "seed", "late"), [(40, 3, 1), (40, 4, 2), (70, 5, 1), (30, 6, 4)])
+def test_crossings_account_for_the_eigenvalues_right_of_the_axis_at_every_angle(n: int, seed: int, late: int) -> None:
+    terms = balanced(*random_loop(n, seed, late=late))
+    found = tracked_crossings(terms)
+    # a crossing at (omega, theta) is one at (-omega, -theta): along the upper half circle both ways are met
+    turns = [(c.omega_rad_s * c.delay_s % (2.0 * np.pi), c.direction) for c in found]
+    met = [(turn, way) if turn <= np.pi else (2.0 * np.pi - turn, -way) for turn, way in turns]
+    for theta in np.linspace(0.01, np.pi - 0.01, 150).tolist():
+        matrix = np.tensordot(np.exp(-1j * np.arange(late + 1) * theta), np.array(terms), axes=1)
+        right = int(np.count_nonzero(np.linalg.eigvals(matrix).real > 0.0))
+        assert right == sum(way for turn, way in met if turn < theta)
+
+
+@pytest.mark.parametrize("excess", [1e-2, 1e-4, 1e-6, 1e-8])
+def test_a_near_tangent_pair_is_found_among_many_states(excess: float) -> None:
+    # s^2 + s + 1 + c e^{-s tau} touches the axis at c = sqrt(3/4); beside it 28 states of other speeds, in one block
+    c = np.sqrt(0.75) * (1.0 + excess)
+    pairs = [([[0.0, 1.0], [-1.0, -1.0]], [[0.0, 0.0], [-c, 0.0]])]
+    rng = np.random.default_rng(3)
+    pairs += [
+        (speed * rng.normal(size=(4, 4)) - 3.0 * speed * np.eye(4), speed * rng.normal(size=(4, 4)))
+        for speed in np.geomspace(0.3, 3.0, 7).tolist()
+    ]
+    expected = sorted(
+        (crossing.omega_rad_s, crossing.delay_s, crossing.direction)
+        for now, late in pairs
+        for crossing in axis_crossings(np.array(now), np.array(late))
+    )
+    basis = np.linalg.qr(rng.normal(size=(30, 30)))[0]
+    now, late = (basis @ matrix @ basis.T for matrix in block_diagonal([[*map(np.array, pair)] for pair in pairs]))
+    found = [(c.omega_rad_s, c.delay_s, c.direction) for c in tracked_crossings([now, late])]
+    # a pair that is this close together is known to the rounding over its distance, which is sqrt(excess)
+    assert len(found) == len(expected) >= 2
+    assert np.array(found) == pytest.approx(np.array(expected), rel=1e-12 / np.sqrt(excess))
