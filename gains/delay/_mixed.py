@@ -218,9 +218,9 @@ def _turning(parts: _Parts, hurwitz: ComplexArray, omega: FloatArray) -> tuple[F
 def _inverse(matrices: ComplexArray) -> ComplexArray:
     """The inverses; large numbers in place of one that is not there, so that the frequency is looked at closely."""
     try:
-        return np.linalg.inv(matrices)
+        return np.array(np.linalg.inv(matrices), dtype=np.complex128)
     except np.linalg.LinAlgError:
-        return np.broadcast_to(np.eye(matrices.shape[1]) / _LEAST_FREQUENCY, matrices.shape)
+        return np.zeros_like(matrices) + np.eye(matrices.shape[1]) / _LEAST_FREQUENCY
 
 
 def _checked(terms: Sequence[DelayedTerm]) -> list[FloatArray]:

@@ -25,9 +25,9 @@ _PLACES = np.linspace(0.0, 1.0, 41)[:, np.newaxis]
 _FREE = (_PLACES * (1.0 - _PLACES)) ** 2
 # error of a quintic in units of its difference from the cubic: that of a branch with a kink amid the interval, which is
 # what two eigenvalues that avoid each other make
-_KINK = 4.0
+_KINK = 3.0
 # above the largest slope of t^2 (1 - t)^2, 0.19: an error may have that slope in units of its bound
-_STEEP = 0.3
+_STEEP = 0.2
 # relative to the norm: eigenvalues that differ by less are equal, an eigenvalue is known to less, one on the axis
 _EQUAL, _KNOWN, _ON_AXIS = 1e-12, 1e-9, 1e-11
 # two branches that lead to one crossing but are this far apart (relative to the norm) have another one each
@@ -237,7 +237,7 @@ def _newton(terms: ComplexArray, theta: FloatArray, omega: FloatArray, v: Comple
     bordered = np.zeros((theta.size, n + 1, n + 1), dtype=np.complex128)
     bordered[:, n, :n] = v.conj()
     right = np.zeros((theta.size, n + 1, 2), dtype=np.complex128)
-    size = 0.0
+    size, b = 0.0, np.zeros(theta.size, dtype=np.complex128)
     for _ in range(_NEWTON_STEPS):
         bordered[:, :n, :n] = 1j * omega[:, np.newaxis, np.newaxis] * np.eye(n) - _at(terms, theta, 0)
         bordered[:, :n, n] = 1j * v

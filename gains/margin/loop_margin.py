@@ -8,7 +8,6 @@ if there are known delays beside it, `gains.sampled.constant` for a held loop of
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import zip_longest
 from math import ceil, floor, gcd, inf, log10, pi
 
 import numpy as np
@@ -160,14 +159,14 @@ def _with_unknown_delay(model: DelayModel) -> LoopMargin:
         notes = ()
     places = [(crossing.omega_rad_s, crossing.delay_s) for crossing in analysis.crossings[:_ERRORS_OF]]
     errors_s = [by_delay_s * scale for _, by_delay_s in crossing_errors(terms, places)]
+    errors_s += [np.nan] * (len(analysis.crossings) - len(errors_s))
     return LoopMargin(
         unknown=model.unknown,
         stable_intervals_s=tuple((start_s * scale, end_s * scale) for start_s, end_s in analysis.stable_intervals_s),
         delay_margin_s=analysis.delay_margin_s * scale,
         delay_margin_error_s=margin_error_s * scale,
         crossings=tuple(
-            _scaled(crossing, error_s, scale)
-            for crossing, error_s in zip_longest(analysis.crossings, errors_s, fillvalue=np.nan)
+            _scaled(crossing, error_s, scale) for crossing, error_s in zip(analysis.crossings, errors_s, strict=True)
         ),
         unstable_roots_at_zero_delay=analysis.unstable_roots_at_zero_delay,
         roots_fixed_at_zero=fixed,
