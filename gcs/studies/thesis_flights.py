@@ -177,6 +177,7 @@ def _snapshots(plot: Any, ticks: TickArray, until_s: float) -> None:
         for row, colour in zip(now, _COLOURS, strict=False):
             plot.plot(row["east_m"] / _FT, row["north_m"] / _FT, "^", color=colour, alpha=strength, markersize=5)
     plot.set_xlabel("east [ft]")
+    plot.locator_params(axis="x", nbins=5)
     plot.set_aspect("equal", adjustable="datalim")
 
 
