@@ -164,15 +164,18 @@ def plot_front(found: FrontFields, figure: str, axes: Any) -> Any:
     if figure not in _FIGURES:
         raise InputError(f"figure: read {figure!r}, wanted one of {', '.join(_FIGURES)}")
     scale = "linear" if figure in {"alpha", "string_peak"} else "log"
-    axes.set(title=_FIGURES[figure], xlabel="loop delay, s", xscale="log", yscale=scale)
+    delays_s = sorted({point.loop_delay_s for point in found.points})
+    axes.set(title=_FIGURES[figure], xlabel="loop delay, ms", xscale="log", yscale=scale)
+    axes.set_xticks(delays_s, [f"{1e3 * delay_s:g}" for delay_s in delays_s])
+    axes.set_xticks([], minor=True)
     for method, predicted, aim in product(METHODS, (False, True), _AIM_NAMES.values()):
         own = [p for p in found.points if (p.method, p.prediction, p.maximised) == (method, predicted, aim)]
         own = [p for p in own if getattr(p, figure) is not None]
         if own:
             label = f"{method}, {'predicted' if predicted else 'not predicted'}, largest {aim}"
             style = {"marker": "o" if aim == "alpha" else "s", "linestyle": "-" if predicted else "--"}
-            delays_s, values = [p.loop_delay_s for p in own], [getattr(p, figure) for p in own]
-            axes.plot(delays_s, values, color=_COLOURS[method], label=label, markersize=4, **style)
+            values = [getattr(p, figure) for p in own]
+            axes.plot([p.loop_delay_s for p in own], values, color=_COLOURS[method], label=label, markersize=4, **style)
     return axes
 
 
@@ -181,5 +184,5 @@ def picture(found: FrontFields, file: Path) -> Path:
     figure, plots = figure_of(2, (10.0, 7.0), (1.0, 1.0), columns=2)
     for plot, name in zip(plots.flat, _FIGURES, strict=False):
         plot_front(found, name, plot)
-    plots[0, 0].legend(fontsize=6)
+    figure.legend(*plots[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2, handlelength=4)
     return saved(figure, file)
