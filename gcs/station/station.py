@@ -34,6 +34,8 @@ AUTOPILOT_COMPONENT = 1
 """A camera or gimbal of a vehicle has its system id, and heartbeats of its own."""
 ANOTHER_ADDRESS = "known system id from another address"
 _HEARTBEAT_NS = NS_PER_S
+_REQUESTS_APART_NS = 7_000_000
+"""The station wakes for TIMESYNC requests no more often than this, and than three times a control period."""
 
 
 class Station:
@@ -73,10 +75,11 @@ class Station:
         self._flight_start_ns: int | None = None
         self._next_tick_ns = start_ns
         self._next_heartbeat_ns = start_ns
-        # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. At most three times a
-        # period the station wakes for them.
+        # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. Of many vehicles some are
+        # sent together.
         self._next_timesync_ns = self._next_requests_ns = start_ns + self._period_ns // 2
         self._timesync_spacing_ns = max(1, self._timesync_ns // n)
+        self._requests_apart_ns = min(self._period_ns // 3, _REQUESTS_APART_NS)
         self._timesync_row = 0
         self._tick_count = 0
         self._stop = ""
@@ -119,7 +122,7 @@ class Station:
         if now_ns >= self._next_requests_ns:
             while now_ns >= self._next_timesync_ns:
                 self._request_timesync(outgoing)
-            self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._period_ns // 3)
+            self._next_requests_ns = max(self._next_timesync_ns, self._next_requests_ns + self._requests_apart_ns)
         return outgoing, tick
 
     def complete(self, tick: Tick, sent_ns: int) -> TickArray:
