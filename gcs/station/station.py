@@ -75,8 +75,8 @@ class Station:
         self._flight_start_ns: int | None = None
         self._next_tick_ns = start_ns
         self._next_heartbeat_ns = start_ns
-        # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. Of many vehicles some are
-        # sent together.
+        # Requests are spread evenly, off the ticks, so that they do not wait behind set-points. Some of those to many
+        # vehicles are sent together.
         self._next_timesync_ns = self._next_requests_ns = start_ns + self._period_ns // 2
         self._timesync_spacing_ns = max(1, self._timesync_ns // n)
         self._requests_apart_ns = min(self._period_ns // 3, _REQUESTS_APART_NS)
