@@ -250,7 +250,8 @@ class DoubleIntegrator:
             if self._navigator is not None:
                 place, velocity = self._navigator.reported(place, velocity, time_ns, boot_ms)
             climbed_m, climb_m_s = (0.0, 0.0) if self._aircraft is None else self._aircraft.climbed()
-            return encoder.local_position(boot_ms, (*place, -self._altitude_m - climbed_m), (*velocity, -climb_m_s))
+            down_m_s = 0.0 - climb_m_s  # not -0.0, whose bytes are sent
+            return encoder.local_position(boot_ms, (*place, -self._altitude_m - climbed_m), (*velocity, down_m_s))
         if message_id == mavlink.POSITION_TARGET:
             return self._active_target(boot_ms)
         return encoder.pack(messages.report(message_id, self._condition(boot_ms)))
@@ -282,7 +283,7 @@ class DoubleIntegrator:
             boot_ms,
             degrees(state.north_m, state.east_m),
             ORIGIN_ALTITUDE_M + self._altitude_m + attitude.climbed_m,
-            (*state.velocity_ne_m_s(), -attitude.climb_m_s),
+            (*state.velocity_ne_m_s(), 0.0 - attitude.climb_m_s),
             (attitude.roll_rad, attitude.pitch_rad, math.remainder(attitude.heading_rad, math.tau)),
             flying=self.flight.flying,
             has_position=True,

@@ -5,9 +5,10 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from sim_vehicles.services import mavlink
 from sim_vehicles.vehicles.shell import Craft, Shell
 from tests.support.fleets.vehicle_kinds import VEHICLES
-from tests.support.sim_client import SECOND, START, arm, command, guided, heartbeat, pack, parse_all
+from tests.support.sim_client import SECOND, START, a_vehicle, arm, command, guided, heartbeat, pack, parse_all
 
 MONITOR = dialect.MAVLink(None, srcSystem=254, srcComponent=190)
 every_kind = pytest.mark.parametrize("make", VEHICLES.values(), ids=VEHICLES)
@@ -76,3 +77,11 @@ def test_frames_are_numbered_in_the_order_sent(make: Make) -> None:
     assert "STATUSTEXT" in kinds
     numbers = [data[4] for data, _ in sent if data[0] == 0xFD]
     assert numbers == [(numbers[0] + k) % 256 for k in range(len(numbers))]
+
+
+def test_a_level_vehicle_sends_no_byte_of_its_vertical_velocity() -> None:
+    """Trailing zeros are omitted; a velocity of -0.0 would not be, and a slow radio would carry fewer vehicles."""
+    sent = a_vehicle().step([(command(511, 32, 100_000), START + SECOND)], START + 3 * SECOND)
+    positions = [frame for frame, _ in sent if mavlink.message_id(frame) == mavlink.LOCAL_POSITION]
+    assert len(positions) > 10
+    assert max(frame[1] for frame in positions) <= dialect.MAVLink_local_position_ned_message.unpacker.size - 4
