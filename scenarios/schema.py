@@ -160,8 +160,9 @@ class Control(Part):
     the station streams is predicted. With `dynamics = "autopilot"` the file must give the `response`, which is part of
     the prediction."""
     for_link: Literal["off", "measured"] = "off"
-    """`measured`: gains of the inclusion principle, and whether to predict, are chosen for links that were measured
-    before (`--links-of`). `criteria` and `string_peak_max` are met at the delays of these links."""
+    """`measured`: gains of the inclusion principle, and whether to predict, are chosen for links that `gcs fly`
+    measures before the flight, or that were measured in a log (`--links-of`). `criteria` and `string_peak_max` are met
+    at the delays of these links."""
     link_headroom: Annotated[float, Field(ge=0, lt=1)] = 0.3
     """With `for_link`: the headroom to keep at the worst delay of the measured links."""
 

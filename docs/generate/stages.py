@@ -85,7 +85,7 @@ def _sampled() -> tuple[Counter[str], float]:
                 return
             frame = frame.f_back
 
-    station, vehicles = Station(plan, start_ns=START_NS), vehicles_of(plan)
+    station, vehicles = Station(plan, start_ns=START_NS), vehicles_of(plan.scenario)
     signal.signal(signal.SIGALRM, look)
     signal.setitimer(signal.ITIMER_REAL, _EVERY_S, _EVERY_S)
     begun_s = time.process_time()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from gcs.cli import FAILED, INTERRUPTED, options
-from gcs.cli.front import LinksOf, chosen_for, with_link
+from gcs.cli.front import LinksOf, chosen_for, chosen_now, with_link
 from gcs.errors import InputError
 from gcs.output import outlive_readers
 
@@ -90,7 +90,7 @@ def fly(
     if connect is None:
         options.refuse(scenario_file, preflight.bad_start(scenario), preflight.endless_link(scenario))
     with contextlib.ExitStack() as opened:
-        link = to = there = None
+        link = to = None
         at = ("--listen", LISTEN if listen is None else listen) if connect is None else ("--connect", connect)
         if not virtual:
             link = opened.enter_context(options.listening(*at, options.opened_guard(key, role="station")))
@@ -100,14 +100,17 @@ def fly(
                 if mirror is None
                 else opened.enter_context(options.mirroring(mirror, link, commands=mirror_commands))
             )
-        scenario, measured = chosen_for(scenario, links_of)
+        unmeasured = links_of is None and scenario.control.for_link == "measured"
+        there = Presence(link, scenario) if unmeasured and link is not None and connect is None else None
+        scenario, measured = (
+            chosen_now(scenario, link, there, key, shown=not as_json) if unmeasured else chosen_for(scenario, links_of)
+        )
         design, plan = flight_plan(scenario)
         if (unstable := preflight.unstable_loop(plan)) is not None:
             options.refuse_or_warn(scenario_file, unstable, allow=allow_unstable)
             plan = preflight.without_actions(plan)
         design = with_trade_off(with_link(design, measured))
-        if link is not None and connect is None:
-            there = Presence(link, plan.scenario)
+        there = there or (None if link is None or connect is not None else Presence(link, plan.scenario))
         taken_over = there is not None and bool(there.taken_over())
         if not as_json:
             print_design(design)
@@ -135,9 +138,7 @@ def fly(
         summary = leave_report(folder, summary)
     options.answer(summary, partial(print_summary, folder=folder), as_json=as_json)
     passed = gate.passed(summary)
-    if summary.reason.startswith("interrupted"):
-        raise typer.Exit(INTERRUPTED)
-    raise typer.Exit(0 if passed else FAILED)
+    raise typer.Exit(INTERRUPTED if summary.reason.startswith("interrupted") else 0 if passed else FAILED)
 
 
 class Gate(NamedTuple):

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from gains.design.front import Method
+    from gcs.drive.takeover import Presence
+    from gcs.drive.udp import StationSocket
     from gcs.plan.design import Design, LinkPart
     from gcs.studies.front import FrontFields, PointFields
     from gcs.studies.prediction import Compared, Comparison
@@ -61,6 +63,20 @@ def chosen_for(scenario: "Scenario", links_of: Path | None) -> "tuple[Scenario, 
         control = type(control)(for_link="measured", **kept)
     asked = checked(scenario.model_copy(update={"control": control}), Path(OPTION))
     return for_measured_links(asked, links_of)
+
+
+def chosen_now(
+    scenario: "Scenario", link: "StationSocket | None", there: "Presence | None", key_file: Path | None, *, shown: bool
+) -> "tuple[Scenario, LinkPart]":
+    """The scenario with gains for its links, which are measured now, and why these; without a socket in virtual time.
+
+    `there` finds simulated vehicles that are present already, or else they are started; None if others are to be flown.
+    """
+    from gcs.watch.before_flight import measured_now
+    from gcs.watch.for_link import best_for
+
+    starts = there is not None and not there.taken_over()
+    return best_for(scenario, measured_now(scenario, link, start_vehicles=starts, key_file=key_file, shown=shown))
 
 
 def with_link(design: "Design", part: "LinkPart | None") -> "Design":

@@ -62,7 +62,7 @@ def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: boo
         write_experiment(folder, plan.scenario, margins_of(plan))
         writer = RunWriter(folder)
     rows: list[TickArray] = []
-    vehicles = vehicles_of(plan, record=records.append if with_truth else None)
+    vehicles = vehicles_of(plan.scenario, record=records.append if with_truth else None)
     for tick in fly_lockstep(plan, station=station, vehicles=vehicles):
         rows.append(tick)
         if writer is not None:

@@ -16,6 +16,7 @@ from gcs.drive.guard import Guard
 from gcs.link.datagram import Datagram
 from gcs.plan.flight_plan import FlightPlan
 from gcs.station.station import Station
+from scenarios.schema import Scenario
 from scenarios.signing.keys import Key
 from scenarios.signing.stamps import Stamps
 from sim_vehicles.drive.fleet import Fleet
@@ -55,9 +56,9 @@ class LinkLosses:
         return self._lost[direction] / max(self._entered[direction], 1)
 
 
-def vehicles_of(plan: FlightPlan, *, record: Record | None = None) -> Vehicles:
-    """The simulated vehicles of a plan and their links, at the start; `record` is called with each truth record."""
-    return Fleet(plan.scenario, START_NS, record=record)
+def vehicles_of(scenario: Scenario, *, record: Record | None = None) -> Vehicles:
+    """The simulated vehicles of a scenario and their links, at the start; `record` is called with each truth record."""
+    return Fleet(scenario, START_NS, record=record)
 
 
 class RecordedVehicles:
@@ -65,7 +66,7 @@ class RecordedVehicles:
 
     def __init__(self, plan: FlightPlan, truth_file: Path) -> None:
         self._truth = TruthLog(truth_file)
-        self._vehicles = vehicles_of(plan, record=self._record)
+        self._vehicles = vehicles_of(plan.scenario, record=self._record)
         self._sent: list[tuple[bytes, int]] = []
 
     def step(self, received: Sent, now_ns: int) -> Sent:
@@ -102,7 +103,7 @@ def fly_lockstep(
     sign and verify at the station's end. The address of a vehicle is (a fixed name, its system id).
     """
     station = station or Station(plan, start_ns=START_NS)
-    vehicles = vehicles or vehicles_of(plan)
+    vehicles = vehicles or vehicles_of(plan.scenario)
     addresses = {system_id: (_HOST, system_id) for system_id in plan.formation.system_ids}
     to_vehicles: Sent = []
     while station.phase is not Phase.ENDED:

@@ -12,6 +12,8 @@ from gcs.link.upload import Upload
 _READY = Step("")
 OPTIONAL = mavlink.POSITION_TARGET_LOCAL_NED
 """The message without which a vehicle can be flown: prediction then assumes that every set-point acts."""
+WITHOUT_TARGET = "does not report its active target"
+"""The event of a vehicle that refuses this message."""
 
 
 def message_rates(rates_hz: dict[int, float]) -> dict[float, float]:

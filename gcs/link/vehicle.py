@@ -20,7 +20,7 @@ from gcs.link.kinds import (
     mode_command,
 )
 from gcs.link.sequence import DUPLICATE, LATE, NEW, SequenceCounter
-from gcs.link.startup import ExternalStartup, Startup
+from gcs.link.startup import OPTIONAL, WITHOUT_TARGET, ExternalStartup, Startup
 from scenarios.schema import NS_PER_S
 
 ARMED = 0x80
@@ -241,7 +241,9 @@ class RemoteVehicle:
         self._command = None
         if result != _ACCEPTED:
             name = RESULTS[result] if result < len(RESULTS) else str(result)
-            if command != ARM_DISARM or not self.startup.arming_refusals:  # repeated ones are counted
+            if command == SET_MESSAGE_INTERVAL and waiting.parameters[0] == OPTIONAL:
+                self._report("vehicle", WITHOUT_TARGET, self.system_id)
+            elif command != ARM_DISARM or not self.startup.arming_refusals:  # repeated ones are counted
                 self._report("vehicle", f"answered {name} to command {command}", self.system_id)
             self.startup.refused(command, waiting.parameters, now_ns, repeated=waiting.confirmation > 0)
             self._not_before_ns = now_ns + NS_PER_S

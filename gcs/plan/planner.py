@@ -47,7 +47,9 @@ _EQUATIONS = {
     "lag with dead time": "lag a' = w(t - dead time) - a, w = u + g (v_s - v), v_s' = u",
     "second order": "a'' / natural frequency^2 + lag a' = u + g (v_s - v) - a, v_s' = u",
 }
-MEASURED_WANTED = "read measured, wanted links to measure: --links-of RUN|FILE.tlog of gcs fly, check or design"
+MEASURED_WANTED = (
+    "read measured, wanted measured links: gcs fly measures them, gcs check and design take --links-of RUN|FILE.tlog"
+)
 NOT_YET_KNOWN = "not yet known"
 _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""

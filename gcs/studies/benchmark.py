@@ -215,7 +215,7 @@ def not_plain(scenario: Scenario) -> str | None:
 
 
 def _flight(plan: FlightPlan, key: Key | None = None) -> _Flown:
-    ends, guard = (vehicles_of(plan), None) if key is None else signed_ends(plan, key)
+    ends, guard = (vehicles_of(plan.scenario), None) if key is None else signed_ends(plan, key)
     vehicles = _Timed(ends)
     begun_s, used_s = time.perf_counter(), time.process_time()
     ticks = sum(1 for _ in fly_lockstep(plan, vehicles=vehicles, guard=guard))

@@ -19,6 +19,7 @@ from rich.text import Text
 
 from gcs.control.phases import patience_s
 from gcs.control.tick import TICK, Event, Mode, TickArray
+from gcs.link.startup import WITHOUT_TARGET
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.plan.mismatch import assumption
@@ -62,6 +63,8 @@ class FlightState:
         self.phase = UNKNOWN
         self.refused = ""
         """What the station refused, in words."""
+        self.without_target = set[int]()
+        """Vehicles that do not report which set-point acts."""
         self.time_s = np.nan
         self.before_s = patience_s(scenario)
         """Scenario time plus this is the time since the station started; shown until the flight begins at 0."""
@@ -106,6 +109,8 @@ class FlightState:
         for event in events:
             if event.kind == "phase":
                 self.phase = event.text
+            if event.text == WITHOUT_TARGET:
+                self.without_target.update(event.about)
             if event.kind == REFUSED:
                 self.refused = event.text
             else:
@@ -246,7 +251,10 @@ def _footer(state: FlightState, figures: Figures) -> list[Text]:
         line.append(f"   {state.skipped} ticks skipped", style="yellow")
     refused = [Text(f"refused: {state.refused}", style="yellow", no_wrap=True)] if state.refused else []
     flown = [Text(at_delay, no_wrap=True)] if (at_delay := state.at_delay(figures)) else []
-    assumed = [Text(f"assumed: {text}", style="dim", no_wrap=True)] if (text := assumption(state.scenario)) else []
+    text = assumption(state.scenario)
+    if text and state.without_target:
+        text = f"{text}: {_vehicles_text(sorted(state.without_target))}"
+    assumed = [Text(f"assumed: {text}", style="dim", no_wrap=True)] if text else []
     return [line, *flown, *refused, *assumed, *(Text(line, style="dim", no_wrap=True) for line in state.news)]
 
 
@@ -280,12 +288,15 @@ def at_once(events: Iterable[Event]) -> list[tuple[Event, list[int]]]:
 
 def event_text(event: Event, system_ids: list[int], before_s: float) -> str:
     """One line of text for an event that concerns these vehicles; `before_s` as in `time_text`."""
-    named = " ".join(str(system_id) for system_id in system_ids[:NAMED_MAX])
-    if len(system_ids) > NAMED_MAX:
-        named += f" and {len(system_ids) - NAMED_MAX} more"
-    who = f"vehicle{'s' * (len(system_ids) > 1)} {named}: " if system_ids else ""
+    who = f"{_vehicles_text(system_ids)}: " if system_ids else ""
     kind = "" if event.kind == "vehicle" else f"{event.kind}  "  # or the word would appear twice
     return f"{time_text(event.time_s, before_s)}  {kind}{who}{event.text}"
+
+
+def _vehicles_text(system_ids: list[int]) -> str:
+    named = " ".join(str(system_id) for system_id in system_ids[:NAMED_MAX])
+    more = f" and {len(system_ids) - NAMED_MAX} more" if len(system_ids) > NAMED_MAX else ""
+    return f"vehicle{'s' * (len(system_ids) > 1)} {named}{more}"
 
 
 class Display:

@@ -1,6 +1,6 @@
-"""Gains for measured links: the loop delay and its spread from a log, and the best gains for these.
+"""Gains for measured links: the loop delay and its spread, and the best gains for these.
 
-The one-way delays and losses of each vehicle in the log are drawn again at the rates of the scenario. Two designs are
+The one-way delays and losses measured of each vehicle are drawn again at the rates of the scenario. Two designs are
 compared at the least and at the worst of these delays: gains without prediction, and gains with prediction over the
 median delay. Either keeps the wanted headroom at the worst delay.
 """
@@ -27,7 +27,7 @@ from gcs.plan.expected_delay import drawn_loop_delays_s
 from gcs.plan.flight_plan import loop_timing
 from gcs.plan.given import with_given
 from gcs.watch.rebuild_report import found
-from gcs.watch.saved_links import recorded
+from gcs.watch.saved_links import LinkRecorder, recorded
 from gcs.watch.tlog import read_tlog
 from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import Control, FixedGains, Scenario
@@ -35,7 +35,7 @@ from scenarios.schema import Control, FixedGains, Scenario
 OPTION = "--links-of"
 LEAST_SHARE = 0.2
 """Prediction must tolerate a mismatch of at least this share of the delay to either side, and of a control period:
-delays will differ from those in the log."""
+delays will differ from those measured."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,23 @@ class MeasuredDelays:
 def measured_delays(run_or_file: Path, scenario: Scenario) -> MeasuredDelays:
     """The loop delays that a scenario would have over the links in a run's folder or a telemetry log.
 
-    From the 1st to the 99th percentile, the widest of any vehicle. Raises InputError if the log shows too little.
+    Raises InputError if the log shows too little.
     """
     log_file = found(run_or_file).log_file
     recorder = recorded(read_tlog(log_file).frames)
     if not recorder.measured:  # one line says what is missing
         recorder.profile(str(log_file), option=f"{OPTION}: {log_file}")
+    return delays_of(recorder, str(run_or_file), scenario)
+
+
+def delays_of(recorder: LinkRecorder, source: str, scenario: Scenario) -> MeasuredDelays:
+    """The loop delays that a scenario would have over links that were measured; `source` says when.
+
+    From the 1st to the 99th percentile, the widest of any vehicle.
+    """
     spreads: list[tuple[float, float, float]] = []
     for system_id in recorder.measured:
-        profile = recorder.profile(str(log_file), only=system_id)
+        profile = recorder.profile(source, only=system_id)
         drawn_s = drawn_loop_delays_s(scenario, profile.up, profile.down)
         low_s, middle_s, high_s = np.percentile(drawn_s[np.isfinite(drawn_s)], [1.0, 50.0, 99.0]).tolist()
         spreads.append((low_s, middle_s, high_s))
@@ -70,7 +78,7 @@ def measured_delays(run_or_file: Path, scenario: Scenario) -> MeasuredDelays:
         max(high - middle for _, middle, high in spreads),
     )
     return MeasuredDelays(
-        source=str(run_or_file),
+        source=source,
         vehicles=tuple(recorder.measured),
         least_s=max(0.0, median_s - shorter_s),
         median_s=median_s,
@@ -95,7 +103,7 @@ def best_for(scenario: Scenario, delays: MeasuredDelays) -> tuple[Scenario, Link
     if not fit:
         reasons = "; ".join(f"{_name(own)}: {own.refused}" for own in candidates)
         worst = f"a loop delay of {1e3 * delays.worst_s:.1f} ms"
-        raise InputError(f"{OPTION}: read {worst} from {delays.source}, wanted one that gains take: {reasons}")
+        raise InputError(f"control.for_link: read {worst} from {delays.source}, wanted one that gains take: {reasons}")
     best = max(fit, key=lambda own: getattr(own, figure))
     others = [own for own in candidates if own is not best]
     against = [own.refused or f"{getattr(own, figure):.4g} {_name(own)}" for own in others]

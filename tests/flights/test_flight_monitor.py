@@ -122,7 +122,7 @@ class Overheard:
 
 def test_mode_and_gain_changes_are_events_and_statustexts() -> None:
     plan = replace(planned(), scenario=TRIANGLE.model_copy(update={"duration_s": 45.0, "links": ramp(0.44)}))
-    station, vehicles = Station(plan, start_ns=START_NS), Overheard(vehicles_of(plan))
+    station, vehicles = Station(plan, start_ns=START_NS), Overheard(vehicles_of(plan.scenario))
     for _ in fly_lockstep(plan, station=station, vehicles=vehicles):
         pass
     changes = [

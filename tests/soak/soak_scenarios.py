@@ -217,7 +217,7 @@ def _control(rng: Rng, vehicles: list[Part], rates: Part, *, onboard: bool, auto
         string_peak_max=one_of(rng, 1.0, 1.0, between(rng, 1.0, 2.0)),
         feed_forward=None,  # these two: see _predict
         prediction=None,
-        for_link=None,  # a link is measured before the flight: not in virtual time
+        for_link=None,  # gains are searched for seconds
         link_headroom=None,
         controller=None,
         linear=None,

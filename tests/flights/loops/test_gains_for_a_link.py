@@ -17,9 +17,11 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.studies.front import point_at
 from gcs.studies.prediction import compared
+from gcs.watch.before_flight import measured_now
 from gcs.watch.for_link import MeasuredDelays, best_for, evaluated
 from scenarios.errors import ScenarioError
 from scenarios.files import checked, load
+from scenarios.keys.link import Jitter, Link, Links, VehicleLinks
 from scenarios.schema import Control, Scenario
 from tests.support.fleets.logged_flight import flown, log_bytes
 from tests.support.known import known
@@ -100,18 +102,42 @@ def test_a_log_without_exchanges_is_refused(tmp_path: Path) -> None:
         chosen_for(CHAIN, file)
 
 
-def test_a_scenario_for_measured_links_wants_a_log() -> None:
+def test_a_scenario_for_measured_links_is_not_designed_without_them() -> None:
     scenario = CHAIN.model_copy(update={"control": Control(for_link="measured")})
-    with pytest.raises(InputError, match=r"control.for_link: read measured, wanted links to measure: --links-of"):
+    with pytest.raises(
+        InputError, match=r"control.for_link: read measured, wanted measured links: gcs fly measures them"
+    ):
         flight_plan(scenario)
     control = Control(for_link="measured", delay_margin_s=0.3)
     with pytest.raises(ScenarioError, match=r"control.for_link"):
         checked(CHAIN.model_copy(update={"control": control}), Path("chain3.toml"))
 
 
+def test_links_measured_just_before_a_flight_have_the_delays_of_its_log() -> None:
+    jitter = Jitter(distribution="uniform", scale_s=0.03)
+    links = Links(up=Link(delay_s=0.2, jitter=jitter, loss_probability=0.05), down=Link(delay_s=0.1))
+    scenario = CHAIN.model_copy(update={"control": Control(for_link="measured"), "links": links})
+    before = measured_now(scenario, None, start_vehicles=False, key_file=None, shown=False)
+    assert before.vehicles == (1, 2, 3)
+    flown_s = flown(CHAIN.model_copy(update={"links": links}).with_calm_monitor())[1].loop_delay_s
+    assert before.median_s == pytest.approx(known(flown_s.p50), abs=PERIOD_S / 2.0)
+    # clocks are known within half a round trip only, but not its length: the spread is that of both ways together
+    assert before.worst_s - before.least_s == pytest.approx(2 * 0.03 + PERIOD_S, rel=0.25)
+
+
+def test_links_that_cannot_be_measured_before_a_flight_are_refused() -> None:
+    deaf = VehicleLinks(system_id=3, down=Link(delay_s=0.02, loss_probability=1.0))
+    links = CHAIN.links.model_copy(update={"vehicles": (deaf,)})
+    scenario = CHAIN.model_copy(update={"control": Control(for_link="measured"), "links": links})
+    with pytest.raises(InputError, match=r"chain3: control.for_link: read too few TIMESYNC exchanges with vehicle 3, "):
+        measured_now(scenario, None, start_vehicles=False, key_file=None, shown=False)
+
+
 def test_a_delay_that_nothing_takes_is_refused() -> None:
     """Margins are designed up to 30 s, and the station predicts over 10 s at most."""
-    with pytest.raises(InputError, match=r"--links-of: read a loop delay of 24000.0 ms from log, wanted one that"):
+    with pytest.raises(
+        InputError, match=r"control.for_link: read a loop delay of 24000.0 ms from log, wanted one that"
+    ):
         best_for(CHAIN, MeasuredDelays("log", (1,), least_s=22.0, median_s=23.0, worst_s=24.0))
 
 

@@ -139,7 +139,7 @@ class Sniffed:
     """The vehicles of a plan, and what each of them was sent."""
 
     def __init__(self, plan: FlightPlan) -> None:
-        self._vehicles = vehicles_of(plan)
+        self._vehicles = vehicles_of(plan.scenario)
         self.sent: dict[int, list[mavlink.Frame]] = {}
 
     def step(self, received: Sent, now_ns: int) -> Sent:
@@ -202,7 +202,7 @@ def test_a_flight_far_from_its_places_does_not_begin() -> None:
     vehicles = [
         v if v.follows is None else v.model_copy(update={"position_ne_m": (-364.0, 30.0)}) for v in pair().vehicles
     ]
-    elsewhere = vehicles_of(plan_of(pair(vehicles=tuple(vehicles))))
+    elsewhere = vehicles_of(pair(vehicles=tuple(vehicles)))
     station = Station(plan, start_ns=START_NS)
     ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=elsewhere)))
     assert station.end_reason == "not formed: vehicle 2 is 334 m from its place at the start, limit 30 m"

@@ -1,13 +1,17 @@
 """The station's conversation with vehicles, frame by frame, with pymavlink as the other side."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gcs.link.datagram import Outgoing
+from gcs.link.startup import WITHOUT_TARGET
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import plan_formation
 from gcs.station.station import Station
 from scenarios.files import load
+from scenarios.schema import Control
 from tests.support.paths import SCENARIOS
 from tests.support.station_peer import HOME, Peer, messages
 
@@ -51,6 +55,17 @@ def test_refused_commands_are_reported_and_tried_again_a_second_later() -> None:
     assert "answered DENIED to command 511" in [event.text for event in station.events]
     times = [k for k in range(2, 100) if commands(station.step([], S + 20 * MS * k)[0])]
     assert times[0] == 50  # the answer came at S
+
+
+def test_a_vehicle_that_does_not_report_its_active_target_is_named_and_flown() -> None:
+    predicted = SCENARIO.model_copy(update={"control": Control(prediction="measured")})
+    station, peer = Station(replace(PLAN, scenario=predicted), start_ns=S), Peer(2)
+    station.step([peer.heartbeat(S)], S)
+    station.step([peer.datagram(peer.link.command_ack_encode(511, 0), S)], S + 20 * MS)
+    outgoing, _ = station.step([peer.datagram(peer.link.command_ack_encode(511, 2), S)], S + 40 * MS)
+    assert [event.system_id for event in station.events if event.text == WITHOUT_TARGET] == [2]
+    outgoing += [frame for k in range(3, 100) for frame in station.step([], S + 20 * MS * k)[0]]
+    assert {command for command, _ in commands(outgoing)} == {176}  # the next step of its start-up
 
 
 def test_an_acknowledgement_of_another_command_is_not_taken_for_ours() -> None:

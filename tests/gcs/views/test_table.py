@@ -8,6 +8,7 @@ import pytest
 from rich.console import Console
 
 from gcs.control.tick import Event, Mode, TickArray
+from gcs.link.startup import WITHOUT_TARGET
 from gcs.views.table import FlightState, plain_line, render
 from scenarios.schema import Scenario
 from tests.support.fleets.flown_run import DESIGN, line, ticks_of
@@ -197,6 +198,15 @@ def test_refusals_have_their_own_line_and_are_no_news() -> None:
     state.add(ticks_of(line(2), start_s=1.0, count=1), [event, replace(event, text="5 unsigned, 1 replayed")])
     assert [text for text in drawn(state) if "refused" in text] == ["refused: 5 unsigned, 1 replayed"]
     assert state.news == []
+
+
+def test_vehicles_that_do_not_report_their_active_target_are_named() -> None:
+    level = line(2)
+    state = flown(level.model_copy(update={"control": level.control.model_copy(update={"prediction": "measured"})}))
+    assert next(text for text in drawn(state) if "assumed:" in text).endswith("acts as it was sent")
+    refusal = Event(time_s=-19.5, kind="vehicle", system_id=2, text=WITHOUT_TARGET)
+    state.add(ticks_of(level, start_s=1.0, count=1), [refusal])
+    assert next(text for text in drawn(state) if "assumed:" in text).endswith("acts as it was sent: vehicle 2")
 
 
 def test_altitudes_are_shown_where_vehicles_fly_at_several() -> None:

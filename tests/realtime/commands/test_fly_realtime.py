@@ -6,7 +6,9 @@ import resource
 import signal
 import struct
 import subprocess
+import sys
 import time  # noqa: TID251 - waits for processes, with time-outs
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,9 @@ from gcs.control.tick import TICK, TickArray
 from gcs.drive.sitl import ORPHAN_S
 from gcs.runs.files import read_ticks
 from gcs.runs.record import TRUTH_FILE
+from scenarios.files import dump, load
+from scenarios.keys.link import Jitter, Link, Links
+from scenarios.schema import Control
 from sim_vehicles.links.truth import ACTED, SAMPLED, read_truth
 from tests.support.paths import SCENARIOS
 from tests.support.processes import GCS, PATIENCE_S, children_named, fly, flying, free_port, short, until
@@ -253,6 +258,30 @@ def test_killed_vehicles_end_the_flight_with_the_station_saying_which(tmp_path: 
     for system_id in (1, 2, 3):
         assert f"vehicle {system_id}: is lost" in out
     assert "verdict  aborted: lost: all vehicles" in out
+
+
+@pytest.mark.parametrize("connected", [False, True])
+def test_gains_are_chosen_for_links_measured_just_before_the_flight(tmp_path: Path, *, connected: bool) -> None:
+    up = Link(delay_s=0.15, jitter=Jitter(distribution="uniform", scale_s=0.02))
+    update = {"duration_s": 4.0, "links": Links(up=up, down=Link(delay_s=0.1)), "control": Control(for_link="measured")}
+    file, folder, at = tmp_path / "measured.toml", tmp_path / "run", f"127.0.0.1:{free_port()}"
+    file.write_text(dump(load(SCENARIOS / "chain3.toml").model_copy(update=update)), encoding="utf-8")
+    vehicles = [sys.executable, "-m", "sim_vehicles.drive.cli", file, "--station", at]
+    with subprocess.Popen(vehicles, stdout=subprocess.DEVNULL) if connected else nullcontext() as running:
+        process = fly(file, "--connect" if connected else "--listen", at, "--out", folder, "--json")
+        out, err = process.communicate(timeout=PATIENCE_S)
+        if running is not None:
+            running.terminate()
+    assert (process.returncode, err) == (0, "")
+    summary, design = json.loads(out), json.loads((folder / "design.json").read_text())
+    measured = design["for_link"]
+    assert (measured["source"], measured["vehicles"]) == ("the 5 s before the flight", [1, 2, 3])
+    # within a control period: where telemetry falls between two ticks is drawn, and in a flight it stays
+    assert measured["loop_delay_s_p50"] == pytest.approx(summary["loop_delay_s"]["p50"], abs=0.02)
+    assert measured["loop_delay_s_worst"] - measured["loop_delay_s_least"] > 0.04
+    own = next(own for own in measured["candidates"] if own["K1"] == pytest.approx(design["K1_1_s"][0][0]))
+    assert own["headroom"] >= measured["headroom"]
+    assert max(known["alpha"] for known in measured["candidates"]) == own["alpha"]
 
 
 @pytest.mark.parametrize(

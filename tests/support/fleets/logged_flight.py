@@ -40,7 +40,7 @@ def log_bytes(entries: list[tuple[int, bytes]]) -> bytes:
 def flown(scenario: Scenario) -> tuple[Design, Summary, TickArray, list[tuple[int, bytes]]]:
     """The design, the summary and the ticks of a flight, and the entries of its log."""
     design, plan = flight_plan(scenario)
-    station, vehicles = Station(plan, start_ns=START_NS), Logged(vehicles_of(plan))
+    station, vehicles = Station(plan, start_ns=START_NS), Logged(vehicles_of(plan.scenario))
     ticks = np.concatenate(list(fly_lockstep(plan, station=station, vehicles=vehicles)))
     events = [*station.events, Event(time_s=0.0, kind="end", text=station.end_reason)]
     return design, summarise(scenario, design, ticks, events), ticks, vehicles.entries
