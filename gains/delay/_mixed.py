@@ -171,12 +171,12 @@ def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) 
     hurwitz = hurwitz - max(0.0, float(hurwitz.real.max()) + _SHIFT * (highest + float(np.abs(hurwitz).max())))
     # M(j omega) = M(0) (I + E) with the norm of E below 1 / 4n: nothing turns there
     slowest = float(np.linalg.svd(parts.matrices.sum(axis=0), compute_uv=False)[-1])
-    still = slowest / (4.0 * parts.size * (1.0 + float(parts.known_s @ parts.norms)))
+    still = min(0.5 * highest, slowest / (4.0 * parts.size * (1.0 + float(parts.known_s @ parts.norms))))
     # nearer to zero than the least frequency, with a root there, the determinant is rounding, and it is real up to it
     omega = parts.frequencies(highest, _COUNT_TURN, _COUNT_GRID)
     omega = omega[omega > (_LEAST_FREQUENCY * highest if at_zero else still)]
     near = np.outer(np.array(beside), np.concatenate([1.0 - _BESIDE, [1.0], 1.0 + _BESIDE])).ravel()
-    omega = np.union1d(omega, near[(near > omega[0]) & (near < omega[-1])])
+    omega = np.union1d(omega, near[(near > omega.min(initial=np.inf)) & (near < omega.max(initial=0.0))])
     omega = omega if at_zero else np.append(0.0, omega)
     phase, slope = _turning(parts, hurwitz, omega)
     for _ in range(_HALVINGS):
