@@ -14,7 +14,7 @@ Newton's method are the crossings of the continuous loop. Whether an end is the 
 """
 
 from collections.abc import Sequence
-from math import floor, inf, pi
+from math import ceil, floor, inf, log, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -37,8 +37,9 @@ _TRIED, _WITHIN, _BESIDE = 4, (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 1e-4
 # share of the mismatch before an end at which others beside it are looked for, how large det(I - N) is there at most,
 # how many of them, and how far around they are believed
 _SHORTLY, _NEAR_ZERO, _BESIDE_IT, _AROUND = 1e-3, 0.03, 6, 20.0
-# a march: delays looked at in a control period and in a window, windows and control periods, and halvings at its end
-_LOOKS_PERIOD, _LOOKS_WINDOW, _SEARCHED, _SEARCHED_PERIODS, _HALVINGS = 3, 20, 3.0, 10, 12
+# a march: delays looked at in a control period and in a window, windows and control periods, how much farther each look
+# is than the one before once there have been as many as in a window, and halvings at its end
+_LOOKS_PERIOD, _LOOKS_WINDOW, _SEARCHED, _SEARCHED_PERIODS, _FARTHER, _HALVINGS = 3, 20, 3.0, 10, 1.15, 16
 
 
 def rates_window(plant: HeldPlant, timing: Timing, assumed_s: float) -> tuple[float, float]:
@@ -202,8 +203,10 @@ class _Rates:
         """The same by looking at one delay after the other."""
         step_s = max(self.tick_s / _LOOKS_PERIOD, wide_s / _LOOKS_WINDOW)
         last_s = min(longest_s, _SEARCHED * wide_s + _SEARCHED_PERIODS * self.common_s)
+        even_s = step_s * np.arange(1, _LOOKS_WINDOW + 1)
+        farther_s = even_s[-1] * _FARTHER ** np.arange(1, max(1, ceil(log(last_s / even_s[-1]) / log(_FARTHER))))
         stable_s = 0.0
-        for aside_s in [*np.arange(step_s, last_s, step_s).tolist(), last_s]:
+        for aside_s in [each for each in (*even_s.tolist(), *farther_s.tolist()) if each < last_s] + [last_s]:
             if not self.is_stable(self.assumed_s + way * aside_s):
                 unstable_s = aside_s
                 break

@@ -65,7 +65,10 @@ def random_scenario(rng: Rng, name: str) -> Part:
         at_end=one_of(rng, "hold", "land"),
     )
     drawn |= _disturbed(np.random.default_rng((drawn["seed"], 1)))
-    if not autopilot or "response" in drawn:
+    uneven = onboard and max(rates["control_hz"], rates["telemetry_hz"]) % min(
+        rates["control_hz"], rates["telemetry_hz"]
+    )
+    if not uneven and (not autopilot or "response" in drawn):  # uneven rates on board: windows take minutes
         fast = max(rates.values()) > 100.0  # the windows of a whole schedule take half a minute
         own = np.random.default_rng(drawn["seed"])
         _predict(own, control, measured=0.5 if fast else "measured", fed=not autopilot and not onboard)
