@@ -198,7 +198,7 @@ def searched(family: GainFamily, wanted: Requirement, *, evaluations: int = _EVA
             most = [_most(family, aim, [other for other in aims if other is not aim], found.point) for aim in aims]
             met = [each.point for each in most if _shortfall(family.figures(each.point), aims) == 0.0]
             if not met:
-                raise InfeasibleError(_refusal(aims, most))
+                raise InfeasibleError(_refusal(aims, most, family.figures(found.point).exact))
             found = _searched(family, objective, aims, met, evaluations)
         # the figures of the search are rough
         exact = family.figures(found.point).exact
@@ -209,8 +209,11 @@ def searched(family: GainFamily, wanted: Requirement, *, evaluations: int = _EVA
     raise SolverError(f"the search misses {wanted} by {max(missed):.2g} of it; relax what is asked for by that")
 
 
-def _refusal(parts: Sequence[Part], most: Sequence[Found]) -> str:
-    """What cannot be had together, and how far each part alone would have to be relaxed."""
+def _refusal(parts: Sequence[Part], most: Sequence[Found], nearest: Figures) -> str:
+    """What cannot be had together, and how far to relax each part alone; if none helps alone, those `nearest` misses.
+
+    All of them by the same share: points then rank as in the search that found the nearest, so that it is found again.
+    """
     named = " and ".join(f"{part.name} = {part.wanted_text}" for part in parts)
     conflict = "exclude each other" if len(parts) > 1 else "cannot be reached"
     reached = [
@@ -218,7 +221,13 @@ def _refusal(parts: Sequence[Part], most: Sequence[Found]) -> str:
         for part, found in zip(parts, most, strict=True)
         if found.rank[0] == 0.0
     ]
-    return f"{named} {conflict}: {' or '.join(text for text in reached if text) or 'relax more than one of them'}"
+    advice = " or ".join(text for text in reached if text)
+    if not advice:
+        short = [part.shortfall(nearest) for part in parts]
+        share = exp(-max(short))
+        missed = [part for part, each in zip(parts, short, strict=True) if each > 0.0 and share > 0.0]
+        advice = " and ".join(part.relaxed(part.wanted * (share if part.at_least else 1.0 / share)) for part in missed)
+    return f"{named} {conflict}: {advice or 'relax more than one of them'}"
 
 
 def _searched(

@@ -11,6 +11,7 @@ from gains.criteria.norms import noise_gain, peak_gain
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
+from gains.sampled._loop import settled_covariance
 from gains.sampled.constant import period_map
 
 PAIR = FormationModel((-1, 0), axes=1)
@@ -101,6 +102,26 @@ def test_noise_gain_is_that_of_a_simulated_loop(delay_s: float) -> None:
         energy = energy + ((K @ state[:3]) ** 2).sum(axis=1)
         state = lifted @ state
     assert found == pytest.approx(float(energy.max() ** 0.5), rel=1e-6)
+
+
+def test_published_h2_norm_of_an_optimal_loop() -> None:
+    """7.748 of example 7 of Scherer, Gahinet and Chilali (1997), whose model and value are python-control's example."""
+    from scipy.linalg import expm, solve_continuous_are
+
+    A, B = np.array([[0.0, 10.0, 2.0], [-1.0, 1.0, 0.0], [0.0, 2.0, -5.0]]), np.array([[0.0], [1.0], [0.0]])
+    entry, outputs, seen, through = np.array([[1.0], [0.0], [1.0]]), np.diag([0.0, 1.0, 1.0]), B.T, 2.0
+    F = -B.T @ solve_continuous_are(A, B, outputs, np.eye(1))
+    Y = solve_continuous_are(A.T, seen.T, entry @ entry.T, np.array([[through**2]]), s=through * entry)
+    L = (Y @ seen.T + through * entry) / through**2
+    loop, noise = np.block([[A, B @ F], [L @ seen, A + B @ F - L @ seen]]), np.vstack([entry, L * through])
+    # the map and the noise of a period of any length have the covariance of the continuous loop (Van Loan)
+    hamiltonian = np.block([[-loop, noise @ noise.T], [np.zeros((6, 6)), loop.T]])
+    exponential: FloatArray = expm(0.02 * hamiltonian).astype(np.float64)
+    step = exponential[6:, 6:].T
+    covariance = settled_covariance(step, step @ exponential[:6, 6:])
+    assert covariance is not None
+    power = np.trace(outputs @ covariance[:3, :3]) + (F @ covariance[3:, 3:] @ F.T).item()
+    assert power**0.5 == pytest.approx(7.748350599360575, rel=1e-9)
 
 
 def test_unstable_loop_has_no_gains() -> None:
