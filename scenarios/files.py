@@ -207,6 +207,8 @@ def _control_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if control.feed_forward and (control.gains is None or control.loop == "onboard"):
         wanted = "0, unless gains are given and loop is ground: no design method provides for it"
         yield "control.feed_forward", control.feed_forward, wanted
+    if control.execute_at and scenario.dynamics == "autopilot":
+        yield "control.execute_at", control.execute_at, "false, with dynamics autopilot: no autopilot holds set-points"
     if control.prediction != "off" and scenario.dynamics != "double_integrator" and scenario.response is None:
         wanted = f"off, with dynamics {scenario.dynamics} and no [response]: a response must be known to be predicted"
         yield "control.prediction", control.prediction, wanted

@@ -159,6 +159,9 @@ class Control(Part):
     changes by at most 0.1 s per second. `off`: the newest states are fed back as they are. With `loop = "onboard"` what
     the station streams is predicted. With `dynamics = "autopilot"` the file must give the `response`, which is part of
     the prediction."""
+    execute_at: bool = False
+    """True: a vehicle holds each set-point until a fixed time after its stamp, by which 99 % of the last 500 arrived.
+    Jitter then becomes constant delay. Not with `dynamics = "autopilot"`."""
     for_link: Literal["off", "measured"] = "off"
     """`measured`: gains of the inclusion principle, and whether to predict, are chosen for links that `gcs fly`
     measures before the flight, or that were measured in a log (`--links-of`). `criteria` and `string_peak_max` are met

@@ -9,6 +9,7 @@ command computed from it acts:
   to the kernel. Together they are the age of the state when the set-point is sent.
 * *down*: the delay of the set-point. It is not measured for each set-point but taken from the newest TIMESYNC request,
   so jitter makes the two differ.
+  With `control.execute_at` vehicles hold set-points: then it lasts until the set-point acts, as the vehicle reports.
 * *repetition*: when telemetry is slower than control, several commands are computed from one state. The repetition
   does not count as delay, because the margin already accounts for the telemetry period. The extra age that lost
   telemetry causes does count.

@@ -87,7 +87,7 @@ TICK = np.dtype(
         ("queue_s", "<f8"),  # from the kernel's receive stamp of the newest state to its use by a step
         ("up_delay_s", "<f8"),  # one-way delay of the newest state: from sample_ns to the kernel's receive stamp
         ("sample_bound_s", "<f8"),  # largest error of sample_ns, telemetry_age_s and up_delay_s (gcs/link/clocks.py)
-        ("down_delay_s", "<f8"),  # newest measured one-way delay station to vehicle; NaN while unknown
+        ("down_delay_s", "<f8"),  # newest one-way delay to the vehicle, with the time it holds a set-point; or NaN
         ("down_bound_s", "<f8"),  # most that it can be wrong
         ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s - repeated_s; ground loop: of the newest
         ("loop_delay_bound_s", "<f8"),  # error that clocks bring into it; NaN if others' states were used

@@ -80,6 +80,8 @@ class RemoteVehicle:
         self.newest = True
         """Whether the last frame taken in was sent after all the others."""
         self.clock = VehicleClock()
+        self._lag = 0, -1
+        """The reported lag in ms, and how often the clock had jumped before; -1 before the first report."""
         self.armed = False
         self.custom_mode = -1
         self.critical = False
@@ -177,6 +179,24 @@ class RemoteVehicle:
         if heartbeat and not replayed:
             self.heartbeat_ns = now_ns
         return replayed
+
+    def named_int(self, fields: tuple[Any, ...]) -> None:
+        """Take in a NAMED_VALUE_INT: when set-points act that the vehicle holds."""
+        _, value, name = fields
+        if name.rstrip(b"\0") == b"LAG_MS":
+            self._lag = value, self.clock.jumps
+
+    def delivery_ns(self, key_ms: int, sent_ns: int) -> int | None:
+        """How long after `sent_ns` the set-point with this stamp acts: it arrives, and the vehicle may hold it.
+
+        It acts when the vehicle's clock shows its stamp plus the reported lag. `key_ms` is 0 if the stamp is unknown.
+        None while the delay is.
+        """
+        clock, (lag_ms, jumps) = self.clock, self._lag
+        if clock.down_ns is None or not key_ms or jumps != clock.jumps or not clock.estimate.samples:
+            return clock.down_ns
+        boot_ns = clock.boot_ns(key_ms + lag_ms & 0xFFFFFFFF, sent_ns)
+        return max(clock.down_ns, clock.estimate.to_station_ns(boot_ns) - sent_ns)
 
     def heartbeat(self, fields: tuple[Any, ...], now_ns: int) -> None:
         """Take in a HEARTBEAT. One made before the vehicle carried out a command does not undo what its ACK said."""

@@ -14,11 +14,10 @@ from scenarios.schema import Control, FixedGains, GainBlock, Scenario
 def with_given(
     scenario: Scenario, *, gains: FixedGains | None = None, blocks: tuple[GainBlock, ...] = (), prediction: Prediction
 ) -> Scenario:
-    """The scenario with gains or blocks given; of its other requirements only the limit on growing errors is kept."""
+    """The scenario with gains or blocks given; of its requirements only the limit on growing errors is kept."""
     old = scenario.control
-    control = Control(
-        loop=old.loop, string_peak_max=old.string_peak_max, gains=gains, blocks=blocks, prediction=prediction
-    )
+    kept = {"loop": old.loop, "string_peak_max": old.string_peak_max, "execute_at": old.execute_at}
+    control = Control.model_validate({**kept, "gains": gains, "blocks": blocks, "prediction": prediction})
     vehicles = tuple(vehicle.model_copy(update={"hears": ()}) for vehicle in scenario.vehicles)
     return scenario.model_copy(update={"control": control, "vehicles": vehicles})
 

@@ -193,6 +193,8 @@ class Station:
                 vehicle.heartbeat(fields, datagram.received_ns)
             case mavlink.COMMAND_ACK:
                 vehicle.acknowledge(fields, datagram.received_ns)
+            case mavlink.NAMED_VALUE_INT:
+                vehicle.named_int(fields)
             case mavlink.STATUSTEXT:
                 text = fields[1].split(b"\0")[0].decode(errors="replace")
                 if vehicle.startup.is_news(text):
@@ -228,7 +230,9 @@ class Station:
         rtt_ns = vehicle.clock.reply(tc1_ns=tc1_ns, ts1_ns=ts1_ns, received_ns=received_ns)
         if rtt_ns is not None:
             self._fresh_rtt_s[row].append(rtt_ns * 1e-9)
-            self._fleet.loop.delivered(row, vehicle.clock.down_ns or 0, ts1_ns)
+            key_ms = (ts1_ns - self._start_ns) // 1_000_000
+            delivery_ns = vehicle.delivery_ns(key_ms, self._start_ns + key_ms * 1_000_000)
+            self._fleet.loop.delivered(row, delivery_ns or 0, ts1_ns)
         if vehicle.clock.jumps != jumps:
             self._history.forget(row)
             vehicle.begin_anew()

@@ -72,8 +72,9 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
         age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
         up_s = (reported.received_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan
         down_s = down_bound_s = loop_bound_s = nan
-        if clock.down_ns is not None:
-            down_s, down_bound_s = clock.down_ns * 1e-9, clock.down_bound_ns * 1e-9
+        down_ns = vehicle.delivery_ns(tick.key_ms, sent_ns)
+        if down_ns is not None:
+            down_s, down_bound_s = down_ns * 1e-9, clock.down_bound_ns * 1e-9
             loop_bound_s = clock.loop_bound_ns * 1e-9 if control.used_ns == control.sample_ns else nan
         offset_s = bound_s = nan
         if estimate.samples > 0:

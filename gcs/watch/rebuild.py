@@ -237,7 +237,10 @@ class _Rebuilding:
             self._history.forget(row)
             self._event(time_ns, "vehicle", CLOCK_JUMPED, vehicle.remote.system_id)
         if frame.msg_id == mavlink.TIMESYNC and frame.fields[0] != 0 and clock.down_ns is not None and vehicle.rtt_s:
-            self._fleet.loop.delivered(row, clock.down_ns, time_ns - round(vehicle.rtt_s[-1] * NS_PER_S))
+            asked_ns, base_ns = time_ns - round(vehicle.rtt_s[-1] * NS_PER_S), self._outline.base_ns
+            key_ms = (asked_ns - base_ns) // 1_000_000 if self._outline.keys else 0
+            delivery_ns = vehicle.remote.delivery_ns(key_ms, base_ns + key_ms * 1_000_000)
+            self._fleet.loop.delivered(row, delivery_ns or 0, asked_ns)
         if frame.msg_id != mavlink.LOCAL_POSITION_NED:
             return
         boot_ms, north, east, down, v_north, v_east, v_down = frame.fields

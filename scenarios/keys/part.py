@@ -23,6 +23,8 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 Flavour = Literal["ardupilot", "px4"]
 Fault = tuple[str, object, str]
 """What is wrong with a scenario: a key, what was read, and what was wanted."""
+HELD_SHARE = 0.99
+"""With `control.execute_at`: the share of the set-points that arrive before they are to act."""
 PREDICTION_MAX_S = 10.0
 """Longest loop delay that the station predicts over."""
 

@@ -26,6 +26,7 @@ REQUESTS = frozenset(kind.id for kind in get_args(Request))
 """Ids of the messages that are requests."""
 
 PARAMETER_VALUE = dialect.MAVLINK_MSG_ID_PARAM_VALUE
+NAMED_INT = dialect.MAVLINK_MSG_ID_NAMED_VALUE_INT
 REAL32, INT32 = dialect.MAV_PARAM_TYPE_REAL32, dialect.MAV_PARAM_TYPE_INT32
 EKF_STATUS = dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
 SYS_STATUS, EXTENDED_SYS_STATE = dialect.MAVLINK_MSG_ID_SYS_STATUS, dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE
@@ -156,6 +157,11 @@ def position_target(
     return dialect.MAVLink_position_target_local_ned_message(
         boot_ms, dialect.MAV_FRAME_LOCAL_NED, mask, *nowhere, *velocity_ned_m_s, *acceleration, *yaw
     )
+
+
+def named_int(boot_ms: int, name: str, value: int) -> Message:
+    """NAMED_VALUE_INT; a value beyond 32 bits wraps, as times in ms do."""
+    return dialect.MAVLink_named_value_int_message(boot_ms, name.encode("ascii"), (value + 2**31) % 2**32 - 2**31)
 
 
 class Condition(NamedTuple):

@@ -31,6 +31,7 @@ from sim_vehicles.services.earth import GRAVITY_M_S2, ORIGIN_ALTITUDE_M, degrees
 from sim_vehicles.services.parameters import ARDUPILOT_SETUP, Parameters, fixed, timeout
 from sim_vehicles.services.services import whole
 from sim_vehicles.vehicles.flight_mode import MODE_NAMES, FlightMode
+from sim_vehicles.vehicles.hold import Hold
 from sim_vehicles.vehicles.onboard import STEP, VehicleLoop, formation_parameters
 from sim_vehicles.vehicles.setpoints import (
     ACCELERATION,
@@ -50,6 +51,10 @@ CANNOT_LAND: Answer = mavlink.DENIED, "cannot land or return, LOITER holds the c
 """Also sent as STATUSTEXT: a person who asks for this may not see the result code."""
 
 _ACCELERATION_ONLY = POSITION_AXES | VELOCITY_AXES | YAW_IGNORED | YAW_RATE_IGNORED
+
+
+LAG_INTERVAL_US = 200_000
+"""Time between two reports of when set-points that are held act."""
 
 
 class DoubleIntegrator:
@@ -89,13 +94,18 @@ class DoubleIntegrator:
         self._aircraft = Aircraft(scenario, own) if aircraft_of(scenario.dynamics) else None
         self._own = OwnMotion(scenario, self._note_fault) if names_code(scenario.dynamics) else self._aircraft
         """Dynamics in place of the double integrator's; `_air` is then set, too."""
+        self._hold = Hold() if scenario.control.execute_at and own.system_id != scenario.external_id else None
+        if self._hold is not None:
+            self.intervals_us = {**self.intervals_us, messages.NAMED_INT: LAG_INTERVAL_US}
         self._navigator = None if scenario.navigation is None else Navigator(scenario, own.system_id, radio.record)
         if onboard is not None:
             radio.schedule.set_interval(STEP, onboard.interval_us, radio.start_ns)
 
     @property
     def deadline_ns(self) -> int:
-        """When the failsafe begins unless a station is heard before."""
+        """When the first set-point held acts, or the failsafe begins unless a station is heard before."""
+        if self._hold is not None and self._hold.next_ns <= self.flight.deadline_ns:
+            return self._hold.next_ns  # a set-point on the deadline is in time
         return self.flight.deadline_ns
 
     def state_at(self, time_ns: int) -> State:
@@ -114,6 +124,15 @@ class DoubleIntegrator:
         self.flight.hear_heartbeat(max(time_ns, self._state_ns))
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
+        """Fly a set-point from now on, or from when it is to act; if it is valid and allowed."""
+        if self._hold is None:
+            return self._fly(setpoint, time_ns)
+        if self._hold.take(setpoint, time_ns, self._radio.clock):
+            return "setpoints_held"
+        self._radio.counters["setpoints_late"] += 1
+        return self._fly(setpoint, time_ns)
+
+    def _fly(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
         """Fly a set-point from now on, if it is valid and allowed; the first one begins the flight."""
         on_launcher = not self.flight.flying
         counts = setpoint.type_mask & AXES
@@ -200,6 +219,9 @@ class DoubleIntegrator:
     # What happens by itself
 
     def happen(self, time_ns: int) -> None:
+        if self._hold is not None and self._hold.next_ns <= time_ns:
+            self._radio.counters[self._fly(self._hold.pop(), max(time_ns, self._state_ns))] += 1
+            return
         self._advance(time_ns)
         self.flight.fail()
         self._command = self._alone()
@@ -252,9 +274,16 @@ class DoubleIntegrator:
             climbed_m, climb_m_s = (0.0, 0.0) if self._aircraft is None else self._aircraft.climbed()
             down_m_s = 0.0 - climb_m_s  # not -0.0, whose bytes are sent
             return encoder.local_position(boot_ms, (*place, -self._altitude_m - climbed_m), (*velocity, down_m_s))
-        if message_id == mavlink.POSITION_TARGET:
-            return self._active_target(boot_ms)
+        if message_id in (mavlink.POSITION_TARGET, messages.NAMED_INT):
+            return self._active_target(boot_ms) if message_id == mavlink.POSITION_TARGET else self._lag(boot_ms)
         return encoder.pack(messages.report(message_id, self._condition(boot_ms)))
+
+    def _lag(self, boot_ms: int) -> bytes | None:
+        """When held set-points act, once there are any."""
+        lag_ms = None if self._hold is None else self._hold.lag_ms
+        if lag_ms is None:
+            return None
+        return self._radio.encoder.pack(messages.named_int(boot_ms, "LAG_MS", lag_ms))
 
     def _active_target(self, boot_ms: int) -> bytes | None:
         """The acceleration that it follows within its limits, while it takes set-points."""

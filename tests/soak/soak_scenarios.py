@@ -71,6 +71,8 @@ def random_scenario(rng: Rng, name: str) -> Part:
     if not uneven and (not autopilot or "response" in drawn):  # uneven rates on board: windows take minutes
         fast = max(rates.values()) > 100.0  # the windows of a whole schedule take half a minute
         own = np.random.default_rng(drawn["seed"])
+        if not autopilot:
+            control["execute_at"] = chance(np.random.default_rng((drawn["seed"], 2)), 0.15)
         _predict(own, control, measured=0.5 if fast else "measured", fed=not autopilot and not onboard)
         rates["target_hz"] = one_of(own, 10.0, 10.0, 0.0, rates["control_hz"])
     return drawn
@@ -218,7 +220,8 @@ def _control(rng: Rng, vehicles: list[Part], rates: Part, *, onboard: bool, auto
         alpha=some(rng, 0.2, spread(rng, 0.01, 0.9)) if required else None,
         decay_rate_1_s=some(rng, 0.2, spread(rng, 0.01, 2.0)) if required else None,
         string_peak_max=one_of(rng, 1.0, 1.0, between(rng, 1.0, 2.0)),
-        feed_forward=None,  # these two: see _predict
+        execute_at=None,  # drawn later, as are the next two
+        feed_forward=None,
         prediction=None,
         for_link=None,  # gains are searched for seconds
         link_headroom=None,

@@ -1,0 +1,67 @@
+"""Holds set-points until a fixed time after their stamps, so that jitter becomes constant delay: a playout buffer.
+
+The stamp, time_boot_ms, is of the station's clock, so only differences of (arrival - stamp) matter. The 99th percentile
+of the last ones is the *lag*: a set-point acts when the vehicle's clock shows its stamp plus the lag. One that arrives
+later acts at once.
+"""
+
+import heapq
+from bisect import bisect_left, insort
+from collections import deque
+from math import ceil
+
+from scenarios.keys.part import HELD_SHARE
+from sim_vehicles.services.clock import NEVER_NS, NS_PER_MS, BootClock
+from sim_vehicles.services.mavlink import Setpoint
+
+_ARRIVALS = 500
+"""Set-points of which the lag is a percentile: 10 s at 50 Hz."""
+_LONGEST_MS = 5000
+"""A lag longer than this after an arrival is of other stamps: of another station, or before the clock was set."""
+
+
+class Hold:
+    """The set-points that have arrived and do not act yet. `next_ns` is when the first of them does."""
+
+    def __init__(self) -> None:
+        self.next_ns = NEVER_NS
+        self.lag_ms: int | None = None
+        """A set-point acts when the vehicle's clock shows its stamp plus this. None before the first."""
+        self._arrivals: deque[int] = deque()
+        self._ordered: list[int] = []
+        self._queue: list[tuple[int, int, Setpoint]] = []
+        """(instant, number, set-point), earliest first."""
+        self._taken = self._newest_ms = self._newest_ns = 0
+
+    def take(self, setpoint: Setpoint, time_ns: int, clock: BootClock) -> bool:
+        """Hold a set-point that arrives now; False if it is so late that it must act at once."""
+        key_ms = setpoint.time_boot_ms
+        arrival_ms = -(-clock.boot_ns(time_ns) // NS_PER_MS) - key_ms
+        self.lag_ms = self._lag_ms(arrival_ms)
+        due_ns = clock.host_ns((key_ms + self.lag_ms) * NS_PER_MS)
+        if key_ms >= self._newest_ms:  # a lag that shrinks lets no set-point overtake those before it
+            due_ns = max(due_ns, self._newest_ns)
+        if due_ns < time_ns:
+            return False
+        self._newest_ms, self._newest_ns = max((key_ms, due_ns), (self._newest_ms, self._newest_ns))
+        heapq.heappush(self._queue, (due_ns, self._taken, setpoint))
+        self._taken += 1
+        self.next_ns = self._queue[0][0]
+        return True
+
+    def pop(self) -> Setpoint:
+        """Remove the first set-point."""
+        _, _, setpoint = heapq.heappop(self._queue)
+        self.next_ns = self._queue[0][0] if self._queue else NEVER_NS
+        return setpoint
+
+    def _lag_ms(self, arrival_ms: int) -> int:
+        if self.lag_ms is not None and self.lag_ms - arrival_ms > _LONGEST_MS:
+            self._arrivals.clear()
+            self._ordered.clear()
+            self._newest_ms = self._newest_ns = 0
+        elif len(self._arrivals) == _ARRIVALS:
+            del self._ordered[bisect_left(self._ordered, self._arrivals.popleft())]
+        self._arrivals.append(arrival_ms)
+        insort(self._ordered, arrival_ms)
+        return self._ordered[ceil(HELD_SHARE * len(self._ordered)) - 1]
