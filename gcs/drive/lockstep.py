@@ -5,6 +5,7 @@ station is called when something of its own is due. Datagrams that arrive earlie
 a socket; the station decides nothing in between.
 """
 
+import gc
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -104,6 +105,14 @@ def fly_lockstep(
     """
     station = station or Station(plan, start_ns=START_NS)
     vehicles = vehicles or vehicles_of(plan.scenario)
+    gc.freeze()  # garbage collection need not look again and again at what exists already
+    try:
+        yield from _ticks(plan, station, vehicles, guard)
+    finally:
+        gc.unfreeze()
+
+
+def _ticks(plan: FlightPlan, station: Station, vehicles: Vehicles, guard: Guard | None) -> Iterator[TickArray]:
     addresses = {system_id: (_HOST, system_id) for system_id in plan.formation.system_ids}
     to_vehicles: Sent = []
     while station.phase is not Phase.ENDED:
