@@ -151,8 +151,7 @@ class Control(Part):
     """Fly this gain matrix, given block by block, instead of designing one. Omitted blocks are zero."""
     feed_forward: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the command of the vehicle in front that is added to each follower's command, computed in the same tick.
-    Only with `gains`, and with `loop = "ground"`. With 1 and K2 = -K1 a follower does what the vehicle in front
-    does."""
+    Only with `gains`, and with `loop = "ground"`. With 1 and K2 = -K1 a follower moves as the vehicle in front."""
     prediction: Prediction = "off"
     """The loop delay over which the station predicts each vehicle from its newest state and the set-points that act
     after it. A number: that many seconds. `measured`: the delay measured for each vehicle, smoothed; the assumed delay
@@ -164,8 +163,8 @@ class Control(Part):
     Jitter then becomes constant delay. Not with `dynamics = "autopilot"`."""
     for_link: Literal["off", "measured"] = "off"
     """`measured`: gains of the inclusion principle, and whether to predict, are chosen for links that `gcs fly`
-    measures before the flight, or that were measured in a log (`--links-of`). `criteria` and `string_peak_max` are met
-    at the delays of these links."""
+    measures before the flight, or that a log shows (`--links-of`). `criteria` and `string_peak_max` hold at their
+    delays."""
     link_headroom: Annotated[float, Field(ge=0, lt=1)] = 0.3
     """With `for_link`: the headroom to keep at the worst delay of the measured links."""
 
