@@ -99,7 +99,8 @@ class Recording:
         self._trail_ends_m: dict[str, Floats] = {}
         self._stream = rr.RecordingStream("formation-gcs")
         sinks = [rr.FileSink(folder / UNFINISHED_FILE), *([] if viewer is None else [rr.GrpcSink(viewer)])]
-        self._stream.set_sinks(*sinks, default_blueprint=_blueprint(scenario, design))
+        self._is_live = viewer is not None
+        self._stream.set_sinks(*sinks, default_blueprint=_blueprint(scenario, design, following=self._is_live))
         self._stream.send_recording_name(scenario.name)
         self._log_scene_styles()
         self._log_plot_styles()
@@ -115,7 +116,7 @@ class Recording:
 
     def redesigned(self, design: Design) -> None:
         """Name the margins of another design."""
-        self._stream.send_blueprint(_blueprint(self._scenario, design))
+        self._stream.send_blueprint(_blueprint(self._scenario, design, following=self._is_live))
 
     def send(self) -> None:
         """Write what was added."""
@@ -315,8 +316,11 @@ def _margins_text(design: Design) -> str:
     return "; of the fastest gains " + ", ".join(known) if known else ""
 
 
-def _blueprint(scenario: Scenario, design: Design) -> Any:
-    """The screen: the scene on the left, with modes and events; plots on the right; time below."""
+def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
+    """The screen: the scene on the left, with modes and events; plots on the right; time below.
+
+    The scene shows the newest time while `following`, else the time of the cursor.
+    """
 
     # all plots show the whole flight on the same axis, wherever the cursor is; at the right a little room for a label
     start, end = (rrb.TimeRangeBoundary.absolute(seconds=at_s) for at_s in (0.0, 1.03 * scenario.duration_s))
@@ -354,7 +358,7 @@ def _blueprint(scenario: Scenario, design: Design) -> Any:
             ),
             column_shares=[1, 1],
         ),
-        rrb.TimePanel(timeline=TIMELINE, expanded=False, play_state="paused"),
+        rrb.TimePanel(timeline=TIMELINE, expanded=False, play_state="following" if following else "paused"),
         rrb.SelectionPanel(expanded=False),
         rrb.BlueprintPanel(expanded=False),
     )
