@@ -25,6 +25,7 @@ from gains.delay._windows import (
     block_analysis,
     check_horizon,
     combined_analysis,
+    without_zero,
     zero_passage,
 )
 
@@ -71,7 +72,8 @@ def analyse_mixed_block(block: Block, terms: Sequence[DelayedTerm], leave_out_ze
     if passage is None and is_singular_for_any_delay(parts.matrices):
         return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
     unstable = _unstable_roots(parts, passage is not None)
-    return block_analysis(block.copies, delayed, _crossings(parts), unstable, passage, parts.highest())
+    found = without_zero(_crossings(parts), passage, parts.highest())
+    return block_analysis(block.copies, delayed, found, unstable, passage)
 
 
 def count_unstable_roots(
