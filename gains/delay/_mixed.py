@@ -29,6 +29,8 @@ from gains.delay._windows import (
     zero_passage,
 )
 
+# a loop without delay whose skew part is below this share of its norm is symmetric
+_SYMMETRIC = 1e-12
 # rad by which e^{-j omega d} turns between neighbouring frequencies, and frequencies a decade: of a sweep, of a count
 _TURN, _COUNT_TURN = 0.1, 0.5
 _POINTS_PER_DECADE, _COUNT_GRID, _DECADES = 60, 20, 9
@@ -170,6 +172,8 @@ def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) 
     """
     highest = parts.highest()
     hurwitz = np.linalg.eigvals(parts.matrices.sum(axis=0))
+    if at_zero and highest <= _SYMMETRIC * float(parts.norms.sum()):  # no delay: all roots are real, one of them zero
+        return int(np.count_nonzero(np.delete(hurwitz, np.argmin(np.abs(hurwitz))).real > 0.0))
     hurwitz = hurwitz - max(0.0, float(hurwitz.real.max()) + _SHIFT * (highest + float(np.abs(hurwitz).max())))
     # M(j omega) = M(0) (I + E) with the norm of E below 1 / 4n: nothing turns there
     slowest = float(np.linalg.svd(parts.matrices.sum(axis=0), compute_uv=False)[-1])
