@@ -10,3 +10,12 @@ class ScenarioError(Exception):
         shown = " ".join(repr(read).split())
         shown = shown if len(shown) <= 80 else shown[:77] + "..."
         super().__init__(f"{file}: {key}: read {shown}, wanted {wanted}")
+
+
+class UnreadableError(ScenarioError):
+    """What was named is no text file."""
+
+    def __init__(self, path: Path, read: str) -> None:
+        run = path / "scenario.toml"
+        such = f", such as {run}" if path.is_dir() and run.is_file() else " (see gcs new)"
+        Exception.__init__(self, f"{path}: read {read}, wanted a scenario file{such}")

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ValidationError
 from pydantic_core import to_json
 
-from scenarios.errors import ScenarioError
+from scenarios.errors import ScenarioError, UnreadableError
 from scenarios.for_link import contradictions as for_link_contradictions
 from scenarios.keys.autopilot import response_contradictions
 from scenarios.keys.criteria import criteria_faults
@@ -41,9 +41,14 @@ def load(path: Path) -> Scenario:
     """
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        read = error.strerror if isinstance(error, OSError) else str(error)
-        raise ScenarioError(path, "file", read, "a readable TOML file") from None
+    except IsADirectoryError:
+        raise UnreadableError(path, "a folder") from None
+    except OSError as error:
+        raise UnreadableError(path, f"nothing: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UnreadableError(path, "bytes that are not UTF-8 text") from None
+    if not text.strip():
+        raise UnreadableError(path, "an empty file")
     return parse(text, path)
 
 

@@ -18,7 +18,7 @@ def names() -> list[str]:
 def located(text: str) -> Path:
     """The scenario file that `text` names: a path, or the name of a shipped scenario if no such file exists."""
     named = FOLDER / f"{text}.toml"
-    return named if text in names() and not Path(text).exists() else Path(text)
+    return named if text in names() and not Path(text).is_file() else Path(text)
 
 
 def description(name: str, folder: Path = FOLDER) -> str:

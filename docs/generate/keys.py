@@ -1,10 +1,16 @@
 """The keys of a scenario: the JSON Schema that editors check scenarios with, and its page in the reference."""
 
+import ast
+import inspect
 import json
 import re
+import textwrap
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 from docs.generate.blocks import ROOT, table
+from scenarios.keys.part import Part
 from scenarios.schema import Scenario
 
 SCHEMA_FILE = ROOT / "scenarios" / "scenario.schema.json"
@@ -26,8 +32,34 @@ Node = dict[str, Any]
 
 def schema() -> Node:
     """The JSON Schema of a scenario file, as TOML can say it: a key that may be omitted has no null."""
-    made = _without_nulls(Scenario.model_json_schema())
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Scenario"} | made
+    made = Scenario.model_json_schema()
+    for kind in _parts(Part):
+        found = made if kind is Scenario else made["$defs"].get(kind.__name__, {})
+        described = {name: text for each in reversed(kind.__mro__) for name, text in _docstrings(each).items()}
+        for name, key in found.get("properties", {}).items():
+            if name in described:
+                found["properties"][name] = dict(sorted({**key, "description": described[name]}.items()))
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "Scenario"} | _without_nulls(made)
+
+
+def _parts(kind: type[Part]) -> Iterator[type[Part]]:
+    yield kind
+    for each in kind.__subclasses__():
+        yield from _parts(each)
+
+
+def _docstrings(kind: type) -> dict[str, str]:
+    """The docstring below each key of a part."""
+    if not issubclass(kind, Part):
+        return {}
+    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
+    assert isinstance(body, ast.ClassDef)
+    return {
+        key.target.id: inspect.cleandoc(below.value.value)
+        for key, below in pairwise(body.body)
+        if isinstance(key, ast.AnnAssign) and isinstance(key.target, ast.Name)
+        if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant) and isinstance(below.value.value, str)
+    }
 
 
 def schema_text() -> str:

@@ -172,13 +172,15 @@ def _observer(folder: Path, viewer: str | None, *, show_table: bool) -> Generato
     command += [] if show_table else ["--no-table"]
     command += [] if viewer is None else ["--viewer", viewer]
     with held_back():  # once started, it ignores Ctrl-C by itself
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+        process = subprocess.Popen(command, stdin=subprocess.PIPE)
     try:
         yield process
     except BaseException:
         process.terminate()
         process.wait(_OBSERVER_PATIENCE_S)
         raise
+    assert process.stdin is not None
+    process.stdin.close()  # all is written
     for end in (process.terminate, process.kill):  # if it does not end by itself after the last event
         try:
             process.wait(_OBSERVER_PATIENCE_S)

@@ -137,12 +137,22 @@ def write_whole(file: Path, data: bytes) -> None:
 
 
 def write_parquet(file: Path, columns: Mapping[str, Any]) -> None:
-    """Replace a Parquet file in one step."""
+    """Replace a Parquet file in one step. A column is a numpy array without gaps, or a list."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    def column(values: Any) -> Any:
+        if not isinstance(values, np.ndarray):
+            return pa.array(values)
+        # pa.array(values) would import pandas where that is installed, which takes a fifth of a second
+        kind, data = pa.from_numpy_dtype(values.dtype), values
+        if values.dtype == bool:  # in Arrow a bit each
+            data = np.packbits(values, bitorder="little")
+        return pa.Array.from_buffers(kind, values.size, [None, pa.py_buffer(data)])
+
     with replacing(file) as part:
-        pq.write_table(pa.table(columns), part, compression="zstd")
+        table = pa.table({name: column(values) for name, values in columns.items()})
+        pq.write_table(table, part, compression="zstd")
 
 
 @contextlib.contextmanager

@@ -10,7 +10,9 @@ recording is whole. It leaves SIGINT and SIGHUP to the parent, which decides how
 """
 
 import argparse
+import gc
 import os
+import select
 import signal
 import sys
 import time  # noqa: TID251 (this process is a driver: it runs at the pace of the flight it watches)
@@ -48,9 +50,18 @@ class Parent:
 
     pid: int
     stop: bool = False
+    has_written: bool = False
+    """It has closed our standard input: all that it writes is written."""
 
     def gone(self) -> bool:
         return os.getppid() != self.pid
+
+    def wait(self) -> None:
+        """Wait until it is time for the next look."""
+        if self.has_written:
+            time.sleep(POLL_S)
+        else:
+            self.has_written = bool(select.select([0], [], [], POLL_S)[0])
 
 
 def main() -> int:
@@ -70,6 +81,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, stop)
     outlive_readers()
     os.environ.setdefault("RUST_LOG", "off")  # Rerun would write errors over the table; one line at the end says them
+    sys.meta_path.insert(0, _NoPandas())
     import_recording()
     os.nice(10)  # not before: the station waits until this is ready
     ready = arguments.folder / READY_FILE
@@ -124,7 +136,7 @@ def observe(
                 recording.send()
                 send_due = now + SEND_S
             if not ended:
-                time.sleep(POLL_S)
+                parent.wait()
 
 
 def recover_run(folder: Path) -> Summary:
@@ -160,6 +172,14 @@ def import_recording() -> bool:
         print(f"no {RECORDING_FILE}: {why}", file=sys.stderr)
         return False
     return True
+
+
+class _NoPandas:
+    """Hides pandas, where that is installed, from Rerun's Arrow: only its import is used, and takes 0.2 s."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(f"{name} is not used here", name=name)
 
 
 class _NoRecording:
@@ -199,4 +219,6 @@ def _inputs(folder: Path, parent: Parent) -> tuple[Scenario, Design] | None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    gc.freeze()  # the interpreter would look for garbage once more as it ends, while the station waits
+    sys.exit(code)

@@ -99,7 +99,8 @@ class Recording:
         self._trail_ends_m: dict[str, Floats] = {}
         self._stream = rr.RecordingStream("formation-gcs")
         sinks = [rr.FileSink(folder / UNFINISHED_FILE), *([] if viewer is None else [rr.GrpcSink(viewer)])]
-        self._stream.set_sinks(*sinks, default_blueprint=_blueprint(scenario, design))
+        self._is_live = viewer is not None
+        self._stream.set_sinks(*sinks, default_blueprint=_blueprint(scenario, design, following=self._is_live))
         self._stream.send_recording_name(scenario.name)
         self._log_scene_styles()
         self._log_plot_styles()
@@ -115,7 +116,7 @@ class Recording:
 
     def redesigned(self, design: Design) -> None:
         """Name the margins of another design."""
-        self._stream.send_blueprint(_blueprint(self._scenario, design))
+        self._stream.send_blueprint(_blueprint(self._scenario, design, following=self._is_live))
 
     def send(self) -> None:
         """Write what was added."""
@@ -191,8 +192,9 @@ class Recording:
         places_m = {"formation": ground_m - leader_m, "ground": ground_m}
         for root, place_m in places_m.items():
             self._send_places(root, times_s, place_m)
-        for k in self._trail_times.pick(times_s):
-            self._send_trail(times_s[[k]], {root: place_m[k] for root, place_m in places_m.items()})
+        if ends := list(self._trail_times.pick(times_s)):
+            for root, place_m in places_m.items():
+                self._send_trail(root, times_s[ends], place_m[ends])
 
     def _send_places(self, root: str, times_s: Floats, place_m: Floats) -> None:
         count, tree = place_m.shape[1], self._tree
@@ -209,12 +211,13 @@ class Recording:
         centers = rr.Ellipsoids3D.columns(centers=wanted_m.reshape(-1, 3)).partition(lengths)
         self._columns(f"{root}/wanted", times_s, centers)
 
-    def _send_trail(self, time_s: Floats, ends_m: dict[str, Floats]) -> None:
-        """The piece flown since the piece before, each logged once; the view shows those of the last seconds."""
-        before_m, self._trail_ends_m = self._trail_ends_m, ends_m
-        for root, start_m in before_m.items():
-            pieces = rr.LineStrips3D.columns(strips=_segments(start_m, ends_m[root])).partition([len(start_m)])
-            self._columns(f"{root}/trails", time_s, pieces)
+    def _send_trail(self, root: str, times_s: Floats, place_m: Floats) -> None:
+        """The pieces flown since the ends before, each logged once; the view shows those of the last seconds."""
+        ends_m = np.concatenate([self._trail_ends_m.get(root, place_m[:0]), place_m])
+        self._trail_ends_m[root] = place_m[-1:]
+        if (pieces := len(ends_m) - 1) > 0:
+            strips = rr.LineStrips3D.columns(strips=_segments(ends_m[:-1], ends_m[1:]))
+            self._columns(f"{root}/trails", times_s[-pieces:], strips.partition([place_m.shape[1]] * pieces))
 
     def _send_events(self, events: list[Event]) -> None:
         """One entry for what one tick says of several vehicles."""
@@ -313,8 +316,11 @@ def _margins_text(design: Design) -> str:
     return "; of the fastest gains " + ", ".join(known) if known else ""
 
 
-def _blueprint(scenario: Scenario, design: Design) -> Any:
-    """The screen: the scene on the left, with modes and events; plots on the right; time below."""
+def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
+    """The screen: the scene on the left, with modes and events; plots on the right; time below.
+
+    The scene shows the newest time while `following`, else the time of the cursor.
+    """
 
     # all plots show the whole flight on the same axis, wherever the cursor is; at the right a little room for a label
     start, end = (rrb.TimeRangeBoundary.absolute(seconds=at_s) for at_s in (0.0, 1.03 * scenario.duration_s))
@@ -352,7 +358,7 @@ def _blueprint(scenario: Scenario, design: Design) -> Any:
             ),
             column_shares=[1, 1],
         ),
-        rrb.TimePanel(timeline=TIMELINE, expanded=False, play_state="paused"),
+        rrb.TimePanel(timeline=TIMELINE, expanded=False, play_state="following" if following else "paused"),
         rrb.SelectionPanel(expanded=False),
         rrb.BlueprintPanel(expanded=False),
     )

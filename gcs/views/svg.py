@@ -113,15 +113,12 @@ def _thinned(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatA
     """The least and the largest value of each column, in order of time; a column without any gives NaN."""
     if len(values) <= 2 * _COLUMNS:
         return time_s, values
-    at: list[int] = []
-    for part in np.array_split(np.arange(len(values)), _COLUMNS):
-        own = values[part]
-        if np.isnan(own).all():
-            at.append(int(part[0]))
-        else:
-            at += sorted({int(part[np.nanargmin(own)]), int(part[np.nanargmax(own)])})
-    if at[-1] != len(values) - 1:
-        at.append(len(values) - 1)
+    edges = np.array([part[0] for part in np.array_split(np.arange(len(values)), _COLUMNS)] + [len(values)])
+    at = edges[:-1, np.newaxis] + np.arange(np.diff(edges).max())  # a column each line
+    own = np.where(at < edges[1:, np.newaxis], values[np.minimum(at, len(values) - 1)], np.nan)
+    least = np.argmin(np.where(np.isnan(own), np.inf, own), axis=1)
+    most = np.argmax(np.where(np.isnan(own), -np.inf, own), axis=1)
+    at = np.unique([*(edges[:-1] + least), *(edges[:-1] + most), len(values) - 1])
     return time_s[at], values[at]
 
 

@@ -51,6 +51,7 @@ def serve(folder_or_rrd: Path) -> int:
         try:
             _wait_for(lambda: _listens("127.0.0.1", page) and _listens("127.0.0.1", data), process, log)
             at = f"http://127.0.0.1:{page}?url=rerun%2Bhttp%3A%2F%2Flocalhost%3A{data}%2Fproxy"
+            at += "&theme=dark"  # for which the colours are chosen, as those of the labels
             print(f"web      {at}\n         until Ctrl-C", flush=True)
             return process.wait()
         except KeyboardInterrupt:

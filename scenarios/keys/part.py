@@ -48,6 +48,6 @@ class Part(BaseModel):
     The docstring under a key is its description in `scenario.schema.json` and in the reference of the documentation.
     """
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    # pydantic's use_attribute_docstrings would read the sources at each start, which takes longer than all the rest of
+    # the schema; docs.generate.keys does so when it is needed
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)

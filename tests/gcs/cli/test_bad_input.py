@@ -13,6 +13,7 @@ from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FIL
 from gcs.runs.summary import finish, summarise
 from gcs.views.observer import record_run
 from gcs.views.report import print_summary
+from scenarios.shipped import FOLDER, located
 from tests.support.fleets.flown_run import DESIGN, line, ticks_of, write_run
 from tests.support.paths import ROOT
 
@@ -69,6 +70,33 @@ def test_what_cannot_be_used_is_refused_before_the_work(
     arguments: str, wanted: str, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert wanted in complaint(capsys, monkeypatch, *arguments.format(run=run).split())
+
+
+@pytest.mark.parametrize(
+    "command", ["fly", "fly --virtual", "check", "design", "stress --onset", "compare", "capacity"]
+)
+def test_what_is_no_scenario_is_named_in_plain_words(
+    command: str, tmp_path: Path, run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    empty, binary = tmp_path / "empty.toml", tmp_path / "binary.toml"
+    empty.write_text("\n")
+    binary.write_bytes(b"\x7fELF\xff\xfe")
+    said = {
+        tmp_path: "read a folder, wanted a scenario file (see gcs new)",
+        run: f"read a folder, wanted a scenario file, such as {run}/scenario.toml",
+        empty: "read an empty file, wanted a scenario file (see gcs new)",
+        binary: "read bytes that are not UTF-8 text, wanted a scenario file (see gcs new)",
+    }
+    for path, words in said.items():
+        assert complaint(capsys, monkeypatch, *command.split(), str(path)) == f"{path}: {words}\n"
+
+
+def test_a_folder_does_not_hide_the_shipped_scenario_of_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "chain3").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert located("chain3").parent == FOLDER
 
 
 DAMAGED = {
