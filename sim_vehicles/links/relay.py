@@ -1,6 +1,6 @@
 """The links of a scenario in front of other programs' vehicles, as one function of datagrams and time.
 
-The system id of its first frame identifies a vehicle; only headers are read. A vehicle gets the same links, random
+A vehicle is known by the system id of its first frame; only headers are read. A vehicle gets the same links, random
 streams and truth log that it would have in a Fleet.
 """
 

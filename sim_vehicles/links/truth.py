@@ -1,7 +1,7 @@
 """The truth log: what happened and when, on the host's clock. The station's estimates are graded against it.
 
-The file is a magic and then fixed-size records, written in batches: a killed process loses its last batch at most. An
-incomplete record at the end is skipped when reading and overwritten when the log is continued.
+The file is a magic number followed by fixed-size records, written in batches: a killed process loses its last batch at
+most. An incomplete record at the end is skipped when reading and overwritten when the log is continued.
 """
 
 import contextlib
