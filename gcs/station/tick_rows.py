@@ -27,7 +27,7 @@ class Reported(NamedTuple):
     received_ns: int = 0
     """The kernel's stamp."""
     bound_s: float = nan
-    """The largest error of the instant at which it was sampled."""
+    """The largest error of the instant at which the state was sampled."""
 
 
 class VehicleTick(NamedTuple):
@@ -43,7 +43,7 @@ class VehicleTick(NamedTuple):
     """NaN while unknown."""
     commanded: bool
     tolerated: Tolerated
-    """How far the loop delay may be from the assumed one."""
+    """How far the loop delay may be from the assumed delay."""
     repeated_s: float
     """See `gcs.control.loop_delay.Repetitions`."""
 
@@ -61,7 +61,7 @@ class Tick(NamedTuple):
 def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
     """The rows of a tick whose set-points were handed over at `sent_ns`, and how much of its margin each vehicle uses.
 
-    The latter in s as of `gcs.plan.mismatch.Tolerated.used_s`: without prediction the loop delay.
+    That is in s, see `gcs.plan.mismatch.Tolerated.used_s`: the loop delay, or the mismatch with prediction.
     """
     packed: list[bytes] = []
     every_used_s: list[float] = []
