@@ -121,7 +121,7 @@ def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flig
 
 
 def _processor_times() -> IntArray:
-    """Ticks of all processors since boot: user, nice, system, idle, iowait, irq, softirq, steal."""
+    """Time of all processors since boot, in jiffies: user, nice, system, idle, iowait, irq, softirq, steal."""
     line = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0]
     return np.array(line.split()[1:9], dtype=np.int64)
 
