@@ -55,6 +55,7 @@ def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, w
 
 
 def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:
+    """Fly a plan in virtual time; `folder` and `with_truth` as for `fly_plan`."""
     station, records = Station(plan, start_ns=START_NS), list[tuple[int, ...]]()
     writer = None
     if folder is not None:

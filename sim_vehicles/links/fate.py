@@ -94,7 +94,10 @@ def constant(link: link_keys.Link) -> bool:
 
 
 def outcome(link: LinkBehaviour, *, bad: bool, time_ns: int, draws: Draws) -> Fate:
-    """The fate of a datagram that enters at a given link time. A channel or a full link may still drop it."""
+    """The fate of a datagram that enters at link time `time_ns`, with the link's state `bad` since the last datagram.
+
+    A channel or a full link may still drop it.
+    """
     bad = draws.burst >= link.to_good if bad else draws.burst < link.to_bad
     fate = PASSED
     for from_ns, until_ns in link.outages_ns:

@@ -49,7 +49,7 @@ def holds_key(data: bytes) -> bool:
 
 
 class Relay:
-    """Links between any vehicles and a station."""
+    """The links of a scenario between a station and any vehicles; `next_event_ns` says when to call `step` next."""
 
     def __init__(self, scenario: schema.Scenario, start_ns: int, *, record: Record | None = None) -> None:
         self.last_heard_ns = start_ns
