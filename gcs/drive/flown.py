@@ -33,8 +33,8 @@ class Flight:
     """A flight's log, in real or virtual time.
 
     `truth` holds when states were sampled and set-points acted, recorded by the vehicles; in virtual time only on
-    request. `steal_share` and `busy_share` are the fractions of the processor time that the host took away and that was
-    not idle; in real time only.
+    request. In real time only, `steal_share` is the fraction of the processor time that the host took away, and
+    `busy_share` the fraction in which processors were not idle.
     """
 
     ticks: TickArray

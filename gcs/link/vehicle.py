@@ -124,6 +124,7 @@ class RemoteVehicle:
 
     @property
     def guided(self) -> bool:
+        """Whether it takes part in the flight: armed and in its guided mode, or flown by somebody else as planned."""
         return self.external or (self.armed and self.custom_mode == self.kind.guided_mode and not self.taken_over)
 
     @property

@@ -108,8 +108,8 @@ def find_disturbance_onsets(
     """Fly the worst disturbances around the stability radii, of the errors of the first `counts` vehicles.
 
     By default these are one follower with the leader, and the whole formation. Relative to the radius, `tolerance` is
-    the spacing of the sizes flown, `allowed` the largest distance of an onset from it. `ended` is called after each
-    flight. Raises InputError if the scenario's loop has no such radii.
+    half the range of the sizes flown in a round, `allowed` the largest distance of an onset from it. `ended` is called
+    after each flight. Raises InputError if the scenario's loop has no such radii.
     """
     probe, delay_s = _probe(plan)
     onsets = tuple(

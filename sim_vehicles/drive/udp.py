@@ -97,6 +97,7 @@ class Sockets:
         self._woken_ns = time.monotonic_ns()
 
     def receive(self) -> list[Received]:
+        """Everything that has arrived, at most `READS_PER_WAKE` datagrams from each socket."""
         begin_ns = time.monotonic_ns()
         to_monotonic_ns = self._clocks.to_monotonic_ns()
         received: list[Received] = []
