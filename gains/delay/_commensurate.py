@@ -49,6 +49,7 @@ from gains.delay._windows import (
     check_horizon,
     combined_analysis,
     unstable_roots,
+    without_zero,
     zero_passage,
 )
 
@@ -104,9 +105,8 @@ def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
         # a simple eigenvalue on the axis may be this far off by rounding
         unstable = int(np.count_nonzero(roots.real > 1e-13 * norm_of(terms)))
         return BlockAnalysis(block.copies, delayed, unstable=unstable, fixed_on_axis=True)
-    found = _block_crossings(terms)
-    unstable = unstable_roots(roots, found, passage)
-    return block_analysis(block.copies, delayed, found, unstable, passage, highest_frequency(terms))
+    found = without_zero(_block_crossings(terms), passage, highest_frequency(terms))
+    return block_analysis(block.copies, delayed, found, unstable_roots(roots, found, passage), passage)
 
 
 def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:

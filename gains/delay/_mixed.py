@@ -25,9 +25,12 @@ from gains.delay._windows import (
     block_analysis,
     check_horizon,
     combined_analysis,
+    without_zero,
     zero_passage,
 )
 
+# a loop without delay whose skew part is below this share of its norm is symmetric
+_SYMMETRIC = 1e-12
 # rad by which e^{-j omega d} turns between neighbouring frequencies, and frequencies a decade: of a sweep, of a count
 _TURN, _COUNT_TURN = 0.1, 0.5
 _POINTS_PER_DECADE, _COUNT_GRID, _DECADES = 60, 20, 9
@@ -71,7 +74,8 @@ def analyse_mixed_block(block: Block, terms: Sequence[DelayedTerm], leave_out_ze
     if passage is None and is_singular_for_any_delay(parts.matrices):
         return BlockAnalysis(block.copies, delayed, fixed_on_axis=True)
     unstable = _unstable_roots(parts, passage is not None)
-    return block_analysis(block.copies, delayed, _crossings(parts), unstable, passage, parts.highest())
+    found = without_zero(_crossings(parts), passage, parts.highest())
+    return block_analysis(block.copies, delayed, found, unstable, passage)
 
 
 def count_unstable_roots(
@@ -168,6 +172,8 @@ def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) 
     """
     highest = parts.highest()
     hurwitz = np.linalg.eigvals(parts.matrices.sum(axis=0))
+    if at_zero and highest <= _SYMMETRIC * float(parts.norms.sum()):  # no delay: all roots are real, one of them zero
+        return int(np.count_nonzero(np.delete(hurwitz, np.argmin(np.abs(hurwitz))).real > 0.0))
     hurwitz = hurwitz - max(0.0, float(hurwitz.real.max()) + _SHIFT * (highest + float(np.abs(hurwitz).max())))
     # M(j omega) = M(0) (I + E) with the norm of E below 1 / 4n: nothing turns there
     slowest = float(np.linalg.svd(parts.matrices.sum(axis=0), compute_uv=False)[-1])

@@ -7,7 +7,7 @@ at that without delay and changes at each crossing, in the order of the delays; 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from math import inf, pi
+from math import gcd, inf, pi
 
 import numpy as np
 
@@ -54,20 +54,23 @@ class DelayAnalysis:
 class ZeroPassage:
     """A real root passes the root that stays at s = 0 at `delay_s`: to the right, unstable (+1), or to the left (-1).
 
-    `direction` is 0 if none passes at a positive delay; `delay_s` is then negative or infinite.
+    `direction` is 0 if none passes at a positive delay; `delay_s` is then negative or infinite. All multiples of tau
+    are multiples of `unit`.
     """
 
     delay_s: float
     direction: int
+    unit: int = 1
 
     def is_seen_as(self, crossing: Crossing, highest: float) -> bool:
         """Whether a crossing is the root at zero, blurred by rounding.
 
-        The locus of that root has modulus one to rounding at low frequencies, so its noise may cross one many times.
+        The locus of that root has modulus one to rounding at low frequencies, so its noise may cross one many times,
+        at each angle of tau that is a whole turn of `unit` tau.
         """
         omega = crossing.omega_rad_s
         apart_s = crossing.delay_s - (self.delay_s if np.isfinite(self.delay_s) else 0.0)
-        return omega < _BLUR * highest and abs(float(np.angle(np.exp(1j * omega * apart_s)))) < _TURN
+        return omega < _BLUR * highest and abs(float(np.angle(np.exp(1j * self.unit * omega * apart_s)))) < _TURN
 
 
 @dataclass(frozen=True)
@@ -142,16 +145,20 @@ def block_analysis(
     found: Sequence[Crossing],
     unstable: int,
     passage: ZeroPassage | None,
-    highest: float,
 ) -> BlockAnalysis:
-    """One block's analysis from its crossings up to the frequency `highest` and its unstable roots without delay.
+    """One block's analysis from its crossings, without those seen of `passage`, and its unstable roots without delay.
 
     `passage` is what `zero_passage` says of a root at zero that is left out, None if there is none.
     """
-    crossings = [crossing for crossing in found if passage is None or not passage.is_seen_as(crossing, highest)]
+    crossings = list(found)
     if passage is not None and passage.direction != 0:
         crossings.append(Crossing(0.0, passage.delay_s, passage.direction, 1))
     return BlockAnalysis(copies, terms, crossings, unstable, fixed_at_zero=passage is not None)
+
+
+def without_zero(found: Sequence[Crossing], passage: ZeroPassage | None, highest: float) -> list[Crossing]:
+    """The crossings up to the frequency `highest` that are not a root at zero, blurred by rounding."""
+    return [crossing for crossing in found if passage is None or not passage.is_seen_as(crossing, highest)]
 
 
 def unstable_roots(roots: ComplexArray, found: Sequence[Crossing], passage: ZeroPassage | None) -> int:
@@ -264,9 +271,12 @@ def zero_passage(
     # simple without delay at all, and with the known ones: two roots that stay are beyond this
     if min(abs(float(w @ v)), abs(float(slope_known))) < _SIMPLE:
         return None
-    delay_s = -float(slope_known) / by_delay if by_delay != 0.0 else np.inf
-    if not 0.0 < delay_s < 1e12 / float(np.linalg.norm(terms, axis=(1, 2)).sum()):
-        return ZeroPassage(delay_s, 0)
+    unit = gcd(*multiples[terms.any(axis=(1, 2))].tolist()) or 1
+    delay_s = -float(slope_known) / by_delay if by_delay != 0.0 else inf
+    if abs(delay_s) * float(np.linalg.norm(terms, axis=(1, 2)).sum()) > 1e12:
+        delay_s = inf  # by_delay is 0 but for rounding
+    if not 0.0 < delay_s < inf:
+        return ZeroPassage(delay_s, 0, unit)
     delays_s = known_s + multiples * delay_s
     first, second = np.eye(len(total)) + weight(delays_s), -weight(delays_s**2)
     kept = singular > 1e-12 * singular[0]
@@ -274,4 +284,4 @@ def zero_passage(
     curvature = float(w @ (second / 2.0 - first @ inverse @ first) @ v)
     if curvature == 0.0:
         return None
-    return ZeroPassage(delay_s, int(np.sign(-by_delay / curvature)))
+    return ZeroPassage(delay_s, int(np.sign(-by_delay / curvature)), unit)

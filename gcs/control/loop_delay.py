@@ -22,6 +22,7 @@ shortens the other. What remains is `loop_delay_bound_s`: the millisecond in whi
 the stamps in TIMESYNC replies, and what the estimate changed between the two.
 """
 
+from collections.abc import Sequence
 from math import ceil, nan
 
 from scenarios.schema import NS_PER_S, Rates
@@ -52,10 +53,10 @@ class Repetitions:
         self._first: list[tuple[int, int]] = [(0, 0)] * vehicles
         """For each vehicle the instant of the state used last, and the tick that used it first."""
 
-    def repeated_s(self, row: int, used_ns: int, due_ns: int) -> float:
-        """Time from the first tick that used a state to the tick due now, at most one period of the telemetry."""
+    def repeated_s(self, used_ns: Sequence[int], due_ns: int) -> list[float]:
+        """Times from the first tick that used each state to the tick due now, at most one period of the telemetry."""
         if self._longest_ns == 0:
-            return 0.0
-        if self._first[row][0] != used_ns:
-            self._first[row] = used_ns, due_ns
-        return min(due_ns - self._first[row][1], self._longest_ns) * 1e-9
+            return [0.0] * len(used_ns)
+        both = zip(used_ns, self._first, strict=True)
+        self._first = [(now, due_ns) if now != before else (before, first_ns) for now, (before, first_ns) in both]
+        return [min(due_ns - first_ns, self._longest_ns) * 1e-9 for _, first_ns in self._first]

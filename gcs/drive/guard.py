@@ -47,7 +47,7 @@ class Guard:
         return verified
 
     def sent(self, outgoing: list[Outgoing], now_ns: int) -> list[Outgoing]:
-        return [Outgoing(self._link.sign(data, now_ns), address) for data, address in outgoing]
+        return [(self._link.sign(data, now_ns), address) for data, address in outgoing]
 
 
 def open_guard(key_file: Path, *, epoch_ns: int, role: str) -> Guard:

@@ -80,7 +80,7 @@ class Mirror:
                 self.counters[f"refused {name} about the rate of the telemetry used for control"] += 1
             else:
                 self.counters[f"passed on {name}"] += 1
-                outgoing += [Outgoing(frame.data, address) for address in addresses]
+                outgoing += [(frame.data, address) for address in addresses]
         return outgoing
 
     def _received(self, now_ns: int) -> list[mavlink.Frame]:

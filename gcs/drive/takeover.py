@@ -92,7 +92,7 @@ class Presence:
             for system_id in sorted(left):
                 self._sequence += 1
                 frame = mavlink.encode(msg_id, fields(target_system=system_id), sequence=self._sequence)
-                outgoing.append(Outgoing(frame, self._addresses[system_id]))
+                outgoing.append((frame, self._addresses[system_id]))
             self._link.send(outgoing)
             for frame in self._listen(now_ns + _ASK_AGAIN_NS):
                 if frame.system_id in left and (text := answer(frame)):

@@ -16,8 +16,5 @@ class Datagram(NamedTuple):
     """Time it waited in the socket buffer before the station read it."""
 
 
-class Outgoing(NamedTuple):
-    """One datagram to be sent."""
-
-    data: bytes
-    address: Address
+Outgoing = tuple[bytes, Address]
+"""One datagram to be sent, and to whom."""

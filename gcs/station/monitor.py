@@ -99,14 +99,14 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
         return _changed(replace(state, mode=Mode.RECOVERING), slowest, seen.time_s)
     if state.mode is Mode.WAITING:
         return replace(state, mode=Mode.NOMINAL)
-    calm = _is_calm(state, seen, margins_s, policy)
+    calm = _is_calm(state, seen.loop_delay_s, margins_s, policy)
     return state if calm else _by_headroom(state, seen, margins_s, slowest, policy)
 
 
-def _is_calm(state: VehicleState, seen: Observation, margins_s: tuple[float, ...], policy: Monitor) -> bool:
+def _is_calm(state: VehicleState, loop_delay_s: float, margins_s: tuple[float, ...], policy: Monitor) -> bool:
     """Whether the vehicle is NOMINAL, its headroom enough or unknown, and no timer runs: true of most ticks."""
     nominal = state.mode is Mode.NOMINAL and state.pressed_s is None and state.eased_s is None
-    return nominal and not headroom(seen.loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
+    return nominal and not headroom(loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
 
 
 def _by_headroom(
@@ -198,26 +198,40 @@ class FormationMonitor:
         """Ticks of this flight so far."""
         self._settled = [Blend(gain_set, gain_set, 1.0) for gain_set in range(len(margins_s))]
 
-    def update(self, fleet: Sequence[Observation]) -> list[tuple[int, VehicleState, VehicleState]]:
-        """Judge a tick; returns row, old and new state of each vehicle whose mode, gain set or release changed."""
-        time_s, flying, *_ = fleet[0]
+    def update(
+        self,
+        time_s: float,
+        silent: Sequence[bool],
+        guided: Sequence[bool],
+        failsafe: Sequence[bool],
+        loop_delay_s: Sequence[float],
+        *,
+        flying: bool,
+    ) -> list[tuple[int, VehicleState, VehicleState]]:
+        """Judge a tick, of which is known what an `Observation` holds, of each vehicle.
+
+        Returns row, old and new state of each vehicle whose mode, gain set or release changed.
+        """
         if flying:
-            self._delays_s[self._judged % len(self._delays_s)] = [seen.loop_delay_s for seen in fleet]
+            self._delays_s[self._judged % len(self._delays_s)] = loop_delay_s
             self._judged += 1
         else:
             self._judged = 0  # before the flight telemetry is slow and the loop is not closed
         delays_s = self._judged_delay_s()
         changes: list[tuple[int, VehicleState, VehicleState]] = []
-        states: list[VehicleState] = []
-        for row, (before, seen, delay_s) in enumerate(zip(self.states, fleet, delays_s, strict=True)):
-            # the same observation with the loop delay that is judged, not that of this tick
-            after = monitored(before, Observation(*seen[:5], delay_s), self.margins_s[row], self._policy)
+        states = list(self.states)
+        each = zip(self.states, delays_s, self.margins_s, silent, guided, failsafe, strict=True)
+        for row, (before, delay_s, margins_s, gone, follows, failed) in enumerate(each):
+            if flying and follows and not gone and _is_calm(before, delay_s, margins_s, self._policy):
+                continue  # what `monitored` would say, for the price of a comparison
+            seen = Observation(time_s, flying, gone, follows, failed, delay_s)
+            after = monitored(before, seen, margins_s, self._policy)
             if after is not before:
                 if after.released and not before.released and row != self._next_to_release():
                     after = replace(after, mode=Mode.CRITICAL, released=False)  # a vehicle behind goes first
                 if (before.mode, before.gain_set, before.released) != (after.mode, after.gain_set, after.released):
                     changes.append((row, before, after))
-            states.append(after)
+                states[row] = after
         self.states = states
         self._open(time_s, flying=flying)
         return changes

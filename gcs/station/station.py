@@ -23,11 +23,12 @@ from gcs.link.datagram import Datagram, Outgoing
 from gcs.link.kinds import Goal
 from gcs.link.vehicle import SILENCE_S, RemoteVehicle
 from gcs.plan.flight_plan import FlightPlan
+from gcs.plan.mismatch import Tolerated
 from gcs.station.absence import absence, describe_change, end_reason
 from gcs.station.breakage import Breakage, not_formed
 from gcs.station.fleet_kind import fleet_of
-from gcs.station.monitor import FormationMonitor, Observation
-from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.station.monitor import FormationMonitor
+from gcs.station.tick_rows import Reported, Tick, tick_rows
 from scenarios.schema import NS_PER_S
 
 AUTOPILOT_COMPONENT = 1
@@ -262,9 +263,10 @@ class Station:
             states = self._monitor.states
             self.request_stop(self._breakage.judge(controls, states, self._absent, distance_m, nearest_m, time_s))
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
-        seen: list[VehicleTick] = []
-        for row, (vehicle, control, monitored, nearest) in enumerate(
-            zip(self.vehicles, controls, self._monitor.states, nearest_m, strict=True)
+        followed: list[bool] = []
+        tolerated: list[Tolerated] = []
+        for row, (vehicle, control, monitored) in enumerate(
+            zip(self.vehicles, controls, self._monitor.states, strict=True)
         ):
             north, east = control.command_m_s2
             commanded = flying and not monitored.released and isfinite(north) and isfinite(east)
@@ -274,19 +276,18 @@ class Station:
                 fields = self._limits.set_point(fields)  # last, so that it holds whoever computed them
                 self._fleet.loop.sent(row, due_ns, fields)
                 self._send(vehicle, mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, outgoing)
-            tolerated = self.plan.tolerance(control.assumed_s)
-            self._monitor.margins_s[row] = tolerated.longer_s
-            fresh_s = self._fresh_rtt_s[row]
-            reported, rtt_s = self._reported[row], fresh_s.popleft() if fresh_s else nan
-            repeated_s = self._repetitions.repeated_s(row, control.used_ns, due_ns)
-            seen.append(
-                VehicleTick(vehicle, monitored, control, reported, rtt_s, nearest, commanded, tolerated, repeated_s)
-            )
+            followed.append(commanded)
+            tolerated.append(self.plan.tolerance(control.assumed_s))
+        self._monitor.margins_s = [each.longer_s for each in tolerated]
         for vehicle in self.vehicles:
             frame = vehicle.next_frame(self._now_ns)
             if frame is not None and vehicle.address is not None:
-                outgoing.append(Outgoing(frame, vehicle.address))
-        tick = Tick(self._tick_count, time_s, due_ns, key_ms, seen)
+                outgoing.append((frame, vehicle.address))
+        tick = Tick(
+            self._tick_count, time_s, due_ns, key_ms, self.vehicles, self._monitor.states, controls,
+            self._reported.copy(), [fresh_s.popleft() if fresh_s else nan for fresh_s in self._fresh_rtt_s],
+            nearest_m, followed, tolerated, self._repetitions.repeated_s([each.used_ns for each in controls], due_ns),
+        )  # fmt: skip
         self._tick_count += 1 + behind
         return tick
 
@@ -308,11 +309,11 @@ class Station:
             self._absent = absent
             self._law = self._fleet.loop.law([why != "" for why in absent])
         time_s = self.scenario_time_s(due_ns)
-        fleet = [
-            Observation(time_s, flying, gone, vehicle.guided, vehicle.critical, used_s)
-            for vehicle, gone, used_s in zip(self.vehicles, silent, self._used_s, strict=True)
-        ]
-        for row, before, after in self._monitor.update(fleet):
+        guided, critical = (
+            [vehicle.guided for vehicle in self.vehicles],
+            [vehicle.critical for vehicle in self.vehicles],
+        )
+        for row, before, after in self._monitor.update(time_s, silent, guided, critical, self._used_s, flying=flying):
             vehicle = self.vehicles[row]
             if flying:
                 vehicle.goal = None if after.released or vehicle.left_out else Goal.FLY
@@ -381,7 +382,7 @@ class Station:
 
     def _send(self, vehicle: RemoteVehicle, msg_id: int, fields: tuple[object, ...], outgoing: list[Outgoing]) -> None:
         if vehicle.address is not None:
-            outgoing.append(Outgoing(vehicle.encode(msg_id, fields), vehicle.address))
+            outgoing.append((vehicle.encode(msg_id, fields), vehicle.address))
 
     def _tell(self, vehicle: RemoteVehicle, mode: Mode, text: str, outgoing: list[Outgoing]) -> None:
         """Announce a change on the link, for other listeners and the telemetry log."""

@@ -1,6 +1,7 @@
 """Packs the rows of the tick record from what the station knows at a tick."""
 
 import struct
+from collections.abc import Sequence
 from math import nan
 from typing import NamedTuple
 
@@ -30,32 +31,26 @@ class Reported(NamedTuple):
     """The largest error of the instant at which the state was sampled."""
 
 
-class VehicleTick(NamedTuple):
-    """One vehicle at one control tick, before its set-point is sent."""
-
-    vehicle: RemoteVehicle
-    monitored: VehicleState
-    control: VehicleControl
-    reported: Reported
-    rtt_s: float
-    """The oldest completed round trip that no earlier tick holds; NaN if there is none."""
-    nearest_m: float
-    """NaN while unknown."""
-    commanded: bool
-    tolerated: Tolerated
-    """How far the loop delay may be from the assumed delay."""
-    repeated_s: float
-    """See `gcs.control.loop_delay.Repetitions`."""
-
-
 class Tick(NamedTuple):
-    """One control tick of the formation."""
+    """One control tick of the formation, before its set-points are sent. Lists have a place for each vehicle."""
 
     number: int
     time_s: float
     due_ns: int
     key_ms: int
-    vehicles: list[VehicleTick]
+    vehicles: Sequence[RemoteVehicle]
+    monitored: Sequence[VehicleState]
+    controls: Sequence[VehicleControl]
+    reported: Sequence[Reported]
+    rtt_s: Sequence[float]
+    """The oldest completed round trip that no earlier tick holds; NaN if there is none."""
+    nearest_m: Sequence[float]
+    """NaN while unknown."""
+    commanded: Sequence[bool]
+    tolerated: Sequence[Tolerated]
+    """How far the loop delay may be from the assumed delay."""
+    repeated_s: Sequence[float]
+    """See `gcs.control.loop_delay.Repetitions`."""
 
 
 def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
@@ -65,8 +60,9 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
     """
     packed: list[bytes] = []
     every_used_s: list[float] = []
-    for seen in tick.vehicles:
-        vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, tolerated, repeated_s = seen
+    for vehicle, monitored, control, reported, rtt_s, nearest_m, commanded, tolerated, repeated_s in zip(
+        *tick[4:], strict=True
+    ):
         clock, frames = vehicle.clock, vehicle.frames
         estimate = clock.estimate
         age_s = (sent_ns - control.sample_ns) * 1e-9 if control.sample_ns > 0 else nan

@@ -318,7 +318,7 @@ class Requests:
     def _numbered(self, msg_id: int, fields: tuple[object, ...], address: Address) -> Outgoing:
         self._sequences[address] += 1
         data = mavlink.encode(msg_id, fields, sequence=self._sequences[address], system_id=SYSTEM_ID)
-        return Outgoing(data, address)
+        return data, address
 
 
 def _spread(values: "array[float]", last: int) -> Estimate:

@@ -28,7 +28,7 @@ from gcs.plan.formation import plan_formation
 from gcs.plan.planner import flight_plan
 from gcs.station.fleet_kind import fleet_of
 from gcs.station.monitor import VehicleState
-from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.station.tick_rows import Reported, Tick, tick_rows
 from gcs.watch.links import Watch, WatchedVehicle
 from scenarios.schema import NS_PER_S, Scenario
 
@@ -272,16 +272,17 @@ class _Rebuilding:
         controls = self._fleet.loop.control(self._history, self._law, [_NO_BLEND] * len(lost), now)
         slots_m = [reported.down_m for reported in self._reported] if self._scenario.has_altitude_slots else None
         nearest_m: list[float] = np.fmin.reduce(distances_m(controls, due_ns, slots_m), axis=1).tolist()
-        seen: list[VehicleTick] = []
-        for row, (vehicle, control, state) in enumerate(zip(self._vehicles, controls, self._states, strict=True)):
-            command = commands.get(vehicle.remote.system_id)
-            sent = control._replace(command_m_s2=command or (nan, nan))
-            repeated_s = self._repetitions.repeated_s(row, control.used_ns, due_ns)
-            figures = self._fresh_rtt_s(row, vehicle), nearest_m[row], command is not None
-            tolerated = self._fleet.plan.tolerance(control.assumed_s)
-            seen.append(VehicleTick(vehicle.remote, state, sent, self._reported[row], *figures, tolerated, repeated_s))
-        number = round((due_ns - self._start_ns) / self._period_ns)
-        rows, _ = tick_rows(Tick(number, time_s, due_ns, key_ms, seen), sent_ns)
+        remotes = [vehicle.remote for vehicle in self._vehicles]
+        sent = [commands.get(remote.system_id) for remote in remotes]
+        tick = Tick(
+            round((due_ns - self._start_ns) / self._period_ns), time_s, due_ns, key_ms, remotes, self._states,
+            [each._replace(command_m_s2=one or (nan, nan)) for each, one in zip(controls, sent, strict=True)],
+            self._reported, [self._fresh_rtt_s(row, vehicle) for row, vehicle in enumerate(self._vehicles)],
+            nearest_m, [one is not None for one in sent],
+            [self._fleet.plan.tolerance(control.assumed_s) for control in controls],
+            self._repetitions.repeated_s([control.used_ns for control in controls], due_ns),
+        )  # fmt: skip
+        rows, _ = tick_rows(tick, sent_ns)
         self._rows.append(rows)
 
     def _fresh_rtt_s(self, row: int, vehicle: WatchedVehicle) -> float:

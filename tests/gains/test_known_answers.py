@@ -71,3 +71,19 @@ def test_a_double_pole_decays_with_its_own_rate() -> None:
 
 def test_a_maximum_between_grid_points_is_found() -> None:
     assert largest_value(np.sin, np.linspace(0.0, 3.0, 8)) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("terms", "unstable"),
+    [
+        ([([[-1.0, 1.0], [1.0, -1.0]], 0.0)], 0),
+        ([([[1.0, 1.0], [1.0, 1.0]], 0.0)], 1),
+        ([([[-1.0]], 0.0), ([[1.0]], 0.0)], 0),
+        ([([[1.0]], 0.0), ([[-1.0]], 0.5)], 0),  # s = 1 - e^{-s d} has a positive root for d > 1
+        ([([[1.0]], 0.0), ([[-1.0]], 3.0)], 1),
+    ],
+)
+def test_other_roots_are_counted_beside_one_that_stays_at_zero(
+    terms: list[tuple[list[list[float]], float]], unstable: int
+) -> None:
+    assert count_unstable_roots(terms, leave_out_zero=True) == unstable

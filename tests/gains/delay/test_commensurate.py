@@ -250,3 +250,16 @@ def test_roots_of_many_multiples_are_counted(
         )
         delayed = [(matrix, multiple * tau_s) for matrix, multiple in zip(late, multiples, strict=True)]
         assert found.unstable_roots_at_zero_delay + entered == unstable_roots([(now, 0.0), *delayed])
+
+
+def test_pair_on_the_axis_at_no_delay_beside_a_fixed_root_at_zero() -> None:
+    # det M(s) = s (s^2 + c e^{-s tau}): no root is left to be taken for noise of the one at zero
+    now = np.array([[0.0, 0.0, -0.10632528972641878], [0.0, 0.0, 0.0], [0.0, 0.6401019196602797, 0.0]])
+    late = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.7418610417423701], [-0.318665534371544, 0.0, 0.0]])
+    for between in (0, 3):
+        analysis = analyse_commensurate([now, *[np.zeros((3, 3))] * between, late], leave_out_zero=True)
+        assert (analysis.delay_margin_s, analysis.roots_fixed_at_zero) == (0.0, 1)
+        found = {round(crossing.omega_rad_s, 6) for crossing in analysis.crossings}
+        assert found == {
+            round(sqrt(0.7418610417423701 * 0.6401019196602797 - 0.318665534371544 * 0.10632528972641878), 6)
+        }

@@ -164,28 +164,32 @@ def formation(n: int, *, separable: bool = True) -> FormationMonitor:
     return FormationMonitor(n, MARGINS_S, POLICY, separable=separable, period_s=0.02)
 
 
-def view(k: int, delays_s: list[float]) -> list[Observation]:
-    return [Observation(0.02 * k, True, False, True, False, delay_s) for delay_s in delays_s]
+def update(
+    monitor: FormationMonitor, k: int, delays_s: list[float], *, flying: bool = True
+) -> list[tuple[int, VehicleState, VehicleState]]:
+    """Tick k at 50 Hz, with every vehicle heard and guided."""
+    n = len(delays_s)
+    return monitor.update(0.02 * k, [False] * n, [True] * n, [False] * n, delays_s, flying=flying)
 
 
 def test_in_a_tree_a_late_vehicle_changes_only_its_gains() -> None:
     monitor = formation(3)
     for k in range(100):
-        monitor.update(view(k, [0.05, 0.29, 0.05]))
+        update(monitor, k, [0.05, 0.29, 0.05])
     assert [state.gain_set for state in monitor.states] == [0, 1, 0]
 
 
 def test_one_late_vehicle_changes_everybodys_gains_where_loops_are_coupled() -> None:
     monitor = formation(3, separable=False)
     for k in range(100):
-        monitor.update(view(k, [0.05, 0.29, 0.05]))
+        update(monitor, k, [0.05, 0.29, 0.05])
     assert [state.gain_set for state in monitor.states] == [1, 1, 1]
 
 
 def test_share_of_the_new_gains_rises_without_a_jump() -> None:
     monitor, shares = formation(1), list[float]()
     for k in range(120):
-        monitor.update(view(k, [0.29]))
+        update(monitor, k, [0.29])
         flown, former, share = monitor.blends(0.02 * k)[0]
         shares.append(flown * share + former * (1 - share))
     assert shares[0] == 0.0
@@ -196,16 +200,16 @@ def test_share_of_the_new_gains_rises_without_a_jump() -> None:
 def test_delays_before_the_flight_are_not_judged() -> None:
     monitor = formation(1)
     for k in range(100):  # slow telemetry of a vehicle that is getting ready
-        monitor.update([seen._replace(flying=False) for seen in view(k, [2.0])])
+        update(monitor, k, [2.0], flying=False)
     for k in range(100, 200):
-        monitor.update(view(k, [0.05]))
+        update(monitor, k, [0.05])
         assert monitor.states[0].mode is Mode.NOMINAL
 
 
 def test_release_goes_from_the_end_of_the_tree_forwards() -> None:
     monitor, order = formation(4), list[int]()
     for k in range(600):
-        for row, before, after_ in monitor.update(view(k, [0.05, 2.0, 2.0, 2.0])):
+        for row, before, after_ in update(monitor, k, [0.05, 2.0, 2.0, 2.0]):
             if after_.released and not before.released:
                 order.append(row)
     assert order == [3, 2, 1]
@@ -214,7 +218,7 @@ def test_release_goes_from_the_end_of_the_tree_forwards() -> None:
 def test_formation_is_not_opened_when_the_slowest_gains_are_enough() -> None:
     monitor = formation(1)
     for k in range(1000):
-        monitor.update(view(k, [0.05 if k < 100 else 0.55]))
+        update(monitor, k, [0.05 if k < 100 else 0.55])
         assert monitor.opening == 1.0
     assert monitor.states[0].gain_set == 2
 
@@ -222,10 +226,10 @@ def test_formation_is_not_opened_when_the_slowest_gains_are_enough() -> None:
 def test_formation_is_opened_slowly_while_the_slowest_gains_are_critical() -> None:
     monitor, openings = formation(2), list[float]()
     for k in range(1500):
-        monitor.update(view(k, [0.05, 1.1]))  # headroom 0.08 on the slowest gains
+        update(monitor, k, [0.05, 1.1])  # headroom 0.08 on the slowest gains
         openings.append(monitor.opening)
     assert openings[-1] == pytest.approx(POLICY.open_factor)
     assert max(np.diff(openings)) == pytest.approx((POLICY.open_factor - 1) * 0.02 / POLICY.open_s)
     for k in range(1500, 3000):
-        monitor.update(view(k, [0.05, 0.05]))
+        update(monitor, k, [0.05, 0.05])
     assert monitor.opening == pytest.approx(1.0)

@@ -1,6 +1,7 @@
 """Each value of the tick record is in the column of its name."""
 
 from math import inf
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from gcs.link.startup import LaunchedStartup
 from gcs.link.vehicle import RemoteVehicle
 from gcs.plan.mismatch import Tolerated
 from gcs.station.monitor import VehicleState
-from gcs.station.tick_rows import Reported, Tick, VehicleTick, tick_rows
+from gcs.station.tick_rows import Reported, Tick, tick_rows
 
 S = 1_000_000_000
 
@@ -35,10 +36,18 @@ def test_every_column_holds_what_its_name_says() -> None:
     )
     monitored = VehicleState(mode=Mode.CAUTION, gain_set=1)
     reported = Reported(13_000, -100.0, 0.5, queue_s=0.001, received_ns=10 * S + 25_000_000, bound_s=3e-6)
-    seen = VehicleTick(
-        vehicle, monitored, control, reported, 0.07, 121.5, True, Tolerated((inf, 0.2), (0.2, 0.3)), 0.01
-    )
-    tick = Tick(number=11, time_s=0.22, due_ns=10 * S + 40_000_000, key_ms=220, vehicles=[seen, seen])
+    seen: list[Any] = [
+        vehicle,
+        monitored,
+        control,
+        reported,
+        0.07,
+        121.5,
+        True,
+        Tolerated((inf, 0.2), (0.2, 0.3)),
+        0.01,
+    ]
+    tick = Tick(11, 0.22, 10 * S + 40_000_000, 220, *([each, each] for each in seen))
     rows, used_s = tick_rows(tick, 10 * S + 50_000_000)
     expected = {
         "tick": 11, "time_s": 0.22, "due_ns": 10 * S + 40_000_000, "sent_ns": 10 * S + 50_000_000, "key_ms": 220,
@@ -66,8 +75,8 @@ def test_what_is_not_known_is_not_a_number() -> None:
     vehicle = RemoteVehicle(7, startup=LaunchedStartup(50.0))
     nan, pair = np.nan, (np.nan, np.nan)
     nothing = VehicleControl(0, (nan, nan, nan, nan), pair, pair, pair, 0)
-    seen = VehicleTick(vehicle, VehicleState(), nothing, Reported(), nan, nan, False, Tolerated((inf,), (0.4,)), 0.0)
-    rows, used_s = tick_rows(Tick(0, -1.0, S, 0, [seen]), S)
+    seen: list[Any] = [vehicle, VehicleState(), nothing, Reported(), nan, nan, False, Tolerated((inf,), (0.4,)), 0.0]
+    rows, used_s = tick_rows(Tick(0, -1.0, S, 0, *([each] for each in seen)), S)
     unknown = {name for name in TICK.names or () if rows[name].dtype.kind == "f" and np.isnan(rows[name][0])}
     floats = {name for name in TICK.names or () if TICK[name].kind == "f"}
     assert unknown == floats - {"time_s", "repeated_s", "assumed_delay_s", "delay_margin_s"}
