@@ -20,8 +20,8 @@ from scenarios.schema import NS_PER_S
 
 _UNANNOUNCED_S = 3.0
 _LEAD_S = 0.5
-"""The velocity target leads the vehicle's newest velocity by what its largest acceleration gains in this time, the age
-of that velocity and the delay down: more only builds up while the vehicle cannot follow."""
+"""The velocity target leads the vehicle's newest velocity by at most what its largest acceleration gains in this time
+plus the age of that velocity plus the delay down. More would only build up while the vehicle cannot follow."""
 _FRAME_RESOLUTION_M = 0.005
 """Half of the last digit of a latitude: an origin that seems to move by less has not moved."""
 

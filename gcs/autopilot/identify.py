@@ -76,8 +76,8 @@ class Flown:
     def velocities(self, responses: list[Response]) -> FloatArray:
         """The velocity at each sample of vehicles with each of these responses of one model, shape (k, n).
 
-        The acceleration and the velocity at the ticks are a convolution with their answers to one tick's command, and a
-        cubic joins them: a recurrence over ticks, whose matrix is squared instead of repeated.
+        At the ticks, acceleration and velocity are the commands convolved with the response to the command of one tick;
+        between ticks the velocity is a cubic. Squaring the matrix of one tick gives that response at all ticks.
         """
         m, h = self.command_m_s2.size, self.period_s
         dynamics = [own_dynamics(response) for response in responses]
@@ -131,7 +131,7 @@ def identify(flown: Flown) -> Generator[None, None, Identified | None]:
 
 
 def _chosen(rms: Mapping[str, float], residuals: FloatArray) -> str:
-    """The model with the least information criterion; residuals that resemble their neighbours count as fewer."""
+    """The model with the least information criterion; correlated residuals count as fewer samples."""
     n = residuals.size
     alike = float(residuals[1:] @ residuals[:-1]) / max(float(residuals @ residuals), 1e-300)
     count = max(10.0, n * (1.0 - alike) / (1.0 + alike)) if alike > 0.0 else float(n)

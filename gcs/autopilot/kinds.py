@@ -28,7 +28,7 @@ ARDUCOPTER = Kind(
     estimator_message=mavlink.EKF_STATUS_REPORT,
     stays_guided=True,
     velocity_grows=True,
-    timesync_error_ns=5_000_000,  # dated back by the bytes' time on a serial port, 3.5 ms at its 57600 baud
+    timesync_error_ns=5_000_000,  # backdated by the bytes' time on a serial port, 3.5 ms at 57600 baud
 )
 PX4_COPTER = Kind(
     "PX4 multicopter",
@@ -45,7 +45,7 @@ PX4_COPTER = Kind(
 
 
 def kind_of(autopilot: int, vehicle_type: int) -> Kind | str | None:
-    """The kind of vehicle that a HEARTBEAT shows, or why it cannot be flown; None while it does not know itself."""
+    """The kind of vehicle that a HEARTBEAT shows, or why it cannot be flown; None while it does not know yet."""
     if vehicle_type == _NOT_YET_KNOWN:
         return None  # ArduPilot before its motors are set up
     if vehicle_type == _FIXED_WING and autopilot == ARDUPILOT:

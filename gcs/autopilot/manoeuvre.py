@@ -32,7 +32,7 @@ class Identification:
         self._amplitude_m_s2 = identify.amplitude_m_s2(plan.scenario.limits.acceleration_max_m_s2)
         self._begin_ns: int | None = None
         self._commands: list[tuple[int, float]] = []
-        """When each acceleration was sent, and it."""
+        """Instant (ns) and acceleration north (m/s²) of each command."""
         self._downs_ns: list[list[int]] = [[] for _ in vehicles]
         """How long commands took to each vehicle."""
         self._samples: list[list[_Sample]] = [[] for _ in vehicles]

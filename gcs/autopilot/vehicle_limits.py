@@ -1,7 +1,7 @@
-"""What an autopilot follows at most: asked of it as parameters, and kept to by the commands it is sent.
+"""The most that an autopilot follows: read from its parameters, and kept to by the commands it is sent.
 
-A command beyond these is not followed, and the loop that is then closed is not the one whose margin is known: it cycles
-or overshoots. So far from its place a vehicle is led along a braking curve instead of the linear law.
+A command beyond these limits is not followed. The loop then closed is not the one whose margin is known: it cycles or
+overshoots. A vehicle far from its place is therefore led along a braking curve instead of by the linear law.
 """
 
 from collections.abc import Sequence
@@ -53,7 +53,7 @@ class ToldLimits:
         return None
 
     def take(self, fields: tuple[Any, ...]) -> None:
-        """Take in a PARAM_VALUE; a value that is no positive number says nothing."""
+        """Take in a PARAM_VALUE; a value that is not a positive number is ignored."""
         value, _, _, field, _ = fields
         name = field.partition(b"\0")[0].decode("ascii", "replace")
         names = [known for known, _ in _PARAMETERS.get(self._kind, ())]
@@ -116,7 +116,7 @@ class Bounds:
         return min(self._most_m_s2, self._limits[row].acceleration_bound_m_s2)
 
     def rest(self, row: int) -> None:
-        """The vehicle is commanded nothing: its next command starts from none."""
+        """The vehicle is commanded nothing; its next command starts from zero."""
         self._last[row], self._approaches[row] = (0.0, 0.0), True
 
     def bounded(self, controls: Sequence[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
@@ -139,10 +139,10 @@ class Bounds:
         return control._replace(command_m_s2=(north, east))
 
     def _braking(self, row: int, control: VehicleControl, blend: Blend, braking_m_s2: float) -> tuple[float, float]:
-        """What the linear law commands too much, far from its place.
+        """By how much the linear law commands too large an acceleration, far from the vehicle's place.
 
-        It approaches at lambda e with lambda = k3 / k1. Beyond e_0 = b / lambda^2 that would need a braking faster than
-        b, so that the speed there is sqrt(2 b (e - e_0 / 2)).
+        Under the law an error e closes at the speed lambda e, lambda = k3 / k1. Beyond e_0 = b / lambda^2 that would
+        need braking harder than b; the speed there is sqrt(2 b (e - e_0 / 2)) instead.
         """
         error_north, error_east = control.spacing_error_m
         error_m = hypot(error_north, error_east)

@@ -7,14 +7,14 @@ ArduPilot it is the acceleration, because the reported velocity grows with it; f
 reported acceleration is that of its velocity loop; from our own vehicles the acceleration, which is all they report.
 
 The *age* of a report is its instant minus the time at which the recognised set-point was due. If none is lost, it lies
-between the delivery delay and one control period more. So a set-point older than the least recent age but newer than
-the recognised one was lost, or is that late; the recognised one replaces it. The assumed delay is not used, so a delay
-mismatch has no effect here.
+between the delivery delay and one control period more. So a set-point that is newer than the recognised one, but older
+than the smallest of the last ages, was lost or is late; the recognised one replaces it. The assumed delay is not used,
+so a delay mismatch has no effect here.
 
-A vehicle that reports only an acceleration reports what it does. If this is none of the accelerations sent, but smaller
-than the expected one and in the same direction, the vehicle clips. Set-points under way are then assumed to be clipped
-to the same size until the vehicle exceeds it. An acceleration in another direction, as when a speed limit removes the
-part along the velocity, says nothing about the set-points under way.
+A vehicle that reports only an acceleration reports the one it follows. If this is none of those sent, but smaller than
+the expected one and in the same direction, the vehicle clips. Set-points under way are then assumed to be clipped to
+the same size until the vehicle exceeds it. An acceleration in another direction, as when a speed limit removes the part
+along the velocity, says nothing about the set-points under way.
 """
 
 import struct

@@ -1,8 +1,8 @@
 """Prediction with the loop on board: the state of the formation at the instant when a streamed acceleration acts.
 
 Vehicles feed back their own errors, so the motion of one depends on those in front of it. The state z of the formation
-has the velocity of each vehicle beside that at the start, and each spacing error p_i = Z_ahead - Z_i + offset_i. With
-the own loops as part of A (`gains.sampled.onboard.streamed_loop`), and w_i and v_d sent to vehicle i,
+holds each vehicle's velocity minus the nominal velocity at the start, and each spacing error p_i = Z_ahead - Z_i +
+offset_i. With the vehicles' own loops in A (`gains.sampled.onboard.streamed_loop`), and w_i and v_d sent to vehicle i,
 
     z' = A z + B u,   u_i = w_i - K_ii^v v_d.
 
@@ -30,7 +30,7 @@ from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from scenarios.schema import NS_PER_S
 
 _GRID_S = 1e-3
-"""Exponentials are computed for whole milliseconds and carried on from there to second order: right to 1e-9 at 20/s."""
+"""Exponentials are computed for whole milliseconds; a second-order series adds the rest: within 1e-9 at 20 1/s."""
 
 
 class Places:
@@ -97,14 +97,14 @@ class StreamPrediction:
         self._inputs[-1][row] = self._streamed[row] - self._on_velocity[row] @ self._target
 
     def used_ns(self, row: int) -> int:
-        """The instant of the oldest newest state that a vehicle's command needs; 0 if it needs none, or lacks one."""
+        """The instant of the oldest among the newest states that a command needs; 0 if it needs none, or lacks one."""
         newest = [self._history.newest(k) for k in self._needs[1][row]]
         return min((0 if report is None else report[0] for report in newest), default=0)
 
     def states(self, row: int) -> tuple[int, float, Places] | None:
         """When a vehicle's set-point acts (ns), the assumed loop delay (s), and the states at that instant.
 
-        None while a state or a delivery delay is unknown, and while a vehicle is lost whose motion matters.
+        None while a state or a delivery delay is unknown, or a vehicle whose motion matters is lost.
         """
         model, needed, used_ns = self._model, self._needs[1][row], self.used_ns(row)
         delays = [self._delivery_ns[k] for k in needed]

@@ -31,14 +31,14 @@ class _Mode(NamedTuple):
     share: complex
     """gamma."""
     owed: complex
-    """What 1 m/s of velocity owed adds to m; 0 if the response owes no velocity."""
+    """What 1 m/s of owed velocity adds to m; 0 if the response has no such state."""
 
 
 class Responding:
     """The motion of a vehicle with a response, for `gcs.control.prediction.CommandHistory`; it holds V, P and the m.
 
     The velocity in a set-point is the integral of all accelerations sent. A vehicle that holds an earlier set-point
-    strays from this velocity, and makes up for it when it takes the next: the velocity that it owes jumps.
+    strays from this velocity. When it takes the next, the velocity that it *owes*, set-point minus own, jumps.
     """
 
     def __init__(self, response: Response) -> None:

@@ -42,7 +42,7 @@ class Mode(IntEnum):
     NOMINAL = 1  # flying, loop delay well below the margin
     CAUTION = 2  # flying, little headroom left
     CRITICAL = 3  # flying, next to no headroom left: the station acts
-    FAILSAFE = 4  # heard, but it does not take set-points: it holds its velocity
+    FAILSAFE = 4  # heard, but it takes no set-points
     LOST = 5  # not heard
     RECOVERING = 6  # flying, its gains on the way back to faster ones
 
@@ -84,21 +84,21 @@ TICK = np.dtype(
         ("command_north_m_s2", "<f8"),  # set-point, acceleration; NaN when none was sent
         ("command_east_m_s2", "<f8"),
         ("nearest_m", "<f8"),  # distance to the nearest other vehicle, at the tick's instant; NaN while unknown
-        ("queue_s", "<f8"),  # from the kernel's receive stamp of the newest state to its use by a step
+        ("queue_s", "<f8"),  # wait of the newest state, from the kernel's receive stamp until the station read it
         ("up_delay_s", "<f8"),  # one-way delay of the newest state: from sample_ns to the kernel's receive stamp
         ("sample_bound_s", "<f8"),  # largest error of sample_ns, telemetry_age_s and up_delay_s (gcs/link/clocks.py)
-        ("down_delay_s", "<f8"),  # newest one-way delay to the vehicle, with the time it holds a set-point; or NaN
-        ("down_bound_s", "<f8"),  # most that it can be wrong
-        ("loop_delay_s", "<f8"),  # age of the oldest state used + down_delay_s - repeated_s; ground loop: of the newest
-        ("loop_delay_bound_s", "<f8"),  # error that clocks bring into it; NaN if others' states were used
-        ("repeated_s", "<f8"),  # how long the set-point has repeated an earlier one, as far as telemetry is slower
+        ("down_delay_s", "<f8"),  # newest one-way delay to the vehicle, and the time it holds set-points; or NaN
+        ("down_bound_s", "<f8"),  # largest error of down_delay_s
+        ("loop_delay_s", "<f8"),  # age of the state used + down_delay_s - repeated_s; onboard: of the oldest one used
+        ("loop_delay_bound_s", "<f8"),  # largest error that clocks bring into it; NaN if others' states were used
+        ("repeated_s", "<f8"),  # how long set-points have repeated one state because telemetry is slower
         ("assumed_delay_s", "<f8"),  # loop delay over which the vehicle was predicted; 0 without prediction
         ("delay_margin_s", "<f8"),  # longest delay that the gains flown tolerate, as known then; infinite: any
         ("headroom", "<f8"),  # 1 - loop delay / margin; with prediction 1 - mismatch / distance to the window's end
-        ("rtt_s", "<f8"),  # a TIMESYNC round trip that has ended and is in no earlier row; NaN if there is none
+        ("rtt_s", "<f8"),  # a completed TIMESYNC round trip that is in no earlier row; NaN if there is none
         ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock, at sent_ns
-        ("clock_offset_bound_s", "<f8"),  # most that it can be wrong
-        ("received", "<u4"),  # frames from this vehicle so far, and those lost, late, twice
+        ("clock_offset_bound_s", "<f8"),  # largest error of clock_offset_s
+        ("received", "<u4"),  # frames from this vehicle so far: received, lost, late (overtaken), duplicate
         ("lost", "<u4"),
         ("late", "<u4"),
         ("duplicate", "<u4"),

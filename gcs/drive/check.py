@@ -45,7 +45,7 @@ class PlannedMotionCheck(Published):
 
 
 class CourseCheck(Published):
-    """A course that takes time to change."""
+    """A smooth course, whose changes of velocity take time."""
 
     duration_s: float
     """When the last waypoint is reached or the last change is over."""

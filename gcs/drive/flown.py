@@ -33,8 +33,8 @@ class Flight:
     """A flight's log, in real or virtual time.
 
     `truth` holds when states were sampled and set-points acted, recorded by the vehicles; in virtual time only on
-    request. `steal_share` and `busy_share` are the fractions of the processor time that the host took away and that was
-    not idle; in real time only.
+    request. In real time only, `steal_share` is the fraction of the processor time that the host took away, and
+    `busy_share` the fraction in which processors were not idle.
     """
 
     ticks: TickArray
@@ -55,6 +55,7 @@ def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, w
 
 
 def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:
+    """Fly a plan in virtual time; `folder` and `with_truth` as for `fly_plan`."""
     station, records = Station(plan, start_ns=START_NS), list[tuple[int, ...]]()
     writer = None
     if folder is not None:
@@ -121,7 +122,7 @@ def fly_real_time(plan: FlightPlan, design: Design, folder: Path | None) -> Flig
 
 
 def _processor_times() -> IntArray:
-    """Ticks of all processors since boot: user, nice, system, idle, iowait, irq, softirq, steal."""
+    """Time of all processors since boot, in jiffies: user, nice, system, idle, iowait, irq, softirq, steal."""
     line = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0]
     return np.array(line.split()[1:9], dtype=np.int64)
 

@@ -105,7 +105,7 @@ def fly_lockstep(
     """
     station = station or Station(plan, start_ns=START_NS)
     vehicles = vehicles or vehicles_of(plan.scenario)
-    gc.freeze()  # garbage collection need not look again and again at what exists already
+    gc.freeze()  # garbage collection need not scan what exists already
     try:
         yield from _ticks(plan, station, vehicles, guard)
     finally:

@@ -77,7 +77,7 @@ class Mirror:
             elif frame.system_id in own or not addresses:
                 self.counters[f"refused {name} of or for a system that is not flown"] += 1
             elif _sets_our_rate(frame):
-                self.counters[f"refused {name} about the rate of the telemetry that is flown with"] += 1
+                self.counters[f"refused {name} about the rate of the telemetry used for control"] += 1
             else:
                 self.counters[f"passed on {name}"] += 1
                 outgoing += [(frame.data, address) for address in addresses]

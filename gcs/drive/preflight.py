@@ -22,11 +22,11 @@ from scenarios.schema import NS_PER_S, Scenario
 
 
 def unstable_loop(plan: FlightPlan) -> str | None:
-    """The root of the loop that grows even without delay; None if the loop has a delay margin.
+    """The fault of a loop that is unstable even without delay; None if the loop has a delay margin, or it is unknown.
 
-    A root of the continuous loop; if only sampling destabilises it, the growth rate of the sampled loop instead.
+    It names the unstable root of the continuous loop, or the growth rate of a loop that only sampling destabilises.
     """
-    if not plan.delay_margin_s <= 0.0:  # which NaN is not: unknown
+    if not plan.delay_margin_s <= 0.0:  # nor is NaN: an unknown margin
         return None
     control = plan.scenario.control
     key = "control.blocks" if control.blocks else "control.gains" if control.gains is not None else "control"

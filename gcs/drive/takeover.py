@@ -127,7 +127,7 @@ class Presence:
         host, port = self._link.address
         who = f"vehicle{'s' * (len(there) > 1)} {' '.join(map(str, there))}"
         return (
-            f"{who} at {host}:{port} {flown}, wanted vehicles of this very scenario or none: wait (those of a killed "
+            f"{who} at {host}:{port} {flown}, wanted vehicles of this same scenario or none: wait (those of a killed "
             f"station end within a minute), use --listen with another port, or fly them with --connect {host}:{port}"
         )
 

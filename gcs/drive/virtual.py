@@ -94,7 +94,7 @@ class VirtualFlight:
 
 
 def load_scenario(scenario: Path | str) -> Scenario:
-    """The scenario in a file, or the shipped one of this name. Raises scenarios.errors.ScenarioError if neither is."""
+    """The scenario in a file, or the shipped one of this name; scenarios.errors.ScenarioError if there is neither."""
     return load(located(str(scenario)))
 
 

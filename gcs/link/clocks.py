@@ -3,8 +3,8 @@
 One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The error of this offset
 is half the difference between the delays down and up, at most RTT / 2. Short round trips say most, so the estimate is a
 straight line fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. It works at any RTT and
-follows the drift of the vehicle's clock. When all exchanges of the window have queued for far longer than those of the
-line before, that line is carried on.
+follows the drift of the vehicle's clock. If all exchanges of the window queued for far longer than those behind the
+previous line, that line is extrapolated instead.
 
 The bound of the error does not depend on that line. The vehicle read its clock after the request left and before the
 reply arrived, so t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits move apart by
@@ -12,23 +12,24 @@ DRIFT_BOUND. The line is kept between them, and the bound is the distance to the
 loss and asymmetry as long as the clock drifts by less than DRIFT_BOUND and has not jumped since the newest exchange.
 
 Limits that contradict each other show that the clock has jumped, or that replies carry wrong stamps: an autopilot may
-date them back by the time that their bytes take on a serial port, and a simulator's clock slips. A contradiction by
+backdate them by the time that their bytes take on a serial port, and a simulator's clock slips. A contradiction by
 more than STAMPS_OFF_NS is a jump. A smaller one is in doubt; until it is decided, the bound covers the limits from
 before it and since. If later exchanges fit the limits from before, the contradiction was an error of stamps:
 `stamp_error_ns` is the largest seen so far, and later contradictions up to that size do not count. The eighth doubtful
 exchange in a row is a jump.
 
 A jump shorter than a round trip may not contradict the limits. But exchanges then lie farther from the line than their
-round trips, the earlier residuals and the known error of the stamps explain. They are doubtful, too; the third in a row
-that is off by more than STAMPS_OFF_NS is a jump.
+round trips, the earlier residuals and the known error of the stamps explain. Such exchanges are doubtful, too; the
+third in a row that is off by more than STAMPS_OFF_NS is a jump.
 
-An error of all stamps by the same time cannot be seen: it acts as an asymmetric link. `expected_error_ns` holds what is
-known beforehand of the errors of a kind of vehicle. To an error that exchanges have shown, the bound adds the least
+An error that is the same in all stamps cannot be seen: it looks like an asymmetric link. `expected_error_ns` holds what
+is known beforehand of the errors of a kind of vehicle. To an error that exchanges have shown, the bound adds the least
 round trip: the exchange that showed it may itself have been off by that much.
 
 Telemetry shows a jump sooner: a state cannot have been sampled after it was received, nor before one that was sent
-earlier. Such a state is refused, and an exchange is due at once to decide. Within the bound it is taken to have been
-sampled when it was received. An overtaken state may predate a jump: it proves nothing, and after a jump it is refused.
+earlier. Such a state is refused, and an exchange is due at once to decide. A state ahead of its reception by no more
+than the bound is taken to have been sampled when it was received. An overtaken state may predate a jump: it proves
+nothing, and after a jump it is refused.
 
 The loop delay of a loop closed over the ground is free of the offset's error, see `gcs.control.loop_delay`.
 """
@@ -56,7 +57,7 @@ fifths of all replies off, eight in a row that exceed all before are rarer than 
 STAMPS_OFF_NS = 20_000_000
 """The largest plausible error of a reply's stamp: 115 bytes at 57600 baud."""
 _SETTLED = 32
-"""A small jump before this many exchanges is not told from errors of stamps, whose size is not known yet."""
+"""Before this many exchanges a small jump cannot be told from errors of stamps, whose size is not yet known."""
 _UNUSUAL = 1.5
 """An exchange this many times farther from the line than any in the window is an outlier, not jitter."""
 _READING_NS = 1000
@@ -68,11 +69,11 @@ _DOUBTFUL_NS = 10_000
 """An exchange this close to the line is never doubtful."""
 _WEIGHT_FLOOR_NS = 200_000.0
 _TILT = 100e-6
-"""More than the rates of two crystals differ."""
+"""An upper bound of how much the rates of two crystals differ."""
 _WANDER = 10e-6
 """How far the rate of a crystal changes with its temperature."""
 _QUEUED_NS = 5_000_000.0
-"""Queues up to this never keep a line from being replaced by that of newer exchanges."""
+"""Queueing for up to this never keeps a new line from replacing the previous one."""
 _EVERY_SAMPLE = 32
 _ESTIMATE_EVERY = 4
 """After the first samples the line is fitted at every fourth only, to save time, and extrapolated in between."""

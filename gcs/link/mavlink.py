@@ -194,7 +194,7 @@ def _checked(data: bytes, refused: Counter[str]) -> Frame | None:
 
 
 def encode(msg_id: int, fields: tuple[Any, ...], *, sequence: int, system_id: int = STATION_SYSTEM_ID) -> bytes:
-    """One frame, by default from the station; `fields` in wire order."""
+    """One unsigned MAVLink 2 frame, by default from the station; `fields` in wire order, `sequence` modulo 256."""
     layout = _LAYOUTS[msg_id]
     payload = layout.packing.pack(*fields).rstrip(b"\0") or b"\0"
     source = system_id, STATION_COMPONENT_ID

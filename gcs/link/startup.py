@@ -48,7 +48,7 @@ class Startup(Protocol):
         ...
 
     def is_news(self, text: str) -> bool:
-        """Whether a text from the vehicle says what it has not just said."""
+        """Whether a text from the vehicle is new, not one that it only repeats."""
         ...
 
     def recognise(self, autopilot: int, vehicle_type: int) -> Kind:

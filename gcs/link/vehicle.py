@@ -81,7 +81,7 @@ class RemoteVehicle:
         """Whether the last frame taken in was sent after all the others."""
         self.clock = VehicleClock()
         self._lag = 0, -1
-        """The reported lag in ms, and how often the clock had jumped before; -1 before the first report."""
+        """The reported lag in ms, and how often the clock had jumped by then; -1 before the first report."""
         self.armed = False
         self.custom_mode = -1
         self.critical = False
@@ -124,6 +124,7 @@ class RemoteVehicle:
 
     @property
     def guided(self) -> bool:
+        """Whether it takes part in the flight: armed and in its guided mode, or flown by somebody else as planned."""
         return self.external or (self.armed and self.custom_mode == self.kind.guided_mode and not self.taken_over)
 
     @property
@@ -181,7 +182,7 @@ class RemoteVehicle:
         return replayed
 
     def named_int(self, fields: tuple[Any, ...]) -> None:
-        """Take in a NAMED_VALUE_INT: when set-points act that the vehicle holds."""
+        """Take in a NAMED_VALUE_INT: the lag after which the vehicle's held set-points act."""
         _, value, name = fields
         if name.rstrip(b"\0") == b"LAG_MS":
             self._lag = value, self.clock.jumps
@@ -190,7 +191,7 @@ class RemoteVehicle:
         """How long after `sent_ns` the set-point with this stamp acts: it arrives, and the vehicle may hold it.
 
         It acts when the vehicle's clock shows its stamp plus the reported lag. `key_ms` is 0 if the stamp is unknown.
-        None while the delay is.
+        None while the delay to the vehicle is unknown.
         """
         clock, (lag_ms, jumps) = self.clock, self._lag
         if clock.down_ns is None or not key_ms or jumps != clock.jumps or not clock.estimate.samples:

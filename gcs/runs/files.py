@@ -25,7 +25,7 @@ _EVENT = TypeAdapter(Event)
 
 
 def read_scenario(folder: Path) -> Scenario:
-    """The scenario of a run as flown; raises also scenarios.files.ScenarioError."""
+    """The scenario of a run as flown. Raises InputError if there is none, ScenarioError if the file is damaged."""
     if not (folder / SCENARIO_FILE).exists():
         raise InputError(f"{folder}: read no {SCENARIO_FILE}, wanted the folder of a run")
     return scenario_files.load(folder / SCENARIO_FILE)

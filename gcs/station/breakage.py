@@ -2,10 +2,10 @@
 
 A flight whose vehicles are that far from their places at the start does not begin (`not_formed`).
 
-A vehicle that returns from its pilot, its failsafe or silence may be far from its place, and the vehicles behind it,
-whose places are relative to it, as far from theirs. Their errors say nothing about the loop until they have had time to
-return. A vehicle is granted this time again only if it has been within the limit since, or if its pilot flew it: a
-formation that diverges while its vehicles keep entering their failsafe is broken.
+A vehicle that returns from its pilot, its failsafe or silence may be far from its place. So may the vehicles behind it,
+whose places are relative to it. Their errors say nothing about the loop until they have had time to return. A vehicle
+is granted this time again only if it has been within the limit since, or if its pilot flew it: a formation that
+diverges while its vehicles keep entering their failsafe is broken.
 """
 
 from collections.abc import Sequence

@@ -28,7 +28,7 @@ class FleetKind(Protocol):
     vehicles: list[RemoteVehicle]
     loop: Loop
     frame_ned_m: list[tuple[float, float, float]]
-    """Where each vehicle's local frame begins, in that of the first vehicle."""
+    """Origin of each vehicle's local frame, in the frame of the first vehicle."""
     speaks_mavlink_1_first: bool
     """Whether a vehicle may speak MAVLink 1 until it hears MAVLink 2."""
     holds_when_left_alone: bool
@@ -55,7 +55,7 @@ class FleetKind(Protocol):
         ...
 
     def bounded(self, controls: list[VehicleControl], blends: Sequence[Blend]) -> list[VehicleControl]:
-        """The commands of the control law, kept to what the vehicles are known to follow."""
+        """The commands of the control law, limited to what the vehicles are known to follow."""
         ...
 
     def locate(self, history: StateHistory) -> None:

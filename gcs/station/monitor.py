@@ -70,14 +70,14 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
     any                 formation not flown, vehicle in failsafe              FAILSAFE
     any                 formation not flown                                   WAITING
     any                 silent                                                LOST
+    any, released       h > caution + hysteresis for ease                     FAILSAFE, no longer released
+    any, released       otherwise                                             FAILSAFE
     any                 not guided                                            FAILSAFE
     LOST, FAILSAFE      heard and guided again                                RECOVERING, slowest set
     WAITING             guided                                                NOMINAL, fastest set
     any                 h < critical for hold, a slower set exists            CRITICAL, next slower set
-    any                 h < critical for hold, slowest set                    CRITICAL
     CRITICAL            h < 0 for hold, slowest set                           FAILSAFE, released
-    any, released       h > caution + hysteresis for ease                     FAILSAFE, no longer released
-    any, released       otherwise                                             FAILSAFE
+    any                 h < critical for hold, slowest set                    CRITICAL
     any, slower set     h+ > caution + hysteresis for ease                    RECOVERING, next faster set
     CRITICAL            h > critical + hysteresis for hold                    CAUTION
     NOMINAL             h < caution                                           CAUTION
@@ -104,7 +104,7 @@ def monitored(state: VehicleState, seen: Observation, margins_s: tuple[float, ..
 
 
 def _is_calm(state: VehicleState, loop_delay_s: float, margins_s: tuple[float, ...], policy: Monitor) -> bool:
-    """Whether the vehicle is NOMINAL with enough or unknown headroom and no condition lasts: true of most ticks."""
+    """Whether the vehicle is NOMINAL, its headroom enough or unknown, and no timer runs: true of most ticks."""
     nominal = state.mode is Mode.NOMINAL and state.pressed_s is None and state.eased_s is None
     return nominal and not headroom(loop_delay_s, margins_s[state.gain_set]) < policy.caution_headroom
 

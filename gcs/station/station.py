@@ -36,7 +36,7 @@ AUTOPILOT_COMPONENT = 1
 ANOTHER_ADDRESS = "known system id from another address"
 _HEARTBEAT_NS = NS_PER_S
 _REQUESTS_APART_NS = 7_000_000
-"""The station wakes for TIMESYNC requests no more often than this, and than three times a control period."""
+"""Least time between two wake-ups for TIMESYNC requests, or a third of the control period if that is shorter."""
 
 
 class Station:
@@ -296,7 +296,7 @@ class Station:
         return control if command_m_s2 is control.command_m_s2 else control._replace(command_m_s2=command_m_s2)
 
     def _decide(self, due_ns: int, outgoing: list[Outgoing]) -> None:
-        """Modes, lost vehicles and the flight's phase."""
+        """Update modes, absent vehicles and the flight's phase."""
         flying = self.phase is Phase.FLYING
         silence_ns = SILENCE_S * NS_PER_S
         silent = [self._now_ns - heard_ns > silence_ns for heard_ns in self._telemetry_ns]

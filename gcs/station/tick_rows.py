@@ -28,7 +28,7 @@ class Reported(NamedTuple):
     received_ns: int = 0
     """The kernel's stamp."""
     bound_s: float = nan
-    """The largest error of the instant at which it was sampled."""
+    """The largest error of the instant at which the state was sampled."""
 
 
 class Tick(NamedTuple):
@@ -48,7 +48,7 @@ class Tick(NamedTuple):
     """NaN while unknown."""
     commanded: Sequence[bool]
     tolerated: Sequence[Tolerated]
-    """How far the loop delay may be from the assumed one."""
+    """How far the loop delay may be from the assumed delay."""
     repeated_s: Sequence[float]
     """See `gcs.control.loop_delay.Repetitions`."""
 
@@ -56,7 +56,7 @@ class Tick(NamedTuple):
 def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
     """The rows of a tick whose set-points were handed over at `sent_ns`, and how much of its margin each vehicle uses.
 
-    The latter in s as of `gcs.plan.mismatch.Tolerated.used_s`: without prediction the loop delay.
+    That is in s, see `gcs.plan.mismatch.Tolerated.used_s`: the loop delay, or the mismatch with prediction.
     """
     packed: list[bytes] = []
     every_used_s: list[float] = []

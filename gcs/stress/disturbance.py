@@ -107,8 +107,9 @@ def find_disturbance_onsets(
 ) -> DisturbanceResult:
     """Fly the worst disturbances around the stability radii, of the errors of the first `counts` vehicles.
 
-    By default these are one follower with the leader, and the whole formation. `ended` is called after each flight.
-    Raises InputError if the scenario's loop has no such radii.
+    By default these are one follower with the leader, and the whole formation. Relative to the radius, `tolerance` is
+    half the range of the sizes flown in a round, `allowed` the largest distance of an onset from it. `ended` is called
+    after each flight. Raises InputError if the scenario's loop has no such radii.
     """
     probe, delay_s = _probe(plan)
     onsets = tuple(

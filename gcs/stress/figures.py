@@ -27,7 +27,8 @@ def growth_figure(
 ) -> Path | None:
     """Growth rate against loop delay: both models, the flights with their errors, and the residuals below.
 
-    The flights `own`, from the scenario's own initial states, are marked at the lower edge.
+    The flights `own`, from the scenario's own initial states, are marked at the lower edge. Returns the file; None, and
+    nothing is drawn, if no flight has a growth rate.
     """
     probes = [o for o in outcomes if o.growth_1_s is not None and o.loop_delay_s is not None]
     if not probes:

@@ -113,7 +113,10 @@ def fly_calm(plan: FlightPlan, folder: Path | None) -> Flight:
 def response_paired(
     plan: FlightPlan, calm: Flight, system_ids: tuple[int, ...], *, amplitude: float, folder: Path | None
 ) -> FreeResponse:
-    """Fly the second flight of a pair, with an error of the given vehicles, and subtract the first."""
+    """Fly the second flight of a pair, with an initial error of the given vehicles, and subtract the first, `calm`.
+
+    `amplitude` is that of `in_place`. Rows after the two flights differ in their ticks are left out.
+    """
     disturbed = replace(plan, scenario=in_place(plan, system_ids, amplitude=amplitude))
     flight = fly_virtual(disturbed, folder, with_truth=True)
     rows, calm_rows = _rows_of(flight.ticks, system_ids), _rows_of(calm.ticks, system_ids)

@@ -21,7 +21,7 @@ from scenarios.schema import Scenario
 REPORT_FILE = "report.html"
 _TEMPLATE = "flight_report.html.j2"
 _NAMED = len(COLOURS)
-"""Vehicles that get a colour of their own; of more, those with the least headroom."""
+"""Up to this many vehicles have a colour each; of more, only those with the least headroom."""
 _NAMED_OF_MANY = 3
 _MOST_EVENTS = 60
 _HEADROOM_LEAST = -1.0

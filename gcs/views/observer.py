@@ -80,7 +80,7 @@ def main() -> int:
         signal.signal(decided_by_parent, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, stop)
     outlive_readers()
-    os.environ.setdefault("RUST_LOG", "off")  # Rerun would write errors over the table; one line at the end says them
+    os.environ.setdefault("RUST_LOG", "off")  # or Rerun writes errors over the table; one line at the end reports them
     sys.meta_path.insert(0, _NoPandas())
     import_recording()
     os.nice(10)  # not before: the station waits until this is ready

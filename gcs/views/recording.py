@@ -6,7 +6,7 @@ about as much as a tick of two.
 
     formation/...   vehicles, trails, wanted places and links as seen from the leader, in m north, east, down of it
     ground/...      the same over the ground, local NED
-    spacing/...     spacing errors of the followers, and below what they count as settled
+    spacing/...     spacing errors of the followers, and the bound below which they count as settled
     delay/...       loop delay and round trip of each vehicle, and the margin of the gains it is flown with, in ms
     headroom/...    in %
     command/...     accelerations sent
@@ -274,7 +274,7 @@ class Recording:
 def length_s(recording: Path) -> float | None:
     """The last scenario time of a recording, None if nothing in it has a time."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it was cut short: what is left of it may do
+        warnings.simplefilter("ignore")  # it was cut short: what is left may suffice
         chunks = [chunk for chunk in RrdReader(recording).stream() if TIMELINE in chunk.timeline_names]
     columns = (chunk.to_record_batch().column(TIMELINE).cast("int64") for chunk in chunks)
     return max((1e-9 * time_ns for column in columns for time_ns in column.to_pylist()), default=None)
@@ -332,7 +332,7 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
 
     few = len(scenario.vehicles) <= LEGEND_MAX
     events = rrb.TextLogColumns(
-        timeline_columns=[TimelineColumn(timeline=TIMELINE, visible=False)],  # the text says it, as it was before 0 too
+        timeline_columns=[TimelineColumn(timeline=TIMELINE, visible=False)],  # the text has it, and times before 0
         text_log_columns=[TextLogColumn(kind="loglevel"), TextLogColumn(kind="body")],
     )
     return rrb.Blueprint(
@@ -365,7 +365,7 @@ def _blueprint(scenario: Scenario, design: Design, *, following: bool) -> Any:
 
 
 def _scene_view(root: str, scenario: Scenario) -> Any:
-    """A 3D view from behind and above, from so far that it holds the wanted formation."""
+    """A 3D view from behind and above, far enough away to show the whole wanted formation."""
     middle_m, reach_m = scene.wanted_extent_m(scenario)
     # What is long from north to south comes near the eye at its southern end: such a formation needs more room.
     radius_m = max(math.hypot(*reach_m), 1.4 * reach_m[0]) or 50.0

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SUCCESS, USAGE, INTERRUPTED = 0, 2, 130
 NS_PER_S = 1_000_000_000
 GOODBYE_NS = NS_PER_S
-"""Time between the shut-down of the last vehicle and the end, in which the last answers leave the links."""
+"""How long the program runs on after the last vehicle was told to shut down, so that its answer leaves the links."""
 
 DESCRIPTION = """\
 Fly the vehicles of a scenario: each is a MAVLink system of its own on its own UDP port, behind emulated links.
@@ -166,7 +166,7 @@ def _links_only(
 def _stop_rule(
     signals: list[int], start_ns: int, options: argparse.Namespace, say: "_Lines", fleet: "Fleet | None" = None
 ) -> Callable[[int, int], bool]:
-    """The rule that ends the command, from the time now and that of a station's last command."""
+    """The rule that ends the program, given the time now and the time of a station's last command."""
     duration_ns, silence_ns = options.duration * NS_PER_S, options.stop_after_silence * NS_PER_S
     alone_since_ns = start_ns if options.parent is None else math.inf
 
@@ -174,7 +174,7 @@ def _stop_rule(
         nonlocal alone_since_ns
         if alone_since_ns == math.inf and os.getppid() != options.parent:
             alone_since_ns = now_ns
-            say.line("the process that started this has gone")
+            say.line("the process that started this one has ended")
             if commanded_ns == start_ns:
                 return True  # nobody has flown them, so nobody will take them over
             if fleet is not None:
@@ -223,12 +223,12 @@ class _Lines:
             )
 
     def lateness(self, sockets: "Sockets") -> None:
-        """Report, at most once a second, datagrams that left too late for the links to be the scenario's."""
+        """Report, at most once a second, datagrams that left so late that the links differ from the scenario's."""
         late, now_ns = sockets.counters["left_late"], time.monotonic_ns()
         if late > self._late and now_ns - self._late_line_ns >= NS_PER_S:
             since_s = (now_ns - self._late_line_ns) / NS_PER_S
             self.line(
-                f"{(now_ns - self._start_ns) / NS_PER_S:8.3f} s  this host does not keep up: {late - self._late} "
+                f"{(now_ns - self._start_ns) / NS_PER_S:8.3f} s  this host cannot keep up: {late - self._late} "
                 f"datagrams left more than 5 ms late in {since_s:.1f} s, the latest {sockets.latest_ns / 1e6:.1f} ms"
             )
             self._late, self._late_line_ns, sockets.latest_ns = late, now_ns, 0

@@ -29,7 +29,7 @@ Datagram = tuple[int, bytes, int]
 """(system id of the vehicle, bytes, host time in ns)"""
 
 _SECTOR = 0
-"""Stands in for a system id where the disturbance that depends on the errors of all vehicles acts."""
+"""In place of a system id: the disturbance that depends on the errors of all vehicles."""
 _DUE_THEN_SYSTEM_ID = itemgetter(2, 0)
 
 
@@ -42,17 +42,17 @@ class _Member:
     leaves_ns: int = NEVER_NS
     """The earliest instant at which a datagram of this vehicle can leave its up link."""
     acts_ns: int = NEVER_NS
-    """Used in order of time only: when the vehicle next acts, or a datagram reaches it."""
+    """When the vehicle next acts, or a datagram reaches it. Used only if events run in order of time."""
 
 
 class Fleet:
     """The vehicles and links of a scenario.
 
     Vehicles do not affect each other, so each is brought up to date only when one of its datagrams can leave, in order
-    of that time and of system id. This is not too late for anything, as all that a vehicle does has its exact instant.
-    There are three exceptions: in a shared channel one vehicle's datagrams delay another's, a sensor sees another
-    vehicle, and a disturbance may depend on the errors of all. Then events run in order of time; at one instant, first
-    the disturbance, then the station's datagrams, then the vehicles by system id.
+    of that time and of system id. Nothing comes too late by this: every event carries its exact instant. There are
+    three exceptions: in a shared channel one vehicle's datagrams delay another's, a sensor sees another vehicle, and a
+    disturbance may depend on the errors of all. Then events run in order of time; at one instant the station's
+    datagrams first enter their links, then the disturbance acts, then the vehicles by system id.
 
     `signed` holds the vehicles' ends of signed links by system id: they sign what the vehicles send, and the vehicles
     get only what could be verified.
@@ -76,9 +76,9 @@ class Fleet:
         """(leaves_ns, system id); an entry that its member contradicts is stale and skipped."""
         self._links = LinkSet(scenario, start_ns, record=record)
         self._acts: list[tuple[int, int]] = []
-        """Used in order of time only: (acts_ns, system id); stale entries are skipped."""
+        """(acts_ns, system id), if events run in order of time; stale entries are skipped."""
         self._entering: list[tuple[int, int, int, bytes]] = []
-        """Used in order of time only: (time, system id, number, data) of the station's datagrams, earliest first."""
+        """The station's datagrams if events run in order of time: (time, system id, number, data), earliest first."""
         self._entered = 0
         sensors = scenario.control.loop == "onboard"
         experiment = f"{fingerprint(scenario)} {scenario.name}"[:LONGEST_TEXT]
@@ -179,7 +179,7 @@ class Fleet:
             member = self._members[system_id]
             if leaves_ns != member.leaves_ns:
                 continue
-            self._live(member, now_ns)
+            self._catch_up(member, now_ns)
             for entry in member.up.due(now_ns):
                 out.append((system_id, entry[3], entry[0]))
                 if self._record is not None:
@@ -189,7 +189,7 @@ class Fleet:
         return out
 
     def _begin(self, data: bytes, time_ns: int) -> None:
-        """The station's first set-point begins the flight of a leader flown by somebody else."""
+        """Begin the flight of a leader flown by somebody else, at the station's first set-point."""
         if self._external is not None and is_set_point(data):
             self._external.begin(time_ns)
             self._external = None
@@ -201,7 +201,7 @@ class Fleet:
         if self._in_order:
             self._run_in_order((), now_ns)
         member = self._members[system_id]
-        self._live(member, now_ns)
+        self._catch_up(member, now_ns)
         self._plan(member)
         return member.vehicle.craft.state_at(now_ns)
 
@@ -231,7 +231,7 @@ class Fleet:
                 member = self._members[acting_id]
                 if acts_ns != member.acts_ns:
                     continue
-                self._live(member, acts_ns)
+                self._catch_up(member, acts_ns)
             else:
                 return
             self._plan(member)
@@ -246,7 +246,7 @@ class Fleet:
             craft.push(push, now_ns)
         heapq.heappush(self._acts, (now_ns + self._sector.period_ns, _SECTOR))
 
-    def _live(self, member: _Member, now_ns: int) -> None:
+    def _catch_up(self, member: _Member, now_ns: int) -> None:
         """Bring a vehicle up to date; what it sends enters its up link."""
         arrived: list[tuple[bytes, int]] = []
         if member.down.next_due_ns <= now_ns:

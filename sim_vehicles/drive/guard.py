@@ -1,4 +1,4 @@
-"""Signing at the vehicles' ends of their links: one for each vehicle, all with the same key."""
+"""Signing at the vehicles' ends of their links: one end for each vehicle, all with the same key."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,7 +9,7 @@ from scenarios.signing.stamps import Stamps, open_stamps
 from sim_vehicles.services.mavlink import CRC_EXTRA
 
 LINK_ID = 0
-"""The link id of the one socket that each vehicle has."""
+"""The link id in signatures; one serves, as each vehicle has one socket."""
 
 
 def signed_links(key: Key, system_ids: Iterable[int], *, epoch_ns: int, stamps: Stamps) -> dict[int, SignedLink]:

@@ -27,11 +27,11 @@ class Peers:
         self._station = station
         self._silence_ns = silence_ns
         self._station_side: dict[int, int] = {}
-        """System id to the file number of the socket that the station hears it from."""
+        """System id to the file descriptor of the socket that the station hears it from."""
         self._system_ids: dict[int, int] = {}
         """The inverse of `_station_side`."""
         self._peers: dict[tuple[int, tuple[str, int]], int] = {}
-        """(File number of our port, the vehicle's address) to system id."""
+        """(File descriptor of our port, the vehicle's address) to system id."""
         self._addresses: dict[int, tuple[int, tuple[str, int]]] = {}
         """System id to the port and address of the vehicle's last datagram."""
         self._heard_ns: dict[int, int] = {}
@@ -51,7 +51,7 @@ class Peers:
             if holds_key(datagram.data):
                 self.sockets.counters["refused_setup_signing"] += 1
                 continue
-            system_id = self._system_ids.get(datagram.file_number)
+            system_id = self._system_ids.get(datagram.descriptor)
             if system_id is not None:
                 received.append(Passing(datagram.time_ns, LINK_DOWN, system_id, datagram.data))
             elif (system_id := self._vehicle(datagram)) is not None:
@@ -64,8 +64,8 @@ class Peers:
             if kind == LINK_UP:
                 self.sockets.send(self._station_side[system_id], data, due_ns)
             else:
-                file_number, address = self._addresses[system_id]
-                self.sockets.send(file_number, data, due_ns, address)
+                descriptor, address = self._addresses[system_id]
+                self.sockets.send(descriptor, data, due_ns, address)
 
     def take_changes(self) -> list[Change]:
         """The vehicles found since the last call."""
@@ -74,7 +74,7 @@ class Peers:
 
     def _vehicle(self, datagram: Received) -> int | None:
         """The vehicle that sent a datagram to one of our ports, or None if that is unknown or refused."""
-        place = datagram.file_number, datagram.address
+        place = datagram.descriptor, datagram.address
         system_id = self._peers.get(place) or sender(datagram.data)
         if system_id is None:
             self.sockets.counters["refused_peer"] += 1

@@ -19,11 +19,11 @@ from scenarios.schema import NS_PER_S
 from sim_vehicles.drive.fleet import Datagram
 
 LONGEST_SPIN_NS, SPIN_OF_ALL_NS = 100_000, 2_000_000
-"""How long the loop polls the clock before a due time instead of sleeping, because with few vehicles the wake-up is
-most of the error. The second figure bounds the sum over all vehicles, to a tenth of a core at 50 Hz."""
+"""How long before a due time the loop polls the clock instead of sleeping: with few vehicles, late wake-ups are most of
+the error. The second figure bounds the sum over all vehicles, to a tenth of a core at 50 Hz."""
 TOGETHER_NS = 1_000
-"""The loop wakes at most once in this time per vehicle, and handles what is close together at once: 250 vehicles act
-and receive about 30,000 times a second."""
+"""Between two wake-ups pass at least this times the number of vehicles; what is due by then is handled together. 250
+vehicles act and receive about 30,000 times a second."""
 LONGEST_WAIT_NS = NS_PER_S // 10
 """The loop checks at least this often whether to stop."""
 DATAGRAM_BYTES = 2048
@@ -42,7 +42,7 @@ _STAMP = struct.Struct("qq")
 class Received(NamedTuple):
     """A datagram with its receiving socket, the instant at which it reached this host, and its sender."""
 
-    file_number: int
+    descriptor: int
     data: bytes
     time_ns: int
     address: tuple[str, int]
@@ -62,7 +62,7 @@ class Sockets:
         self._emptied_ns = self._woken_ns = time.monotonic_ns()
 
     def add(self, *, bind: tuple[str, int] | None = None, connect: tuple[str, int] | None = None) -> int:
-        """Open a socket, bound or connected, and return its file number; a connected one hears only its peer.
+        """Open a socket, bound or connected, and return its file descriptor; a connected one hears only its peer.
 
         Raises OSError if the address cannot be used.
         """
@@ -97,27 +97,28 @@ class Sockets:
         self._woken_ns = time.monotonic_ns()
 
     def receive(self) -> list[Received]:
+        """Everything that has arrived, at most `READS_PER_WAKE` datagrams from each socket."""
         begin_ns = time.monotonic_ns()
         to_monotonic_ns = self._clocks.to_monotonic_ns()
         received: list[Received] = []
         emptied = True
-        for file_number, _ in self._epoll.poll(0):
+        for descriptor, _ in self._epoll.poll(0):
             read = 0
-            for data, stamp_ns, address in self._read(self._sockets[file_number]):
+            for data, stamp_ns, address in self._read(self._sockets[descriptor]):
                 # Stamps jump if the wall clock is set, but nothing arrived before the sockets were last empty.
                 latest_ns = time.monotonic_ns()
                 time_ns = latest_ns if stamp_ns is None else stamp_ns + to_monotonic_ns
                 time_ns = min(max(time_ns, self._emptied_ns), latest_ns)
-                received.append(Received(file_number, data, time_ns, address))
+                received.append(Received(descriptor, data, time_ns, address))
                 read += 1
             emptied = emptied and read < READS_PER_WAKE
         if emptied:
             self._emptied_ns = begin_ns
         return received
 
-    def send(self, file_number: int, data: bytes, due_ns: int, address: tuple[str, int] | None = None) -> None:
+    def send(self, descriptor: int, data: bytes, due_ns: int, address: tuple[str, int] | None = None) -> None:
         """Send to the address, or to the socket's peer; failures are counted."""
-        own = self._sockets[file_number]
+        own = self._sockets[descriptor]
         try:
             if address is None:
                 own.send(data)
@@ -157,11 +158,11 @@ class Ports:
     def __init__(self, system_ids: tuple[int, ...], station: tuple[str, int]) -> None:
         self.sockets = Sockets()
         try:
-            self._file_numbers = {system_id: self.sockets.add(connect=station) for system_id in system_ids}
+            self._descriptors = {system_id: self.sockets.add(connect=station) for system_id in system_ids}
         except OSError:
             self.sockets.close()
             raise
-        self._system_ids = {number: system_id for system_id, number in self._file_numbers.items()}
+        self._system_ids = {number: system_id for system_id, number in self._descriptors.items()}
 
     def receive(self) -> list[Datagram]:
         """Everything that has arrived, with the instants at which it reached this host."""
@@ -170,7 +171,7 @@ class Ports:
 
     def send(self, datagrams: list[Datagram]) -> None:
         for system_id, data, due_ns in datagrams:
-            self.sockets.send(self._file_numbers[system_id], data, due_ns)
+            self.sockets.send(self._descriptors[system_id], data, due_ns)
 
 
 class _Clocks:

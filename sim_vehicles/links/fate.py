@@ -39,7 +39,7 @@ class Fate(NamedTuple):
 
     fate: int
     bad: bool
-    """The link's state for the next datagram."""
+    """Whether the next datagram finds the link in its bad state."""
     delay_ns: int
     duplicate_delay_ns: int
     """-1 if there is no second copy."""
@@ -94,7 +94,10 @@ def constant(link: link_keys.Link) -> bool:
 
 
 def outcome(link: LinkBehaviour, *, bad: bool, time_ns: int, draws: Draws) -> Fate:
-    """The fate of a datagram that enters at a link time, before any channel or full link drops it."""
+    """The fate of a datagram that enters at link time `time_ns`, with the link's state `bad` since the last datagram.
+
+    A channel or a full link may still drop it.
+    """
     bad = draws.burst >= link.to_good if bad else draws.burst < link.to_bad
     fate = PASSED
     for from_ns, until_ns in link.outages_ns:
@@ -114,7 +117,7 @@ def outcome(link: LinkBehaviour, *, bad: bool, time_ns: int, draws: Draws) -> Fa
 
 
 def delay_at(link: LinkBehaviour, time_ns: int) -> int:
-    """The delay without jitter at a link time: linear between points; at a step, that after it."""
+    """The delay without jitter at a link time: linear between points; at a step, the delay after it."""
     points = link.points_ns
     if len(points) == 1:
         return points[0][1]

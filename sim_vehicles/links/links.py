@@ -21,7 +21,7 @@ CAPACITY = 10_000
 """Most datagrams under way, twice what 100 s of delay at 50 Hz need. A full link drops and counts the rest."""
 
 SETPOINT_IDS = (82, 84, 86)
-"""SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first of them begins the flight."""
+"""SET_ATTITUDE_TARGET and SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: the first such message begins the flight."""
 
 
 def is_set_point(data: bytes) -> bool:
@@ -118,7 +118,7 @@ class Link:
         return sum(self.counts[FATES[fate]] for fate in (truth.LOST, truth.OUTAGE, truth.QUEUE_FULL, LINK_FULL))
 
     def send(self, data: bytes, time_ns: int) -> None:
-        """Take in a datagram that enters the link at a time."""
+        """Take in a datagram that enters the link at `time_ns`."""
         self.entered += 1  # also the order of datagrams that are due at one instant: first in, first out
         if self._stream is not None:
             self._send_drawn(data, time_ns, self._stream)
@@ -138,7 +138,7 @@ class Link:
         return out
 
     def row(self, entry: Entry, time_ns: int) -> Row:
-        """The truth record of a datagram that left at a time."""
+        """The truth record of a datagram that left at `time_ns`."""
         due_ns, _, entered_ns, data, fate, queued_ns = entry
         return self.kind, self.system_id, message_id(data), time_ns, entered_ns, due_ns, fate, queued_ns
 

@@ -1,6 +1,6 @@
 """The links of a scenario in front of other programs' vehicles, as one function of datagrams and time.
 
-The system id of its first frame identifies a vehicle; only headers are read. A vehicle gets the same links, random
+A vehicle is known by the system id of its first frame; only headers are read. A vehicle gets the same links, random
 streams and truth log that it would have in a Fleet.
 """
 
@@ -49,7 +49,7 @@ def holds_key(data: bytes) -> bool:
 
 
 class Relay:
-    """Links between any vehicles and a station."""
+    """The links of a scenario between a station and any vehicles; `next_event_ns` says when to call `step` next."""
 
     def __init__(self, scenario: schema.Scenario, start_ns: int, *, record: Record | None = None) -> None:
         self.last_heard_ns = start_ns

@@ -1,7 +1,7 @@
 """The truth log: what happened and when, on the host's clock. The station's estimates are graded against it.
 
-The file is a magic and then fixed-size records, written in batches: a killed process loses its last batch at most. An
-incomplete record at the end is skipped when reading and overwritten when the log is continued.
+The file is a magic number followed by fixed-size records, written in batches: a killed process loses its last batch at
+most. An incomplete record at the end is skipped when reading and overwritten when the log is continued.
 """
 
 import contextlib
@@ -70,7 +70,10 @@ Record = Callable[[Row], None]
 
 
 class TruthLog:
-    """A truth log open for writing; pass its `record` to a Fleet."""
+    """A truth log open for writing, a new one or one to continue; pass its `record` to a Fleet.
+
+    Raises ValueError if the file is of another kind, and OSError if it cannot be opened.
+    """
 
     def __init__(self, path: Path) -> None:
         self.lost = 0
@@ -115,7 +118,7 @@ class TruthLog:
 
 
 def disturbance_row(kind: int, system_id: int, key: int, time_ns: int, north: float, east: float) -> Row:
-    """The record of a disturbance with these components in SI units."""
+    """The record of a disturbance, PUSHED to VELOCITY_ERROR, whose components are in the units of `disturbances`."""
     return kind, system_id, key, time_ns, round(north * _PARTS), round(east * _PARTS)
 
 

@@ -1,8 +1,9 @@
 """What pushes a vehicle in flight besides its own acceleration: wind, gusts, and what the fleet adds.
 
-A push is constant for an interval: an acceleration, and a velocity that carries the vehicle along without being its
-own. Half of the change of velocity is applied before the vehicle's own motion in that interval and half after it. This
-is exact for a double integrator within its limits, and of second order in 10 ms where motion depends on velocity.
+A push is constant for an interval: an acceleration, and a velocity that carries the vehicle along but does not show in
+its own velocity. Half of the change of velocity is applied before the vehicle's own motion in that interval and half
+after it. This is exact for a double integrator within its limits, and of second order in 10 ms where motion depends on
+velocity.
 
 Gusts are a first-order process with the exact stationary variance, drawn every `STEP_NS` and held. Their instants count
 from the start of the vehicles, so common gusts push all of them at once.
@@ -92,8 +93,8 @@ class Air:
     ) -> Moved:
         """The motion at a later instant; `move` is the vehicle's own motion over a duration in s.
 
-        `shift` adds changes of position (north, east) and velocity to a motion. `foreseen`: this time will be asked
-        for again, so nothing is recorded and nothing forgotten.
+        `shift` adds changes of position (north, east) and velocity to a motion. `foreseen`: a look ahead over
+        an interval that will be computed again, so nothing is recorded or forgotten.
         """
         while from_ns < to_ns:
             push, until_ns = self._at(from_ns)
@@ -130,6 +131,6 @@ class Air:
 
 
 def air_of(scenario: Scenario, system_id: int, start_ns: int, record: Record | None) -> Air | None:
-    """What pushes a vehicle; None in still air, unless the scenario names the vehicle's dynamics."""
+    """What pushes a vehicle; None in still air, unless the scenario names the user's own dynamics."""
     still = scenario.disturbance is None and scenario.dynamics in BUILT_IN
     return None if still else Air(scenario, system_id, start_ns, record)

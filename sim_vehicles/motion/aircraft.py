@@ -4,12 +4,13 @@ The autopilot follows the commanded acceleration w by way of a reference that an
 
     a_r'' = ω² (w - a_r) - 2 ζ ω a_r',   v_r' = a_r,   ω = 2 rad/s, ζ = 0.8
 
-Of a_r + (v_r - v) 3 1/s, the part along the flight sets the throttle and the part across it the bank angle of a
-coordinated turn. The elevator holds the altitude, the rudder keeps the turn coordinated. What each control does to the
-model at this speed is measured before the flight. Divided by it, one set of gains flies different models.
+Of a_r + k (v_r - v), k = 3 1/s, the component along the course sets the throttle, and the component across it the bank
+angle of a coordinated turn. The elevator holds the altitude, the rudder keeps the turn coordinated. How strongly each
+control acts on the model at this speed is measured before the flight. Gains are divided by that, so that one set of
+gains flies different models.
 
-Autopilot and model run every 10 ms, with the mean of what was commanded since. In between, and for what is foreseen,
-the acceleration stays as it was. Vectors in the plane are complex numbers, north + j east.
+Autopilot and model run every 10 ms, with the mean of what was commanded since. In between, and when looking ahead, the
+acceleration is held. Vectors in the plane are complex numbers, north + j east.
 """
 
 import cmath
@@ -29,7 +30,7 @@ STEP_S = 0.01
 FOOT_M = 0.3048
 _OMEGA_RAD_S, _DAMPING, _VELOCITY_1_S = 2.0, 0.8, 3.0
 _OWED_M_S = 0.5
-"""How far the reference goes ahead of an aircraft that cannot follow."""
+"""Most by which the velocity of the reference differs from that of an aircraft that cannot follow."""
 _BANK_1_S, _ROLL_1_S, _BANK_MAX_RAD = 5.0, 12.0, math.radians(60.0)
 _CLIMB_1_S, _CLIMB_1_S2 = 0.5, 0.05
 """Climb rate per height to go, and per its integral."""
@@ -42,13 +43,13 @@ _NUDGES = (
         for control, rate in (("aileron", "p"), ("elevator", "q"), ("rudder", "r"))
     ),
 )
-"""Each control, the rate that it changes, for how long that is watched in s, and the unit of the rate."""
+"""Each control, the quantity that it changes, for how long that is observed in s, and its unit in SI."""
 _NUDGE = 0.05
 _FULL_TRIM = 1
 
 
 class Attitude(NamedTuple):
-    """What an aircraft shows beside its motion in the plane, at its last step; angles as in MAVLink's ATTITUDE."""
+    """Height gained, climb rate and angles of an aircraft at its last step; angles as in MAVLink's ATTITUDE."""
 
     climbed_m: float
     climb_m_s: float
@@ -103,7 +104,7 @@ class Aircraft:
         return self._shown
 
     def foreseen(self, state: State, command: Command, bounds: Bounds, duration_s: float) -> State:
-        """The same without remembering it, by the present acceleration."""
+        """The state after `duration_s` at the present acceleration; the aircraft itself is not advanced."""
         del command, bounds  # the model has its own limits
         north, east = state.velocity_ne_m_s()
         t, a_north, a_east = duration_s, self._acceleration.real, self._acceleration.imag
@@ -112,16 +113,16 @@ class Aircraft:
         return state_from(place, (north + t * a_north, east + t * a_east))
 
     def climbed(self) -> tuple[float, float]:
-        """Height since the start and climb rate, at the last step."""
+        """Height gained since the start, and climb rate, at the last step."""
         return self._model["position/h-sl-ft"] * FOOT_M - self._height_m, self._model["velocities/h-dot-fps"] * FOOT_M
 
     def attitude(self) -> Attitude:
-        """The same and the angles."""
+        """Height gained, climb rate and angles, at the last step."""
         roll, pitch, heading = (self._model[f"attitude/{angle}-rad"] for angle in ("phi", "theta", "psi"))
         return Attitude(*self.climbed(), roll, pitch, heading)
 
     def _step(self, wanted: complex) -> None:
-        """Autopilot and model, a step further."""
+        """Run autopilot and model for one step."""
         pull = _OMEGA_RAD_S**2 * (wanted - self._followed)
         self._jerk += STEP_S * (pull - 2.0 * _DAMPING * _OMEGA_RAD_S * self._jerk)
         self._followed += STEP_S * self._jerk
@@ -159,13 +160,13 @@ class Aircraft:
 
 
 class _FlightError(Exception):
-    """Why a model cannot be flown, as what was wanted."""
+    """A model cannot be flown; the text names what was wanted."""
 
 
 def _levelled(name: str, speed_m_s: float, altitude_m: float, course_rad: float) -> Any:
     """A model of the package in steady level flight over a course."""
     try:
-        jsbsim: Any = import_module("jsbsim")  # without types of its own
+        jsbsim: Any = import_module("jsbsim")  # has no type stubs
     except ModuleNotFoundError:
         raise _FlightError("the package jsbsim: pip install 'formation-gcs[jsbsim]'") from None
     folder = Path(jsbsim.__file__).parent
@@ -176,7 +177,7 @@ def _levelled(name: str, speed_m_s: float, altitude_m: float, course_rad: float)
     model.set_debug_level(0)
     try:
         model.load_model(name)
-        model.disable_output()  # that of the model, which would be written into this folder
+        model.disable_output()  # the model's own, which would be written into the working directory
         model.set_dt(STEP_S)
         for key, value in (
             ("ic/h-sl-ft", altitude_m / FOOT_M),
@@ -194,13 +195,13 @@ def _levelled(name: str, speed_m_s: float, altitude_m: float, course_rad: float)
     except (jsbsim.BaseError, RuntimeError) as error:
         wanted = f"a model that flies level at {speed_m_s:g} m/s and {altitude_m:g} m ({' '.join(str(error).split())})"
         raise _FlightError(wanted) from None
-    model.set_trim_status(False)  # its engines would respond at once
+    model.set_trim_status(False)  # while it is set, engines respond at once
     return model
 
 
 @lru_cache(maxsize=16)
 def _effects(name: str, speed_m_s: float, altitude_m: float) -> dict[str, float]:
-    """The acceleration (m/s² or rad/s²) that each whole control adds to steady flight."""
+    """The acceleration (m/s² or rad/s²) that full deflection of each control adds to steady flight."""
     found: dict[str, float] = {}
     for control, rate, duration_s, unit in _NUDGES:
         ends: list[float] = []

@@ -34,7 +34,7 @@ class Motion(NamedTuple):
     climb_m_s: float = 0.0
     yaw_rad: float = 0.0
     inner: Inner | None = None
-    """What its response remembers; None if that is a plain lag, without a jerk limit."""
+    """What its response remembers; None for a plain lag without a jerk limit."""
 
 
 class Target(NamedTuple):

@@ -4,8 +4,8 @@
     lag with dead time  lag a'(t) = w(t - T) - a(t)
     second order        a'' / omega_n^2 + lag a' = w - a
 
-for north and east. |w| is clipped to the acceleration limit, and then its change to the jerk limit. Within a step w is
-held at its mean. The plain lag without these is in `sim_vehicles.motion.copter`.
+for north and east. |w| is clipped to the acceleration limit, then the change of w to the jerk limit. Within a step w is
+held at its mean. The plain lag without a jerk limit is in `sim_vehicles.motion.copter`.
 """
 
 import math
@@ -25,11 +25,11 @@ class Inner(NamedTuple):
     jerk_m_s3: Vector = (0.0, 0.0)
     """a', of a second order."""
     line: _Line = ()
-    """What has been aimed at in the last dead time, oldest first: duration in s, north, east."""
+    """Delay line: the accelerations aimed at in the last dead time, oldest first, as (duration in s, north, east)."""
 
 
 def inner_of(settings: schema.Autopilot) -> Inner | None:
-    """The memory of a response at rest; None if a plain lag serves."""
+    """The memory of a response at rest; None for a plain lag without a jerk limit."""
     if not (settings.dead_time_s or settings.natural_frequency_rad_s or settings.jerk_max_m_s3):
         return None
     return Inner(line=((settings.dead_time_s, 0.0, 0.0),) if settings.dead_time_s else ())
@@ -90,7 +90,7 @@ def _second_order(a: float, jerk: float, to: float, settings: schema.Autopilot, 
 
 
 def _shifted(line: _Line, h: float) -> tuple[_Line, Vector]:
-    """The line without its oldest `h` seconds, and their mean."""
+    """The delay line without its oldest `h` seconds, and their mean."""
     north = east = 0.0
     left_s, first = h, 0
     while first < len(line):

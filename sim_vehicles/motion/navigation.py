@@ -12,7 +12,11 @@ Pair = tuple[float, float]
 
 
 class Navigator:
-    """The errors of one vehicle's reports. Each report draws eight numbers, whichever are used."""
+    """The errors of one vehicle's reports: white noise plus a bias b, a first-order Gauss-Markov process.
+
+    b(t + h) = f b(t) + sqrt(1 - f^2) sigma w, f = exp(-h / bias_time_s), with w standard normal. Each report draws
+    eight numbers, whichever are used.
+    """
 
     def __init__(self, scenario: Scenario, system_id: int, record: Record | None) -> None:
         own = scenario.navigation

@@ -4,11 +4,11 @@ The function is `step(state, command, dt_s, memory)`, which returns the state `d
 
     state    (4,): position north and east in m, velocity north and east in m/s
     command  (2,): the commanded acceleration north and east in m/s²
-    dt_s     at most `LONGEST_STEP_S`, and as short as the time between two messages
+    dt_s     at most `LONGEST_STEP_S`; it may be as short as the time between two messages
     memory   a dict of this vehicle's own, empty at the start; the only thing it may remember in
 
-After a step that raises an exception or returns anything but four finite numbers of a possible size, the vehicle has
-moved at constant velocity; this is counted.
+In a step that raises an exception, or returns anything but four finite numbers within FARTHEST_M and FASTEST_M_S, the
+vehicle keeps its velocity; such faults are counted.
 """
 
 import copy

@@ -57,7 +57,7 @@ class SectorBound:
 
 
 class AllPass:
-    """A filter (c + 1/z) / (1 + c/z) for each row of a signal (k, 2); c = 1 passes it on."""
+    """A filter (c + 1/z) / (1 + c/z) for each row of a signal (k, 2); c = 1 leaves it unchanged."""
 
     def __init__(self, coefficients: tuple[float, ...], count: int) -> None:
         self._c = np.array(coefficients or (1.0,) * count)[:, np.newaxis]

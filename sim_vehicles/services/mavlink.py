@@ -1,7 +1,7 @@
 """The vehicles' side of MAVLink 2: datagrams to messages, and messages to frames.
 
 Each datagram is split into frames on its own: with pymavlink's stream parser a truncated frame would swallow the next
-datagram. pymavlink's message tables do the rest, and its decoder all but the frequent messages. Refused frames are
+datagram. The message tables are pymavlink's, and so is the decoder of all but the frequent messages. Refused frames are
 counted by reason; nothing is raised.
 """
 

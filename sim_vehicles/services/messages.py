@@ -82,7 +82,7 @@ def parameter_error(message: ParameterRead | ParameterSet) -> Message:
 
 
 def text_value(name: str, text: str) -> Message:
-    """PARAM_EXT_VALUE of the one parameter whose value is text."""
+    """PARAM_EXT_VALUE of the one parameter whose value is text: up to 128 ASCII characters, the name up to 16."""
     kind = dialect.MAV_PARAM_EXT_TYPE_CUSTOM
     return dialect.MAVLink_param_ext_value_message(name.encode("ascii"), text.encode("ascii"), kind, 1, 0)
 

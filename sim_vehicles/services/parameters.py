@@ -165,4 +165,4 @@ ARDUPILOT_SETUP, PX4_SETUP = (
     [Parameter(name, value, whole=isinstance(value, int)) for name, value in values.items()]
     for values in (_ARDUPILOT_VALUES, _PX4_VALUES)
 )
-"""Without effect, but QGroundControl warns of a vehicle without a frame, calibrated sensors, a radio and a battery."""
+"""They have no effect. Without them QGroundControl warns that frame, sensors, radio or battery are not set up."""

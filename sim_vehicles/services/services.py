@@ -1,7 +1,7 @@
 """What every kind of vehicle answers when a ground station asks for more than telemetry.
 
-Most ground stations greet a vehicle with a request for AUTOPILOT_VERSION. From then on the vehicle also sends, slowly,
-the reports that they expect. Our own station does not greet, and is sent only what it requests.
+Most ground stations greet a vehicle with a request for AUTOPILOT_VERSION. From then on the vehicle also sends, at
+low rates, the reports that they expect. Our own station does not greet, and is sent only what it requests.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Clock errors of a vehicle in SITL: TIMESYNC replies that are dated back, and slips when the simulator lags."""
+"""Clock errors of a vehicle in SITL: backdated TIMESYNC replies, and slips when the simulator lags."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ from sim_vehicles.services.draws import Use, draws_of
 
 
 def backdating_ns(scenario: Scenario, system_id: int) -> Iterator[int]:
-    """By how much each TIMESYNC reply of a vehicle is dated back, without end; empty where replies are exact."""
+    """By how much (ns) each TIMESYNC reply of a vehicle is backdated, without end; empty where replies are exact."""
     most_ns = round(scenario.autopilot.sitl.timesync_back_s * NS_PER_S)
     rng = draws_of(scenario.seed, system_id, Use.BACKDATING)
     while scenario.dynamics == "autopilot" and scenario.autopilot.sitl.timesync_back_s > 0.0:
@@ -15,7 +15,7 @@ def backdating_ns(scenario: Scenario, system_id: int) -> Iterator[int]:
 
 
 def slips(scenario: Scenario, system_id: int, start_ns: int) -> Iterator[tuple[int, int]]:
-    """When a boot clock falls behind, and by how much: (host time in ns, change in ns), without end."""
+    """When a boot clock slips, and by how much: (host time in ns, change in ns), without end; empty without slips."""
     sitl, time_ns = scenario.autopilot.sitl, start_ns
     rng = draws_of(scenario.seed, system_id, Use.SLIPS)
     while sitl.slip_s:

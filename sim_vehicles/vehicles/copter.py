@@ -95,7 +95,7 @@ class Copter:
             motion, _ = self._flown(time_ns, foreseen=True)
         return state_from(motion[0:2], motion[2:4])
 
-    # What happens by itself
+    # Timed events
 
     @property
     def deadline_ns(self) -> int:
@@ -286,7 +286,7 @@ class Copter:
 
     @property
     def _steers(self) -> bool:
-        """Whether it follows set-points, or stands because they have stopped."""
+        """Whether it follows set-points, or hovers because they have stopped."""
         return self.mode == self.rules.guided_mode and not self.landed and self._takeoff_m is None
 
     def _active_target(self, boot_ms: int) -> messages.Message:

@@ -29,7 +29,7 @@ TEMPORARILY_REJECTED, FAILED = 1, 4
 PX4_TAKEOFF_ALTITUDE = "MIS_TAKEOFF_ALT"
 """The parameter with the altitude above ground, in m, of a take-off command without an altitude."""
 MOST_JERK_M_S3 = 20.0
-"""What both autopilots allow at most, for a vehicle without a limit."""
+"""The jerk limit that a vehicle without one reports: the most that both autopilots allow."""
 GROUND_DISARM_S = 10.0
 """Both autopilots disarm if they have not taken off this long after arming."""
 

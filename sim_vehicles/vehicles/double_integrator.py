@@ -54,7 +54,7 @@ _ACCELERATION_ONLY = POSITION_AXES | VELOCITY_AXES | YAW_IGNORED | YAW_RATE_IGNO
 
 
 LAG_INTERVAL_US = 200_000
-"""Time between two reports of when set-points that are held act."""
+"""Time between two reports of the lag after which held set-points act."""
 
 
 class DoubleIntegrator:
@@ -103,7 +103,7 @@ class DoubleIntegrator:
 
     @property
     def deadline_ns(self) -> int:
-        """When the first set-point held acts, or the failsafe begins unless a station is heard before."""
+        """When the first held set-point acts, or the failsafe begins unless a station is heard before."""
         if self._hold is not None and self._hold.next_ns <= self.flight.deadline_ns:
             return self._hold.next_ns  # a set-point on the deadline is in time
         return self.flight.deadline_ns
@@ -124,7 +124,7 @@ class DoubleIntegrator:
         self.flight.hear_heartbeat(max(time_ns, self._state_ns))
 
     def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str:
-        """Fly a set-point from now on, or from when it is to act; if it is valid and allowed."""
+        """Fly a valid and allowed set-point from now on or, if set-points are held, from when it is to act."""
         if self._hold is None:
             return self._fly(setpoint, time_ns)
         if self._hold.take(setpoint, time_ns, self._radio.clock):
@@ -216,7 +216,7 @@ class DoubleIntegrator:
             self._radio.tell(time_ns, MODE_NAMES[mode] + (", failsafe over" if before[1] else ""))
         return result, ""
 
-    # What happens by itself
+    # Timed events
 
     def happen(self, time_ns: int) -> None:
         if self._hold is not None and self._hold.next_ns <= time_ns:
@@ -279,7 +279,7 @@ class DoubleIntegrator:
         return encoder.pack(messages.report(message_id, self._condition(boot_ms)))
 
     def _lag(self, boot_ms: int) -> bytes | None:
-        """When held set-points act, once there are any."""
+        """The lag after which held set-points act; None before the first."""
         lag_ms = None if self._hold is None else self._hold.lag_ms
         if lag_ms is None:
             return None
@@ -347,5 +347,5 @@ class DoubleIntegrator:
         counters = self._radio.counters
         counters["model_faults"] += 1
         if counters["model_faults"] == 1:
-            self._radio.tell(self._state_ns, f"its dynamics: {text}")
+            self._radio.tell(self._state_ns, f"fault in its dynamics: {text}")
             self._radio.say(self._state_ns, f"dynamics: {text}"[:50])  # the characters of one chunk

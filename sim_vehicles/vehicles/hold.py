@@ -1,8 +1,8 @@
 """Holds set-points until a fixed time after their stamps, so that jitter becomes constant delay: a playout buffer.
 
-The stamp, time_boot_ms, is of the station's clock, so only differences of (arrival - stamp) matter. The 99th percentile
-of the last ones is the *lag*: a set-point acts when the vehicle's clock shows its stamp plus the lag. One that arrives
-later acts at once.
+The stamp, time_boot_ms, is in the station's clock, the arrival in the vehicle's; their unknown offset is constant. The
+*lag* is the 99th percentile of the last differences arrival - stamp, offset included. A set-point acts when the
+vehicle's clock shows its stamp plus the lag. One that arrives later acts at once.
 """
 
 import heapq
@@ -17,7 +17,8 @@ from sim_vehicles.services.mavlink import Setpoint
 _ARRIVALS = 500
 """Set-points of which the lag is a percentile: 10 s at 50 Hz."""
 _LONGEST_MS = 5000
-"""A lag longer than this after an arrival is of other stamps: of another station, or before the clock was set."""
+"""If the lag exceeds a new difference by more than this, the older stamps were of another station, or of a clock that
+has been set since: they are forgotten."""
 
 
 class Hold:

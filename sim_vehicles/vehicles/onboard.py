@@ -27,7 +27,7 @@ _AXES = "NE"
 _NAMES_P, _NAMES_V = ([f"FORM_{kind}_{i}{j}" for i in _AXES for j in _AXES] for kind in ("KP", "KV"))
 
 Look = tuple[float, float, float, float]
-"""Position and velocity of another vehicle relative to this one, north and east."""
+"""What the sensor measures: position and velocity of another vehicle relative to this one, north and east."""
 
 
 def formation_parameters() -> list[Parameter]:
@@ -94,7 +94,7 @@ class VehicleLoop:
         self._own_m_s2 = north, east
 
     def command(self) -> Command:
-        """The command in action; zero until the first set-point has brought v_d."""
+        """The command u; zero until the first set-point has brought v_d."""
         (own_north, own_east), (north, east) = self._own_m_s2, self._streamed_m_s2
         whole = own_north + north, own_east + east
         return Command(*whole) if math.isfinite(sum(whole)) else Command()

@@ -65,9 +65,11 @@ class Radio:
         self.out.append((frame, time_ns))
 
     def say(self, time_ns: int, text: str, severity: int = mavlink.SEVERITY_CRITICAL) -> None:
+        """Send a STATUSTEXT."""
         self.send(self.encoder.statustext(severity, text), time_ns)
 
     def tell(self, time_ns: int, text: str) -> None:
+        """Note a change, for whoever runs the simulation."""
         self.changes.append(Change(time_ns, self.system_id, text))
 
     def acted(self, setpoint: mavlink.Setpoint, time_ns: int) -> None:
@@ -101,7 +103,7 @@ class Craft(Protocol):
     def acts_at(self, time_ns: int) -> int: ...
     def hear_heartbeat(self, time_ns: int) -> None: ...
 
-    def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str: ...  # the counter to raise
+    def take_setpoint(self, setpoint: mavlink.Setpoint, time_ns: int) -> str: ...  # the counter to increment
     def command(self, command: mavlink.Command, time_ns: int) -> Answer | None: ...  # None: it is not about flying
     def change_mode(self, mode: int | None, time_ns: int) -> Answer: ...  # None: an unknown one
     def parameters_set(self, time_ns: int) -> None: ...

@@ -209,7 +209,7 @@ def test_a_display_connecting_in_flight_does_not_slow_the_telemetry() -> None:
                 other.sendto(data, address)
             passed = mirror.passed_on([vehicle], 0)
     assert [data for data, _ in passed] == sent[len(slowing) :]
-    refused = "refused {} about the rate of the telemetry that is flown with"
+    refused = "refused {} about the rate of the telemetry used for control"
     assert mirror.counters[refused.format("REQUEST_DATA_STREAM")] == 2
     assert mirror.counters[refused.format("COMMAND_LONG")] == mirror.counters[refused.format("COMMAND_INT")] == 1
 
