@@ -6,8 +6,6 @@ formation flies with several seeds, and is carried only if it holds with all of 
 as soon as it ends, so that a study can be resumed.
 """
 
-import contextlib
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from math import ceil, log2
@@ -23,8 +21,9 @@ from gcs.drive.preflight import bad_start, endless_link, unstable_loop
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.published import json_text
-from gcs.runs.record import SCENARIO_FILE, RecordLog, write_whole
+from gcs.runs.record import SCENARIO_FILE, write_whole
 from gcs.station.station import Station
+from gcs.stress.campaign import Store, check_study
 from gcs.studies.benchmark import with_vehicles
 from scenarios.files import dump
 from scenarios.schema import Scenario
@@ -257,37 +256,22 @@ class LoadStore:
     """
 
     def __init__(self, folder: Path, scenario: Scenario, *, resume: bool) -> None:
-        self._folder, self._loads = folder, dict[tuple[float, int, int], Load]()
-        file, text = folder / SCENARIO_FILE, dump(scenario)
-        if resume and not file.is_file():
-            raise InputError(f"--resume: read no {SCENARIO_FILE} in {folder}, wanted the folder of a capacity study")
-        if resume and file.read_text(encoding="utf-8") != text:
-            raise InputError(f"--resume: {folder} holds a study of another scenario, wanted {file}")
-        write_whole(file, text.encode())
-        self._log = RecordLog(folder / LOADS_FILE)
-        lines = (folder / LOADS_FILE).read_bytes()
-        for line in lines.splitlines():
-            with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; it is flown again
-                self._keep(Load(**json.loads(line)))
-        if lines and not lines.endswith(b"\n"):
-            self._log.add(b"\n")
+        self._folder = folder
+        if resume:
+            check_study("--resume", folder / LOADS_FILE, "capacity study", dump(scenario))
+        write_whole(folder / SCENARIO_FILE, dump(scenario).encode())
+        self._store = Store(folder / LOADS_FILE, Load, lambda load: (load.rate_hz, load.vehicles, load.seed))
 
     def fly(self, scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
         """The flight of this many vehicles at a rate, from the folder or flown now."""
-        stored = self._loads.get((rate_hz, vehicles, scenario.seed))
-        if stored is not None:
-            return stored
-        load = fly_loaded(scenario, rate_hz, vehicles)
-        self._log.add((json.dumps(asdict(load), allow_nan=False) + "\n").encode())
-        return self._keep(load)
+        flown, key = self._store.flown, (rate_hz, vehicles, scenario.seed)
+        if key not in flown:
+            self._store.add(fly_loaded(scenario, rate_hz, vehicles))
+        return flown[key]
 
     def write_result(self, found: list[Capacity]) -> None:
         """Write capacity.json."""
         write_whole(self._folder / RESULT_FILE, json_text({"capacities": [asdict(each) for each in found]}).encode())
 
     def close(self) -> None:
-        self._log.close()
-
-    def _keep(self, load: Load) -> Load:
-        self._loads[load.rate_hz, load.vehicles, load.seed] = load
-        return load
+        self._store.close()
