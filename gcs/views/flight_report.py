@@ -14,6 +14,7 @@ from gcs.runs.record import DESIGN_FILE, SUMMARY_FILE, write_whole
 from gcs.runs.summary_record import Summary
 from gcs.views.page import rendered
 from gcs.views.report import flight_lines
+from gcs.views.scene import MODE_COLORS
 from gcs.views.svg import COLOURS, OTHERS, Level, Line, chart
 from gcs.views.table import at_once
 from scenarios.schema import Scenario
@@ -26,15 +27,7 @@ _NAMED_OF_MANY = 3
 _MOST_EVENTS = 60
 _HEADROOM_LEAST = -1.0
 """Headrooms below this are drawn at the lower edge."""
-_MODE_COLOURS = {
-    Mode.NOMINAL: "#2e7d32",
-    Mode.RECOVERING: "#00838f",
-    Mode.CAUTION: "#f0a020",
-    Mode.CRITICAL: "#c62828",
-    Mode.FAILSAFE: "#8e24aa",
-    Mode.LOST: "#5d1620",
-    Mode.WAITING: "#9aa3ad",
-}
+_MODE_COLOURS = {mode: "#{:02x}{:02x}{:02x}".format(*color) for mode, color in MODE_COLORS.items()}
 
 
 class Charted(NamedTuple):

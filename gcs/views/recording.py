@@ -50,15 +50,6 @@ _CURVES = {
 }
 """Curves with one line for each vehicle: the column of the ticks, and what it is multiplied by."""
 
-MODE_COLORS: dict[Mode, Color] = {
-    Mode.WAITING: (110, 110, 120),
-    Mode.NOMINAL: (56, 142, 60),
-    Mode.RECOVERING: (38, 166, 154),
-    Mode.CAUTION: (245, 166, 35),
-    Mode.CRITICAL: (229, 57, 53),
-    Mode.FAILSAFE: (171, 71, 188),
-    Mode.LOST: (120, 20, 30),
-}
 LIMIT_COLOR: Color = (255, 72, 66)
 PALE: Color = (130, 135, 145)
 
@@ -263,7 +254,7 @@ class Recording:
         for level in self._levels:
             lines(level.path, [level.name], [LIMIT_COLOR if level.limit else PALE], 3.5 if level.limit else 1.0)
         names = [mode.name for mode in Mode]
-        lanes = rr.StateConfiguration(values=names, labels=names, colors=[MODE_COLORS[mode] for mode in Mode])
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=[scene.MODE_COLORS[mode] for mode in Mode])
         for label in labels:
             self._stream.log(f"modes/{label}", lanes, static=True)
 

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Mode, TickArray
 from gcs.plan.course import PlannedMotion
 from gcs.plan.formation import plan_formation
 from scenarios.schema import Scenario
@@ -29,6 +29,16 @@ PALETTE: tuple[Color, ...] = (
     (240, 240, 240), (66, 165, 245), (255, 167, 38), (102, 187, 106), (236, 90, 160),
     (255, 238, 88), (38, 198, 218), (171, 130, 255), (239, 83, 80), (174, 213, 129),
 )  # fmt: skip
+
+MODE_COLORS: dict[Mode, Color] = {
+    Mode.WAITING: (110, 110, 120),
+    Mode.NOMINAL: (56, 142, 60),
+    Mode.RECOVERING: (38, 166, 154),
+    Mode.CAUTION: (245, 166, 35),
+    Mode.CRITICAL: (229, 57, 53),
+    Mode.FAILSAFE: (171, 71, 188),
+    Mode.LOST: (120, 20, 30),
+}
 
 
 def vehicle_colors(count: int) -> list[Color]:
