@@ -64,7 +64,6 @@ class ToldLimits:
 
     @property
     def acceleration_bound_m_s2(self) -> float:
-        """The largest acceleration that the vehicle is sent."""
         told = self._told[0]
         return ACCELERATION_M_S2 if told is None else _ACCELERATION_SHARE * told
 
@@ -75,7 +74,6 @@ class ToldLimits:
         return JERK_M_S3 if told is None else _JERK_SHARE * told
 
     def in_words(self) -> str:
-        """The bounds, and where they are from."""
         told = [
             f"{name} {value:g} {unit}"
             for (name, _), value, unit in zip(

@@ -34,7 +34,6 @@ def _wide_console() -> Console:
 
 
 def print_result(result: CampaignResult, folder: Path) -> None:
-    """Print the onset beside the margin, the points of the sweep, and where the files are."""
     console = _wide_console()
     margin_s, points = result.delay_margin_s, result.points
     if result.gains.margin_unknown:
@@ -87,7 +86,6 @@ def _against(result: CampaignResult, onset: Onset) -> str:
 
 
 def _limit(result: CampaignResult) -> str:
-    """What the onset is compared with."""
     return "sampled margin" if result.gains.prediction is None else "end of the mismatch window"
 
 
@@ -115,7 +113,6 @@ def _columns(axes: list[str]) -> dict[str, Callable[[Outcome], str]]:
 
 
 def print_reflown(reflown: Reflown) -> None:
-    """Print the outcome of a trial that was flown again, and whether it is identical."""
     console, outcome = plain_console(), reflown.outcome
     console.print(f"trial    {outcome.id}, {outcome.kind}, seed {outcome.seed}, {place_text(outcome.coordinates)}")
     console.print(f"verdict  {outcome.verdict}: {outcome.reason}")
@@ -145,7 +142,6 @@ def checks_of(result: CampaignResult) -> list[Check]:
 
 
 def print_disturbances(result: DisturbanceResult) -> None:
-    """Print the onsets of disturbances beside the stability radii."""
     console = _wide_console()
     columns: dict[str, Callable[[DisturbanceOnset], str]] = {
         "errors of": lambda o: "one follower" if len(o.vehicles) == 2 else "all vehicles",

@@ -19,7 +19,6 @@ _WHOLE_CORE = 0.95
 
 
 def print_comparison(scenario: Scenario, routes: list[Route], grown: list[DesignCost]) -> None:
-    """Print the figures of all routes side by side, and how long designs take as the formation grows."""
     console = plain_console()
     columns: dict[str, Callable[[tuple[str, list[str]]], str]] = {"": lambda row: row[0]}
     columns |= {route.method: lambda row, k=k: row[1][k] for k, route in enumerate(routes)}
@@ -70,7 +69,6 @@ _LOAD_COLUMNS: dict[str, Callable[[Load], str]] = {
 
 
 def print_benchmark(result: Benchmark) -> None:
-    """Print how much faster than real time flights are, and the station's share of its period."""
     how = "compiled" if result.compiled else "interpreted"
     print(f"{result.vehicles} vehicles at {result.control_hz:g} Hz, one core, hot path {how}")
     print(
@@ -99,7 +97,6 @@ def print_benchmark(result: Benchmark) -> None:
 
 
 def print_peers(found: SideBySide) -> None:
-    """Print a row for each figure, and the peers that are not compared with."""
     console = plain_console()
     columns: dict[str, Callable[[Row], str]] = {
         "": lambda row: f"{row.peer}: {row.work}",
@@ -118,7 +115,6 @@ def print_peers(found: SideBySide) -> None:
 
 
 def print_cluster(found: ClusterMap) -> None:
-    """Print the efficiency of a map on Dask, and what each trial costs beside its flight."""
     print(f"map             {found.trials} trials of {found.seconds:g} s on Dask, {1e3 * found.trial_s:.0f} ms each")
     print(
         f"{found.workers} workers       {found.all_workers_s:.1f} s; one takes {found.one_worker_s:.1f} s: "
@@ -133,7 +129,6 @@ def print_cluster(found: ClusterMap) -> None:
 
 
 def print_real_time(result: RealTimeBenchmark) -> None:
-    """Print how punctual the station was, and the errors of its measurements."""
     control = result.control
     p50, p99 = (ms_text(late_s, ".3f") for late_s in (control.lateness_s.p50, control.lateness_s.p99))
     print(f"{result.reason}; load {result.load_average:.1f}, {result.steal_share:.1%} taken by the host")

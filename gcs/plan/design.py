@@ -95,7 +95,6 @@ class VehicleResponse(Published):
 
     @property
     def response(self) -> Response:
-        """The response itself."""
         return Response(self.lag_s, self.velocity_gain_1_s, self.dead_time_s, self.natural_frequency_rad_s)
 
 

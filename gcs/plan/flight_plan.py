@@ -70,7 +70,6 @@ class FlightPlan:
 
     @cached_property
     def margins_s(self) -> tuple[float, ...]:
-        """The delay margins of the gain schedule."""
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
 
     @cached_property
@@ -107,7 +106,6 @@ class FlightPlan:
 
     @property
     def model(self) -> FormationModel:
-        """The formation's error model."""
         return self.formation.model
 
     @property

@@ -42,7 +42,6 @@ def write_design(folder: Path, design: Design) -> None:
 
 
 def write_experiment(folder: Path, scenario: Scenario, design: Design) -> None:
-    """Write what is to be flown into a run's folder."""
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(scenario), encoding="utf-8")
     write_code(scenario, folder)
     write_design(folder, design)
@@ -83,7 +82,6 @@ def _from_parquet(file: Path) -> TickArray:
 
 
 def _checked(file: Path, kind: type[_Record], wanted: str) -> _Record:
-    """The record of a kind that a JSON file holds."""
     with usable(file, wanted):
         text = file.read_bytes()
     try:

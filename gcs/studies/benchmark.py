@@ -73,8 +73,6 @@ class RealTimeBenchmark(Grade):
 
 
 class _Flown(NamedTuple):
-    """The run time of a flight."""
-
     ticks: int
     core_share: float
     s_per_tick: float
@@ -171,7 +169,6 @@ def _cost(signed: list[_Flown], plain: list[_Flown]) -> SigningCost:
 
 
 def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchmark:
-    """Fly `seconds` of a scenario over UDP."""
     from gcs.runs.summary import finish
 
     designed, plan = flight_plan(without_solver(scenario, seconds))

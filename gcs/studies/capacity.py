@@ -253,7 +253,6 @@ class LoadStore:
         return flown[key]
 
     def write_result(self, found: list[Capacity]) -> None:
-        """Write capacity.json."""
         write_whole(self._folder / RESULT_FILE, json_text({"capacities": [asdict(each) for each in found]}).encode())
 
     def close(self) -> None:

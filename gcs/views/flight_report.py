@@ -31,8 +31,6 @@ _MODE_COLOURS = {mode: "#{:02x}{:02x}{:02x}".format(*color) for mode, color in M
 
 
 class Charted(NamedTuple):
-    """A chart with its heading and what its lines are."""
-
     title: str
     svg: str
     note: str

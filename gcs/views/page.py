@@ -30,7 +30,6 @@ def percent_text(value: float | None, form: str = "+.3%") -> str:
 
 
 def data_uri(png: Path) -> str:
-    """A picture as an address that holds it."""
     return "data:image/png;base64," + base64.b64encode(png.read_bytes()).decode("ascii")
 
 

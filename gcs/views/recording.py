@@ -105,11 +105,9 @@ class Recording:
         self._events += events
 
     def redesigned(self, design: Design) -> None:
-        """Name the margins of another design."""
         self._stream.send_blueprint(_blueprint(self._scenario, design))
 
     def send(self) -> None:
-        """Write what was added."""
         if self._events:
             self._send_events(self._events)
         ticks = np.concatenate(self._ticks) if self._ticks else np.empty((0, 1), TICK)
@@ -208,7 +206,6 @@ class Recording:
             self._columns(f"{root}/trails", time_s, pieces)
 
     def _send_events(self, events: list[Event]) -> None:
-        """One entry for what one tick says of several vehicles."""
         said = at_once(events)
         times_s = np.array([max(event.time_s, 0.0) for event, _ in said])
         texts = [event_text(event, system_ids, self._before_s) for event, system_ids in said]
@@ -216,7 +213,6 @@ class Recording:
         self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
 
     def _log_scene_styles(self) -> None:
-        """Colours, names and sizes of what moves."""
         colors, few = scene.vehicle_colors(len(self._labels)), len(self._labels) <= LABELS_MAX
         own = [colors[k] for k in self._tree.followers]
         spacing_m = min((math.hypot(*offset) for offset in self._tree.offsets_m[:, :2]), default=1.0)
@@ -236,8 +232,6 @@ class Recording:
                 self._stream.log(f"{root}/{name}", strips, static=True)
 
     def _log_plot_styles(self) -> None:
-        """Colours, names and widths of the curves."""
-
         def lines(path: str, names: list[str], colors: list[Color], width: float = 1.5) -> None:
             style = rr.SeriesLines(colors=colors, names=names, widths=[width] * len(names))
             self._stream.log(path, style, static=True)

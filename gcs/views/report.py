@@ -276,7 +276,6 @@ def _reason(summary: Summary) -> str:
 
 
 def delay_text(summary: Summary) -> str:
-    """Loop delay against the margin."""
     delay, margin_s = summary.loop_delay_s, summary.delay_margin_s
     margin = "no limit" if margin_s is None else f"margin {ms_text(margin_s)}"
     if summary.margin_unknown:
@@ -317,11 +316,9 @@ def response_text(response: ResponsePart | None) -> str:
 
 
 def _code_text(code: tuple[CodeRecord, ...]) -> str:
-    """The files of code with their hashes."""
     return ", ".join(f"{each.file}, sha256 {each.sha256[:_HASH]}" for each in code)
 
 
 def _law_text(law: LawRecord) -> str:
-    """How often a law was called, and how often in vain or too long."""
     slow = "" if law.over_budget is None else f", {law.over_budget} over {1e3 * law.budget_s:g} ms"
     return f"{law.calls} calls, {law.unusable} without a usable command{slow}"

@@ -77,7 +77,6 @@ class Tree:
 
 
 def tree_of(scenario: Scenario) -> Tree:
-    """The formation's tree as arrays."""
     index = {vehicle.system_id: k for k, vehicle in enumerate(scenario.vehicles)}
     formation = plan_formation(scenario)
     rows = [formation.row(vehicle.system_id) for vehicle in scenario.vehicles]

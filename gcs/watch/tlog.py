@@ -40,7 +40,6 @@ def read_tlog(file: Path) -> TelemetryLog:
 
 
 def parse_tlog(data: bytes) -> TelemetryLog:
-    """The frames of a log's bytes."""
     stamps_us: list[int] = []
     frames: list[mavlink.Frame] = []
     counters: Counter[str] = Counter()
