@@ -1,6 +1,6 @@
 """`gcs stress`: fly the formation at many link delays, and see whether it breaks where the margin predicts.
 
-The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
+The work is in `gcs.stress`; what is printed is in `gcs.cli.results`.
 """
 
 import contextlib
@@ -110,7 +110,7 @@ def stress(
         _disturb(scenario_file, study.plan, delay, tolerance=tolerance, allowed=assert_onset, out=out, as_json=as_json)
     if junit is not None:
         options.out_file("--junit", junit)
-    from gcs.cli.stress_output import checks_of, print_reflown, print_result
+    from gcs.cli.results import checks_of, print_reflown, print_result
     from gcs.drive.preflight import endless_link
     from gcs.runs.junit import write_junit
     from gcs.stress.axes import parse_axis
@@ -203,7 +203,7 @@ def _disturb(
     as_json: bool,
 ) -> None:
     """Find the disturbances that break the formation, at the link delay of the scenario or of --delay, and exit."""
-    from gcs.cli.stress_output import print_disturbances
+    from gcs.cli.results import print_disturbances
     from gcs.runs.record import write_whole
     from gcs.stress.axes import at_coordinates, parse_axis
     from gcs.stress.disturbance import find_disturbance_onsets, refusal

@@ -12,8 +12,8 @@ import typer
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it comes with pymavlink, untyped
 from typer.testing import CliRunner
 
+from gcs.cli.results import checks_of
 from gcs.cli.stress import stress
-from gcs.cli.stress_output import checks_of
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.junit import write_junit
