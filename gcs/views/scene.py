@@ -31,13 +31,13 @@ PALETTE: tuple[Color, ...] = (
 )  # fmt: skip
 
 MODE_COLORS: dict[Mode, Color] = {
-    Mode.WAITING: (110, 110, 120),
     Mode.NOMINAL: (56, 142, 60),
     Mode.RECOVERING: (38, 166, 154),
     Mode.CAUTION: (245, 166, 35),
     Mode.CRITICAL: (229, 57, 53),
     Mode.FAILSAFE: (171, 71, 188),
     Mode.LOST: (120, 20, 30),
+    Mode.WAITING: (110, 110, 120),
 }
 
 
