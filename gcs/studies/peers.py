@@ -19,8 +19,7 @@ from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gcs.drive.sitl import VehicleProcess
 from gcs.published import Published
-from gcs.studies import codec
-from gcs.studies.benchmark import GAINS, benchmark, with_vehicles, without_solver
+from gcs.studies.benchmark import GAINS, benchmark, decode_s, encode_s, with_vehicles, without_solver
 from gcs.studies.compare_cost import timed
 from scenarios.files import dump
 from scenarios.schema import Scenario
@@ -113,8 +112,8 @@ def _row(peer: str, work: str, unit: str, ours: float, theirs: float) -> Row:
 
 def _codecs() -> Iterator[Row]:
     for work, each in (
-        ("decode a LOCAL_POSITION_NED", codec.decode_s()),
-        ("encode a SET_POSITION_TARGET_LOCAL_NED", codec.encode_s()),
+        ("decode a LOCAL_POSITION_NED", decode_s()),
+        ("encode a SET_POSITION_TARGET_LOCAL_NED", encode_s()),
     ):
         yield _row("pymavlink", work, "µs", 1e6 * each.ours, 1e6 * each.theirs)
 
