@@ -1,5 +1,8 @@
 """The error that a user is shown as one line, and that line for a package that only an extra installs."""
 
+from collections.abc import Generator
+from contextlib import contextmanager
+
 _EXTRAS = {
     "cvxpy": "solver",
     "clarabel": "solver",
@@ -14,6 +17,15 @@ _EXTRAS = {
 
 class InputError(Exception):
     """The user's input cannot be used: one line with what was read and what was wanted; exit code 2."""
+
+
+@contextmanager
+def usable(what: object, wanted: str) -> Generator[None]:
+    """While entered, an OSError is an InputError about what the user named."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{what}: {error.strerror}, wanted {wanted}") from None
 
 
 def extra_wanted(module: str | None) -> str:

@@ -22,8 +22,7 @@ from gcs.drive.lockstep import START_NS, fly_lockstep, vehicles_of
 from gcs.link import mavlink
 from gcs.plan.planner import flight_plan
 from gcs.station.station import Station
-from gcs.studies.benchmark import with_vehicles, without_solver
-from gcs.studies.codec import position_frames, pymavlink_parse_s
+from gcs.studies.benchmark import position_frames, pymavlink_parse_s, with_vehicles, without_solver
 from scenarios.files import load
 
 COMMAND = "python -m docs.generate.stages"

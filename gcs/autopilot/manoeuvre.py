@@ -77,7 +77,6 @@ class Identification:
         yield self._plan.with_margins(tuple(margins_s), responses)
 
     def _why_not(self, row: int, seen: Identified | None) -> str:
-        """Why a vehicle has no response, and what may be done."""
         way_on = "a [response] in the scenario replaces the manoeuvre"
         if seen is None:
             rate_hz, asked_hz = len(self._samples[row]) / identify.LONGEST_S, self._plan.scenario.rates.telemetry_hz

@@ -30,12 +30,11 @@ _ATTEMPTS, _PATIENCE_NS = 3, NS_PER_S
 
 
 class ToldLimits:
-    """The limits that one vehicle tells; None while, or if, it does not."""
+    """The limits that one vehicle tells."""
 
     def __init__(self) -> None:
-        self.acceleration_m_s2: float | None = None
-        self.jerk_m_s3: float | None = None
-        self.timeout_s: float | None = None
+        self._told: list[float | None] = [None] * 3
+        """Acceleration, jerk and set-point time-out; None while, or if, it does not tell them."""
         self._kind = ""
         self._asked: dict[str, int] = {}
         self._not_before_ns = 0
@@ -45,7 +44,7 @@ class ToldLimits:
         if now_ns < self._not_before_ns or kind.name not in _PARAMETERS:
             return None
         self._kind = kind.name
-        for (name, _), known in zip(_PARAMETERS[kind.name], self._values, strict=True):
+        for (name, _), known in zip(_PARAMETERS[kind.name], self._told, strict=True):
             if known is None and self._asked.get(name, 0) < _ATTEMPTS:
                 self._asked[name] = self._asked.get(name, 0) + 1
                 self._not_before_ns = now_ns + max(_PATIENCE_NS, 3 * rtt_ns)
@@ -61,36 +60,24 @@ class ToldLimits:
             return
         self._not_before_ns = 0
         at = names.index(name)
-        value = round(value * _PARAMETERS[self._kind][at][1], 6)
-        match at:
-            case 0:
-                self.acceleration_m_s2 = value
-            case 1:
-                self.jerk_m_s3 = value
-            case _:
-                self.timeout_s = value
-
-    @property
-    def _values(self) -> tuple[float | None, float | None, float | None]:
-        return self.acceleration_m_s2, self.jerk_m_s3, self.timeout_s
+        self._told[at] = round(value * _PARAMETERS[self._kind][at][1], 6)
 
     @property
     def acceleration_bound_m_s2(self) -> float:
-        """The largest acceleration that the vehicle is sent."""
-        told = self.acceleration_m_s2
+        told = self._told[0]
         return ACCELERATION_M_S2 if told is None else _ACCELERATION_SHARE * told
 
     @property
     def jerk_bound_m_s3(self) -> float:
         """How fast that acceleration may change."""
-        return JERK_M_S3 if self.jerk_m_s3 is None else _JERK_SHARE * self.jerk_m_s3
+        told = self._told[1]
+        return JERK_M_S3 if told is None else _JERK_SHARE * told
 
     def in_words(self) -> str:
-        """The bounds, and where they are from."""
         told = [
             f"{name} {value:g} {unit}"
             for (name, _), value, unit in zip(
-                _PARAMETERS.get(self._kind, ()), self._values, ("m/s^2", "m/s^3", "s"), strict=False
+                _PARAMETERS.get(self._kind, ()), self._told, ("m/s^2", "m/s^3", "s"), strict=False
             )
             if value is not None
         ]

@@ -26,8 +26,6 @@ class _Target:
 
 
 class VelocityTargets:
-    """The velocity targets of all vehicles."""
-
     def __init__(
         self, vehicles: Sequence[RemoteVehicle], starts: Sequence[AutopilotStartup], *, period_s: float
     ) -> None:

@@ -1,7 +1,7 @@
 """Every command: options, one-line errors and what a terminal prints. The only package that imports Typer.
 
-The exit codes are defined here; 0 is success. A group of commands has a file, and what it prints another if that needs
-imports too slow for `gcs --help`: hence one file more than twelve.
+The exit codes are defined here; 0 is success. A group of commands has a file; what needs imports too slow for
+`gcs --help` to print it is in `results`.
 """
 
 FAILED = 1

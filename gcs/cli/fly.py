@@ -2,10 +2,10 @@
 
 import contextlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,7 +15,6 @@ from gcs.errors import InputError
 from gcs.output import outlive_readers
 
 if TYPE_CHECKING:
-    from gcs.runs.junit import Check
     from gcs.runs.summary_record import Summary
 
 LISTEN = "127.0.0.1:14550"
@@ -79,8 +78,7 @@ def fly(
     from gcs.views.report import print_design, print_summary
 
     outlive_readers()
-    gate = Gate(assert_headroom, assert_settled, junit)
-    gate.refuse_unusable()
+    _refuse_unusable(assert_headroom, assert_settled, junit)
     sockets = {"--connect": connect, "--listen": listen, "--mirror": mirror, "--key": key}
     _refuse_contradictions(sockets, speed, live, virtual=virtual, mirror_commands=mirror_commands)
     scenario = options.load_scenario(scenario_file, loop, without, links=links, allow_code=allow_code)
@@ -137,52 +135,40 @@ def fly(
             there.shut_down()
         summary = leave_report(folder, summary)
     options.answer(summary, partial(print_summary, folder=folder), as_json=as_json)
-    passed = gate.passed(summary)
+    passed = _passed(summary, assert_headroom, assert_settled, junit)
     raise typer.Exit(INTERRUPTED if summary.reason.startswith("interrupted") else 0 if passed else FAILED)
 
 
-class Gate(NamedTuple):
-    """What a flight must meet for exit code 0, besides being stable and completely logged."""
+def _refuse_unusable(least_headroom: float | None, settled_s: float | None, junit: Path | None) -> None:
+    if least_headroom is not None:
+        options.within("--assert-headroom", least_headroom, -1e3, 1.0)
+    if settled_s is not None:
+        options.within("--assert-settled", settled_s, 0.0, 1e6, "seconds")
+    if junit is not None:
+        options.out_file("--junit", junit)
 
-    least_headroom: float | None
-    settled_s: float | None
-    junit: Path | None
 
-    def refuse_unusable(self) -> None:
-        if self.least_headroom is not None:
-            options.within("--assert-headroom", self.least_headroom, -1e3, 1.0)
-        if self.settled_s is not None:
-            options.within("--assert-settled", self.settled_s, 0.0, 1e6, "seconds")
-        if self.junit is not None:
-            options.out_file("--junit", self.junit)
+def _passed(summary: "Summary", least_headroom: float | None, settled_s: float | None, junit: Path | None) -> bool:
+    """Check the flight, and print one line for each assertion that fails; the summary tells the rest."""
+    from gcs.runs.junit import Check, write_junit
+    from gcs.views.console import number_text
 
-    def passed(self, summary: "Summary") -> bool:
-        """Check the flight, and print one line for each assertion that fails; the summary tells the rest."""
-        from gcs.runs.junit import Check, write_junit
-
-        stable = "" if summary.verdict == "stable" else f"{summary.verdict}: {summary.reason}"
-        checks = [Check("the flight is stable", stable), Check("the log is whole", "; ".join(summary.not_logged))]
-        asserted = list(self._asserted(summary))
-        if self.junit is not None:
-            suite = f"gcs fly {summary.scenario}"
-            write_junit(self.junit, suite, [*checks, *asserted], time_s=summary.duration_s or 0.0)
-        for failed in (check for check in asserted if check.failure):
-            print(f"failed: {failed.name}: {failed.failure}", file=sys.stderr)
-        return not any(check.failure for check in [*checks, *asserted])
-
-    def _asserted(self, summary: "Summary") -> "Iterator[Check]":
-        from gcs.runs.junit import Check
-        from gcs.views.console import number_text
-
-        least, after_s = summary.headroom_min, summary.settling_time_s
-        if self.least_headroom is not None:
-            met = least is not None and least >= self.least_headroom
-            name = f"the headroom is at least {self.least_headroom:.1%}"
-            yield Check(name, "" if met else f"read {number_text(least, '.1%')}")
-        if self.settled_s is not None:
-            met = after_s is not None and after_s <= self.settled_s
-            name = f"the errors settle within {self.settled_s:g} s"
-            yield Check(name, "" if met else f"read {number_text(after_s, '.2f')} s")
+    stable = "" if summary.verdict == "stable" else f"{summary.verdict}: {summary.reason}"
+    checks = [Check("the flight is stable", stable), Check("the log is whole", "; ".join(summary.not_logged))]
+    least, after_s, asserted = summary.headroom_min, summary.settling_time_s, list[Check]()
+    if least_headroom is not None:
+        met = least is not None and least >= least_headroom
+        name = f"the headroom is at least {least_headroom:.1%}"
+        asserted.append(Check(name, "" if met else f"read {number_text(least, '.1%')}"))
+    if settled_s is not None:
+        met = after_s is not None and after_s <= settled_s
+        name = f"the errors settle within {settled_s:g} s"
+        asserted.append(Check(name, "" if met else f"read {number_text(after_s, '.2f')} s"))
+    if junit is not None:
+        write_junit(junit, f"gcs fly {summary.scenario}", [*checks, *asserted], time_s=summary.duration_s or 0.0)
+    for failed in (check for check in asserted if check.failure):
+        print(f"failed: {failed.name}: {failed.failure}", file=sys.stderr)
+    return not any(check.failure for check in [*checks, *asserted])
 
 
 def _refuse_contradictions(

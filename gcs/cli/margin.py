@@ -128,7 +128,6 @@ def margin_fields(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> dic
 
 
 def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None:
-    """Print the verdict, the crossings and the notes."""
     from gcs.views.console import plain_console, table_of
 
     console = plain_console()

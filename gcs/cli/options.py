@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from gcs.errors import InputError
+from gcs.errors import InputError, usable
 
 if TYPE_CHECKING:
     from gcs.drive.guard import Guard
@@ -141,11 +141,9 @@ def refuse_or_warn(file: Path, finding: str, *, allow: bool) -> None:
 
 def out_folder(out: Path, wanted: str = "a new or empty folder", option: str = "--out") -> Path:
     """The new or empty folder that an option names; it is created if it does not exist."""
-    try:
+    with usable(f"{option}: {out}", "a folder that can be written"):
         out.mkdir(parents=True, exist_ok=True)
         used = any(out.iterdir())
-    except OSError as error:
-        raise InputError(f"{option}: {out}: {error.strerror}, wanted a folder that can be written") from None
     if used:
         raise InputError(f"{option}: {out} is not empty, wanted {wanted}")
     return out
@@ -160,14 +158,12 @@ def run_folder(out: Path | None, name: str) -> Path:
 
 def out_file(option: str, file: Path) -> None:
     """Refuse a file that cannot be written before any work is done for it; creates its folder."""
-    try:
+    with usable(f"{option}: {file}", "a file that can be written"):
         new = not file.exists()
         file.parent.mkdir(parents=True, exist_ok=True)
         file.open("ab").close()
         if new:
             file.unlink()
-    except OSError as error:
-        raise InputError(f"{option}: {file}: {error.strerror}, wanted a file that can be written") from None
 
 
 def address(option: str, text: str) -> tuple[str, int]:
@@ -187,10 +183,8 @@ def listening(option: str, text: str, guard: "Guard | None" = None) -> "StationS
     from gcs.drive.udp import StationSocket
 
     host, port = address(option, text)
-    try:
+    with usable(f"{option}: {text}", "a free UDP port of this machine"):
         return StationSocket(host, port, guard)
-    except OSError as error:
-        raise InputError(f"{option}: {text}: {error.strerror}; wanted a free UDP port of this machine") from None
 
 
 def warn_if_open(link: "StationSocket") -> None:
@@ -218,10 +212,8 @@ def mirroring(text: str, link: "StationSocket", *, commands: bool) -> "Mirror":
     host, port = address("--mirror", text)
     if port == 0:
         raise InputError(f"--mirror: read {text}, wanted the port of a ground station")
-    try:
+    with usable(f"--mirror: {text}", "the address of a ground station"):
         mirror = Mirror(host, port, commands=commands, signed=link.guard and link.guard.mirror_link)
-    except OSError as error:
-        raise InputError(f"--mirror: {text}: {error.strerror}; wanted the address of a ground station") from None
     (to_host, to_port), (own_host, own_port) = mirror.address, link.address
     here = to_host == own_host or (ip_address(own_host).is_unspecified and ip_address(to_host).is_loopback)
     if here and to_port == own_port:

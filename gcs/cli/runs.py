@@ -24,7 +24,6 @@ def grade(run: RunFolder, as_json: AsJson = False) -> None:
 
 
 def print_grade(result: "Grade") -> None:
-    """Print the errors of each quantity in a line of its own."""
     from gcs.views.console import ms_text
 
     print(f"errors against the truth, {result.vehicles} vehicles, ms")

@@ -1,6 +1,6 @@
 """`gcs stress`: fly the formation at many link delays, and see whether it breaks where the margin predicts.
 
-The work is in `gcs.stress`; what is printed is in `gcs.cli.stress_output`.
+The work is in `gcs.stress`; what is printed is in `gcs.cli.results`.
 """
 
 import contextlib
@@ -110,7 +110,7 @@ def stress(
         _disturb(scenario_file, study.plan, delay, tolerance=tolerance, allowed=assert_onset, out=out, as_json=as_json)
     if junit is not None:
         options.out_file("--junit", junit)
-    from gcs.cli.stress_output import checks_of, print_reflown, print_result
+    from gcs.cli.results import checks_of, print_reflown, print_result
     from gcs.drive.preflight import endless_link
     from gcs.runs.junit import write_junit
     from gcs.stress.axes import parse_axis
@@ -203,7 +203,7 @@ def _disturb(
     as_json: bool,
 ) -> None:
     """Find the disturbances that break the formation, at the link delay of the scenario or of --delay, and exit."""
-    from gcs.cli.stress_output import print_disturbances
+    from gcs.cli.results import print_disturbances
     from gcs.runs.record import write_whole
     from gcs.stress.axes import at_coordinates, parse_axis
     from gcs.stress.disturbance import find_disturbance_onsets, refusal
@@ -245,7 +245,7 @@ def _campaign(
     """Fly the sweep over the axes and, with a tolerance, search for the onset; returns the result and its folder."""
     from gcs.drive.fly import new_folder
     from gcs.runs.record import SCENARIO_FILE, write_whole
-    from gcs.stress.campaign import Store, check_campaign, run_campaign, write_table
+    from gcs.stress.campaign import TRIALS_FILE, check_study, run_campaign, trials_of, write_table
     from gcs.stress.report import result_of, write_report
     from gcs.stress.study import NoOnset, find_onset
     from gcs.views.console import progress
@@ -255,7 +255,7 @@ def _campaign(
     scenario = dump(study.plan.scenario)
     if resume:
         assert out is not None
-        check_campaign(out, "--resume", scenario)
+        check_study("--resume", out / TRIALS_FILE, scenario=scenario)
     sweep: list[Outcome] = []
     onset: Onset | NoOnset | None = None
     onset_shorter: Onset | None = None
@@ -267,7 +267,7 @@ def _campaign(
             folder = out if resume else options.out_folder(out, "a new or empty folder, or --resume")
         write_whole(folder / SCENARIO_FILE, scenario.encode())
         write_code(study.plan.scenario, folder)
-        store = stack.enter_context(contextlib.closing(Store(folder)))
+        store = stack.enter_context(contextlib.closing(trials_of(folder)))
         begin = stack.enter_context(progress(shown=shown))
         try:
             if axes:
@@ -283,7 +283,7 @@ def _campaign(
         except KeyboardInterrupt:
             typer.echo(store.resume, err=True)
             raise
-    outcomes = list(store.outcomes.values())
+    outcomes = list(store.flown.values())
     write_table(outcomes, folder)
     result = result_of(
         study, design, outcomes, axes=axes, sweep=sweep, onset=onset, onset_shorter=onset_shorter, allowed=allowed

@@ -1,4 +1,4 @@
-"""`gcs compare`, `thesis`, `bench` and `capacity`; what they print is in `gcs.cli.study_output`."""
+"""`gcs compare`, `thesis`, `bench` and `capacity`; what they print is in `gcs.cli.results`."""
 
 import contextlib
 import os
@@ -25,7 +25,7 @@ def compare(
 
     Exit code 1 if no method gives a design.
     """
-    from gcs.cli.study_output import print_comparison
+    from gcs.cli.results import print_comparison
     from gcs.drive.preflight import bad_start, endless_link
     from gcs.studies import compare as comparing
     from gcs.studies.compare_cost import design_costs
@@ -115,7 +115,7 @@ def bench(
 
     With --cluster, the map is flown twice on Dask: by one local worker and by all. Each trial flies for --seconds.
     """
-    from gcs.cli.study_output import print_benchmark, print_cluster, print_peers, print_real_time
+    from gcs.cli.results import print_benchmark, print_cluster, print_peers, print_real_time
     from gcs.drive.preflight import bad_start, endless_link
     from gcs.studies import benchmark
 
@@ -164,7 +164,7 @@ def capacity(
 
     The links carry a formation if its loop delay stays within the delay margin.
     """
-    from gcs.cli.study_output import print_capacity
+    from gcs.cli.results import print_capacity
     from gcs.studies.capacity import LoadStore
     from gcs.studies.capacity import capacity as capacity_of
     from gcs.views.console import progress

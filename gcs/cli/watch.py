@@ -169,7 +169,6 @@ def _save(file: Path, recorder: "LinkRecorder", source: str, *, shown: bool) -> 
 
 
 def _print_rebuilt(report: "RebuildReport") -> None:
-    """Print what the log holds, its links, and the flight if the formation is known."""
     from gcs.views.console import plain_console
     from gcs.views.report import delay_text, print_flight
     from gcs.watch.table import links_table

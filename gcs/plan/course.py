@@ -108,7 +108,6 @@ class PlannedMotion:
         return [(span.from_s, _array(span.before), _array(span.after)) for span in self._spans[1:]]
 
     def largest(self, row: int) -> Largest:
-        """The extremes of a vehicle's planned motion over the flight."""
         slowest, fastest, most, fastest_turn = inf, 0.0, 0.0, 0.0
         for time_s in self._moments_s():
             _, (v_n, v_e), (a_n, a_e) = self.reference(row, time_s)

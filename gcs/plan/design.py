@@ -12,6 +12,7 @@ from gains.core._semidefinite import SolverFacts
 from gains.core.requirement import Requirement
 from gains.performance.response import Response
 from gcs.published import Published
+from scenarios.schema import GainBlock
 
 Matrix = tuple[tuple[float, ...], ...]
 
@@ -64,20 +65,12 @@ class Proof(Published):
     inequality_eigenvalue_max: float | None = None
 
 
-class Block(Published):
-    """The gain with which a vehicle uses the errors of another, or its own; both are system ids."""
-
-    vehicle: int
-    of: int
-    gain: Matrix
-
-
 class GainSet(Published):
     """One entry of the gain schedule: its gains, or the share of the stream it flies with, and its figures."""
 
     streamed_share: float = 1.0
     time_scale: float = 1.0
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[GainBlock, ...] = ()
     K1_1_s: Matrix | None = None
     K2_1_s: Matrix | None = None
     K3_1_s2: Matrix | None = None
@@ -102,7 +95,6 @@ class VehicleResponse(Published):
 
     @property
     def response(self) -> Response:
-        """The response itself."""
         return Response(self.lag_s, self.velocity_gain_1_s, self.dead_time_s, self.natural_frequency_rad_s)
 
 
@@ -281,7 +273,7 @@ class Design(Published):
     method: str = ""
     loop: Literal["ground", "onboard"] = "ground"
     pattern: str = ""
-    blocks: tuple[Block, ...] = ()
+    blocks: tuple[GainBlock, ...] = ()
     schedule: tuple[GainSet, ...] = ()
     response: ResponsePart | None = None
     onboard: OnboardPart | None = None

@@ -4,7 +4,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -15,8 +15,10 @@ from gains.performance.response import Response, sampled_margin
 from gains.sampled.multirate import Timing
 from gains.sampled.onboard import OnboardTiming
 from gcs.plan.formation import Formation
-from gcs.plan.mismatch import TABULATED_S, Tabulated, Tolerated, Window, distances, window
+from gcs.plan.mismatch import TABULATED_S, Predicted, Tabulated, Tolerated, distances, window
 from scenarios.schema import Scenario
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,6 @@ class FlightPlan:
 
     @cached_property
     def margins_s(self) -> tuple[float, ...]:
-        """The delay margins of the gain schedule."""
         return (self.delay_margin_s, *(margin_s for _, margin_s in self.slower))
 
     @cached_property
@@ -79,12 +80,10 @@ class FlightPlan:
             without = Tolerated((inf,) * len(self.margins_s), self.margins_s)
             return lambda _: without
 
-        def windows(K: FloatArray, *assumed_s: float) -> list[Window]:
-            return [window(self.model, K, self.timing, at_s, *self.vehicles_own) for at_s in assumed_s]
-
+        every = [self.predicted(K) for K in self.gains]
         if isinstance(prediction, str):
-            return Tabulated([windows(K, *TABULATED_S) for K in self.gains])
-        ends = [distances(windows(K, prediction)[0], prediction) for K in self.gains]
+            return Tabulated([[window(own, at_s) for at_s in TABULATED_S] for own in every])
+        ends = [distances(window(own, prediction), prediction) for own in every]
         fixed = Tolerated(tuple(shorter for shorter, _ in ends), tuple(longer for _, longer in ends))
         return lambda _: fixed
 
@@ -93,10 +92,11 @@ class FlightPlan:
         """The vehicles' responses in the model's order; None if they are immediate or unknown."""
         return None if self.responses is None else self.responses.in_order(self.formation.system_ids)
 
-    @property
-    def vehicles_own(self) -> tuple[list[Response] | None, OnboardTiming | None]:
-        """What vehicles do by themselves: their responses, and the timing of their own loops."""
-        return self.responses_in_order, onboard_timing(self.scenario)
+    def predicted(self, K: FloatArray) -> Predicted:
+        """The formation with one of its gains, as it is predicted."""
+        known = self.responses_in_order
+        responses = None if known is None else tuple(known)
+        return Predicted(self.model, K.tobytes(), self.timing, responses, onboard_timing(self.scenario))
 
     @property
     def assumed_s(self) -> float | None:
@@ -106,7 +106,6 @@ class FlightPlan:
 
     @property
     def model(self) -> FormationModel:
-        """The formation's error model."""
         return self.formation.model
 
     @property
@@ -147,9 +146,8 @@ def given_responses(scenario: Scenario) -> Responses | None:
     return Responses("given", {vehicle.system_id: response for vehicle in scenario.vehicles})
 
 
-def margins_with(plan: FlightPlan, responses: Responses) -> list[float]:
-    """The margin (s) of each of the plan's gains."""
-    steps = margin_steps(plan, responses)
+def at_once(steps: Generator[None, None, Found]) -> Found:
+    """The result of what is otherwise computed in steps between control ticks."""
     while True:
         try:
             next(steps)
@@ -158,7 +156,7 @@ def margins_with(plan: FlightPlan, responses: Responses) -> list[float]:
 
 
 def margin_steps(plan: FlightPlan, responses: Responses) -> Generator[None, None, list[float]]:
-    """What `margins_with` returns, computed in steps between control ticks.
+    """The margin (s) of each of the plan's gains, computed in steps.
 
     Where every vehicle's loop has a margin of its own and both axes are alike, a step is one vehicle, some milliseconds
     (`gains.performance.lone_margin`). Otherwise it is `sampled_margin` of all vehicles together.

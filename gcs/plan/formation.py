@@ -20,7 +20,6 @@ class Formation:
     """Wanted position relative to the vehicle in front when the flight begins, (n, 2); zero for the leader."""
 
     def row(self, system_id: int) -> int:
-        """The place of a vehicle in the order."""
         return self.system_ids.index(system_id)
 
     def place_ne_m(self) -> FloatArray:

@@ -1,5 +1,8 @@
 """Puts gains, found by a search or by a user, into a scenario that can be written, checked and flown."""
 
+from collections.abc import Sequence
+from itertools import product
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -41,12 +44,13 @@ def with_gain(scenario: Scenario, K: ArrayLike, *, prediction: Prediction = "off
     return with_given(scenario, blocks=gain_blocks(both_axes, formation), prediction=prediction)
 
 
-def gain_blocks(K: RealArray, formation: Formation) -> tuple[GainBlock, ...]:
-    """K block by block, as a scenario gives it, without those that are zero, except each vehicle's own."""
+def gain_blocks(
+    K: RealArray, formation: Formation, links: Sequence[tuple[int, int]] | None = None
+) -> tuple[GainBlock, ...]:
+    """K block by block, as a scenario gives it: of these links, or else those not zero and each vehicle's own."""
     model, ids = formation.model, formation.system_ids
     return tuple(
         GainBlock(vehicle=ids[i], of=ids[j], gain=(tuple(block[0].tolist()), tuple(block[1].tolist())))
-        for i in range(model.vehicles)
-        for j in range(model.vehicles)
-        if (block := K[model.input_slice(i), model.output_slice(j)]).any() or i == j
+        for i, j in links or product(range(model.vehicles), repeat=2)
+        if (block := K[model.input_slice(i), model.output_slice(j)]).any() or i == j or links
     )

@@ -89,55 +89,50 @@ def distances(window: Window, assumed_s: float) -> tuple[float, float]:
     return assumed_s - least_s if least_s > 0.0 else inf, most_s - assumed_s
 
 
-def window(
-    model: FormationModel,
-    K: FloatArray,
-    timing: Timing,
-    assumed_s: float,
-    responses: Sequence[Response] | None = None,
-    onboard: OnboardTiming | None = None,
-) -> Window:
-    """The mismatch window of a sampled formation that is predicted over `assumed_s`.
+class Predicted(NamedTuple):
+    """A formation that its station predicts, as a key of what is computed of it once."""
 
-    `responses` are those of the vehicles in the model's order; without them they respond at once. `onboard` is the
-    timing of the vehicles' own loops, if they have one. The map of one period has a state for each command on its way.
-    Where these are too many, the window is that of the continuous model, narrowed at either end by a common period of
-    both rates, which is more than the models differ.
-    """
-    if assumed_s <= _MOST_ON_THE_WAY * timing.faster_s:
-        return _window(model, K.tobytes(), timing, assumed_s, None if responses is None else tuple(responses), onboard)
-    least_s, most_s = continuous_window(model, K, timing, assumed_s, responses, onboard)
-    return min(assumed_s, least_s + timing.common_s), max(assumed_s, most_s - timing.common_s)
+    model: FormationModel
+    gain: bytes
+    """K of u = K e."""
+    timing: Timing
+    responses: tuple[Response, ...] | None = None
+    """Of the vehicles in the model's order; None if they respond at once."""
+    onboard: OnboardTiming | None = None
+    """The timing of the vehicles' own loops, if they have one."""
 
-
-def continuous_window(
-    model: FormationModel,
-    K: FloatArray,
-    timing: Timing,
-    assumed_s: float,
-    responses: Sequence[Response] | None = None,
-    onboard: OnboardTiming | None = None,
-) -> Window:
-    """The mismatch window of the continuous model, in which the hold counts as half a period of delay."""
-    half_s = timing.held_s / 2.0
-    loop, measured = predicted_loop(model, K, responses, onboard)
-    least_s, most_s = mismatch_window_continuous(*loop, assumed_s=assumed_s + half_s, measured=measured)
-    return max(0.0, least_s - half_s), most_s - half_s
+    def loop(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], list[bool] | None]:
+        """A, B and K, and which states are measured: the errors, not what is computed of the responses."""
+        model, K = self.model, np.frombuffer(self.gain).reshape(self.model.inputs, self.model.states)
+        if self.onboard is not None:
+            return streamed_loop(model, K, self.onboard), None
+        if self.responses is None:
+            return (model.A, model.B, K), None
+        loop = formation_loop(model, K, self.responses)
+        return loop, [k < model.states for k in range(len(loop[0]))]
 
 
 @lru_cache(maxsize=1024)
-def _window(
-    model: FormationModel,
-    gain: bytes,
-    timing: Timing,
-    assumed_s: float,
-    responses: tuple[Response, ...] | None,
-    onboard: OnboardTiming | None,
-) -> Window:
-    """Cached: all flights of a campaign use the same windows."""
-    K = np.frombuffer(gain).reshape(model.inputs, model.states)
-    loop, measured = predicted_loop(model, K, responses, onboard)
-    return mismatch_window(*loop, timing, assumed_s=assumed_s, measured=measured)
+def window(flown: Predicted, assumed_s: float) -> Window:
+    """The mismatch window of a sampled formation that is predicted over `assumed_s`.
+
+    The map of one period has a state for each command on its way. Where these are too many, the window is that of the
+    continuous model, narrowed at either end by a common period of both rates, which is more than the models differ.
+    Cached: all flights of a campaign use the same windows.
+    """
+    if assumed_s > _MOST_ON_THE_WAY * flown.timing.faster_s:
+        least_s, most_s = continuous_window(flown, assumed_s)
+        return min(assumed_s, least_s + flown.timing.common_s), max(assumed_s, most_s - flown.timing.common_s)
+    loop, measured = flown.loop()
+    return mismatch_window(*loop, flown.timing, assumed_s=assumed_s, measured=measured)
+
+
+def continuous_window(flown: Predicted, assumed_s: float) -> Window:
+    """The mismatch window of the continuous model, in which the hold counts as half a period of delay."""
+    half_s = flown.timing.held_s / 2.0
+    loop, measured = flown.loop()
+    least_s, most_s = mismatch_window_continuous(*loop, assumed_s=assumed_s + half_s, measured=measured)
+    return max(0.0, least_s - half_s), most_s - half_s
 
 
 def assumption(scenario: Scenario) -> str:
@@ -149,18 +144,3 @@ def assumption(scenario: Scenario) -> str:
         return f"where vehicles do not report their active targets, {as_sent}"
     why = "those of own loops do not show it" if on_board else "rates.target_hz is 0"
     return f"{as_sent}: no active targets are asked for, as {why}"
-
-
-def predicted_loop(
-    model: FormationModel,
-    K: FloatArray,
-    responses: Sequence[Response] | None,
-    onboard: OnboardTiming | None = None,
-) -> tuple[tuple[FloatArray, FloatArray, FloatArray], list[bool] | None]:
-    """A, B and K, and which states are measured: the errors, not what is computed of the responses."""
-    if onboard is not None:
-        return streamed_loop(model, K, onboard), None
-    if responses is None:
-        return (model.A, model.B, K), None
-    loop = formation_loop(model, K, responses)
-    return loop, [k < model.states for k in range(len(loop[0]))]

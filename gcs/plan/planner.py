@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from math import inf
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.requirement import Criteria, Requirement, plain
-from gains.delay.constant import delay_margin
 from gains.design.design import Design as InclusionDesign
 from gains.design.design import design, evaluate_gains, trade_off
 from gains.design.graph import GraphDesign
@@ -18,14 +16,11 @@ from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, leader_follower, overlapping, with_links, without_links
 from gains.performance.predicted import fed_forward
 from gains.performance.response import Response, continuous_margin, sampled_margin
-from gains.performance.robust import robustness
 from gains.performance.string_stability import string_peak
-from gains.sampled.constant import sampled_delay_margin
 from gcs.errors import InputError
 from gcs.plan.at_delay import with_figures_at_delay
 from gcs.plan.criteria import with_criteria
 from gcs.plan.design import (
-    Block,
     Design,
     GainSet,
     PredictionPart,
@@ -34,13 +29,22 @@ from gcs.plan.design import (
     VehicleResponse,
     WindowAt,
 )
-from gcs.plan.flight_plan import FlightPlan, Responses, given_responses, loop_timing, margins_with, onboard_timing
+from gcs.plan.flight_plan import (
+    FlightPlan,
+    Responses,
+    at_once,
+    given_responses,
+    loop_timing,
+    margin_steps,
+    onboard_timing,
+)
 from gcs.plan.formation import Formation, plan_formation
+from gcs.plan.given import gain_blocks
 from gcs.plan.mismatch import assumption, continuous_window, window
 from gcs.plan.onboard import onboard_plan
 from gcs.plan.own_law import OWN_DYNAMICS, code_records, own_plan, with_unknown_margin
 from scenarios.keys.own import BUILT_IN
-from scenarios.schema import Scenario
+from scenarios.schema import GainBlock, Scenario
 
 _EQUATIONS = {
     "lag": "lag a' = u + g (v_s - v) - a, v_s' = u",
@@ -79,26 +83,42 @@ def flight_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
 
 
 def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
-    """Design and plan of gains that are designed or given."""
-    formation = plan_formation(scenario)
-    model = formation.model
-    if scenario.control.method != "inclusion" or scenario.control.blocks:
-        return _flown_loop(*_graph_plan(scenario, formation))
-    responses = given_responses(scenario)
-    found = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
-    slower = _slower(scenario, model, found)
+    """Design and plan of gains that are designed or given, by inclusion or on an information pattern.
+
+    Slowed down by a factor s, K1 / s, K2 / s and K3 / s² move the loop s times slower and take s times the delay.
+    """
+    formation, period_s = plan_formation(scenario), loop_timing(scenario).held_s
+    model, scales, control = formation.model, scenario.monitor.time_scales, scenario.control
+    responses, around_loss = given_responses(scenario), ()
+    if control.method != "inclusion" or control.blocks:
+        pattern = pattern_of(scenario, formation)
+        first = _graph_design(scenario, formation, pattern)
+        slowed = [time_scaled(model, first.K, s) for s in scales[1:]]
+        found = [first, *(evaluate_gains(model, K, pattern=pattern, period_s=period_s) for K in slowed)]
+        gains = [own.K for own in found]
+        blocks = [gain_blocks(K, formation, pattern.links) for K in gains]
+        schedule = [_entry(s, own, blocks=each) for s, own, each in zip(scales, found, blocks, strict=True)]
+        ids = formation.system_ids
+        parts = {"links": [(ids[i], ids[j]) for i, j in first.links], "blocks": blocks[0]}
+        if control.loop != "onboard":
+            around_loss = _around_loss(model, first.delay_margin_s, scales, period_s)
+    else:
+        first = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
+        slowed = [(first.K1 / s, first.K2 / s, first.K3 / s**2) for s in scales[1:]]
+        found = [first, *(evaluate_gains(model, gain, period_s=period_s) for gain in slowed)]
+        gains = [_flown(scenario, model, model.overlapping_gain(own.K1, own.K2, own.K3)) for own in found]
+        schedule = [_entry(s, own) for s, own in zip(scales, found, strict=True)]
+        parts = {"feed_forward": control.feed_forward} if control.feed_forward else {}
     plan = FlightPlan(
         scenario=scenario,
         formation=formation,
-        gain=_flown(scenario, model, model.overlapping_gain(found.K1, found.K2, found.K3)),
-        delay_margin_s=found.delay_margin_s,
-        slower=tuple(
-            (_flown(scenario, model, K), inf if own.delay_margin_s is None else own.delay_margin_s) for K, own in slower
-        ),
+        gain=gains[0],
+        delay_margin_s=first.delay_margin_s,
+        slower=tuple((K, own.delay_margin_s) for K, own in zip(gains[1:], found[1:], strict=True)),
+        separable=len(model.coupled_vehicles(gains[0])) == model.vehicles,
+        around_loss=around_loss,
     )
-    entries = (_entry(1.0, found), *(own for _, own in slower))
-    more = {"feed_forward": scenario.control.feed_forward} if scenario.control.feed_forward else {}
-    whole = Design.model_validate(found.to_dict() | {"schedule": entries} | more)
+    whole = Design.model_validate(first.to_dict() | {"schedule": schedule} | parts)
     return _flown_loop(*_with_responses(whole, plan, responses))
 
 
@@ -140,11 +160,11 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
 
 
 def _window_at(plan: FlightPlan, assumed_s: float) -> WindowAt:
-    flown = plan.model, plan.gain, plan.timing, assumed_s, *plan.vehicles_own
+    flown = plan.predicted(plan.gain)
     return WindowAt(
         assumed_delay_s=assumed_s,
-        mismatch_window_s=window(*flown),
-        mismatch_window_continuous_s=continuous_window(*flown),
+        mismatch_window_s=window(flown, assumed_s),
+        mismatch_window_continuous_s=continuous_window(flown, assumed_s),
     )
 
 
@@ -155,7 +175,7 @@ def _with_responses(whole: Design, plan: FlightPlan, responses: Responses | None
     if responses is None and plan.timing.commands == 1:  # the design was found for these
         return whole, plan
     margins_s = (
-        tuple(margins_with(plan, responses))
+        tuple(at_once(margin_steps(plan, responses)))
         if responses
         else tuple(sampled_margin(plan.model, K, None, timing=plan.timing) for K in plan.gains)
     )
@@ -218,27 +238,7 @@ def _with_margins(
     )
 
 
-def _slower(scenario: Scenario, model: FormationModel, found: InclusionDesign) -> list[tuple[FloatArray, GainSet]]:
-    """The gain and the figures of the design slowed down by each of the scenario's factors.
-
-    With K1 / s, K2 / s and K3 / s² the loop moves s times slower, so its delay margin is s times larger.
-    """
-    period_s = loop_timing(scenario).held_s
-    slower: list[tuple[FloatArray, GainSet]] = []
-    for s in scenario.monitor.time_scales[1:]:
-        gains = found.K1 / s, found.K2 / s, found.K3 / s**2
-        K = model.overlapping_gain(*gains)
-        figures = {
-            "alpha": robustness(*gains),
-            "delay_margin_s": float(sampled_delay_margin(model.A, model.B, K, period_s=period_s)),
-            "delay_margin_continuous_s": delay_margin(model.A, model.B @ K),
-        }
-        names = dict(zip(("K1_1_s", "K2_1_s", "K3_1_s2"), gains, strict=True))
-        slower.append((K, GainSet.model_validate(plain({"time_scale": s} | names | figures))))
-    return slower
-
-
-def _entry(time_scale: float, found: InclusionDesign | GraphDesign, **gains: Sequence[Block]) -> GainSet:
+def _entry(time_scale: float, found: InclusionDesign | GraphDesign, **gains: Sequence[GainBlock]) -> GainSet:
     names = found.to_dict()
     known = {name: names[name] for name in GainSet.model_fields if name in names}
     return GainSet.model_validate({"time_scale": time_scale} | known | gains)
@@ -267,42 +267,20 @@ def _requirement(scenario: Scenario) -> Requirement:
     )
 
 
-def _graph_plan(scenario: Scenario, formation: Formation) -> tuple[Design, FlightPlan]:
-    """Design and plan on an information pattern, designed or given block by block."""
+def _graph_design(scenario: Scenario, formation: Formation, pattern: Pattern) -> GraphDesign:
+    """Gains on an information pattern, designed or given block by block."""
     control, timing, model = scenario.control, loop_timing(scenario), formation.model
     period_s = timing.held_s
-    pattern = pattern_of(scenario, formation)
     if control.blocks:
-        found = evaluate_gains(model, _given_gain(scenario, formation), pattern=pattern, period_s=period_s)
-    else:
-        assert control.method not in ("inclusion", "python")
-        wanted = _requirement(scenario)
-        onboard = onboard_timing(scenario)
-        found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s, onboard=onboard)
-        short_s = (wanted.delay_margin_s or 0.0) - sampled_margin(model, found.K, None, timing=timing)
-        if onboard is None and timing.commands > 1 and short_s > 0.0:
-            wanted = replace(wanted, delay_margin_s=(wanted.delay_margin_s or 0.0) + _MORE * short_s)
-            found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
-    scales = scenario.monitor.time_scales
-    gains = [time_scaled(model, found.K, scale) for scale in scales]
-    slower = [evaluate_gains(model, gain, pattern=pattern, period_s=period_s) for gain in gains[1:]]
-    plan = FlightPlan(
-        scenario=scenario,
-        formation=formation,
-        gain=found.K,
-        delay_margin_s=found.delay_margin_s,
-        slower=tuple((entry.K, entry.delay_margin_s) for entry in slower),
-        separable=len(model.coupled_vehicles(found.K)) == model.vehicles,
-        around_loss=() if control.loop == "onboard" else _around_loss(model, found.delay_margin_s, scales, period_s),
-    )
-    schedule = [
-        _entry(scale, entry, blocks=_blocks(entry.K, formation, pattern))
-        for scale, entry in zip(scales, [found, *slower], strict=True)
-    ]
-    ids = formation.system_ids
-    links = [(ids[i], ids[j]) for i, j in found.links]
-    parts = {"links": links, "blocks": schedule[0].blocks, "schedule": schedule}
-    return _with_responses(Design.model_validate(found.to_dict() | parts), plan, given_responses(scenario))
+        return evaluate_gains(model, _given_gain(scenario, formation), pattern=pattern, period_s=period_s)
+    assert control.method not in ("inclusion", "python")
+    wanted, onboard = _requirement(scenario), onboard_timing(scenario)
+    found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s, onboard=onboard)
+    short_s = (wanted.delay_margin_s or 0.0) - sampled_margin(model, found.K, None, timing=timing)
+    if onboard is None and timing.commands > 1 and short_s > 0.0:
+        wanted = replace(wanted, delay_margin_s=(wanted.delay_margin_s or 0.0) + _MORE * short_s)
+        found = design(model, wanted, method=control.method, pattern=pattern, period_s=period_s)
+    return found
 
 
 def pattern_of(scenario: Scenario, formation: Formation) -> Pattern:
@@ -322,15 +300,6 @@ def _given_gain(scenario: Scenario, formation: Formation) -> FloatArray:
     for block in scenario.control.blocks:
         K[model.input_slice(row(block.vehicle)), model.output_slice(row(block.of))] = block.gain
     return K
-
-
-def _blocks(K: FloatArray, formation: Formation, pattern: Pattern) -> list[Block]:
-    """The gain matrix block by block, as a scenario gives it."""
-    ids, model = formation.system_ids, formation.model
-    return [
-        Block(vehicle=ids[i], of=ids[j], gain=K[model.input_slice(i), model.output_slice(j)].tolist())
-        for i, j in pattern.links
-    ]
 
 
 def _around_loss(

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from gcs.control.tick import TICK, Event, Mode, TickArray
-from gcs.errors import InputError
+from gcs.errors import InputError, usable
 from gcs.plan.design import Design
 from gcs.published import Published
 from gcs.runs.record import DESIGN_FILE, EVENTS_FILE, PARQUET_FILE, SCENARIO_FILE, TICKS_FILE, write_whole
@@ -42,7 +42,6 @@ def write_design(folder: Path, design: Design) -> None:
 
 
 def write_experiment(folder: Path, scenario: Scenario, design: Design) -> None:
-    """Write what is to be flown into a run's folder."""
     (folder / SCENARIO_FILE).write_text(scenario_files.dump(scenario), encoding="utf-8")
     write_code(scenario, folder)
     write_design(folder, design)
@@ -88,11 +87,10 @@ def _from_parquet(file: Path) -> TickArray:
 
 
 def _checked(file: Path, kind: type[_Record], wanted: str) -> _Record:
-    """The record of a kind that a JSON file holds."""
+    with usable(file, wanted):
+        text = file.read_bytes()
     try:
-        return kind.model_validate_json(file.read_bytes(), strict=True)
-    except OSError as error:
-        raise InputError(f"{file}: {error.strerror}, wanted {wanted}") from None
+        return kind.model_validate_json(text, strict=True)
     except ValidationError as errors:
         raise InputError(f"{file}: {_first(errors)}; wanted {wanted}") from None
 
@@ -148,12 +146,10 @@ class RunTail:
             raise InputError(f"{self._folder / EVENTS_FILE}: {_first(errors)}; wanted the events of a run") from None
 
     def _new(self, name: str, start: int, unit: int) -> tuple[bytes, int]:
-        try:
+        with usable(self._folder / name, "a file of a run"):
+            if not (self._folder / name).exists():
+                return b"", 0
             with (self._folder / name).open("rb") as file:
                 file.seek(start)
                 data = file.read()
-        except FileNotFoundError:
-            return b"", 0
-        except OSError as error:
-            raise InputError(f"{self._folder / name}: {error.strerror}, wanted a file of a run") from None
         return data, len(data) - len(data) % unit

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gains.core.arrays import FloatArray
 from gcs.control.tick import TickArray
-from gcs.errors import InputError
+from gcs.errors import InputError, usable
 from gcs.published import Published
 from gcs.runs.files import read_ticks
 from gcs.runs.record import TRUTH_FILE
@@ -54,15 +54,14 @@ def grade(folder: Path) -> Grade:
 
     Raises InputError if the folder is not a run, or has no truth log.
     """
-    try:
-        truth = read_truth(folder / TRUTH_FILE)
-    except FileNotFoundError:
-        wanted = "the folder of a run whose vehicles the station started"
-        raise InputError(f"{folder}: read no {TRUTH_FILE}, wanted {wanted}") from None
-    except OSError as error:
-        raise InputError(f"{folder / TRUTH_FILE}: {error.strerror}, wanted the truth log in a run's folder") from None
-    except ValueError as error:
-        raise InputError(f"{error}, wanted the truth log of a run's vehicles") from None
+    with usable(folder / TRUTH_FILE, "the truth log in a run's folder"):
+        try:
+            truth = read_truth(folder / TRUTH_FILE)
+        except FileNotFoundError:
+            wanted = "the folder of a run whose vehicles the station started"
+            raise InputError(f"{folder}: read no {TRUTH_FILE}, wanted {wanted}") from None
+        except ValueError as error:
+            raise InputError(f"{error}, wanted the truth log of a run's vehicles") from None
     if not truth.size:
         raise InputError(f"{folder / TRUTH_FILE}: read no record, wanted the truth log of a run's vehicles")
     ticks = read_ticks(folder)

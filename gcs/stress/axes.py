@@ -28,7 +28,6 @@ class Axis:
 
     @property
     def label(self) -> str:
-        """The label at the axis of a plot."""
         if self.name.startswith("delay_"):
             return f"link delay of vehicle {self.name.removeprefix('delay_')}, up + down [s]"
         return _LABELS[self.name]
@@ -112,7 +111,6 @@ def every_link(scenario: Scenario) -> list[Link]:
 
 
 def place_text(coordinates: Mapping[str, float]) -> str:
-    """The text for a point of a campaign."""
     return ", ".join(f"{name.replace('_', ' of ')} {value:g}" for name, value in coordinates.items())
 
 

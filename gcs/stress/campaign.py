@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from gcs.errors import InputError
 from gcs.interrupts import FROM_TERMINAL, held_back
@@ -31,73 +31,79 @@ from gcs.stress.trial import Outcome, Trial
 TRIALS_FILE = "trials.jsonl"
 PARQUET_FILE = "trials.parquet"
 _PR_SET_PDEATHSIG = 1
+_Record = TypeVar("_Record")
 
 Fly = Callable[[Sequence[Trial]], Iterator[Outcome]]
 """Flies trials and yields their outcomes as they end, in any order."""
 
 
-class Store:
-    """The finished trials of a campaign's folder.
+class Store(Generic[_Record]):
+    """The flights of a study that are finished, by their keys, in a file of JSON lines.
 
-    Raises InputError if another campaign has it open: both would fly the same trials.
+    Raises InputError if another process has it open: both would fly the same.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.file = folder / TRIALS_FILE
-        self.outcomes: dict[str, Outcome] = {}
-        self._log = RecordLog(self.file)
+    def __init__(self, file: Path, kind: Callable[..., _Record], key: Callable[[_Record], Any]) -> None:
+        self.file, self._key = file, key
+        self.flown: dict[Any, _Record] = {}
+        self._log = RecordLog(file)
         try:
             fcntl.flock(self._log.descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._log.close()
-            raise InputError(f"{folder}: another gcs stress works there; wanted a folder of its own") from None
-        text = self.file.read_bytes()
+            raise InputError(f"{file.parent}: another gcs works there; wanted a folder of its own") from None
+        text = file.read_bytes()
         for line in text.splitlines():
-            with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; its trial is flown again
-                outcome = Outcome(**json.loads(line))
-                self.outcomes[outcome.id] = outcome
+            with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; its flight is flown again
+                record = kind(**json.loads(line))
+                self.flown[key(record)] = record
         if text and not text.endswith(b"\n"):
             self._log.add(b"\n")
 
-    def add(self, outcome: Outcome) -> None:
-        """Store an outcome; it is in the file when this returns. Raises InputError if it cannot be written."""
+    def add(self, record: _Record) -> None:
+        """Store a flight; it is in the file when this returns. Raises InputError if it cannot be written."""
         try:
-            self._log.add((outcome.to_json() + "\n").encode())
+            self._log.add((json.dumps(vars(record), allow_nan=False) + "\n").encode())
         except OSError as error:
             raise InputError(f"{self.file}: {error.strerror}; {self.resume}") from None
-        self.outcomes[outcome.id] = outcome
+        self.flown[self._key(record)] = record
 
     @property
     def resume(self) -> str:
-        """What tells the user how to resume the campaign."""
-        return f"{len(self.outcomes)} trials are stored; continue with --resume --out {self.file.parent}"
+        """What tells the user how to resume the study."""
+        return f"{len(self.flown)} flights are stored; continue with --resume --out {self.file.parent}"
 
     def close(self) -> None:
         self._log.close()
 
 
-def check_campaign(folder: Path, flag: str, scenario: str | None = None) -> None:
-    """Refuse a folder that holds no campaign, or a campaign of another scenario; `scenario` is TOML.
+def trials_of(folder: Path) -> Store[Outcome]:
+    """The finished trials of a campaign's folder."""
+    return Store(folder / TRIALS_FILE, Outcome, lambda outcome: outcome.id)
+
+
+def check_study(flag: str, file: Path, kind: str = "campaign", scenario: str | None = None) -> None:
+    """Refuse a folder without the file of a kind of study, or with a study of another scenario; `scenario` is TOML.
 
     Raises InputError with what was read and what was wanted.
     """
-    for name in (SCENARIO_FILE, TRIALS_FILE):
-        if not (folder / name).is_file():
-            raise InputError(f"{flag}: read no {name} in {folder}, wanted the folder of a campaign")
-    file = folder / SCENARIO_FILE
-    if scenario is not None and file.read_text(encoding="utf-8") != scenario:
-        raise InputError(f"{flag}: {folder} holds a campaign of another scenario or loop, wanted {file}")
+    for name in (SCENARIO_FILE, file.name):
+        if not file.with_name(name).is_file():
+            raise InputError(f"{flag}: read no {name} in {file.parent}, wanted the folder of a {kind}")
+    known = file.with_name(SCENARIO_FILE)
+    if scenario is not None and known.read_text(encoding="utf-8") != scenario:
+        raise InputError(f"{flag}: {file.parent} holds a {kind} of another scenario or loop, wanted {known}")
 
 
 def run_campaign(
-    trials: Sequence[Trial], store: Store, fly: Fly, *, ended: Callable[[int], None] | None = None
+    trials: Sequence[Trial], store: Store[Outcome], fly: Fly, *, ended: Callable[[int], None] | None = None
 ) -> list[Outcome]:
     """Return the outcomes of trials in the given order; those not stored are flown, each once.
 
     `ended` is called after each trial with the number still to come. Raises KeyboardInterrupt also if Ctrl-C
     ended a flight in real time; that flight does not count as flown.
     """
-    missing = {trial.id: trial for trial in trials if trial.id not in store.outcomes}
+    missing = {trial.id: trial for trial in trials if trial.id not in store.flown}
     left = len(missing)
     try:
         for outcome in fly(list(missing.values())) if missing else ():
@@ -112,7 +118,7 @@ def run_campaign(
             raise
         raise InputError(f"{error.filename}: {error.strerror}; {store.resume}") from None
     # the same trial may have other coordinates in another sweep
-    return [replace(store.outcomes[trial.id], coordinates=dict(trial.coordinates)) for trial in trials]
+    return [replace(store.flown[trial.id], coordinates=dict(trial.coordinates)) for trial in trials]
 
 
 @dataclass(frozen=True)
@@ -136,9 +142,9 @@ def refly(study: Study, folder: Path, wanted: str) -> Reflown:
     """
     from gcs.views.observer import recover_run  # slow to import, and workers need none of it
 
-    check_campaign(folder, "--trial")
-    with contextlib.closing(Store(folder)) as store:
-        found = [outcome for outcome in store.outcomes.values() if outcome.id.startswith(wanted)]
+    check_study("--trial", folder / TRIALS_FILE)
+    with contextlib.closing(trials_of(folder)) as store:
+        found = [outcome for outcome in store.flown.values() if outcome.id.startswith(wanted)]
     if len(found) != 1:
         raise InputError(f"--trial: read {wanted!r}, wanted the id of one trial in {folder}")
     [stored] = found

@@ -40,7 +40,6 @@ def _gains(design: Design) -> dict[str, Any]:
 
 
 def _only(*names: str) -> PlainSerializer:
-    """Writes only these fields of a record."""
     return PlainSerializer(lambda record: {name: getattr(record, name) for name in names})
 
 

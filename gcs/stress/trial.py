@@ -111,10 +111,6 @@ class Outcome:
     elapsed_s: float = 0.0
     error: str | None = None
 
-    def to_json(self) -> str:
-        """One line of JSON."""
-        return json.dumps(asdict(self), allow_nan=False)
-
 
 Run = Callable[[Sequence[Trial]], list[Outcome]]
 """Returns the outcomes of trials in their order, flying those that are not stored."""

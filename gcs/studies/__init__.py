@@ -2,6 +2,6 @@
 
 `compare` sets the design routes side by side, with `compare_cost` as formations grow. `thesis` reproduces the source,
 with the flights and figures of `thesis_flights`. `capacity` finds how many vehicles a scenario's links carry,
-`benchmark` how fast flights are computed, with `codec` beside pymavlink's, and `cluster` what a map costs on Dask.
-`peers` does the same work with other people's tools.
+`benchmark` how fast flights are computed, and `cluster` what a map costs on Dask. `peers` does the same work with
+other people's tools.
 """

@@ -1,23 +1,27 @@
-"""How fast flights are computed: virtual time against real time, and the station's share of its control period."""
+"""How fast flights are computed: virtual time against real time, the station's share of its period, and its codec."""
 
 import os
 import tempfile
 import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from gcs.drive.flown import fly_real_time
 from gcs.drive.lockstep import Sent, Vehicles, fly_lockstep, signed_ends, vehicles_of
 from gcs.interrupts import raised
+from gcs.link import mavlink
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.published import Published
 from gcs.runs.grade import Grade, grade
 from gcs.runs.summary_record import Control
 from gcs.station import station
-from gcs.studies.codec import position_frames, pymavlink_parse_s
 from scenarios.keys.course import Course
 from scenarios.schema import FixedGains, Scenario, Vehicle
 from scenarios.signing.keys import KEY_BYTES, Key
@@ -29,6 +33,8 @@ _COLUMN = 10
 _SPACING_M = 100.0
 _PARSES = 20
 """Times that pymavlink parses the frames of a tick after each flight."""
+_FRAMES, _REPEATS = 250, 20
+"""Frames that the codecs are timed with, and how often."""
 
 
 class SigningCost(Published):
@@ -73,12 +79,17 @@ class RealTimeBenchmark(Grade):
 
 
 class _Flown(NamedTuple):
-    """The run time of a flight."""
-
     ticks: int
     core_share: float
     s_per_tick: float
     station_s_per_tick: float
+
+
+class Seconds(NamedTuple):
+    """The run time of the same work by the station and by pymavlink."""
+
+    ours: float
+    theirs: float
 
 
 @dataclass
@@ -171,7 +182,6 @@ def _cost(signed: list[_Flown], plain: list[_Flown]) -> SigningCost:
 
 
 def benchmark_real_time(scenario: Scenario, *, seconds: float) -> RealTimeBenchmark:
-    """Fly `seconds` of a scenario over UDP."""
     from gcs.runs.summary import finish
 
     designed, plan = flight_plan(without_solver(scenario, seconds))
@@ -221,3 +231,59 @@ def _flight(plan: FlightPlan, key: Key | None = None) -> _Flown:
     ticks = sum(1 for _ in fly_lockstep(plan, vehicles=vehicles, guard=guard))
     taken_s, used_s = time.perf_counter() - begun_s, time.process_time() - used_s
     return _Flown(ticks, min(1.0, used_s / taken_s), taken_s / ticks, (taken_s - vehicles.taken_s) / ticks)
+
+
+def position_frames(count: int) -> list[bytes]:
+    """One LOCAL_POSITION_NED of each of `count` vehicles in flight; no byte of it is omitted as a trailing zero."""
+    states = [(1000 + k, 100.5 * k, -3.25 * k, -1000.0, 91.44, 0.125, -0.5) for k in range(count)]
+    position = mavlink.LOCAL_POSITION_NED
+    return [mavlink.encode(position, state, sequence=0, system_id=k + 1) for k, state in enumerate(states)]
+
+
+def pymavlink_parse_s(frames: Sequence[bytes]) -> float:
+    """The time that pymavlink's parser takes for the frames, each a datagram of its own."""
+    parser: Any = dialect.MAVLink(None)
+    return _taken_s(lambda: [parser.parse_char(frame) for frame in frames])
+
+
+def decode_s() -> Seconds:
+    """The time to decode one LOCAL_POSITION_NED and verify its checksum: the least of several runs."""
+    frames, refused = position_frames(_FRAMES), Counter[str]()
+    return _least(
+        lambda: _taken_s(lambda: [mavlink.decode(frame, refused) for frame in frames]),
+        lambda: pymavlink_parse_s(frames),
+    )
+
+
+def encode_s() -> Seconds:
+    """The time to encode one set-point, SET_POSITION_TARGET_LOCAL_NED: the least of several runs."""
+    packer: Any = dialect.MAVLink(None, mavlink.STATION_SYSTEM_ID, mavlink.STATION_COMPONENT_ID)
+    return _least(
+        lambda: _taken_s(lambda: [station_set_point(k) for k in range(_FRAMES)]),
+        lambda: _taken_s(lambda: [pymavlink_set_point(packer, k) for k in range(_FRAMES)]),
+    )
+
+
+def station_set_point(key_ms: int) -> bytes:
+    """A set-point with an acceleration only, by the station."""
+    fields = mavlink.acceleration_set_point(key_ms=key_ms, target_system=1, north_m_s2=0.5, east_m_s2=-0.25)
+    return mavlink.encode(mavlink.SET_POSITION_TARGET_LOCAL_NED, fields, sequence=0)
+
+
+def pymavlink_set_point(packer: Any, key_ms: int) -> bytes:
+    """The same set-point by pymavlink."""
+    numbers = key_ms, 1, 1, dialect.MAV_FRAME_LOCAL_NED, mavlink.IGNORE_ALL_BUT_ACCELERATION
+    fields = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, -0.25, 0.0, 0.0, 0.0
+    return dialect.MAVLink_set_position_target_local_ned_message(*numbers, *fields).pack(packer)
+
+
+def _taken_s(work: Callable[[], object]) -> float:
+    begun_s = time.perf_counter()
+    work()
+    return time.perf_counter() - begun_s
+
+
+def _least(ours: Callable[[], float], theirs: Callable[[], float]) -> Seconds:
+    """The least time a frame of each, measured in turn, so that a busy machine slows both."""
+    taken = [Seconds(ours(), theirs()) for _ in range(_REPEATS)]
+    return Seconds(min(each.ours for each in taken) / _FRAMES, min(each.theirs for each in taken) / _FRAMES)

@@ -6,8 +6,6 @@ formation flies with several seeds, and is carried only if it holds with all of 
 as soon as it ends, so that a study can be resumed.
 """
 
-import contextlib
-import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from math import ceil, log2
@@ -23,8 +21,9 @@ from gcs.drive.preflight import bad_start, endless_link, unstable_loop
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.published import json_text
-from gcs.runs.record import SCENARIO_FILE, RecordLog, write_whole
+from gcs.runs.record import SCENARIO_FILE, write_whole
 from gcs.station.station import Station
+from gcs.stress.campaign import Store, check_study
 from gcs.studies.benchmark import with_vehicles
 from scenarios.files import dump
 from scenarios.schema import Scenario
@@ -120,46 +119,29 @@ def capacity(
     for fault in (bad_start(formed), endless_link(formed)):
         if fault is not None:
             raise InputError(f"{scenario.name}: {fault}")
-    searches = [_Search(scenario, rate_hz, most, seeds, fly or fly_loaded) for rate_hz in rates_hz]
-    for k, search in enumerate(searches):
-        while search.wants_more:
-            search.advance()
-            ended(sum(later.at_most_left for later in searches[k:]))
-    return [search.found for search in searches]
+    found: list[Capacity] = []
+    for k, rate_hz in enumerate(rates_hz):
+        own, low, count = Capacity(rate_hz, most=None, next=None), FEWEST - 1, FEWEST
+        while count > low:
+            try:
+                load = worst_load(scenario, rate_hz, count, seeds, fly)
+            except GainsError as error:
+                own, count = replace(own, failed=str(error)), 0
+            else:
+                own, low = (replace(own, most=load), count) if load.holds else (replace(own, next=load), low)
+                count = min(2 * low, most) if own.next is None else (low + own.next.vehicles) // 2
+            later = len(rates_hz) - 1 - k
+            ended(_at_most(low, count, own.next, most) + later * _at_most(FEWEST - 1, FEWEST, None, most))
+        found.append(own)
+    return found
 
 
-class _Search:
-    """The search for the capacity at one rate: the size doubles until a formation fails, then bisection."""
-
-    def __init__(self, scenario: Scenario, rate_hz: float, most: int, seeds: int, fly: FlyLoaded) -> None:
-        self.found = Capacity(rate_hz, most=None, next=None)
-        self._scenario, self._most, self._seeds, self._fly = scenario, most, seeds, fly
-        self._low, self._count = FEWEST - 1, FEWEST
-
-    @property
-    def wants_more(self) -> bool:
-        return self._count > self._low and not self.found.failed
-
-    @property
-    def at_most_left(self) -> int:
-        """The greatest number of formations that it may still fly."""
-        if not self.wants_more:
-            return 0
-        beyond = self.found.next.vehicles if self.found.next is not None else self._most + 1
-        doublings = 0 if self.found.next is not None else ceil(log2(self._most / self._count)) + 1
-        return doublings + ceil(log2(max(1, beyond - self._low)))
-
-    def advance(self) -> None:
-        """Fly the next formation."""
-        try:
-            load = worst_load(self._scenario, self.found.rate_hz, self._count, self._seeds, self._fly)
-        except GainsError as error:
-            self.found = replace(self.found, failed=str(error))
-            return
-        self.found = replace(self.found, most=load) if load.holds else replace(self.found, next=load)
-        self._low = self._count if load.holds else self._low
-        beyond = self.found.next
-        self._count = min(2 * self._low, self._most) if beyond is None else (self._low + beyond.vehicles) // 2
+def _at_most(low: int, count: int, beyond: Load | None, most: int) -> int:
+    """The greatest number of formations that a search may still fly, from `count` vehicles on."""
+    if count <= low:
+        return 0
+    doublings = 0 if beyond is not None else ceil(log2(most / count)) + 1
+    return doublings + ceil(log2(max(1, (most + 1 if beyond is None else beyond.vehicles) - low)))
 
 
 def worst_load(scenario: Scenario, rate_hz: float, vehicles: int, seeds: int, fly: FlyLoaded | None = None) -> Load:
@@ -257,37 +239,21 @@ class LoadStore:
     """
 
     def __init__(self, folder: Path, scenario: Scenario, *, resume: bool) -> None:
-        self._folder, self._loads = folder, dict[tuple[float, int, int], Load]()
-        file, text = folder / SCENARIO_FILE, dump(scenario)
-        if resume and not file.is_file():
-            raise InputError(f"--resume: read no {SCENARIO_FILE} in {folder}, wanted the folder of a capacity study")
-        if resume and file.read_text(encoding="utf-8") != text:
-            raise InputError(f"--resume: {folder} holds a study of another scenario, wanted {file}")
-        write_whole(file, text.encode())
-        self._log = RecordLog(folder / LOADS_FILE)
-        lines = (folder / LOADS_FILE).read_bytes()
-        for line in lines.splitlines():
-            with contextlib.suppress(ValueError, TypeError):  # a kill cut this line short; it is flown again
-                self._keep(Load(**json.loads(line)))
-        if lines and not lines.endswith(b"\n"):
-            self._log.add(b"\n")
+        self._folder = folder
+        if resume:
+            check_study("--resume", folder / LOADS_FILE, "capacity study", dump(scenario))
+        write_whole(folder / SCENARIO_FILE, dump(scenario).encode())
+        self._store = Store(folder / LOADS_FILE, Load, lambda load: (load.rate_hz, load.vehicles, load.seed))
 
     def fly(self, scenario: Scenario, rate_hz: float, vehicles: int) -> Load:
         """The flight of this many vehicles at a rate, from the folder or flown now."""
-        stored = self._loads.get((rate_hz, vehicles, scenario.seed))
-        if stored is not None:
-            return stored
-        load = fly_loaded(scenario, rate_hz, vehicles)
-        self._log.add((json.dumps(asdict(load), allow_nan=False) + "\n").encode())
-        return self._keep(load)
+        flown, key = self._store.flown, (rate_hz, vehicles, scenario.seed)
+        if key not in flown:
+            self._store.add(fly_loaded(scenario, rate_hz, vehicles))
+        return flown[key]
 
     def write_result(self, found: list[Capacity]) -> None:
-        """Write capacity.json."""
         write_whole(self._folder / RESULT_FILE, json_text({"capacities": [asdict(each) for each in found]}).encode())
 
     def close(self) -> None:
-        self._log.close()
-
-    def _keep(self, load: Load) -> Load:
-        self._loads[load.rate_hz, load.vehicles, load.seed] = load
-        return load
+        self._store.close()

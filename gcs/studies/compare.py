@@ -128,7 +128,6 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
 
 
 def _overshoot(plan: FlightPlan, flown: TickArray) -> float | None:
-    """The largest overshoot of a spacing error, as a share of its initial size."""
     shares: list[float] = []
     for system_id in plan.formation.system_ids[1:]:
         own = flown[flown["system_id"] == system_id]
@@ -172,7 +171,6 @@ def string_peak(model: FormationModel, K: FloatArray) -> float | None:
 def write_comparison(
     folder: Path, scenario: Scenario, routes: list[Route], flights: Flights, grown: list[DesignCost]
 ) -> None:
-    """Write compare.json, the figures, and the page compare.html."""
     (folder / SCENARIO_FILE).write_text(dump(scenario), encoding="utf-8")
     result = {"scenario": scenario.name, "routes": routes, "sizes": grown}
     (folder / RESULT_FILE).write_text(json_text(result, default=vars), encoding="utf-8")

@@ -13,6 +13,7 @@ from gcs.autopilot.identify import MISFIT_MAX, Flown, Identified, identify
 from gcs.autopilot.manoeuvre import in_words
 from gcs.drive.flown import fly_virtual
 from gcs.errors import InputError
+from gcs.plan.flight_plan import at_once
 from gcs.plan.planner import flight_plan
 from gcs.runs.grade import commands_of
 from gcs.runs.record import END
@@ -76,7 +77,7 @@ def _identified(scenario: Scenario, axis: str) -> Identified:
     )
     sample_s = instants_s[:, 1] - instants_s[0, 0]
     inside = sample_s >= 0.0
-    found = _result(Flown(1.0 / alone.rates.control_hz, command, sample_s[inside], velocity[inside]))
+    found = at_once(identify(Flown(1.0 / alone.rates.control_hz, command, sample_s[inside], velocity[inside])))
     if found is None or found.misfit > MISFIT_MAX:
         read = (
             "no motion"
@@ -98,12 +99,3 @@ def as_toml(found: Mapping[str, Identified]) -> str:
         *(f"{name} = {value}" for name, value in values.items() if value > _LEAST),
     ]
     return "\n".join(lines)
-
-
-def _result(flown: Flown) -> Identified | None:
-    steps = identify(flown)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value

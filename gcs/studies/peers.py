@@ -6,11 +6,11 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time  # noqa: TID251 - run time is what is measured; nothing flown depends on it
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from timeit import timeit
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,7 @@ from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
 from gcs.drive.sitl import VehicleProcess
 from gcs.published import Published
-from gcs.studies import codec
-from gcs.studies.benchmark import GAINS, benchmark, with_vehicles, without_solver
+from gcs.studies.benchmark import GAINS, benchmark, decode_s, encode_s, with_vehicles, without_solver
 from gcs.studies.compare_cost import timed
 from scenarios.files import dump
 from scenarios.schema import Scenario
@@ -113,8 +112,8 @@ def _row(peer: str, work: str, unit: str, ours: float, theirs: float) -> Row:
 
 def _codecs() -> Iterator[Row]:
     for work, each in (
-        ("decode a LOCAL_POSITION_NED", codec.decode_s()),
-        ("encode a SET_POSITION_TARGET_LOCAL_NED", codec.encode_s()),
+        ("decode a LOCAL_POSITION_NED", decode_s()),
+        ("encode a SET_POSITION_TARGET_LOCAL_NED", encode_s()),
     ):
         yield _row("pymavlink", work, "µs", 1e6 * each.ours, 1e6 * each.theirs)
 
@@ -156,17 +155,13 @@ def _margins() -> Iterator[Row]:
         _, phase_deg, _, _, crossover_rad_s, _ = control.stability_margins(loop, returnall=True)
         return float((np.radians(phase_deg) / crossover_rad_s).min())
 
-    figures = [(*_timed(lambda: delay_margin(A0, A1)), *_timed(theirs)) for _ in range(_MARGINS)]
-    own_s, _, other_s, _ = figures[0]
+    def ours() -> float:
+        return delay_margin(A0, A1)
+
     work = "delay margin of a follower's continuous loop"
-    yield _row("python-control", work, "ms", 1e3 * own_s, 1e3 * other_s)
-    taken = min(figure[1] for figure in figures), min(figure[3] for figure in figures)
-    yield _row("python-control", f"time of the {work}", "ms", 1e3 * taken[0], 1e3 * taken[1])
-
-
-def _timed(margin: Callable[[], float]) -> tuple[float, float]:
-    begun_s = time.perf_counter()
-    return margin(), time.perf_counter() - begun_s
+    yield _row("python-control", work, "ms", 1e3 * ours(), 1e3 * theirs())
+    taken = [(timeit(ours, number=1), timeit(theirs, number=1)) for _ in range(_MARGINS)]
+    yield _row("python-control", f"time of the {work}", "ms", *(1e3 * min(own) for own in zip(*taken, strict=True)))
 
 
 def _growth(peer: str) -> Iterator[Row]:

@@ -386,7 +386,6 @@ def subset_margin_by_sweep(number: int) -> float:
 
 
 def write_page(folder: Path, found: list[Claim]) -> Path:
-    """Write thesis.md, with all claims, and the figures to a folder."""
     formation_figure(folder / "inclusion.png", "inclusion")
     formation_figure(folder / "graph.png", "graph-dk")
     responses_figure(folder / "responses.png")

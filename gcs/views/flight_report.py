@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from gcs.runs.record import DESIGN_FILE, SUMMARY_FILE, write_whole
 from gcs.runs.summary_record import Summary
 from gcs.views.page import rendered
 from gcs.views.report import flight_lines
+from gcs.views.scene import MODE_COLORS
 from gcs.views.svg import COLOURS, OTHERS, Level, Line, chart
 from gcs.views.table import at_once
 from scenarios.schema import Scenario
@@ -26,23 +26,7 @@ _NAMED_OF_MANY = 3
 _MOST_EVENTS = 60
 _HEADROOM_LEAST = -1.0
 """Headrooms below this are drawn at the lower edge."""
-_MODE_COLOURS = {
-    Mode.NOMINAL: "#2e7d32",
-    Mode.RECOVERING: "#00838f",
-    Mode.CAUTION: "#f0a020",
-    Mode.CRITICAL: "#c62828",
-    Mode.FAILSAFE: "#8e24aa",
-    Mode.LOST: "#5d1620",
-    Mode.WAITING: "#9aa3ad",
-}
-
-
-class Charted(NamedTuple):
-    """A chart with its heading and what its lines are."""
-
-    title: str
-    svg: str
-    note: str
+_MODE_COLOURS = {mode: "#{:02x}{:02x}{:02x}".format(*color) for mode, color in MODE_COLORS.items()}
 
 
 def leave_report(folder: Path, summary: Summary) -> Summary:
@@ -105,7 +89,8 @@ def _named(least: Sequence[float | None]) -> list[int]:
     return np.argsort(known, kind="stable")[:_NAMED_OF_MANY].tolist()
 
 
-def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: list[str]) -> list[Charted]:
+def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: list[str]) -> list[tuple[str, str, str]]:
+    """The charts: of each its heading, its SVG and what its lines are."""
     time_s = flown["time_s"][:, 0]
     sent = flown["commanded"]
 
@@ -126,7 +111,7 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
     margin_ms = 1e3 * np.where(np.isfinite(flown["delay_margin_s"]), flown["delay_margin_s"], np.nan)
     error_m = np.hypot(flown["spacing_error_north_m"], flown["spacing_error_east_m"])
     return [
-        Charted(
+        (
             "Headroom",
             chart(
                 time_s,
@@ -139,7 +124,7 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
             ),
             "At 0 the loop delay has reached the margin of the gains that are flown.",
         ),
-        Charted(
+        (
             "Loop delay and margin",
             chart(
                 time_s,
@@ -151,7 +136,7 @@ def _charts(scenario: Scenario, flown: TickArray, labels: list[str], colours: li
             "Solid: each vehicle's loop delay. Dashed: the margin of its gains at that time; where the monitor takes "
             "slower gains, it rises.",
         ),
-        Charted(
+        (
             "Spacing errors",
             chart(time_s, lines(error_m), title="spacing errors over time", unit="m", least=0.0),
             "Distance of each follower from its place behind the vehicle in front.",

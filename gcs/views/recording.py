@@ -50,15 +50,6 @@ _CURVES = {
 }
 """Curves with one line for each vehicle: the column of the ticks, and what it is multiplied by."""
 
-MODE_COLORS: dict[Mode, Color] = {
-    Mode.WAITING: (110, 110, 120),
-    Mode.NOMINAL: (56, 142, 60),
-    Mode.RECOVERING: (38, 166, 154),
-    Mode.CAUTION: (245, 166, 35),
-    Mode.CRITICAL: (229, 57, 53),
-    Mode.FAILSAFE: (171, 71, 188),
-    Mode.LOST: (120, 20, 30),
-}
 LIMIT_COLOR: Color = (255, 72, 66)
 PALE: Color = (130, 135, 145)
 
@@ -119,7 +110,6 @@ class Recording:
         self._stream.send_blueprint(_blueprint(self._scenario, design, following=self._is_live))
 
     def send(self) -> None:
-        """Write what was added."""
         if self._events:
             self._send_events(self._events)
         ticks = np.concatenate(self._ticks) if self._ticks else np.empty((0, 1), TICK)
@@ -220,7 +210,6 @@ class Recording:
             self._columns(f"{root}/trails", times_s[-pieces:], strips.partition([place_m.shape[1]] * pieces))
 
     def _send_events(self, events: list[Event]) -> None:
-        """One entry for what one tick says of several vehicles."""
         said = at_once(events)
         times_s = np.array([max(event.time_s, 0.0) for event, _ in said])
         texts = [event_text(event, system_ids, self._before_s) for event, system_ids in said]
@@ -228,7 +217,6 @@ class Recording:
         self._columns("events", times_s, rr.TextLog.columns(text=texts, level=levels))
 
     def _log_scene_styles(self) -> None:
-        """Colours, names and sizes of what moves."""
         colors, few = scene.vehicle_colors(len(self._labels)), len(self._labels) <= LABELS_MAX
         own = [colors[k] for k in self._tree.followers]
         spacing_m = min((math.hypot(*offset) for offset in self._tree.offsets_m[:, :2]), default=1.0)
@@ -248,8 +236,6 @@ class Recording:
                 self._stream.log(f"{root}/{name}", strips, static=True)
 
     def _log_plot_styles(self) -> None:
-        """Colours, names and widths of the curves."""
-
         def lines(path: str, names: list[str], colors: list[Color], width: float = 1.5) -> None:
             style = rr.SeriesLines(colors=colors, names=names, widths=[width] * len(names))
             self._stream.log(path, style, static=True)
@@ -266,7 +252,7 @@ class Recording:
         for level in self._levels:
             lines(level.path, [level.name], [LIMIT_COLOR if level.limit else PALE], 3.5 if level.limit else 1.0)
         names = [mode.name for mode in Mode]
-        lanes = rr.StateConfiguration(values=names, labels=names, colors=[MODE_COLORS[mode] for mode in Mode])
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=[scene.MODE_COLORS[mode] for mode in Mode])
         for label in labels:
             self._stream.log(f"modes/{label}", lanes, static=True)
 

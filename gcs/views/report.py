@@ -7,7 +7,6 @@ from rich.console import Console
 from rich.text import Text
 
 from gcs.plan.design import (
-    Block,
     CodeRecord,
     CriteriaPart,
     Design,
@@ -21,6 +20,7 @@ from gcs.runs.record import RECORDING_FILE, STARTED
 from gcs.runs.refusals import in_words
 from gcs.runs.summary_record import FlownSpread, LawRecord, Summary, VehicleSummary
 from gcs.views.console import UNKNOWN, ms_text, number_text, plain_console, table_of
+from scenarios.schema import GainBlock
 
 _HASH = 12
 """Digits of a hash that are shown."""
@@ -179,7 +179,7 @@ _TRADE_OFF_COLUMNS: dict[str, Callable[[TradeOffPoint], str]] = {
     "delay margin, ms": lambda point: ms_text(point.delay_margin_s, unit=""),
     "largest alpha": lambda point: f"{point.alpha:.3f}",
 }
-_BLOCK_COLUMNS: dict[str, Callable[[Block], str]] = {
+_BLOCK_COLUMNS: dict[str, Callable[[GainBlock], str]] = {
     "vehicle": lambda block: str(block.vehicle),
     "uses": lambda block: str(block.of),
     "spacing error, 1/s²": lambda block: _matrix(list(zip(*block.gain, strict=True))[:-2]),
@@ -276,7 +276,6 @@ def _reason(summary: Summary) -> str:
 
 
 def delay_text(summary: Summary) -> str:
-    """Loop delay against the margin."""
     delay, margin_s = summary.loop_delay_s, summary.delay_margin_s
     margin = "no limit" if margin_s is None else f"margin {ms_text(margin_s)}"
     if summary.margin_unknown:
@@ -317,11 +316,9 @@ def response_text(response: ResponsePart | None) -> str:
 
 
 def _code_text(code: tuple[CodeRecord, ...]) -> str:
-    """The files of code with their hashes."""
     return ", ".join(f"{each.file}, sha256 {each.sha256[:_HASH]}" for each in code)
 
 
 def _law_text(law: LawRecord) -> str:
-    """How often a law was called, and how often in vain or too long."""
     slow = "" if law.over_budget is None else f", {law.over_budget} over {1e3 * law.budget_s:g} ms"
     return f"{law.calls} calls, {law.unusable} without a usable command{slow}"

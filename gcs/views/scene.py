@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs.control.tick import TickArray
+from gcs.control.tick import Mode, TickArray
 from gcs.plan.course import PlannedMotion
 from gcs.plan.formation import plan_formation
 from scenarios.schema import Scenario
@@ -29,6 +29,16 @@ PALETTE: tuple[Color, ...] = (
     (240, 240, 240), (66, 165, 245), (255, 167, 38), (102, 187, 106), (236, 90, 160),
     (255, 238, 88), (38, 198, 218), (171, 130, 255), (239, 83, 80), (174, 213, 129),
 )  # fmt: skip
+
+MODE_COLORS: dict[Mode, Color] = {
+    Mode.NOMINAL: (56, 142, 60),
+    Mode.RECOVERING: (38, 166, 154),
+    Mode.CAUTION: (245, 166, 35),
+    Mode.CRITICAL: (229, 57, 53),
+    Mode.FAILSAFE: (171, 71, 188),
+    Mode.LOST: (120, 20, 30),
+    Mode.WAITING: (110, 110, 120),
+}
 
 
 def vehicle_colors(count: int) -> list[Color]:
@@ -67,7 +77,6 @@ class Tree:
 
 
 def tree_of(scenario: Scenario) -> Tree:
-    """The formation's tree as arrays."""
     index = {vehicle.system_id: k for k, vehicle in enumerate(scenario.vehicles)}
     formation = plan_formation(scenario)
     rows = [formation.row(vehicle.system_id) for vehicle in scenario.vehicles]

@@ -1,16 +1,16 @@
-"""Small charts as SVG text: lines over time, drawn without any library, readable in a page of any width.
+"""Small charts as SVG text: lines over time, readable in a page of any width.
 
 Lines are thinned to the extremes of each column of the picture, so no peak is lost and a long flight stays small.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
 from math import ceil, floor, isfinite, log10
 
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gcs.views.page import rendered
 
 COLOURS = "#1f4e79", "#c1440e", "#2e7d32", "#6a3d9a", "#b8860b", "#00838f", "#ad1457", "#5d4037"
 OTHERS = "#b9c2cc"
@@ -69,36 +69,26 @@ def chart(
     def y(value: float) -> float:
         return _HEIGHT - _BOTTOM - (min(max(value, low), high) - low) / (high - low) * (_HEIGHT - _TOP - _BOTTOM)
 
-    parts = [
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(title)}" '
-        'xmlns="http://www.w3.org/2000/svg" font-family="system-ui, sans-serif" font-size="13">'
-    ]
-    for mark in marks:
-        parts.append(_straight(_LEFT, y(mark), _WIDTH - _RIGHT, y(mark), "#dde2e8"))
-        parts.append(_text(_LEFT - 6, y(mark) + 4, f"{mark:g}", anchor="end"))
-    for mark in (mark for mark in _ticks(start_s, end_s) if start_s <= mark <= end_s):
-        parts.append(_straight(x(mark), _HEIGHT - _BOTTOM, x(mark), _HEIGHT - _BOTTOM + 4, "#5a6572"))
+    return rendered(
+        "chart.svg.j2",
+        title=title,
+        unit=unit,
+        box=(_WIDTH, _HEIGHT),
+        edges=(_LEFT, _WIDTH - _RIGHT, _HEIGHT - _BOTTOM),
+        marks=[(y(mark), f"{mark:g}") for mark in marks],
         # the last one ends at the edge: no tick is cut off
-        parts.append(_text(x(mark), _HEIGHT - _BOTTOM + 18, f"{mark:g}", anchor="end" if mark == end_s else "middle"))
-    parts.append(_straight(_LEFT, _HEIGHT - _BOTTOM, _WIDTH - _RIGHT, _HEIGHT - _BOTTOM, "#5a6572"))
-    parts.append(_text(_WIDTH - _RIGHT, _HEIGHT - 3, "time, s", anchor="end"))
-    parts.append(_text(_LEFT, _HEIGHT - 3, unit, anchor="start"))
-    # those with a label last: they lie above the others
-    for line in sorted(lines, key=lambda line: bool(line.label)):
-        points = [
-            " ".join(f"{x(at_s):.1f},{y(value):.1f}" for at_s, value in run)
-            for run in _runs(*_thinned(time_s, line.values))
-        ]
-        dash = ' stroke-dasharray="5 3"' if line.dashed else ""
-        width = 1.7 if line.label else 1.0
-        parts += [
-            f'<polyline points="{run}" fill="none" stroke="{line.colour}" stroke-width="{width}"{dash}/>'
-            for run in points
-        ]
-    for level in levels:
-        parts.append(_straight(_LEFT, y(level.value), _WIDTH - _RIGHT, y(level.value), level.colour, dashed=True))
-        parts.append(_text(_WIDTH - _RIGHT - 2, y(level.value) - 4, level.label, anchor="end", colour=level.colour))
-    return "".join([*parts, "</svg>"])
+        times=[
+            (x(mark), f"{mark:g}", "end" if mark == end_s else "middle")
+            for mark in _ticks(start_s, end_s)
+            if start_s <= mark <= end_s
+        ],
+        # those with a label last: they lie above the others
+        lines=[
+            (line, [" ".join(f"{x(at_s):.1f},{y(value):.1f}" for at_s, value in run) for run in _runs(time_s, line)])
+            for line in sorted(lines, key=lambda line: bool(line.label))
+        ],
+        levels=[(y(level.value), level) for level in levels],
+    )
 
 
 def _ticks(low: float, high: float) -> list[float]:
@@ -122,21 +112,13 @@ def _thinned(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatA
     return time_s[at], values[at]
 
 
-def _runs(time_s: FloatArray, values: FloatArray) -> list[list[tuple[float, float]]]:
-    """The pieces of a line between values that are not finite."""
+def _runs(time_s: FloatArray, line: Line) -> list[list[tuple[float, float]]]:
+    """The pieces of a line, thinned, between values that are not finite."""
     runs: list[list[tuple[float, float]]] = [[]]
-    for at_s, value in zip(time_s.tolist(), values.tolist(), strict=True):
+    times_s, values = _thinned(time_s, line.values)
+    for at_s, value in zip(times_s.tolist(), values.tolist(), strict=True):
         if isfinite(value):
             runs[-1].append((at_s, value))
         elif runs[-1]:
             runs.append([])
     return [run for run in runs if run]
-
-
-def _straight(x1: float, y1: float, x2: float, y2: float, colour: str, *, dashed: bool = False) -> str:
-    dash = ' stroke-dasharray="2 3"' if dashed else ""
-    return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{colour}"{dash}/>'
-
-
-def _text(x: float, y: float, text: str, *, anchor: str, colour: str = "#5a6572") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}">{escape(text)}</text>'

@@ -84,7 +84,6 @@ class FlightState:
         self._window: TickArray = np.empty((0, len(self.system_ids)), TICK)
 
     def redesigned(self, design: Design) -> None:
-        """Compare with the margins of a design."""
         self._design = design
         self._at_delay: dict[tuple[int, int], str] = {}
         self.margin_unknown = design.margin_unknown
@@ -259,7 +258,6 @@ def _footer(state: FlightState, figures: Figures) -> list[Text]:
 
 
 def plain_line(state: FlightState) -> str:
-    """The formation in one line of text."""
     figures = state.figures()
     modes = [
         f"{mode.name} {' '.join(str(state.system_ids[k]) for k in indices)}"

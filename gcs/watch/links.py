@@ -288,7 +288,6 @@ class Requests:
         self._sequences: Counter[Address] = Counter()
 
     def due(self, watch: Watch, now_ns: int) -> list[Outgoing]:
-        """The requests to be sent now."""
         asked = self._for_positions(watch, now_ns) if self._position_interval_us else []
         if now_ns < self.next_ns:
             return asked

@@ -181,7 +181,6 @@ class _Rebuilding:
         self._take_telemetry(row, vehicle, time_ns, frame)
 
     def finished(self) -> Rebuilt:
-        """What was found, once the log has been read."""
         self._close_tick()
         self._look(self._newest_ns + self._period_ns)  # takes in what came after the last tick
         rows = np.concatenate(self._rows) if self._rows else np.empty(0, TICK)

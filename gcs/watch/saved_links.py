@@ -50,7 +50,6 @@ class LinkRecorder:
         self._seen: dict[int, _OneVehicle] = {}
 
     def note(self, frame: mavlink.Frame, received_ns: int) -> None:
-        """Note a frame that the watch has just taken in."""
         vehicle = self._watch.vehicles.get(frame.system_id)
         if vehicle is None:
             return

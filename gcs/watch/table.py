@@ -29,7 +29,6 @@ def render(report: WatchReport, *, width: int, height: int | None = None) -> Ren
 
 
 def plain_line(report: WatchReport) -> str:
-    """The links in one line of text."""
     vehicles = report.vehicles
     if not vehicles:
         return f"{report.duration_s:8.1f} s  no vehicle heard"
@@ -80,7 +79,6 @@ def links_table(vehicles: Sequence[LinkFigures], width: int) -> Table:
 
 
 def _bound(figures: LinkFigures) -> str:
-    """The mark of delays that are lower bounds."""
     return "≥ " if figures.loop_delay_s.status == LOWER_BOUND else ""
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gcs.errors import InputError
+from gcs.errors import InputError, usable
 from gcs.link import mavlink
 from gcs.link.clocks import LATEST_NS
 
@@ -31,10 +31,8 @@ class TelemetryLog:
 
 def read_tlog(file: Path) -> TelemetryLog:
     """Read what can be read of a log. Raises InputError if the file cannot be read or there is no frame in it."""
-    try:
+    with usable(file, "a telemetry log"):
         data = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"{file}: {error.strerror}, wanted a telemetry log") from None
     log = parse_tlog(data)
     if not log.frames:
         raise InputError(f"{file}: read no MAVLink frame in {len(data)} bytes, wanted a telemetry log (.tlog)")
@@ -42,7 +40,6 @@ def read_tlog(file: Path) -> TelemetryLog:
 
 
 def parse_tlog(data: bytes) -> TelemetryLog:
-    """The frames of a log's bytes."""
     stamps_us: list[int] = []
     frames: list[mavlink.Frame] = []
     counters: Counter[str] = Counter()

@@ -9,7 +9,6 @@ import pytest
 from gains.sampled.prediction import predicted_growth_rate
 from gcs.control.tick import TickArray
 from gcs.plan.flight_plan import FlightPlan
-from gcs.plan.mismatch import predicted_loop
 from gcs.plan.planner import flight_plan
 from scenarios.keys.link import DelayPoint, Link
 from scenarios.schema import Control, FixedGains, Scenario
@@ -77,7 +76,7 @@ def settled_then_slower(plan: FlightPlan, aside_s: float) -> Flight:
 def test_copters_beyond_their_window_grow_apart_as_computed() -> None:
     plan = planned(ASSUMED_S, 0.59)
     flight = settled_then_slower(plan, 0.1)
-    loop, measured = predicted_loop(plan.model, plan.gains[0], plan.responses_in_order)
+    loop, measured = plan.predicted(plan.gains[0]).loop()
     delay_s = float(np.median(flight.flown["loop_delay_s"][flight.flown["time_s"] > 30.0]))
     growth_1_s = predicted_growth_rate(*loop, plan.timing, assumed_s=ASSUMED_S, delay_s=delay_s, measured=measured)
     error_m = flight.error_m(2)

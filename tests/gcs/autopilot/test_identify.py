@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from gains.performance.response import Response
 from gcs.autopilot.identify import LONGEST_S, MISFIT_MAX, Flown, Identified, amplitude_m_s2, identify, manoeuvre_m_s2
+from gcs.plan.flight_plan import at_once
 from scenarios.schema import Autopilot
 from sim_vehicles.motion.copter import Motion, Target, advance
 from sim_vehicles.motion.lagged import inner_of
@@ -50,12 +51,7 @@ def flown(
 
 
 def found(seen: Flown) -> Identified | None:
-    steps = identify(seen)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value
+    return at_once(identify(seen))
 
 
 @pytest.mark.parametrize("response", MODELS)

@@ -22,7 +22,8 @@ def answered(kind: Kind, values: dict[bytes, float]) -> tuple[ToldLimits, list[b
 
 def test_an_arducopters_limits_bound_what_it_is_sent() -> None:
     limits, asked = answered(ARDUCOPTER, {b"WPNAV_ACCEL": 250.0, b"PSC_JERK_XY": 5.0, b"GUID_TIMEOUT": 3.0})
-    assert (limits.acceleration_bound_m_s2, limits.jerk_bound_m_s3, limits.timeout_s) == (2.25, 4.0, 3.0)
+    assert (limits.acceleration_bound_m_s2, limits.jerk_bound_m_s3) == (2.25, 4.0)
+    assert limits.in_words().endswith(", GUID_TIMEOUT 3 s")
     assert len(asked) == 3
 
 
@@ -43,4 +44,4 @@ def test_what_was_not_asked_is_not_believed() -> None:
     limits = ToldLimits()
     limits.take((10.0, 3, 0, b"WPNAV_ACCEL\0", 9))
     assert limits.next(UNRECOGNISED, 0, target_system=1, rtt_ns=0) is None
-    assert limits.acceleration_m_s2 is None
+    assert limits.in_words().endswith("it tells no limits")

@@ -13,7 +13,7 @@ from gcs.control.tick import Event
 from gcs.errors import InputError
 from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.summary import finish
-from gcs.stress.campaign import Store
+from gcs.stress.campaign import trials_of
 from gcs.stress.trial import Outcome
 from tests.support.fleets.flown_run import line, prepare, ticks_of
 
@@ -88,16 +88,16 @@ def test_a_flight_is_summarised_though_its_summary_cannot_be_written(tmp_path: P
 
 def test_a_failed_campaign_ends_in_one_line_and_keeps_trials(tmp_path: Path) -> None:
     one, two = (Outcome(id=name, kind="own", seed=1, coordinates={}, real_time=False) for name in ("one", "two"))
-    store = Store(tmp_path)
+    store = trials_of(tmp_path)
     store.add(one)
     with (
         disk_full_at(store.file.stat().st_size + 20),
-        pytest.raises(InputError, match=r"trials\.jsonl: File too large; 1 trials are stored; continue with --resume"),
+        pytest.raises(InputError, match=r"trials\.jsonl: File too large; 1 flights are stored; continue with --resume"),
     ):
         store.add(two)
     store.close()
-    again = Store(tmp_path)
-    assert list(again.outcomes) == ["one"]
+    again = trials_of(tmp_path)
+    assert list(again.flown) == ["one"]
     again.add(two)
     again.close()
     assert store.file.read_bytes().count(b"\n") == 2

@@ -13,7 +13,15 @@ import pyarrow.parquet as pq
 import pytest
 
 from gcs.errors import InputError
-from gcs.stress.campaign import PARQUET_FILE, TRIALS_FILE, Store, dask_workers, local_workers, run_campaign, write_table
+from gcs.stress.campaign import (
+    PARQUET_FILE,
+    TRIALS_FILE,
+    dask_workers,
+    local_workers,
+    run_campaign,
+    trials_of,
+    write_table,
+)
 from gcs.stress.measure import fly_trial
 from gcs.stress.trial import Outcome, Trial
 from tests.support.fleets.stress_pair import trials
@@ -43,11 +51,11 @@ def same(outcomes: Sequence[Outcome]) -> list[Outcome]:
 def test_an_interrupted_campaign_goes_on_where_it_was(tmp_path: Path) -> None:
     wanted = trials(5)
     first = Here(stop_after=2)
-    store = Store(tmp_path)
+    store = trials_of(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         run_campaign(wanted, store, first)
     store.close()
-    second, again = Here(), Store(tmp_path)
+    second, again = Here(), trials_of(tmp_path)
     outcomes = run_campaign(wanted, again, second)
     again.close()
     assert (len(first.flown), len(second.flown)) == (2, 3)
@@ -58,7 +66,7 @@ def test_an_interrupted_campaign_goes_on_where_it_was(tmp_path: Path) -> None:
 
 def test_a_trial_at_two_coordinates_is_flown_once(tmp_path: Path) -> None:
     [trial] = trials(1)
-    fly, store = Here(), Store(tmp_path)
+    fly, store = Here(), trials_of(tmp_path)
     outcomes = run_campaign([trial, replace(trial, coordinates=(("x", 1.0),))], store, fly)
     store.close()
     assert len(fly.flown) == 1
@@ -66,28 +74,28 @@ def test_a_trial_at_two_coordinates_is_flown_once(tmp_path: Path) -> None:
 
 
 def test_two_campaigns_do_not_fly_in_one_folder(tmp_path: Path) -> None:
-    first = Store(tmp_path)
-    with pytest.raises(InputError, match="another gcs stress"):
-        Store(tmp_path)
+    first = trials_of(tmp_path)
+    with pytest.raises(InputError, match="another gcs works"):
+        trials_of(tmp_path)
     first.close()
-    Store(tmp_path).close()
+    trials_of(tmp_path).close()
 
 
 def test_a_line_cut_short_costs_its_own_trial_only(tmp_path: Path) -> None:
-    wanted, store = trials(3), Store(tmp_path)
+    wanted, store = trials(3), trials_of(tmp_path)
     run_campaign(wanted, store, Here())
     store.close()
     file = tmp_path / TRIALS_FILE
     file.write_bytes(file.read_bytes()[:-40])
-    fly, store = Here(), Store(tmp_path)
+    fly, store = Here(), trials_of(tmp_path)
     run_campaign(wanted, store, fly)
     store.close()
     assert fly.flown == [wanted[2].id]
-    assert set(Store(tmp_path).outcomes) == {trial.id for trial in wanted}
+    assert set(trials_of(tmp_path).flown) == {trial.id for trial in wanted}
 
 
 def test_a_trial_that_raises_is_recorded_and_the_others_fly(tmp_path: Path) -> None:
-    wanted, store, left = trials(3, bad=1), Store(tmp_path), list[int]()
+    wanted, store, left = trials(3, bad=1), trials_of(tmp_path), list[int]()
     outcomes = run_campaign(wanted, store, Here(), ended=left.append)
     store.close()
     assert [outcome.error is None for outcome in outcomes] == [True, False, True]
@@ -112,11 +120,11 @@ def test_a_flight_ended_by_ctrl_c_is_not_stored(tmp_path: Path) -> None:
     def interrupted(wanted: Sequence[Trial]) -> Iterator[Outcome]:
         yield from (replace(fly_trial(one), reason="interrupted: SIGINT") for one in wanted)
 
-    store = Store(tmp_path)
+    store = trials_of(tmp_path)
     with pytest.raises(KeyboardInterrupt):
         run_campaign([trial], store, interrupted)
     store.close()
-    assert Store(tmp_path).outcomes == {}
+    assert trials_of(tmp_path).flown == {}
 
 
 KILLED = """
@@ -124,9 +132,9 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from tests.support.fleets.stress_pair import trials
-from gcs.stress.campaign import Store, local_workers, run_campaign
+from gcs.stress.campaign import local_workers, run_campaign, trials_of
 if __name__ == "__main__":
-    store = Store(Path(sys.argv[1]))
+    store = trials_of(Path(sys.argv[1]))
     with local_workers(2) as fly:
         run_campaign(trials(40), store, fly, ended=lambda left: print(left, flush=True))
 """
@@ -158,14 +166,14 @@ def test_kill_9_loses_nothing_finished_and_leaves_no_workers(tmp_path: Path) -> 
     process.wait()
     while running_in_group(process.pid):  # multiprocessing's own tracker of semaphores has still to tidy up
         pass
-    store, fly, wanted = Store(tmp_path), Here(), trials(6)
-    kept = set(store.outcomes)
+    store, fly, wanted = trials_of(tmp_path), Here(), trials(6)
+    kept = set(store.flown)
     assert len(kept) >= 3
     run_campaign(wanted, store, fly)
     store.close()
     assert set(fly.flown) == {trial.id for trial in wanted} - kept
     lines = (tmp_path / TRIALS_FILE).read_text(encoding="utf-8").splitlines()
-    assert len([json.loads(line)["id"] for line in lines]) == len(store.outcomes)
+    assert len([json.loads(line)["id"] for line in lines]) == len(store.flown)
 
 
 def test_processes_and_a_dask_cluster_give_what_one_process_gives(tmp_path: Path) -> None:

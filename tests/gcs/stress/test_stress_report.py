@@ -12,13 +12,13 @@ import typer
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it comes with pymavlink, untyped
 from typer.testing import CliRunner
 
+from gcs.cli.results import checks_of
 from gcs.cli.stress import stress
-from gcs.cli.stress_output import checks_of
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.junit import write_junit
 from gcs.runs.record import SUMMARY_FILE
-from gcs.stress.campaign import TRIALS_FILE, Store, local_workers, run_campaign
+from gcs.stress.campaign import TRIALS_FILE, local_workers, run_campaign, trials_of
 from gcs.stress.report import CampaignResult
 from gcs.stress.study import Onset, Study, find_onset
 from gcs.stress.trial import Outcome
@@ -95,7 +95,7 @@ def test_a_campaign_is_taken_up_with_its_own_scenario_only(tmp_path: Path) -> No
 
 
 def found_with(plan: FlightPlan, folder: Path) -> Onset:
-    store = Store(folder)
+    store = trials_of(folder)
     with local_workers(1) as fly:
         onset = find_onset(Study(plan), lambda trials: run_campaign(trials, store, fly), tolerance=0.02)
     store.close()

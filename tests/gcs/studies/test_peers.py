@@ -13,8 +13,14 @@ from examples.peers.plain import Law
 from gcs.cli.main import app
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
-from gcs.studies.benchmark import GAINS, with_vehicles, without_solver
-from gcs.studies.codec import position_frames, pymavlink_set_point, station_set_point
+from gcs.studies.benchmark import (
+    GAINS,
+    position_frames,
+    pymavlink_set_point,
+    station_set_point,
+    with_vehicles,
+    without_solver,
+)
 from gcs.studies.peers import PeerError, run_script, side_by_side
 from scenarios.files import load
 from tests.support.paths import SCENARIOS
