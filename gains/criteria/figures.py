@@ -31,7 +31,6 @@ class LoopFigures:
     that of spacing errors and of velocity errors, see `gains.core.requirement.Criteria`. Where errors run down a chain
     of equal followers, `chain` is one of them. Figures without delay do not include a response.
 
-    >>> from gains.formation.model import FormationModel
     >>> lone = LoopFigures(FormationModel((-1,), axes=1), np.array([[-1.0]]), FlownTiming(np.inf, 0.02), 0.29)
     >>> round(lone.decay_rate_1_s, 6), round(lone.decay_rate_at_delay_1_s, 3), round(lone.alpha_at_delay, 3)
     (1.0, 1.631, 1.0)

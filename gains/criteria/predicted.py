@@ -48,8 +48,6 @@ class PredictedFigures:
 
     The gains of `triangle5`, assumed and true delay 0.6 s:
 
-    >>> from gains.criteria.predicted import PredictedFigures
-    >>> from gains.formation.model import FormationModel
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> K = pair.overlapping_gain([[-3.408]], [[0.631]], [[5.608]])
     >>> found = PredictedFigures(pair, K, 0.02, 0.6, (0.6,))

@@ -36,7 +36,6 @@ def analyse_delay(
 
     x'' - 0.1 x' + 2 x = x(t - tau) is stable for delays between 0.1 s and 1.7 s only:
 
-    >>> from gains import analyse_delay
     >>> found = analyse_delay([[0, 1], [-2, 0.1]], [[0, 0], [1, 0]])
     >>> [(round(start_s, 4), round(end_s, 4)) for start_s, end_s in found.stable_intervals_s]
     [(0.1002, 1.7179)]
@@ -51,7 +50,6 @@ def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 
     `inf` if no delay does, 0 if the loop is unstable without delay. Arguments and exceptions as of `analyse_delay`.
 
-    >>> from gains import delay_margin
     >>> round(delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796
     """

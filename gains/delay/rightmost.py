@@ -33,7 +33,6 @@ def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
     At tau = pi / 2 x'(t) = -x(t - tau) has the roots +-j, and with tau = 1 one that is Lambert's W(-1):
 
     >>> from math import pi
-    >>> from gains import rightmost_root
     >>> rightmost, later = (rightmost_root([([[-1]], delay_s)]) for delay_s in (1, pi / 2))
     >>> round(rightmost.real, 6), round(rightmost.imag, 6), round(later.imag, 6)
     (-0.318132, 1.337236, 1.0)
@@ -48,7 +47,6 @@ def rightmost_roots(terms: Sequence[tuple[ArrayLike, float]], count: int) -> Com
 
     Of x'(t) = -x(t - 1) these are the branches of Lambert's W(-1):
 
-    >>> from gains.delay.rightmost import rightmost_roots
     >>> rightmost_roots([([[-1]], 1.0)], 3).round(3).tolist()
     [(-0.318+1.337j), (-2.062+7.589j), (-2.653+13.949j)]
     """

@@ -67,7 +67,6 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
 
     x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2): up to pi / 2 and pi / 4, whatever the other delay is.
 
-    >>> from gains import delay_box
     >>> box = delay_box([[0, 0], [1, 0]], [[[-1, 0], [0, 0]], [[0, 0], [0, -2]]])
     >>> [round(limit_s, 6) for limit_s in box.limits_s], box.is_exact
     ([1.570796, 0.785398], True)
@@ -133,7 +132,6 @@ def boundary_of_two_delays(
 
     Without tau_2 the loop x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) takes tau_1 up to acos(-0.5) / sqrt(0.75) = 2.4184:
 
-    >>> from gains.delay.several import boundary_of_two_delays
     >>> edge = boundary_of_two_delays([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
     >>> at_once = min((pair for line in edge for pair in line.delays_s.tolist()), key=lambda pair: pair[1])
     >>> round(at_once[0], 4), at_once[1]

@@ -78,7 +78,6 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     A leader that may not use its own velocity error keeps its integrator, unless a link is added:
 
     >>> from gains import FormationModel
-    >>> from gains.formation.fixed_modes import fixed_modes
     >>> from gains.formation.pattern import formation_plant, leader_follower
     >>> from gains.formation.pattern import without_links
     >>> pair = FormationModel((-1, 0), axes=1)

@@ -47,7 +47,6 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     `gains.delay.constant.delay_margin`. Raises BadModelError unless the matrices are square, finite and of one size,
     and DisagreementError if the methods differ, with what each one found.
 
-    >>> from gains import checked_delay_margin
     >>> round(checked_delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796
     """

@@ -45,9 +45,6 @@ def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArra
 
     A follower gets half the leader's command beside its own gains:
 
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.performance.predicted import fed_forward
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> fed_forward(pair, np.array([[-3.0, 0.0, 0.0], [1.0, 2.0, -3.0]]), 0.5).tolist()
     [[-3.0, 0.0, 0.0], [-0.5, 2.0, -3.0]]
@@ -67,8 +64,6 @@ class PredictedLoop:
 
     The gains of `triangle5`, with and without prediction over 0.25 s, at that loop delay:
 
-    >>> from gains.performance.predicted import PredictedLoop
-    >>> from gains.performance.scalar_gains import ScalarGains
     >>> gains = ScalarGains(k1=3.408, k2=0.631, k3=5.608, alpha=0.817)
     >>> loops = [PredictedLoop(gains, period_s=0.02, assumed_s=assumed_s) for assumed_s in (0.0, 0.25)]
     >>> [round(loop.string_peak(0.25), 2) for loop in loops], [round(loop.alpha(0.25), 2) for loop in loops]

@@ -182,9 +182,6 @@ def coupled_blocks(
 
     A chain of three: each vehicle is a block, and the two followers are alike. Sampling at 50 Hz costs half a period:
 
-    >>> import numpy as np
-    >>> from gains import FormationModel, Timing
-    >>> from gains.sampled.coupled_block import coupled_blocks
     >>> chain = FormationModel((-1, 0, 1))
     >>> K = chain.overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
     >>> blocks = coupled_blocks(chain, K, (1, 2, 3), timing=Timing(control_s=0.02, telemetry_s=0.02))

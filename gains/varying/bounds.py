@@ -43,7 +43,6 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
 
     A loop of the paper of 2013: 6.059 s for a constant delay, where the exact margin is 6.1726 s.
 
-    >>> from gains import varying_delay_bound
     >>> round(varying_delay_bound([[-2, 0], [0, -0.9]], [[-1, 0], [-1, -1]], rate=0.0), 2)
     6.06
     """

@@ -71,8 +71,6 @@ def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBoun
 
     x'(t) = -x(t - tau(t)): a constant delay may come near pi / 2, one that jumps may not.
 
-    >>> from math import inf
-    >>> from gains.varying.jitter import Jitter, bound_covering
     >>> [bound_covering([[0]], [[-1]], Jitter(1.4, spread_s, inf)).cover for spread_s in (0.0, 0.15)]
     ['constant', 'none']
     """
@@ -119,8 +117,6 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
 
     x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
 
-    >>> from math import inf
-    >>> from gains.varying.jitter import spread_bound
     >>> [round(spread_bound([[0]], [[-1]], mean_s=0.5, rate=rate), 2) for rate in (1.0, inf)]
     [0.5, 0.47]
     """
