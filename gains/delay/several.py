@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from math import inf, isfinite, pi
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import distinct_blocks, real_matrix, square_matrices
 from gains.delay._curves import at_delay, crossing_solutions
@@ -214,7 +214,7 @@ def _edge_point(
     return pair_s, float(found[0])
 
 
-def _runs(kept: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+def _runs(kept: BoolArray) -> Iterator[tuple[int, int]]:
     """Begin and end of each stretch that is kept."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(np.int8)))
     return zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)

@@ -18,10 +18,9 @@ from math import inf
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.core._bracketing import met_end
-from gains.core.arrays import FloatArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains
@@ -116,7 +115,7 @@ class FlownFormation:
         sigma = np.linalg.svd(self.characteristic(omega, delay_s), compute_uv=False)
         return sigma[:, -1].astype(np.float64)
 
-    def characteristic(self, omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
+    def characteristic(self, omega: FloatArray, delay_s: float) -> ComplexArray:
         """jωI − A − B h (K_own e^{−jωτ_own} + K_others e^{−jω(τ + T/2)}), shape (k, n, n); h are the responses.
 
         Of one axis if the gains act on every axis alike, which is as large as that of all of them.
@@ -144,7 +143,7 @@ class FlownFormation:
         magnitudes = np.abs(np.linalg.eigvals(sum(self._matrices)))
         return float(max(magnitudes.min(), 1e-6 * magnitudes.max()))
 
-    def _answers(self, omega: FloatArray) -> NDArray[np.complex128]:
+    def _answers(self, omega: FloatArray) -> ComplexArray:
         """From wanted to real accelerations, (k, n, 1): the factor of each row of B K."""
         model, _ = self._narrowed
         factors = np.ones((len(omega), model.states, 1), dtype=np.complex128)
@@ -246,5 +245,5 @@ class FlownLoop:
         k1, k2, k3 = self._k
         return np.array([[-k1]]), np.array([[k2]]), np.array([[k3]])
 
-    def _answer(self, omega: FloatArray) -> NDArray[np.complex128]:
+    def _answer(self, omega: FloatArray) -> ComplexArray:
         return np.ones_like(omega, dtype=np.complex128) if self.response is None else self.response.transfer(omega)

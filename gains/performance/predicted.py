@@ -25,9 +25,8 @@ from functools import cached_property
 from math import inf, pi
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import PAIR, ScalarGains
@@ -152,21 +151,19 @@ class PredictedLoop:
         highest = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ K, 2) + np.linalg.norm(B @ K @ self._ahead, 2))
         return np.geomspace(_LOWEST * self._slowest, highest, _FREQUENCIES)
 
-    def _resolvents(self, omega: FloatArray) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    def _resolvents(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """s (k, 1, 1) and (s I - A)^{-1} (k, n, n)."""
         s, A = (1j * omega[:, np.newaxis, np.newaxis]).astype(np.complex128), self._matrices[0]
         return s, np.linalg.inv(s * np.eye(len(A)) - A).astype(np.complex128)
 
-    def _seen(
-        self, s: NDArray[np.complex128], resolvent: NDArray[np.complex128], delay_s: float
-    ) -> NDArray[np.complex128]:
+    def _seen(self, s: ComplexArray, resolvent: ComplexArray, delay_s: float) -> ComplexArray:
         """What the predicted state answers to commands, (k, n, 2), in continuous time."""
         B = self._matrices[1]
         mismatch = np.exp(-s * delay_s) - np.exp(-s * self.assumed_s)
         answers = resolvent @ B
         return (answers + self._ahead @ answers * mismatch) * np.exp(-s * self.period_s / 2.0)
 
-    def _seen_sampled(self, omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
+    def _seen_sampled(self, omega: FloatArray, delay_s: float) -> ComplexArray:
         """S(z) at z = e^{j omega T}, shape (k, n, 2)."""
         z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
         Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))

@@ -26,9 +26,9 @@ from functools import partial
 from math import inf, isfinite
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.delay._crossings import DelayedTerm
 from gains.delay._mixed import analyse_mixed
@@ -151,9 +151,7 @@ def checked_assumption(assumed_s: float) -> float:
     return float(assumed_s)
 
 
-def checked_mask(
-    loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequence[bool] | None
-) -> NDArray[np.bool_] | None:
+def checked_mask(loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequence[bool] | None) -> BoolArray | None:
     """Which states are measured (n,), None if all are; BadModelError if that does not fit the loop."""
     A, _, K = loop
     mask = None if measured is None else np.array(measured, dtype=np.bool_)
