@@ -17,11 +17,10 @@ from dataclasses import replace
 from math import pi
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
+from gains.core.structure import Block, balanced, is_singular_for_any_delay
 from gains.delay._crossings import (
     LARGEST_ALGEBRAIC_BLOCK,
     Crossing,
@@ -42,15 +41,7 @@ from gains.delay._loci import (
     unit_crossings,
 )
 from gains.delay._tracked import UnclearError, tracked_crossings
-from gains.delay._windows import (
-    BlockAnalysis,
-    DelayAnalysis,
-    block_analysis,
-    check_horizon,
-    combined_analysis,
-    unstable_roots,
-    zero_passage,
-)
+from gains.delay._windows import BlockAnalysis, block_analysis, unstable_roots, zero_passage
 
 # loci are eigenvalues of many companion matrices; beyond this size of them angles are followed instead
 _LARGEST_LOCI = 30
@@ -71,21 +62,6 @@ _REACH, _NEWTON_STEPS = 1.5, 3
 _SLOW, _BESIDE = 1e-6, 0.05
 # a local extremum of a real part is refined when its sample is this close to the axis, relative to the norm
 _NEAR_AXIS = 0.1
-
-
-def analyse_commensurate(
-    matrices: Sequence[ArrayLike], *, horizon_s: float | None = None, leave_out_zero: bool = False
-) -> DelayAnalysis:
-    """Stability windows, critical delays and margin in tau of x'(t) = sum_k A_k x(t - k tau).
-
-    `matrices` are A_0, A_1, ..., A_m, real (n, n), 1/s. The options, and what is raised, are those of
-    `gains.delay.constant.analyse_delay`; BadModelError also without a matrix or if m n is too large.
-    """
-    check_horizon(horizon_s)
-    if len(matrices) == 0:
-        raise BadModelError("matrices is empty; at least A_0 is wanted")
-    blocks = distinct_blocks(*square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)}))
-    return combined_analysis([analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
 
 
 def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:

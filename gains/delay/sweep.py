@@ -45,8 +45,8 @@ def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
 
     Where an eigenvalue s of A(theta) = sum_k A_k e^{-j k theta} crosses the imaginary axis at j omega, tau = theta /
     omega is critical. Sorted real parts are continuous in the angle, so crossings can be bracketed, and local extrema
-    near zero are refined. 0 if the loop is unstable without delay, `inf` if no crossing is found. Arguments and
-    exceptions as of `gains.delay._commensurate.analyse_commensurate`.
+    near zero are refined. 0 if the loop is unstable without delay, `inf` if no crossing is found. Raises as
+    `gains.delay.constant.analyse_delay` does of these matrices.
     """
     checked = square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)})
     return min(_circle_margin(balanced(*block.matrices)) for block in distinct_blocks(*checked))
