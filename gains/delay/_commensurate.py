@@ -40,7 +40,7 @@ from gains.delay._loci import (
     solved_beside_poles,
     unit_crossings,
 )
-from gains.delay._tracked import UnclearError, tracked_crossings
+from gains.delay._tracked import UnclearError, at_angle, tracked_crossings
 from gains.delay._windows import BlockAnalysis, block_analysis, unstable_roots, zero_passage
 
 # loci are eigenvalues of many companion matrices; beyond this size of them angles are followed instead
@@ -158,7 +158,7 @@ def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
         # a determinant that vanishes at more angles than its degree vanishes at all; three unrelated angles stand for
         # them, with a tolerance far above rounding
         else:
-            matrices = 1j * omega * np.eye(terms[0].shape[0]) - _at_angle(terms, np.array([0.0, 1.0, 2.5]))
+            matrices = 1j * omega * np.eye(terms[0].shape[0]) - at_angle(terms, np.array([0.0, 1.0, 2.5]))
             if np.linalg.svd(matrices, compute_uv=False)[:, -1].max() < 1e-12 * scale:
                 return True
     return False
@@ -200,16 +200,10 @@ def _candidates(terms: Sequence[FloatArray], highest: float) -> FloatArray:
     theta = _candidate_angles(terms)
     if theta.size == 0:
         return np.empty(0)
-    roots = np.linalg.eigvals(_at_angle(terms, theta))
+    roots = np.linalg.eigvals(at_angle(terms, theta))
     near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
     omega = np.unique(np.abs(roots.imag[near_axis]))
     return omega[(omega > 0.0) & (omega < 1.1 * highest)]
-
-
-def _at_angle(terms: Sequence[FloatArray], theta: FloatArray) -> ComplexArray:
-    """sum_k A_k e^{-j k theta}, shape (angles, n, n)."""
-    turns = np.exp(-1j * theta[:, np.newaxis] * np.arange(len(terms)))
-    return np.tensordot(turns, np.array(terms), axes=1)
 
 
 def norm_of(terms: Sequence[FloatArray]) -> float:
@@ -225,7 +219,7 @@ def circle_loci(terms: Sequence[FloatArray]) -> Loci:
     scale = norm_of(terms)
 
     def loci(theta: FloatArray) -> ComplexArray:
-        return np.exp(np.linalg.eigvals(_at_angle(terms, theta)) / scale).astype(np.complex128)
+        return np.exp(np.linalg.eigvals(at_angle(terms, theta)) / scale).astype(np.complex128)
 
     return loci
 
@@ -244,7 +238,7 @@ def passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool
     """
     if omega > _SLOW * highest_frequency(terms):
         return False
-    beside = np.abs(np.linalg.eigvals(_at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
+    beside = np.abs(np.linalg.eigvals(at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
     return bool(beside.min() > 1e3 * omega)
 
 
@@ -277,11 +271,9 @@ def _candidate_angles(terms: Sequence[FloatArray]) -> FloatArray:
 
 def _roots_and_slopes(terms: Sequence[FloatArray], theta: FloatArray) -> tuple[ComplexArray, FloatArray]:
     """Eigenvalues s of A(theta), shape (angles, n), and d(Re s) / d theta: zero where an eigenvalue is defective."""
-    roots, right = np.linalg.eig(_at_angle(terms, theta))
-    k = np.arange(len(terms))
-    change = np.tensordot(-1j * k * np.exp(-1j * theta[:, np.newaxis] * k), np.array(terms), axes=1)
+    roots, right = np.linalg.eig(at_angle(terms, theta))
     try:
-        slopes = np.real(np.einsum("tii->ti", np.linalg.solve(right, change @ right)))
+        slopes = np.real(np.einsum("tii->ti", np.linalg.solve(right, at_angle(terms, theta, 1) @ right)))
     except np.linalg.LinAlgError:
         slopes = np.zeros(roots.shape)
     return roots.astype(np.complex128), slopes.astype(np.float64)

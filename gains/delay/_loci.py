@@ -8,6 +8,7 @@ two frequencies at which a different number of moduli exceeds one, there is a cr
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -114,16 +115,10 @@ def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
     """
     logs = log_moduli(loci(points))
     above = np.count_nonzero(logs > 0.0, axis=1)
-    intervals = np.flatnonzero(above[1:] != above[:-1])
-    if intervals.size == 0:
+    crossed = [(i, rank) for i, ends in enumerate(pairwise(above.tolist())) for rank in range(min(ends), max(ends))]
+    if not crossed:
         return []
-    lower: list[int] = []
-    rank: list[int] = []
-    for i in intervals.tolist():
-        ranks = range(min(above[i], above[i + 1]), max(above[i], above[i + 1]))
-        lower.extend([i] * len(ranks))
-        rank.extend(ranks)
-    at, nth = np.array(lower), np.array(rank)
+    at, nth = np.array(crossed).T
 
     def nth_log(omega: FloatArray) -> FloatArray:
         return log_moduli(loci(omega))[np.arange(omega.size), nth]
