@@ -1,11 +1,10 @@
-"""How vehicles with autopilots respond to set-points, as the file describes it, and its contradictions."""
+"""How vehicles with autopilots respond to set-points, as the file describes it."""
 
-from collections.abc import Iterator
 from typing import Annotated
 
 from pydantic import Field
 
-from scenarios.keys.part import Fault, NotNegative, Part, Positive
+from scenarios.keys.part import NotNegative, Part, Positive
 
 DeadTime = Annotated[float, Field(ge=0, le=1)]
 
@@ -29,9 +28,3 @@ class Response(Part):
     """Dead time before the lag."""
     natural_frequency_rad_s: Positive | None = None
     """Natural frequency; makes the response one of second order."""
-
-
-def response_contradictions(key: str, dead_time_s: float, natural_frequency_rad_s: float | None) -> Iterator[Fault]:
-    """What contradicts itself in a response."""
-    if dead_time_s and natural_frequency_rad_s is not None:
-        yield f"{key}.dead_time_s", dead_time_s, "no such key with natural_frequency_rad_s: one model at a time"

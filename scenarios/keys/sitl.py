@@ -1,11 +1,10 @@
 """The clock errors that simulated copters share with autopilots in SITL."""
 
-from collections.abc import Iterator
 from typing import Annotated
 
 from pydantic import Field
 
-from scenarios.keys.part import Fault, Part
+from scenarios.keys.part import Part
 
 
 class Sitl(Part):
@@ -18,9 +17,3 @@ class Sitl(Part):
     """Mean time by which the boot clock falls behind whenever the simulator cannot keep up; exponential."""
     slip_every_s: Annotated[float, Field(gt=0, le=86400)] = 20.0
     """Mean time between two such slips; exponential. Only with `slip_s`."""
-
-
-def sitl_contradictions(sitl: Sitl, dynamics: str) -> Iterator[Fault]:
-    """Keys that would have no effect."""
-    if sitl != Sitl() and dynamics != "autopilot":
-        yield "autopilot.sitl", sitl.model_dump(), "no such key without dynamics autopilot"
