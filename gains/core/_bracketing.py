@@ -41,6 +41,17 @@ def local_maxima(values: FloatArray) -> IntArray:
     return np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
 
 
+def highest(function: Functions, grid: FloatArray) -> tuple[float, float]:
+    """Place and height of the largest value on a rising grid, with every local maximum refined."""
+    values = function(grid)
+    inner = local_maxima(values)
+    if inner.size:
+        places = peaks(function, grid[inner - 1], grid[inner + 1])
+        grid, values = np.concatenate([grid, places]), np.concatenate([values, function(places)])
+    at = int(np.argmax(values))
+    return float(grid[at]), float(values[at])
+
+
 def may_reach_zero(points: FloatArray, values: FloatArray) -> BoolArray:
     """Where a local maximum below zero of samples (k, r) of r functions may hide a zero, shape (k - 2, r).
 

@@ -19,12 +19,12 @@ from typing import Literal
 
 import numpy as np
 
-from gains.core._bracketing import met_end
+from gains.core._bracketing import highest, met_end
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains
-from gains.performance.string_stability import largest_magnitude, largest_value, string_peak
+from gains.performance.string_stability import largest_magnitude, string_peak
 from gains.sampled.onboard import own_part
 
 # Where no α is asked for, it counts as kept down to this share of its value without delay.
@@ -85,7 +85,7 @@ class FlownFormation:
         """α at a loop delay (s); 0 from the margin on."""
         if not delay_s < self.timing.delay_margin_s:
             return 0.0
-        return -largest_value(lambda omega: -self.singular_value(omega, delay_s), self.frequencies())
+        return -highest(lambda omega: -self.singular_value(omega, delay_s), self.frequencies())[1]
 
     def alpha_limit_s(self, alpha: float) -> float:
         """The largest loop delay up to which α is kept: `inf` if at every one, 0 if not even without delay."""

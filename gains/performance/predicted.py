@@ -26,11 +26,11 @@ from math import inf, pi
 
 import numpy as np
 
+from gains.core._bracketing import highest
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import PAIR, ScalarGains
-from gains.performance.string_stability import largest_value
 from gains.sampled._loop import HeldPlant, held_entry
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window
@@ -90,7 +90,7 @@ class PredictedLoop:
         if not self.is_stable(delay_s):
             return inf
         frequencies = np.geomspace(_LOWEST * self._slowest, pi / self.period_s, _FREQUENCIES)
-        return max(1.0, largest_value(lambda omega: self.growth(omega, delay_s), frequencies))
+        return max(1.0, highest(lambda omega: self.growth(omega, delay_s), frequencies)[1])
 
     def growth(self, omega: FloatArray, delay_s: float) -> FloatArray:
         """|U_i / U_j| (k,) at frequencies omega (k,) in rad/s up to pi / `period_s`, if the loop is stable."""
@@ -114,7 +114,7 @@ class PredictedLoop:
             disturbed = resolvent + resolvent @ late @ commands
             return np.linalg.norm(disturbed[:, :3, :3], ord=2, axis=(1, 2))
 
-        return 1.0 / largest_value(gain, self._frequencies)
+        return 1.0 / highest(gain, self._frequencies)[1]
 
     def is_stable(self, delay_s: float) -> bool:
         """Whether a true delay is in the window."""
