@@ -36,9 +36,9 @@ from gains.delay._loci import (
     Loci,
     UnitCrossing,
     highest_frequency,
-    near_unit_extrema,
     solved_beside_poles,
     unit_crossings,
+    with_extrema,
 )
 from gains.delay._tracked import UnclearError, at_angle, tracked_crossings
 from gains.delay._windows import BlockAnalysis, block_analysis, unstable_roots, zero_passage
@@ -226,8 +226,7 @@ def circle_loci(terms: Sequence[FloatArray]) -> Loci:
 
 def circle_points(terms: Sequence[FloatArray]) -> FloatArray:
     """Grid angles, and the extrema at which a real part comes near the axis and turns back."""
-    theta = _grid_angles(terms)
-    return np.union1d(theta, near_unit_extrema(circle_loci(terms), theta, near=_NEAR_AXIS))
+    return with_extrema(circle_loci(terms), _grid_angles(terms), near=_NEAR_AXIS)
 
 
 def passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool:

@@ -47,6 +47,11 @@ class UnitCrossing:
     locus: complex
     outward: int
 
+    @property
+    def delay_s(self) -> float:
+        """The least delay >= 0 with e^{j omega delay} at the locus."""
+        return float(np.angle(self.locus)) % (2.0 * np.pi) / self.omega
+
 
 def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """B (n, r) and C (r, n) with B C = `matrix` to rounding, r its numerical rank, and equal norms of both."""
@@ -143,8 +148,8 @@ def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: f
     return [crossing for crossing in crossings if crossing.omega > _SLOW * highest or not is_flat(crossing)]
 
 
-def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
-    """Frequencies of local extrema of the sorted log moduli that may reach zero between grid points.
+def with_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
+    """The frequencies, and those of local extrema of the sorted log moduli between them that may reach zero.
 
     Extrema whose sampled log modulus is `near` or more away from zero are taken not to reach it.
     """
@@ -152,13 +157,19 @@ def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT
     peak, valley = may_reach_zero(omega, logs), may_reach_zero(omega, -logs)
     row, rank = np.nonzero((peak | valley) & (np.abs(logs[1:-1]) < near))
     if row.size == 0:
-        return np.empty(0)
+        return omega
     sign = np.where(peak[row, rank], 1.0, -1.0)
 
     def height(at: FloatArray) -> FloatArray:
         return sign * log_moduli(loci(at))[np.arange(at.size), rank]
 
-    return peaks(height, omega[row], omega[row + 2])
+    return np.union1d(omega, peaks(height, omega[row], omega[row + 2]))
+
+
+def swept_crossings(loci: Loci, omega: FloatArray) -> list[UnitCrossing]:
+    """The crossings of loci between ascending frequencies, extrema near one included, those at zero left out."""
+    omega = with_extrema(loci, omega)
+    return without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
 
 
 def slope_sign(loci: Loci, omega: float, locus: complex) -> int:

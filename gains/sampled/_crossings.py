@@ -20,7 +20,7 @@ from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._crossings import separating_points
-from gains.delay._loci import Loci, delay_loci, near_unit_extrema, sweep_frequencies, unit_crossings
+from gains.delay._loci import Loci, delay_loci, sweep_frequencies, unit_crossings, with_extrema
 from gains.sampled._loop import SampledPlant, block_radius, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
@@ -164,8 +164,7 @@ def _sweep_points(plant: SampledPlant, loci: Loci) -> FloatArray:
     """Frequencies dense enough to see every crossing, extrema near one included."""
     angle = sweep_frequencies(plant.A, plant.B @ plant.K) * plant.period_s
     angle = np.union1d(angle[angle < pi * 0.99], np.linspace(0.01, pi - 1e-4, 200))
-    omega = np.tan(angle / 2.0) * 2.0 / plant.period_s
-    return np.union1d(omega, near_unit_extrema(loci, omega))
+    return with_extrema(loci, np.tan(angle / 2.0) * 2.0 / plant.period_s)
 
 
 def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:

@@ -152,13 +152,9 @@ class CoupledBlock:
             return rate_1_s
         return rate_1_s + self.growth_continuous_at_1_s(loop_delay_s) - self.growth_continuous_1_s(mean_s)
 
-    def same_as(self, other: "CoupledBlock") -> bool:
-        """Whether the other block is the same system, made of other vehicles."""
-        return self.kind == other.kind
-
     @property
     def kind(self) -> Hashable:
-        """Equal for blocks that are the same system."""
+        """Equal for blocks that are the same system, made of other vehicles."""
         return self.timing, self.assumed_s, *((part.shape, (part + 0.0).tobytes()) for part in (self.A, self.B, self.K))
 
 
