@@ -28,7 +28,7 @@ from gains.delay._crossings import (
     axis_crossings,
     crossings_of_loci,
     hidden_crossings,
-    is_root,
+    near_axis,
     polish,
     separating_points,
 )
@@ -47,8 +47,6 @@ from gains.delay._windows import BlockAnalysis, block_analysis, unstable_roots, 
 _LARGEST_LOCI = 30
 # states times the largest multiple: a sweep takes some seconds there
 _LARGEST_PRODUCT = 3000
-# candidates are kept this close to the imaginary axis, relative to the norm; a false one costs little
-_CANDIDATE_TOLERANCE = 1e-3
 # the pencil's companion matrix takes 0.1 s at this size; larger problems are left to the grid
 _LARGEST_PENCIL = 450
 # the polynomial in cos(theta) is expanded here: outside [-1, 1], and at no special value
@@ -105,7 +103,6 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
             for crossing in axis_crossings(terms[0], terms[k])
             for turn in range(k)
         ]
-    highest = highest_frequency(used)
     if (len(used) - 1) * rank > _LARGEST_LOCI:
         return _crossings_by_angle(used)
 
@@ -113,9 +110,7 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
         return np.broadcast_to(np.array(used, dtype=np.complex128), (omega.size, len(used), *used[0].shape))
 
     loci = companion_loci(terms_at, column_space(used[1:]))
-    found = crossings_of_loci(loci, _candidates(used, highest), highest)
-    polished = [polish(used, crossing) for crossing in found if is_root(used, crossing)]
-    return sorted(polished, key=lambda crossing: crossing.omega_rad_s)
+    return crossings_of_loci(used, loci, _candidates(used))
 
 
 def _is_passage(terms: Sequence[FloatArray], crossing: Crossing) -> bool:
@@ -195,15 +190,10 @@ def column_space(late: Sequence[FloatArray]) -> FloatArray:
     return U[:, : int(np.count_nonzero(singular > beside.shape[1] * np.finfo(float).eps * singular[0]))]
 
 
-def _candidates(terms: Sequence[FloatArray], highest: float) -> FloatArray:
+def _candidates(terms: Sequence[FloatArray]) -> FloatArray:
     """Frequencies that come near every crossing, ascending."""
     theta = _candidate_angles(terms)
-    if theta.size == 0:
-        return np.empty(0)
-    roots = np.linalg.eigvals(at_angle(terms, theta))
-    near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
-    omega = np.unique(np.abs(roots.imag[near_axis]))
-    return omega[(omega > 0.0) & (omega < 1.1 * highest)]
+    return near_axis(np.linalg.eigvals(at_angle(terms, theta)), terms) if theta.size else theta
 
 
 def norm_of(terms: Sequence[FloatArray]) -> float:

@@ -92,6 +92,17 @@ def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | flo
     return loci
 
 
+def unit_gain_roots(A: FloatArray, B: FloatArray, C: FloatArray, D: float = 0.0) -> ComplexArray:
+    """Among these (2n,) are all j omega with |C (j omega I - A)^{-1} B + D| = 1: eigenvalues of a Hamiltonian matrix.
+
+    It is the matrix whose imaginary eigenvalues decide whether an H-infinity norm exceeds one.
+    """
+    # |D| = 1 sends one solution to infinity
+    rest = 1.0 - D * D if abs(1.0 - D * D) > 1e-12 else 1e-12
+    corner = A + B @ C * (D / rest)
+    return np.linalg.eigvals(np.block([[corner, B @ B.T / rest], [-C.T @ C / rest, -corner.T]])).astype(np.complex128)
+
+
 def solved_beside_poles(matrices: NDArray[Any], right: FloatArray) -> NDArray[Any]:
     """X with M X = `right` (n, r) for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
 

@@ -20,7 +20,7 @@ from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._crossings import separating_points
-from gains.delay._loci import Loci, delay_loci, sweep_frequencies, unit_crossings, with_extrema
+from gains.delay._loci import Loci, delay_loci, sweep_frequencies, unit_crossings, unit_gain_roots, with_extrema
 from gains.sampled._loop import SampledPlant, block_radius, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
@@ -146,14 +146,8 @@ def _tustin(plant: SampledPlant, m: float) -> tuple[FloatArray, FloatArray, Floa
 
 
 def _hamiltonian_points(F: FloatArray, G: FloatArray, K: FloatArray, D: float, period_s: float) -> FloatArray:
-    """Frequencies that separate all solutions of |D + K (jw I - F)^-1 G| = 1: eigenvalues of a Hamiltonian matrix.
-
-    The matrix whose imaginary eigenvalues decide whether an H-infinity norm exceeds one.
-    """
-    # |D| = 1 is a crossing at z = -1, found elsewhere; here it only sends one solution to infinity
-    rest = 1.0 - D * D if abs(1.0 - D * D) > 1e-12 else 1e-12
-    corner = F + G @ K * (D / rest)
-    roots = np.linalg.eigvals(np.block([[corner, G @ G.T / rest], [-K.T @ K / rest, -corner.T]])).astype(np.complex128)
+    """Frequencies that separate all solutions of |D + K (jw I - F)^-1 G| = 1; |D| = 1 is a crossing at z = -1."""
+    roots = unit_gain_roots(F, G, K, D)
     near_axis = np.abs(roots.real) <= 1e-3 * (np.abs(roots) + float(np.linalg.norm(F)))
     highest = 1e5 / period_s
     omega = np.sort(roots.imag[near_axis & (roots.imag > 0.0) & (roots.imag < highest)])
