@@ -17,9 +17,9 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import to_json
 
 from scenarios.errors import ScenarioError
+from scenarios.keys.autopilot import Sitl
 from scenarios.keys.link import Link, Links
 from scenarios.keys.part import Fault
-from scenarios.keys.sitl import Sitl
 from scenarios.link_files import each_link, load_profile, with_traces
 from scenarios.manoeuvres import contradictions as manoeuvre_contradictions
 from scenarios.own_code import as_flown, own_code_faults, with_code

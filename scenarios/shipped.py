@@ -3,6 +3,7 @@
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
+PROFILES = FOLDER / "profiles"
 SCHEMA = FOLDER / "scenario.schema.json"
 _SCHEMA_LINE = f"#:schema ./{SCHEMA.name}"
 _SPACING_M, _ASIDE_M, _SPEED_M_S = 40.0, 40.0, 25.0
@@ -10,9 +11,9 @@ _ERRORS_M = (3.0, -2.0), (-2.0, 2.0), (1.0, 3.0), (-3.0, -1.0)
 """Initial offsets (north, east) of a new scenario's vehicles from their places, used in turn."""
 
 
-def names() -> list[str]:
-    """The names of the scenarios that ship, sorted."""
-    return sorted(file.stem for file in FOLDER.glob("*.toml"))
+def names(folder: Path = FOLDER) -> list[str]:
+    """The names of the scenarios that ship, or of the files of another folder, sorted."""
+    return sorted(file.stem for file in folder.glob("*.toml"))
 
 
 def located(text: str) -> Path:

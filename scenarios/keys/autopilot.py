@@ -1,4 +1,4 @@
-"""How vehicles with autopilots respond to set-points, as the file describes it."""
+"""How vehicles with autopilots respond to set-points, and the clock errors of simulated ones, as in SITL."""
 
 from typing import Annotated
 
@@ -28,3 +28,15 @@ class Response(Part):
     """Dead time before the lag."""
     natural_frequency_rad_s: Positive | None = None
     """Natural frequency; makes the response one of second order."""
+
+
+class Sitl(Part):
+    """The clocks of vehicles that run in SITL. Everything is drawn from the seed, for each vehicle on its own."""
+
+    timesync_back_s: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Largest time by which the stamps in TIMESYNC replies are too early; that of each reply is uniform from 0. An
+    ArduPilot dates them back by the time of their bytes on a serial port: up to 0.0035 at its default baud rate."""
+    slip_s: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Mean time by which the boot clock falls behind whenever the simulator cannot keep up; exponential."""
+    slip_every_s: Annotated[float, Field(gt=0, le=86400)] = 20.0
+    """Mean time between two such slips; exponential. Only with `slip_s`."""
