@@ -92,7 +92,8 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
     rank = column_space(used[1:]).shape[1]
     if len(terms[0]) > LARGEST_ALGEBRAIC_BLOCK and rank > 1:
         try:
-            return [each for each in tracked_crossings(used) if not _is_passage(used, each)]
+            tracked = tracked_crossings(used)
+            return [c for c in tracked if not passes_zero(used, c.omega_rad_s * c.delay_s, c.omega_rad_s)]
         except UnclearError:
             return _crossings_by_angle(used)
     if len(present) == 1:
@@ -111,11 +112,6 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
 
     loci = companion_loci(terms_at, column_space(used[1:]))
     return crossings_of_loci(used, loci, _candidates(used))
-
-
-def _is_passage(terms: Sequence[FloatArray], crossing: Crossing) -> bool:
-    omega = crossing.omega_rad_s
-    return omega == 0.0 or passes_zero(terms, omega * crossing.delay_s, omega)
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
@@ -225,8 +221,8 @@ def passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool
     An eigenvalue of A(theta) that passes zero is slow at this angle only; the slow motions of a loop are slow at the
     angles beside it too.
     """
-    if omega > _SLOW * highest_frequency(terms):
-        return False
+    if omega == 0.0 or omega > _SLOW * highest_frequency(terms):
+        return omega == 0.0
     beside = np.abs(np.linalg.eigvals(at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
     return bool(beside.min() > 1e3 * omega)
 

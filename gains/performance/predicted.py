@@ -27,7 +27,7 @@ from math import inf, pi
 import numpy as np
 
 from gains.core._bracketing import highest
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import PAIR, ScalarGains
@@ -94,7 +94,12 @@ class PredictedLoop:
 
     def growth(self, omega: FloatArray, delay_s: float) -> FloatArray:
         """|U_i / U_j| (k,) at frequencies omega (k,) in rad/s up to pi / `period_s`, if the loop is stable."""
-        front, own = (self._matrices[2][1] @ self._seen_sampled(omega, delay_s)).T
+        z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
+        Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
+        mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
+        resolvent = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
+        S = resolvent @ G + self._ahead @ resolvent @ mismatch
+        front, own = (self._matrices[2][1] @ S).T
         return np.abs((self.feed_forward + front) / (1.0 - own))
 
     def alpha(self, delay_s: float) -> float:
@@ -104,17 +109,21 @@ class PredictedLoop:
         """
         if not self.is_stable(delay_s):
             return 0.0
-        _, B, alone = self._matrices
-        K = fed_forward(PAIR, alone, self.feed_forward)
+        A, B, alone = self._matrices
+        K, L, half_s = fed_forward(PAIR, alone, self.feed_forward), self._ahead, self.period_s / 2.0
 
         def gain(omega: FloatArray) -> FloatArray:
-            s, resolvent = self._resolvents(omega)
-            late = B * np.exp(-s * (delay_s + self.period_s / 2.0))
-            commands = np.linalg.solve(np.eye(2) - K @ self._seen(s, resolvent, delay_s), K @ self._ahead @ resolvent)
-            disturbed = resolvent + resolvent @ late @ commands
+            s = (1j * omega[:, np.newaxis, np.newaxis]).astype(np.complex128)
+            resolvent = np.linalg.inv(s * np.eye(len(A)) - A)
+            answers, mismatch = resolvent @ B, np.exp(-s * delay_s) - np.exp(-s * self.assumed_s)
+            # what the predicted state answers to commands
+            seen = (answers + L @ answers * mismatch) * np.exp(-s * half_s)
+            commands = np.linalg.solve(np.eye(2) - K @ seen, K @ L @ resolvent)
+            disturbed = resolvent + resolvent @ (B * np.exp(-s * (delay_s + half_s))) @ commands
             return np.linalg.norm(disturbed[:, :3, :3], ord=2, axis=(1, 2))
 
-        return 1.0 / highest(gain, self._frequencies)[1]
+        most = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ alone, 2) + np.linalg.norm(B @ alone @ L, 2))
+        return 1.0 / highest(gain, np.geomspace(_LOWEST * self._slowest, most, _FREQUENCIES))[1]
 
     def is_stable(self, delay_s: float) -> bool:
         """Whether a true delay is in the window."""
@@ -144,29 +153,3 @@ class PredictedLoop:
     def _slowest(self) -> float:
         A, B, K = self._matrices
         return float(np.abs(np.linalg.eigvals(A + B @ K)).min())
-
-    @cached_property
-    def _frequencies(self) -> FloatArray:
-        A, B, K = self._matrices
-        highest = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ K, 2) + np.linalg.norm(B @ K @ self._ahead, 2))
-        return np.geomspace(_LOWEST * self._slowest, highest, _FREQUENCIES)
-
-    def _resolvents(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """s (k, 1, 1) and (s I - A)^{-1} (k, n, n)."""
-        s, A = (1j * omega[:, np.newaxis, np.newaxis]).astype(np.complex128), self._matrices[0]
-        return s, np.linalg.inv(s * np.eye(len(A)) - A).astype(np.complex128)
-
-    def _seen(self, s: ComplexArray, resolvent: ComplexArray, delay_s: float) -> ComplexArray:
-        """What the predicted state answers to commands, (k, n, 2), in continuous time."""
-        B = self._matrices[1]
-        mismatch = np.exp(-s * delay_s) - np.exp(-s * self.assumed_s)
-        answers = resolvent @ B
-        return (answers + self._ahead @ answers * mismatch) * np.exp(-s * self.period_s / 2.0)
-
-    def _seen_sampled(self, omega: FloatArray, delay_s: float) -> ComplexArray:
-        """S(z) at z = e^{j omega T}, shape (k, n, 2)."""
-        z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
-        Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
-        mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
-        resolvent = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
-        return resolvent @ G + self._ahead @ resolvent @ mismatch
