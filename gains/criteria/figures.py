@@ -153,10 +153,8 @@ class LoopFigures:
             # with several inputs the scaling takes minutes
             exact = self.thinned == 1 and self.model.vehicles == 2
             return spread_bound(A, late, mean_s=middle_s, rate=rate, scaled=exact)
-        for start_s, end_s in analyse_delay(A, late).stable_intervals_s:
-            if start_s < middle_s < end_s or start_s == 0.0 == middle_s:
-                return min(mean_s if start_s == 0.0 else middle_s - start_s, end_s - middle_s)
-        return 0.0
+        start_s, end_s = analyse_delay(A, late).window_around(middle_s) or (middle_s, middle_s)
+        return min(mean_s if start_s == 0.0 else middle_s - start_s, end_s - middle_s)
 
     @cached_property
     def _roots(self) -> ComplexArray:

@@ -189,7 +189,7 @@ def column_space(late: Sequence[FloatArray]) -> FloatArray:
 def _candidates(terms: Sequence[FloatArray]) -> FloatArray:
     """Frequencies that come near every crossing, ascending."""
     theta = _candidate_angles(terms)
-    return near_axis(np.linalg.eigvals(at_angle(terms, theta)), terms) if theta.size else theta
+    return near_axis(np.linalg.eigvals(at_angle(terms, theta)).astype(np.complex128), terms) if theta.size else theta
 
 
 def norm_of(terms: Sequence[FloatArray]) -> float:
