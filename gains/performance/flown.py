@@ -183,7 +183,9 @@ class FlownLoop:
         if not delay_s < self.timing.delay_margin_s:
             return inf
         own_s, front_s = self.timing.delays_s(delay_s)
-        return string_peak(self._matrices, own_s, front_delay_s=front_s, answer=self._answer)
+        k1, k2, k3 = self._k
+        gains = np.array([[-k1]]), np.array([[k2]]), np.array([[k3]])
+        return string_peak(gains, own_s, front_delay_s=front_s, answer=self._answer)
 
     def string_limit_s(self, peak: float) -> float:
         """The largest loop delay up to which no spacing error grows by more than `peak` >= 1 from vehicle to vehicle.
@@ -239,11 +241,6 @@ class FlownLoop:
     @property
     def _k(self) -> tuple[float, float, float]:
         return self.gains.k1, self.gains.k2, self.gains.k3
-
-    @property
-    def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        k1, k2, k3 = self._k
-        return np.array([[-k1]]), np.array([[k2]]), np.array([[k3]])
 
     def _answer(self, omega: FloatArray) -> ComplexArray:
         return np.ones_like(omega, dtype=np.complex128) if self.response is None else self.response.transfer(omega)
