@@ -17,17 +17,14 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import to_json
 
 from scenarios.errors import ScenarioError, UnreadableError
-from scenarios.for_link import contradictions as for_link_contradictions
-from scenarios.keys.autopilot import response_contradictions
-from scenarios.keys.criteria import criteria_faults
-from scenarios.keys.disturbance import disturbance_contradictions
+from scenarios.keys.autopilot import Sitl
 from scenarios.keys.link import Link, Links
 from scenarios.keys.part import Fault
-from scenarios.keys.sitl import sitl_contradictions
 from scenarios.link_files import each_link, load_profile, with_traces
 from scenarios.manoeuvres import contradictions as manoeuvre_contradictions
 from scenarios.own_code import as_flown, own_code_faults, with_code
 from scenarios.places import line_of, location_of, named, wanted_of
+from scenarios.requirements import contradictions as requirement_contradictions
 from scenarios.schema import Scenario
 
 _A_VEHICLE = "the system_id of a vehicle of this scenario"
@@ -170,27 +167,15 @@ def _contradictions(scenario: Scenario) -> Iterator[Fault]:
     yield from _links_contradictions(scenario)
     yield from own_code_faults(scenario)
     yield from _control_contradictions(scenario)
-    yield from criteria_faults(
-        scenario.control.criteria,
-        scenario.control.overlap,
-        method=scenario.control.method,
-        given=scenario.control.gains is not None or bool(scenario.control.blocks),
-        loop=scenario.control.loop,
-        at_once=scenario.dynamics == "double_integrator" and scenario.control.prediction == "off",
-    )
-    yield from for_link_contradictions(scenario)
+    yield from requirement_contradictions(scenario)
     yield from _block_contradictions(scenario)
     yield from _hearing_contradictions(scenario)
     yield from _monitor_contradictions(scenario)
     yield from _onboard_contradictions(scenario)
     yield from _autopilot_contradictions(scenario)
-    yield from sitl_contradictions(scenario.autopilot.sitl, scenario.dynamics)
-    yield from disturbance_contradictions(
-        scenario.disturbance,
-        vehicles=len(scenario.vehicles),
-        steady=len(scenario.nominal_velocity) == 1 and not scenario.manoeuvres,
-        dynamics=scenario.dynamics,
-    )
+    if scenario.autopilot.sitl != Sitl() and scenario.dynamics != "autopilot":
+        yield "autopilot.sitl", scenario.autopilot.sitl.model_dump(), "no such key without dynamics autopilot"
+    yield from _sector_contradictions(scenario)
     limits = scenario.limits
     if limits.speed_max_m_s is not None and limits.speed_max_m_s <= limits.speed_min_m_s:
         yield "limits.speed_max_m_s", limits.speed_max_m_s, f"more than speed_min_m_s = {limits.speed_min_m_s:g}"
@@ -297,8 +282,9 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if times_s != sorted(times_s):
         yield "autopilot.clock_jumps", times_s, "times that do not decrease"
     for key, part in (("autopilot", scenario.autopilot), ("response", scenario.response)):
-        if part is not None:
-            yield from response_contradictions(key, part.dead_time_s, part.natural_frequency_rad_s)
+        if part is not None and part.dead_time_s and part.natural_frequency_rad_s is not None:
+            wanted = "no such key with natural_frequency_rad_s: one model at a time"
+            yield f"{key}.dead_time_s", part.dead_time_s, wanted
     if scenario.dynamics == "autopilot":
         if scenario.altitude_m == 0:
             yield "altitude_m", scenario.altitude_m, "an altitude above 0 to take off to, with dynamics autopilot"
@@ -309,6 +295,25 @@ def _autopilot_contradictions(scenario: Scenario) -> Iterator[Fault]:
     if scenario.response is not None and scenario.dynamics == "double_integrator":
         wanted = "no such key with dynamics double_integrator, which respond at once"
         yield "response", scenario.response.model_dump(), wanted
+
+
+def _sector_contradictions(scenario: Scenario) -> Iterator[Fault]:
+    sector = None if scenario.disturbance is None else scenario.disturbance.sector
+    if sector is None:
+        return
+    key, count = "disturbance.sector", 2 * len(scenario.vehicles) - 1
+    if scenario.dynamics != "double_integrator":
+        yield key, f"dynamics {scenario.dynamics}", "no such key, unless dynamics is double_integrator"
+    if len(scenario.nominal_velocity) != 1 or scenario.manoeuvres:
+        wanted = "no such key, unless one nominal velocity and one shape are flown"
+        yield key, "velocities or offsets that change", wanted
+    square = len(sector.direction) == count and all(len(row) == count for row in sector.direction)
+    if not square or not any(any(row) for row in sector.direction):
+        read = f"{len(sector.direction)} rows of {sorted({len(row) for row in sector.direction})} numbers"
+        yield f"{key}.direction", read, f"{count} rows of {count} numbers, not all zero"
+    for name, found in (("all_pass_in", sector.all_pass_in), ("all_pass_out", sector.all_pass_out)):
+        if len(found) not in (0, count):
+            yield f"{key}.{name}", f"{len(found)} numbers", f"{count} numbers, or none"
 
 
 def _velocity_contradictions(scenario: Scenario) -> Iterator[Fault]:

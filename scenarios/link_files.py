@@ -15,14 +15,9 @@ from scenarios.keys.link import TRACE_DELAYS, Link, Links
 from scenarios.keys.part import MOST
 from scenarios.keys.profile import LinkProfile
 from scenarios.schema import Scenario
+from scenarios.shipped import PROFILES, names
 
-FOLDER = Path(__file__).parent / "profiles"
 TRACE_COLUMN = "delay_s"
-
-
-def names() -> list[str]:
-    """The names of the profiles that ship, sorted."""
-    return sorted(file.stem for file in FOLDER.glob("*.toml"))
 
 
 def load_profile(name: str, beside: Path, key: str) -> LinkProfile:
@@ -30,8 +25,9 @@ def load_profile(name: str, beside: Path, key: str) -> LinkProfile:
 
     Raises ScenarioError.
     """
-    path = FOLDER / f"{name}.toml" if name in names() else beside.parent / name
-    wanted = f"one of {', '.join(names())}, or a file that gcs monitor --save-links wrote"
+    shipped = names(PROFILES)
+    path = PROFILES / f"{name}.toml" if name in shipped else beside.parent / name
+    wanted = f"one of {', '.join(shipped)}, or a file that gcs monitor --save-links wrote"
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         return LinkProfile.model_validate_json(to_json(data))

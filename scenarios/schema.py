@@ -13,7 +13,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
 
-from scenarios.keys.autopilot import DeadTime, Response
+from scenarios.keys.autopilot import DeadTime, Response, Sitl
 from scenarios.keys.course import Course, FormationChange
 from scenarios.keys.criteria import Criteria, Overlap
 from scenarios.keys.disturbance import Disturbance, Navigation
@@ -34,7 +34,6 @@ from scenarios.keys.part import (
     Velocity,
 )
 from scenarios.keys.rates import Rates
-from scenarios.keys.sitl import Sitl
 from scenarios.smooth import Bounds, SmoothCourse, course_by_steps, course_by_waypoints
 
 NS_PER_S = 1_000_000_000

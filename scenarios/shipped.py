@@ -3,6 +3,7 @@
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
+PROFILES = FOLDER / "profiles"
 SCHEMA = FOLDER / "scenario.schema.json"
 _SCHEMA_LINE = f"#:schema ./{SCHEMA.name}"
 _SPACING_M, _ASIDE_M, _SPEED_M_S = 40.0, 40.0, 25.0
@@ -10,9 +11,9 @@ _ERRORS_M = (3.0, -2.0), (-2.0, 2.0), (1.0, 3.0), (-3.0, -1.0)
 """Initial offsets (north, east) of a new scenario's vehicles from their places, used in turn."""
 
 
-def names() -> list[str]:
-    """The names of the scenarios that ship, sorted."""
-    return sorted(file.stem for file in FOLDER.glob("*.toml"))
+def names(folder: Path = FOLDER) -> list[str]:
+    """The names of the scenarios that ship, or of the files of another folder, sorted."""
+    return sorted(file.stem for file in folder.glob("*.toml"))
 
 
 def located(text: str) -> Path:
@@ -42,10 +43,13 @@ def columns(new_name: str, count: int, length: int) -> str:
     Each vehicle follows the one in front of it; the head of a column follows the head of the column to its left. A
     single column is staggered: each vehicle flies behind and to the right of the one in front.
     """
+    shape = f"A chain of {length}: each vehicle follows the one in front of it."
+    if count > 1:
+        shape = f"{count} columns of {length}: the heads of the columns follow the head to their left."
     vehicles = "\n".join(_vehicle(k, length, alone=count == 1) for k in range(count * length))
     return f"""\
 {_SCHEMA_LINE}
-# {_shape(count, length)}
+# {shape}
 # Every key, with its unit, default and bounds: docs/reference/scenario.md; editors that know TOML show them too.
 name = "{new_name}"
 seed = 1           # of everything random: links, clocks, starting phases
@@ -69,12 +73,6 @@ down = {{ delay_s = 0.02 }}  # set-points, one way
 # [limits]  # what the vehicles can fly
 # acceleration_max_m_s2 = 20.0
 """
-
-
-def _shape(count: int, length: int) -> str:
-    if count == 1:
-        return f"A chain of {length}: each vehicle follows the one in front of it."
-    return f"{count} columns of {length}: the heads of the columns follow the head to their left."
 
 
 def _vehicle(k: int, length: int, *, alone: bool) -> str:

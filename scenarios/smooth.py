@@ -21,8 +21,6 @@ _SPARE = 1.0001
 def smooth_step(x: float) -> tuple[float, float, float]:
     """s(x) and its first two derivatives; 0 before x = 0, and 1 after x = 1.
 
-    Examples
-    --------
     >>> smooth_step(0.5), smooth_step(1.5)
     ((0.5, 1.875, 0.0), (1.0, 0.0, 0.0))
     """

@@ -7,9 +7,8 @@ step then solves in one batch.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray, IntArray
+from gains.core.arrays import BoolArray, FloatArray, IntArray
 
 Functions = Callable[[FloatArray], FloatArray]
 
@@ -42,7 +41,18 @@ def local_maxima(values: FloatArray) -> IntArray:
     return np.flatnonzero((values[1:-1] >= values[:-2]) & (values[1:-1] >= values[2:])) + 1
 
 
-def may_reach_zero(points: FloatArray, values: FloatArray) -> NDArray[np.bool_]:
+def highest(function: Functions, grid: FloatArray) -> tuple[float, float]:
+    """Place and height of the largest value on a rising grid, with every local maximum refined."""
+    values = function(grid)
+    inner = local_maxima(values)
+    if inner.size:
+        places = peaks(function, grid[inner - 1], grid[inner + 1])
+        grid, values = np.concatenate([grid, places]), np.concatenate([values, function(places)])
+    at = int(np.argmax(values))
+    return float(grid[at]), float(values[at])
+
+
+def may_reach_zero(points: FloatArray, values: FloatArray) -> BoolArray:
     """Where a local maximum below zero of samples (k, r) of r functions may hide a zero, shape (k - 2, r).
 
     A smooth peak exceeds its highest sample by an eighth of its height above the neighbours; a kink by as much as the

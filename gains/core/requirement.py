@@ -37,7 +37,6 @@ class Criteria:
     period, or with `discrete` held for one. BadModelError if a number is out of its range, or a figure at a delay is
     asked for without the delay.
 
-    >>> from gains.core.requirement import Criteria
     >>> Criteria(at_delay_s=0.3, alpha_at_delay=0.5).objective, Criteria(damping_min=0.7).objective
     ('alpha_at_delay', None)
     """
@@ -112,7 +111,6 @@ class Requirement:
 
     A delay margin of 0.3 s is wanted when nothing is given:
 
-    >>> from gains import Requirement
     >>> Requirement().delay_margin_s, Requirement(alpha=0.4).delay_margin_s
     (0.3, None)
     >>> Requirement(string_peak_max=1.2, loop="onboard").peak_limit

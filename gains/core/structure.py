@@ -10,6 +10,7 @@ each block is analysed on its own, and equal blocks once.
 import heapq
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from math import log2
 
 import numpy as np
@@ -260,18 +261,15 @@ def _components(size: int, driven: IntArray, driver: IntArray) -> IntArray:
 
 def _drivers_first(lowest_index: list[int], edges: Iterable[tuple[int, int]]) -> list[int]:
     """Topological order of components, the component of the lowest state index first in a tie."""
-    waiting_for = [0] * len(lowest_index)
-    drives: list[list[int]] = [[] for _ in lowest_index]
+    sorter = TopologicalSorter[int](dict.fromkeys(range(len(lowest_index)), ()))
     for driver, driven in edges:
-        waiting_for[driven] += 1
-        drives[driver].append(driven)
-    ready = [(lowest, k) for k, lowest in enumerate(lowest_index) if not waiting_for[k]]
-    heapq.heapify(ready)
+        sorter.add(driven, driver)
+    sorter.prepare()
+    ready: list[tuple[int, int]] = []
     order: list[int] = []
-    while ready:
+    while sorter.is_active():
+        for k in sorter.get_ready():
+            heapq.heappush(ready, (lowest_index[k], k))
         order.append(heapq.heappop(ready)[1])
-        for k in drives[order[-1]]:
-            waiting_for[k] -= 1
-            if not waiting_for[k]:
-                heapq.heappush(ready, (lowest_index[k], k))
+        sorter.done(order[-1])
     return order

@@ -31,7 +31,6 @@ class LoopFigures:
     that of spacing errors and of velocity errors, see `gains.core.requirement.Criteria`. Where errors run down a chain
     of equal followers, `chain` is one of them. Figures without delay do not include a response.
 
-    >>> from gains.formation.model import FormationModel
     >>> lone = LoopFigures(FormationModel((-1,), axes=1), np.array([[-1.0]]), FlownTiming(np.inf, 0.02), 0.29)
     >>> round(lone.decay_rate_1_s, 6), round(lone.decay_rate_at_delay_1_s, 3), round(lone.alpha_at_delay, 3)
     (1.0, 1.631, 1.0)
@@ -154,10 +153,8 @@ class LoopFigures:
             # with several inputs the scaling takes minutes
             exact = self.thinned == 1 and self.model.vehicles == 2
             return spread_bound(A, late, mean_s=middle_s, rate=rate, scaled=exact)
-        for start_s, end_s in analyse_delay(A, late).stable_intervals_s:
-            if start_s < middle_s < end_s or start_s == 0.0 == middle_s:
-                return min(mean_s if start_s == 0.0 else middle_s - start_s, end_s - middle_s)
-        return 0.0
+        start_s, end_s = analyse_delay(A, late).window_around(middle_s) or (middle_s, middle_s)
+        return min(mean_s if start_s == 0.0 else middle_s - start_s, end_s - middle_s)
 
     @cached_property
     def _roots(self) -> ComplexArray:

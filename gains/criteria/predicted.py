@@ -16,6 +16,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.core._bracketing import highest
 from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.criteria.figures import LoopFigures
@@ -24,7 +25,6 @@ from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
 from gains.performance.predicted import PredictedLoop
 from gains.performance.scalar_gains import ScalarGains
-from gains.performance.string_stability import largest_value
 from gains.sampled._loop import HeldPlant, carry, radius_of, rate_of, split_delay
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window, predicted_growth_rate
@@ -48,8 +48,6 @@ class PredictedFigures:
 
     The gains of `triangle5`, assumed and true delay 0.6 s:
 
-    >>> from gains.criteria.predicted import PredictedFigures
-    >>> from gains.formation.model import FormationModel
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> K = pair.overlapping_gain([[-3.408]], [[0.631]], [[5.608]])
     >>> found = PredictedFigures(pair, K, 0.02, 0.6, (0.6,))
@@ -172,7 +170,7 @@ class PredictedFigures:
         return max(1.0, *(self._largest(lambda at, s=s: loop.growth(at, s), omega) for s in self.delays_s))
 
     def _largest(self, function: Callable[[FloatArray], FloatArray], omega: FloatArray) -> float:
-        return largest_value(function, omega) if self.thinned == 1 else float(function(omega).max())
+        return highest(function, omega)[1] if self.thinned == 1 else float(function(omega).max())
 
     def _peak(self, out: FloatArray, entry: FloatArray) -> float:
         """Largest gain from disturbances that act by `entry` to what `out` reads of the errors."""

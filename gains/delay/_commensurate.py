@@ -17,11 +17,10 @@ from dataclasses import replace
 from math import pi
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
-from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
+from gains.core.structure import Block, balanced, is_singular_for_any_delay
 from gains.delay._crossings import (
     LARGEST_ALGEBRAIC_BLOCK,
     Crossing,
@@ -29,7 +28,7 @@ from gains.delay._crossings import (
     axis_crossings,
     crossings_of_loci,
     hidden_crossings,
-    is_root,
+    near_axis,
     polish,
     separating_points,
 )
@@ -37,28 +36,17 @@ from gains.delay._loci import (
     Loci,
     UnitCrossing,
     highest_frequency,
-    near_unit_extrema,
     solved_beside_poles,
     unit_crossings,
+    with_extrema,
 )
-from gains.delay._tracked import UnclearError, tracked_crossings
-from gains.delay._windows import (
-    BlockAnalysis,
-    DelayAnalysis,
-    block_analysis,
-    check_horizon,
-    combined_analysis,
-    unstable_roots,
-    without_zero,
-    zero_passage,
-)
+from gains.delay._tracked import UnclearError, at_angle, tracked_crossings
+from gains.delay._windows import BlockAnalysis, block_analysis, unstable_roots, without_zero, zero_passage
 
 # loci are eigenvalues of many companion matrices; beyond this size of them angles are followed instead
 _LARGEST_LOCI = 30
 # states times the largest multiple: a sweep takes some seconds there
 _LARGEST_PRODUCT = 3000
-# candidates are kept this close to the imaginary axis, relative to the norm; a false one costs little
-_CANDIDATE_TOLERANCE = 1e-3
 # the pencil's companion matrix takes 0.1 s at this size; larger problems are left to the grid
 _LARGEST_PENCIL = 450
 # the polynomial in cos(theta) is expanded here: outside [-1, 1], and at no special value
@@ -72,21 +60,6 @@ _REACH, _NEWTON_STEPS = 1.5, 3
 _SLOW, _BESIDE = 1e-6, 0.05
 # a local extremum of a real part is refined when its sample is this close to the axis, relative to the norm
 _NEAR_AXIS = 0.1
-
-
-def analyse_commensurate(
-    matrices: Sequence[ArrayLike], *, horizon_s: float | None = None, leave_out_zero: bool = False
-) -> DelayAnalysis:
-    """Stability windows, critical delays and margin in tau of x'(t) = sum_k A_k x(t - k tau).
-
-    `matrices` are A_0, A_1, ..., A_m, real (n, n), 1/s. The options, and what is raised, are those of
-    `gains.delay.constant.analyse_delay`; BadModelError also without a matrix or if m n is too large.
-    """
-    check_horizon(horizon_s)
-    if len(matrices) == 0:
-        raise BadModelError("matrices is empty; at least A_0 is wanted")
-    blocks = distinct_blocks(*square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)}))
-    return combined_analysis([analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
 
 
 def analyse_block(block: Block, leave_out_zero: bool) -> BlockAnalysis:
@@ -118,7 +91,8 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
     rank = column_space(used[1:]).shape[1]
     if len(terms[0]) > LARGEST_ALGEBRAIC_BLOCK and rank > 1:
         try:
-            return [each for each in tracked_crossings(used) if not _is_passage(used, each)]
+            tracked = tracked_crossings(used)
+            return [c for c in tracked if not passes_zero(used, c.omega_rad_s * c.delay_s, c.omega_rad_s)]
         except UnclearError:
             return _crossings_by_angle(used)
     if len(present) == 1:
@@ -129,7 +103,6 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
             for crossing in axis_crossings(terms[0], terms[k])
             for turn in range(k)
         ]
-    highest = highest_frequency(used)
     if (len(used) - 1) * rank > _LARGEST_LOCI:
         return _crossings_by_angle(used)
 
@@ -137,14 +110,7 @@ def _block_crossings(terms: Sequence[FloatArray]) -> list[Crossing]:
         return np.broadcast_to(np.array(used, dtype=np.complex128), (omega.size, len(used), *used[0].shape))
 
     loci = companion_loci(terms_at, column_space(used[1:]))
-    found = crossings_of_loci(loci, _candidates(used, highest), highest)
-    polished = [polish(used, crossing) for crossing in found if is_root(used, crossing)]
-    return sorted(polished, key=lambda crossing: crossing.omega_rad_s)
-
-
-def _is_passage(terms: Sequence[FloatArray], crossing: Crossing) -> bool:
-    omega = crossing.omega_rad_s
-    return omega == 0.0 or passes_zero(terms, omega * crossing.delay_s, omega)
+    return crossings_of_loci(used, loci, _candidates(used))
 
 
 def _crossings_by_angle(terms: Sequence[FloatArray]) -> list[Crossing]:
@@ -182,7 +148,7 @@ def _has_fixed_root(terms: Sequence[FloatArray], roots: ComplexArray) -> bool:
         # a determinant that vanishes at more angles than its degree vanishes at all; three unrelated angles stand for
         # them, with a tolerance far above rounding
         else:
-            matrices = 1j * omega * np.eye(terms[0].shape[0]) - _at_angle(terms, np.array([0.0, 1.0, 2.5]))
+            matrices = 1j * omega * np.eye(terms[0].shape[0]) - at_angle(terms, np.array([0.0, 1.0, 2.5]))
             if np.linalg.svd(matrices, compute_uv=False)[:, -1].max() < 1e-12 * scale:
                 return True
     return False
@@ -219,21 +185,10 @@ def column_space(late: Sequence[FloatArray]) -> FloatArray:
     return U[:, : int(np.count_nonzero(singular > beside.shape[1] * np.finfo(float).eps * singular[0]))]
 
 
-def _candidates(terms: Sequence[FloatArray], highest: float) -> FloatArray:
+def _candidates(terms: Sequence[FloatArray]) -> FloatArray:
     """Frequencies that come near every crossing, ascending."""
     theta = _candidate_angles(terms)
-    if theta.size == 0:
-        return np.empty(0)
-    roots = np.linalg.eigvals(_at_angle(terms, theta))
-    near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
-    omega = np.unique(np.abs(roots.imag[near_axis]))
-    return omega[(omega > 0.0) & (omega < 1.1 * highest)]
-
-
-def _at_angle(terms: Sequence[FloatArray], theta: FloatArray) -> ComplexArray:
-    """sum_k A_k e^{-j k theta}, shape (angles, n, n)."""
-    turns = np.exp(-1j * theta[:, np.newaxis] * np.arange(len(terms)))
-    return np.tensordot(turns, np.array(terms), axes=1)
+    return near_axis(np.linalg.eigvals(at_angle(terms, theta)).astype(np.complex128), terms) if theta.size else theta
 
 
 def norm_of(terms: Sequence[FloatArray]) -> float:
@@ -249,15 +204,14 @@ def circle_loci(terms: Sequence[FloatArray]) -> Loci:
     scale = norm_of(terms)
 
     def loci(theta: FloatArray) -> ComplexArray:
-        return np.exp(np.linalg.eigvals(_at_angle(terms, theta)) / scale).astype(np.complex128)
+        return np.exp(np.linalg.eigvals(at_angle(terms, theta)) / scale).astype(np.complex128)
 
     return loci
 
 
 def circle_points(terms: Sequence[FloatArray]) -> FloatArray:
     """Grid angles, and the extrema at which a real part comes near the axis and turns back."""
-    theta = _grid_angles(terms)
-    return np.union1d(theta, near_unit_extrema(circle_loci(terms), theta, near=_NEAR_AXIS))
+    return with_extrema(circle_loci(terms), _grid_angles(terms), near=_NEAR_AXIS)
 
 
 def passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool:
@@ -266,9 +220,9 @@ def passes_zero(terms: Sequence[FloatArray], theta: float, omega: float) -> bool
     An eigenvalue of A(theta) that passes zero is slow at this angle only; the slow motions of a loop are slow at the
     angles beside it too.
     """
-    if omega > _SLOW * highest_frequency(terms):
-        return False
-    beside = np.abs(np.linalg.eigvals(_at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
+    if omega == 0.0 or omega > _SLOW * highest_frequency(terms):
+        return omega == 0.0
+    beside = np.abs(np.linalg.eigvals(at_angle(terms, np.array([theta - _BESIDE, theta + _BESIDE]))))
     return bool(beside.min() > 1e3 * omega)
 
 
@@ -301,11 +255,9 @@ def _candidate_angles(terms: Sequence[FloatArray]) -> FloatArray:
 
 def _roots_and_slopes(terms: Sequence[FloatArray], theta: FloatArray) -> tuple[ComplexArray, FloatArray]:
     """Eigenvalues s of A(theta), shape (angles, n), and d(Re s) / d theta: zero where an eigenvalue is defective."""
-    roots, right = np.linalg.eig(_at_angle(terms, theta))
-    k = np.arange(len(terms))
-    change = np.tensordot(-1j * k * np.exp(-1j * theta[:, np.newaxis] * k), np.array(terms), axes=1)
+    roots, right = np.linalg.eig(at_angle(terms, theta))
     try:
-        slopes = np.real(np.einsum("tii->ti", np.linalg.solve(right, change @ right)))
+        slopes = np.real(np.einsum("tii->ti", np.linalg.solve(right, at_angle(terms, theta, 1) @ right)))
     except np.linalg.LinAlgError:
         slopes = np.zeros(roots.shape)
     return roots.astype(np.complex128), slopes.astype(np.float64)

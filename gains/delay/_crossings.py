@@ -23,6 +23,7 @@ from gains.delay._loci import (
     slope_sign,
     sweep_frequencies,
     unit_crossings,
+    unit_gain_roots,
     without_limits_at_zero,
 )
 
@@ -87,13 +88,26 @@ def axis_crossings(A0: FloatArray, A1: FloatArray) -> list[Crossing]:
     B, C = factor_rank(A1)
     if B.shape[1] == 0:
         return []
-    highest = highest_frequency((A0, A1))
-    found = crossings_of_loci(delay_loci(A0, B, C), _candidates(A0, A1, B, C, highest), highest)
-    polished = [polish((A0, A1), crossing) for crossing in found if is_root((A0, A1), crossing)]
+    return crossings_of_loci((A0, A1), delay_loci(A0, B, C), _candidates(A0, A1, B, C))
+
+
+def crossings_of_loci(terms: Sequence[FloatArray], loci: Loci, candidates: FloatArray) -> list[Crossing]:
+    """All crossings of one block, mere touches included, given frequencies that come near each of them."""
+    highest = highest_frequency(terms)
+    crossings = unit_crossings(loci, separating_points(candidates, highest))
+    found = without_limits_at_zero(loci, crossings + hidden_crossings(loci, candidates, crossings), highest)
+    polished = [polish(terms, crossing) for crossing in found if _is_root(terms, crossing)]
     return sorted(polished, key=lambda crossing: (crossing.omega_rad_s, crossing.delay_s))
 
 
-def is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
+def near_axis(roots: ComplexArray, terms: Sequence[FloatArray]) -> FloatArray:
+    """The ascending frequencies of those roots that are near the imaginary axis and below the bound of crossings."""
+    highest = highest_frequency(terms)
+    omega = np.unique(np.abs(roots.imag[np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))]))
+    return omega[(omega > 0.0) & (omega < 1.1 * highest)]
+
+
+def _is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
     """Whether j omega I - sum_k A_k e^{-j k theta} is singular, at least roughly, at a crossing.
 
     Near a multiple pole of the resolvent loci are huge, and small ones beside them are rounding, which may cross the
@@ -105,28 +119,19 @@ def is_root(matrices: Sequence[FloatArray], crossing: UnitCrossing) -> bool:
     return bool(least <= _RESIDUAL * (crossing.omega + sum(float(np.linalg.norm(matrix)) for matrix in matrices)))
 
 
-def crossings_of_loci(loci: Loci, candidates: FloatArray, highest: float) -> list[UnitCrossing]:
-    """All crossings of the unit circle, mere touches included, given frequencies that come near each of them."""
-    crossings = unit_crossings(loci, separating_points(candidates, highest))
-    return without_limits_at_zero(loci, crossings + hidden_crossings(loci, candidates, crossings), highest)
-
-
-def _candidates(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray, highest: float) -> FloatArray:
+def _candidates(A0: FloatArray, A1: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """Ascending frequencies, one of which is at every crossing up to rounding."""
     if B.shape[1] == 1:
-        # |C (jw - A0)^-1 B| = 1 exactly if jw is an eigenvalue of this Hamiltonian matrix (2n x 2n)
-        roots = np.linalg.eigvals(np.block([[A0, B @ B.T], [-C.T @ C, -A0.T]])).astype(np.complex128)
+        roots = unit_gain_roots(A0, B, C)
     elif A0.shape[0] <= LARGEST_ALGEBRAIC_BLOCK:
         roots = _kronecker_roots(A0, A1)
     else:
         return sweep_frequencies(A0, A1)
-    near_axis = np.abs(roots.real) <= _CANDIDATE_TOLERANCE * (highest + np.abs(roots))
-    omega = np.sort(roots.imag[near_axis & (roots.imag > 0.0)])
-    return omega[omega < 1.1 * highest]
+    return near_axis(roots, (A0, A1))
 
 
 def _kronecker_roots(A0: FloatArray, A1: FloatArray) -> ComplexArray:
-    """Square roots (in the upper half plane) of the eigenvalues of K- K+, where K+-X = A0 X +- A1 X'.
+    """Square roots of the eigenvalues of K- K+, where K+-X = A0 X +- A1 X'.
 
     With (A0 + z A1) v = j w v, |z| = 1, z = e^{-j theta}, the matrix Y = e^{j theta/2} v v* satisfies
     A0 Y + A1 Y* = j w Y; its real and imaginary parts R, S give K+ R = -w S, K- S = w R, so K- K+ R = -w^2 R.
@@ -135,9 +140,7 @@ def _kronecker_roots(A0: FloatArray, A1: FloatArray) -> ComplexArray:
     identity = np.eye(n)
     straight = np.einsum("im,jl->ijml", A0, identity).reshape(n * n, n * n)
     crossed = np.einsum("il,jm->ijml", A1, identity).reshape(n * n, n * n)
-    squares = np.linalg.eigvals((straight - crossed) @ (straight + crossed)).astype(np.complex128)
-    roots = np.sqrt(squares)
-    return np.where(roots.imag >= 0.0, roots, -roots)
+    return np.sqrt(np.linalg.eigvals((straight - crossed) @ (straight + crossed)).astype(np.complex128))
 
 
 def separating_points(candidates: FloatArray, highest: float) -> FloatArray:

@@ -9,7 +9,7 @@ from math import pi
 import numpy as np
 
 from gains.core.arrays import ComplexArray, FloatArray
-from gains.delay._loci import near_unit_extrema, unit_crossings
+from gains.delay._loci import unit_crossings, with_extrema
 
 # angles of the grid of starting points, and angles of the other delay in the search from each
 _SEED_ANGLES, _SEARCH_ANGLES = 48, 160
@@ -77,8 +77,7 @@ def _solutions_at(terms: FloatArray, alpha: float) -> list[FloatArray]:
         matrices = now + terms[2] * np.exp(-1j * beta)[:, np.newaxis, np.newaxis]
         return np.exp(np.linalg.eigvals(matrices)).astype(np.complex128)
 
-    beta = np.linspace(1e-9, 2.0 * pi, _SEARCH_ANGLES)
-    beta = np.union1d(beta, near_unit_extrema(loci, beta, near=_NEAR_AXIS))
+    beta = with_extrema(loci, np.linspace(1e-9, 2.0 * pi, _SEARCH_ANGLES), near=_NEAR_AXIS)
     points = [np.array([np.angle(crossing.locus), alpha, crossing.omega]) for crossing in unit_crossings(loci, beta)]
     return [_corrected(terms, point) for point in points if point[0] > _LOWEST]
 

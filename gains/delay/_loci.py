@@ -8,6 +8,7 @@ two frequencies at which a different number of moduli exceeds one, there is a cr
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,11 @@ class UnitCrossing:
     omega: float
     locus: complex
     outward: int
+
+    @property
+    def delay_s(self) -> float:
+        """The least delay >= 0 with e^{j omega delay} at the locus."""
+        return float(np.angle(self.locus)) % (2.0 * np.pi) / self.omega
 
 
 def factor_rank(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -86,6 +92,17 @@ def delay_loci(A0: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | flo
     return loci
 
 
+def unit_gain_roots(A: FloatArray, B: FloatArray, C: FloatArray, D: float = 0.0) -> ComplexArray:
+    """Among these (2n,) are all j omega with |C (j omega I - A)^{-1} B + D| = 1: eigenvalues of a Hamiltonian matrix.
+
+    It is the matrix whose imaginary eigenvalues decide whether an H-infinity norm exceeds one.
+    """
+    # |D| = 1 sends one solution to infinity
+    rest = 1.0 - D * D if abs(1.0 - D * D) > 1e-12 else 1e-12
+    corner = A + B @ C * (D / rest)
+    return np.linalg.eigvals(np.block([[corner, B @ B.T / rest], [-C.T @ C / rest, -corner.T]])).astype(np.complex128)
+
+
 def solved_beside_poles(matrices: NDArray[Any], right: FloatArray) -> NDArray[Any]:
     """X with M X = `right` (n, r) for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
 
@@ -114,16 +131,10 @@ def unit_crossings(loci: Loci, points: FloatArray) -> list[UnitCrossing]:
     """
     logs = log_moduli(loci(points))
     above = np.count_nonzero(logs > 0.0, axis=1)
-    intervals = np.flatnonzero(above[1:] != above[:-1])
-    if intervals.size == 0:
+    crossed = [(i, rank) for i, ends in enumerate(pairwise(above.tolist())) for rank in range(min(ends), max(ends))]
+    if not crossed:
         return []
-    lower: list[int] = []
-    rank: list[int] = []
-    for i in intervals.tolist():
-        ranks = range(min(above[i], above[i + 1]), max(above[i], above[i + 1]))
-        lower.extend([i] * len(ranks))
-        rank.extend(ranks)
-    at, nth = np.array(lower), np.array(rank)
+    at, nth = np.array(crossed).T
 
     def nth_log(omega: FloatArray) -> FloatArray:
         return log_moduli(loci(omega))[np.arange(omega.size), nth]
@@ -148,8 +159,8 @@ def without_limits_at_zero(loci: Loci, crossings: list[UnitCrossing], highest: f
     return [crossing for crossing in crossings if crossing.omega > _SLOW * highest or not is_flat(crossing)]
 
 
-def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
-    """Frequencies of local extrema of the sorted log moduli that may reach zero between grid points.
+def with_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT) -> FloatArray:
+    """The frequencies, and those of local extrema of the sorted log moduli between them that may reach zero.
 
     Extrema whose sampled log modulus is `near` or more away from zero are taken not to reach it.
     """
@@ -157,13 +168,19 @@ def near_unit_extrema(loci: Loci, omega: FloatArray, *, near: float = _NEAR_UNIT
     peak, valley = may_reach_zero(omega, logs), may_reach_zero(omega, -logs)
     row, rank = np.nonzero((peak | valley) & (np.abs(logs[1:-1]) < near))
     if row.size == 0:
-        return np.empty(0)
+        return omega
     sign = np.where(peak[row, rank], 1.0, -1.0)
 
     def height(at: FloatArray) -> FloatArray:
         return sign * log_moduli(loci(at))[np.arange(at.size), rank]
 
-    return peaks(height, omega[row], omega[row + 2])
+    return np.union1d(omega, peaks(height, omega[row], omega[row + 2]))
+
+
+def swept_crossings(loci: Loci, omega: FloatArray) -> list[UnitCrossing]:
+    """The crossings of loci between ascending frequencies, extrema near one included, those at zero left out."""
+    omega = with_extrema(loci, omega)
+    return without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
 
 
 def slope_sign(loci: Loci, omega: float, locus: complex) -> int:

@@ -18,7 +18,7 @@ from gains.core.errors import BadModelError, DisagreementError
 from gains.core.structure import Block, balanced, distinct_blocks, is_singular_for_any_delay, square_matrices
 from gains.delay._commensurate import column_space, companion_loci
 from gains.delay._crossings import Crossing, DelayedTerm
-from gains.delay._loci import near_unit_extrema, unit_crossings, without_limits_at_zero
+from gains.delay._loci import swept_crossings
 from gains.delay._windows import (
     BlockAnalysis,
     DelayAnalysis,
@@ -154,12 +154,8 @@ def _crossings(parts: _Parts) -> list[Crossing]:
     if parts.degree == 0:
         return []
     loci = companion_loci(parts.at, column_space(list(parts.matrices[parts.multiples > 0])))
-    omega = parts.frequencies(1.1 * parts.highest())
-    omega = np.union1d(omega, near_unit_extrema(loci, omega))
-    return [
-        Crossing(each.omega, float(np.angle(each.locus)) % (2.0 * pi) / each.omega, each.outward, roots=2)
-        for each in without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
-    ]
+    found = swept_crossings(loci, parts.frequencies(1.1 * parts.highest()))
+    return [Crossing(each.omega, each.delay_s, each.outward, roots=2) for each in found]
 
 
 def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) -> int:

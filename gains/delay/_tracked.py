@@ -93,23 +93,23 @@ def _sample(terms: ComplexArray, theta: float, scale: float) -> _Sample:
     """With V^{-1} A V = diag(s), W = V^{-1} A' V and X = V^{-1} A'' V the derivatives of s_i are W_ii and
     X_ii + 2 sum_j W_ij W_ji / (s_i - s_j).
     """
-    roots, right = np.linalg.eig(_at(terms, theta, 0))
+    roots, right = np.linalg.eig(at_angle(terms, theta))
     try:
         left = np.linalg.inv(right)
     except np.linalg.LinAlgError as error:
         raise UnclearError from error
-    by_theta = left @ _at(terms, theta, 1) @ right
+    by_theta = left @ at_angle(terms, theta, 1) @ right
     gaps = roots[:, np.newaxis] - roots
     gaps[np.abs(gaps) < _EQUAL * scale] = np.inf
     coupling = 2.0 * (by_theta * by_theta.T / gaps).sum(axis=1)
-    bends = np.einsum("ij,ji->i", left, _at(terms, theta, 2) @ right) + coupling
+    bends = np.einsum("ij,ji->i", left, at_angle(terms, theta, 2) @ right) + coupling
     return _Sample(theta, roots, np.diag(by_theta), bends, right)
 
 
-def _at(terms: ComplexArray, theta: FloatArray | float, order: int) -> ComplexArray:
-    """The derivative of this order of A by theta, shape (n, n) for each angle."""
+def at_angle(terms: Sequence[FloatArray] | ComplexArray, theta: FloatArray | float, order: int = 0) -> ComplexArray:
+    """A(theta), or its derivative of this order by theta, shape (n, n) for each angle."""
     multiples = -1j * np.arange(len(terms))
-    return np.tensordot(np.exp(np.multiply.outer(theta, multiples)) * multiples**order, terms, axes=1)
+    return np.tensordot(np.exp(np.multiply.outer(theta, multiples)) * multiples**order, np.asarray(terms), axes=1)
 
 
 def _between(terms: ComplexArray, left: _Sample, right: _Sample, scale: float) -> Iterator[_Found]:
@@ -239,10 +239,10 @@ def _newton(terms: ComplexArray, theta: FloatArray, omega: FloatArray, v: Comple
     right = np.zeros((theta.size, n + 1, 2), dtype=np.complex128)
     size, b = 0.0, np.zeros(theta.size, dtype=np.complex128)
     for _ in range(_NEWTON_STEPS):
-        bordered[:, :n, :n] = 1j * omega[:, np.newaxis, np.newaxis] * np.eye(n) - _at(terms, theta, 0)
+        bordered[:, :n, :n] = 1j * omega[:, np.newaxis, np.newaxis] * np.eye(n) - at_angle(terms, theta)
         bordered[:, :n, n] = 1j * v
         right[:, :n, 0] = -(bordered[:, :n, :n] @ v[..., np.newaxis])[..., 0]
-        right[:, :n, 1] = (_at(terms, theta, 1) @ v[..., np.newaxis])[..., 0]
+        right[:, :n, 1] = (at_angle(terms, theta, 1) @ v[..., np.newaxis])[..., 0]
         try:
             step = np.linalg.solve(bordered, right)
         except np.linalg.LinAlgError:

@@ -49,6 +49,11 @@ class DelayAnalysis:
     roots_fixed_at_zero: int = 0
     """The number of roots at s = 0 that were left out at the caller's request."""
 
+    def window_around(self, delay_s: float) -> tuple[float, float] | None:
+        """The window of stability in which a delay is; None if there is none."""
+        windows = self.stable_intervals_s
+        return next((w for w in windows if w[0] < delay_s < w[1] or w[0] == delay_s == 0.0), None)
+
 
 @dataclass(frozen=True)
 class ZeroPassage:

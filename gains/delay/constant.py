@@ -19,29 +19,28 @@ __all__ = ["Crossing", "DelayAnalysis", "analyse_delay", "delay_margin"]
 
 
 def analyse_delay(
-    A0: ArrayLike, A1: ArrayLike, *, horizon_s: float | None = None, leave_out_zero: bool = False
+    A0: ArrayLike, A1: ArrayLike, *further: ArrayLike, horizon_s: float | None = None, leave_out_zero: bool = False
 ) -> DelayAnalysis:
-    """Stability windows, critical delays and delay margin of x'(t) = A0 x(t) + A1 x(t - tau).
+    """Stability windows, critical delays and delay margin of x'(t) = A0 x(t) + A1 x(t - tau) + A2 x(t - 2 tau) + ...
 
-    A0 and A1 are real matrices (n, n) in 1/s. All windows are listed, of which there are finitely many, or with
-    `horizon_s` only those that begin before this delay.
+    A0, A1 and the `further` A2, A3, ... are real matrices (n, n) in 1/s. All windows are listed, of which there are
+    finitely many, or with `horizon_s` only those that begin before this delay.
 
     A loop with a root that stays on the imaginary axis at every delay is asymptotically stable at none: no window,
-    margin 0. One is s = 0 if A0 + A1 is singular. If that root is merely the common value of a consensus, ask for
-    `leave_out_zero`, which judges a block with a simple root at s = 0 by its other roots, or remove states on which
-    nothing acts with `gains.core.structure.without_equilibria`.
+    margin 0. One is s = 0 if the sum of the matrices is singular. If that root is merely the common value of a
+    consensus, ask for `leave_out_zero`, which judges a block with a simple root at s = 0 by its other roots, or remove
+    states on which nothing acts with `gains.core.structure.without_equilibria`.
 
-    Raises BadModelError unless the matrices are square, finite and of one size and the horizon is positive, and
+    Raises BadModelError unless the matrices are square, finite, of one size and not too many, and the horizon positive;
     DisagreementError if crossings and eigenvalues contradict each other (a loop at the limit of double precision).
 
     x'' - 0.1 x' + 2 x = x(t - tau) is stable for delays between 0.1 s and 1.7 s only:
 
-    >>> from gains import analyse_delay
     >>> found = analyse_delay([[0, 1], [-2, 0.1]], [[0, 0], [1, 0]])
     >>> [(round(start_s, 4), round(end_s, 4)) for start_s, end_s in found.stable_intervals_s]
     [(0.1002, 1.7179)]
     """
-    blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
+    blocks = distinct_blocks(*square_matrices(**{f"A{k}": matrix for k, matrix in enumerate((A0, A1, *further))}))
     check_horizon(horizon_s)
     return combined_analysis([analyse_block(block, leave_out_zero) for block in blocks], horizon_s)
 
@@ -51,7 +50,6 @@ def delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
 
     `inf` if no delay does, 0 if the loop is unstable without delay. Arguments and exceptions as of `analyse_delay`.
 
-    >>> from gains import delay_margin
     >>> round(delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796
     """

@@ -33,12 +33,11 @@ def rightmost_root(terms: Sequence[tuple[ArrayLike, float]]) -> complex:
     At tau = pi / 2 x'(t) = -x(t - tau) has the roots +-j, and with tau = 1 one that is Lambert's W(-1):
 
     >>> from math import pi
-    >>> from gains import rightmost_root
     >>> rightmost, later = (rightmost_root([([[-1]], delay_s)]) for delay_s in (1, pi / 2))
     >>> round(rightmost.real, 6), round(rightmost.imag, 6), round(later.imag, 6)
     (-0.318132, 1.337236, 1.0)
     """
-    return complex(_roots_of(terms, 1)[0])
+    return complex(rightmost_roots(terms, 1)[0])
 
 
 def rightmost_roots(terms: Sequence[tuple[ArrayLike, float]], count: int) -> ComplexArray:
@@ -48,14 +47,9 @@ def rightmost_roots(terms: Sequence[tuple[ArrayLike, float]], count: int) -> Com
 
     Of x'(t) = -x(t - 1) these are the branches of Lambert's W(-1):
 
-    >>> from gains.delay.rightmost import rightmost_roots
     >>> rightmost_roots([([[-1]], 1.0)], 3).round(3).tolist()
     [(-0.318+1.337j), (-2.062+7.589j), (-2.653+13.949j)]
     """
-    return _roots_of(terms, count)
-
-
-def _roots_of(terms: Sequence[tuple[ArrayLike, float]], count: int) -> ComplexArray:
     if len(terms) == 0:
         raise BadModelError("terms is empty; at least one pair (matrix, delay) is wanted")
     delays = np.array([float(delay_s) for _, delay_s in terms])

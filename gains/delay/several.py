@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from math import inf, isfinite, pi
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.core.structure import distinct_blocks, real_matrix, square_matrices
 from gains.delay._curves import at_delay, crossing_solutions
@@ -67,7 +67,6 @@ def delay_box(A0: ArrayLike, late: Sequence[ArrayLike]) -> DelayBox:
 
     x_1' = -x_1(t - tau_1), x_2' = x_1 - 2 x_2(t - tau_2): up to pi / 2 and pi / 4, whatever the other delay is.
 
-    >>> from gains import delay_box
     >>> box = delay_box([[0, 0], [1, 0]], [[[-1, 0], [0, 0]], [[0, 0], [0, -2]]])
     >>> [round(limit_s, 6) for limit_s in box.limits_s], box.is_exact
     ([1.570796, 0.785398], True)
@@ -133,7 +132,6 @@ def boundary_of_two_delays(
 
     Without tau_2 the loop x'(t) = -x(t - tau_1) - 0.5 x(t - tau_2) takes tau_1 up to acos(-0.5) / sqrt(0.75) = 2.4184:
 
-    >>> from gains.delay.several import boundary_of_two_delays
     >>> edge = boundary_of_two_delays([[0]], [[-1]], [[-0.5]], longest_s=(3.0, 3.0))
     >>> at_once = min((pair for line in edge for pair in line.delays_s.tolist()), key=lambda pair: pair[1])
     >>> round(at_once[0], 4), at_once[1]
@@ -158,65 +156,62 @@ def _images(matrices: tuple[FloatArray, ...], curve: FloatArray, longest_s: tupl
     last = np.floor(((np.array(longest_s) * omega - angles) / (2.0 * pi)).max(axis=0)).astype(int)
     for p in range(first[0], last[0] + 1):
         for q in range(first[1], last[1] + 1):
-            delays_s = (angles + 2.0 * pi * np.array([p, q])) / omega
-            yield from _inside(matrices, curve, delays_s, (p, q), longest_s)
+            yield from _Image(matrices, curve, (p, q), longest_s).inside()
 
 
-def _inside(
-    matrices: tuple[FloatArray, ...],
-    curve: FloatArray,
-    delays_s: FloatArray,
-    turns: tuple[int, int],
-    longest_s: tuple[float, float],
-) -> Iterator[Polyline]:
-    """The stretches of a polyline in the box, each up to the points where the curve enters and leaves it."""
-    inside = np.all((delays_s >= 0.0) & (delays_s <= np.array(longest_s)), axis=1)
-    for begin, end in _runs(inside):
-        points, omega = delays_s[begin:end], curve[begin:end, 0]
-        for last, beyond in ((begin, begin - 1), (end - 1, end)):
-            if 0 <= beyond < len(delays_s):
-                edge = _edge_point(matrices, curve, delays_s, (last, beyond), turns, longest_s)
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """The delays that belong to a curve of solutions after whole turns p and q."""
+
+    matrices: tuple[FloatArray, ...]
+    curve: FloatArray
+    turns: tuple[int, int]
+    longest_s: tuple[float, float]
+
+    def inside(self) -> Iterator[Polyline]:
+        """The stretches in the box, each up to the points where the curve enters and leaves it."""
+        delays_s = self._delays_s(self.curve)
+        for begin, end in _runs(self._is_inside(delays_s)):
+            points, omega = delays_s[begin:end], self.curve[begin:end, 0]
+            for last, beyond in ((begin, begin - 1), (end - 1, end)):
+                edge = self._edge_point(last, beyond) if 0 <= beyond < len(delays_s) else None
                 if edge is not None:
                     place = 0 if beyond < begin else len(points)
                     points, omega = np.insert(points, place, edge[0], axis=0), np.insert(omega, place, edge[1])
-        if len(points) >= _LEAST_POINTS:
-            yield Polyline(points, omega)
+            if len(points) >= _LEAST_POINTS:
+                yield Polyline(points, omega)
+
+    def _delays_s(self, solutions: FloatArray) -> FloatArray:
+        """Delays (..., 2) of solutions (..., 3)."""
+        return (solutions[..., 1:] + 2.0 * pi * np.array(self.turns)) / solutions[..., :1]
+
+    def _is_inside(self, delays_s: FloatArray) -> BoolArray:
+        return np.all((delays_s >= 0.0) & (delays_s <= np.array(self.longest_s)), axis=-1)
+
+    def _edge_point(self, last: int, beyond: int) -> tuple[FloatArray, float] | None:
+        """Delays and frequency where the curve meets the edge of the box between a vertex inside and one outside."""
+        here, there = self._delays_s(self.curve[[last, beyond]])
+        # the edge that the chord meets first
+        met = [
+            ((bound_s - float(here[which])) / float(there[which] - here[which]), which, bound_s)
+            for which in (0, 1)
+            for bound_s in (0.0, self.longest_s[which])
+            if ((there[which] < 0.0) if bound_s == 0.0 else (there[which] > bound_s))
+        ]
+        if not met or min(met)[0] <= 0.0:
+            return None
+        share, which, bound_s = min(met)
+        start = self.curve[last] + share * (self.curve[beyond] - self.curve[last])
+        found = at_delay(self.matrices, start, which=which, delay_s=bound_s, turns=self.turns[which])
+        if found is None:
+            return None
+        pair_s = self._delays_s(found)
+        pair_s[which] = bound_s
+        # the curve may have left by another edge before
+        return (pair_s, float(found[0])) if self._is_inside(pair_s) else None
 
 
-def _edge_point(
-    matrices: tuple[FloatArray, ...],
-    curve: FloatArray,
-    delays_s: FloatArray,
-    between: tuple[int, int],
-    turns: tuple[int, int],
-    longest_s: tuple[float, float],
-) -> tuple[FloatArray, float] | None:
-    """Delays and frequency where the curve meets the edge of the box between a vertex inside and the next, outside."""
-    last, beyond = between
-    here, there = delays_s[last], delays_s[beyond]
-    # the edge that the chord meets first
-    met = [
-        ((bound_s - float(here[which])) / float(there[which] - here[which]), which, bound_s)
-        for which in (0, 1)
-        for bound_s in (0.0, longest_s[which])
-        if ((there[which] < 0.0) if bound_s == 0.0 else (there[which] > bound_s))
-    ]
-    if not met or min(met)[0] <= 0.0:
-        return None
-    share, which, bound_s = min(met)
-    start = curve[last] + share * (curve[beyond] - curve[last])
-    found = at_delay(matrices, start, which=which, delay_s=bound_s, turns=turns[which])
-    if found is None:
-        return None
-    pair_s = (found[1:] + 2.0 * pi * np.array(turns)) / found[0]
-    pair_s[which] = bound_s
-    # the curve may have left by another edge before
-    if not bool(np.all((pair_s >= 0.0) & (pair_s <= np.array(longest_s)))):
-        return None
-    return pair_s, float(found[0])
-
-
-def _runs(kept: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+def _runs(kept: BoolArray) -> Iterator[tuple[int, int]]:
     """Begin and end of each stretch that is kept."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], kept, [False]]).astype(np.int8)))
     return zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)

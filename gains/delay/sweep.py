@@ -14,13 +14,7 @@ from numpy.typing import ArrayLike
 from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, distinct_blocks, square_matrices
 from gains.delay._commensurate import circle_loci, circle_points, norm_of, passes_zero
-from gains.delay._loci import (
-    delay_loci,
-    near_unit_extrema,
-    sweep_frequencies,
-    unit_crossings,
-    without_limits_at_zero,
-)
+from gains.delay._loci import delay_loci, sweep_frequencies, swept_crossings, unit_crossings
 
 # a root of A(theta) this close to the imaginary axis, relative to the norm, is on it
 _ON_AXIS = 1e-9
@@ -45,8 +39,8 @@ def circle_sweep_margin(matrices: Sequence[ArrayLike]) -> float:
 
     Where an eigenvalue s of A(theta) = sum_k A_k e^{-j k theta} crosses the imaginary axis at j omega, tau = theta /
     omega is critical. Sorted real parts are continuous in the angle, so crossings can be bracketed, and local extrema
-    near zero are refined. 0 if the loop is unstable without delay, `inf` if no crossing is found. Arguments and
-    exceptions as of `gains.delay._commensurate.analyse_commensurate`.
+    near zero are refined. 0 if the loop is unstable without delay, `inf` if no crossing is found. Raises as
+    `gains.delay.constant.analyse_delay` does of these matrices.
     """
     checked = square_matrices(**{f"matrices[{k}]": matrix for k, matrix in enumerate(matrices)})
     return min(_circle_margin(balanced(*block.matrices)) for block in distinct_blocks(*checked))
@@ -58,12 +52,8 @@ def _frequency_margin(A0: FloatArray, A1: FloatArray) -> float:
     if not A1.any():
         return inf
     loci = delay_loci(A0, A1, np.eye(A0.shape[0]))
-    omega = sweep_frequencies(A0, A1)
-    omega = np.union1d(omega, near_unit_extrema(loci, omega))
-    # e^{j theta} is the locus, so the delay is its angle in [0, 2 pi) over the frequency; an angle a rounding error
-    # below zero would belong to a root on the axis at zero delay, which A0 + A1 Hurwitz excludes
-    crossings = without_limits_at_zero(loci, unit_crossings(loci, omega), float(omega[-1]))
-    return min((float(np.angle(c.locus)) % (2.0 * pi) / c.omega for c in crossings), default=inf)
+    # an angle just below zero would belong to a root on the axis at zero delay, which A0 + A1 Hurwitz excludes
+    return min((crossing.delay_s for crossing in swept_crossings(loci, sweep_frequencies(A0, A1))), default=inf)
 
 
 def _circle_margin(terms: Sequence[FloatArray]) -> float:

@@ -125,7 +125,6 @@ def design(
 
     A leader and two followers in a chain, with a delay margin of 0.3 s at 50 Hz:
 
-    >>> from gains import FormationModel, Requirement, design
     >>> found = design(FormationModel((-1, 0, 1)), Requirement(delay_margin_s=0.3), period_s=0.02)
     >>> round(found.delay_margin_s, 4), found.K1.shape
     (0.3, (2, 2))
@@ -176,7 +175,6 @@ def evaluate_gains(
 
     K1 = −1, K3 = 1: a follower takes 0.711119 s, or half a period less when sampled.
 
-    >>> from gains import FormationModel, evaluate_gains
     >>> found = evaluate_gains(FormationModel((-1, 0), axes=1), ([[-1]], [[0]], [[1]]), period_s=0.02)
     >>> round(found.delay_margin_continuous_s, 6), round(found.delay_margin_s, 3)
     (0.711119, 0.701)
@@ -246,7 +244,6 @@ def trade_off(
     Arguments as in `gains.core.requirement.Requirement`; commands are sampled and held every `period_s`. Raises
     BadModelError if the period is not positive or the limit is below 1.
 
-    >>> from gains import trade_off
     >>> points = trade_off(period_s=0.02)
     >>> points[0].delay_margin_s, points[-1].delay_margin_s, points[0].alpha > points[-1].alpha
     (0.05, 1.0, True)

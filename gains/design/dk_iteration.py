@@ -19,11 +19,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from gains.core._semidefinite import SolverFacts, solved
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError, DisagreementError, InfeasibleError, SolverError
 from gains.criteria.poles import roots_of
 from gains.formation.pattern import Pattern, Plant, check_fits
@@ -145,7 +144,7 @@ def _lyapunov_step(states: int, effort: list[SolverFacts]) -> Callable[[FloatArr
     return step
 
 
-def _gain_step(plant: Plant, mask: NDArray[np.bool_], effort: list[SolverFacts]) -> Callable[[FloatArray], FloatArray]:
+def _gain_step(plant: Plant, mask: BoolArray, effort: list[SolverFacts]) -> Callable[[FloatArray], FloatArray]:
     """From P to the K with the pattern and ‖K‖ ≤ k̄ for which (1) holds with the least α; compiled once."""
     import cvxpy as cp
 

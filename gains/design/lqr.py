@@ -14,10 +14,10 @@ Control 15 (1970), 44-48, for the gradient.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import linalg
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, FloatArray, IntArray
 from gains.core.errors import BadModelError, InfeasibleError
 from gains.core.structure import real_matrix, strongly_connected_blocks
 from gains.formation.pattern import Plant
@@ -62,7 +62,7 @@ class LyapunovEquations:
     eigenvalue, which rounding would spread into the right half plane.
     """
 
-    def __init__(self, A: FloatArray, blocks: list[NDArray[np.intp]]) -> None:
+    def __init__(self, A: FloatArray, blocks: list[IntArray]) -> None:
         # driven blocks first makes the matrix block upper triangular
         order = np.concatenate(blocks[::-1])
         self._basis = np.zeros(A.shape)
@@ -106,7 +106,7 @@ class LyapunovEquations:
 class Cost:
     """J and its gradient for one plant, pattern and weights."""
 
-    def __init__(self, plant: Plant, mask: NDArray[np.bool_], weights: Weights) -> None:
+    def __init__(self, plant: Plant, mask: BoolArray, weights: Weights) -> None:
         self.plant, self.mask, self.weights = plant, mask, weights
         feedback = (plant.B != 0.0).astype(float) @ mask.astype(float) @ (plant.C != 0.0).astype(float)
         self.blocks = strongly_connected_blocks(plant.A, feedback)

@@ -38,7 +38,6 @@ def predicted_gains(wanted: Requirement, period_s: float, at_s: Sequence[float] 
     With 20 % of mismatch to either side of 0.6 s, errors decay at 2.5 1/s; without prediction at 0.96 1/s at best:
 
     >>> from gains.core.requirement import Criteria, Requirement
-    >>> from gains.design.predicted import predicted_gains
     >>> criteria = Criteria(0.6, "decay_rate_at_delay_1_s", delays_s=(0.48, 0.72), delay_rate=0.0)
     >>> found = predicted_gains(Requirement(criteria=criteria), 0.02)
     >>> round(found.k1, 1), round(found.k3, 1)

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.formation.pattern import Link, Pattern, Plant, check_fits, checked_pattern_gain
 
@@ -62,7 +62,7 @@ class ExpandedGain:
     phi1: FloatArray
     phi2: FloatArray
     """0/1 matrices, shapes (inputs, expanded inputs) and (expanded outputs, outputs)."""
-    mask: NDArray[np.bool_]
+    mask: BoolArray
     """Entries of K̄ that may be nonzero: block diagonal, shape (expanded inputs, expanded outputs)."""
 
     def expand(self, K: ArrayLike) -> FloatArray:
@@ -182,11 +182,11 @@ def _stacked(vehicles: list[int], sizes: tuple[int, ...]) -> FloatArray:
     return np.eye(int(starts[-1]))[index.astype(np.intp)]
 
 
-def _rank_bound(blocks: NDArray[np.bool_]) -> int:
+def _rank_bound(blocks: BoolArray) -> int:
     return int(np.linalg.matrix_rank(blocks.astype(float)))
 
 
-def _classes(rows: NDArray[np.bool_]) -> list[list[int]]:
+def _classes(rows: BoolArray) -> list[list[int]]:
     """Indices of the rows that are not empty, equal ones together."""
     found: dict[bytes, list[int]] = {}
     for k in np.flatnonzero(rows.any(axis=1)).tolist():
@@ -194,11 +194,11 @@ def _classes(rows: NDArray[np.bool_]) -> list[list[int]]:
     return list(found.values())
 
 
-def _rows(blocks: NDArray[np.bool_]) -> list[Subgraph]:
+def _rows(blocks: BoolArray) -> list[Subgraph]:
     return [Subgraph((i,), tuple(np.flatnonzero(row).tolist())) for i, row in enumerate(blocks) if row.any()]
 
 
-def _largest_first(core: NDArray[np.bool_]) -> list[Subgraph]:
+def _largest_first(core: BoolArray) -> list[Subgraph]:
     """Greedy partition: again and again the largest subgraph on the common outputs of one or two inputs."""
     left = core.copy()
     graphs: list[Subgraph] = []
@@ -214,7 +214,7 @@ def _largest_first(core: NDArray[np.bool_]) -> list[Subgraph]:
     return graphs
 
 
-def _search(core: NDArray[np.bool_], count: int, steps: Iterator[int]) -> tuple[list[Subgraph] | None, bool]:
+def _search(core: BoolArray, count: int, steps: Iterator[int]) -> tuple[list[Subgraph] | None, bool]:
     """A partition into at most `count` subgraphs if there is one, and whether the steps were enough to know.
 
     The first uncovered link joins one of the open subgraphs, with the further links that complete it, or opens a new

@@ -16,9 +16,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core.arrays import ComplexArray, FloatArray
+from gains.core.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from gains.core.errors import DisagreementError, InfeasibleError
 from gains.core.structure import distinct_blocks, strongly_connected_blocks
 from gains.formation.pattern import Link, Pattern, Plant, check_fits
@@ -60,12 +59,12 @@ class FixedMode:
 class _Component:
     """One diagonal block of the closed loop: the inputs that act on it and, for each, the rows of C it uses."""
 
-    states: NDArray[np.intp]
+    states: IntArray
     A: FloatArray
     B: tuple[FloatArray, ...]
     C: FloatArray
     inputs: tuple[int, ...]
-    rows: tuple[NDArray[np.bool_], ...]
+    rows: tuple[BoolArray, ...]
 
 
 def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[FixedMode, ...]:
@@ -78,7 +77,6 @@ def fixed_modes(plant: Plant, pattern: Pattern, *, seed: int = 0) -> tuple[Fixed
     A leader that may not use its own velocity error keeps its integrator, unless a link is added:
 
     >>> from gains import FormationModel
-    >>> from gains.formation.fixed_modes import fixed_modes
     >>> from gains.formation.pattern import formation_plant, leader_follower
     >>> from gains.formation.pattern import without_links
     >>> pair = FormationModel((-1, 0), axes=1)

@@ -33,7 +33,6 @@ class FormationModel:
     A leader and two followers in a chain. With K1 = −1, K3 = 1 per axis a follower has the loop
     s² + (s + 1) e^{−sτ} = 0 and a delay margin of 0.711119 s:
 
-    >>> import numpy as np
     >>> from gains import FormationModel, delay_margin
     >>> chain = FormationModel((-1, 0, 1))
     >>> chain.states, chain.inputs

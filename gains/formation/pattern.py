@@ -110,8 +110,6 @@ def leader_follower(formation: FormationModel) -> Pattern:
 
     C = I: the leader's output is its velocity error, a follower's its spacing and velocity errors.
 
-    >>> from gains import FormationModel
-    >>> from gains.formation.pattern import leader_follower
     >>> leader_follower(FormationModel((-1, 0, 1))).links
     ((0, 0), (1, 0), (1, 1), (2, 1), (2, 2))
     """
@@ -124,8 +122,6 @@ def leader_follower(formation: FormationModel) -> Pattern:
 def bidirectional(formation: FormationModel) -> Pattern:
     """Every vehicle uses its own output and those of the vehicles in front and behind, as in section 5.
 
-    >>> from gains import FormationModel
-    >>> from gains.formation.pattern import bidirectional
     >>> bidirectional(FormationModel((-1, 0, 1))).blocks.astype(int).tolist()
     [[1, 1, 0], [1, 1, 1], [0, 1, 1]]
     """
@@ -138,7 +134,6 @@ def overlapping(formation: FormationModel, *, ahead: int = 1, behind: bool = Fal
 
     More overlaps than the source's (4.6). BadModelError if `ahead` is below 1.
 
-    >>> from gains.formation.model import FormationModel
     >>> overlapping(FormationModel((-1, 0, 1, 2)), ahead=2, leader=True).blocks.astype(int).tolist()
     [[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 0], [1, 1, 1, 1]]
     """
@@ -158,8 +153,6 @@ def overlapping(formation: FormationModel, *, ahead: int = 1, behind: bool = Fal
 def all_to_all(formation: FormationModel) -> Pattern:
     """Every vehicle uses all outputs: the centralised controller.
 
-    >>> from gains import FormationModel
-    >>> from gains.formation.pattern import all_to_all
     >>> all_to_all(FormationModel((-1, 0))).links
     ((0, 0), (0, 1), (1, 0), (1, 1))
     """
@@ -189,8 +182,6 @@ def without_links(pattern: Pattern, links: Iterable[Link]) -> Pattern:
 def formation_plant(formation: FormationModel, C: ArrayLike | None = None) -> Plant:
     """The error model of the formation with outputs y = C e, C of shape (outputs, states); C = I if not given.
 
-    >>> from gains import FormationModel
-    >>> from gains.formation.pattern import formation_plant
     >>> plant = formation_plant(FormationModel((-1, 0, 1)))
     >>> plant.A.shape, plant.B.shape, plant.C.shape
     ((10, 10), (10, 6), (10, 10))

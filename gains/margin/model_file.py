@@ -88,7 +88,6 @@ def parse_model(text: str) -> DelayModel | HeldModel:
 
     BadModelError says in one line which key, what was read and what was wanted.
 
-    >>> from gains import parse_model
     >>> model = parse_model('{"terms": [{"A": [[-1]], "delay": "0.1 + 2*tau"}]}')
     >>> model.unknown, model.terms[0].fixed_s, model.terms[0].multiple
     ('tau', 0.1, Fraction(2, 1))

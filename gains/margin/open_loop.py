@@ -46,7 +46,6 @@ def feedback_of_matrices(
 ) -> tuple[FloatArray, FloatArray]:
     """The same of a state-space system: A (n, n), B (n, p), C (p, n), D (p, p) zero.
 
-    >>> from gains.margin.open_loop import feedback_of_matrices
     >>> feedback_of_matrices([[0, 1], [0, -1]], [[0], [1]], [[1, 0]])[1].tolist()
     [[0.0, 0.0], [-1.0, 0.0]]
     """
@@ -63,7 +62,6 @@ def feedback_of_matrices(
 def feedback_of_polynomials(num: Any, den: Any) -> tuple[FloatArray, FloatArray]:
     """The same of num / den with the highest power first, also nested as [[num]].
 
-    >>> from gains.margin.open_loop import feedback_of_polynomials
     >>> sum(feedback_of_polynomials([2], [1, 3])).tolist()
     [[-5.0]]
     """

@@ -47,7 +47,6 @@ def checked_delay_margin(A0: ArrayLike, A1: ArrayLike) -> float:
     `gains.delay.constant.delay_margin`. Raises BadModelError unless the matrices are square, finite and of one size,
     and DisagreementError if the methods differ, with what each one found.
 
-    >>> from gains import checked_delay_margin
     >>> round(checked_delay_margin([[0]], [[-1]]), 6)  # x'(t) = -x(t - tau): pi / 2
     1.570796
     """
@@ -125,11 +124,8 @@ def _confirmed_beside_windows(
         pairs = [(term.matrix, term.delay_s(tau_s)) for term in terms]
         turns = rate * max(delay_s for _, delay_s in pairs)
         if analysis.roots_fixed_at_zero or (not thorough and largest * (12.0 + turns / 2.0) > _SPECTRUM_BUDGET):
-            method = "root count"
-            beside = [c.omega_rad_s for c in analysis.crossings if _is_near(c, tau_s)]
-            growth = _counted_growth(
-                pairs, rate, turns, largest, beside, leave_out_zero=analysis.roots_fixed_at_zero > 0
-            )
+            long = turns > _COUNT_BUDGET or (_COUNT_POINTS + 10.0 * turns) * largest**3 > _INVERSE_BUDGET
+            method, growth = "root count", nan if long else rate * _sign_of_growth(analysis, pairs, tau_s)
         else:
             method, growth = "rightmost root", _growth(pairs)
         if not np.isnan(growth):
@@ -142,12 +138,6 @@ def _confirmed_beside_windows(
     return methods
 
 
-def _is_near(crossing: Crossing, tau_s: float) -> bool:
-    """Whether one of the delays of a crossing is so near that its root is near the axis."""
-    away = crossing.omega_rad_s * (tau_s - crossing.delay_s)
-    return abs(float(np.angle(np.exp(1j * away)))) < _NEAR_TURN
-
-
 def _growth(pairs: Sequence[tuple[FloatArray, float]]) -> float:
     """Real part (1/s) of the rightmost root; nan where the delay is too long for its discretisation."""
     from gains.delay.rightmost import rightmost_root
@@ -158,24 +148,18 @@ def _growth(pairs: Sequence[tuple[FloatArray, float]]) -> float:
         return nan
 
 
-def _counted_growth(
-    pairs: Sequence[tuple[FloatArray, float]],
-    rate: float,
-    turns: float,
-    largest: int,
-    beside: Sequence[float],
-    *,
-    leave_out_zero: bool,
-) -> float:
-    """A number of the sign of the growth, from a count of roots; nan where it would take long or is too close."""
+def _sign_of_growth(analysis: DelayAnalysis, pairs: Sequence[tuple[FloatArray, float]], tau_s: float) -> float:
+    """1 if a count finds roots right of the axis, -1 if none; nan where one is too close to it."""
     from gains.delay._mixed import count_unstable_roots
 
-    if turns > _COUNT_BUDGET or (_COUNT_POINTS + 10.0 * turns) * largest**3 > _INVERSE_BUDGET:
-        return nan
+    # frequencies of the crossings whose delay is so near that their roots are near the axis
+    away = ((c.omega_rad_s, c.omega_rad_s * (tau_s - c.delay_s)) for c in analysis.crossings)
+    beside = [omega for omega, turn in away if abs(float(np.angle(np.exp(1j * turn)))) < _NEAR_TURN]
     try:
-        return rate if count_unstable_roots(pairs, leave_out_zero=leave_out_zero, beside=beside) > 0 else -rate
+        count = count_unstable_roots(pairs, leave_out_zero=analysis.roots_fixed_at_zero > 0, beside=beside)
     except DisagreementError:
         return nan
+    return 1.0 if count > 0 else -1.0
 
 
 def _delays_to_look_at(

@@ -20,9 +20,8 @@ from functools import cached_property
 from math import ceil, exp
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.formation.model import FormationModel
 from gains.sampled._loop import HeldPlant, held_entry, matrix_exponentials, radius_of, rate_of, settled_covariance
@@ -109,7 +108,7 @@ class DisturbedFormation:
         """F: the map of states, gusts, late commands and bias over one period."""
         return self._lifted[0]
 
-    def closed(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def closed(self, z: ComplexArray) -> ComplexArray:
         """(zI − Φ − G(z) K)^{−1} at points z (k, 1, 1): from what is added to the states after a period to the states.
 
         G(z) is what late and held commands do; its size is that of the states, the gusts among them.

@@ -18,14 +18,13 @@ from math import inf
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core._bracketing import met_end
-from gains.core.arrays import FloatArray
+from gains.core._bracketing import highest, met_end
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains
-from gains.performance.string_stability import largest_magnitude, largest_value, string_peak
+from gains.performance.string_stability import largest_magnitude, string_peak
 from gains.sampled.onboard import own_part
 
 # Where no α is asked for, it counts as kept down to this share of its value without delay.
@@ -86,7 +85,7 @@ class FlownFormation:
         """α at a loop delay (s); 0 from the margin on."""
         if not delay_s < self.timing.delay_margin_s:
             return 0.0
-        return -largest_value(lambda omega: -self.singular_value(omega, delay_s), self.frequencies())
+        return -highest(lambda omega: -self.singular_value(omega, delay_s), self.frequencies())[1]
 
     def alpha_limit_s(self, alpha: float) -> float:
         """The largest loop delay up to which α is kept: `inf` if at every one, 0 if not even without delay."""
@@ -116,7 +115,7 @@ class FlownFormation:
         sigma = np.linalg.svd(self.characteristic(omega, delay_s), compute_uv=False)
         return sigma[:, -1].astype(np.float64)
 
-    def characteristic(self, omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
+    def characteristic(self, omega: FloatArray, delay_s: float) -> ComplexArray:
         """jωI − A − B h (K_own e^{−jωτ_own} + K_others e^{−jω(τ + T/2)}), shape (k, n, n); h are the responses.
 
         Of one axis if the gains act on every axis alike, which is as large as that of all of them.
@@ -144,7 +143,7 @@ class FlownFormation:
         magnitudes = np.abs(np.linalg.eigvals(sum(self._matrices)))
         return float(max(magnitudes.min(), 1e-6 * magnitudes.max()))
 
-    def _answers(self, omega: FloatArray) -> NDArray[np.complex128]:
+    def _answers(self, omega: FloatArray) -> ComplexArray:
         """From wanted to real accelerations, (k, n, 1): the factor of each row of B K."""
         model, _ = self._narrowed
         factors = np.ones((len(omega), model.states, 1), dtype=np.complex128)
@@ -184,7 +183,9 @@ class FlownLoop:
         if not delay_s < self.timing.delay_margin_s:
             return inf
         own_s, front_s = self.timing.delays_s(delay_s)
-        return string_peak(self._matrices, own_s, front_delay_s=front_s, answer=self._answer)
+        k1, k2, k3 = self._k
+        gains = np.array([[-k1]]), np.array([[k2]]), np.array([[k3]])
+        return string_peak(gains, own_s, front_delay_s=front_s, answer=self._answer)
 
     def string_limit_s(self, peak: float) -> float:
         """The largest loop delay up to which no spacing error grows by more than `peak` >= 1 from vehicle to vehicle.
@@ -241,10 +242,5 @@ class FlownLoop:
     def _k(self) -> tuple[float, float, float]:
         return self.gains.k1, self.gains.k2, self.gains.k3
 
-    @property
-    def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        k1, k2, k3 = self._k
-        return np.array([[-k1]]), np.array([[k2]]), np.array([[k3]])
-
-    def _answer(self, omega: FloatArray) -> NDArray[np.complex128]:
+    def _answer(self, omega: FloatArray) -> ComplexArray:
         return np.ones_like(omega, dtype=np.complex128) if self.response is None else self.response.transfer(omega)

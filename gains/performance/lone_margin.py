@@ -13,9 +13,8 @@ from collections.abc import Callable
 from math import inf, pi
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled.constant import growth_rate
@@ -41,7 +40,7 @@ def lone_margin(k1: float, k3: float, response: Response, *, period_s: float) ->
 
     bands = 2.0 * pi / period_s * np.arange(-_ALIASES, _ALIASES + 1.0)[:, np.newaxis]
 
-    def loop(omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
+    def loop(omega: FloatArray, delay_s: float) -> ComplexArray:
         w = omega + bands
         s = 1j * w
         held = (1.0 - np.exp(-s * period_s)) / (s * period_s)
@@ -55,7 +54,7 @@ def lone_margin(k1: float, k3: float, response: Response, *, period_s: float) ->
     return min((_at_crossing(loop, float(omega[k]), float(omega[k + 1])) for k in crossed), default=inf)
 
 
-def _at_crossing(loop: Callable[[FloatArray, float], NDArray[np.complex128]], low: float, high: float) -> float:
+def _at_crossing(loop: Callable[[FloatArray, float], ComplexArray], low: float, high: float) -> float:
     """The delay at which the loop is -1 near the frequency where its size passes one."""
     delay_s = 0.0
     for _ in range(_ROUNDS):

@@ -25,13 +25,12 @@ from functools import cached_property
 from math import inf, pi
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gains.core._bracketing import highest
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import PAIR, ScalarGains
-from gains.performance.string_stability import largest_value
 from gains.sampled._loop import HeldPlant, held_entry
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window
@@ -45,9 +44,6 @@ def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArra
 
     A follower gets half the leader's command beside its own gains:
 
-    >>> import numpy as np
-    >>> from gains.formation.model import FormationModel
-    >>> from gains.performance.predicted import fed_forward
     >>> pair = FormationModel((-1, 0), axes=1)
     >>> fed_forward(pair, np.array([[-3.0, 0.0, 0.0], [1.0, 2.0, -3.0]]), 0.5).tolist()
     [[-3.0, 0.0, 0.0], [-0.5, 2.0, -3.0]]
@@ -67,8 +63,6 @@ class PredictedLoop:
 
     The gains of `triangle5`, with and without prediction over 0.25 s, at that loop delay:
 
-    >>> from gains.performance.predicted import PredictedLoop
-    >>> from gains.performance.scalar_gains import ScalarGains
     >>> gains = ScalarGains(k1=3.408, k2=0.631, k3=5.608, alpha=0.817)
     >>> loops = [PredictedLoop(gains, period_s=0.02, assumed_s=assumed_s) for assumed_s in (0.0, 0.25)]
     >>> [round(loop.string_peak(0.25), 2) for loop in loops], [round(loop.alpha(0.25), 2) for loop in loops]
@@ -96,11 +90,16 @@ class PredictedLoop:
         if not self.is_stable(delay_s):
             return inf
         frequencies = np.geomspace(_LOWEST * self._slowest, pi / self.period_s, _FREQUENCIES)
-        return max(1.0, largest_value(lambda omega: self.growth(omega, delay_s), frequencies))
+        return max(1.0, highest(lambda omega: self.growth(omega, delay_s), frequencies)[1])
 
     def growth(self, omega: FloatArray, delay_s: float) -> FloatArray:
         """|U_i / U_j| (k,) at frequencies omega (k,) in rad/s up to pi / `period_s`, if the loop is stable."""
-        front, own = (self._matrices[2][1] @ self._seen_sampled(omega, delay_s)).T
+        z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
+        Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
+        mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
+        resolvent = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
+        S = resolvent @ G + self._ahead @ resolvent @ mismatch
+        front, own = (self._matrices[2][1] @ S).T
         return np.abs((self.feed_forward + front) / (1.0 - own))
 
     def alpha(self, delay_s: float) -> float:
@@ -110,17 +109,21 @@ class PredictedLoop:
         """
         if not self.is_stable(delay_s):
             return 0.0
-        _, B, alone = self._matrices
-        K = fed_forward(PAIR, alone, self.feed_forward)
+        A, B, alone = self._matrices
+        K, L, half_s = fed_forward(PAIR, alone, self.feed_forward), self._ahead, self.period_s / 2.0
 
         def gain(omega: FloatArray) -> FloatArray:
-            s, resolvent = self._resolvents(omega)
-            late = B * np.exp(-s * (delay_s + self.period_s / 2.0))
-            commands = np.linalg.solve(np.eye(2) - K @ self._seen(s, resolvent, delay_s), K @ self._ahead @ resolvent)
-            disturbed = resolvent + resolvent @ late @ commands
+            s = (1j * omega[:, np.newaxis, np.newaxis]).astype(np.complex128)
+            resolvent = np.linalg.inv(s * np.eye(len(A)) - A)
+            answers, mismatch = resolvent @ B, np.exp(-s * delay_s) - np.exp(-s * self.assumed_s)
+            # what the predicted state answers to commands
+            seen = (answers + L @ answers * mismatch) * np.exp(-s * half_s)
+            commands = np.linalg.solve(np.eye(2) - K @ seen, K @ L @ resolvent)
+            disturbed = resolvent + resolvent @ (B * np.exp(-s * (delay_s + half_s))) @ commands
             return np.linalg.norm(disturbed[:, :3, :3], ord=2, axis=(1, 2))
 
-        return 1.0 / largest_value(gain, self._frequencies)
+        most = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ alone, 2) + np.linalg.norm(B @ alone @ L, 2))
+        return 1.0 / highest(gain, np.geomspace(_LOWEST * self._slowest, most, _FREQUENCIES))[1]
 
     def is_stable(self, delay_s: float) -> bool:
         """Whether a true delay is in the window."""
@@ -150,31 +153,3 @@ class PredictedLoop:
     def _slowest(self) -> float:
         A, B, K = self._matrices
         return float(np.abs(np.linalg.eigvals(A + B @ K)).min())
-
-    @cached_property
-    def _frequencies(self) -> FloatArray:
-        A, B, K = self._matrices
-        highest = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ K, 2) + np.linalg.norm(B @ K @ self._ahead, 2))
-        return np.geomspace(_LOWEST * self._slowest, highest, _FREQUENCIES)
-
-    def _resolvents(self, omega: FloatArray) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """s (k, 1, 1) and (s I - A)^{-1} (k, n, n)."""
-        s, A = (1j * omega[:, np.newaxis, np.newaxis]).astype(np.complex128), self._matrices[0]
-        return s, np.linalg.inv(s * np.eye(len(A)) - A).astype(np.complex128)
-
-    def _seen(
-        self, s: NDArray[np.complex128], resolvent: NDArray[np.complex128], delay_s: float
-    ) -> NDArray[np.complex128]:
-        """What the predicted state answers to commands, (k, n, 2), in continuous time."""
-        B = self._matrices[1]
-        mismatch = np.exp(-s * delay_s) - np.exp(-s * self.assumed_s)
-        answers = resolvent @ B
-        return (answers + self._ahead @ answers * mismatch) * np.exp(-s * self.period_s / 2.0)
-
-    def _seen_sampled(self, omega: FloatArray, delay_s: float) -> NDArray[np.complex128]:
-        """S(z) at z = e^{j omega T}, shape (k, n, 2)."""
-        z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
-        Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
-        mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
-        resolvent = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
-        return resolvent @ G + self._ahead @ resolvent @ mismatch

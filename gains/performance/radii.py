@@ -23,7 +23,7 @@ from math import inf, pi, tau
 
 import numpy as np
 
-from gains.core._bracketing import local_maxima, peaks
+from gains.core._bracketing import highest, peaks
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.performance.disturbed import DisturbedFormation
@@ -129,13 +129,8 @@ class SectorLoop:
         T = self.formation.period_s
         grid = np.geomspace(_LEAST_ANGLE, pi * (1.0 - 1e-9), _ANGLES) / T
         grid = np.unique(np.concatenate([[0.0] if not more.size else [], grid, self._resonances()]))
-        looked = function(grid)
-        inner = local_maxima(looked)
-        refined = peaks(function, grid[inner - 1], grid[inner + 1]) if inner.size else np.zeros(0)
-        omega = np.concatenate([more, grid, refined])
-        heights = np.concatenate([values, looked, function(refined) if inner.size else refined])
-        at = int(np.argmax(heights))
-        return float(omega[at]), float(heights[at])
+        known = zip(more.tolist(), values.tolist(), strict=True)
+        return max([*known, highest(function, grid)], key=lambda each: each[1])
 
     def _resonances(self) -> FloatArray:
         """The frequencies (rad/s) of the loop's own motions, where narrow peaks are."""
@@ -149,25 +144,17 @@ class SectorLoop:
         sizes = np.outer(np.abs(right), np.abs(left))
         if angle == 0.0 or angle >= pi * (1.0 - 1e-6):
             return Worst(radius, omega, np.outer(right.real, left.real))
-        entries = [(right, +1), (left, -1)]
-        best: tuple[float, list[FloatArray], list[FloatArray]] = (inf, [], [])
-        for turn in np.linspace(0.0, pi, _ROTATIONS, endpoint=False).tolist():
-            signs: list[FloatArray] = []
-            filters: list[FloatArray] = []
-            for vector, way in entries:
-                phase = way * np.angle(vector * np.exp(1j * turn))
-                sign, c = _all_pass(phase, angle)
-                none = np.abs(vector) <= _NOTHING
-                signs.append(np.where(none, 1.0, sign))
-                filters.append(np.where(none, 1.0, c))
-            worst = max(
-                float(np.abs(c[np.abs(v) > _NOTHING]).max()) for c, (v, _) in zip(filters, entries, strict=True)
-            )
-            if worst < best[0]:
-                best = worst, signs, filters
-        _, (out_signs, in_signs), (out, into) = best
-        direction = sizes * np.outer(out_signs, in_signs)
-        return Worst(radius, omega, direction, tuple(into.tolist()), tuple(out.tolist()))
+        turns = np.exp(1j * np.linspace(0.0, pi, _ROTATIONS, endpoint=False))[:, np.newaxis]
+        signs, filters, largest = list[FloatArray](), list[FloatArray](), list[FloatArray]()
+        for vector, way in ((right, +1), (left, -1)):
+            sign, c = _all_pass(way * np.angle(vector * turns), angle)
+            none = np.abs(vector) <= _NOTHING
+            signs.append(np.where(none, 1.0, sign))
+            filters.append(np.where(none, 1.0, c))
+            largest.append(np.where(none, 0.0, np.abs(c)).max(axis=1))
+        best = int(np.argmin(np.maximum(*largest)))
+        direction = sizes * np.outer(signs[0][best], signs[1][best])
+        return Worst(radius, omega, direction, tuple(filters[1][best].tolist()), tuple(filters[0][best].tolist()))
 
 
 def _all_pass(phase: FloatArray, angle: float) -> tuple[FloatArray, FloatArray]:

@@ -18,9 +18,8 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.delay.constant import delay_margin
 from gains.formation.model import FormationModel
@@ -67,7 +66,7 @@ class Response:
         """Damping ratio of a second order; None for the other models."""
         return None if self.natural_frequency_rad_s is None else self.lag_s * self.natural_frequency_rad_s / 2.0
 
-    def transfer(self, omega: FloatArray) -> NDArray[np.complex128]:
+    def transfer(self, omega: FloatArray) -> ComplexArray:
         """a / u at jω, from wanted to real acceleration: h (s + g) / (s + g h)."""
         s, g = 1j * omega, self.velocity_gain_1_s
         below = self.lag_s * s + 1.0

@@ -60,9 +60,6 @@ def robustness(K1: ArrayLike, K2: ArrayLike, K3: ArrayLike, W: ArrayLike | None 
 
     These gains are weakest at ω = 0, where α is the least singular value of A_cl:
 
-    >>> import numpy as np
-    >>> from gains import robustness
-    >>> from gains.performance.robust import subsystem_loop
     >>> least = np.linalg.svd(subsystem_loop(-3, 2, 2), compute_uv=False)[-1]
     >>> round(robustness(-3, 2, 2), 6), round(float(least), 6)
     (0.532094, 0.532094)

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import FloatArray, IntArray
 from gains.formation.model import FormationModel
 
 PAIR = FormationModel((-1, 0), axes=1)
@@ -160,9 +159,7 @@ def _frequencies_below_growth(k1: FloatArray, k3: FloatArray) -> FloatArray:
     return np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape, 96))
 
 
-def _around_least(
-    function: Callable[[FloatArray], FloatArray], omega: FloatArray
-) -> tuple[FloatArray, NDArray[np.intp]]:
+def _around_least(function: Callable[[FloatArray], FloatArray], omega: FloatArray) -> tuple[FloatArray, IntArray]:
     """The values around the least one of each row, ever closer, and its index along the last axis, off the ends."""
     values = function(omega)
     at = _index_of_least(values)
@@ -174,5 +171,5 @@ def _around_least(
     return values, at
 
 
-def _index_of_least(values: FloatArray) -> NDArray[np.intp]:
+def _index_of_least(values: FloatArray) -> IntArray:
     return np.clip(np.argmin(values, axis=-1, keepdims=True), 1, values.shape[-1] - 2)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core._bracketing import local_maxima, peaks
+from gains.core._bracketing import highest
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 
@@ -75,14 +75,4 @@ def largest_magnitude(response: Callable[[FloatArray], NDArray[Any]], *, near_ra
         raise BadModelError(f"near_rad_s is {near_rad_s}; a positive frequency is wanted")
     decades = _DECADES_BELOW + _DECADES_ABOVE
     omega = near_rad_s * np.logspace(-_DECADES_BELOW, _DECADES_ABOVE, decades * _POINTS_PER_DECADE)
-    return largest_value(lambda at: np.abs(response(at)), omega)
-
-
-def largest_value(function: Callable[[FloatArray], FloatArray], grid: FloatArray) -> float:
-    """Return the largest value of a function (k,) -> (k,) on a rising grid, with every local maximum refined."""
-    values = function(grid)
-    inner = local_maxima(values)
-    largest = float(values.max())
-    if inner.size:
-        largest = max(largest, float(function(peaks(function, grid[inner - 1], grid[inner + 1])).max()))
-    return largest
+    return highest(lambda at: np.abs(response(at)), omega)[1]

@@ -20,7 +20,7 @@ from gains.core._bracketing import bracketed_roots
 from gains.core.arrays import FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._crossings import separating_points
-from gains.delay._loci import Loci, delay_loci, near_unit_extrema, sweep_frequencies, unit_crossings
+from gains.delay._loci import delay_loci, sweep_frequencies, unit_crossings, unit_gain_roots, with_extrema
 from gains.sampled._loop import SampledPlant, block_radius, split_delay
 
 # least number of fractions m of a period at which the angles are computed; more when much happens in one period
@@ -122,9 +122,15 @@ def _unit_angles(plant: SampledPlant, m: float) -> list[tuple[float, complex]]:
     F, G, D = _tustin(plant, m)
     loci = delay_loci(F, G, plant.K, D)
     if plant.B.shape[1] == 1:
-        points = _hamiltonian_points(F, G, plant.K, float(D[0, 0]), plant.period_s)
+        # |D| = 1 is a crossing at z = -1, found elsewhere
+        roots, highest = unit_gain_roots(F, G, plant.K, float(D[0, 0])), 1e5 / plant.period_s
+        near_axis = np.abs(roots.real) <= 1e-3 * (np.abs(roots) + float(np.linalg.norm(F)))
+        omega = roots.imag[near_axis & (roots.imag > 0.0) & (roots.imag < highest)]
+        points = separating_points(np.sort(omega), highest)
     else:
-        points = _sweep_points(plant, loci)
+        angle = sweep_frequencies(plant.A, plant.B @ plant.K) * plant.period_s
+        angle = np.union1d(angle[angle < pi * 0.99], np.linspace(0.01, pi - 1e-4, 200))
+        points = with_extrema(loci, np.tan(angle / 2.0) * 2.0 / plant.period_s)
     return [
         (2.0 * float(np.arctan(crossing.omega * plant.period_s / 2.0)), crossing.locus)
         for crossing in unit_crossings(loci, points)
@@ -143,29 +149,6 @@ def _tustin(plant: SampledPlant, m: float) -> tuple[FloatArray, FloatArray, Floa
     F, both, difference = solved[:, :n], solved[:, n : n + inputs], solved[:, n + inputs :]
     rate = 2.0 / period_s
     return rate * F, rate * (both + F @ difference), plant.K @ difference
-
-
-def _hamiltonian_points(F: FloatArray, G: FloatArray, K: FloatArray, D: float, period_s: float) -> FloatArray:
-    """Frequencies that separate all solutions of |D + K (jw I - F)^-1 G| = 1: eigenvalues of a Hamiltonian matrix.
-
-    The matrix whose imaginary eigenvalues decide whether an H-infinity norm exceeds one.
-    """
-    # |D| = 1 is a crossing at z = -1, found elsewhere; here it only sends one solution to infinity
-    rest = 1.0 - D * D if abs(1.0 - D * D) > 1e-12 else 1e-12
-    corner = F + G @ K * (D / rest)
-    roots = np.linalg.eigvals(np.block([[corner, G @ G.T / rest], [-K.T @ K / rest, -corner.T]])).astype(np.complex128)
-    near_axis = np.abs(roots.real) <= 1e-3 * (np.abs(roots) + float(np.linalg.norm(F)))
-    highest = 1e5 / period_s
-    omega = np.sort(roots.imag[near_axis & (roots.imag > 0.0) & (roots.imag < highest)])
-    return separating_points(omega, highest)
-
-
-def _sweep_points(plant: SampledPlant, loci: Loci) -> FloatArray:
-    """Frequencies dense enough to see every crossing, extrema near one included."""
-    angle = sweep_frequencies(plant.A, plant.B @ plant.K) * plant.period_s
-    angle = np.union1d(angle[angle < pi * 0.99], np.linspace(0.01, pi - 1e-4, 200))
-    omega = np.tan(angle / 2.0) * 2.0 / plant.period_s
-    return np.union1d(omega, near_unit_extrema(loci, omega))
 
 
 def _refined(plant: SampledPlant, delay_s: float, angle: float) -> float:

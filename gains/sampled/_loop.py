@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, ComplexArray, FloatArray
 from gains.core.structure import balanced, distinct_blocks
 from gains.delay._loci import factor_rank
 
@@ -54,7 +54,7 @@ class HeldPlant:
     B: FloatArray
     K: FloatArray
     period_s: float
-    measured: NDArray[np.bool_] | None = None
+    measured: BoolArray | None = None
 
     def transition(self, duration_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """e^{A t} (k, n, n) and int_0^t e^{A s} ds B (k, n, r) for k durations t."""
@@ -76,7 +76,7 @@ class HeldPlant:
         return carry(self.A, self.measured, duration_s)
 
 
-def carry(A: FloatArray, measured: NDArray[np.bool_] | None, duration_s: FloatArray) -> FloatArray:
+def carry(A: FloatArray, measured: BoolArray | None, duration_s: FloatArray) -> FloatArray:
     """See `HeldPlant.carry`."""
     seen = np.arange(len(A)) if measured is None else np.flatnonzero(measured)
     maps = np.zeros((duration_s.size, *A.shape))
@@ -144,7 +144,7 @@ def rate_of(radius: float, period_s: float) -> float:
     return float(np.log(radius)) / period_s if radius > 0.0 else -inf
 
 
-def held_entry(plant: SampledPlant, z: NDArray[np.complex128], delay_s: float) -> NDArray[np.complex128]:
+def held_entry(plant: SampledPlant, z: ComplexArray, delay_s: float) -> ComplexArray:
     """(G0 z + G1) z^{-q-1}, (k, n, r) at points z (k, 1, 1): what commands that are held and late do to the state."""
     whole, rest_s = split_delay(delay_s, plant.period_s)
     G, newer = plant.transition(np.array([plant.period_s, plant.period_s - rest_s]))[1]

@@ -16,7 +16,6 @@ Newton's method its delay. The crossings nearest to tau^ on either side end the 
 from math import inf, pi
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.core._bracketing import bracketed_roots, may_reach_zero
 from gains.core.arrays import ComplexArray, FloatArray
@@ -118,7 +117,7 @@ class _PredictedBlock:
         turning = np.linspace(0.0, pi, refinement * (int(turns) + 200))
         return np.union1d(turning[1:-1], np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE) * (pi * 0.999))
 
-    def _terms(self, angle: FloatArray) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    def _terms(self, angle: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """K e^{A tau^} (z I - Phi)^{-1}, shape (k, r, n), and the part (k, r, r) that does not depend on tau."""
         plant, z = self.plant, np.exp(1j * angle)[:, np.newaxis, np.newaxis]
         resolvent = (z * np.eye(len(self.Phi)) - self.Phi).swapaxes(1, 2)
@@ -127,20 +126,18 @@ class _PredictedBlock:
         assumed = ahead @ held_entry(plant, z, self.assumed_s)
         return ahead, np.eye(plant.K.shape[0]) - rows @ self.G + assumed
 
-    def _entered(self, z: NDArray[np.complex128], rest_s: FloatArray) -> NDArray[np.complex128]:
+    def _entered(self, z: ComplexArray, rest_s: FloatArray) -> ComplexArray:
         """G0 z + G1 (k, n, r) with a part of a period in the delay."""
         newer = self.plant.transition(self.plant.period_s - rest_s)[1]
         return newer * (z - 1.0) + self.G
 
-    def _loci(
-        self, angle: FloatArray, m: float, ahead: NDArray[np.complex128], rest: NDArray[np.complex128]
-    ) -> ComplexArray:
+    def _loci(self, angle: FloatArray, m: float, ahead: ComplexArray, rest: ComplexArray) -> ComplexArray:
         """The values (k, r) that z^{q+1} takes at a crossing whose delay is m beyond a whole number of periods."""
         z = np.exp(1j * angle)[:, np.newaxis, np.newaxis]
         entered = self._entered(z, np.array([m * self.plant.period_s]))
         return np.linalg.eigvals(np.linalg.solve(rest, ahead @ entered)).astype(np.complex128)
 
-    def _characteristic(self, angle: FloatArray, delay_s: FloatArray) -> NDArray[np.complex128]:
+    def _characteristic(self, angle: FloatArray, delay_s: FloatArray) -> ComplexArray:
         """The matrix (k, r, r) that is singular where e^{j phi} is an eigenvalue, at each of k angles and delays."""
         whole = np.floor(delay_s / self.plant.period_s)
         z = np.exp(1j * angle)[:, np.newaxis, np.newaxis]

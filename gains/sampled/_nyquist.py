@@ -18,7 +18,6 @@ from math import ceil, floor, inf, log, pi
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.sampled._loop import HeldPlant
@@ -62,8 +61,8 @@ class _Grid(NamedTuple):
     """Angles (k,) of z, X_0 (n, k, m) as a function of w, and what the samples see of it by the assumed delay."""
 
     angle: FloatArray
-    first: NDArray[np.complex128]
-    assumed: NDArray[np.complex128]
+    first: ComplexArray
+    assumed: ComplexArray
 
 
 class _Rates:
@@ -110,7 +109,7 @@ class _Rates:
         last = coarse[min(large.max(initial=0) + 1, coarse.size - 1)]
         return angles[angles <= last] if bound[-1] < _SMALL else angles
 
-    def _first(self, angle: FloatArray) -> NDArray[np.complex128]:
+    def _first(self, angle: FloatArray) -> ComplexArray:
         free = np.exp(1j * angle)[:, np.newaxis, np.newaxis] * np.eye(len(self.closed)) - self.powers[-1]
         return np.ascontiguousarray(np.linalg.solve(free, self.added[-1]).swapaxes(0, 1), np.complex128)
 
@@ -133,14 +132,14 @@ class _Rates:
             of_w.append(flow @ self.added[k] + hold @ self.on_w[k])
         return exponents, np.vstack(of_first), np.vstack(of_w)
 
-    def _seen(self, angle: FloatArray, first: NDArray[np.complex128], delay_s: float) -> NDArray[np.complex128]:
+    def _seen(self, angle: FloatArray, first: ComplexArray, delay_s: float) -> ComplexArray:
         """What the samples see of w through the commands, (m, k, m), with a true delay."""
         exponents, of_first, of_w = self._answers(delay_s)
         turned = np.exp(1j * np.outer(np.repeat(exponents, len(self.closed))[self.kept], angle))
         seen = of_first[self.kept].astype(np.complex128) @ first.reshape(len(first), -1)
         return turned[:, :, np.newaxis] * (seen.reshape(-1, *first.shape[1:]) + of_w[self.kept][:, np.newaxis])
 
-    def _differences(self, grid: _Grid, delay_s: float) -> NDArray[np.complex128]:
+    def _differences(self, grid: _Grid, delay_s: float) -> ComplexArray:
         """I - N (k, m, m)."""
         N = self._seen(grid.angle, grid.first, delay_s) - grid.assumed
         return np.eye(self.kept.size) - N.swapaxes(0, 1)

@@ -64,7 +64,6 @@ def sampled_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, *, period_s: 
 
     x' = u, u = -x with a period of 1 s takes a delay of 1 s; with a short one pi / 2 - T / 2 or so:
 
-    >>> from gains import sampled_delay_margin
     >>> [round(sampled_delay_margin([[0]], [[1]], [[-1]], period_s=period_s), 3) for period_s in (1.0, 0.02)]
     [1.0, 1.561]
     """

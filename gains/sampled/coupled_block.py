@@ -152,13 +152,9 @@ class CoupledBlock:
             return rate_1_s
         return rate_1_s + self.growth_continuous_at_1_s(loop_delay_s) - self.growth_continuous_1_s(mean_s)
 
-    def same_as(self, other: "CoupledBlock") -> bool:
-        """Whether the other block is the same system, made of other vehicles."""
-        return self.kind == other.kind
-
     @property
     def kind(self) -> Hashable:
-        """Equal for blocks that are the same system."""
+        """Equal for blocks that are the same system, made of other vehicles."""
         return self.timing, self.assumed_s, *((part.shape, (part + 0.0).tobytes()) for part in (self.A, self.B, self.K))
 
 
@@ -182,9 +178,6 @@ def coupled_blocks(
 
     A chain of three: each vehicle is a block, and the two followers are alike. Sampling at 50 Hz costs half a period:
 
-    >>> import numpy as np
-    >>> from gains import FormationModel, Timing
-    >>> from gains.sampled.coupled_block import coupled_blocks
     >>> chain = FormationModel((-1, 0, 1))
     >>> K = chain.overlapping_gain(-np.eye(2), 0 * np.eye(2), np.eye(2))
     >>> blocks = coupled_blocks(chain, K, (1, 2, 3), timing=Timing(control_s=0.02, telemetry_s=0.02))

@@ -55,7 +55,6 @@ class Timing:
 
     Control at 50 Hz, telemetry at 20 Hz: samples at 0 and 50 ms are first used at 0 and 60 ms.
 
-    >>> from gains import Timing
     >>> timing = Timing(control_s=0.02, telemetry_s=0.05)
     >>> timing.held_s, timing.commands, timing.common_s, timing.spread_s
     (0.05, 2, 0.1, 0.005)
@@ -144,7 +143,6 @@ def multirate_delay_margin(A: ArrayLike, B: ArrayLike, K: ArrayLike, timing: Tim
 
     x' = u, u = -x: with a period of 1 s it takes a delay of 1 s, whichever of the two rates has it.
 
-    >>> from gains import Timing, multirate_delay_margin
     >>> [round(multirate_delay_margin([[0]], [[1]], [[-1]], Timing(*s)), 6) for s in ((1.0, 0.2), (0.2, 1.0))]
     [1.0, 1.0]
     """

@@ -222,9 +222,6 @@ def onboard_loop(model: FormationModel, K: FloatArray, timing: OnboardTiming) ->
 
     A follower uses its own errors at once, and its leader needs nobody: no delay destabilises the pair.
 
-    >>> import numpy as np
-    >>> from gains import FormationModel
-    >>> from gains.sampled.onboard import OnboardTiming, onboard_loop
     >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
     >>> loop = onboard_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
     >>> loop.late.tolist(), loop.continuous_margin_s(), loop.sampled_margin_s()
@@ -249,8 +246,6 @@ def streamed_loop(
     the sensors measure. BadModelError if there is none, because the steps are too long for the gains. With it margins
     differ from those of `OnboardLoop` by 2 parts in 10^4 at 17 1/s and 50 Hz.
 
-    >>> from gains import FormationModel
-    >>> from gains.sampled.onboard import OnboardTiming
     >>> K = np.array([[-1.0, 0.0, 0.0], [0.5, 1.0, -1.0]])
     >>> A, _, others = streamed_loop(FormationModel((-1, 0), axes=1), K, OnboardTiming(control_s=0.1, steps=5))
     >>> round(float(A[0, 0]), 4), others.tolist()

@@ -26,9 +26,9 @@ from functools import partial
 from math import inf, isfinite
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from gains.core.arrays import FloatArray
+from gains.core.arrays import BoolArray, FloatArray
 from gains.core.errors import BadModelError, DisagreementError
 from gains.delay._crossings import DelayedTerm
 from gains.delay._mixed import analyse_mixed
@@ -72,8 +72,6 @@ def mismatch_window(
 
     x' = u, u = -x takes 1.56 s at 50 Hz. A station that assumes 3 s takes 1.45 to 4.77 s:
 
-    >>> from gains.sampled.multirate import Timing
-    >>> from gains.sampled.prediction import mismatch_window
     >>> [round(end_s, 3) for end_s in mismatch_window([[0]], [[1]], [[-1]], Timing(0.02, 0.02), assumed_s=3.0)]
     [1.449, 4.765]
     """
@@ -110,7 +108,6 @@ def mismatch_window_continuous(
 
     x' = u, u = -x: s + 1 + e^{-s tau} - e^{-3 s} = 0.
 
-    >>> from gains.sampled.prediction import mismatch_window_continuous
     >>> [round(end_s, 3) for end_s in mismatch_window_continuous([[0]], [[1]], [[-1]], assumed_s=3.0)]
     [1.386, 4.873]
     """
@@ -138,8 +135,6 @@ def predicted_growth_rate(
 
     x' = u, u = -x at a delay that is assumed rightly: that without delay, ln(1 - T) / T.
 
-    >>> from gains.sampled.multirate import Timing
-    >>> from gains.sampled.prediction import predicted_growth_rate
     >>> round(predicted_growth_rate([[0]], [[1]], [[-1]], Timing(0.5, 0.5), assumed_s=3.2, delay_s=3.2), 6)
     -1.386294
     """
@@ -156,9 +151,7 @@ def checked_assumption(assumed_s: float) -> float:
     return float(assumed_s)
 
 
-def checked_mask(
-    loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequence[bool] | None
-) -> NDArray[np.bool_] | None:
+def checked_mask(loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequence[bool] | None) -> BoolArray | None:
     """Which states are measured (n,), None if all are; BadModelError if that does not fit the loop."""
     A, _, K = loop
     mask = None if measured is None else np.array(measured, dtype=np.bool_)

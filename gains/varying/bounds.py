@@ -26,7 +26,7 @@ from gains.delay.constant import delay_margin
 
 # bisection stops at this relative accuracy
 _ACCURACY = 1e-4
-# the search for a bound ends at this many time constants 1 / (||A0|| + ||A1||)
+# bisection ends at the exact margin for constant delays, or at this many time constants 1 / (||A0|| + ||A1||)
 _LONGEST = 1e3
 # states of one block; the unknowns grow with the square and the work with the sixth power
 _LARGEST_BLOCK = 8
@@ -43,34 +43,24 @@ def varying_delay_bound(A0: ArrayLike, A1: ArrayLike, *, rate: float) -> float:
 
     A loop of the paper of 2013: 6.059 s for a constant delay, where the exact margin is 6.1726 s.
 
-    >>> from gains import varying_delay_bound
     >>> round(varying_delay_bound([[-2, 0], [0, -0.9]], [[-1, 0], [-1, -1]], rate=0.0), 2)
     6.06
     """
     if not rate >= 0.0:
         raise BadModelError(f"rate is {rate}; a number >= 0 is wanted, inf for any variation")
-    return min(_varying_bound_of_block(now, late, rate) / unit for now, late, unit in _checked_blocks(A0, A1))
-
-
-def _checked_blocks(A0: ArrayLike, A1: ArrayLike) -> list[tuple[FloatArray, FloatArray, float]]:
-    """The distinct blocks, scaled by a unit of time of their own (third entry, 1/s) to numbers near one."""
     blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
     largest = max(len(block.indices) for block in blocks)
     if largest > _LARGEST_BLOCK:
         raise BadModelError(
             f"the loop has a strongly connected block of {largest} states; at most {_LARGEST_BLOCK} are wanted"
         )
-    scaled: list[tuple[FloatArray, FloatArray, float]] = []
+    bounds_s: list[float] = []
     for block in blocks:
         now, late = balanced(*block.matrices)
+        # in a unit of time of its own numbers are near one
         unit = float(np.linalg.norm(now) + np.linalg.norm(late)) or 1.0
-        scaled.append((now / unit, late / unit, unit))
-    return scaled
-
-
-def _upper_end(now: FloatArray, late: FloatArray) -> float:
-    """The upper end of a bisection: the exact margin for constant delays, or a thousand time constants."""
-    return min(delay_margin(now, late), _LONGEST)
+        bounds_s.append(_varying_bound_of_block(now / unit, late / unit, rate) / unit)
+    return min(bounds_s)
 
 
 def _bisected(proved: Callable[[float], bool], upper: float) -> float:
@@ -91,9 +81,10 @@ def _bisected(proved: Callable[[float], bool], upper: float) -> float:
 
 
 def _varying_bound_of_block(now: FloatArray, late: FloatArray, rate: float) -> float:
+    margin_s = delay_margin(now, late)
     if not late.any():
-        return delay_margin(now, late)
-    upper = _upper_end(now, late)
+        return margin_s
+    upper = min(margin_s, _LONGEST)
     if upper > 0.0 and _is_independent_of_length(now, late, rate):
         return inf
 
@@ -101,7 +92,7 @@ def _varying_bound_of_block(now: FloatArray, late: FloatArray, rate: float) -> f
         return _varying_functional_exists(now, late, delay_s, rate)
 
     bound_s = _bisected(proved, upper)
-    return max(bound_s, _small_gain_of_block(now, late)) if rate == inf else bound_s
+    return max(bound_s, _small_gain_of_block(now, late, upper)) if rate == inf else bound_s
 
 
 def _he(matrix: FloatArray) -> FloatArray:
@@ -169,19 +160,14 @@ def _varying_functional_exists(now: FloatArray, late: FloatArray, h: float, rate
     return positive_definite_solution(shapes if any_rate else [*shapes, Unknown(n)], inequalities) is not None
 
 
-def _small_gain_of_block(now: FloatArray, late: FloatArray) -> float:
-    """A delay h such that the block is stable for every tau(t) in [0, h], however it varies.
+def _small_gain_of_block(now: FloatArray, late: FloatArray, upper: float) -> float:
+    """A delay h up to `upper` such that the block is stable for every tau(t) in [0, h], however it varies.
 
     h = 1 / min over D of max over omega of ||D C j omega (j omega I - A0 - A1)^{-1} B D^{-1}||, A1 = B C of full rank;
     D is a full matrix because the delay acts on all signals alike. The minimum is found, and proved, by the bounded
-    real lemma with the unknown P = D'D. 0 when the loop is unstable without delay, `inf` without a delayed part.
+    real lemma with the unknown P = D'D.
     """
-    total = now + late
-    if float(np.linalg.eigvals(total).real.max()) >= 0.0:
-        return 0.0
-    B, C = factor_rank(late)
-    if B.shape[1] == 0:
-        return inf
+    total, (B, C) = now + late, factor_rank(late)
     n, r = B.shape
     outputs = C @ np.hstack([total, B])
 
@@ -195,4 +181,4 @@ def _small_gain_of_block(now: FloatArray, late: FloatArray) -> float:
 
         return positive_definite_solution([Unknown(n), Unknown(r)], inequalities) is not None
 
-    return _bisected(proved, _upper_end(now, late))
+    return _bisected(proved, upper)

@@ -7,7 +7,7 @@ least to the most demanding and returns the first that covers it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, sqrt
+from math import inf, isfinite, nan, sqrt
 from typing import Literal
 
 import numpy as np
@@ -71,26 +71,23 @@ def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBoun
 
     x'(t) = -x(t - tau(t)): a constant delay may come near pi / 2, one that jumps may not.
 
-    >>> from math import inf
-    >>> from gains.varying.jitter import Jitter, bound_covering
     >>> [bound_covering([[0]], [[-1]], Jitter(1.4, spread_s, inf)).cover for spread_s in (0.0, 0.15)]
     ['constant', 'none']
     """
     _check(jitter)
     analysis = analyse_delay(A0, A1)
-    largest_s = jitter.mean_s + jitter.spread_s
-    spread_s = (
-        _spread_admitted(A0, A1, jitter.mean_s, jitter.rate)
-        if _is_inside(analysis.stable_intervals_s, jitter.mean_s)
-        else -1.0
-    )
-    any_s = varying_delay_bound(A0, A1, rate=inf)
+    window, largest_s = analysis.window_around(jitter.mean_s), jitter.mean_s + jitter.spread_s
+    spread_s = spread_bound(A0, A1, mean_s=jitter.mean_s, rate=jitter.rate)
     bounds: dict[Cover, float] = {
         "rate": varying_delay_bound(A0, A1, rate=jitter.rate) if isfinite(jitter.rate) else 0.0,
-        "spread": jitter.mean_s + min(spread_s, jitter.mean_s) if spread_s >= 0.0 else 0.0,
-        "any": any_s,
+        "spread": jitter.mean_s + spread_s if window else 0.0,
+        "any": varying_delay_bound(A0, A1, rate=inf),
     }
-    cover, bound_s = _first(jitter, bounds, analysis.stable_intervals_s)
+    covering: list[tuple[Cover, float]] = [each for each in bounds.items() if largest_s <= each[1]]
+    if jitter.spread_s == 0.0:
+        covering = [("constant", window[1])] if window else []
+    covering.append(("none", nan))
+    cover, bound_s = covering[0]
     return CoveringBound(
         cover=cover,
         bound_s=bound_s,
@@ -98,7 +95,7 @@ def bound_covering(A0: ArrayLike, A1: ArrayLike, jitter: Jitter) -> CoveringBoun
         constant_margin_s=analysis.delay_margin_s,
         rate_bound_s=bounds["rate"],
         spread_bound_s=bounds["spread"],
-        any_bound_s=any_s,
+        any_bound_s=bounds["any"],
     )
 
 
@@ -119,15 +116,16 @@ def spread_bound(A0: ArrayLike, A1: ArrayLike, *, mean_s: float, rate: float = i
 
     x'(t) = -x(t - tau(t)) about 0.5 s, where |omega / (j omega + e^{-j omega / 2})| is at most 1.59:
 
-    >>> from math import inf
-    >>> from gains.varying.jitter import spread_bound
     >>> [round(spread_bound([[0]], [[-1]], mean_s=0.5, rate=rate), 2) for rate in (1.0, inf)]
     [0.5, 0.47]
     """
     _check(Jitter(mean_s, 0.0, rate))
-    if not _is_inside(analyse_delay(A0, A1).stable_intervals_s, mean_s):
+    if analyse_delay(A0, A1).window_around(mean_s) is None:
         return 0.0
-    return min(_spread_admitted(A0, A1, mean_s, rate, scaled=scaled), mean_s)
+    gain = 1.0 if rate <= 1.0 else sqrt(7.0 / 4.0)
+    blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
+    admitted_s = min(_spread_of_block(balanced(*block.matrices), mean_s, scaled=scaled) for block in blocks) / gain
+    return min(admitted_s, mean_s)
 
 
 def _check(jitter: Jitter) -> None:
@@ -137,30 +135,6 @@ def _check(jitter: Jitter) -> None:
         raise BadModelError(f"spread_s is {jitter.spread_s}; 0 to the mean delay of {jitter.mean_s} s is wanted")
     if not jitter.rate >= 0.0:
         raise BadModelError(f"rate is {jitter.rate}; a number >= 0 is wanted, inf for jumps")
-
-
-def _is_inside(windows: tuple[tuple[float, float], ...], delay_s: float) -> bool:
-    return any(start_s < delay_s < end_s or start_s == delay_s == 0.0 for start_s, end_s in windows)
-
-
-def _first(jitter: Jitter, bounds: dict[Cover, float], windows: tuple[tuple[float, float], ...]) -> tuple[Cover, float]:
-    """The first cover, in the order of `bounds`, and the largest delay that it admits."""
-    if jitter.spread_s == 0.0:
-        for start_s, end_s in windows:
-            if _is_inside(((start_s, end_s),), jitter.mean_s):
-                return "constant", end_s
-        return "none", float("nan")
-    largest_s = jitter.mean_s + jitter.spread_s
-    for cover, bound_s in bounds.items():
-        if largest_s <= bound_s:
-            return cover, bound_s
-    return "none", float("nan")
-
-
-def _spread_admitted(A0: ArrayLike, A1: ArrayLike, mean_s: float, rate: float, *, scaled: bool = True) -> float:
-    gain = 1.0 if rate <= 1.0 else sqrt(7.0 / 4.0)
-    blocks = distinct_blocks(*square_matrices(A0=A0, A1=A1))
-    return min(_spread_of_block(balanced(*block.matrices), mean_s, scaled=scaled) for block in blocks) / gain
 
 
 def _spread_of_block(matrices: tuple[FloatArray, ...], mean_s: float, *, scaled: bool) -> float:

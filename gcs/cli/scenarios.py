@@ -25,16 +25,12 @@ def scenarios(
     as_json: options.AsJson = False,
 ) -> None:
     """List the scenarios that ship; commands accept their names."""
-    from scenarios.shipped import description, names
+    from scenarios.shipped import FOLDER, PROFILES, description, names
 
-    if links:
-        from scenarios import link_files
-
-        key, found = "links", {name: description(name, link_files.FOLDER) for name in link_files.names()}
-    else:
-        key, found = "scenarios", {name: description(name) for name in names()}
+    folder = PROFILES if links else FOLDER
+    found = {name: description(name, folder) for name in names(folder)}
     if as_json:
-        options.print_json({key: found})
+        options.print_json({"links" if links else "scenarios": found})
         return
     from rich.table import Table
 

@@ -48,8 +48,8 @@ from gcs.runs.grade import commands_of, commands_on_board, effective_delay_s
 from gcs.stress.axes import has_constant_links
 from gcs.stress.growth import CHANNELS
 from gcs.stress.trial import is_modelled
+from scenarios.keys.autopilot import Sitl
 from scenarios.keys.link import Link
-from scenarios.keys.sitl import Sitl
 from scenarios.schema import Limits, NominalVelocity, Safety, Scenario, Vehicle
 
 PROBE_S, _HIDDEN_MODE_S = 20.0, 60.0

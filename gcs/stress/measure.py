@@ -107,7 +107,7 @@ def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     fresh = first_uses(pilot.ticks)
     delays_s, loops = median_delays_s(fresh, base.formation.system_ids), plan_loops(base)
     critical = _loop_of(loops, delays_s, trial.probe)
-    probed = next(loop for loop in loops if loop.same_as(critical)) if trial.probe == CRITICAL else critical
+    probed = next(loop for loop in loops if loop.kind == critical.kind) if trial.probe == CRITICAL else critical
     waiting_s = _slowest(base, critical, delays_s)[2] % critical.timing.step_s
     up, down = links = base.scenario.link_of(critical.system_ids[0])
     outcome = replace(outcome, link_delay_s=up.delay_s + down.delay_s, waiting_s=round(waiting_s, 9))

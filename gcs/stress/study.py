@@ -248,7 +248,7 @@ def _found(
     link_s = max(0.0, zero.loop_delay_s - waiting_s)
     seed = study.plan.scenario.seed
     at_onset = {"delay": round(link_s, 6)}
-    others = [kind.system_ids[0] for kind in unlike_blocks(blocks) if not kind.same_as(block)]
+    others = [unlike.system_ids[0] for unlike in unlike_blocks(blocks) if unlike.kind != block.kind]
     others = dict.fromkeys([*others, blocks[-1].system_ids[-1]])
     checks = run([study.trial("probe", at_onset, seed=seed, probe=system_id) for system_id in others])
     # with prediction, stay away from the other end of the window

@@ -1,11 +1,10 @@
-"""How vehicles with autopilots respond to set-points, as the file describes it, and its contradictions."""
+"""How vehicles with autopilots respond to set-points, and the clock errors of simulated ones, as in SITL."""
 
-from collections.abc import Iterator
 from typing import Annotated
 
 from pydantic import Field
 
-from scenarios.keys.part import Fault, NotNegative, Part, Positive
+from scenarios.keys.part import NotNegative, Part, Positive
 
 DeadTime = Annotated[float, Field(ge=0, le=1)]
 
@@ -31,7 +30,13 @@ class Response(Part):
     """Natural frequency; makes the response one of second order."""
 
 
-def response_contradictions(key: str, dead_time_s: float, natural_frequency_rad_s: float | None) -> Iterator[Fault]:
-    """What contradicts itself in a response."""
-    if dead_time_s and natural_frequency_rad_s is not None:
-        yield f"{key}.dead_time_s", dead_time_s, "no such key with natural_frequency_rad_s: one model at a time"
+class Sitl(Part):
+    """The clocks of vehicles that run in SITL. Everything is drawn from the seed, for each vehicle on its own."""
+
+    timesync_back_s: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Largest time by which the stamps in TIMESYNC replies are too early; that of each reply is uniform from 0. An
+    ArduPilot dates them back by the time of their bytes on a serial port: up to 0.0035 at its default baud rate."""
+    slip_s: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Mean time by which the boot clock falls behind whenever the simulator cannot keep up; exponential."""
+    slip_every_s: Annotated[float, Field(gt=0, le=86400)] = 20.0
+    """Mean time between two such slips; exponential. Only with `slip_s`."""

@@ -1,13 +1,10 @@
 """Further requirements of a design, and who hears whom; `gains.core.requirement.Criteria` is the design's side."""
 
-from collections.abc import Iterator
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from scenarios.keys.part import Fault, NotNegative, Part, Positive
-
-_AT_DELAY = "alpha_at_delay", "decay_rate_at_delay_1_s"
+from scenarios.keys.part import NotNegative, Part, Positive
 
 
 class Overlap(Part):
@@ -61,35 +58,3 @@ class Criteria(Part):
     weight: tuple[Positive, Positive] | None = None
     """Weights of spacing errors and of velocity errors, the diagonal of W: every alpha then bounds disturbances by
     alpha |W e|. Omitted: W = I."""
-
-
-def criteria_faults(
-    criteria: Criteria | None, overlap: Overlap | None, *, method: str, given: bool, loop: str, at_once: bool
-) -> Iterator[Fault]:
-    """What contradicts the keys of this file.
-
-    `given`: gains or blocks are. `at_once`: vehicles respond at once and no delay is predicted over.
-    """
-    if overlap is not None and (method == "inclusion" or given):
-        yield "control.overlap", overlap.model_dump(), "no such key, unless method is graph-lqr or graph-dk, designed"
-    if criteria is None:
-        return
-    if given:
-        yield "control.criteria", "requirements", "either criteria, or gains or blocks"
-    if loop == "onboard":
-        yield "control.loop", loop, "ground, with control.criteria"
-    if not at_once:
-        yield "control.criteria", "requirements", "no such key with dynamics autopilot or prediction"
-    low, high = criteria.delays_s or (0.0, 0.0)
-    if low > high:
-        yield "control.criteria.delays_s", [low, high], "the smaller delay first"
-    if criteria.delays_s is None and criteria.delay_rate is not None:
-        yield "control.criteria.delay_rate", criteria.delay_rate, "no such key without delays_s"
-    for name in _AT_DELAY:
-        value = getattr(criteria, name)
-        if criteria.at_delay_s is None and value is not None:
-            yield f"control.criteria.{name}", value, "no such key without at_delay_s"
-    if criteria.discrete and criteria.at_delay_s is None:
-        yield "control.criteria.discrete", True, "no such key without at_delay_s"
-    if criteria.at_delay_s is None and criteria.maximise in _AT_DELAY:
-        yield "control.criteria.maximise", criteria.maximise, "what needs no delay, without at_delay_s"

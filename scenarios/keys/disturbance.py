@@ -1,11 +1,10 @@
 """What disturbs a scenario's vehicles and what they report; `sim_vehicles.motion` implements it."""
 
-from collections.abc import Iterator
 from typing import Annotated
 
 from pydantic import Field
 
-from scenarios.keys.part import Fault, NotNegative, Number, Part, Positive
+from scenarios.keys.part import NotNegative, Number, Part, Positive
 
 AllPass = Annotated[float, Field(gt=-1, le=1)]
 
@@ -68,28 +67,3 @@ class Navigation(Part):
     """Standard deviation of the velocity's bias."""
     bias_time_s: Positive = 60.0
     """Correlation time of the biases."""
-
-
-def disturbance_contradictions(
-    disturbance: Disturbance | None, *, vehicles: int, steady: bool, dynamics: str
-) -> Iterator[Fault]:
-    """What contradicts the sector in a scenario with this many vehicles; `steady`: one velocity, one shape."""
-    sector = None if disturbance is None else disturbance.sector
-    if sector is None:
-        return
-    key, count = "disturbance.sector", 2 * vehicles - 1
-    if dynamics != "double_integrator":
-        yield key, f"dynamics {dynamics}", "no such key, unless dynamics is double_integrator"
-    if not steady:
-        yield (
-            key,
-            "velocities or offsets that change",
-            "no such key, unless one nominal velocity and one shape are flown",
-        )
-    square = len(sector.direction) == count and all(len(row) == count for row in sector.direction)
-    if not square or not any(any(row) for row in sector.direction):
-        read = f"{len(sector.direction)} rows of {sorted({len(row) for row in sector.direction})} numbers"
-        yield f"{key}.direction", read, f"{count} rows of {count} numbers, not all zero"
-    for name, found in (("all_pass_in", sector.all_pass_in), ("all_pass_out", sector.all_pass_out)):
-        if len(found) not in (0, count):
-            yield f"{key}.{name}", f"{len(found)} numbers", f"{count} numbers, or none"

@@ -3,28 +3,18 @@
 from hashlib import sha256
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
-from pydantic_core import PydanticCustomError
+from pydantic import Field
 
-from scenarios.keys.part import Part
+from scenarios.keys.part import Part, one_fault
 
 CodeName = Annotated[str, Field(pattern=r"^[^:]+\.py:[A-Za-z_][A-Za-z0-9_]*$")]
 """A name in a Python file, whose path is relative to the scenario file."""
-
 
 AircraftName = Annotated[str, Field(pattern=r"^jsbsim(:[A-Za-z0-9_-]+)?$")]
 """A model of the package jsbsim."""
 
 
-def _one_fault(value: object, validate: ValidatorFunctionWrapHandler) -> object:
-    """One fault for a key of two types; pydantic reports one for each of them."""
-    try:
-        return validate(value)
-    except ValidationError as error:
-        raise PydanticCustomError("dynamics", "dynamics") from error
-
-
-Dynamics = Annotated[Literal["double_integrator", "autopilot"] | AircraftName | CodeName, WrapValidator(_one_fault)]
+Dynamics = Annotated[Literal["double_integrator", "autopilot"] | AircraftName | CodeName, one_fault("dynamics")]
 NO_LAW = {"controller": None, "linear": None}
 """What changes in `[control]` for a method other than python."""
 BUILT_IN = "double_integrator", "autopilot"

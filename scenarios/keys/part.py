@@ -3,7 +3,7 @@
 Numbers are bounded where the messages (single precision) and the clocks (nanoseconds) can still tell them apart.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, LiteralString
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidatorFunctionWrapHandler, WrapValidator
 from pydantic_core import PydanticCustomError
@@ -29,16 +29,21 @@ PREDICTION_MAX_S = 10.0
 """Longest loop delay that the station predicts over."""
 
 
-def _one_fault(value: object, validate: ValidatorFunctionWrapHandler) -> object:
-    """One fault for a key of two types; pydantic reports one for each of them."""
-    try:
-        return validate(value)
-    except ValidationError as error:
-        raise PydanticCustomError("prediction", "prediction", {"most": PREDICTION_MAX_S}) from error
+def one_fault(kind: LiteralString, **context: float) -> WrapValidator:
+    """One fault for a key of several types; pydantic reports one for each of them. `scenarios.places` words it."""
+
+    def validated(value: object, validate: ValidatorFunctionWrapHandler) -> object:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            raise PydanticCustomError(kind, kind, context) from error
+
+    return WrapValidator(validated)
 
 
 Prediction = Annotated[
-    Literal["off", "measured"] | Annotated[float, Field(gt=0, le=PREDICTION_MAX_S)], WrapValidator(_one_fault)
+    Literal["off", "measured"] | Annotated[float, Field(gt=0, le=PREDICTION_MAX_S)],
+    one_fault("prediction", most=PREDICTION_MAX_S),
 ]
 
 

@@ -118,7 +118,9 @@ class SignedLink:
             return FLAGS if frame[2] & ~SIGNED else SETUP if number == SETUP_SIGNING else UNKNOWN
         if frame[2] and compare_digest(self._signature(frame[:-6]), frame[-6:]):
             return ""
-        if not self._checksum_right(frame[:-SIGNATURE] if frame[2] else frame):
+        unsigned = frame[:-SIGNATURE] if frame[2] else frame
+        checksum = mcrf4xx(unsigned[1:-CHECKSUM] + self._crc_extra[number])
+        if checksum != int.from_bytes(unsigned[-CHECKSUM:], "little"):
             return CHECKSUM_WRONG
         return WRONG if frame[2] else UNSIGNED
 
@@ -142,10 +144,6 @@ class SignedLink:
 
     def _signature(self, data: bytes) -> bytes:
         return hashlib.sha256(self._key.secret + data).digest()[:6]
-
-    def _checksum_right(self, frame: bytes) -> bool:
-        extra = self._crc_extra[frame[7] | frame[8] << 8 | frame[9] << 16]
-        return mcrf4xx(frame[1:-CHECKSUM] + extra) == int.from_bytes(frame[-CHECKSUM:], "little")
 
 
 def _toggled(frame: bytes) -> bytes:

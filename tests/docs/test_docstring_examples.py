@@ -62,7 +62,6 @@ INTERNAL_FUNCTIONS = {
     "gains.performance.scalar_gains.gains_of_margin",
     "gains.performance.scalar_gains.least_singular_value",
     "gains.performance.scalar_gains.onboard_front_gain_limit",
-    "gains.performance.string_stability.largest_value",
     "gains.sampled.constant.checked_delay",
     "gains.sampled.constant.checked_loop",
     "gains.sampled.constant.period_map",

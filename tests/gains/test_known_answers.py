@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from gains.core._bracketing import highest
 from gains.core.structure import is_singular_for_any_delay
 from gains.delay._crossings import DelayedTerm, crossing_errors
 from gains.delay._mixed import count_unstable_roots
@@ -13,7 +14,6 @@ from gains.design.search import fastest_decay
 from gains.performance.behaviour import block_margin, diagonal_blocks
 from gains.performance.robust import subsystem_loop
 from gains.performance.scalar_gains import decay_rate_of, least_singular_value
-from gains.performance.string_stability import largest_value
 
 
 def test_at_every_delay_a_resting_loop_has_a_zero_root() -> None:
@@ -70,7 +70,7 @@ def test_a_double_pole_decays_with_its_own_rate() -> None:
 
 
 def test_a_maximum_between_grid_points_is_found() -> None:
-    assert largest_value(np.sin, np.linspace(0.0, 3.0, 8)) == pytest.approx(1.0, abs=1e-12)
+    assert highest(np.sin, np.linspace(0.0, 3.0, 8))[1] == pytest.approx(1.0, abs=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from gcs.control.tick import CLOCK_JUMPED
 from gcs.drive.lockstep import START_NS
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
+from scenarios.keys.autopilot import Sitl
 from scenarios.keys.link import Link, Links
-from scenarios.keys.sitl import Sitl
 from scenarios.schema import ClockJump, Rates, Scenario
 from tests.support.fleets.flown_copters import COPTERS5, TRUTH, Flight, fly
 

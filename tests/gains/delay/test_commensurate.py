@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from gains.core.errors import BadModelError
-from gains.delay._commensurate import analyse_commensurate
 from gains.delay._crossings import DelayedTerm
 from gains.delay._mixed import analyse_mixed
 from gains.delay.constant import analyse_delay
@@ -42,14 +41,14 @@ def random_terms(seed: int) -> list[Matrix]:
 
 def test_published_window_of_two_delays() -> None:
     entry = benchmark("two_commensurate_delays_2x2")
-    [window] = analyse_commensurate(entry["A"]).stable_intervals_s
+    [window] = analyse_delay(*entry["A"]).stable_intervals_s
     # the benchmark's delays are tau / 2 and tau; its figures have 14 digits
     assert np.array(window) * 2.0 == pytest.approx(np.array(entry["computed"]), rel=1e-12)
 
 
 def test_published_spring_network_with_three_delays() -> None:
     entry = benchmark("spring_network_n3_h2h3h")
-    analysis = analyse_commensurate(entry["A"])
+    analysis = analyse_delay(*entry["A"])
     [(start_s, end_s)] = analysis.stable_intervals_s
     assert end_s == pytest.approx(entry["computed"][0], rel=1e-12)
     for delay_s in entry["classification"]["stable"]:
@@ -62,7 +61,7 @@ def test_published_spring_network_with_three_delays() -> None:
 
 def test_one_late_matrix_is_the_single_delay_test() -> None:
     A0, A1 = np.array([[0.0, 1.0], [-2.0, 0.1]]), np.array([[0.0, 0.0], [1.0, 0.0]])
-    single, multiple = analyse_delay(A0, A1), analyse_commensurate([A0, np.zeros((2, 2)), A1])
+    single, multiple = analyse_delay(A0, A1), analyse_delay(A0, np.zeros((2, 2)), A1)
     for window, expected in zip(multiple.stable_intervals_s, single.stable_intervals_s, strict=True):
         assert np.array(window) * 2.0 == pytest.approx(np.array(expected), rel=1e-13)
 
@@ -70,14 +69,14 @@ def test_one_late_matrix_is_the_single_delay_test() -> None:
 def test_scalar_with_two_delays_is_the_closed_form() -> None:
     # s = -a (z + z^2), z = e^{-s tau}: on the axis cos + cos 2 = 0, theta = pi/3, omega = a (sin + sin 2) = a sqrt(3)
     for a in (0.5, 1.0, 40.0):
-        margin_s = analyse_commensurate([[[0.0]], [[-a]], [[-a]]]).delay_margin_s
+        margin_s = analyse_delay([[0.0]], [[-a]], [[-a]]).delay_margin_s
         assert margin_s == pytest.approx(pi / (3.0 * sqrt(3.0) * a), rel=1e-13)
 
 
 @pytest.mark.parametrize("seed", range(60))
 def test_windows_are_those_of_the_rightmost_root(seed: int) -> None:
     terms = random_terms(seed)
-    windows = analyse_commensurate(terms, horizon_s=4.0).stable_intervals_s
+    windows = analyse_delay(*terms, horizon_s=4.0).stable_intervals_s
     for delay_s in np.random.default_rng(seed).uniform(0.02, 4.0, 4).tolist():
         # next to an end the sign of the rightmost root is a matter of rounding
         if min((abs(delay_s - end) for window in windows for end in window), default=inf) > 1e-6:
@@ -90,18 +89,18 @@ def test_windows_are_those_of_the_rightmost_root(seed: int) -> None:
 def test_sweep_along_the_circle_agrees(seed: int) -> None:
     terms = random_terms(seed)
     # crossings are well conditioned here; a missed one is off by far more
-    assert circle_sweep_margin(terms) == pytest.approx(analyse_commensurate(terms).delay_margin_s, rel=1e-9)
+    assert circle_sweep_margin(terms) == pytest.approx(analyse_delay(*terms).delay_margin_s, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_margin_scales_with_time_and_is_free_of_coordinates(seed: int) -> None:
     terms = random_terms(seed)
-    margin_s = analyse_commensurate(terms).delay_margin_s
-    assert analyse_commensurate([310.0 * matrix for matrix in terms]).delay_margin_s == pytest.approx(margin_s / 310.0)
+    margin_s = analyse_delay(*terms).delay_margin_s
+    assert analyse_delay(*[310.0 * matrix for matrix in terms]).delay_margin_s == pytest.approx(margin_s / 310.0)
     T = np.random.default_rng(seed).normal(size=terms[0].shape) + 3.0 * np.eye(len(terms[0]))
     turned = [np.linalg.solve(T, matrix @ T) for matrix in terms]
     # a similarity of condition number up to some hundreds costs as many digits
-    assert analyse_commensurate(turned).delay_margin_s == pytest.approx(margin_s, rel=1e-8)
+    assert analyse_delay(*turned).delay_margin_s == pytest.approx(margin_s, rel=1e-8)
 
 
 def test_large_block_leaves_the_frequencies_to_the_sweep() -> None:
@@ -109,7 +108,7 @@ def test_large_block_leaves_the_frequencies_to_the_sweep() -> None:
     size = 21
     terms = [rng.normal(size=(size, size)) for _ in range(3)]
     terms[0] = terms[0] - (float(np.linalg.eigvals(sum(terms[1:], terms[0])).real.max()) + 0.5) * np.eye(size)
-    margin_s = analyse_commensurate(terms, horizon_s=1e-300).delay_margin_s
+    margin_s = analyse_delay(*terms, horizon_s=1e-300).delay_margin_s
     # the rightmost root is known to 1e-12 and moves by some 1 / s per second
     for share, stable in ((1.0 - 1e-9, True), (1.0 + 1e-9, False)):
         root = rightmost_root([(matrix, k * share * margin_s) for k, matrix in enumerate(terms)])
@@ -118,25 +117,24 @@ def test_large_block_leaves_the_frequencies_to_the_sweep() -> None:
 
 def test_followers_one_behind_the_other_are_one_block() -> None:
     terms = [np.diag([0.0, 0.0]), np.array([[-1.0, 0.0], [1.0, -1.0]]), np.array([[-1.0, 0.0], [0.5, -1.0]])]
-    assert analyse_commensurate(terms).delay_margin_s == pytest.approx(pi / (3.0 * sqrt(3.0)), rel=1e-13)
+    assert analyse_delay(*terms).delay_margin_s == pytest.approx(pi / (3.0 * sqrt(3.0)), rel=1e-13)
 
 
 def test_root_at_zero_for_every_delay_is_never_stable() -> None:
-    analysis = analyse_commensurate([[[-2.0]], [[1.0]], [[1.0]]])
+    analysis = analyse_delay([[-2.0]], [[1.0]], [[1.0]])
     assert (analysis.stable_intervals_s, analysis.delay_margin_s) == ((), 0.0)
 
 
 @pytest.mark.parametrize(
     ("matrices", "message"),
     [
-        ([], "matrices is empty"),
         ([[[1.0]]] * 4000, "a product of at most 3000"),
         ([[[1.0]], np.eye(2)], "1x1 is wanted"),
     ],
 )
 def test_wrong_terms_are_named(matrices: list[Matrix], message: str) -> None:
     with pytest.raises(BadModelError, match=message):
-        analyse_commensurate(matrices)
+        analyse_delay(*matrices)
 
 
 def test_known_delay_beside_the_unknown_shortens_it() -> None:
@@ -188,7 +186,7 @@ def test_horizon_must_be_positive(horizon_s: float) -> None:
     with pytest.raises(BadModelError, match="horizon_s is"):
         analyse_mixed([DelayedTerm(np.array([[-1.0]]), 0.1, 1)], horizon_s=horizon_s)
     with pytest.raises(BadModelError, match="horizon_s is"):
-        analyse_commensurate([[[0.0]], [[-1.0]]], horizon_s=horizon_s)
+        analyse_delay([[0.0]], [[-1.0]], horizon_s=horizon_s)
 
 
 def unstable_roots(terms: list[tuple[Matrix, float]]) -> int:
@@ -239,7 +237,7 @@ def test_roots_of_many_multiples_are_counted(
     terms = [now, *(np.zeros_like(now) for _ in range(max(multiples)))]
     for multiple, matrix in zip(multiples, late, strict=True):
         terms[multiple] = matrix
-    found = analyse_commensurate(terms, horizon_s=1e-3)
+    found = analyse_delay(*terms, horizon_s=1e-3)
     for tau_s in (0.11, 0.37, 0.83, 1.31):
         entered = sum(
             crossing.direction
@@ -257,7 +255,7 @@ def test_pair_on_the_axis_at_no_delay_beside_a_fixed_root_at_zero() -> None:
     now = np.array([[0.0, 0.0, -0.10632528972641878], [0.0, 0.0, 0.0], [0.0, 0.6401019196602797, 0.0]])
     late = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -0.7418610417423701], [-0.318665534371544, 0.0, 0.0]])
     for between in (0, 3):
-        analysis = analyse_commensurate([now, *[np.zeros((3, 3))] * between, late], leave_out_zero=True)
+        analysis = analyse_delay(now, *[np.zeros((3, 3))] * between, late, leave_out_zero=True)
         assert (analysis.delay_margin_s, analysis.roots_fixed_at_zero) == (0.0, 1)
         found = {round(crossing.omega_rad_s, 6) for crossing in analysis.crossings}
         assert found == {

@@ -7,7 +7,6 @@ import pytest
 
 from gains.core.arrays import FloatArray
 from gains.core.structure import balanced, block_diagonal
-from gains.delay._commensurate import analyse_commensurate
 from gains.delay._crossings import axis_crossings
 from gains.delay._mixed import count_unstable_roots
 from gains.delay._tracked import tracked_crossings
@@ -37,7 +36,7 @@ def test_followed_branches_cross_where_the_pencil_says(seed: int) -> None:
 @pytest.mark.parametrize("late", [1, 2])
 def test_large_blocks_lose_stability_at_their_margin(late: int) -> None:
     matrices = random_loop(40, 5, late=late)
-    margin_s = analyse_commensurate(matrices).delay_margin_s
+    margin_s = analyse_delay(*matrices).delay_margin_s
     assert 0.0 < margin_s < np.inf
     # 1e-4 beside the margin the growth is far above what Newton's method leaves
     for factor, stable in ((1.0 - 1e-4, True), (1.0 + 1e-4, False)):

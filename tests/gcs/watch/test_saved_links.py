@@ -10,9 +10,8 @@ from gcs.runs.files import read_summary
 from gcs.runs.record import SUMMARY_FILE
 from scenarios.errors import ScenarioError
 from scenarios.files import load, with_profile
-from scenarios.link_files import FOLDER as PROFILES
-from scenarios.link_files import load_profile, names
-from scenarios.shipped import FOLDER
+from scenarios.link_files import load_profile
+from scenarios.shipped import FOLDER, PROFILES, names
 
 
 def run(*arguments: str) -> str:
@@ -48,8 +47,8 @@ def test_links_are_found_relative_to_the_current_folder(tmp_path: Path, monkeypa
 
 
 def test_every_shipped_profile_can_be_flown_and_names_its_source() -> None:
-    assert names() == ["lte", "radio", "satellite", "wifi"]
-    for name in names():
+    assert names(PROFILES) == ["lte", "radio", "satellite", "wifi"]
+    for name in names(PROFILES):
         profile = load_profile(name, FOLDER / "chain3.toml", "links.profile")
         assert profile.source
         assert profile.licence

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from scenarios.keys.autopilot import Sitl
 from scenarios.keys.part import Flavour
-from scenarios.keys.sitl import Sitl
 from sim_vehicles.services.sitl import slips
 from sim_vehicles.vehicles.copter import Copter
 from sim_vehicles.vehicles.shell import Shell

@@ -1,0 +1,63 @@
+"""What contradicts the further requirements of a design, and `control.for_link`, which measures their delays."""
+
+from collections.abc import Iterator
+
+from scenarios.keys.part import Fault
+from scenarios.schema import Scenario
+
+_AT_DELAY = "alpha_at_delay", "decay_rate_at_delay_1_s"
+_MEASURED = "at_delay_s", "delays_s", "delay_rate"
+
+
+def contradictions(scenario: Scenario) -> Iterator[Fault]:
+    """Faults of `control.criteria`, `control.overlap` and `control.for_link` that no single key shows."""
+    yield from _criteria_contradictions(scenario)
+    yield from _for_link_contradictions(scenario)
+
+
+def _criteria_contradictions(scenario: Scenario) -> Iterator[Fault]:
+    control, criteria = scenario.control, scenario.control.criteria
+    given = control.gains is not None or control.blocks
+    if control.overlap is not None and (control.method == "inclusion" or given):
+        wanted = "no such key, unless method is graph-lqr or graph-dk, designed"
+        yield "control.overlap", control.overlap.model_dump(), wanted
+    if criteria is None:
+        return
+    if given:
+        yield "control.criteria", "requirements", "either criteria, or gains or blocks"
+    if control.loop == "onboard":
+        yield "control.loop", control.loop, "ground, with control.criteria"
+    if scenario.dynamics != "double_integrator" or control.prediction != "off":
+        yield "control.criteria", "requirements", "no such key with dynamics autopilot or prediction"
+    low, high = criteria.delays_s or (0.0, 0.0)
+    if low > high:
+        yield "control.criteria.delays_s", [low, high], "the smaller delay first"
+    if criteria.delays_s is None and criteria.delay_rate is not None:
+        yield "control.criteria.delay_rate", criteria.delay_rate, "no such key without delays_s"
+    if criteria.at_delay_s is not None:
+        return
+    for name in (*_AT_DELAY, "discrete"):
+        if value := getattr(criteria, name):
+            yield f"control.criteria.{name}", value, "no such key without at_delay_s"
+    if criteria.maximise in _AT_DELAY:
+        yield "control.criteria.maximise", criteria.maximise, "what needs no delay, without at_delay_s"
+
+
+def _for_link_contradictions(scenario: Scenario) -> Iterator[Fault]:
+    control, key = scenario.control, "control.for_link"
+    if control.for_link == "off":
+        return
+    required = control.alpha or control.delay_margin_s or control.decay_rate_1_s
+    if required or control.gains is not None or control.blocks:
+        yield key, control.for_link, "off, with gains, blocks, alpha, delay_margin_s or decay_rate_1_s"
+    if control.method != "inclusion" or control.loop != "ground":
+        yield key, control.for_link, "off, unless method is inclusion and loop is ground"
+    if control.prediction != "off" or scenario.dynamics == "autopilot":
+        yield key, control.for_link, "off, with prediction or dynamics autopilot"
+    if control.criteria is None:
+        return
+    for name in _MEASURED:
+        if (value := getattr(control.criteria, name)) is not None:
+            yield f"control.criteria.{name}", value, "no such key with for_link: the delays are measured"
+    if control.criteria.maximise == "delay_margin_s":
+        yield "control.criteria.maximise", control.criteria.maximise, "alpha or decay_rate_1_s, with for_link"
