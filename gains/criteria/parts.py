@@ -14,6 +14,10 @@ Figures = LoopFigures | PredictedFigures
 _AT_LEAST = "delay_margin_s", "alpha", "decay_rate_1_s"
 _CRITERIA_AT_LEAST = "alpha_at_delay", "decay_rate_at_delay_1_s", "damping_min"
 _CRITERIA_AT_MOST = "natural_frequency_max_rad_s", "spacing_gain_max_s2", "noise_gain_max"
+# growth of spacing errors that is only rounding
+_ROUNDING = 1e-9
+# decimals of a second to which an interval of delays is read: its middle must not depend on how narrow it is
+_DECIMALS = 12
 # how far an unstable or missing figure counts as being from any requirement, in logarithms
 _FAR = 1e3
 
@@ -38,7 +42,9 @@ class Part:
 
     def figure(self, figures: Figures) -> float:
         """What gains reach of it."""
-        return getattr(figures, "string_peak" if self.name == "string_peak_max" else self.name)
+        if self.name == "string_peak_max":
+            return figures.string_peak / (1.0 + _ROUNDING)
+        return getattr(figures, self.name)
 
     def shortfall(self, figures: Figures) -> float:
         """How far gains are from it, as the logarithm of a ratio; 0 if they meet it."""
@@ -54,11 +60,23 @@ class Part:
         more = exp(1.2 * short + 1e-6) if short > 0.0 else 1.0
         return replace(self, wanted=self.wanted * more if self.at_least else self.wanted / more)
 
-    def relaxed(self, reached: float) -> str:
-        """The advice to ask for no more than was reached; empty if that is nothing."""
-        if not 0.0 < reached < inf:
-            return ""
-        return f"{'lower' if self.at_least else 'raise'} {self.name} to {rounded(reached, up=not self.at_least):g}"
+    def relaxed(self, figures: Figures) -> Self | None:
+        """A part that asks for no more than gains reach; None if that is nothing."""
+        reached = self.figure(figures)
+        return self._for(reached) if 0.0 < reached < inf else None
+
+    def eased(self, share: float) -> Self:
+        """A part that asks for less, by a share as a logarithm."""
+        return self._for(self.wanted * exp(-share if self.at_least else share))
+
+    @property
+    def advice(self) -> str:
+        """What to change of a requirement, so that it asks for this part."""
+        return f"{'lower' if self.at_least else 'raise'} {self.name} to {self.wanted_text}"
+
+    def _for(self, reached: float) -> Self:
+        """A part for a value, which it asks for as its text says: rounded to the easier side."""
+        return replace(self, wanted=float(f"{rounded(reached, up=not self.at_least):.6g}"))
 
 
 @dataclass(frozen=True)
@@ -74,30 +92,28 @@ class DelaysPart(Part):
 
     @property
     def wanted_text(self) -> str:
-        return f"[{self.mean_s - self.wanted:g}, {self.mean_s + self.wanted:g}]"
+        return f"[{self.mean_s - self.wanted:.12g}, {self.mean_s + self.wanted:.12g}]"
 
     def figure(self, figures: Figures) -> float:
         return figures.proved_spread_s(self.mean_s, self.rate)
 
-    def relaxed(self, reached: float) -> str:
-        spread_s = rounded(reached, up=False)
-        if spread_s <= 0.0:
-            return ""
-        return f"narrow {self.name} to [{self.mean_s - spread_s:.6g}, {self.mean_s + spread_s:.6g}]"
+    @property
+    def advice(self) -> str:
+        return f"narrow {self.name} to {self.wanted_text}"
 
 
 def parts_of(wanted: Requirement) -> list[Part]:
     """Everything that a requirement asks for, in the order of its fields."""
     parts = [Part(name, value, True) for name in _AT_LEAST if (value := getattr(wanted, name)) is not None]
     if wanted.string_peak_max is not None:
-        parts.append(Part("string_peak_max", wanted.string_peak_max * (1.0 + 1e-9), False))
+        parts.append(Part("string_peak_max", wanted.string_peak_max, False))
     for names, at_least in ((_CRITERIA_AT_LEAST, True), (_CRITERIA_AT_MOST, False)):
         given = ((name, getattr(wanted.criteria, name, None)) for name in names)
         parts += [Part(name, value, at_least) for name, value in given if value is not None]
     if wanted.criteria is not None and wanted.criteria.delays_s is not None:
         (low, high), rate = wanted.criteria.delays_s, wanted.criteria.delay_rate
-        middle = (low + high) / 2.0
-        parts.append(DelaysPart("delays_s", (high - low) / 2.0, True, middle, inf if rate is None else rate))
+        middle_s, spread_s = round((low + high) / 2.0, _DECIMALS), round((high - low) / 2.0, _DECIMALS)
+        parts.append(DelaysPart("delays_s", spread_s, True, middle_s, inf if rate is None else rate))
     return parts
 
 

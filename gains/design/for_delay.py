@@ -9,14 +9,15 @@ maximised. What decays fastest is known in closed form, and no search begins wor
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import count
 from math import exp, inf, log, sqrt
 from typing import Protocol
 
 import numpy as np
 
-from gains.core._evolution import Found, Rank, best_of
+from gains.core._evolution import Rank, best_of
 from gains.core.arrays import BoolArray, FloatArray
-from gains.core.errors import InfeasibleError, SolverError
+from gains.core.errors import InfeasibleError
 from gains.core.requirement import Requirement
 from gains.core.structure import positive_seconds
 from gains.criteria.figures import LoopFigures
@@ -27,14 +28,21 @@ from gains.formation.model import FormationModel
 from gains.performance.flown import FlownLoop, FlownTiming
 from gains.performance.scalar_gains import PAIR, ScalarGains
 
-# How many gains a search compares.
-_EVALUATIONS = 320
+Reached = tuple[FloatArray, Figures]
+"""A point of a family and its exact figures."""
+
+# How many gains a search compares: for each free entry, and of any family at least and at most.
+_EVALUATIONS_EACH, _EVALUATIONS_LEAST, _EVALUATIONS_MOST = 50, 320, 1280
 # Searches until gains meet with exact figures what they met with rough ones.
 _AIMS = 4
 # Frequencies left out while searching; peaks are looked at closer in any case.
 _THINNED = 4
 # At no delay and no hold gains have no scale of their own: the search begins at that of this delay.
 _NO_DELAY_S = 0.1
+# Shares by which several parts are relaxed together, as multiples of the largest shortfall of the nearest gains.
+_SHARES = 1.0, 1.5, 2.0, 3.0
+# a shortfall, in logarithms, from which nothing can be said of how far to relax: what is missed is out of reach
+_HOPELESS = 100.0
 # how far an unstable loop counts as being from any requirement
 _UNSTABLE = 1e4
 # and one that meets no part that is quick to compute; above every shortfall of those that are not
@@ -182,84 +190,99 @@ class PatternGains:
         return LoopFigures(self.model, K, self.timing, self.delay_s, self.weight, discrete=discrete, thinned=_THINNED)
 
 
-def searched(family: GainFamily, wanted: Requirement, *, evaluations: int = _EVALUATIONS) -> tuple[FloatArray, Figures]:
+def searched(family: GainFamily, wanted: Requirement, *, evaluations: int | None = None) -> Reached:
     """Return the point of a family that meets a requirement with criteria and is best in its objective, with figures.
 
-    `evaluations` is how many gains are compared. InfeasibleError if none was found that meets the requirement; its
-    message says how far each part alone would have to be relaxed.
+    `evaluations` is how many gains are compared; None: more, the more free entries they have. InfeasibleError if none
+    was found that meets the requirement; its message says how far each part alone, or several together, have to be
+    relaxed. Whoever asks for exactly that gets gains: those by which the message was found are found again.
     """
     assert wanted.criteria is not None
     objective = wanted.criteria.objective or ("alpha" if wanted.delay_margin_s is not None else "delay_margin_s")
-    parts = aims = parts_of(wanted)
-    missed: list[float] = []
-    for _ in range(_AIMS):
-        found = _searched(family, objective, aims, family.starts, evaluations)
-        if found.rank[0] > 0.0:
-            most = [_most(family, aim, [other for other in aims if other is not aim], found.point) for aim in aims]
-            met = [each.point for each in most if _shortfall(family.figures(each.point), aims) == 0.0]
-            if not met:
-                raise InfeasibleError(_refusal(aims, most, family.figures(found.point).exact))
-            found = _searched(family, objective, aims, met, evaluations)
-        # the figures of the search are rough
-        exact = family.figures(found.point).exact
-        missed = [part.shortfall(exact) for part in parts]
-        if not any(missed):
-            return found.point, exact
-        aims = [aim.tightened(short) for aim, short in zip(aims, missed, strict=True)]
-    raise SolverError(f"the search misses {wanted} by {max(missed):.2g} of it; relax what is asked for by that")
+    parts = parts_of(wanted)
+
+    def cost(figures: Figures) -> float:
+        return -float(getattr(figures, objective))
+
+    found = _best(family, parts, cost, family.starts, evaluations)
+    most: list[Reached] = []
+    for part in parts if not _meets(found[1], parts) else ():
+        most.append(_most(family, part, parts))
+        if _meets(most[-1][1], parts):
+            better = _best(family, parts, cost, [most[-1][0]], evaluations)
+            return better if _meets(better[1], parts) else most[-1]
+    if most:
+        raise InfeasibleError(_refusal(family, parts, most, found[1]))
+    return found
 
 
-def _refusal(parts: Sequence[Part], most: Sequence[Found], nearest: Figures) -> str:
-    """What cannot be had together, and how far to relax each part alone; if none helps alone, those `nearest` misses.
-
-    All of them by the same share: points then rank as in the search that found the nearest, so that it is found again.
-    """
+def _refusal(family: GainFamily, parts: Sequence[Part], most: Sequence[Reached], nearest: Figures) -> str:
+    """What cannot be had together, and how far to relax each part alone, or several if none helps alone."""
     named = " and ".join(f"{part.name} = {part.wanted_text}" for part in parts)
     conflict = "exclude each other" if len(parts) > 1 else "cannot be reached"
-    reached = [
-        part.relaxed(found.rank[1] * (-1.0 if part.at_least else 1.0))
-        for part, found in zip(parts, most, strict=True)
-        if found.rank[0] == 0.0
-    ]
-    advice = " or ".join(text for text in reached if text)
-    if not advice:
-        short = [part.shortfall(nearest) for part in parts]
-        share = exp(-max(short))
-        missed = [part for part, each in zip(parts, short, strict=True) if each > 0.0 and share > 0.0]
-        advice = " and ".join(part.relaxed(part.wanted * (share if part.at_least else 1.0 / share)) for part in missed)
+    alone = [_relaxed(part, reached, parts) for part, reached in zip(parts, most, strict=True)]
+    advice = " or ".join(part.advice for part in alone if part) or _together(family, parts, nearest)
     return f"{named} {conflict}: {advice or 'relax more than one of them'}"
 
 
-def _searched(
-    family: GainFamily, objective: str, parts: Sequence[Part], starts: Sequence[FloatArray], evaluations: int
-) -> Found:
-    """The best point of a search that meets the parts, or the nearest to it."""
-
-    def rank(point: FloatArray) -> Rank:
-        figures = family.figures(point)
-        short = _shortfall(figures, parts)
-        return short, -float(getattr(figures, objective)) if short == 0.0 else inf
-
-    return _from_best_start(rank, family, starts, evaluations)
+def _relaxed(part: Part, reached: Reached, parts: Sequence[Part]) -> Part | None:
+    """A part for what gains reach of it; None if they miss another one."""
+    _, figures = reached
+    return part.relaxed(figures) if _meets(figures, [other for other in parts if other is not part]) else None
 
 
-def _most(family: GainFamily, part: Part, others: Sequence[Part], nearest: FloatArray) -> Found:
-    """The point at which a part is met best of all that meet the others."""
+def _together(family: GainFamily, parts: Sequence[Part], nearest: Figures) -> str:
+    """The advice to relax all that the nearest gains miss by one share, the last of it as far as is then needed."""
+    short = [part.shortfall(nearest) for part in parts]
+    for share in (max(short) * times for times in _SHARES if max(short) < _HOPELESS):
+        eased = [part.eased(share) if each > 0.0 else part for part, each in zip(parts, short, strict=True)]
+        *missed, last = [part for part, each in zip(eased, short, strict=True) if each > 0.0]
+        if (found := _relaxed(last, _most(family, last, eased), eased)) is not None:
+            return " and ".join(part.advice for part in (*missed, found))
+    return ""
+
+
+def _most(family: GainFamily, part: Part, parts: Sequence[Part]) -> Reached:
+    """The gains that reach most of a part of those that meet all others.
+
+    How much is wanted of the part does not matter, so that whoever wants what they reach finds the same gains.
+    """
     sign = 1.0 if part.at_least else -1.0
+    others = [other for other in parts if other is not part]
+    return _best(family, others, lambda figures: -sign * part.figure(figures), family.starts, None)
+
+
+def _best(
+    family: GainFamily,
+    parts: Sequence[Part],
+    cost: Callable[[Figures], float],
+    starts: Sequence[FloatArray],
+    evaluations: int | None,
+) -> Reached:
+    """The gains of least cost that meet the parts, or the nearest to them: a search from the best of the starts.
+
+    While searching, figures are rough. Gains that miss a part with exact ones are searched again, aiming higher.
+    """
+    aims = parts
+    enough = min(max(_EVALUATIONS_EACH * starts[0].size, _EVALUATIONS_LEAST), _EVALUATIONS_MOST)
 
     def rank(point: FloatArray) -> Rank:
         figures = family.figures(point)
-        short = _shortfall(figures, others)
-        return short, -sign * part.figure(figures) if short == 0.0 else inf
+        short = _shortfall(figures, aims)
+        return short, cost(figures) if short == 0.0 else inf
 
-    return _from_best_start(rank, family, [nearest, *family.starts], _EVALUATIONS)
+    for turn in count(1):
+        found = best_of(rank, min(starts, key=rank), step=family.step, evaluations=evaluations or enough)
+        exact = family.figures(found.point).exact
+        if turn == _AIMS or found.rank[0] > 0.0 or _meets(exact, parts):
+            return found.point, exact
+        aims = [aim.tightened(part.shortfall(exact)) for aim, part in zip(aims, parts, strict=True)]
+    raise AssertionError
 
 
-def _from_best_start(
-    rank: Callable[[FloatArray], Rank], family: GainFamily, starts: Sequence[FloatArray], evaluations: int
-) -> Found:
-    """The best point of a search from the best of the starts."""
-    return best_of(rank, min(starts, key=rank), step=family.step, evaluations=evaluations)
+def _meets(figures: Figures, parts: Sequence[Part]) -> bool:
+    """Whether gains are stable and meet all parts."""
+    return _shortfall(figures, parts) == 0.0
 
 
 def _shortfall(figures: Figures, parts: Sequence[Part]) -> float:

@@ -163,9 +163,9 @@ def _study(
     from gcs.stress.study import Study
 
     scenario = options.load_scenario(file, loop, links=links, allow_code=allow_code)
-    if scenario.dynamics == "autopilot" and (real_time or disturbance):
+    if (disturbance and scenario.dynamics != "double_integrator") or (real_time and scenario.dynamics == "autopilot"):
         option = "--disturbance" if disturbance else "--real-time"
-        raise InputError(f"{file}: dynamics: read 'autopilot', wanted double_integrator with {option}")
+        raise InputError(f"{file}: dynamics: read {scenario.dynamics!r}, wanted double_integrator with {option}")
     if scenario.control.prediction == "measured":
         wanted = "off, or a number of seconds: gcs stress tests an assumed delay that is fixed"
         raise InputError(f"{file}: control.prediction: read 'measured', wanted {wanted}")

@@ -20,13 +20,19 @@ def chain(**update: object) -> Scenario:
     return load(located("chain3")).with_calm_monitor().model_copy(update=update)
 
 
-def test_flown_spread_of_the_errors_is_the_computed_one() -> None:
+@pytest.mark.parametrize("prediction", ["off", "measured"])
+@pytest.mark.parametrize("delay_s", [0.05, 0.15, 0.25])
+def test_flown_spread_of_the_errors_is_the_computed_one(delay_s: float, prediction: str) -> None:
     together = Clocks(offset_max_s=0.0, drift_max_ppm=0.0)  # else noise is averaged between two reports
     noisy = chain(disturbance=AIR, navigation=NOISE, clocks=together, duration_s=40.0)
-    flown = fly_virtual(noisy.with_link_delay(up_s=0.06, down_s=0.08))
+    control = noisy.control.model_copy(update={"prediction": prediction})
+    noisy = noisy.model_copy(update={"control": control})
+    flown = fly_virtual(noisy.with_link_delay(up_s=0.4 * delay_s, down_s=0.6 * delay_s))
+    assert flown.summary.loop_delay_s.p50 == pytest.approx(delay_s, abs=1e-3)
     assert flown.summary.spread is not None
     ratios = [(own.reported_rms_m or 0.0) / (own.predicted_rms_m or 1.0) for own in flown.summary.spread.vehicles]
-    # three quarters of the power are white noise; the rest has about 40 independent values on each axis: 3 % together
+    # most of the power is white noise; the rest has about 40 independent values on each axis: 3 % for all together
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
     assert ratios == pytest.approx([1.0, 1.0], abs=0.08)
 
 
