@@ -12,10 +12,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from gcs.drive.virtual import VirtualFlight, fly_virtual, load_scenario
     from gcs.plan.given import with_gain
     from gcs.plan.own_law import LawFormation
     from gcs.studies.front import front, plot_front
+    from gcs.studies.virtual import VirtualFlight, fly_virtual, load_scenario
     from gcs.views.plots import plot_growth, plot_root_locus
 
 __all__ = [
@@ -24,7 +24,7 @@ __all__ = [
 ]  # fmt: skip
 
 _NAMES = {
-    "drive.virtual": "VirtualFlight fly_virtual load_scenario",
+    "studies.virtual": "VirtualFlight fly_virtual load_scenario",
     "plan.given": "with_gain",
     "plan.own_law": "LawFormation",
     "studies.front": "front plot_front",

@@ -35,11 +35,14 @@ def main() -> None:
         gcs("stress", SCENARIOS / "chain3.toml", "--onset", "--delay", "0:0.6:7", "--out", folder / "onset")
         jitter = ["--delay", "0.15:0.375:10", "--jitter", "0:0.08:5", "--seeds", "3"]
         gcs("stress", SCENARIOS / "chain3.toml", *jitter, "--out", folder / "map")
+        predicted = ["--delay", "0.15:0.85:8", "--jitter", "0:0.08:3", "--prediction", "0,0.6"]
+        gcs("stress", SCENARIOS / "chain3.toml", *predicted, "--out", folder / "maps")
         gcs("thesis", "--out", folder / "thesis")
         shutil.copy(folder / "flight.png", DOCS / "flight.png")
         shutil.copy(folder / "monitor.png", DOCS / "monitor.png")
         shutil.copy(folder / "onset" / "growth.png", DOCS / "onset.png")
         shutil.copy(folder / "map" / "map.png", DOCS / "map.png")
+        shutil.copy(folder / "maps" / "map.png", DOCS / "maps.png")
         shutil.copytree(folder / "thesis", DOCS / "thesis", dirs_exist_ok=True)
 
 

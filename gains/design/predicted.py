@@ -76,9 +76,13 @@ class PredictedTree:
 
     @property
     def starts(self) -> Sequence[FloatArray]:
-        # a double root with a window of about 1 / (k1 + k3 tau^) to either side
-        k1 = 2.0 * (sqrt(1.0 + 1.0 / self.tolerated) - 1.0) / self.assumed_s
-        return [np.array([log(share * k1 * self.tree.late_s), 0.3, log(0.25)]) for share in (0.9, 0.6, 0.3)]
+        # a window of about 1 / (k1 + k3 tau^) to either side. A double root decays fastest; the largest alpha with a
+        # string peak of 1 is near k3 = 0.45 k1^2, k2 = 0.27 k1
+        found: list[FloatArray] = []
+        for share, front, ratio in ((0.9, 0.3, 0.25), (0.6, 0.3, 0.25), (0.3, 0.3, 0.25), (1.0, 0.27, 0.45)):
+            k1 = (sqrt(1.0 + 4.0 * ratio / self.tolerated) - 1.0) / (2.0 * ratio * self.assumed_s)
+            found.append(np.array([log(share * k1 * self.tree.late_s), front, log(ratio)]))
+        return found
 
     def figures(self, point: FloatArray) -> PredictedFigures:
         """The figures of the gains of a point."""

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from gcs.drive.takeover import Presence
     from gcs.drive.udp import StationSocket
     from gcs.plan.design import Design, LinkPart
-    from gcs.studies.front import FrontFields, PointFields
-    from gcs.studies.prediction import Compared, Comparison
+    from gcs.studies.front import Compared, Comparison, FrontFields, PointFields
     from scenarios.schema import Scenario
 
 LinksOf = Annotated[
@@ -150,7 +149,7 @@ def _print_front(found: "FrontFields") -> None:
 def show_comparison(design: "Design", name: str, *, as_json: bool) -> None:
     """Compare the loop delays with prediction and without, and print that."""
     from gcs.cli.options import answer
-    from gcs.studies.prediction import compared
+    from gcs.studies.front import compared
 
     answer(compared(design, name), _print_comparison, as_json=as_json)
 
@@ -159,17 +158,25 @@ def _print_comparison(found: "Comparison") -> None:
     from gcs.views.console import ms_text, plain_console, table_of
 
     columns: dict[str, Callable[[Compared], str]] = {
-        "prediction": lambda w: "off" if w.tolerated is None else f"±{w.tolerated:.0%}",
-        "loop delay": lambda w: ms_text(w.loop_delay_s),
+        "pred": lambda w: "off" if w.tolerated is None else f"±{w.tolerated:.0%}",
+        "delay": lambda w: ms_text(w.loop_delay_s, unit=""),
         "ratio": lambda w: f"{w.ratio:.2f}",
-        "stable between": lambda w: f"{1e3 * w.stable_s[0]:.1f} and {ms_text(w.stable_s[1])}",
-        "decay, 1/s": lambda w: f"{w.decay_rate_1_s:.3f}",
-        "string peak": lambda w: f"{w.string_peak:.2f}",
+        "stable, ms": lambda w: " to ".join(ms_text(end_s, unit="") for end_s in w.stable_s),
+        "decay": lambda w: f"{w.decay_rate_1_s:.3f}",
+        "peak": lambda w: f"{w.string_peak:.2f}",
         "alpha": lambda w: f"{w.alpha:.3f}",
-        "disturbance, s²": lambda w: f"{w.spacing_gain_s2:.3f}",
+        "gain": lambda w: f"{w.spacing_gain_s2:.3f}",
         "noise": lambda w: f"{w.noise_gain:.2f}",
     }
-    plain_console().print(table_of(found.ways, columns))
+    console = plain_console()
+    for line in (
+        "delay    the longest in ms at equal decay and string peak: that of any static",
+        "         gains, and predicted with these gains, which are stable at every",
+        "         constant delay within the share under pred",
+        "decay    in 1/s; gain from disturbance to spacing error in s²; noise to commands",
+    ):
+        console.print(line)
+    console.print(table_of(found.ways, columns, dense=True))
 
 
 def scenario_at(

@@ -41,6 +41,10 @@ def stress(
     ] = "",
     loss: Annotated[str, typer.Option(metavar=_AXIS, help="fraction of datagrams lost, each way")] = "",
     rate: Annotated[str, typer.Option(metavar=_AXIS, help="control rate in Hz; the gains stay as designed")] = "",
+    prediction: Annotated[
+        str,
+        typer.Option(metavar="S,S", help="with a map: assumed loop delays in s, 0 without prediction, side by side"),
+    ] = "",
     loop: options.LoopOption = None,
     links: options.LinksOption = None,
     disturbance: Annotated[
@@ -75,8 +79,8 @@ def stress(
     """Raise the link delay until the formation breaks.
 
     --delay, --delay-of, --jitter, --loss and --rate take FROM:TO:N (N values, ends included) or a list (0.1,0.2,0.4).
-    One of them makes a sweep, two make a map. The loop delay is the link delay plus the wait for the control tick. The
-    measured onset is compared with the delay margin.
+    One of them makes a sweep, two make a map, and --prediction maps beside each other. The loop delay is the link delay
+    plus the wait for the control tick. The measured onset is compared with the delay margin.
 
     With --disturbance and --onset, every vehicle is disturbed by w = D e, where e are the errors, at one link delay:
     that of the scenario, or one --delay. The worst D is scaled up, and the onset compared with the stability radii.
@@ -91,10 +95,8 @@ def stress(
     if (trial or resume) and (out is None or not out.is_dir()):
         flag = "--trial" if trial else "--resume"
         raise InputError(f"--out: read {out}, wanted the folder of a campaign, which {flag} needs")
-    if not (trial or onset or given or disturbance):
-        raise InputError("nothing to fly; wanted --onset, or an axis such as --delay 0:0.6:13")
-    if len(given) > 2:
-        raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
+    _refuse_axes(given, prediction, searches=bool(trial or onset or disturbance))
+    given += [("--prediction", prediction)] if prediction else []
     for name, value in (("--tolerance", tolerance), ("--assert-onset", assert_onset)):
         if value is not None and not 0.0 < value < 1.0:
             raise InputError(f"{name}: read {value:g}, wanted a fraction between 0 and 1, such as 0.02")
@@ -146,6 +148,15 @@ def stress(
         write_junit(junit, f"gcs stress {result.scenario}", checks_of(result), time_s=result.flight_time_s)
     options.answer(result, partial(print_result, folder=folder), as_json=as_json)
     raise typer.Exit(0 if result.passed else FAILED)
+
+
+def _refuse_axes(given: "list[tuple[str, str]]", prediction: str, *, searches: bool) -> None:
+    if not (given or searches):
+        raise InputError("nothing to fly; wanted --onset, or an axis such as --delay 0:0.6:13")
+    if len(given) > 2:
+        raise InputError(f"read {len(given)} axes, wanted one (a sweep) or two (a map)")
+    if prediction and (len(given) != 2 or searches):
+        raise InputError(f"--prediction: read {prediction}, wanted it with two other axes (a map) and no search")
 
 
 def _study(

@@ -118,6 +118,8 @@ class VehicleControl(NamedTuple):
     """Instant of the errors from which the command was computed: `sample_ns` with the loop on the ground."""
     assumed_s: float = 0.0
     """The loop delay over which the errors were predicted; 0 without prediction."""
+    acts_ns: int = 0
+    """When the command is assumed to act, to which instant the errors were predicted; 0 without prediction."""
 
 
 _UNKNOWN = VehicleControl(0, (nan, nan, nan, nan), (nan, nan), (nan, nan), (nan, nan), 0)

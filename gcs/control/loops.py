@@ -147,7 +147,7 @@ class PredictingGroundLoop:
             own = law[row]
             if own is not None and acts_ns > 0:
                 command = command_at(self._states, own, row, acts_ns, blends[row], nominal_m_s, opening)
-                controls[row] = controls[row]._replace(command_m_s2=command, assumed_s=assumed_s)
+                controls[row] = controls[row]._replace(command_m_s2=command, assumed_s=assumed_s, acts_ns=acts_ns)
         return controls
 
     def delivered(self, row: int, down_ns: int, sent_ns: int) -> None:
@@ -242,7 +242,8 @@ class PredictingStreamedLoop:
             if own is not None and found is not None:
                 acts_ns, assumed_s, states = found
                 command = command_at(states, own, row, acts_ns, blends[row], nominal_m_s, opening)
-                control = controls[row]._replace(used_ns=self._prediction.used_ns(row), assumed_s=assumed_s)
+                used_ns = self._prediction.used_ns(row)
+                control = controls[row]._replace(used_ns=used_ns, assumed_s=assumed_s, acts_ns=acts_ns)
                 controls[row] = self._streamed.opened(row, control, command, opening)
         return controls
 

@@ -94,7 +94,7 @@ TICK = np.dtype(
         ("repeated_s", "<f8"),  # how long set-points have repeated one state because telemetry is slower
         ("assumed_delay_s", "<f8"),  # loop delay over which the vehicle was predicted; 0 without prediction
         ("delay_margin_s", "<f8"),  # longest delay that the gains flown tolerate, as known then; infinite: any
-        ("headroom", "<f8"),  # 1 - loop delay / margin; with prediction 1 - mismatch / distance to the window's end
+        ("headroom", "<f8"),  # 1 - loop delay / margin; predicted: 1 - mismatch of set-point / distance to window's end
         ("rtt_s", "<f8"),  # a completed TIMESYNC round trip that is in no earlier row; NaN if there is none
         ("clock_offset_s", "<f8"),  # vehicle's boot clock minus station clock, at sent_ns
         ("clock_offset_bound_s", "<f8"),  # largest error of clock_offset_s

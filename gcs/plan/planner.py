@@ -59,7 +59,7 @@ _MARGINS_AROUND_LOSS_S = 0.1, 30.0
 """Least and largest delay margin of the gains flown around a lost vehicle."""
 
 _SHOWN_S = (0.1, 0.3, 0.6, 1.0, 1.5, 3.0)
-"""Assumed delays whose windows a design shows."""
+"""Assumed delays whose windows a design shows, if they tolerate a control period of mismatch."""
 _MORE = 1.1
 """A design whose margin falls short at these rates is repeated for a margin larger by this times the shortfall."""
 
@@ -154,7 +154,10 @@ def _prediction(plan: FlightPlan) -> PredictionPart:
     """The mismatch windows of the fastest gains. Also computes the plan's tolerance, which no tick can wait for."""
     assumed_s = plan.assumed_s
     plan.tolerance(assumed_s or 0.0)
-    found = {at_s: _window_at(plan, at_s) for at_s in sorted({assumed_s or _SHOWN_S[0], *_SHOWN_S})}
+    # gains chosen for a short delay tolerate next to nothing over a long one, where the continuous model takes seconds
+    flown = plan.predicted(plan.gain)
+    fits = [at_s for at_s in _SHOWN_S if window(flown, at_s)[1] > at_s + plan.timing.held_s]
+    found = {at_s: _window_at(plan, at_s) for at_s in sorted({assumed_s or _SHOWN_S[0], *fits})}
     own = dict.fromkeys(WindowAt.model_fields) if assumed_s is None else found[assumed_s].model_dump()
     return PredictionPart.model_validate(own | {"windows": tuple(found.values()), "assumes": assumption(plan.scenario)})
 

@@ -77,7 +77,9 @@ def tick_rows(tick: Tick, sent_ns: int) -> tuple[TickArray, list[float]]:
             offset_s, bound_s = estimate.offset_at_ns(sent_ns) * 1e-9, estimate.bound_at_ns(sent_ns) * 1e-9
         loop_s = loop_delay_s(control.used_ns, sent_ns, down_s, repeated_s)
         margin_s = tolerated.longer_s[monitored.gain_set]
-        used_s = tolerated.used_s(monitored.gain_set, loop_s - control.assumed_s)
+        # the age of a state is known, so only a set-point that acts at another instant than assumed is a mismatch
+        mismatch_s = (sent_ns - control.acts_ns) * 1e-9 + down_s if control.acts_ns > 0 else loop_s
+        used_s = tolerated.used_s(monitored.gain_set, mismatch_s)
         every_used_s.append(used_s)
         packed.append(
             _ROW.pack(

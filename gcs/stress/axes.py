@@ -16,12 +16,13 @@ import numpy as np
 
 from gcs.errors import InputError
 from scenarios.keys.link import Jitter, Link, VehicleLinks
+from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import Scenario
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One quantity that varies. `name` is "delay", "jitter", "loss", "rate", or "delay_<system id>"."""
+    """One quantity that varies. `name` is "delay", "jitter", "loss", "rate", "prediction", or "delay_<system id>"."""
 
     name: str
     values: tuple[float, ...]
@@ -33,16 +34,24 @@ class Axis:
         return _LABELS[self.name]
 
 
+PREDICTION = "prediction"
 _LABELS = {
     "delay": "link delay, up + down [s]",
     "jitter": "link jitter, each way [s]",
     "loss": "loss of datagrams, each way",
     "rate": "control and telemetry rate [Hz]",
+    PREDICTION: "assumed loop delay [s], 0 without prediction",
 }
 _FORM = "FROM:TO:N"
 _MOST = 10_000
 """Most values of an axis."""
-_RANGES = {"delay": (0.0, 60.0), "jitter": (0.0, 10.0), "loss": (0.0, 1.0), "rate": (1.0, 500.0)}
+_RANGES = {
+    "delay": (0.0, 60.0),
+    "jitter": (0.0, 10.0),
+    "loss": (0.0, 1.0),
+    "rate": (1.0, 500.0),
+    PREDICTION: (0.0, PREDICTION_MAX_S),
+}
 
 
 def parse_axis(option: str, text: str, system_ids: tuple[int, ...] = ()) -> Axis:
@@ -84,6 +93,11 @@ def at_coordinates(scenario: Scenario, coordinates: dict[str, float]) -> Scenari
     """
     if "rate" in coordinates:
         scenario = _with_rate(scenario, coordinates["rate"])
+    if PREDICTION in coordinates:
+        prediction = coordinates[PREDICTION] or "off"
+        scenario = scenario.model_copy(
+            update={"control": scenario.control.model_copy(update={"prediction": prediction})}
+        )
     if "delay" in coordinates:
         up_s, down_s = split_delay(coordinates["delay"], 1.0 / scenario.rates.control_hz)
         scenario = scenario.with_link_delay(up_s=up_s, down_s=down_s)

@@ -17,7 +17,7 @@ from gains.performance.response import formation_loop
 from gains.sampled.coupled_block import unlike_blocks
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
-from gcs.stress.axes import Axis, at_coordinates, every_link
+from gcs.stress.axes import PREDICTION, Axis, at_coordinates, every_link
 from gcs.stress.figures import MEASURED
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, plan_loops
@@ -33,20 +33,63 @@ def map_figure(
 ) -> Path | None:
     """Measured growth over two axes, averaged over the seeds, with the measured and the predicted boundaries.
 
-    The mark of each cell shows the worst verdict of its flights in `verdicts`.
+    The mark of each cell shows the worst verdict of its flights in `verdicts`. A third axis, the assumed delay of a
+    station that predicts, makes a map of each of its values, side by side in the same colours.
     """
-    axes = [replace(axis, values=tuple(sorted(axis.values))) for axis in axes]
-    measured = _cells(axes, outcomes, "growth_1_s")
-    predicted = _cells(axes, outcomes, "predicted_growth_1_s")
-    if not np.isfinite(measured).any():
+    shown = [replace(axis, values=tuple(sorted(axis.values))) for axis in axes if axis.name != PREDICTION]
+    maps = [
+        (_predicting(study, at), _without(at, outcomes), _without(at, verdicts))
+        for at in next((axis.values for axis in axes if axis.name == PREDICTION), (None,))
+    ]
+    growth = [_cells(shown, own, "growth_1_s") for _, own, _ in maps]
+    if not np.isfinite(growth).any():
         return None
+    figure, plots = figure_of(1, (9.0 if len(maps) == 1 else 7.0 * len(maps), 6.2), columns=len(maps))
+    reach = max(1e-6, min(float(np.nanmax(np.abs(growth))), 1.0))
+    colors = None
+    for plot, (own_study, own, own_verdicts), measured in zip(np.ravel(plots), maps, growth, strict=True):
+        colors = _draw_map(plot, own_study, shown, own, measured, reach)
+        _mark(plot, shown, own_verdicts, dark=np.abs(measured) > 0.6 * reach, decays=measured < 0.0)
+        if len(maps) > 1:
+            assumed_s = own_study.plan.assumed_s
+            plot.set_title("without prediction" if assumed_s is None else f"predicted over {assumed_s:g} s")
+    figure.colorbar(colors, ax=plots, label="growth of small errors [1/s]: red grows, blue dies away", extend="both")
+    entries = [entry for plot in np.ravel(plots) for entry in zip(*plot.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in entries}
+    figure.legend(handles.values(), handles.keys(), loc="outside upper left", ncols=2, frameon=False, fontsize=9)
+    return saved(figure, file)
+
+
+def _predicting(study: Study, assumed_s: float | None) -> Study:
+    """The study of a station that predicts over this delay, 0 for one that does not; None leaves it as it is."""
+    if assumed_s is None:
+        return study
+    return replace(
+        study, plan=replace(study.plan, scenario=at_coordinates(study.plan.scenario, {PREDICTION: assumed_s}))
+    )
+
+
+def _without(assumed_s: float | None, outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """The outcomes at this assumed delay, which is left out of their coordinates."""
+    if assumed_s is None:
+        return list(outcomes)
+    others = [{name: at for name, at in own.coordinates.items() if name != PREDICTION} for own in outcomes]
+    return [
+        replace(own, coordinates=rest)
+        for own, rest in zip(outcomes, others, strict=True)
+        if own.coordinates[PREDICTION] == assumed_s
+    ]
+
+
+def _draw_map(
+    plot: Any, study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome], measured: FloatArray, reach: float
+) -> Any:
+    """Draw the cells and the boundaries of one map; returns what its colours mean."""
+    predicted = _cells(axes, outcomes, "predicted_growth_1_s")
     across, up = (np.array(axis.values) for axis in axes)
-    figure, (plot,) = figure_of(1, (9.0, 6.2))
-    reach = max(1e-6, min(float(np.nanmax(np.abs(measured))), 1.0))
     plot.set_facecolor(_BLANK)
     plot.grid(visible=False)
     colors = plot.pcolormesh(cell_edges(across), cell_edges(up), measured.T, cmap="RdBu_r", vmin=-reach, vmax=reach)
-    figure.colorbar(colors, ax=plot, label="growth of small errors [1/s]: red grows, blue dies away", extend="both")
     for values, color, dashes, label in (
         (measured, MEASURED, "solid", "boundary in flight"),
         (predicted, _PREDICTED, "dashed", "predicted: sampled model at the loop delay of each flight"),
@@ -60,16 +103,13 @@ def map_figure(
     if line is not None:
         label = "guaranteed to the left, however the delay varies"
         plot.plot(*line.T, color=_GUARANTEED, linestyle="dashdot", linewidth=2.0, label=label)
-    _mark(plot, axes, verdicts, dark=np.abs(measured) > 0.6 * reach, decays=measured < 0.0)
     if np.isnan(measured).any():
         plot.plot([], [], "s", color=_BLANK, markersize=9, label="no growth rate could be measured")
     plot.set(xlabel=axes[0].label, ylabel=axes[1].label, xlim=cell_edges(across)[[0, -1]], ylim=cell_edges(up)[[0, -1]])
     for axis, values in ((plot.xaxis, across), (plot.yaxis, up)):
         flown = values[:: 1 + (values.size - 1) // _MOST_TICKS].tolist()
         axis.set_ticks(flown, [f"{value:g}" for value in flown])
-    handles = dict(zip(*reversed(plot.get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside upper left", ncols=2, frameon=False, fontsize=9)
-    return saved(figure, file)
+    return colors
 
 
 def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:

@@ -225,7 +225,7 @@ def write_report(folder: Path, result: CampaignResult, *, study: Study, axes: Se
         figures: dict[str, tuple[str, Path | None]] = {"growth": ("Growth of errors against delay", growth)}
         if len(axes) == 1 and not fitted:
             figures["axis"] = ("Growth of errors", axis_figure(folder / "axis.png", axis=axes[0], outcomes=points))
-        if len(axes) == 2:
+        if len(axes) > 1:
             map_ = map_figure(folder / "map.png", study=study, axes=axes, outcomes=points, verdicts=own or points)
             figures["map"] = ("Map", map_)
         figures["worst"] = ("The worst flights", worst_figure(folder / "worst.png", everything))

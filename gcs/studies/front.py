@@ -1,13 +1,25 @@
-"""`gcs design --front` and `--at`: what can be had at a loop delay, by every route, with and without prediction."""
+"""`gcs design --front` and `--at`: what can be had at a loop delay, by every route, with and without prediction.
+
+`--compare-prediction`: the loop delay that gains take with prediction, against any without it. Slow gains take a long
+delay, so delays are compared at equal decay and string peak: the longest at which any static gains decay as fast as
+those of the scenario do with prediction, and the longest over which a station can predict with these, stable at every
+constant delay within a share of it.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
+from math import sqrt
 from pathlib import Path
 from typing import Any, Literal
 
 from gains.core.requirement import plain
+from gains.design.for_delay import fastest_at_delay
 from gains.design.front import AIMS, Aim, FrontPoint, FrontSearch, Method, Refusal, Route, efficient
+from gains.performance.scalar_gains import PAIR, ScalarGains
+from gains.sampled.multirate import Timing
+from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 from gcs.errors import InputError
+from gcs.plan.design import Design
 from gcs.plan.flight_plan import loop_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.given import with_gain, with_given
@@ -15,6 +27,8 @@ from gcs.plan.planner import pattern_of
 from gcs.published import Published
 from gcs.stress.campaign import local_workers
 from gcs.views.page import figure_of, saved
+from gcs.watch.for_link import evaluated
+from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import FixedGains, Scenario
 
 METHODS: tuple[Method, ...] = ("inclusion", "graph-lqr")
@@ -22,6 +36,11 @@ DELAYS_S = 0.1, 0.3, 0.6, 1.5
 MOST_VEHICLES = 12
 """The figures are those of the whole formation; of larger ones they take minutes."""
 Prediction = Literal["on", "off"]
+TOLERATED = 0.2, 0.1, 0.05, 0.03
+"""Shares of the delay by which a comparison asks the true delay to differ from the assumed one."""
+_STEPS = 12
+# k2 as a share of k1, in gains without prediction
+_FRONT_SHARE = 0.2
 _COLOURS = {"inclusion": "#1f4e79", "graph-lqr": "#c1440e"}
 _FIGURES = {
     "alpha": "α of the whole formation, 1/s",
@@ -154,6 +173,64 @@ def fields_of(found: FrontPoint | Refusal) -> PointFields:
     if isinstance(found, Refusal):
         return PointFields.model_validate(named | {"refused": found.reason})
     return PointFields.model_validate(named | plain({k: v for k, v in vars(found).items() if k in _OF_POINT}))
+
+
+class Compared(Published):
+    """One way to take a loop delay, with its figures there; both ways decay alike."""
+
+    prediction: bool
+    tolerated: float | None = None
+    loop_delay_s: float
+    ratio: float
+    stable_s: tuple[float, float]
+    decay_rate_1_s: float
+    string_peak: float
+    alpha: float
+    spacing_gain_s2: float
+    noise_gain: float
+
+
+class Comparison(Published):
+    """What the prediction of a scenario's gains is worth, and what it costs."""
+
+    scenario: str
+    ways: tuple[Compared, ...]
+
+
+def compared(design: Design, name: str) -> Comparison:
+    """The comparison for the gains of a design. Raises InputError if it is not one by inclusion of stable gains."""
+    if design.inclusion_gains is None or design.loop != "ground" or design.response is not None:
+        raise InputError(
+            f"{name}: read another design, wanted one by inclusion, loop ground, of vehicles without a lag"
+        )
+    own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
+    period_s, gains = design.period_s, ScalarGains(-own, front, spacing, 0.0)
+    loop = PAIR.A, PAIR.B, gains.K, Timing(period_s, period_s)
+    wanted_1_s = -predicted_growth_rate(*loop, assumed_s=period_s, delay_s=period_s)
+    late_s = (2.0 - sqrt(2.0)) / wanted_1_s - period_s / 2.0
+    if not (wanted_1_s > 0.0 and late_s > 0.0):
+        raise InputError(f"{name}: read gains that decay at {wanted_1_s:.3g} 1/s, wanted slower ones that are stable")
+
+    def takes(assumed_s: float, share: float) -> bool:
+        least_s, most_s = mismatch_window(*loop, assumed_s=assumed_s)
+        return (least_s <= (1.0 - share) * assumed_s or least_s == 0.0) and most_s >= (1.0 + share) * assumed_s
+
+    def way(own: ScalarGains, delay_s: float, share: float | None = None) -> Compared:
+        assumed_s = None if share is None else delay_s
+        figures = evaluated(own, period_s, assumed_s, (delay_s, delay_s)).model_dump()
+        shown = {name: figures[name] for name in Compared.model_fields if name in figures}
+        return Compared(**shown, tolerated=share, loop_delay_s=delay_s, ratio=delay_s / late_s)
+
+    k1, k3 = fastest_at_delay(late_s + period_s / 2.0)  # no static gains decay faster
+    ways = [way(ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0), late_s)]
+    for share in TOLERATED:
+        longest_s, beyond_s = 0.0, PREDICTION_MAX_S
+        for _ in range(_STEPS):
+            middle_s = (longest_s + beyond_s) / 2.0
+            longest_s, beyond_s = (middle_s, beyond_s) if takes(middle_s, share) else (longest_s, middle_s)
+        if longest_s > 0.0:
+            ways.append(way(gains, longest_s, share))
+    return Comparison(scenario=name, ways=tuple(ways))
 
 
 def plot_front(found: FrontFields, figure: str, axes: Any) -> Any:

@@ -22,7 +22,6 @@ from docs.generate.runner import CommandError, Runner
 from docs.generate.sessions import Step, steps_of
 from gcs.cli.margin import margin_fields, margin_of_file, margin_of_scenario
 from gcs.drive.lockstep import START_NS, fly_lockstep
-from gcs.drive.virtual import fly_virtual
 from gcs.plan.criteria import with_bounds
 from gcs.plan.design import Design, LinkGains, LinkPart
 from gcs.plan.disturbed import with_spread
@@ -32,6 +31,7 @@ from gcs.runs.record import SCENARIO_FILE, RunWriter
 from gcs.runs.summary import finish
 from gcs.station.station import Station
 from gcs.stress.trial import Outcome
+from gcs.studies.virtual import fly_virtual
 from scenarios import files
 from scenarios.keys.criteria import Criteria
 from scenarios.keys.disturbance import Navigation

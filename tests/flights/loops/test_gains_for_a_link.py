@@ -15,8 +15,8 @@ from gcs.plan.planner import flight_plan
 from gcs.stress.axes import at_coordinates
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from gcs.studies.front import point_at
-from gcs.studies.prediction import compared
+from gcs.studies.front import compared, point_at
+from gcs.studies.virtual import fly_virtual
 from gcs.watch.before_flight import measured_now
 from gcs.watch.for_link import MeasuredDelays, best_for, evaluated
 from scenarios.errors import ScenarioError
@@ -93,6 +93,27 @@ def test_what_is_chosen_for_a_link_beats_the_default_there(chosen: tuple[Scenari
     settled = flown(at_coordinates(scenario, {"delay": 2.0 * LINK_S}))[1]
     assert settled.verdict == "stable"
     assert known(settled.headroom_min) >= part.headroom
+
+
+def test_a_flight_keeps_the_headroom_that_was_asked_for() -> None:
+    """States that come late or get lost make the loop delay longer, but their age is known: no mismatch."""
+    link = Link(delay_s=0.2, jitter=Jitter(distribution="uniform", scale_s=0.03), loss_probability=0.05)
+    control = Control(for_link="measured", string_peak_max=1.0)
+    scenario = CHAIN.model_copy(update={"links": Links(up=link, down=link), "control": control, "duration_s": 20.0})
+    flight = fly_virtual(scenario)
+    part = flight.design.for_link
+    assert part is not None
+    assert "with prediction: alpha" in part.chosen
+    assert part.headroom < known(flight.summary.headroom_min) < 0.8  # 0.60
+    assert np.nanmax(flight.loop_delay_s - flight.ticks["assumed_delay_s"]) > 0.08  # of 0.10 s tolerated
+
+
+def test_gains_for_a_short_delay_are_designed_though_a_long_one_leaves_them_nothing() -> None:
+    """Over the 20 ms of chain3 they are so fast that a prediction over 3 s would tolerate 1 ms."""
+    flight = fly_virtual(CHAIN.model_copy(update={"control": Control(for_link="measured"), "duration_s": 2.0}))
+    assert flight.summary.verdict == "stable"
+    assert flight.design.prediction is not None
+    assert [at.assumed_delay_s for at in flight.design.prediction.windows] == [0.1]
 
 
 def test_a_log_without_exchanges_is_refused(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ def test_every_column_holds_what_its_name_says() -> None:
         command_m_s2=(9.0, 10.0),
         used_ns=10 * S,
         assumed_s=0.1,
+        acts_ns=10 * S + 110_000_000,
     )
     monitored = VehicleState(mode=Mode.CAUTION, gain_set=1)
     reported = Reported(13_000, -100.0, 0.5, queue_s=0.001, received_ns=10 * S + 25_000_000, bound_s=3e-6)
@@ -68,7 +69,7 @@ def test_every_column_holds_what_its_name_says() -> None:
     for row in rows:
         found = {name: row[name].item() for name in expected}
         assert all(np.isclose(found[name], expected[name], rtol=1e-12) for name in expected), found
-    assert used_s == pytest.approx([0.045, 0.045])  # 0.03 s too short, where 0.2 s are tolerated
+    assert used_s == pytest.approx([0.045, 0.045])  # acts 0.03 s earlier than assumed, where 0.2 s are tolerated
 
 
 def test_what_is_not_known_is_not_a_number() -> None:

@@ -1,15 +1,17 @@
 """The lines over a map: where the models say the formation breaks, and where it is proved not to."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from gcs.stress.axes import Axis, at_coordinates
-from gcs.stress.boundary import cell_edges, guaranteed_line, two_delays_lines
+from gcs.stress.boundary import cell_edges, guaranteed_line, map_figure, two_delays_lines
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
-from gcs.stress.trial import plan_loops
+from gcs.stress.trial import Outcome, plan_loops, plan_of
 from scenarios.keys.link import Jitter, Link
 from tests.support.fleets.stress_pair import SCENARIO, pair_plan
 
@@ -44,6 +46,31 @@ def test_a_predicting_station_guarantees_nothing_by_the_unpredicted_loop() -> No
     study = Study(replace(pair_plan(), scenario=SCENARIO.model_copy(update={"control": control})))
     assert guaranteed_line(study, DELAY_JITTER) is None
     assert two_delays_lines(study, (Axis("delay_1", (0.1, 0.5)), Axis("delay_2", (0.1, 0.5))), []) == []
+
+
+def test_maps_with_and_without_prediction_are_drawn_side_by_side(tmp_path: Path) -> None:
+    """One campaign flies both; every cell keeps its assumed delay, and neither map shows flights of the other."""
+    study = Study(pair_plan())
+    axes = [Axis("delay", (0.2, 0.6)), Axis("loss", (0.0, 0.2)), Axis("prediction", (0.0, 0.6))]
+    trials = study.sweep(axes, seeds=1)
+    assert len(trials) == 2 * 8  # probes and flights from the start
+    outcomes: list[Outcome] = []
+    for trial in trials:
+        at = dict(trial.coordinates)
+        assert plan_of(trial).assumed_s == (at["prediction"] or None)
+        growth = abs(at["delay"] - at["prediction"]) - 0.3
+        outcomes.append(
+            Outcome(
+                trial.id, trial.kind, 1, at, real_time=False,
+                growth_1_s=growth, predicted_growth_1_s=growth, verdict="unstable" if growth > 0.0 else "stable",
+            )
+        )  # fmt: skip
+    drawn = [
+        map_figure(tmp_path / f"{len(own[2].values)}.png", study=study, axes=own, outcomes=outcomes, verdicts=outcomes)
+        for own in (axes, [axes[0], axes[1], Axis("prediction", (0.6,))])
+    ]
+    both, one = (imread(file).shape[1] for file in drawn if file is not None)
+    assert both > 1.4 * one
 
 
 def test_two_loops_of_a_tree_break_along_a_rectangle() -> None:

@@ -17,6 +17,8 @@ from gcs.runs.record import END
 from gcs.runs.summary import summarise
 from gcs.runs.summary_record import Summary
 from gcs.station.station import Station
+from gcs.watch.before_flight import measured_now
+from gcs.watch.for_link import best_for
 from scenarios.files import load
 from scenarios.own_code import refusal
 from scenarios.schema import Scenario
@@ -132,7 +134,13 @@ def fly_virtual(
     if not allow_code and (refused := refusal(scenario, Path(scenario.name))):
         raise InputError(refused)
     _refuse(scenario, bad_start(scenario) or endless_link(scenario))
+    measured = None
+    if scenario.control.for_link == "measured":
+        delays = measured_now(scenario, None, start_vehicles=False, key_file=None, shown=False)
+        scenario, measured = best_for(scenario, delays)
     design, plan = flight_plan(scenario)
+    if measured is not None:
+        design = design.model_copy(update={"for_link": measured})
     if (unstable := unstable_loop(plan)) is not None:
         _refuse(scenario, None if allow_unstable else unstable)
         plan = without_actions(plan)

@@ -10,14 +10,17 @@ from gcs.errors import InputError
 from gcs.runs.files import read_ticks
 from scenarios.errors import ScenarioError
 from scenarios.files import dump, load
-from scenarios.schema import FixedGains
+from scenarios.schema import Control, FixedGains
 from tests.support.paths import SCENARIOS
 
 
-def test_python_and_the_command_fly_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("control", [Control(), Control(for_link="measured")])
+def test_python_and_the_command_fly_the_same_bits(
+    control: Control, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from gcs.cli.main import main
 
-    scenario = load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0})
+    scenario = load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0, "control": control})
     flight = gcs.fly_virtual(scenario)
     file = tmp_path / "chain3.toml"
     file.write_text(dump(scenario))
@@ -26,6 +29,7 @@ def test_python_and_the_command_fly_the_same_bits(tmp_path: Path, monkeypatch: p
         main()
     assert flight.ticks.tobytes() == read_ticks(tmp_path / "run").tobytes()
     assert flight.table().num_rows == flight.ticks.size
+    assert (flight.design.for_link is None) == (control.for_link == "off")
 
 
 def test_the_tutorial_names_every_array() -> None:
