@@ -5,7 +5,7 @@ import pytest
 
 from gains.core._bracketing import highest
 from gains.core.structure import is_singular_for_any_delay
-from gains.delay._crossings import DelayedTerm, crossing_errors
+from gains.delay._crossings import DelayedTerm, crossing_errors, nearly_null
 from gains.delay._mixed import count_unstable_roots
 from gains.delay._windows import ZeroPassage, zero_passage
 from gains.delay.constant import delay_margin
@@ -30,6 +30,19 @@ def test_a_pair_of_roots_is_unstable_beyond_the_margin() -> None:
 def test_a_simple_crossing_is_known_to_rounding() -> None:
     [(_, delay_error_s)] = crossing_errors([DelayedTerm(np.array([[-1.0]]), 0.0, 1)], [(1.0, np.pi / 2.0)])
     assert 0.0 < delay_error_s < 1e-14
+
+
+@pytest.mark.parametrize("together", [1, 2])
+def test_vectors_of_a_nearly_singular_matrix_are_those_of_its_decomposition(together: int) -> None:
+    rng = np.random.default_rng(1)
+    parts = rng.normal(size=(2, 30, 30)) + 1j * rng.normal(size=(2, 30, 30))
+    U, Vh = (np.linalg.qr(part)[0] for part in parts)
+    singular = np.append(np.linspace(1.0, 0.1, 30 - together), np.full(together, 1e-12))
+    least, left, right = nearly_null(np.array((U * singular) @ Vh, dtype=np.complex128), 1.0)
+    assert least == pytest.approx(1e-12, rel=1e-2)
+    # the border moves the vectors by the least singular value over the gap of 0.1
+    assert left @ left.conj().T == pytest.approx(U[:, -together:] @ U[:, -together:].conj().T, abs=1e-10)
+    assert right @ right.conj().T == pytest.approx(Vh[-together:].conj().T @ Vh[-together:], abs=1e-10)
 
 
 def test_a_root_passes_the_one_at_zero_once() -> None:
