@@ -146,7 +146,7 @@ def _disturbance() -> Iterator[Claim]:
         "(3.20)-(3.24)", "disturbance w: stable under every |w| ≤ α |e| of a follower and the vehicle in front",
         f"{ALPHA}, not flown",
         f"the worst w makes the formation unstable from {onset.onset_1_s:.4f} 1/s on in flight, at "
-        f"{1e3 * delay_s:.0f} ms of loop delay",
+        f"{1e3 * delay_s:.0f} ms of loop delay: `gcs stress SCENARIO --disturbance --onset`",
         f"complex stability radius of the sampled loop {onset.radius_1_s:.4f} 1/s", "agrees",
     )  # fmt: skip
 
