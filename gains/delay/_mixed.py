@@ -170,9 +170,10 @@ def _unstable_roots(parts: _Parts, at_zero: bool, beside: Sequence[float] = ()) 
     """
     highest = parts.highest()
     hurwitz = np.linalg.eigvals(parts.matrices.sum(axis=0))
-    if at_zero and highest <= _SYMMETRIC * float(parts.norms.sum()):  # no delay: all roots are real, one of them zero
-        others = np.arange(hurwitz.size) != np.argmin(np.abs(hurwitz))
-        return int(np.count_nonzero(hurwitz[others].real > 0.0))
+    zero = _SYMMETRIC * float(parts.norms.sum())
+    if highest <= zero:  # no delay: all roots are real
+        others = np.arange(hurwitz.size) != np.argmin(np.abs(hurwitz)) if at_zero else slice(None)
+        return int(np.count_nonzero(hurwitz[others].real > zero))
     hurwitz = hurwitz - max(0.0, float(hurwitz.real.max()) + _SHIFT * (highest + float(np.abs(hurwitz).max())))
     # M(j omega) = M(0) (I + E) with the norm of E below 1 / 4n: nothing turns there
     slowest = float(np.linalg.svd(parts.matrices.sum(axis=0), compute_uv=False)[-1])
