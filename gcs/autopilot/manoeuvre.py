@@ -23,20 +23,27 @@ class _Sample(NamedTuple):
 
 
 class Identification:
-    """Collects the vehicles' velocities during the manoeuvre, then computes the result in steps, one per tick."""
+    """Collects the vehicles' velocities during the manoeuvre, then computes the result in steps, one per tick.
+
+    A manoeuvre that a vehicle did not follow is flown once more: a gust may have passed, or a simulator have stalled.
+    """
 
     def __init__(self, plan: FlightPlan, vehicles: Sequence[RemoteVehicle], report: Report) -> None:
         self._plan = plan
         self._vehicles = vehicles
         self._report = report
         self._amplitude_m_s2 = identify.amplitude_m_s2(plan.scenario.limits.acceleration_max_m_s2)
+        self._is_repeated = False
+        self._begin()
+
+    def _begin(self) -> None:
         self._begin_ns: int | None = None
         self._commands: list[tuple[int, float]] = []
         """Instant (ns) and acceleration north (m/s²) of each command."""
-        self._downs_ns: list[list[int]] = [[] for _ in vehicles]
+        self._downs_ns: list[list[int]] = [[] for _ in self._vehicles]
         """How long commands took to each vehicle."""
-        self._samples: list[list[_Sample]] = [[] for _ in vehicles]
-        self._jumps = [vehicle.clock.jumps for vehicle in vehicles]
+        self._samples: list[list[_Sample]] = [[] for _ in self._vehicles]
+        self._jumps = [vehicle.clock.jumps for vehicle in self._vehicles]
         self._steps = self._result()
 
     def command(self, due_ns: int) -> tuple[float, float]:
@@ -66,6 +73,13 @@ class Identification:
         found: dict[int, Identified] = {}
         for row, vehicle in enumerate(self._vehicles):
             seen = yield from identify.identify(self._flown(row))
+            if seen is not None and seen.misfit > identify.MISFIT_MAX and not self._is_repeated:
+                text = f"{seen.misfit:.0%} of its velocity is unexplained: the manoeuvre is flown once more"
+                self._report("response", text, vehicle.system_id)
+                self._is_repeated = True
+                self._begin()
+                yield None
+                return
             if seen is None or seen.misfit > identify.MISFIT_MAX:
                 yield f"not identified: vehicle {vehicle.system_id} {self._why_not(row, seen)}"
                 return

@@ -195,6 +195,27 @@ def test_a_clock_jump_in_the_manoeuvre_leaves_the_same_response(by_s: float) -> 
         assert found.velocity_gain_1_s == pytest.approx(TRUTH.velocity_gain_1_s, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("again", "end"), [(False, "completed: duration reached"), (True, "not identified: vehicle 3 ")]
+)
+def test_a_disturbed_manoeuvre_is_flown_once_more(again: bool, end: str) -> None:
+    # set-points that are lost for a second, in the first manoeuvre or in both
+    times_s = (13.5, 20.8) if again else (13.5,)
+    silent = Link(delay_s=0.02, outages=tuple(Outage(from_s=s, until_s=s + 1.5) for s in times_s))
+    links = COPTERS5.links.model_copy(
+        update={"vehicles": (VehicleLinks(system_id=3, down=silent),), "times_from": "start"}
+    )
+    flight = fly(plan_for(three(duration_s=10.0).model_copy(update={"links": links})))
+    repeated = [event for event in flight.events if event.text.endswith("the manoeuvre is flown once more")]
+    assert [event.system_id for event in repeated] == [3]
+    assert flight.station.end_reason.startswith(end)
+    responses = flight.station.plan.responses
+    assert again == (responses is None)
+    if responses is not None:
+        assert responses.of[3].lag_s == pytest.approx(TRUTH.lag_s, rel=0.02)
+        assert max(float(flight.error_m(k)[-1]) for k in (2, 3)) < 0.17
+
+
 def test_clocks_that_drift_by_500_ppm_change_nothing() -> None:
     drifting = COPTERS5.clocks.model_copy(update={"drift_max_ppm": 500.0})
     flight = fly(plan_for(three().model_copy(update={"clocks": drifting})))
