@@ -150,7 +150,7 @@ def stress(
     raise typer.Exit(0 if result.passed else FAILED)
 
 
-def _refuse_axes(given: "list[tuple[str, str]]", prediction: str, *, searches: bool) -> None:
+def _refuse_axes(given: list[tuple[str, str]], prediction: str, *, searches: bool) -> None:
     if not (given or searches):
         raise InputError("nothing to fly; wanted --onset, or an axis such as --delay 0:0.6:13")
     if len(given) > 2:
