@@ -6,9 +6,10 @@ The loop is sampled and held (`gains.sampled.constant`), with everything that pu
     u_k = K (x_k + M (ν_k + b_k))                              what the station knows is wrong by noise and bias
     b_{k+1} = e^{−T/τ_b} b_k + white noise
 
-ν is white, b has the correlation time τ_b, and M takes errors of positions and velocities to those of e. All vehicles
-sample at one instant; where they do not, a station that interpolates between two reports averages their white noise. A
-station that predicts feeds back the state that it expects at the loop delay it assumes, from its own commands.
+ν is white, b has the correlation time τ_b, and M takes errors of positions and velocities to those of e. Vehicles may
+sample at different instants: the station then interpolates between two reports of another vehicle, which averages their
+noise, and ν_{k−1} is one more state. A station that predicts feeds back the state that it expects at the loop delay it
+assumes, from its own commands; it starts from the newest report of each vehicle and interpolates nothing.
 
 With the gust among the states and late commands beside them, one period is s_{k+1} = F s_k + noise of covariance Q, and
 the stationary covariance is P = F P F' + Q, which doubling solves: P = Q + F Q F' + F² Q F²' + ... A steady wind adds a
@@ -24,7 +25,15 @@ import numpy as np
 from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import BadModelError
 from gains.formation.model import FormationModel
-from gains.sampled._loop import HeldPlant, held_entry, matrix_exponentials, radius_of, rate_of, settled_covariance
+from gains.sampled._loop import (
+    HeldPlant,
+    held_entry,
+    lifted_map,
+    matrix_exponentials,
+    radius_of,
+    rate_of,
+    settled_covariance,
+)
 from gains.sampled.multirate import Predictor, Timing, multirate_map
 
 
@@ -78,7 +87,8 @@ class DisturbedFormation:
     B: FloatArray
     K: FloatArray
     period_s: float
-    delay_s: float
+    delay_s: float | FloatArray
+    """Loop delay, s: of all vehicles, or of each (vehicles,). With prediction: of all."""
     gusts: Gusts | None = None
     sensing: Sensing = Sensing()
     wind_m_s2: FloatArray | None = None
@@ -87,15 +97,19 @@ class DisturbedFormation:
     pushed: FloatArray | None = None
     """What accelerations from outside do to the rates of all states, (n, inputs), as of
     `gains.performance.response.pushed_states`; None where there are no further states."""
+    older: FloatArray | None = None
+    """(2, vehicles, vehicles): the share of the report before the newest in the position, and in the velocity, of
+    vehicle k as known at the instant of vehicle i's newest state. None if all vehicles sample at one instant."""
 
     def spread(self) -> Spread:
         """The stationary spread. Raises BadModelError if the loop is not stable."""
-        F, Q, entry, seen = self._lifted
+        F, Q, entry, seen, noise = self._lifted
         covariance = settled_covariance(F, Q)
         if covariance is None:
-            raise BadModelError(f"the loop is not stable at {self.delay_s:g} s of loop delay; wanted a stable one")
+            slowest_s = np.max(self.delay_s)
+            raise BadModelError(f"the loop is not stable at {slowest_s:g} s of loop delay; wanted a stable one")
         n = self.model.states
-        reported = np.diag(seen @ covariance @ seen.T) + np.diag(self._noise @ self._noise.T)
+        reported = np.diag(seen @ covariance @ seen.T) + np.diag(noise @ noise.T)
         mean = np.linalg.solve(np.eye(len(F)) - F, entry)[:n].astype(np.float64) if entry.any() else np.zeros(n)
         return Spread(mean, np.sqrt(np.maximum(np.diag(covariance)[:n], 0.0)), np.sqrt(reported))
 
@@ -114,7 +128,7 @@ class DisturbedFormation:
         G(z) is what late and held commands do; its size is that of the states, the gusts among them.
         """
         T, size = self.period_s, len(self._pushed.A)
-        Phi, acts = self._pushed.transition(np.array([T]))[0][0], held_entry(self._pushed, z, self.delay_s)
+        Phi, acts = self._pushed.transition(np.array([T]))[0][0], held_entry(self._pushed, z, self._late_s)
         reach, held = self._expected
         back = sum((hold * z ** (-age) for age, hold in held.items()), np.zeros_like(self.B) + 0j * z)
         command = np.linalg.inv(np.eye(self.B.shape[1]) - self.K @ back) @ self.K @ reach
@@ -197,13 +211,24 @@ class DisturbedFormation:
         return plant.transition(np.array([self.assumed_s]))[0][0], held
 
     @cached_property
-    def _lifted(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """F and Q of s = (x, w, u_{k−1}, ..., b), what a steady wind adds in a period, and e as reported."""
+    def _lifted(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """F and Q of s = (x, w, u_{k−1}, ..., ν_{k−1}, b), what a steady wind adds in a period, and e as reported.
+
+        The errors reported are those of s by the fourth matrix, and of ν_k by the fifth.
+        """
         T, model, n = self.period_s, self.model, len(self.A)
-        step = self._stepped(self.K)
+        step, calm = self._stepped(self.K), self._stepped(np.zeros_like(self.K))
         # what a wrong e does in a period
-        wrong = (step - self._stepped(np.zeros_like(self.K)))[:, : model.states]
-        told, seen = wrong @ self._noise, np.eye(model.states, len(step))
+        wrong = (step - calm)[:, : model.states]
+        told, seen, noise = wrong @ self._noise, np.eye(model.states, len(step)), self._noise
+        if self.older is not None and noise.any():
+            u_before, e_before = self._of_older(self.older)
+            commands = (self._stepped(np.eye(*self.K.shape)) - calm)[:, : model.inputs]
+            before = commands @ u_before if self.assumed_s is None else np.zeros_like(told)
+            kept = np.eye(noise.shape[1])
+            told, noise, seen = np.vstack([told - before, kept]), noise - e_before, np.hstack([seen, e_before])
+            step = np.block([[step, before], [np.zeros((len(kept), step.shape[1])), 0.0 * kept]])
+            wrong = np.vstack([wrong, np.zeros((len(kept), model.states))])
         added = told @ told.T
         added[: len(self._push_covariance), : len(self._push_covariance)] += self._push_covariance
         if self._bias.any():
@@ -217,15 +242,31 @@ class DisturbedFormation:
             acts = self._acts
             hold = HeldPlant(self.A, acts, acts.T, T).transition(np.array([T]))[1][0]
             steady[:n] = hold @ np.tile(self.wind_m_s2, model.vehicles)
-        return step, added, steady, seen
+        return step, added, steady, seen, noise
+
+    def _of_older(self, share: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What the noise of the reports before the newest does to the commands, and to e as reported."""
+        model, commands, errors = self.model, np.zeros((self.model.inputs, self._noise.shape[1])), 0.0 * self._noise
+        for i in range(model.vehicles):
+            seen = self._noise * np.repeat(share[:, i].ravel(), model.axes)
+            rows = model.input_slice(i)
+            commands[rows] = self.K[rows, : model.states] @ seen
+            for own in (model.velocity_slice(i), model.spacing_slice(i) if i > 0 else slice(0)):
+                errors[own] = seen[own]
+        return commands, errors
+
+    @property
+    def _late_s(self) -> float | FloatArray:
+        """The loop delay of all inputs, or of each."""
+        return np.repeat(self.delay_s, self.model.axes) if isinstance(self.delay_s, np.ndarray) else self.delay_s
 
     def _stepped(self, K: FloatArray) -> FloatArray:
         """The map of (x, w, u_{k−1}, ...) over one period with another gain; the station believes in no gusts."""
         plant = replace(self._pushed, K=np.hstack([K, np.zeros((len(K), self._entry.shape[1]))]))
-        predictor = None
-        if self.assumed_s is not None:
-            calm = np.zeros_like(plant.A)
-            calm[: len(self.A), : len(self.A)] = self.A
-            predictor = Predictor(replace(plant, A=calm), self.assumed_s)
+        if self.assumed_s is None:
+            return lifted_map(plant, self._late_s)
+        calm = np.zeros_like(plant.A)
+        calm[: len(self.A), : len(self.A)] = self.A
+        predictor = Predictor(replace(plant, A=calm), self.assumed_s)
         timing = Timing(self.period_s, self.period_s)
-        return multirate_map(plant, timing, delay_s=self.delay_s, predictor=predictor)
+        return multirate_map(plant, timing, delay_s=float(self.delay_s), predictor=predictor)

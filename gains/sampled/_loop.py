@@ -144,11 +144,24 @@ def rate_of(radius: float, period_s: float) -> float:
     return float(np.log(radius)) / period_s if radius > 0.0 else -inf
 
 
-def held_entry(plant: SampledPlant, z: ComplexArray, delay_s: float) -> ComplexArray:
-    """(G0 z + G1) z^{-q-1}, (k, n, r) at points z (k, 1, 1): what commands that are held and late do to the state."""
-    whole, rest_s = split_delay(delay_s, plant.period_s)
-    G, newer = plant.transition(np.array([plant.period_s, plant.period_s - rest_s]))[1]
-    return (newer * (z - 1.0) + G) * z ** (-whole - 1)
+def held_entry(plant: SampledPlant, z: ComplexArray, delay_s: float | FloatArray) -> ComplexArray:
+    """(G0 z + G1) z^{-q-1}, (k, n, r) at points z (k, 1, 1): what commands that are held and late do to the state.
+
+    The delay is that of all inputs, or of each (r,).
+    """
+    entry = np.zeros_like(plant.B) + 0j * z
+    for own_s, of_own in _inputs_by_delay(delay_s, plant.B.shape[1]):
+        whole, rest_s = split_delay(own_s, plant.period_s)
+        G, newer = plant.transition(np.array([plant.period_s, plant.period_s - rest_s]))[1]
+        entry += (newer * (z - 1.0) + G) * z ** (-whole - 1) * of_own
+    return entry
+
+
+def _inputs_by_delay(delay_s: float | FloatArray, inputs: int) -> list[tuple[float, FloatArray]]:
+    """Each delay there is, with ones (r,) at the inputs that have it."""
+    if isinstance(delay_s, np.ndarray):
+        return [(own_s, np.equal(delay_s, own_s).astype(np.float64)) for own_s in np.unique(delay_s).tolist()]
+    return [(delay_s, np.ones(inputs))]
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
@@ -161,23 +174,26 @@ def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
     return whole, min(max(delay_s - whole * period_s, 0.0), period_s)
 
 
-def lifted_map(plant: SampledPlant, delay_s: float) -> FloatArray:
-    """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one period on, see `gains.sampled.constant.period_map`."""
-    whole, rest_s = split_delay(delay_s, plant.period_s)
-    Phi, G = plant.transition(np.array([plant.period_s, plant.period_s - rest_s]))
-    newer = G[1]
-    older = G[0] - G[1]
+def lifted_map(plant: SampledPlant, delay_s: float | FloatArray) -> FloatArray:
+    """The matrix that takes (x_k, u_{k-1}, ..., u_{k-s}) one period on, see `gains.sampled.constant.period_map`.
+
+    The delay is that of all inputs, or of each (r,).
+    """
     n, inputs = plant.B.shape
-    kept = whole + (1 if rest_s > 0.0 else 0)
+    splits = [(*split_delay(own_s, plant.period_s), of_own) for own_s, of_own in _inputs_by_delay(delay_s, inputs)]
+    kept = max(whole + (1 if rest_s > 0.0 else 0) for whole, rest_s, _ in splits)
+    Phi, G = plant.transition(np.array([plant.period_s, *(plant.period_s - rest_s for _, rest_s, _ in splits)]))
     lifted = np.zeros((n + kept * inputs, n + kept * inputs))
     lifted[:n, :n] = Phi[0]
-    # column block s holds u_{k-s}; u_k itself is K x_k
-    for age, gain in ((whole, newer), (whole + 1, older)):
-        if age == 0:
-            lifted[:n, :n] += gain @ plant.K
-        elif age <= kept:
-            start = n + (age - 1) * inputs
-            lifted[:n, start : start + inputs] += gain
+    for (whole, _, of_own), acted in zip(splits, G[1:], strict=True):
+        newer, older = acted * of_own, (G[0] - acted) * of_own
+        # column block s holds u_{k-s}; u_k itself is K x_k
+        for age, gain in ((whole, newer), (whole + 1, older)):
+            if age == 0:
+                lifted[:n, :n] += gain @ plant.K
+            elif age <= kept:
+                start = n + (age - 1) * inputs
+                lifted[:n, start : start + inputs] += gain
     if kept > 0:
         lifted[n : n + inputs, :n] = plant.K
         lifted[n + inputs :, n : lifted.shape[1] - inputs] = np.eye((kept - 1) * inputs)

@@ -1,10 +1,13 @@
 """How far a scenario's gusts, wind and errors of navigation spread the spacing errors, computed for a loop delay.
 
 Exact for a station that closes every loop with one rate (`gains.performance.disturbed`), with the fastest gains and
-links of one constant delay, if all vehicles sample at one instant. Where their clocks differ the station interpolates
-the state of the vehicle in front between two reports, which averages white noise: the errors reported are then up to
-13 % smaller. Not computed for the loop on board, nor for a disturbance that depends on the errors (a sector).
+links of one constant delay. Where clocks differ the station interpolates the state of the vehicle in front between two
+reports, which averages white noise. How much is known only after the flight: before it, all vehicles are taken to
+sample at one instant, and the errors reported may be up to 13 % smaller. Not computed for the loop on board, nor for a
+disturbance that depends on the errors (a sector).
 """
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,22 +33,27 @@ def with_spread(design: Design, plan: FlightPlan) -> Design:
     return design.model_copy(update={"spread": spread, "whole": _whole(design, plan, delay_s)})
 
 
-def predicted_spread(design: Design, scenario: Scenario, delay_s: float | None) -> PredictedSpread | None:
-    """The rms of each follower's spacing error; None if nothing disturbs them, or it is not known."""
+def predicted_spread(
+    design: Design, scenario: Scenario, delay_s: float | FloatArray | None, older: FloatArray | None = None
+) -> PredictedSpread | None:
+    """The rms of each follower's spacing error; None if nothing disturbs them, or it is not known.
+
+    `delay_s` and `older` are those of `gains.performance.disturbed.DisturbedFormation`.
+    """
     formation = plan_formation(scenario)
     flown = (
         None if delay_s is None or design.margin_unknown else disturbed_formation(design, scenario, formation, delay_s)
     )
     if flown is None or delay_s is None or not (decay_1_s := flown.decay_1_s()) > 0.0:
         return None
-    spread, model = flown.spread(), formation.model
+    spread, model = replace(flown, older=older).spread(), formation.model
 
     def rms_m(deviation: FloatArray, vehicle: int) -> float:
         own = model.spacing_slice(vehicle)
         return float(np.sqrt((deviation[own] ** 2 + spread.mean[own] ** 2).sum()))
 
     return PredictedSpread(
-        loop_delay_s=delay_s,
+        loop_delay_s=float(np.max(delay_s)),
         decay_rate_1_s=decay_1_s,
         vehicles=tuple(
             VehicleSpread(
@@ -59,9 +67,9 @@ def predicted_spread(design: Design, scenario: Scenario, delay_s: float | None) 
 
 
 def disturbed_formation(
-    design: Design, scenario: Scenario, formation: Formation, delay_s: float
+    design: Design, scenario: Scenario, formation: Formation, delay_s: float | FloatArray
 ) -> DisturbedFormation | None:
-    """The loop of a design at a loop delay (s), with what disturbs it."""
+    """The loop of a design at a loop delay (s), that of all vehicles or of each, with what disturbs it."""
     air, navigation, rates, control = scenario.disturbance, scenario.navigation, scenario.rates, scenario.control
     K = _gain(design, formation.model)
     if (air is None and navigation is None) or K is None or control.loop == "onboard":
@@ -74,13 +82,14 @@ def disturbed_formation(
             return None
         every = [known[system_id] for system_id in formation.system_ids]
         loop, pushed = formation_loop(formation.model, K, every), pushed_states(formation.model, every)
-    assumed_s = delay_s if control.prediction == "measured" else control.prediction
+    slowest_s = float(np.max(delay_s))
+    assumed_s = slowest_s if control.prediction == "measured" else control.prediction
     gusts = None if air is None else air.gusts
     return DisturbedFormation(
         formation.model,
         *loop,
         period_s=1.0 / rates.control_hz,
-        delay_s=delay_s,
+        delay_s=delay_s if isinstance(assumed_s, str) else slowest_s,
         gusts=None if gusts is None else Gusts(gusts.deviation_m_s2, gusts.correlation_time_s, gusts.common),
         sensing=Sensing() if navigation is None else Sensing(**navigation.model_dump()),
         wind_m_s2=None if air is None else np.array(air.wind_ne_m_s2),

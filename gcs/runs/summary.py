@@ -18,6 +18,7 @@ from gcs.errors import InputError
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design
 from gcs.plan.disturbed import predicted_spread
+from gcs.plan.formation import plan_formation
 from gcs.plan.own_law import code_records
 from gcs.runs import record
 from gcs.runs.files import RunTail, read_design, read_scenario, read_ticks
@@ -35,7 +36,7 @@ from gcs.runs.summary_record import (
     VehicleFlownSpread,
     VehicleSummary,
 )  # fmt: skip
-from scenarios.schema import Scenario
+from scenarios.schema import NS_PER_S, Scenario
 
 _SKEW_SPAN_S = 1.0
 """A clock's skew is not estimated over a shorter time than this."""
@@ -114,9 +115,12 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         if event.text == CLOCK_JUMPED:
             jumps[event.system_id].append(event.time_s)
     late = sent[sent["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0)]
-    headroom_end = min(_medians(late, "headroom"), default=None)  # of the vehicles, in the last quarter of the flight
+    headroom_end = min(
+        _medians(late, "headroom").values(), default=None
+    )  # of the vehicles, in the last quarter of the flight
     logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
-    slowest_s = max((round(delay_s, 9) for delay_s in _medians(sent, "loop_delay_s")), default=None)
+    delays_s = {system_id: round(delay_s, 9) for system_id, delay_s in _medians(sent, "loop_delay_s").items()}
+    slowest_s = max(delays_s.values(), default=None)
     return Summary(
         scenario=scenario.name,
         verdict=verdict(reason, settled, headroom_end=headroom_end, logged=logged),
@@ -130,8 +134,8 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         response=design.response,
         loop_delay_s=_spread(sent["loop_delay_s"]),
         loop_delay_bound_s=np.fmax.reduce(sent["loop_delay_bound_s"], initial=np.nan),
-        at_loop_delay=figures_at(design, scenario, None if slowest_s is None else round(slowest_s, 9)),
-        spread=_flown_spread(scenario, design, flown, slowest_s),
+        at_loop_delay=figures_at(design, scenario, slowest_s),
+        spread=_flown_spread(scenario, design, flown, delays_s),
         headroom_min=np.fmin.reduce(sent["headroom"], initial=np.nan),
         headroom_end=headroom_end,
         settling_time_s=settled,
@@ -149,10 +153,12 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
     )
 
 
-def _medians(rows: TickArray, name: str) -> list[float]:
-    """The median of a column for each vehicle that has known values in it."""
-    columns = (rows[name][rows["system_id"] == system_id] for system_id in np.unique(rows["system_id"]))
-    return [float(np.median(known)) for own in columns if (known := own[np.isfinite(own)]).size]
+def _medians(rows: TickArray, name: str) -> dict[int, float]:
+    """The median of a column for each vehicle that has known values in it, by its system id."""
+    columns = {
+        system_id: rows[name][rows["system_id"] == system_id] for system_id in np.unique(rows["system_id"]).tolist()
+    }
+    return {key: float(np.median(known)) for key, own in columns.items() if (known := own[np.isfinite(own)]).size}
 
 
 Errors = tuple[FloatArray, FloatArray]
@@ -272,20 +278,26 @@ def _clock(own: TickArray, exchanges: int, jumps_s: list[float]) -> Clock:
     )
 
 
-def _flown_spread(scenario: Scenario, design: Design, flown: TickArray, delay_s: float | None) -> FlownSpread | None:
+def _flown_spread(
+    scenario: Scenario, design: Design, flown: TickArray, delays_s: dict[int, float]
+) -> FlownSpread | None:
     """The rms of each follower's reported spacing error, from when its start and the last turn are forgotten.
 
     None if nothing disturbs the vehicles, nothing can be computed, or the flight ended before that.
     """
-    if scenario.disturbance is None and scenario.navigation is None:
+    if (scenario.disturbance is None and scenario.navigation is None) or not delays_s:
         return None
+    slowest_s, ids = max(delays_s.values()), plan_formation(scenario).system_ids
+    delay_s = np.array([delays_s.get(system_id, slowest_s) for system_id in ids])
     predicted = predicted_spread(design, scenario, delay_s)
     if predicted is None:
         return None
     from_s = scenario.nominal_velocity[-1].from_s + _DECAYS / predicted.decay_rate_1_s
+    flown = flown[flown["time_s"] >= from_s]
+    predicted = predicted_spread(design, scenario, delay_s, _older_shares(flown, ids, scenario)) or predicted
     vehicles: list[VehicleFlownSpread] = []
     for own in predicted.vehicles:
-        rows = flown[(flown["system_id"] == own.system_id) & (flown["time_s"] >= from_s)]
+        rows = flown[flown["system_id"] == own.system_id]
         square = rows["spacing_error_north_m"] ** 2 + rows["spacing_error_east_m"] ** 2
         square = square[np.isfinite(square)]
         if not square.size:
@@ -299,6 +311,28 @@ def _flown_spread(scenario: Scenario, design: Design, flown: TickArray, delay_s:
             )
         )
     return FlownSpread(loop_delay_s=predicted.loop_delay_s, from_s=from_s, vehicles=tuple(vehicles))
+
+
+def _older_shares(flown: TickArray, ids: Sequence[int], scenario: Scenario) -> FloatArray:
+    """(2, n, n): how much of the report before the newest is in what vehicle i sees of vehicle k; see `history.at`.
+
+    Averaged over the ticks so that the variance w^2 + (1 - w)^2 of white noise is kept: shares change as clocks drift.
+    """
+    period_ns = NS_PER_S / scenario.rates.telemetry_hz
+    ticks, at = np.unique(flown["tick"], return_inverse=True)
+    sample_ns = np.full((ticks.size, len(ids)), np.nan)
+    for column, system_id in enumerate(ids):
+        own = (flown["system_id"] == system_id) & np.isfinite(flown["telemetry_age_s"])
+        sample_ns[at[own], column] = (flown["sample_ns"] - flown["due_ns"][:1])[own]
+    shares = np.zeros((2, len(ids), len(ids)))
+    for row in range(len(ids)):
+        newer = (sample_ns - sample_ns[:, [row]]) / period_ns
+        x = np.where(newer > 0.0, newer % 1.0, 0.0)  # how far back from the newer of the two reports
+        known = np.maximum(np.isfinite(newer).sum(axis=0), 1)
+        for share, of_older in zip(shares, (x * x * (3.0 - 2.0 * x), x), strict=True):
+            both = (of_older * (1.0 - of_older)).sum(axis=0) / known
+            share[row] = 0.5 - np.sqrt(np.maximum(0.25 - both, 0.0))
+    return shares
 
 
 def _control(scenario: Scenario, flown: TickArray) -> Control:

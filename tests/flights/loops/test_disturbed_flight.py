@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gcs import fly_virtual
+from gcs.plan.disturbed import predicted_spread
 from gcs.plan.planner import flight_plan
 from gcs.stress.disturbance import find_disturbance_onsets
 from scenarios.files import load
@@ -34,6 +35,23 @@ def test_flown_spread_of_the_errors_is_the_computed_one(delay_s: float, predicti
     # most of the power is white noise; the rest has about 40 independent values on each axis: 3 % for all together
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.05)
     assert ratios == pytest.approx([1.0, 1.0], abs=0.08)
+
+
+@pytest.mark.parametrize("prediction", ["off", "measured"])
+def test_the_spread_of_vehicles_that_sample_at_other_instants_is_computed_too(prediction: str) -> None:
+    apart = chain(navigation=NOISE, clocks=Clocks(drift_max_ppm=0.0), duration_s=40.0, seed=3)
+    apart = apart.model_copy(update={"control": apart.control.model_copy(update={"prediction": prediction})})
+    flown = fly_virtual(apart.with_link_delay(up_s=0.04, down_s=0.06))
+    assert flown.summary.spread is not None
+    before = predicted_spread(flown.design, apart, flown.summary.spread.loop_delay_s)
+    assert before is not None
+    lessened = [
+        (own.predicted_rms_m or 0.0) / together.reported_rms_m
+        for own, together in zip(flown.summary.spread.vehicles, before.vehicles, strict=True)
+    ]
+    assert min(lessened) < 0.9  # of a vehicle whose reports fall between those of the one in front
+    ratios = [(own.reported_rms_m or 0.0) / (own.predicted_rms_m or 1.0) for own in flown.summary.spread.vehicles]
+    assert ratios == pytest.approx([1.0, 1.0], abs=0.05)
 
 
 def test_the_same_seed_gives_the_same_disturbed_flight() -> None:

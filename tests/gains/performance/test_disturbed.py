@@ -1,5 +1,7 @@
 """The spread of errors under gusts and noise: two ways that share no algebra, and known answers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
@@ -10,14 +12,18 @@ from gains.core.errors import BadModelError
 from gains.formation.model import FormationModel
 from gains.performance.disturbed import DisturbedFormation, Gusts, Sensing
 from gains.performance.response import Response, formation_loop, pushed_states
+from gains.sampled._loop import HeldPlant, held_entry
 
 CHAIN = FormationModel((-1, 0, 1), axes=1)
 GAIN = CHAIN.overlapping_gain([[-3.408]], [[0.631]], [[5.608]])
 EVERYTHING = Sensing(0.5, 0.1, 0.3, 0.05, bias_time_s=5.0)
 
 
+OLDER = np.array([[[0, 0, 0], [0.3, 0, 0], [0.1, 0.45, 0]], [[0, 0, 0], [0.25, 0, 0], [0.2, 0.4, 0]]])
+
+
 def spread_by_frequency(flown: DisturbedFormation) -> FloatArray:
-    """Standard deviations of the errors: the spectrum of each source, integrated over frequency, without F and P."""
+    """Standard deviations of the errors, true and reported: spectra of each source, integrated, without F and P."""
     model, gusts, sensing, T = flown.model, flown.gusts, flown.sensing, flown.period_s
     assert gusts is not None
     n, states = len(flown.A), model.states
@@ -42,7 +48,7 @@ def spread_by_frequency(flown: DisturbedFormation) -> FloatArray:
         of_velocities[model.velocity_slice(i), i] = 1.0
         if i > 0:
             of_positions[model.spacing_slice(i), [i, model.predecessors[i]]] = -1.0, 1.0
-    variance = np.zeros(states)
+    variance, plant = np.zeros((2, states)), HeldPlant(A, np.pad(flown.B, ((0, count), (0, 0))), 0.0 * A, T)
     fades = np.exp(-T / sensing.bias_time_s)
     for part in np.array_split(np.arange(12_000), 6):
         z = np.exp(2j * np.pi * (part + 0.5) / 12_000)[:, np.newaxis, np.newaxis]
@@ -51,9 +57,22 @@ def spread_by_frequency(flown: DisturbedFormation) -> FloatArray:
         noise = np.hstack([sensing.position_noise_m * of_positions, sensing.velocity_noise_m_s * of_velocities])
         bias = np.hstack([sensing.position_bias_m * of_positions, sensing.velocity_bias_m_s * of_velocities])
         power = (closed @ pushed * closed.conj()).sum(axis=2).real[:, :states]
-        power += (np.abs(told @ noise) ** 2).sum(axis=2)[:, :states]
-        power += (np.abs(told @ bias * (1.0 - fades**2) ** 0.5 / (z - fades)) ** 2).sum(axis=2)[:, :states]
-        variance += power.sum(axis=0) / 12_000
+        heard, shown = told @ noise, noise + 0.0 * z
+        if flown.older is not None:  # of others, part of the noise comes a period later
+            for i, k in np.argwhere(flown.older[0] > 0.0):
+                ahead = [of_positions[:, k] * flown.older[0, i, k], of_velocities[:, k] * flown.older[1, i, k]]
+                columns = [k, model.vehicles + k]
+                older = np.stack(ahead, axis=1) * (sensing.position_noise_m, sensing.velocity_noise_m_s)
+                commanded = held_entry(plant, z, flown.delay_s)[:, :, [i]] @ flown.K[[i], :states] @ older
+                heard[:, :, columns] += closed @ commanded * (1.0 / z - 1.0)
+                if k == model.predecessors[i]:
+                    own = model.spacing_slice(i)
+                    shown[:, own, columns] += older[own] * (1.0 / z - 1.0)
+        drift = told @ bias * (1.0 - fades**2) ** 0.5 / (z - fades)
+        for one, direct in ((0, 0.0), (1, 1.0)):
+            of_noise = heard[:, :states] + direct * shown
+            of_bias = drift[:, :states] + direct * bias * (1.0 - fades**2) ** 0.5 / (z - fades)
+            variance[one] += (power + (np.abs(of_noise) ** 2 + np.abs(of_bias) ** 2).sum(axis=2)).sum(axis=0) / 12_000
     return np.sqrt(variance)
 
 
@@ -67,14 +86,34 @@ def test_lyapunov_equation_and_spectrum_give_the_same_spread(
         CHAIN, CHAIN.A, CHAIN.B, GAIN, 0.02, delay_s, Gusts(0.5, 2.0, common), EVERYTHING, assumed_s=assumed_s
     )
     # rounding, amplified by sums over 12,000 frequencies
-    assert spread_by_frequency(flown) == pytest.approx(flown.spread().true, rel=1e-9)
+    spread = flown.spread()
+    assert spread_by_frequency(flown) == pytest.approx(np.stack([spread.true, spread.reported]), rel=1e-9)
+
+
+def test_vehicles_whose_loop_delays_differ_have_the_same_spread_both_ways() -> None:
+    late_s = np.array([0.03, 0.157, 0.0])
+    flown = DisturbedFormation(CHAIN, CHAIN.A, CHAIN.B, GAIN, 0.02, late_s, Gusts(0.5, 2.0), EVERYTHING, older=OLDER)
+    spread = flown.spread()
+    assert spread_by_frequency(flown) == pytest.approx(np.stack([spread.true, spread.reported]), rel=1e-9)
+    alike = replace(flown, delay_s=np.full(3, 0.157)).spread()
+    assert alike.true == pytest.approx(replace(flown, delay_s=0.157).spread().true, rel=1e-12)
+    assert alike.true[1] == pytest.approx(spread.true[1], rel=0.2)  # vehicle 2, whose own loop is as late
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.157])
+def test_noise_averaged_between_two_reports_gives_the_same_spread_both_ways(delay_s: float) -> None:
+    flown = DisturbedFormation(CHAIN, CHAIN.A, CHAIN.B, GAIN, 0.02, delay_s, Gusts(0.5, 2.0), EVERYTHING, older=OLDER)
+    spread = flown.spread()
+    assert spread_by_frequency(flown) == pytest.approx(np.stack([spread.true, spread.reported]), rel=1e-9)
+    assert spread.reported[4] < replace(flown, older=None).spread().reported[4]
 
 
 def test_vehicles_with_a_lag_have_the_same_spread_both_ways() -> None:
     loop = formation_loop(CHAIN, GAIN / 3.0, [Response(0.15, 2.0)] * 3)
     pushed = pushed_states(CHAIN, [Response(0.15, 2.0)] * 3)
     flown = DisturbedFormation(CHAIN, *loop, 0.02, 0.06, Gusts(0.5, 2.0), EVERYTHING, pushed=pushed)
-    assert spread_by_frequency(flown) == pytest.approx(flown.spread().true, rel=1e-9)
+    spread = flown.spread()
+    assert spread_by_frequency(flown) == pytest.approx(np.stack([spread.true, spread.reported]), rel=1e-9)
 
 
 def test_noise_on_one_integrator_has_the_textbook_variance() -> None:
