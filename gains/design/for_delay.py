@@ -35,6 +35,9 @@ Reached = tuple[FloatArray, Figures]
 _EVALUATIONS_EACH, _EVALUATIONS_LEAST, _EVALUATIONS_MOST = 50, 320, 1280
 # Searches until gains meet with exact figures what they met with rough ones.
 _AIMS = 4
+# A search of more than a few entries is continued from its best point with shorter steps, by these divisors: it may have
+# started so near to what is wanted that nearly all first draws were farther away.
+_FEW, _FINER = 3, (4.0, 16.0)
 # Frequencies left out while searching; peaks are looked at closer in any case.
 _THINNED = 4
 # At no delay and no hold gains have no scale of their own: the search begins at that of this delay.
@@ -48,7 +51,9 @@ _UNSTABLE = 1e4
 # and one that meets no part that is quick to compute; above every shortfall of those that are not
 _SLOW_PARTS = 2e3
 # margins from which gains on a pattern are started, as multiples of the delay with half a hold
-_SPARES = 1.5, 2.0, 3.0
+_SPARES = 1.5, 2.0, 3.0, 6.0, 12.0
+# and of gains behind another vehicle, as multiples of the fastest at the delay
+_SCALES = 1.0, 1.7, 0.3, 0.1
 _FASTEST = 2.0 - sqrt(2.0)
 
 
@@ -126,7 +131,7 @@ class TreeGains:
     @property
     def starts(self) -> Sequence[FloatArray]:
         k1, k3 = fastest_at_delay(self.late_s)
-        return [np.array([log(scale * k1 * self.late_s), 0.2, log(k3 / k1**2)]) for scale in (1.0, 1.7)]
+        return [np.array([log(scale * k1 * self.late_s), 0.2, log(k3 / k1**2)]) for scale in _SCALES]
 
     def gains(self, point: FloatArray) -> ScalarGains:
         """The gains of a point; their α is not known."""
@@ -173,7 +178,10 @@ class PatternGains:
             for base, margin_s in zip(self.bases, margins, strict=True)
             for spare in _SPARES
         )
-        return [self.point(K) for K in scaled]
+        tree = TreeGains(self.delay_s, self.timing)
+        alike = (tree.gains(point) for point in tree.starts)  # for every vehicle, those behind another
+        own = [self.model.overlapping_gain([[-g.k1]], [[g.k2]], [[g.k3]]) for g in alike]
+        return [self.point(K) for K in (*scaled, *own)]
 
     def point(self, K: FloatArray) -> FloatArray:
         """The point of a K with the pattern."""
@@ -273,6 +281,8 @@ def _best(
 
     for turn in count(1):
         found = best_of(rank, min(starts, key=rank), step=family.step, evaluations=evaluations or enough)
+        for finer in _FINER if evaluations is None and starts[0].size > _FEW else ():
+            found = best_of(rank, found.point, step=family.step / finer, evaluations=enough)
         exact = family.figures(found.point).exact
         if turn == _AIMS or found.rank[0] > 0.0 or _meets(exact, parts):
             return found.point, exact

@@ -87,12 +87,16 @@ REFUSED: list[tuple[str, dict[str, Any], set[str]]] = [
     ("inclusion", {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6)}, {"delays_s"}),
     ("inclusion", {"spacing_gain_max_s2": 0.7} | VARYING, {"spacing_gain_max_s2", "delays_s"}),
     ("inclusion", {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6), "delay_rate": 0.0}, {"delays_s"}),
-    ("graph-lqr", {"damping_min": 0.95, "natural_frequency_max_rad_s": 1.5}, {"natural_frequency_max_rad_s"}),
+    ("graph-lqr", REGION | {"natural_frequency_max_rad_s": 0.8}, {"natural_frequency_max_rad_s"}),
     ("graph-lqr", WEIGHTED, {"decay_rate_at_delay_1_s"}),
     ("graph-lqr", {"spacing_gain_max_s2": 0.4, "noise_gain_max": 3.0}, {"spacing_gain_max_s2", "noise_gain_max"}),
-    ("graph-lqr", VARYING, {"delays_s"}),
+    ("graph-lqr", VARYING | {"delays_s": (0.0, 3.0)}, {"delays_s"}),
     # neither is reached however far the other one is relaxed
-    ("graph-lqr", WEIGHTED | {"alpha_at_delay": 0.7}, {"alpha_at_delay and decay_rate_at_delay_1_s"}),
+    (
+        "graph-lqr",
+        WEIGHTED | {"alpha_at_delay": 0.8, "decay_rate_at_delay_1_s": 2.5},
+        {"alpha_at_delay and decay_rate_at_delay_1_s"},
+    ),
 ]
 
 
