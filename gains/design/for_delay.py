@@ -35,8 +35,8 @@ Reached = tuple[FloatArray, Figures]
 _EVALUATIONS_EACH, _EVALUATIONS_LEAST, _EVALUATIONS_MOST = 50, 320, 1280
 # Searches until gains meet with exact figures what they met with rough ones.
 _AIMS = 4
-# A search of more than a few entries is continued from its best point with shorter steps, by these divisors: it may have
-# started so near to what is wanted that nearly all first draws were farther away.
+# A search of more than a few entries is continued from its best point with shorter steps, by these divisors: it may
+# have started so near to what is wanted that nearly all first draws were farther away.
 _FEW, _FINER = 3, (4.0, 16.0)
 # Frequencies left out while searching; peaks are looked at closer in any case.
 _THINNED = 4
