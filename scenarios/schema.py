@@ -271,6 +271,8 @@ class Autopilot(Part):
     """Maximum rate of change of the acceleration that it aims at; unlimited if omitted."""
     speed_max_m_s: Positive = 12.0
     """Maximum horizontal speed."""
+    drag_1_m: NotNegative = 0.0
+    """Deceleration by the air, divided by the square of the horizontal speed."""
     climb_max_m_s: Positive = 2.5
     """Maximum climb rate."""
     telemetry_after_s: NotNegative = 1.0

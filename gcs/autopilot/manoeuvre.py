@@ -1,12 +1,13 @@
 """The identification manoeuvre of all vehicles, tick by tick, and the flight plan with the responses found."""
 
 from collections.abc import Iterator, Sequence
+from math import hypot
 from typing import NamedTuple
 
 import numpy as np
 
 from gcs.autopilot import identify
-from gcs.autopilot.identify import Flown, Identified
+from gcs.autopilot.identify import Flown, Identified, RunUp
 from gcs.control.history import StateHistory
 from gcs.link.vehicle import RemoteVehicle, Report
 from gcs.plan.flight_plan import FlightPlan, Responses, margin_steps
@@ -19,27 +20,36 @@ _UNNOTICED_NS = NS_PER_S
 class _Sample(NamedTuple):
     sampled_ns: int
     seen_ns: int
-    velocity_north_m_s: float
+    velocity_m_s: float
+    """In the direction of the manoeuvre."""
 
 
 class Identification:
     """Collects the vehicles' velocities during the manoeuvre, then computes the result in steps, one per tick.
 
-    A manoeuvre that a vehicle did not follow is flown once more: a gust may have passed, or a simulator have stalled.
+    The vehicles are first brought to the velocity at which the formation flight begins. The manoeuvre is across it, or
+    north at rest. One that a vehicle did not follow is flown once more: a gust may have passed, or a simulator have
+    stalled.
     """
 
     def __init__(self, plan: FlightPlan, vehicles: Sequence[RemoteVehicle], report: Report) -> None:
         self._plan = plan
         self._vehicles = vehicles
         self._report = report
-        self._amplitude_m_s2 = identify.amplitude_m_s2(plan.scenario.limits.acceleration_max_m_s2)
+        self._limit_m_s2 = plan.scenario.limits.acceleration_max_m_s2
+        self._amplitude_m_s2 = identify.amplitude_m_s2(self._limit_m_s2)
+        north, east = plan.scenario.nominal_velocity_at(0.0)
+        speed_m_s = hypot(north, east)
+        self._direction_ne = (-east / speed_m_s, north / speed_m_s) if speed_m_s > 0.0 else (1.0, 0.0)
+        self._run_up: tuple[int, RunUp] | None = None
+        """When the run-up began (ns), and what it is."""
         self._is_repeated = False
         self._begin()
 
     def _begin(self) -> None:
         self._begin_ns: int | None = None
         self._commands: list[tuple[int, float]] = []
-        """Instant (ns) and acceleration north (m/s²) of each command."""
+        """Instant (ns) and acceleration (m/s²) of each command in the direction of the manoeuvre."""
         self._downs_ns: list[list[int]] = [[] for _ in self._vehicles]
         """How long commands took to each vehicle."""
         self._samples: list[list[_Sample]] = [[] for _ in self._vehicles]
@@ -48,25 +58,42 @@ class Identification:
 
     def command(self, due_ns: int) -> tuple[float, float]:
         """The acceleration that all vehicles are commanded at a tick, which it notes."""
+        if self._run_up is None:
+            return 0.0, 0.0
+        began_ns, run_up = self._run_up
+        since_s = (due_ns - began_ns) / NS_PER_S
+        if since_s < run_up.duration_s:
+            return run_up.acceleration_m_s2(since_s)
         if self._begin_ns is None:
             self._begin_ns = due_ns
-        since_s = (due_ns - self._begin_ns) / NS_PER_S
-        command = identify.manoeuvre_m_s2(since_s, self._amplitude_m_s2)
+        command = identify.manoeuvre_m_s2((due_ns - self._begin_ns) / NS_PER_S, self._amplitude_m_s2)
         if not self._commands or self._commands[-1][0] < due_ns:  # once for all vehicles
-            self._commands.append((due_ns, command[0]))
+            self._commands.append((due_ns, command))
             for vehicle, downs_ns in zip(self._vehicles, self._downs_ns, strict=True):
                 downs_ns.append(vehicle.clock.down_ns or 0)
-        return command
+        north, east = self._direction_ne
+        return command * north, command * east
 
     def next(self, due_ns: int, history: StateHistory) -> FlightPlan | str | None:
         """The plan with the margins of the responses found, or why there is none; None while it takes longer."""
         gone = next((v for v in self._vehicles if v.silent or v.taken_over or v.startup.has_landed), None)
         if gone is not None:
             return f"not identified: vehicle {gone.system_id} {gone.missing}"
+        if self._run_up is None:
+            self._run_up = due_ns, self._run_up_from(history)
         if self._begin_ns is None or due_ns - self._begin_ns < identify.LONGEST_S * NS_PER_S:
             self._observe(due_ns, history)
             return None
         return next(self._steps)
+
+    def _run_up_from(self, history: StateHistory) -> RunUp:
+        """From the vehicles' mean velocity to the nominal one; a leader that somebody else flies sets no velocity."""
+        scenario = self._plan.scenario
+        states = [newest[1] for row in range(len(self._vehicles)) if (newest := history.newest(row))]
+        if scenario.external_id is not None or not states:
+            return identify.run_up((0.0, 0.0), None)
+        north, east = np.array(scenario.nominal_velocity_at(0.0)) - np.mean(states, axis=0)[2:]
+        return identify.run_up((float(north), float(east)), self._limit_m_s2)
 
     def _result(self) -> Iterator[FlightPlan | str | None]:
         """The result, after a None for each step before it."""
@@ -111,7 +138,8 @@ class Identification:
                 self._samples[row] = [s for s in self._samples[row] if s.seen_ns < due_ns - _UNNOTICED_NS]
             samples, newest = self._samples[row], history.newest(row)
             if newest is not None and (not samples or newest[0] > samples[-1].sampled_ns):
-                samples.append(_Sample(newest[0], due_ns, newest[1][2]))
+                (north, east), (_, _, v_north, v_east) = self._direction_ne, newest[1]
+                samples.append(_Sample(newest[0], due_ns, north * v_north + east * v_east))
 
     def _flown(self, row: int) -> Flown:
         """The manoeuvre as one vehicle saw it, on the grid of control ticks; a missed tick repeats the one before."""
@@ -119,12 +147,12 @@ class Identification:
         sent_s = (np.array([at_ns for at_ns, _ in self._commands], dtype=np.int64) - begin_ns) / NS_PER_S
         ticks = np.arange(round(float(sent_s[-1]) / period_s) + 1)
         newest = np.searchsorted(np.rint(sent_s / period_s), ticks, side="right") - 1
-        command = np.array([north for _, north in self._commands])[newest]
+        command = np.array([acceleration for _, acceleration in self._commands])[newest]
         acts_ns = begin_ns + round(float(np.median(self._downs_ns[row])))
         sampled_ns = np.array([s.sampled_ns for s in self._samples[row]], dtype=np.int64)
         sample_s = (sampled_ns - acts_ns) / NS_PER_S
         inside = (sample_s >= 0.0) & (sample_s <= ticks.size * period_s)
-        velocity = np.array([s.velocity_north_m_s for s in self._samples[row]], dtype=np.float64)
+        velocity = np.array([s.velocity_m_s for s in self._samples[row]], dtype=np.float64)
         return Flown(period_s, command, sample_s[inside], velocity[inside])
 
 

@@ -2,8 +2,9 @@
 
     w = a_set + g (v_set - v),  |w| clipped to the limit;   lag a' = w - a,   v' = a,   p' = v
 
-for north and east; g = 0 if no velocity is set. Between set-points v_set integrates a_set if the autopilot does so. The
-climb rate follows its command with a lag of its own. RK4 integrates in steps of at most 10 ms.
+for north and east; g = 0 if no velocity is set. The air decelerates it by drag |v| v. Between set-points v_set
+integrates a_set if the autopilot does so. The climb rate follows its command with a lag of its own. RK4 integrates in
+steps of at most 10 ms.
 """
 
 import math
@@ -109,9 +110,12 @@ def _step(motion: Motion, target: Target, limits: schema.Autopilot, h: float) ->
 
 
 def _after(motion: Motion, plane: tuple[float, ...], target: Target, limits: schema.Autopilot, h: float) -> Motion:
-    """The motion after a step: `plane` with its speed limited, and the new altitude and yaw."""
+    """The motion after a step: `plane` with its speed lessened and limited, and the new altitude and yaw."""
     north, east, v_n, v_e, a_n, a_e = plane
     speed = math.hypot(v_n, v_e)
+    if limits.drag_1_m:  # speed' = -drag speed^2
+        left = 1.0 / (1.0 + limits.drag_1_m * speed * h)
+        v_n, v_e, speed = left * v_n, left * v_e, left * speed
     if speed > limits.speed_max_m_s:
         v_n, v_e = v_n * limits.speed_max_m_s / speed, v_e * limits.speed_max_m_s / speed
     altitude, climb = _climbed(motion.altitude_m, motion.climb_m_s, target, limits, h)

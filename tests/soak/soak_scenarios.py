@@ -398,6 +398,7 @@ def _autopilot(rng: Rng, duration_s: float) -> Part:
         velocity_gain_1_s=one_of(rng, 2.0, spread(rng, 0.5, 4.0)),
         acceleration_max_m_s2=one_of(rng, 5.0, spread(rng, 2.0, 15.0)),
         speed_max_m_s=one_of(rng, 12.0, between(rng, 8.0, 30.0)),
+        drag_1_m=0.0,  # would change what settles; flown in the tests of copters
         climb_max_m_s=one_of(rng, 2.5, between(rng, 2.0, 5.0)),
         telemetry_after_s=between(rng, 0.0, 1.0),
         ready_after_s=between(rng, 0.0, 2.0),

@@ -174,7 +174,7 @@ def test_the_next_station_takes_no_vehicle_from_its_pilot(flavour: str) -> None:
     # and given back it goes on
     first.modes[(second_ns - START_NS) / SECOND + 20.0] = RULES[flavour].guided_mode
     for tick in fly_lockstep(station.plan, station=station, vehicles=first):
-        if tick["due_ns"][0] > second_ns + 30 * SECOND:
+        if tick["due_ns"][0] > second_ns + 37 * SECOND:
             break
     assert station.phase == "flying"
 

@@ -8,7 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gains.performance.response import Response
-from gcs.autopilot.identify import LONGEST_S, MISFIT_MAX, Flown, Identified, amplitude_m_s2, identify, manoeuvre_m_s2
+from gcs.autopilot.identify import (
+    LONGEST_S,
+    MISFIT_MAX,
+    Flown,
+    Identified,
+    amplitude_m_s2,
+    identify,
+    manoeuvre_m_s2,
+    run_up,
+)
 from gcs.plan.flight_plan import at_once
 from scenarios.schema import Autopilot
 from sim_vehicles.motion.copter import Motion, Target, advance
@@ -38,9 +47,7 @@ def flown(
     commands, velocities = list[float](), list[float]()
     for k in range(COMMANDS):
         at_s = k * PERIOD_S
-        commands.append(
-            math.copysign(2.0, math.sin(2 * at_s)) if square else manoeuvre_m_s2(at_s, amplitude_m_s2(3.0))[0]
-        )
+        commands.append(math.copysign(2.0, math.sin(2 * at_s)) if square else manoeuvre_m_s2(at_s, amplitude_m_s2(3.0)))
         target = Target(commands[-1], 0.0, velocity, 0.0, autopilot.velocity_gain_1_s, growth=1.0)
         for sample in sample_s[(sample_s >= at_s) & (sample_s < at_s + PERIOD_S)].tolist():
             velocities.append(advance(motion, target, autopilot, sample - at_s)[0].velocity_north_m_s)
@@ -74,7 +81,7 @@ def test_noise_of_a_centimetre_a_second_chooses_no_richer_model(response: Respon
     # what commands at the crossover are late by is found better than how it divides into lag and dead time
     late_s, known_s = (r.lag_s + r.dead_time_s for r in (seen.response, response))
     assert late_s == pytest.approx(known_s, rel=0.05)
-    assert 0.005 < seen.misfit < 0.03
+    assert 0.005 < seen.misfit < 0.05
 
 
 def test_no_velocity_feedback_is_identified_as_next_to_none() -> None:
@@ -117,12 +124,22 @@ def test_whatever_is_reported_is_a_fit_or_none(velocity: list[float]) -> None:
     assert fit is None or (math.isfinite(fit.misfit) and fit.response.lag_s > 0.0)
 
 
-def test_the_manoeuvre_ends_where_it_began_and_is_smooth() -> None:
+def test_the_manoeuvre_ends_as_fast_as_it_began_and_is_smooth() -> None:
     amplitude = amplitude_m_s2(3.0)
-    acceleration = np.array([manoeuvre_m_s2(s, amplitude)[0] for s in np.arange(0.0, LONGEST_S, 1e-3).tolist()])
+    acceleration = np.array([manoeuvre_m_s2(s, amplitude) for s in np.arange(0.0, LONGEST_S, 1e-3).tolist()])
     velocity = np.cumsum(acceleration) * 1e-3
     assert velocity[-1] == pytest.approx(0.0, abs=0.01)
-    assert float(velocity.sum()) * 1e-3 == pytest.approx(0.0, abs=0.01)
+    assert 0.0 < float(velocity.sum()) * 1e-3 < 3.0  # metres to one side
     assert np.abs(np.diff(acceleration)).max() * 1e3 < 2.55  # half of the 5 m/s^3 of PSC_JERK_XY
     assert np.abs(acceleration).max() < 1.0
     assert amplitude_m_s2(0.5) == 0.25
+
+
+def test_the_run_up_ends_at_the_wanted_velocity_within_half_the_limit() -> None:
+    for limit_m_s2, most_m_s2 in ((3.0, 1.5), (1.0, 0.5), (None, 1.5)):
+        ramp = run_up((3.0, -4.0), limit_m_s2)
+        each = np.array([ramp.acceleration_m_s2(s) for s in np.arange(0.0, ramp.duration_s, 1e-3).tolist()])
+        assert each.sum(axis=0) * 1e-3 == pytest.approx([3.0, -4.0], abs=1e-3)
+        assert np.hypot(*each.T).max() == pytest.approx(most_m_s2, rel=1e-5)
+        assert not each[-2500:].any()  # the velocity settles
+    assert run_up((0.1, 0.1), 3.0).duration_s == 0.0
