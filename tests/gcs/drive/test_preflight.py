@@ -44,7 +44,9 @@ def complaint(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
     return told.err
 
 
-@pytest.mark.parametrize("command", [("design",), ("fly",), ("stress", "--onset"), ("design", "--loop", "onboard")])
+@pytest.mark.parametrize(
+    "command", [("design",), ("fly", "--virtual"), ("stress", "--onset"), ("design", "--loop", "onboard")]
+)
 @pytest.mark.parametrize(
     ("gains", "told"),
     [
@@ -118,19 +120,19 @@ def test_starts_in_collision_or_past_the_limit_are_found_beforehand(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     near = chain_file(tmp_path, ("[-242.79, 243.09]", "[-122.82, 125.52]"))
-    for command in (("fly",), ("stress", "--onset"), ("bench",), ("compare",)):
+    for command in (("fly", "--virtual"), ("stress", "--onset"), ("bench",), ("compare",)):
         line = complaint(capsys, monkeypatch, command[0], str(near), *command[1:])
         assert "read vehicles 2 and 3 3 m apart, wanted at least safety.collision_distance_m = 5 m" in line
     assert flight_plan(load(near))[1].delay_margin_s > 0.29  # designed all the same
     far = chain_file(tmp_path, ("[-242.79, 243.09]", "[-2242.79, 243.09]"))
-    assert "read vehicle 3 with a spacing error of 1998" in complaint(capsys, monkeypatch, "fly", str(far))
+    assert "read vehicle 3 with a spacing error of 1998" in complaint(capsys, monkeypatch, "fly", str(far), "--virtual")
 
 
 def test_a_link_too_slow_for_the_flight_is_found_beforehand(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = str(ROOT / "scenarios/chain3.toml")
-    line = complaint(capsys, monkeypatch, "fly", file, "--link-delay", "40")
+    line = complaint(capsys, monkeypatch, "fly", file, "--virtual", "--link-delay", "40")
     assert line == (
         f"{file}: links: read a round trip of 80 s to vehicle 1, wanted less than the 20 s that the station "
         "waits for an answer\n"
