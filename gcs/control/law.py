@@ -48,30 +48,37 @@ FeedbackLaw = tuple[VehicleLaw | None, ...]
 """The law of each vehicle; None if it is lost."""
 
 
-def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequence[bool]) -> FeedbackLaw:
+def feedback_law(
+    formation: Formation, gains: tuple[FloatArray, ...], lost: Sequence[bool], returning: Sequence[bool] | None = None
+) -> FeedbackLaw:
     """The law for a schedule of gain matrices K, without the lost vehicles.
 
     Each K is (inputs, states) in the order of `gains.formation.model.FormationModel`.
 
     The nearest remaining vehicle ahead stands in for a lost one: spacing is kept to it, at the sum of both offsets, and
     its velocity error is used. Terms without a stand-in, and the spacing error of the lost vehicle, are omitted. A
-    vehicle with nobody left ahead keeps the nominal velocity, as the leader does.
+    vehicle with nobody left ahead keeps the nominal velocity, as the leader does. One that is `returning` to its place
+    flies its own law, while the others do without it, as if it were lost.
     """
     model = formation.model
-    stand_in: list[int] = []
-    for row, ahead in enumerate(model.predecessors):
-        stand_in.append(row if not lost[row] else stand_in[ahead] if ahead >= 0 else -1)
+    without = [one or other for one, other in zip(lost, returning or lost, strict=True)]
     K = np.stack(gains)
-    in_front = [stand_in[ahead] if ahead >= 0 else -1 for ahead in model.predecessors]
+    in_front = [-1] * model.vehicles
     blocks: dict[tuple[int, int], FloatArray] = {}
 
     def block(i: int, k: int) -> FloatArray:
         return blocks.setdefault((i, k), np.zeros((len(gains), 2, 4)))
 
-    for i in (row for row, gone in enumerate(lost) if not gone):
+    of_most = _stand_ins(model.predecessors, without)
+    for i in (row for row, away in enumerate(lost) if not away):
+        gone, (stand_in, front) = without, of_most
+        if without[i]:
+            gone = [away and row != i for row, away in enumerate(without)]
+            stand_in, front = _stand_ins(model.predecessors, gone)
+        in_front[i] = front[i]
         block(i, i)
-        if in_front[i] >= 0:
-            block(i, in_front[i])
+        if front[i] >= 0:
+            block(i, front[i])
         rows = K[:, model.input_slice(i)]
         used = {(column + 2) // 4 for column in np.flatnonzero(rows.any(axis=(0, 1))).tolist()}
         for j in sorted(used):
@@ -79,9 +86,9 @@ def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequ
             if on_velocity.any() and stand_in[j] >= 0:
                 block(i, stand_in[j])[:, :, 2:] += on_velocity
             on_spacing = rows[:, :, model.spacing_slice(j)] if j > 0 else on_velocity[:, :, :0]
-            if on_spacing.any() and not lost[j] and in_front[j] >= 0:
+            if on_spacing.any() and not gone[j] and front[j] >= 0:
                 # e_j^p = Z_ahead - Z_j - d
-                block(i, in_front[j])[:, :, :2] += on_spacing
+                block(i, front[j])[:, :, :2] += on_spacing
                 block(i, j)[:, :, :2] -= on_spacing
     place = formation.place_ne_m()
 
@@ -95,6 +102,14 @@ def feedback_law(formation: Formation, gains: tuple[FloatArray, ...], lost: Sequ
         return VehicleLaw(terms, in_front[i])
 
     return tuple(None if lost[i] else law(i) for i in range(len(in_front)))
+
+
+def _stand_ins(predecessors: Sequence[int], gone: Sequence[bool]) -> tuple[list[int], list[int]]:
+    """Which vehicle is flown with in place of each, and in place of the one in front of each; -1 for none."""
+    stand_in: list[int] = []
+    for row, ahead in enumerate(predecessors):
+        stand_in.append(row if not gone[row] else stand_in[ahead] if ahead >= 0 else -1)
+    return stand_in, [stand_in[ahead] if ahead >= 0 else -1 for ahead in predecessors]
 
 
 class Blend(NamedTuple):

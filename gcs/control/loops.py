@@ -50,8 +50,8 @@ class Order(NamedTuple):
 class Loop(Protocol):
     """What depends on where the loop is closed."""
 
-    def law(self, lost: Sequence[bool]) -> FeedbackLaw:
-        """The station's share of each vehicle's command, with lost vehicles left out."""
+    def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
+        """The station's share of each vehicle's command, without the lost ones: see `law.feedback_law`."""
         ...
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
@@ -97,8 +97,8 @@ class GroundLoop:
     def __init__(self, plan: FlightPlan) -> None:
         self._plan = plan
 
-    def law(self, lost: Sequence[bool]) -> FeedbackLaw:
-        return feedback_law(self._plan.formation, _gains(self._plan, lost), lost)
+    def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
+        return feedback_law(self._plan.formation, _gains(self._plan, lost, returning), lost, returning)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
         return formation_control(
@@ -180,9 +180,9 @@ class StreamedLoop:
             north, east = (on_spacing @ plan.formation.offset_ne_m[i]).tolist()
             self._opened_m_s2[i] = north, east
 
-    def law(self, lost: Sequence[bool]) -> FeedbackLaw:
-        streamed = tuple(K - own_part(self._plan.model, K) for K in _gains(self._plan, lost))
-        return feedback_law(self._plan.formation, streamed, lost)
+    def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
+        streamed = tuple(K - own_part(self._plan.model, K) for K in _gains(self._plan, lost, returning))
+        return feedback_law(self._plan.formation, streamed, lost, returning)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
         nominal_m_s, opening = now.nominal_velocity_m_s, now.opening
@@ -266,9 +266,9 @@ def _deliveries(plan: FlightPlan) -> list[Delivery]:
     ]
 
 
-def _gains(plan: FlightPlan, lost: Sequence[bool]) -> tuple[Any, ...]:
-    """The gain schedule, or what replaces it while a vehicle is lost."""
-    return plan.around_loss if any(lost) and plan.around_loss else plan.gains
+def _gains(plan: FlightPlan, lost: Sequence[bool], returning: Sequence[bool] | None) -> tuple[Any, ...]:
+    """The gain schedule, or what replaces it while others do without a vehicle."""
+    return plan.around_loss if plan.around_loss and any((*lost, *(returning or ()))) else plan.gains
 
 
 def _oldest_needed(history: Reports, law: VehicleLaw | None) -> int:

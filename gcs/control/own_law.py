@@ -105,9 +105,9 @@ class OwnLawLoop:
         self._known: tuple[Vector, float] | None = None
         self._formation = law_formation(plan.formation, (0.0, 0.0), plan.timing.step_s)
 
-    def law(self, lost: Sequence[bool]) -> FeedbackLaw:
+    def law(self, lost: Sequence[bool], returning: Sequence[bool] | None = None) -> FeedbackLaw:
         """The law with zero gains: it gives the spacing errors and says who is lost."""
-        return feedback_law(self._plan.formation, (np.zeros_like(self._plan.gain),), lost)
+        return feedback_law(self._plan.formation, (np.zeros_like(self._plan.gain),), lost, returning)
 
     def control(
         self,

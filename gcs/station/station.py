@@ -5,8 +5,8 @@ or in virtual time, with the same bytes.
 """
 
 from collections import Counter, deque
-from collections.abc import Callable
-from math import isfinite, nan
+from collections.abc import Callable, Sequence
+from math import hypot, isfinite, nan
 
 import numpy as np
 
@@ -37,6 +37,8 @@ ANOTHER_ADDRESS = "known system id from another address"
 _HEARTBEAT_NS = NS_PER_S
 _REQUESTS_APART_NS = 7_000_000
 """Least time between two wake-ups for TIMESYNC requests, or a third of the control period if that is shorter."""
+_NEAR = 0.1
+"""A vehicle that returns is near its place within this share of the spacing error limit."""
 
 
 class Station:
@@ -91,6 +93,9 @@ class Station:
         self._fresh_rtt_s = [deque[float]() for _ in range(n)]
         self._used_s = [nan] * n
         self._absent = [""] * n
+        self._returning: list[bool | None] = [None] * n
+        """Of a vehicle that takes part again, whether it was far from its place when last looked at; None of others.
+        The others do without it until it is near."""
 
     @property
     def next_event_ns(self) -> int:
@@ -261,6 +266,7 @@ class Station:
         nearest_m: list[float] = np.fmin.reduce(distance_m, axis=1).tolist()
         if flying:
             states = self._monitor.states
+            self._take_back(controls)
             self.request_stop(self._breakage.judge(controls, states, self._absent, distance_m, nearest_m, time_s))
         key_ms = (due_ns - self._start_ns) // 1_000_000 & 0xFFFFFFFF
         followed: list[bool] = []
@@ -291,6 +297,24 @@ class Station:
         self._tick_count += 1 + behind
         return tick
 
+    def _take_back(self, controls: Sequence[VehicleControl]) -> None:
+        """Let the others fly again with vehicles that have come near their places."""
+        near_m = _NEAR * self.plan.scenario.safety.spacing_error_limit_m
+        for row, control in enumerate(controls):
+            was_far = self._returning[row]
+            if was_far is None:
+                continue
+            self._returning[row] = None if hypot(*control.spacing_error_m) <= near_m else True
+            if self._returning[row] is None:
+                self._set_law()
+                if was_far:
+                    self._report("vehicle", "is back near its place", self.vehicles[row].system_id)
+
+    def _set_law(self) -> None:
+        self._law = self._fleet.loop.law(
+            [why != "" for why in self._absent], [back is not None for back in self._returning]
+        )
+
     def _limited(self, control: VehicleControl) -> VehicleControl:
         command_m_s2 = self._limits.command(control.command_m_s2)
         return control if command_m_s2 is control.command_m_s2 else control._replace(command_m_s2=command_m_s2)
@@ -306,8 +330,12 @@ class Station:
             for vehicle, now, was in zip(self.vehicles, absent, self._absent, strict=True):
                 if now != was and flying:
                     self._report("vehicle", describe_change(was, now), vehicle.system_id)
+            followers = self.plan.model.followers
+            for row in followers:
+                if absent[row] or self._absent[row]:
+                    self._returning[row] = None if absent[row] else False
             self._absent = absent
-            self._law = self._fleet.loop.law([why != "" for why in absent])
+            self._set_law()
         time_s = self.scenario_time_s(due_ns)
         guided, critical = (
             [vehicle.guided for vehicle in self.vehicles],

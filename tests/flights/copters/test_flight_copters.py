@@ -264,22 +264,36 @@ def test_a_vehicle_piloted_home_is_left_alone_and_flown_around(flavour: str, mod
 def test_a_vehicle_given_back_by_its_pilot_rejoins_the_formation(flavour: str, mode: int) -> None:
     flight = fly_with_a_pilot(flavour, {5.0: mode, 8.0: RULES[flavour].guided_mode})
     assert flight.station.end_reason == "completed: duration reached"
-    assert flight.texts("vehicle")[-1] == "is given back"
+    assert flight.texts("vehicle")[-2:] == ["is given back", "is back near its place"]
     assert flight.error_m(3)[-1] < 0.17
 
 
-def fly_with_a_pilot(flavour: str, modes: dict[float, int]) -> Flight:
-    """A flight in which the pilot of vehicle 3 changes its mode at these times."""
-    scenario = three(flavour=flavour, duration_s=20.0)
+def test_nobody_follows_a_vehicle_that_returns_from_far() -> None:
+    mode, guided = 5, RULES["ardupilot"].guided_mode
+    flight = fly_with_a_pilot("ardupilot", {8.0: mode, 20.0: guided}, system_id=2, duration_s=75.0)
+    assert flight.station.end_reason == "completed: duration reached"
+    rows = {k: flight.flown[flight.flown["system_id"] == k] for k in (1, 2, 3)}
+    ticks = np.intersect1d(rows[1]["tick"][rows[1]["time_s"] > 7.0], rows[3]["tick"])
+    first, third = (rows[k][np.isin(rows[k]["tick"], ticks)] for k in (1, 3))
+    north, east = (third[name] - first[name] for name in ("north_m", "east_m"))
+    assert np.hypot(north + 24.0, east - 24.0).max() < 3.5  # its place, at the sum of both offsets
+    assert np.nanmax(flight.error_m(2)) > 40.0
+    assert flight.error_m(2)[-1] < 0.17
+    assert flight.texts("vehicle")[-1] == "is back near its place"
+
+
+def fly_with_a_pilot(flavour: str, modes: dict[float, int], *, system_id: int = 3, duration_s: float = 20.0) -> Flight:
+    """A flight in which the pilot of a vehicle changes its mode at these times."""
+    scenario = three(flavour=flavour, duration_s=duration_s)
     station, fleet = Station(plan_for(scenario), start_ns=START_NS), Fleet(scenario, START_NS)
     wanted, ticks = deque(sorted(modes.items())), list[TickArray]()
     for tick in fly_lockstep(station.plan, station=station, vehicles=fleet):
         ticks.append(tick)
         if wanted and tick["time_s"][0] > wanted[0][0]:
             # what a switch of its remote control does is the command, without a link
-            vehicle, (_, mode) = fleet.vehicle(3), wanted.popleft()
+            vehicle, (_, mode) = fleet.vehicle(system_id), wanted.popleft()
             packed = (mode >> 16 & 0xFF, mode >> 24) if flavour == "px4" else (mode, 0)
-            vehicle.step([(command(176, 1, *packed, system=3), int(tick["due_ns"][0]))], int(tick["due_ns"][0]))
+            vehicle.step([(command(176, 1, *packed, system=system_id), int(tick["due_ns"][0]))], int(tick["due_ns"][0]))
     return Flight(station, fleet, np.concatenate(ticks), station.events)
 
 
