@@ -115,9 +115,7 @@ def summarise(scenario: Scenario, design: Design, ticks: TickArray, events: Sequ
         if event.text == CLOCK_JUMPED:
             jumps[event.system_id].append(event.time_s)
     late = sent[sent["time_s"] >= 0.75 * flown["time_s"].max(initial=0.0)]
-    headroom_end = min(
-        _medians(late, "headroom").values(), default=None
-    )  # of the vehicles, in the last quarter of the flight
+    headroom_end = min(_medians(late, "headroom").values(), default=None)
     logged = not any(text.startswith(record.TICKS_FILE) for text in not_logged)
     delays_s = {system_id: round(delay_s, 9) for system_id, delay_s in _medians(sent, "loop_delay_s").items()}
     slowest_s = max(delays_s.values(), default=None)
@@ -289,12 +287,11 @@ def _flown_spread(
         return None
     slowest_s, ids = max(delays_s.values()), plan_formation(scenario).system_ids
     delay_s = np.array([delays_s.get(system_id, slowest_s) for system_id in ids])
-    predicted = predicted_spread(design, scenario, delay_s)
+    predicted = predicted_spread(design, scenario, delay_s, _older_shares(flown, ids, scenario))
     if predicted is None:
         return None
     from_s = scenario.nominal_velocity[-1].from_s + _DECAYS / predicted.decay_rate_1_s
     flown = flown[flown["time_s"] >= from_s]
-    predicted = predicted_spread(design, scenario, delay_s, _older_shares(flown, ids, scenario)) or predicted
     vehicles: list[VehicleFlownSpread] = []
     for own in predicted.vehicles:
         rows = flown[flown["system_id"] == own.system_id]
