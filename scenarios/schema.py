@@ -3,8 +3,7 @@
 Units are part of each key's name. Positions and velocities are in the horizontal plane of one local NED frame,
 as pairs (north, east): the formation control is planar. Each vehicle keeps an altitude of its own.
 
-The docstring below a key is its description in `scenario.schema.json` and in the reference. Larger parts are files in
-`scenarios.keys`, such as `link` for `[links]`.
+The docstring below a key describes it in `scenario.schema.json` and the reference. Larger parts: `scenarios.keys`.
 """
 
 from collections.abc import Callable

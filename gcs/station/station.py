@@ -93,9 +93,9 @@ class Station:
         self._fresh_rtt_s = [deque[float]() for _ in range(n)]
         self._used_s = [nan] * n
         self._absent = [""] * n
-        self._returning: list[bool | None] = [None] * n
-        """Of a vehicle that takes part again, whether it was far from its place when last looked at; None of others.
-        The others do without it until it is near."""
+        self._returning: dict[int, bool] = {}
+        """Vehicles that take part again, by row, and whether they were far from their places when last looked at. The
+        others do without them until they are near."""
 
     @property
     def next_event_ns(self) -> int:
@@ -300,19 +300,19 @@ class Station:
     def _take_back(self, controls: Sequence[VehicleControl]) -> None:
         """Let the others fly again with vehicles that have come near their places."""
         near_m = _NEAR * self.plan.scenario.safety.spacing_error_limit_m
-        for row, control in enumerate(controls):
-            was_far = self._returning[row]
-            if was_far is None:
+        for row, was_far in [*self._returning.items()]:
+            control = controls[row]
+            if not control.sample_ns or hypot(*control.spacing_error_m) > near_m:
+                self._returning[row] = True
                 continue
-            self._returning[row] = None if hypot(*control.spacing_error_m) <= near_m else True
-            if self._returning[row] is None:
-                self._set_law()
-                if was_far:
-                    self._report("vehicle", "is back near its place", self.vehicles[row].system_id)
+            del self._returning[row]  # near, or with nobody ahead to be far from
+            self._set_law()
+            if was_far:
+                self._report("vehicle", "is back near its place", self.vehicles[row].system_id)
 
     def _set_law(self) -> None:
         self._law = self._fleet.loop.law(
-            [why != "" for why in self._absent], [back is not None for back in self._returning]
+            [why != "" for why in self._absent], [row in self._returning for row in range(len(self._absent))]
         )
 
     def _limited(self, control: VehicleControl) -> VehicleControl:
@@ -330,10 +330,11 @@ class Station:
             for vehicle, now, was in zip(self.vehicles, absent, self._absent, strict=True):
                 if now != was and flying:
                     self._report("vehicle", describe_change(was, now), vehicle.system_id)
-            followers = self.plan.model.followers
-            for row in followers:
-                if absent[row] or self._absent[row]:
-                    self._returning[row] = None if absent[row] else False
+            for row in self.plan.model.followers:
+                if absent[row]:
+                    self._returning.pop(row, None)
+                elif self._absent[row]:
+                    self._returning[row] = False
             self._absent = absent
             self._set_law()
         time_s = self.scenario_time_s(due_ns)

@@ -67,6 +67,17 @@ def errors(states: FloatArray, v_d: tuple[float, float]) -> FloatArray:
 
 
 @pytest.mark.parametrize("gain", [OVERLAPPING, RNG.normal(size=OVERLAPPING.shape)], ids=["overlapping", "full"])
+def test_others_do_without_a_vehicle_that_returns_by_its_own_law(gain: FloatArray) -> None:
+    away = (False, True, False, False, False)
+    returning, lost, all_there = (
+        feedback_law(TREE, (gain,), gone, back) for gone, back in ((NOBODY, away), (away, NOBODY), (NOBODY, NOBODY))
+    )
+    assert returning[1] == all_there[1]
+    assert [returning[row] for row in (0, 2, 3, 4)] == [lost[row] for row in (0, 2, 3, 4)]
+    assert returning != all_there
+
+
+@pytest.mark.parametrize("gain", [OVERLAPPING, RNG.normal(size=OVERLAPPING.shape)], ids=["overlapping", "full"])
 def test_commands_are_those_of_the_thesis(gain: FloatArray) -> None:
     states = RNG.normal(size=(5, 4)) * [1000, 1000, 50, 50] + [1e5, -1e5, 0, 0]
     v_d = (40.0, -3.0)
