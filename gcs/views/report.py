@@ -82,7 +82,7 @@ def _print_criteria(found: CriteriaPart, console: Console) -> None:
         share = found.alpha_at_delay / found.alpha_bound
         bound = f", {share:.0%} of {found.alpha_bound:.4f}, which no controller exceeds"
     console.print(
-        f"criteria roots have damping {found.damping:.3f} and natural frequencies up to "
+        f"criteria without delay: roots have damping {found.damping:.3f} and natural frequencies up to "
         f"{found.natural_frequency_rad_s:.3f} rad/s"
     )
     weight = "" if found.weight == (1.0, 1.0) else f" with W = {found.weight[0]:g}, {found.weight[1]:g}"
@@ -90,7 +90,7 @@ def _print_criteria(found: CriteriaPart, console: Console) -> None:
         f"         {at}: decay {found.decay_rate_at_delay_1_s:.3f} 1/s, alpha{weight} {found.alpha_at_delay:.4f}{bound}"
     )
     console.print(
-        f"         disturbing acceleration to spacing error {number_text(found.spacing_gain_s2, '.3f')} s², "
+        f"         {at}: disturbing acceleration to spacing error {number_text(found.spacing_gain_s2, '.3f')} s², "
         f"noise to command {number_text(found.noise_gain, '.3f')}"
     )
     if found.delays_jumping_s is not None:
