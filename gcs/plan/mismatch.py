@@ -128,11 +128,9 @@ def window(flown: Predicted, assumed_s: float) -> Window:
 
 
 def continuous_window(flown: Predicted, assumed_s: float) -> Window:
-    """The mismatch window of the continuous model, in which the hold counts as half a period of delay."""
-    half_s = flown.timing.held_s / 2.0
+    """The mismatch window of the continuous model, without any hold, as the continuous delay margin is."""
     loop, measured = flown.loop()
-    least_s, most_s = mismatch_window_continuous(*loop, assumed_s=assumed_s + half_s, measured=measured)
-    return max(0.0, least_s - half_s), most_s - half_s
+    return mismatch_window_continuous(*loop, assumed_s=assumed_s, measured=measured)
 
 
 def assumption(scenario: Scenario) -> str:

@@ -46,6 +46,27 @@ def test_a_fixed_assumption_tolerates_the_published_mismatch() -> None:
     assert len(tolerated.longer_s) == 3
 
 
+@pytest.mark.parametrize(
+    ("assumed_s", "sampled_s", "continuous_s"),
+    [
+        # the windows of both models, each as k1 = 3.408 and k3 = 5.608 have it by an independent computation of its
+        # equation, to the digit printed here
+        (0.3, (0.0, 0.5429), (0.0, 0.5480)),
+        (0.6, (0.4504, 0.7569), (0.4446, 0.7642)),
+        (1.5, (1.4163, 1.5838), (1.4134, 1.5869)),
+        (3.0, (2.9516, 3.0484), (2.9499, 3.0501)),
+    ],
+)
+def test_the_design_record_has_the_windows_of_both_models(
+    assumed_s: float, sampled_s: tuple[float, float], continuous_s: tuple[float, float]
+) -> None:
+    control = Control.model_validate({"gains": GAINS, "prediction": assumed_s})
+    found = flight_plan(TRIANGLE.model_copy(update={"control": control}))[0].prediction
+    assert found is not None
+    assert found.mismatch_window_s == pytest.approx(sampled_s, abs=5e-5)
+    assert found.mismatch_window_continuous_s == pytest.approx(continuous_s, abs=5e-5)
+
+
 @pytest.mark.parametrize("gain_set", [0, 1, 2])
 @pytest.mark.parametrize("assumed_s", [0.07, 0.25, 0.52, 1.1, 1.6, 2.4, 6.1, 9.0])
 def test_the_table_has_the_exact_windows_or_somewhat_narrower_ones(gain_set: int, assumed_s: float) -> None:
