@@ -194,8 +194,11 @@ def _control_contradictions(scenario: Scenario) -> Iterator[Fault]:
         yield "control.method", control.method, wanted
     if control.gains is not None and control.method != "inclusion":
         yield "control.method", control.method, "inclusion, with gains given; a graph's gains are given as blocks"
-    if control.feed_forward and (control.gains is None or control.loop == "onboard"):
-        wanted = "0, unless gains are given and loop is ground: no design method provides for it"
+    searched = control.gains is None and (control.criteria is not None or control.for_link != "off")
+    if control.feed_forward and (
+        control.method != "inclusion" or control.blocks or control.loop == "onboard" or searched
+    ):
+        wanted = "0, unless method is inclusion without blocks, criteria and for_link, and loop is ground"
         yield "control.feed_forward", control.feed_forward, wanted
     if control.execute_at and scenario.dynamics == "autopilot":
         yield "control.execute_at", control.execute_at, "false, with dynamics autopilot: no autopilot holds set-points"

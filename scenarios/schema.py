@@ -149,7 +149,8 @@ class Control(Part):
     """Fly this gain matrix, given block by block, instead of designing one. Omitted blocks are zero."""
     feed_forward: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Share of the command of the vehicle in front that is added to each follower's command, computed in the same tick.
-    Only with `gains`, and with `loop = "ground"`. With 1 and K2 = -K1 a follower moves as the vehicle in front."""
+    Gains are designed for it; margins do not depend on it. Only with `method = "inclusion"`, without `blocks`,
+    `criteria` and `for_link`, and with `loop = "ground"`. With 1 and K2 = -K1 a follower moves as the one in front."""
     prediction: Prediction = "off"
     """The loop delay over which the station predicts each vehicle from its newest state and the set-points that act
     after it. A number: that many seconds. `measured`: the delay measured for each vehicle, smoothed; the assumed delay

@@ -17,13 +17,18 @@ ALPHA_MIN, DELAY_MARGIN_MAX_S = 5e-4, 30.0
 
 
 @dataclass(frozen=True)
-class OnboardPeak:
-    """A limit on the growth of spacing errors in the onboard loop, where only the errors of others arrive late."""
+class ChainLimit:
+    """How much spacing errors may grow from one vehicle to the next, and the loop in which they do."""
 
-    peak: float
+    peak: float | None = None
+    """None: without limit."""
+    loop: Literal["ground", "onboard"] = "ground"
+    """On board only the errors of others are late."""
+    feed_forward: float = 0.0
+    """Share of the command of the vehicle in front that each follower adds to its own."""
 
 
-PeakLimit = float | OnboardPeak | None
+UNLIMITED = ChainLimit()
 
 
 Objective = Literal["alpha", "decay_rate_1_s", "alpha_at_delay", "decay_rate_at_delay_1_s", "delay_margin_s"]
@@ -113,8 +118,8 @@ class Requirement:
 
     >>> Requirement().delay_margin_s, Requirement(alpha=0.4).delay_margin_s
     (0.3, None)
-    >>> Requirement(string_peak_max=1.2, loop="onboard").peak_limit
-    OnboardPeak(peak=1.2)
+    >>> Requirement(string_peak_max=1.2, loop="onboard").chain_limit
+    ChainLimit(peak=1.2, loop='onboard', feed_forward=0.0)
     """
 
     delay_margin_s: float | None = None
@@ -131,6 +136,9 @@ class Requirement:
     """The loop that is flown. On board a pattern without cycles takes any delay; `delay_margin_s` then limits each
     vehicle's own gains, as if a ground station closed their loops. On a pattern with cycles the onboard loop must have
     this margin too."""
+    feed_forward: float = 0.0
+    """Share, 0 to 1, of the command of the vehicle in front that each follower adds to its own. It changes no margin
+    and no decay, but alpha and the growth of spacing errors. In the ground loop, by inclusion and without criteria."""
     criteria: Criteria | None = None
     """What else must be reached. Gains are then searched by `gains.design.for_delay`."""
 
@@ -145,15 +153,18 @@ class Requirement:
             raise BadModelError(f"alpha = {self.alpha}; wanted at least {ALPHA_MIN}")
         if self.string_peak_max is not None and not 1 <= self.string_peak_max < np.inf:
             raise BadModelError(f"string_peak_max = {self.string_peak_max}; wanted a number of at least 1")
+        if not 0.0 <= self.feed_forward <= 1.0:
+            raise BadModelError(f"feed_forward = {self.feed_forward}; wanted a number from 0 to 1")
+        if self.feed_forward and (self.loop == "onboard" or self.criteria is not None):
+            raise BadModelError(f"feed_forward = {self.feed_forward}; wanted 0 with criteria or the onboard loop")
         given = (self.delay_margin_s, self.alpha, self.decay_rate_1_s, self.criteria and self.criteria.at_delay_s)
         if all(wanted is None for wanted in given):
             object.__setattr__(self, "delay_margin_s", DEFAULT_DELAY_MARGIN_S)
 
     @property
-    def peak_limit(self) -> PeakLimit:
+    def chain_limit(self) -> ChainLimit:
         """`string_peak_max` as a limit in the loop that is flown."""
-        peak = self.string_peak_max
-        return peak if peak is None or self.loop == "ground" else OnboardPeak(peak)
+        return ChainLimit(self.string_peak_max, self.loop, self.feed_forward)
 
 
 def plain(value: Any) -> Any:

@@ -26,6 +26,7 @@ from gains.design.search import largest_alpha
 from gains.formation.model import FormationModel, checked_gain
 from gains.formation.pattern import Pattern, checked_pattern_gain, leader_follower
 from gains.performance.behaviour import Behaviour, BlockMargin, behaviour, block_margin, diagonal_blocks
+from gains.performance.predicted import fed_forward
 from gains.performance.robust import Certificate, certify, robustness
 from gains.performance.string_stability import Gains
 from gains.sampled.constant import sampled_delay_margin
@@ -56,6 +57,8 @@ class Design:
     K3: FloatArray
     """Gains on the own velocity error (1/s), that of the vehicle in front (1/s) and the spacing error (1/s²), each of
     shape (axes, axes)."""
+    feed_forward: float
+    """Share of the command of the vehicle in front that each follower adds; margins are the same without."""
     alpha: float
     """Exact sector bound for W = I, `gains.performance.robust.robustness`; 0 if the loop is unstable."""
     delay_margin_s: float
@@ -137,7 +140,7 @@ def design(
     gains = required_gains(wanted, period_s) if wanted.criteria is None else criteria_gains(wanted, period_s)
     identity = np.eye(formation.axes)
     matrices = 0.0 - gains.k1 * identity, gains.k2 * identity, gains.k3 * identity
-    result = _assess(formation, matrices, period_s=period_s, requirement=wanted)
+    result = _assess(formation, matrices, wanted.feed_forward, period_s=period_s, requirement=wanted)
     decay = result.behaviour.decay_rate_1_s
     if (
         result.delay_margin_s < (wanted.delay_margin_s or 0.0)
@@ -153,7 +156,11 @@ def design(
 
 @overload
 def evaluate_gains(
-    formation: FormationModel, gains: tuple[ArrayLike, ArrayLike, ArrayLike], *, period_s: float
+    formation: FormationModel,
+    gains: tuple[ArrayLike, ArrayLike, ArrayLike],
+    *,
+    period_s: float,
+    feed_forward: float = 0.0,
 ) -> Design: ...
 
 
@@ -164,14 +171,20 @@ def evaluate_gains(
 
 
 def evaluate_gains(
-    formation: FormationModel, gains: Any, *, period_s: float, pattern: Pattern | None = None
+    formation: FormationModel,
+    gains: Any,
+    *,
+    period_s: float,
+    pattern: Pattern | None = None,
+    feed_forward: float = 0.0,
 ) -> Design | GraphDesign:
     """Return margins, robustness and decay of given gains.
 
     Gains of an unstable loop are reported too: α and the margins are 0 and there is no certificate. `gains` are K1, K2
     and K3, each of shape (axes, axes), or with a `pattern`, which says who may use whose output, K of u = K e, shape
-    (inputs, states). Commands are sampled and held every `period_s`. Raises BadModelError if a gain is not finite, not
-    of its shape or not in the pattern, or the period is not positive.
+    (inputs, states). Commands are sampled and held every `period_s`. With K1, K2 and K3 each follower may add the share
+    `feed_forward` of the command of the vehicle in front. Raises BadModelError if a gain is not finite, not of its
+    shape or not in the pattern, or the period is not positive.
 
     K1 = −1, K3 = 1: a follower takes 0.711119 s, or half a period less when sampled.
 
@@ -184,11 +197,16 @@ def evaluate_gains(
     own, front, spacing = (
         checked_gain(name, gain, formation.axes) for name, gain in zip(("K1", "K2", "K3"), gains, strict=True)
     )
-    return _assess(formation, (own, front, spacing), period_s=period_s, requirement=None)
+    return _assess(formation, (own, front, spacing), feed_forward, period_s=period_s, requirement=None)
 
 
-def _assess(formation: FormationModel, gains: Gains, *, period_s: float, requirement: Requirement | None) -> Design:
-    """Everything that is reported of gains, given or designed to a requirement, for the whole formation."""
+def _assess(
+    formation: FormationModel, gains: Gains, share: float, *, period_s: float, requirement: Requirement | None
+) -> Design:
+    """Everything that is reported of gains, given or designed to a requirement, for the whole formation.
+
+    `share` is the feed-forward. A follower behind the leader gets `share` K1 e_leader^v by it, as if K2 were larger.
+    """
     # scipy.sparse takes a quarter of a second to import, which commands that only read a design need not wait for.
     from gains.formation.inclusion import expand, expanded_gain, modified_gain, verify_inclusion
 
@@ -196,9 +214,10 @@ def _assess(formation: FormationModel, gains: Gains, *, period_s: float, require
     expansion, K_expanded = expand(formation), modified_gain(formation, expanded_gain(formation, *gains))
     verify_inclusion(expansion, A, B, K=K, K_expanded=K_expanded)
 
-    alpha = robustness(*gains)
-    margin_s = sampled_delay_margin(A, B, K, period_s=period_s)
-    continuous_s = delay_margin(A, B @ K)
+    flown, K_flown = (gains[0], gains[1] + share * gains[0], gains[2]), fed_forward(formation, K, share)
+    alpha = robustness(*flown)
+    margin_s = sampled_delay_margin(A, B, K_flown, period_s=period_s)
+    continuous_s = delay_margin(A, B @ K_flown)
     leader, follower = (block_margin(*block) for block in diagonal_blocks(gains))
     blocks_s = [leader.delay_margin_s, follower.delay_margin_s][: formation.vehicles]
     if not np.isclose(continuous_s, min(blocks_s), rtol=1e-9, atol=0):
@@ -210,6 +229,7 @@ def _assess(formation: FormationModel, gains: Gains, *, period_s: float, require
         K1=gains[0],
         K2=gains[1],
         K3=gains[2],
+        feed_forward=share,
         alpha=alpha,
         delay_margin_s=margin_s,
         delay_margin_continuous_s=continuous_s,
@@ -217,10 +237,11 @@ def _assess(formation: FormationModel, gains: Gains, *, period_s: float, require
         vehicles=formation.vehicles,
         leader=leader,
         follower=follower,
-        behaviour=behaviour(gains, (margin_s + period_s) / 2),
-        certificate=_certificate(gains, alpha, given=requirement is None),
+        behaviour=behaviour(gains, (margin_s + period_s) / 2, feed_forward=share),
+        certificate=_certificate(flown, alpha, given=requirement is None),
         requirement=requirement,
         method="inclusion" if requirement else "given",
+        pattern=PATTERN + (f" + {share:g} u_predecessor" if share else ""),
     )
 
 
@@ -237,18 +258,22 @@ def _certificate(gains: Gains, alpha: float, *, given: bool) -> Certificate | No
 
 
 def trade_off(
-    *, period_s: float, string_peak_max: float | None = None, loop: Literal["ground", "onboard"] = "ground"
+    *,
+    period_s: float,
+    string_peak_max: float | None = None,
+    loop: Literal["ground", "onboard"] = "ground",
+    feed_forward: float = 0.0,
 ) -> tuple[TradeOffPoint, ...]:
     """Return the largest α at sampled delay margins from 0.05 to 1 s, without those that no gains have.
 
     Arguments as in `gains.core.requirement.Requirement`; commands are sampled and held every `period_s`. Raises
-    BadModelError if the period is not positive or the limit is below 1.
+    BadModelError if the period is not positive or another argument is out of its range.
 
     >>> points = trade_off(period_s=0.02)
     >>> points[0].delay_margin_s, points[-1].delay_margin_s, points[0].alpha > points[-1].alpha
     (0.05, 1.0, True)
     """
     positive_seconds("period_s", period_s)
-    limit = Requirement(string_peak_max=string_peak_max, loop=loop).peak_limit
+    limit = Requirement(string_peak_max=string_peak_max, loop=loop, feed_forward=feed_forward).chain_limit
     points = ((margin_s, largest_alpha(margin_s, period_s, limit)) for margin_s in _TRADE_OFF_MARGINS_S)
     return tuple(TradeOffPoint(margin_s, gains.alpha) for margin_s, gains in points if gains is not None)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from gains.core._bracketing import met_end
 from gains.core.errors import InfeasibleError
-from gains.core.requirement import DELAY_MARGIN_MAX_S, PeakLimit, Requirement
+from gains.core.requirement import DELAY_MARGIN_MAX_S, ChainLimit, Requirement
 from gains.criteria.parts import rounded
 from gains.design.search import fastest_decay, largest_alpha, largest_margin
 from gains.performance.lone_margin import lone_margin
@@ -37,7 +37,7 @@ def required_gains(wanted: Requirement, period_s: float) -> ScalarGains:
 
 def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains | None:
     """The gains of `required_gains`, None if there are none."""
-    limit, decay = wanted.peak_limit, wanted.decay_rate_1_s or 0.0
+    limit, decay = wanted.chain_limit, wanted.decay_rate_1_s or 0.0
     margin_s = wanted.delay_margin_s
     if margin_s is None and wanted.alpha is not None:
         found = largest_margin(wanted.alpha, period_s, limit, decay)
@@ -50,7 +50,7 @@ def _best_gains(wanted: Requirement, period_s: float) -> ScalarGains | None:
     return None if gains is None or gains.alpha < (wanted.alpha or 0.0) else gains
 
 
-def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: PeakLimit) -> float:
+def _margin_of_decay(decay_rate_1_s: float, period_s: float, limit: ChainLimit) -> float:
     """The largest margin (s) with which gains decay as fast as this, 0 if none do; longer margins decay slower."""
     low, high = 0.0, DELAY_MARGIN_MAX_S
     if fastest_decay(high, period_s, limit) >= decay_rate_1_s:
@@ -83,7 +83,7 @@ def _conflict(wanted: Requirement, period_s: float) -> str:
 
 def _most(name: str, wanted: Requirement, period_s: float) -> float:
     """The largest value of one part of the requirement that leaves the others as they are; 0 if none does."""
-    limit, margin_s = wanted.peak_limit, wanted.delay_margin_s or 0.0
+    limit, margin_s = wanted.chain_limit, wanted.delay_margin_s or 0.0
     alpha, decay = wanted.alpha or 0.0, wanted.decay_rate_1_s or 0.0
     if name == "alpha":
         gains = largest_alpha(margin_s, period_s, limit, decay)
@@ -123,7 +123,7 @@ def requirement_with(requirement: Requirement, response: Response | None, *, tim
         responses, lag_s = [response] * 2, response.lag_s + response.dead_time_s
 
     def excess(without_s: float) -> float:
-        found = largest_alpha(without_s, timing.held_s, requirement.peak_limit, requirement.decay_rate_1_s or 0.0)
+        found = largest_alpha(without_s, timing.held_s, requirement.chain_limit, requirement.decay_rate_1_s or 0.0)
         if found is None:
             return -wanted_s
         if response is not None and response.dead_time_s and timing.commands == 1:  # which takes the other too long

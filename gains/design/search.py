@@ -9,12 +9,12 @@ import numpy as np
 
 from gains.core._bracketing import met_end
 from gains.core.arrays import FloatArray
-from gains.core.requirement import OnboardPeak, PeakLimit
+from gains.core.requirement import UNLIMITED, ChainLimit
 from gains.performance.scalar_gains import (
     ScalarGains,
     alpha_of,
     decay_rate_of,
-    front_gain_limit,
+    front_gain_range,
     gains_of_margin,
     onboard_front_gain_limit,
 )
@@ -25,8 +25,9 @@ _ROUNDS_ALL_FRONT = 5
 _SCAN_FIRST, _SCAN_NEXT, _SCAN_SPARE, _ROUNDS = (25, 17), (9, 9), 9, 18
 # The angle of the crossing, as a share of the one at which k3 = 0 in the continuous loop; above 1 in the sampled loop.
 _SHARE_MIN, _SHARE_MAX = 0.02, 1.3
-# |k2| is sought up to this multiple of k1. The optimum of α is near k1.
-_FRONT_MAX = 2.0
+# |k2| is sought up to this multiple of k1. The optimum of α is near k1. A range of k2 that is empty by this share of k1
+# is a point, as with full feed-forward.
+_FRONT_MAX, _SLIVER = 2.0, 1e-9
 # k1 T at most: without delay the sampled leader moves by the factor 1 − k1 T a period, which this keeps above −0.8.
 _OWN_STEP_MAX = 1.8
 # α is exact to about this, so an α asked for is aimed at from above by it, and no finer root is sought.
@@ -41,19 +42,19 @@ _SCAN_FASTEST, _ROUNDS_FASTEST = 33, 12
 
 
 def largest_alpha(
-    delay_margin_s: float, period_s: float, string_peak_max: PeakLimit = None, decay_rate_1_s: float = 0.0
+    delay_margin_s: float, period_s: float, limit: ChainLimit = UNLIMITED, decay_rate_1_s: float = 0.0
 ) -> ScalarGains | None:
     """Return the gains of largest α among those with at least the given delay margin, None if there are none.
 
     The margin is that of the loop with all feedback late, sampled and held every `period_s`, or continuous if that is
-    0. Spacing errors grow from vehicle to vehicle by at most `string_peak_max`, both without delay and with half the
+    0. Spacing errors grow from vehicle to vehicle by no more than `limit` says, both without delay and with half the
     margin as loop delay (plus half a period for the hold), or on board at every delay. The continuous loop without
-    delay decays at least with `decay_rate_1_s`.
+    delay decays at least with `decay_rate_1_s`. α is that of the loop with the feed-forward in `limit`.
     """
     # Axes of the scan: share of the crossing angle, k2 as a share of its limit, margin left over in periods.
     shares = (_SHARE_MIN, _SHARE_MAX)
     if decay_rate_1_s > 0.0:
-        fast = _fast_shares(decay_rate_1_s, delay_margin_s, period_s, string_peak_max)
+        fast = _fast_shares(decay_rate_1_s, delay_margin_s, period_s, limit)
         if fast is None:
             return None
         shares = fast
@@ -63,7 +64,7 @@ def largest_alpha(
     for turn in range(_ROUNDS):
         points = (*(_SCAN_FIRST if turn == 0 else _SCAN_NEXT), _SCAN_SPARE if spare_max else 1)
         grids = [np.linspace(*window, count) for window, count in zip(windows, points, strict=True)]
-        found = _best_of_grid(grids, delay_margin_s, period_s, string_peak_max, decay_rate_1_s)
+        found = _best_of_grid(grids, delay_margin_s, period_s, limit, decay_rate_1_s)
         if found is not None and (best is None or found[0].alpha > best[0].alpha):
             best = found
         if best is None:
@@ -79,7 +80,7 @@ def largest_alpha(
 
 
 def largest_margin(
-    alpha: float, period_s: float, string_peak_max: PeakLimit = None, decay_rate_1_s: float = 0.0
+    alpha: float, period_s: float, limit: ChainLimit = UNLIMITED, decay_rate_1_s: float = 0.0
 ) -> tuple[float, ScalarGains] | None:
     """Return the largest delay margin (s) at which α can be reached, and the gains; None if no margin is left.
 
@@ -87,7 +88,7 @@ def largest_margin(
     """
 
     def excess(margin_s: float) -> float:
-        gains = largest_alpha(margin_s, period_s, string_peak_max, decay_rate_1_s)
+        gains = largest_alpha(margin_s, period_s, limit, decay_rate_1_s)
         return (gains.alpha if gains else 0.0) - alpha - _ALPHA_RESOLUTION
 
     # Double the margin until α is lost, or halve it until α is there; below two periods the last half is all of it.
@@ -104,20 +105,20 @@ def largest_margin(
         if f_low < 0:
             high, f_high = low, f_low
     margin_s = met_end(excess, (low, f_low), (high, f_high), resolution=_ALPHA_RESOLUTION)
-    gains = largest_alpha(margin_s, period_s, string_peak_max, decay_rate_1_s)
+    gains = largest_alpha(margin_s, period_s, limit, decay_rate_1_s)
     assert gains is not None
     return margin_s, gains
 
 
-def fastest_decay(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit = None) -> float:
+def fastest_decay(delay_margin_s: float, period_s: float, limit: ChainLimit = UNLIMITED) -> float:
     """Return the largest decay rate (1/s), without delay, of gains with a margin; 0 if no gains have the margin.
 
     Arguments as of `largest_alpha`.
     """
-    return _fastest(delay_margin_s, period_s, string_peak_max)[0]
+    return _fastest(delay_margin_s, period_s, limit)[0]
 
 
-def _fastest(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit) -> tuple[float, float]:
+def _fastest(delay_margin_s: float, period_s: float, limit: ChainLimit) -> tuple[float, float]:
     """The largest decay rate of a margin and the share of the crossing angle that has it.
 
     Along the curve the decay rate rises to that share, critical damping or the last that is usable, and falls.
@@ -126,7 +127,7 @@ def _fastest(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit)
     rate, share = 0.0, (low + high) / 2
     for _ in range(_ROUNDS_FASTEST):
         shares = np.linspace(low, high, _SCAN_FASTEST)
-        rates = _decay_rates(shares, delay_margin_s, period_s, string_peak_max)
+        rates = _decay_rates(shares, delay_margin_s, period_s, limit)
         at = int(np.argmax(rates))
         rate, share = float(rates[at]), float(shares[at])
         low, high = float(shares[max(at - 1, 0)]), float(shares[min(at + 1, shares.size - 1)])
@@ -134,10 +135,10 @@ def _fastest(delay_margin_s: float, period_s: float, string_peak_max: PeakLimit)
 
 
 def _fast_shares(
-    decay_rate_1_s: float, delay_margin_s: float, period_s: float, string_peak_max: PeakLimit
+    decay_rate_1_s: float, delay_margin_s: float, period_s: float, limit: ChainLimit
 ) -> tuple[float, float] | None:
     """The shares of the crossing angle between which gains of a margin decay as fast as this; None if none do."""
-    rate, share = _fastest(delay_margin_s, period_s, string_peak_max)
+    rate, share = _fastest(delay_margin_s, period_s, limit)
     if rate < decay_rate_1_s:
         return None
 
@@ -146,7 +147,7 @@ def _fast_shares(
         fast, slow = share, end
         for _ in range(_ROUNDS_FASTEST):
             shares = np.linspace(fast, slow, _SCAN_FASTEST)
-            rates = _decay_rates(shares, delay_margin_s, period_s, string_peak_max)
+            rates = _decay_rates(shares, delay_margin_s, period_s, limit)
             count = int(np.argmin(rates >= decay_rate_1_s)) or shares.size
             fast, slow = float(shares[count - 1]), float(shares[min(count, shares.size - 1)])
         return fast
@@ -154,12 +155,12 @@ def _fast_shares(
     return last_fast(_SHARE_MIN), last_fast(_SHARE_MAX)
 
 
-def _decay_rates(share: FloatArray, delay_margin_s: float, period_s: float, string_peak_max: PeakLimit) -> FloatArray:
+def _decay_rates(share: FloatArray, delay_margin_s: float, period_s: float, limit: ChainLimit) -> FloatArray:
     """The decay rate at each share, the largest over the margin to spare; 0 where no gains can be used."""
     spare_max = _spare_max(delay_margin_s, period_s)
     spare = np.linspace(0.0, spare_max, _SCAN_SPARE if spare_max else 1)[:, None]
-    k1, k3, limit = _usable_gains(share, delay_margin_s + spare * period_s, period_s, string_peak_max)
-    return np.where(np.isfinite(limit), decay_rate_of(k1, k3), 0.0).max(axis=0)
+    k1, k3, _, most = _usable_gains(share, delay_margin_s + spare * period_s, period_s, limit)
+    return np.where(np.isfinite(most), decay_rate_of(k1, k3), 0.0).max(axis=0)
 
 
 def _spare_max(delay_margin_s: float, period_s: float) -> float:
@@ -168,45 +169,53 @@ def _spare_max(delay_margin_s: float, period_s: float) -> float:
 
 
 def _usable_gains(
-    share: FloatArray, margin_s: FloatArray, period_s: float, string_peak_max: PeakLimit
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """k1, k3 of each share and margin (broadcast), and the largest |k2| to try: NaN where they cannot be used."""
+    share: FloatArray, margin_s: FloatArray, period_s: float, limit: ChainLimit
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """k1, k3 of each share and margin (broadcast), and the least and the largest k2; NaN where they cannot be used."""
     share, margin_s = np.broadcast_arrays(share, margin_s)
     k1, k3 = gains_of_margin(share, margin_s, period_s)
-    limit = _front_limit(k1, k3, (margin_s + period_s) / 2, string_peak_max)
-    return k1, k3, np.where((k1 > 0) & (k3 > 0) & (k1 * period_s <= _OWN_STEP_MAX), limit, np.nan)
+    least, most = _front_range(k1, k3, (margin_s + period_s) / 2, limit)
+    usable = (k1 > 0) & (k3 > 0) & (k1 * period_s <= _OWN_STEP_MAX) & (least <= most + _SLIVER * k1)
+    return k1, k3, np.where(usable, least, np.nan), np.where(usable, most, np.nan)
 
 
 def _best_of_grid(
-    grids: list[FloatArray], delay_margin_s: float, period_s: float, string_peak_max: PeakLimit, decay_rate_1_s: float
+    grids: list[FloatArray], delay_margin_s: float, period_s: float, limit: ChainLimit, decay_rate_1_s: float
 ) -> tuple[ScalarGains, tuple[float, float, float]] | None:
     """The gains of largest α on the grids of share, front and spare, and where they are; None if none can be used."""
     front = grids[1]
     share, spare = (grid.ravel() for grid in np.meshgrid(grids[0], grids[2]))
-    k1, k3, limit = _usable_gains(share, delay_margin_s + spare * period_s, period_s, string_peak_max)
-    usable = np.isfinite(limit)
+    k1, k3, least, most = _usable_gains(share, delay_margin_s + spare * period_s, period_s, limit)
+    usable = np.isfinite(most)
     if decay_rate_1_s > 0.0:
         usable &= np.where(usable, decay_rate_of(k1, k3), 0.0) >= decay_rate_1_s
     if not usable.any():
         return None
-    k1, k3, limit, share, spare = (grid[usable] for grid in (k1, k3, limit, share, spare))
-    k2 = limit[:, None] * front
-    alpha = alpha_of(k1[:, None], k2, k3[:, None])
+    k1, k3, least, most, share, spare = (grid[usable] for grid in (k1, k3, least, most, share, spare))
+    k2 = ((least + most) / 2)[:, None] + ((most - least) / 2)[:, None] * front
+    alpha = alpha_of(k1[:, None], k2 - limit.feed_forward * k1[:, None], k3[:, None])
     i, j = np.unravel_index(int(np.argmax(alpha)), alpha.shape)
     gains = ScalarGains(float(k1[i]), float(k2[i, j]) + 0.0, float(k3[i]), float(alpha[i, j]))
     return gains, (float(share[i]), float(front[j]), float(spare[i]))
 
 
-def _front_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string_peak_max: PeakLimit) -> FloatArray:
-    """Largest |k2| to try: a multiple of k1, less where spacing errors would grow, NaN where they grow in any case."""
-    limit = _FRONT_MAX * k1
-    if string_peak_max is None:
-        return limit
-    if isinstance(string_peak_max, OnboardPeak):
-        return np.minimum(limit, onboard_front_gain_limit(k1, k3, string_peak_max.peak))
+def _front_range(
+    k1: FloatArray, k3: FloatArray, delay_s: FloatArray, limit: ChainLimit
+) -> tuple[FloatArray, FloatArray]:
+    """The least and the largest k2 to try: a multiple of k1, less where spacing errors would grow.
+
+    Where they grow in any case, the least is above the largest, or both are NaN.
+    """
+    least, most = -_FRONT_MAX * k1, _FRONT_MAX * k1
+    if limit.peak is None:
+        return least, most
+    if limit.loop == "onboard":
+        most = np.minimum(most, onboard_front_gain_limit(k1, k3, limit.peak))
+        return -most, most
     for delay in (np.zeros_like(delay_s), delay_s):
-        limit = np.minimum(limit, front_gain_limit(k1, k3, delay, string_peak_max))
-    return limit
+        low, high = front_gain_range(k1, k3, delay, limit.peak, limit.feed_forward)
+        least, most = np.maximum(least, low), np.minimum(most, high)
+    return least, most
 
 
 def _narrowed(

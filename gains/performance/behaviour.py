@@ -66,11 +66,13 @@ def block_margin(A0: ArrayLike, A1: ArrayLike) -> BlockMargin:
     return BlockMargin(analysis.delay_margin_s, first.omega_rad_s if first else float("nan"))
 
 
-def behaviour(gains: Gains, delay_s: float, *, own_delay_s: float | None = None) -> Behaviour:
+def behaviour(
+    gains: Gains, delay_s: float, *, own_delay_s: float | None = None, feed_forward: float = 0.0
+) -> Behaviour:
     """Return the behaviour of a formation whose leader and followers have the gains K1, K2 and K3.
 
     For the figures with delay all feedback is late by the constant `delay_s`, except that a vehicle's own errors are
-    late by `own_delay_s` if that is given.
+    late by `own_delay_s` if that is given. Followers add the share `feed_forward` of the command in front.
 
     The leader's root is −1, the follower's s² + s + 1 has damping 1/2:
 
@@ -86,8 +88,8 @@ def behaviour(gains: Gains, delay_s: float, *, own_delay_s: float | None = None)
         damping=min(_damping(root) for root in roots.tolist()),
         decay_rate_delayed_1_s=float(-max(root.real for root in late)),
         damping_delayed=_damping(late[1]),
-        string_peak=string_peak(gains, 0.0),
-        string_peak_delayed=string_peak(gains, own_s, front_delay_s=delay_s),
+        string_peak=string_peak(gains, 0.0, feed_forward=feed_forward),
+        string_peak_delayed=string_peak(gains, own_s, front_delay_s=delay_s, feed_forward=feed_forward),
         delay_s=delay_s,
     )
 

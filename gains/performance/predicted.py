@@ -33,7 +33,7 @@ from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled._loop import HeldPlant, held_entry
 from gains.sampled.multirate import Timing
-from gains.sampled.prediction import mismatch_window
+from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 
 # frequencies of the first look at a response, and how far below the slowest motion they begin
 _FREQUENCIES, _LOWEST = 1500, 1e-3
@@ -85,7 +85,7 @@ class PredictedLoop:
     def string_peak(self, delay_s: float) -> float:
         """Largest ratio of a follower's commanded motion to that in front, over all frequencies that samples have.
 
-        At least one; `inf` outside the window.
+        At least one; `inf` where the loop is unstable.
         """
         if not self.is_stable(delay_s):
             return inf
@@ -103,7 +103,7 @@ class PredictedLoop:
         return np.abs((self.feed_forward + front) / (1.0 - own))
 
     def alpha(self, delay_s: float) -> float:
-        """Disturbances |w| up to alpha |e| (1/s) are withstood at a true loop delay; 0 outside the window.
+        """Disturbances |w| up to alpha |e| (1/s) are withstood at a true loop delay; 0 if the loop is unstable.
 
         The complex stability radius, as of `gains.performance.flown`: the hold counts as half a period.
         """
@@ -126,9 +126,13 @@ class PredictedLoop:
         return 1.0 / highest(gain, np.geomspace(_LOWEST * self._slowest, most, _FREQUENCIES))[1]
 
     def is_stable(self, delay_s: float) -> bool:
-        """Whether a true delay is in the window."""
-        least_s, most_s = self.window_s
-        return least_s < delay_s < most_s or delay_s == least_s == 0.0 < most_s
+        """Whether the loop is stable at a true delay, in its window or in another interval of delays."""
+        A, B, K = self._matrices
+        timing = Timing(self.period_s, self.period_s)
+        growth_1_s = predicted_growth_rate(
+            A, B, K, timing, assumed_s=self.assumed_s, delay_s=delay_s, measured=self._measured
+        )
+        return growth_1_s < 0.0
 
     @cached_property
     def _matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -1,11 +1,13 @@
 """One follower with scalar gains: its delay margin, growth of errors, robustness and decay, by formula.
 
-The gains act on every axis alike, u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p, and all feedback is late. The delay margin
-depends on (k1, k3) alone and the gains of a given margin form a curve with an explicit equation (`gains_of_margin`).
+The gains act on every axis alike, u_i = −k1 e_i^v + k2 e_j^v + k3 e_i^p + k_ff u_j, and all feedback is late. The delay
+margin depends on (k1, k3) alone and the gains of a given margin form a curve with an explicit equation
+(`gains_of_margin`).
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 
@@ -17,6 +19,8 @@ PAIR = FormationModel((-1, 0), axes=1)
 # Frequencies of the first look at a response, and of each closer look between the neighbours of the least one. Three
 # closer looks, and a parabola through the last, give σ_min to about 1e-10 of itself.
 _FREQUENCIES, _FREQUENCIES_CLOSER, _CLOSER_LOOKS = 40, 9, 3
+# How much farther frequencies reach with feed-forward, and how many times more are looked at, at most.
+_FARTHEST, _MOST_FREQUENCIES = 10.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -67,27 +71,37 @@ def gains_of_margin(share: FloatArray, delay_margin_s: FloatArray, period_s: flo
     return spacing.imag / determinant, velocity.imag / determinant
 
 
-def front_gain_limit(k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string_peak_max: float) -> FloatArray:
-    """Return the largest |k2| with which spacing errors grow by at most `string_peak_max` from vehicle to vehicle.
+def front_gain_range(
+    k1: FloatArray, k3: FloatArray, delay_s: FloatArray, string_peak_max: float, feed_forward: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the largest k2 with which spacing errors grow by at most `string_peak_max` per vehicle.
 
-    The spacing error of a vehicle follows that of the vehicle in front with
-    Γ(s) = (k2 s + k3) e^{−sτ} / (s² + (k1 s + k3) e^{−sτ}). |Γ(jω)| ≤ L for all ω is
+    The spacing error of a vehicle follows that of the vehicle in front, of whose command it adds the share k_ff
+    `feed_forward`, with Γ(s) = (k_ff s² + (k2 s + k3) e^{−sτ}) / (s² + (k1 s + k3) e^{−sτ}). |Γ(jω)| ≤ L is
 
-        k2² ≤ L² (ω² − 2 (k3 cos ωτ + k1 ω sin ωτ) + k1²) + (L² − 1) k3² / ω²     for all ω > 0,
+        (k2 − k_ff ω sin ωτ)² ≤ L² (ω² − 2 (k3 cos ωτ + k1 ω sin ωτ) + k1²) + (L² − 1) k3² / ω²
+                                + 2 k_ff k3 cos ωτ − (k_ff ω cos ωτ)²                            for all ω > 0,
 
-    without delay and with L = 1: k2² ≤ k1² − 2 k3. The result has the shape of `k1`: NaN where no k2 will do.
+    without delay, with L = 1 and k_ff = 0: k2² ≤ k1² − 2 k3. The results have the shape of `k1`; where no k2 will do,
+    the least is above the largest.
     """
-    at_rest = k1**2 - 2 * k3 if string_peak_max == 1 else np.full_like(k1, np.inf)
-    omega = _frequencies_below_growth(k1, k3)
+    omega, at_rest = _frequencies_below_growth(k1, k3, feed_forward), k1**2 - 2 * (1.0 - feed_forward) * k3
     k1, k3, delay_s = k1[..., None], k3[..., None], delay_s[..., None]
 
-    def bound(omega: FloatArray) -> FloatArray:
+    def most(omega: FloatArray, side: float) -> FloatArray:
+        """The largest k2 of one frequency, or of the mirrored range; a range of negative width where there is none."""
         lag = omega * delay_s
         flat = omega**2 - 2 * (k3 * np.cos(lag) + k1 * omega * np.sin(lag)) + k1**2
-        return string_peak_max**2 * flat + (string_peak_max**2 - 1) * (k3 / omega) ** 2
+        square = string_peak_max**2 * flat + (string_peak_max**2 - 1) * (k3 / omega) ** 2
+        if feed_forward:
+            square += 2.0 * feed_forward * k3 * np.cos(lag) - (feed_forward * omega * np.cos(lag)) ** 2
+        return side * feed_forward * omega * np.sin(lag) + np.copysign(np.sqrt(np.abs(square)), square)
 
-    least = np.minimum(_around_least(bound, omega)[0].min(axis=-1), at_rest)
-    return np.sqrt(np.where(least >= 0, least, np.nan))
+    sides = (-1.0, 1.0) if feed_forward else (1.0,)  # without, the range is its own mirror image
+    ends = [_around_least(lambda omega, side=side: most(omega, side), omega)[0].min(axis=-1) for side in sides]
+    if string_peak_max == 1:
+        ends = [np.minimum(end, np.copysign(np.sqrt(np.abs(at_rest)), at_rest)) for end in ends]
+    return -ends[0], ends[-1]
 
 
 def onboard_front_gain_limit(k1: FloatArray, k3: FloatArray, string_peak_max: float) -> FloatArray:
@@ -153,10 +167,15 @@ def decay_rate_of(k1: FloatArray, k3: FloatArray) -> FloatArray:
     return k1 / 2 - np.sqrt(np.maximum(k1**2 / 4 - k3, 0.0))
 
 
-def _frequencies_below_growth(k1: FloatArray, k3: FloatArray) -> FloatArray:
-    """Frequencies up to 2 k1 + √(2 k3), above which bounds of k2 grow at every delay: ω² outgrows 2 (k3 + k1 ω)."""
-    highest = 2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3)))
-    return np.broadcast_to(np.linspace(0, highest, 97)[1:], (*k1.shape, 96))
+def _frequencies_below_growth(k1: FloatArray, k3: FloatArray, feed_forward: float = 0.0) -> FloatArray:
+    """Frequencies up to 2 k1 + √(2 k3), above which bounds of k2 grow at every delay: ω² outgrows 2 (k3 + k1 ω).
+
+    Of ω² feed-forward leaves (1 − k_ff²) ω² only: then they reach farther.
+    """
+    farther = min(1.0 / (1.0 - feed_forward) if feed_forward < 1.0 else inf, _FARTHEST)
+    highest = farther * (2 * np.max(np.abs(k1)) + np.sqrt(2 * np.max(np.abs(k3))))
+    count = round(96 * min(farther, _MOST_FREQUENCIES))
+    return np.broadcast_to(np.linspace(0, highest, count + 1)[1:], (*k1.shape, count))
 
 
 def _around_least(function: Callable[[FloatArray], FloatArray], omega: FloatArray) -> tuple[FloatArray, IntArray]:

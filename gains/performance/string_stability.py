@@ -25,7 +25,12 @@ _POINTS_PER_DECADE, _DECADES_BELOW, _DECADES_ABOVE = 300, 4, 2
 
 
 def string_peak(
-    gains: Gains, delay_s: float, *, front_delay_s: float | None = None, answer: Transfer = np.ones_like
+    gains: Gains,
+    delay_s: float,
+    *,
+    front_delay_s: float | None = None,
+    answer: Transfer = np.ones_like,
+    feed_forward: float = 0.0,
 ) -> float:
     """Return the largest singular value of Γ(jω) over ω, at least |Γ(0)| = 1.
 
@@ -33,10 +38,10 @@ def string_peak(
     alike, also the spacing error in front to the follower's own. With own feedback delayed by a and that of the vehicle
     in front by b::
 
-        Γ(s) = (s² I − (s K1 − K3) h e^{−sa})^{-1} (s K2 e^{−sb} + K3 e^{−sa}) h
+        Γ(s) = (s² I − (s K1 − K3) h e^{−sa})^{-1} ((s K2 e^{−sb} + K3 e^{−sa}) h + s² k_ff I)
 
     a is `delay_s` and b `front_delay_s`, the same if not given, as when a ground station closes every loop. h(jω) is
-    `answer`, from wanted to real acceleration.
+    `answer`, from wanted to real acceleration; k_ff is `feed_forward`, the share of the command in front that is added.
 
     |1 / (s² + s + 1)| peaks at 2 / √3:
 
@@ -54,6 +59,8 @@ def string_peak(
         at_once, late = ((h * np.exp(-s * delay))[:, None, None] for delay in (delay_s, behind_s))
         s = s[:, None, None]
         loop, entry = s**2 * identity - (s * own - spacing) * at_once, s * front * late + spacing * at_once
+        if feed_forward:
+            entry = entry + s**2 * feed_forward * identity
         if len(identity) == 1:
             return (entry / loop)[:, 0, 0]
         return np.linalg.norm(np.linalg.solve(loop, entry), ord=2, axis=(1, 2))

@@ -18,6 +18,7 @@ from pydantic_core import to_jsonable_python
 from gains.core.errors import BadModelError
 from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
 from gains.margin.model_file import DelayModel, Term, parse_model, with_short_zeros
+from gcs.plan.design import PredictionPart
 
 _ROWS = 20
 """Most rows of a table."""
@@ -36,6 +37,8 @@ class ScenarioMargin:
     margin: LoopMargin
     loop: str
     delay_margin_sampled_s: float | None
+    prediction: PredictionPart | None
+    """The mismatch windows of a station that predicts; the margins are those without prediction."""
 
 
 def margin_of_file(file: Path) -> LoopMargin | LoopAtGivenDelays:
@@ -105,15 +108,17 @@ def margin_of_scenario(file: Path, *, allow_code: bool = False) -> ScenarioMargi
     flown = "no limit" if sampled_s is None else f"margin {sampled_s:.6g} s"
     note = f"as flown, sampled and held every {design.period_s * 1e3:g} ms: {flown}"
     if design.prediction is not None:
-        note = note.replace("as flown", "without prediction") + "; gcs design tells where the loop is stable with it"
-    return ScenarioMargin(replace(found, notes=(f"loop {loop}: {what}", note, *found.notes)), loop, sampled_s)
+        note = note.replace("as flown", "without prediction")
+    margin = replace(found, notes=(f"loop {loop}: {what}", note, *found.notes))
+    return ScenarioMargin(margin, loop, sampled_s, design.prediction)
 
 
 def margin_fields(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> dict[str, Any]:
     """The JSON of a margin: null for an unbounded number; a crossing has only the fields that are known."""
     if isinstance(found, ScenarioMargin):
         flown = {"loop": found.loop, "delay_margin_sampled_s": found.delay_margin_sampled_s}
-        return margin_fields(found.margin) | flown
+        predicted = {} if found.prediction is None else {"prediction": found.prediction.to_dict()}
+        return margin_fields(found.margin) | flown | predicted
     if isinstance(found, LoopAtGivenDelays):
         unknown = dict.fromkeys(("unknown", "stable_intervals_s", "delay_margin_s", "delay_independent"))
         return unknown | {
@@ -129,6 +134,7 @@ def margin_fields(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> dic
 
 def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None:
     from gcs.views.console import plain_console, table_of
+    from gcs.views.report import windows_table
 
     console = plain_console()
     if isinstance(found, LoopAtGivenDelays):
@@ -149,6 +155,8 @@ def print_margin(found: LoopMargin | LoopAtGivenDelays | ScenarioMargin) -> None
             console.print(f"and {len(margin.crossings) - _ROWS} more crossings")
     for note in margin.notes:
         console.print(note)
+    if isinstance(found, ScenarioMargin) and found.prediction is not None:
+        console.print(windows_table(found.prediction))
 
 
 def _omega(crossing: MarginCrossing) -> str:

@@ -23,15 +23,19 @@ from scenarios.schema import Scenario
 
 def with_figures_at_delay(design: Design, scenario: Scenario) -> Design:
     """The design with `at_loop_delay`: the figures at the expected loop delay, and the delays up to which they hold."""
-    flown, chains = _flown(design, scenario)
-    if not flown:
+    at_delay = figures_at(design, scenario, expected_loop_delay_s(scenario))
+    if at_delay.alpha is None:
         return design
+    if _is_predicted(design):
+        found = FiguresAtExpectedDelay(**at_delay.model_dump())
+        return design.model_copy(update={"at_loop_delay": found})
+    flown, chains = _flown(design, scenario)
     requirement = design.requirement
     peak = ((requirement and requirement.string_peak_max) or 1.0) if chains else None
     # where vehicles differ, the least counts
     alpha = (requirement and requirement.alpha) or ALPHA_KEPT * min(formation.alpha(0.0) for formation in flown)
     figures = FiguresAtExpectedDelay(
-        **figures_at(design, scenario, expected_loop_delay_s(scenario)).model_dump(),
+        **at_delay.model_dump(),
         alpha_kept=alpha,
         alpha_kept_to_s=plain(min(formation.alpha_limit_s(alpha) for formation in flown)),
         string_peak_kept=peak,

@@ -151,11 +151,12 @@ class FiguresAtDelay(Published):
 class FiguresAtExpectedDelay(FiguresAtDelay):
     """The figures at the loop delay of the scenario's links, and the delays up to which they stay above a limit."""
 
-    alpha_kept: float
-    alpha_kept_to_s: float | None
+    alpha_kept: float | None = None
+    """None with prediction or feed-forward, where the delays are not computed."""
+    alpha_kept_to_s: float | None = None
     """None where α is kept at every loop delay; the same below."""
-    string_peak_kept: float | None
-    string_peak_kept_to_s: float | None
+    string_peak_kept: float | None = None
+    string_peak_kept_to_s: float | None = None
 
 
 class VehicleSpread(Published):

@@ -105,10 +105,11 @@ def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     else:
         first = _design(scenario, model, next(iter(responses.of.values())) if responses else None)
         slowed = [(first.K1 / s, first.K2 / s, first.K3 / s**2) for s in scales[1:]]
-        found = [first, *(evaluate_gains(model, gain, period_s=period_s) for gain in slowed)]
-        gains = [_flown(scenario, model, model.overlapping_gain(own.K1, own.K2, own.K3)) for own in found]
+        fed = control.feed_forward
+        found = [first, *(evaluate_gains(model, gain, period_s=period_s, feed_forward=fed) for gain in slowed)]
+        gains = [fed_forward(model, model.overlapping_gain(own.K1, own.K2, own.K3), fed) for own in found]
         schedule = [_entry(s, own) for s, own in zip(scales, found, strict=True)]
-        parts = {"feed_forward": control.feed_forward} if control.feed_forward else {}
+        parts = {}
     plan = FlightPlan(
         scenario=scenario,
         formation=formation,
@@ -122,12 +123,6 @@ def _gains_plan(scenario: Scenario) -> tuple[Design, FlightPlan]:
     return _flown_loop(*_with_responses(whole, plan, responses))
 
 
-def _flown(scenario: Scenario, model: FormationModel, K: FloatArray) -> FloatArray:
-    """The gain with the scenario's feed-forward of the command in front added; margins stay the same."""
-    share = scenario.control.feed_forward
-    return fed_forward(model, K, share) if share else K
-
-
 def with_trade_off(design: Design) -> Design:
     """The design with the best α at other delay margins, which takes longer to compute than all its other figures.
 
@@ -135,8 +130,10 @@ def with_trade_off(design: Design) -> Design:
     """
     if design.inclusion_gains is None or design.margin_unknown:
         return design
-    wanted = design.requirement or Requirement()
-    points = trade_off(period_s=design.period_s, string_peak_max=wanted.string_peak_max, loop=wanted.loop)
+    wanted, fed = design.requirement or Requirement(), design.feed_forward
+    points = trade_off(
+        period_s=design.period_s, string_peak_max=wanted.string_peak_max, loop=wanted.loop, feed_forward=fed
+    )
     return design.model_copy(update={"trade_off": tuple(TradeOffPoint(**asdict(point)) for point in points)})
 
 
@@ -225,7 +222,8 @@ def described(design: Design, plan: FlightPlan) -> Design:
     response = known.response
     if design.inclusion_gains is not None:  # the same for each vehicle, as on a leader-follower tree only
         own, front, spacing = (np.array(gain) for gain in design.inclusion_gains)
-        peaks = [string_peak((own, front, spacing), 0.0, answer=answer.transfer) for answer in set(every)]
+        gains, fed = (own, front, spacing), design.feed_forward
+        peaks = [string_peak(gains, 0.0, answer=answer.transfer, feed_forward=fed) for answer in set(every)]
         response = response.model_copy(update={"string_peak": max(peaks)})
     schedule = _with_margins(design, plan.margins_s, continuous_s)
     return with_figures_at_delay(known.with_schedule(schedule, response=response), plan.scenario)
@@ -251,7 +249,8 @@ def _design(scenario: Scenario, model: FormationModel, response: Response | None
     control, timing = scenario.control, loop_timing(scenario)
     if control.gains is not None:
         own, front, spacing = (gain * np.eye(2) for gain in (control.gains.K1, control.gains.K2, control.gains.K3))
-        return evaluate_gains(model, (own, front, spacing), period_s=timing.held_s)
+        gains = own, front, spacing
+        return evaluate_gains(model, gains, period_s=timing.held_s, feed_forward=control.feed_forward)
     wanted = _requirement(scenario)
     if wanted.criteria is None:
         return design(model, requirement_with(wanted, response, timing=timing), period_s=timing.held_s)
@@ -266,6 +265,7 @@ def _requirement(scenario: Scenario) -> Requirement:
         decay_rate_1_s=control.decay_rate_1_s,
         string_peak_max=control.string_peak_max,
         loop=control.loop,
+        feed_forward=control.feed_forward if control.method == "inclusion" else 0.0,
         criteria=None if control.criteria is None else Criteria(**control.criteria.model_dump()),
     )
 

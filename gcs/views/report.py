@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from gcs.plan.design import (
@@ -12,6 +13,7 @@ from gcs.plan.design import (
     Design,
     FiguresAtDelay,
     FiguresAtExpectedDelay,
+    PredictionPart,
     ResponsePart,
     TradeOffPoint,
     WindowAt,
@@ -120,12 +122,17 @@ def _print_margins(design: Design, console: Console) -> None:
         console.print(f"         without prediction; the station predicts over {over}")
         if design.prediction.assumes:
             console.print(f"         and assumes: {design.prediction.assumes}")
-        console.print(table_of(design.prediction.windows, _WINDOW_COLUMNS, title="stable between, with prediction"))
+        console.print(windows_table(design.prediction))
     if design.vehicles == 1:
         console.print("         of the one vehicle's own velocity loop, as nobody follows it")
     if design.onboard is not None:
         ground_s = design.onboard.ground_delay_margin_s
         console.print(f"         {ms_text(ground_s)} if the station closed every loop with the same gains")
+
+
+def windows_table(prediction: PredictionPart) -> Table:
+    """The mismatch windows of a station that predicts, a row for each assumed delay."""
+    return table_of(prediction.windows, _WINDOW_COLUMNS, title="stable between, with prediction")
 
 
 def _end(end_s: float | None) -> str:
@@ -143,6 +150,8 @@ _WINDOW_COLUMNS: dict[str, Callable[[WindowAt], str]] = {
 
 def _print_figures_at_delay(flown: FiguresAtExpectedDelay, console: Console) -> None:
     console.print(f"         {figures_text(flown)} (that of the scenario's links)")
+    if flown.alpha_kept is None:
+        return
     kept = f"at least {flown.alpha_kept:.4f} {_up_to(flown.alpha_kept_to_s)}"
     if flown.string_peak_kept is None:
         console.print(f"         {kept}")

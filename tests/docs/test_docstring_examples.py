@@ -58,7 +58,7 @@ INTERNAL_FUNCTIONS = {
     "gains.performance.robust.subsystem_loop",
     "gains.performance.scalar_gains.alpha_of",
     "gains.performance.scalar_gains.decay_rate_of",
-    "gains.performance.scalar_gains.front_gain_limit",
+    "gains.performance.scalar_gains.front_gain_range",
     "gains.performance.scalar_gains.gains_of_margin",
     "gains.performance.scalar_gains.least_singular_value",
     "gains.performance.scalar_gains.onboard_front_gain_limit",

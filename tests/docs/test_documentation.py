@@ -140,7 +140,11 @@ def test_every_field_of_a_margin_is_described_and_no_other(tmp_path: Path) -> No
     numbers = tmp_path / "numbers.json"
     numbers.write_text('{"terms": [{"A": [[0]], "delay": 0}, {"A": [[-1]], "delay": 0.1}]}', encoding="utf-8")
     models = [margin_of_file(file) for file in (numbers, *sorted((ROOT / "docs" / "models").glob("*.json")))]
-    scenarios = (margin_of_scenario(ROOT / "scenarios" / f"thesis_{loop}.toml") for loop in ("delay", "gains"))
+    predicted = tmp_path / "predicted.toml"
+    text = (ROOT / "scenarios" / "chain3.toml").read_text(encoding="utf-8")
+    predicted.write_text(text.replace("[control]", "[control]\nprediction = 0.6"), encoding="utf-8")
+    thesis = (ROOT / "scenarios" / f"thesis_{loop}.toml" for loop in ("delay", "gains"))
+    scenarios = (margin_of_scenario(file) for file in (*thesis, predicted))
     results = [*models, *scenarios]
     assert set[str]().union(*(found_fields(margin_fields(result), known) for result in results)) == known.keys()
 

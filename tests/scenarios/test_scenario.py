@@ -110,11 +110,11 @@ BAD = {
         "control.prediction",
         "off, measured, or a number",
     ),
-    "feed-forward of a design": (
+    "feed-forward of a design to criteria": (
         'loop = "ground"',
-        'loop = "ground"\nfeed_forward = 0.5',
+        'loop = "ground"\nfeed_forward = 0.5\ncriteria = { damping_min = 0.5 }',
         "control.feed_forward",
-        "0, unless gains are given",
+        "0, unless method is inclusion",
     ),
     "alpha of one": ("delay_margin_s = 0.3", "alpha = 1.0", "control.alpha", "less than 1"),
     "gains and requirement": (

@@ -24,9 +24,10 @@ CHAIN = load(SCENARIOS / "chain3.toml")
 K1, K3 = 3.408, 5.608
 
 
-def scenario(share: float, K2: float) -> Scenario:
-    gains = FixedGains(K1=-K1, K2=K2, K3=K3)
-    control = Control.model_validate({"gains": gains, "feed_forward": share})
+def scenario(share: float, K2: float | None) -> Scenario:
+    """With given gains, or with K2 None designed ones."""
+    wanted = {"delay_margin_s": 0.3} if K2 is None else {"gains": FixedGains(K1=-K1, K2=K2, K3=K3)}
+    control = Control.model_validate(wanted | {"feed_forward": share})
     return CHAIN.model_copy(update={"control": control})
 
 
@@ -35,7 +36,7 @@ def planned(share: float, K2: float) -> FlightPlan:
     return flight_plan(scenario(share, K2).with_calm_monitor())[1]
 
 
-def stepped(share: float, K2: float, *, link_s: float, leader_m_s: float = 0.0) -> TickArray:
+def stepped(share: float, K2: float | None, *, link_s: float, leader_m_s: float = 0.0) -> TickArray:
     """A flight in place, whose nominal velocity changes by 2 m/s; or whose leader alone begins that much faster."""
     speed = CHAIN.nominal_velocity[0].velocity_ne_m_s[0]
     steps = tuple(
@@ -91,6 +92,14 @@ def test_feed_forward_changes_neither_margin_nor_growth_of_a_loop() -> None:
     fed, without = (fly_trial(Study(p).trial("probe", {"delay": 0.27}, seed=1)) for p in (plan, bare))
     assert known(fed.growth_1_s) == pytest.approx(known(fed.predicted_growth_1_s), abs=5e-3)
     assert fed.predicted_growth_1_s == without.predicted_growth_1_s
+
+
+def test_designed_gains_keep_errors_from_growing_at_long_delay() -> None:
+    """At 0.23 s of link delay; there the gains designed without feed-forward let them grow 2.2 times."""
+    first, second = sizes_m(stepped(0.9, None, link_s=0.23, leader_m_s=2.0))
+    assert second < first
+    first, second = sizes_m(stepped(0.0, None, link_s=0.23, leader_m_s=2.0))
+    assert second > 1.2 * first
 
 
 def test_figures_at_a_delay_are_the_fed_forward_loops() -> None:

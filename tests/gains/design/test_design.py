@@ -13,7 +13,10 @@ from gains.core.errors import BadModelError, InfeasibleError
 from gains.delay.constant import delay_margin
 from gains.design.design import Design, Requirement, design, evaluate_gains, trade_off
 from gains.formation.model import FormationModel
+from gains.performance.predicted import PredictedLoop, fed_forward
 from gains.performance.robust import robustness
+from gains.performance.scalar_gains import ScalarGains
+from gains.performance.string_stability import string_peak
 from gains.sampled.constant import sampled_delay_margin, spectral_radius
 
 TRIANGLE = FormationModel((-1, 0, 1, 0, 3))
@@ -175,6 +178,35 @@ def test_string_stability_costs_little_alpha_and_holds_down_a_chain(default_desi
     response = np.linalg.solve(1j * omega[:, None, None] * np.eye(len(A)) - A, start[:, None])[:, :, 0]
     spacing = np.array([np.linalg.norm(response[:, chain.spacing_slice(i)], axis=1) for i in chain.followers])
     assert (spacing[1:] <= spacing[:-1] * (1 + 1e-6)).all()
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_gains_are_designed_for_the_command_fed_forward(share: float) -> None:
+    """α, proof, margin and growth of the loop that flies, each against another computation of it."""
+    wanted = Requirement(delay_margin_s=0.3, string_peak_max=1.0, feed_forward=share)
+    found = design(TRIANGLE, wanted, period_s=0.02)
+    k1, k2, k3 = -found.K1[0, 0], found.K2[0, 0], found.K3[0, 0]
+    flown = fed_forward(TRIANGLE, TRIANGLE.overlapping_gain(found.K1, found.K2, found.K3), share)
+    # the first follower's row of the flown gain is (3.26) with the gain on the leader's velocity error that it shows
+    on_leader = flown[TRIANGLE.input_slice(1), TRIANGLE.velocity_slice(0)]
+    assert found.alpha == pytest.approx(robustness(found.K1, on_leader, found.K3), rel=1e-12)
+    assert found.certificate is not None
+    assert 0.999 * found.alpha < found.certificate.alpha < found.alpha
+    assert 0.3 <= sampled_delay_margin(TRIANGLE.A, TRIANGLE.B, flown, period_s=0.02) <= 0.3 + 1e-9
+    loop = PredictedLoop(ScalarGains(k1, k2, k3, 0.0), 0.02, 0.0, feed_forward=share)
+    # 2e-3: the design takes the hold as half a period of delay
+    assert max(loop.string_peak(delay_s) for delay_s in (0.0, 0.15)) <= 1.0 + 2e-3
+    # no gain on the velocity in front is better within what may grow, tried one by one
+    tried = [
+        robustness(-k1, other - share * k1, k3)
+        for other in np.linspace(-2.0 * k1, 2.0 * k1, 81)
+        if string_peak((found.K1, other * EYE, found.K3), 0.16, feed_forward=share) <= 1.0
+        and string_peak((found.K1, other * EYE, found.K3), 0.0, feed_forward=share) <= 1.0
+    ]
+    assert max(tried) <= found.alpha + 1e-9
+    bare = design(TRIANGLE, Requirement(delay_margin_s=0.3, string_peak_max=1.0), period_s=0.02)
+    late = PredictedLoop(ScalarGains(-bare.K1[0, 0], bare.K2[0, 0], bare.K3[0, 0], 0.0), 0.02, 0.0)
+    assert loop.string_peak(0.25) < 0.6 * late.string_peak(0.25)
 
 
 def test_trade_off_falls_and_passes_through_the_design(default_design: Design) -> None:

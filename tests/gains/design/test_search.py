@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gains.core.requirement import ChainLimit
 from gains.delay.constant import delay_margin
 from gains.design.search import largest_alpha, largest_margin
 from gains.formation.model import FormationModel
 from gains.performance.robust import robustness
-from gains.performance.scalar_gains import alpha_of, front_gain_limit, gains_of_margin
+from gains.performance.scalar_gains import alpha_of, front_gain_range, gains_of_margin
 from gains.sampled.constant import sampled_delay_margin
 
 FOLLOWER = FormationModel((-1, 0), axes=1)
@@ -63,28 +64,43 @@ def test_quick_alpha_is_the_exact_alpha(k1: float, front: float, spacing: float)
     assert quick == pytest.approx(robustness(-k1, k2, k3), rel=2e-7)
 
 
+@pytest.mark.parametrize("feed_forward", [0.0, 0.6, 0.9])
 @pytest.mark.parametrize("peak", [1.0, 1.05, 1.3])
 @pytest.mark.parametrize("delay_s", [0.0, 0.15])
-def test_front_gain_limit_is_where_spacing_errors_begin_to_grow(peak: float, delay_s: float) -> None:
-    """|Γ(jω)| computed from its definition on a dense grid: within the peak at the limit, above it 1 % beyond."""
+def test_front_gain_range_is_where_spacing_errors_begin_to_grow(
+    peak: float, delay_s: float, feed_forward: float
+) -> None:
+    """|Γ(jω)| computed from its definition on a dense grid: within the peak at both ends, above it 1 % beyond."""
     k1, k3 = 3.5, 4.5
-    limit = float(front_gain_limit(np.array([k1]), np.array([k3]), np.array([delay_s]), peak)[0])
-    s = 1j * np.geomspace(1e-3, 100, 200_001)
+    ends = front_gain_range(np.array([k1]), np.array([k3]), np.array([delay_s]), peak, feed_forward)
+    least, most = (float(end[0]) for end in ends)
+    assert least < most
+    s = 1j * np.geomspace(1e-3, 300, 400_001)
     late = np.exp(-s * delay_s)
 
     def growth(k2: float) -> float:
-        return float(np.abs((k2 * s + k3) * late / (s**2 + (k1 * s + k3) * late)).max())
+        entry = feed_forward * s**2 + (k2 * s + k3) * late
+        return float(np.abs(entry / (s**2 + (k1 * s + k3) * late)).max())
 
     # The search for the least frequency resolves the peak to 1e-6.
-    assert growth(limit) <= peak + 1e-6
-    assert growth(1.01 * limit) > peak
+    assert max(growth(least), growth(most)) <= peak + 1e-6
+    assert growth(most + 0.01 * k1) > peak
+    assert growth(least - 0.01 * k1) > peak
     if peak == 1 and delay_s == 0:
-        assert limit == pytest.approx(np.sqrt(k1**2 - 2 * k3), rel=1e-9)
+        assert most == pytest.approx(np.sqrt(k1**2 - 2 * (1.0 - feed_forward) * k3), rel=1e-9)
 
 
 def test_when_own_loops_amplify_no_front_gain_is_small_enough() -> None:
     """k1² < 2 k3: even without feed-forward the follower overshoots."""
-    assert np.isnan(front_gain_limit(np.array([1.0]), np.array([1.0]), np.array([0.0]), 1.0)[0])
+    least, most = front_gain_range(np.array([1.0]), np.array([1.0]), np.array([0.0]), 1.0)
+    assert least[0] > most[0]
+
+
+def test_full_feed_forward_leaves_one_front_gain() -> None:
+    """k2 = k1: both vehicles then do the same, so that nothing propagates at any delay."""
+    for delay_s in (0.15, 0.29):
+        ends = front_gain_range(np.array([3.5]), np.array([4.5]), np.array([delay_s]), 1.0, 1.0)
+        assert [float(end[0]) for end in ends] == pytest.approx([3.5, 3.5], rel=1e-3)  # the grid of frequencies
 
 
 @pytest.mark.parametrize(("margin_s", "coarse"), [(0.1, 0.94), (0.3, 0.80), (0.5, 0.63)])
@@ -118,7 +134,7 @@ def test_no_neighbour_with_the_margin_is_better(angle: float, front: float, peri
 
 def test_asking_for_margin_period_or_string_stability_costs_alpha() -> None:
     def alpha(margin_s: float, period_s: float, peak: float | None) -> float:
-        gains = largest_alpha(margin_s, period_s, peak)
+        gains = largest_alpha(margin_s, period_s, ChainLimit(peak))
         assert gains is not None
         return gains.alpha
 
@@ -133,11 +149,11 @@ def test_asking_for_margin_period_or_string_stability_costs_alpha() -> None:
 @pytest.mark.parametrize("peak", [None, 1.0])
 @pytest.mark.parametrize("alpha", [0.05, 0.5, 0.8, 0.95])
 def test_largest_margin_inverts_largest_alpha(alpha: float, peak: float | None) -> None:
-    found = largest_margin(alpha, 0.05, peak)
+    found = largest_margin(alpha, 0.05, ChainLimit(peak))
     assert found is not None
     margin_s, gains = found
     assert gains.alpha >= alpha
-    here, beyond = largest_alpha(margin_s, 0.05, peak), largest_alpha(margin_s * 1.001, 0.05, peak)
+    here, beyond = (largest_alpha(factor * margin_s, 0.05, ChainLimit(peak)) for factor in (1.0, 1.001))
     assert here is not None
     assert beyond is not None
     assert beyond.alpha < alpha <= here.alpha

@@ -255,6 +255,21 @@ def test_a_scenario_has_the_margins_of_the_loop_it_flies(
     assert f"as flown, sampled and held every 20 ms: margin {sampled_s}" in capsys.readouterr().out
 
 
+def test_a_scenario_that_predicts_has_its_windows_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "predicted.toml"
+    text = (SCENARIOS / "chain3.toml").read_text()
+    file.write_text(text.replace("[control]\n", "[control]\nprediction = 0.6\n"))
+    found = margin_of_scenario(file)
+    result = margin_fields(found)
+    assert result["delay_margin_sampled_s"] == pytest.approx(0.3, abs=1e-6)  # without prediction
+    least_s, most_s = result["prediction"]["mismatch_window_s"]
+    assert least_s < 0.6 < most_s
+    print_margin(found)
+    shown = capsys.readouterr().out
+    assert "stable between, with prediction" in shown
+    assert f"{1e3 * least_s:.1f}" in shown
+
+
 def test_a_scenario_whose_vehicles_answer_late_is_refused() -> None:
     with pytest.raises(ModelFileError, match="dynamics: read 'autopilot', wanted double_integrator"):
         margin_of_scenario(SCENARIOS / "copters5.toml")
