@@ -81,8 +81,8 @@ class LoopFigures:
 
     @cached_property
     def delay_margin_s(self) -> float:
-        """Margin of the sampled loop, all feedback late, of vehicles that respond at once; in searches about that."""
-        A, B, K, period_s = self.model.A, self.model.B, self.K, self.timing.period_s
+        """Margin of the sampled loop, all feedback late; in searches about that."""
+        (A, B, K), period_s = formation_loop(self.model, self.K, self.responses), self.timing.period_s
         if self.decay_rate_1_s <= 0.0:
             return 0.0
         if self.thinned > 1:  # exact but for terms in the square of the period

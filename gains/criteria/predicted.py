@@ -24,6 +24,7 @@ from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
 from gains.performance.predicted import PredictedLoop
+from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled._loop import HeldPlant, carry, radius_of, rate_of, split_delay
 from gains.sampled.multirate import Timing
@@ -42,9 +43,9 @@ Complex = NDArray[np.complex128]
 class PredictedFigures:
     """What a formation of one axis is good for with a gain K, predicted over `assumed_s`.
 
-    Figures at a delay are the worst at the true loop delays `delays_s`. Vehicles respond at once. `chain` has k1, k2
-    and k3 where errors run down a chain of equal followers. `thinned` is as of `LoopFigures`, and the window of a
-    search that of the continuous loop, unless the delay is short.
+    Figures at a delay are the worst at the true loop delays `delays_s`. `chain` has k1, k2 and k3 where errors run down
+    a chain of equal followers. `thinned` is as of `LoopFigures`, and the window of a search that of the continuous
+    loop, unless the delay is short. Figures without delay do not include the `responses`, for which nothing is thinned.
 
     The gains of `triangle5`, assumed and true delay 0.6 s:
 
@@ -63,6 +64,7 @@ class PredictedFigures:
     weight: tuple[float, float] | None = None
     chain: ScalarGains | None = None
     thinned: int = 1
+    responses: tuple[Response, ...] | None = None
 
     @property
     def exact(self) -> Self:
@@ -99,11 +101,23 @@ class PredictedFigures:
         return self.window_s[1] if self.window_s[1] > self.assumed_s else 0.0
 
     @cached_property
+    def _loop(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A, B and K with the responses."""
+        return formation_loop(self.model, self.K, self.responses)
+
+    @property
+    def _measured(self) -> list[bool]:
+        """Errors; a response is computed from the commands."""
+        return [k < self.model.states for k in range(len(self._loop[0]))]
+
+    @cached_property
     def window_s(self) -> tuple[float, float]:
         """The least and the largest true loop delay (s), see `gains.sampled.prediction.mismatch_window`."""
-        A, B, K = self.model.A, self.model.B, self.K
+        A, B, K = self._loop
         if self.thinned == 1 or self.assumed_s < _SHORT * self.period_s:
-            return mismatch_window(A, B, K, Timing(self.period_s, self.period_s), assumed_s=self.assumed_s)
+            return mismatch_window(
+                A, B, K, Timing(self.period_s, self.period_s), assumed_s=self.assumed_s, measured=self._measured
+            )
         half_s = self.period_s / 2.0
         least_s, most_s = _rough_window((A, B, K), self.assumed_s + half_s, _FREQUENCIES // self.thinned)
         return max(0.0, least_s - half_s), most_s - half_s
@@ -121,19 +135,20 @@ class PredictedFigures:
     @cached_property
     def decay_rate_at_delay_1_s(self) -> float:
         """Of the slowest motion of the sampled loop, at the worst of the delays; in searches about that."""
-        A, BK, half_s = self.model.A, self.model.B @ self.K, self.period_s / 2.0
+        (A, B, K), half_s = self._loop, self.period_s / 2.0
 
         def decay(delay_s: float) -> float:
             if self.decay_rate_1_s <= 0.0:
                 return self.decay_rate_1_s
-            if delay_s == self.assumed_s:  # the loop behind the delay is that without
+            if delay_s == self.assumed_s and self.responses is None:  # the loop behind the delay is that without
                 Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
-                return -rate_of(radius_of(Phi + G @ self.K), self.period_s)
-            loop = A, self.model.B, self.K, Timing(self.period_s, self.period_s)
+                return -rate_of(radius_of(Phi + G @ K), self.period_s)
             if self.thinned == 1:
-                return -predicted_growth_rate(*loop, assumed_s=self.assumed_s, delay_s=delay_s)
-            late = BK @ self._ahead
-            terms = [(A + BK, 0.0), (late, delay_s + half_s), (-late, self.assumed_s + half_s)]
+                delays = {"assumed_s": self.assumed_s, "delay_s": delay_s}
+                timing = Timing(self.period_s, self.period_s)
+                return -predicted_growth_rate(A, B, K, timing, measured=self._measured, **delays)
+            late = B @ K @ self._ahead
+            terms = [(A + B @ K, 0.0), (late, delay_s + half_s), (-late, self.assumed_s + half_s)]
             return -rightmost_root(terms).real
 
         return min(map(decay, self.delays_s))
@@ -165,7 +180,8 @@ class PredictedFigures:
             return 1.0
         if self.decay_rate_at_delay_1_s <= 0.0:
             return inf
-        loop = PredictedLoop(self.chain, self.period_s, self.assumed_s)
+        response = self.responses[0] if self.responses else None
+        loop = PredictedLoop(self.chain, self.period_s, self.assumed_s, response)
         omega = np.geomspace(_LOWEST * self._slowest, pi / self.period_s, _FREQUENCIES)[:: self.thinned]
         return max(1.0, *(self._largest(lambda at, s=s: loop.growth(at, s), omega) for s in self.delays_s))
 
@@ -176,8 +192,8 @@ class PredictedFigures:
         """Largest gain from disturbances that act by `entry` to what `out` reads of the errors."""
         if self.decay_rate_at_delay_1_s <= 0.0:
             return inf
-        A, B, K, L = self.model.A, self.model.B, self.K, self._ahead
-        half_s = self.period_s / 2.0
+        (A, B, K), L, half_s, more = self._loop, self._ahead, self.period_s / 2.0, len(self._measured) - out.shape[1]
+        out, entry = np.pad(out, ((0, 0), (0, more))), np.pad(entry, ((0, more), (0, 0)))
 
         def gain_at(delay_s: float) -> Callable[[FloatArray], FloatArray]:
             def gain(omega: FloatArray) -> FloatArray:
@@ -196,7 +212,7 @@ class PredictedFigures:
 
     def _noise(self, angles: FloatArray, delay_s: float) -> float:
         z = np.exp(1j * angles)[:, np.newaxis, np.newaxis]
-        plant, K = self._plant, self.K
+        plant, K = self._plant, self._loop[2]
         Phi, G = (maps[0] for maps in plant.transition(np.array([self.period_s])))
 
         def entry(late_s: float) -> Complex:
@@ -216,7 +232,7 @@ class PredictedFigures:
 
     @cached_property
     def _plant(self) -> HeldPlant:
-        return HeldPlant(self.model.A, self.model.B, self.K, self.period_s)
+        return HeldPlant(*self._loop, self.period_s, np.array(self._measured))
 
     @cached_property
     def _slowest(self) -> float:

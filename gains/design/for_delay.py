@@ -26,7 +26,10 @@ from gains.delay.constant import delay_margin
 from gains.design.time_scale import time_scaled
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownLoop, FlownTiming
+from gains.performance.response import Response, formation_loop
 from gains.performance.scalar_gains import PAIR, ScalarGains
+from gains.sampled._loop import HeldPlant, held_entry
+from gains.sampled.multirate import Timing, multirate_growth_rate
 
 Reached = tuple[FloatArray, Figures]
 """A point of a family and its exact figures."""
@@ -55,6 +58,9 @@ _SPARES = 1.5, 2.0, 3.0, 6.0, 12.0
 # and of gains behind another vehicle, as multiples of the fastest at the delay
 _SCALES = 1.0, 1.7, 0.3, 0.1
 _FASTEST = 2.0 - sqrt(2.0)
+# With a response: frequencies of a root at the wanted decay, up to this many times it, by how much (1/s) rounding may
+# make another root slower, and how well the delay is known.
+_FREQUENCIES, _HIGHEST, _NO_SLOWER, _RESOLUTION_S = 100, 5.0, 1e-6, 1e-4
 
 
 def fastest_at_delay(late_s: float) -> tuple[float, float]:
@@ -66,6 +72,49 @@ def fastest_at_delay(late_s: float) -> tuple[float, float]:
     x = -_FASTEST
     k1 = -x * (2.0 + x) * exp(x)
     return k1 / late_s, -(x * x * exp(x) + k1 * x) / late_s**2
+
+
+def longest_static_delay(
+    decay_1_s: float, period_s: float, response: Response | None = None
+) -> tuple[float, ScalarGains]:
+    """Return the longest loop delay (s) at which static gains decay at a rate (1/s), and these gains, with k2 = 0.
+
+    None decay as fast if it is 0 or less. Of vehicles that respond at once it follows from `fastest_at_delay`, and a
+    hold counts as half a period. With a `response` the loop is that of one period: gains with a root at (-decay + j w)
+    are linear in (k1, k3), and the delay is raised while those of any w of a grid have no slower root.
+
+    A lag of 0.15 s costs half of the delay:
+
+    >>> lag = Response(lag_s=0.15, velocity_gain_1_s=2.0)
+    >>> [round(longest_static_delay(1.0, 0.02, response)[0], 3) for response in (None, lag)]
+    [0.576, 0.32]
+    """
+    longest_s = _FASTEST / decay_1_s - period_s / 2.0
+    if response is None or longest_s <= 0.0:
+        k1, k3 = fastest_at_delay(longest_s + period_s / 2.0)
+        return longest_s, ScalarGains(k1, 0.0, k3, 0.0)
+    A, B, K = formation_loop(PAIR, np.zeros((2, 3)), (response, response))
+    plant, timing = HeldPlant(A, B, K, period_s), Timing(period_s, period_s)
+    z = np.exp((1j * np.linspace(0.0, _HIGHEST, _FREQUENCIES + 1)[1:] - 1.0) * decay_1_s * period_s)[:, None, None]
+    resolvent = np.linalg.inv(z * np.eye(len(A)) - plant.transition(np.array([period_s]))[0])
+
+    def gains_at(delay_s: float) -> ScalarGains | None:
+        answers = (resolvent @ held_entry(plant, z, delay_s))[:, 1:3, 1]  # spacing and velocity of the follower
+        each = np.linalg.solve(np.stack([answers.real, answers.imag], axis=1), np.array([[1.0], [0.0]]))[..., 0]
+        for k3, k1 in each[(each[:, 0] > 0.0) & (each[:, 1] < 0.0)]:
+            own = ScalarGains(-float(k1), 0.0, float(k3), 0.0)
+            loop = formation_loop(PAIR, own.K, (response, response))
+            if multirate_growth_rate(*loop, timing, delay_s=delay_s) < _NO_SLOWER - decay_1_s:
+                return own
+        return None
+
+    least_s, beyond_s, found = 0.0, inf, gains_at(0.0)
+    while found is not None and beyond_s - least_s > _RESOLUTION_S:
+        middle_s = least_s + longest_s / 2.0 if beyond_s == inf else (least_s + beyond_s) / 2.0
+        better = gains_at(middle_s)
+        least_s, beyond_s = (least_s, middle_s) if better is None else (middle_s, beyond_s)
+        found = better or found
+    return least_s, found or ScalarGains(0.0, 0.0, 0.0, 0.0)
 
 
 def criteria_gains(wanted: Requirement, period_s: float) -> ScalarGains:

@@ -170,9 +170,9 @@ def _print_comparison(found: "Comparison") -> None:
     }
     console = plain_console()
     for line in (
-        "delay    the longest in ms at equal decay and string peak: that of any static",
-        "         gains, and predicted with these gains, which are stable at every",
-        "         constant delay within the share under pred",
+        "delay    the longest in ms at equal decay: that of any static gains, and",
+        "         predicted with these gains, which are stable at every constant delay",
+        "         within the share under pred",
         "decay    in 1/s; gain from disturbance to spacing error in s²; noise to commands",
     ):
         console.print(line)

@@ -3,8 +3,9 @@
 The prediction assumes that every set-point acts, one delivery delay after it was due. A lost one never acts: the
 vehicle holds the one before. A report says which set-point the vehicle holds at an instant. It carries the vehicle's
 own time and no key of a set-point, so the set-point is recognised by its values, float32 in both directions. From
-ArduPilot it is the acceleration, because the reported velocity grows with it; from PX4 the velocity, because the
-reported acceleration is that of its velocity loop; from our own vehicles the acceleration, which is all they report.
+ArduPilot it is the acceleration, because the reported velocity grows with it; ArduPilot keeps it in cm/s^2, which rounds
+every fourth value to its neighbour. From PX4 it is the velocity, because the reported acceleration is that of its
+velocity loop; from our own vehicles the acceleration, which is all they report.
 
 The *age* of a report is its instant minus the time at which the recognised set-point was due. If none is lost, it lies
 between the delivery delay and one control period more. So a set-point that is newer than the recognised one, but older
@@ -31,6 +32,8 @@ _EARLY = 0.05
 """A set-point is expected to act this share of a period before it reaches the least age: clocks err by as much."""
 _ASIDE = 0.02
 """Tangent of the angle up to which two accelerations have the same direction."""
+_ROUNDED = 2.0**-22
+"""Two values are the same if they differ by this share at most: two steps of a float32."""
 _VELOCITY, _ACCELERATION, _TYPE_MASK = slice(4, 6), slice(7, 9), 12
 """Places among the fields of SET_POSITION_TARGET_LOCAL_NED and of POSITION_TARGET_LOCAL_NED."""
 _ON_THE_WIRE = struct.Struct("<2f")
@@ -45,6 +48,12 @@ class Alterable(Protocol):
 def _vector(fields: tuple[Any, ...], place: slice) -> complex:
     """North + 1j * east as the link carries it."""
     return complex(*_ON_THE_WIRE.unpack(_ON_THE_WIRE.pack(*fields[place])))
+
+
+def _is_same(reported: complex, sent: complex) -> bool:
+    """Whether both parts of a reported vector are those of one that was sent."""
+    off = reported - sent
+    return abs(off.real) <= _ROUNDED * abs(sent.real) and abs(off.imag) <= _ROUNDED * abs(sent.imag)
 
 
 def _is_shortened(reported: complex, sent: complex) -> bool:
@@ -84,10 +93,10 @@ class ActiveTargets:
         expected, least_age_ns = self._expected(at_ns), min(self._ages_ns, default=0)
         oldest = bisect_left(self._due_ns, at_ns - least_age_ns - self._held_ns)
         recent = range(oldest, bisect_right(self._due_ns, at_ns))
-        value, same = acceleration, [place for place in recent if self._acceleration[place] == acceleration]
+        value, same = acceleration, [place for place in recent if _is_same(acceleration, self._acceleration[place])]
         if not same and not only:
             value = _vector(fields, _VELOCITY)
-            same = [place for place in recent if self._velocity[place] == value]
+            same = [place for place in recent if _is_same(value, self._velocity[place])]
         if len(same) == 1 and value and self._due_ns[same[0]] != self._aged_ns:
             # a vehicle that has stopped reports zeros of its own; repeated reports only add growing ages
             self._aged_ns = self._due_ns[same[0]]

@@ -1,28 +1,29 @@
 """`gcs design --front` and `--at`: what can be had at a loop delay, by every route, with and without prediction.
 
 `--compare-prediction`: the loop delay that gains take with prediction, against any without it. Slow gains take a long
-delay, so delays are compared at equal decay and string peak: the longest at which any static gains decay as fast as
-those of the scenario do with prediction, and the longest over which a station can predict with these, stable at every
-constant delay within a share of it.
+delay, so delays are compared at equal decay: the longest at which any static gains decay as fast as those of the
+scenario do with prediction, and the longest over which a station can predict with these, stable at every constant delay
+within a share of it. The string peak of the static gains is no smaller; with a response it is larger.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import product
-from math import sqrt
 from pathlib import Path
 from typing import Any, Literal
 
 from gains.core.requirement import plain
-from gains.design.for_delay import fastest_at_delay
+from gains.design.for_delay import longest_static_delay
 from gains.design.front import AIMS, Aim, FrontPoint, FrontSearch, Method, Refusal, Route, efficient
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled.multirate import Timing
-from gains.sampled.prediction import mismatch_window, predicted_growth_rate
+from gains.sampled.prediction import predicted_growth_rate
 from gcs.errors import InputError
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import loop_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.given import with_gain, with_given
+from gcs.plan.mismatch import Predicted, window
 from gcs.plan.planner import pattern_of
 from gcs.published import Published
 from gcs.stress.campaign import local_workers
@@ -182,6 +183,9 @@ class Compared(Published):
     tolerated: float | None = None
     loop_delay_s: float
     ratio: float
+    K1: float
+    K2: float
+    K3: float
     stable_s: tuple[float, float]
     decay_rate_1_s: float
     string_peak: float
@@ -199,30 +203,31 @@ class Comparison(Published):
 
 def compared(design: Design, name: str) -> Comparison:
     """The comparison for the gains of a design. Raises InputError if it is not one by inclusion of stable gains."""
-    if design.inclusion_gains is None or design.loop != "ground" or design.response is not None:
-        raise InputError(
-            f"{name}: read another design, wanted one by inclusion, loop ground, of vehicles without a lag"
-        )
+    answers = set(design.responses.values())
+    if design.inclusion_gains is None or design.loop != "ground" or len(answers) != (design.response is not None):
+        wanted = "one by inclusion, loop ground, and [response] if vehicles have an autopilot"
+        raise InputError(f"{name}: read another design, wanted {wanted}")
     own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
-    period_s, gains = design.period_s, ScalarGains(-own, front, spacing, 0.0)
-    loop = PAIR.A, PAIR.B, gains.K, Timing(period_s, period_s)
-    wanted_1_s = -predicted_growth_rate(*loop, assumed_s=period_s, delay_s=period_s)
-    late_s = (2.0 - sqrt(2.0)) / wanted_1_s - period_s / 2.0
-    if not (wanted_1_s > 0.0 and late_s > 0.0):
+    period_s, gains, response = design.period_s, ScalarGains(-own, front, spacing, 0.0), next(iter(answers), None)
+    timing = Timing(period_s, period_s)
+    flown = Predicted(PAIR, gains.K.tobytes(), timing, None if response is None else (response, response))
+    loop, measured = flown.loop()
+    wanted_1_s = -predicted_growth_rate(*loop, timing, assumed_s=period_s, delay_s=period_s, measured=measured)
+    late_s, fastest = longest_static_delay(wanted_1_s, period_s, response) if wanted_1_s > 0.0 else (0.0, gains)
+    if late_s <= 0.0:
         raise InputError(f"{name}: read gains that decay at {wanted_1_s:.3g} 1/s, wanted slower ones that are stable")
 
     def takes(assumed_s: float, share: float) -> bool:
-        least_s, most_s = mismatch_window(*loop, assumed_s=assumed_s)
+        least_s, most_s = window(flown, assumed_s)
         return (least_s <= (1.0 - share) * assumed_s or least_s == 0.0) and most_s >= (1.0 + share) * assumed_s
 
     def way(own: ScalarGains, delay_s: float, share: float | None = None) -> Compared:
         assumed_s = None if share is None else delay_s
-        figures = evaluated(own, period_s, assumed_s, (delay_s, delay_s)).model_dump()
+        figures = evaluated(own, period_s, assumed_s, (delay_s, delay_s), response).model_dump()
         shown = {name: figures[name] for name in Compared.model_fields if name in figures}
         return Compared(**shown, tolerated=share, loop_delay_s=delay_s, ratio=delay_s / late_s)
 
-    k1, k3 = fastest_at_delay(late_s + period_s / 2.0)  # no static gains decay faster
-    ways = [way(ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0), late_s)]
+    ways = [way(replace(fastest, k2=_FRONT_SHARE * fastest.k1), late_s)]
     for share in TOLERATED:
         longest_s, beyond_s = 0.0, PREDICTION_MAX_S
         for _ in range(_STEPS):

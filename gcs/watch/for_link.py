@@ -18,9 +18,9 @@ from gains.criteria.predicted import PredictedFigures
 from gains.design.for_delay import criteria_gains
 from gains.design.front import Aim
 from gains.design.predicted import predicted_gains
-from gains.formation.model import FormationModel
 from gains.performance.flown import FlownLoop, FlownTiming
-from gains.performance.scalar_gains import ScalarGains
+from gains.performance.response import Response
+from gains.performance.scalar_gains import PAIR, ScalarGains
 from gcs.errors import InputError
 from gcs.plan.design import LinkGains, LinkPart
 from gcs.plan.expected_delay import drawn_loop_delays_s
@@ -158,18 +158,24 @@ def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicte
     return evaluated(gains, period_s, middle_s if predicted else None, ends_s)
 
 
-def evaluated(gains: ScalarGains, period_s: float, assumed_s: float | None, ends_s: tuple[float, float]) -> LinkGains:
+def evaluated(
+    gains: ScalarGains,
+    period_s: float,
+    assumed_s: float | None,
+    ends_s: tuple[float, float],
+    response: Response | None = None,
+) -> LinkGains:
     """Gains with their exact figures: at the worse end of the delays with prediction, else at the longer delay."""
-    model = FormationModel((-1, 0), axes=1)
-    K = model.overlapping_gain([[-gains.k1]], [[gains.k2]], [[gains.k3]])
+    K, responses = gains.K, None if response is None else (response, response)
     if assumed_s is not None:
-        figures = PredictedFigures(model, K, period_s, assumed_s, ends_s, chain=gains)
+        figures = PredictedFigures(PAIR, K, period_s, assumed_s, ends_s, chain=gains, responses=responses)
         least_s, most_s = figures.window_s
         shorter = (assumed_s - ends_s[0]) / (assumed_s - least_s) if least_s > 0.0 else 0.0
         headroom = 1.0 - max(shorter, (ends_s[1] - assumed_s) / (most_s - assumed_s))
     else:
         timing = FlownTiming(inf, period_s)
-        figures = LoopFigures(model, K, timing, ends_s[1], chain=FlownLoop(gains, timing))
+        chain = FlownLoop(gains, timing, response)
+        figures = LoopFigures(PAIR, K, timing, ends_s[1], responses=responses, chain=chain)
         least_s, most_s = 0.0, figures.delay_margin_s
         headroom = 1.0 - ends_s[1] / most_s
     return LinkGains(

@@ -9,6 +9,8 @@ import heapq
 import math
 from collections.abc import Mapping
 
+import numpy as np
+
 from scenarios import schema
 from scenarios.schema import NS_PER_S
 from sim_vehicles.motion.air import Air
@@ -292,10 +294,13 @@ class Copter:
     def _active_target(self, boot_ms: int) -> messages.Message:
         """What it steers to now: the velocity of the set-point, and its acceleration.
 
-        With ArduCopter the velocity has grown since. PX4 reports the acceleration that its velocity loop wants.
+        With ArduCopter the velocity has grown since, and float32 has rounded the acceleration on its way to cm and back.
+        PX4 reports the acceleration that its velocity loop wants.
         """
         target, (north, east) = self._target, self._target[0:2]
-        if not self.rules.velocity_grows:
+        if self.rules.velocity_grows:
+            north, east = (np.array((north, east), np.float32) * np.float32(100.0) * np.float32(0.01)).tolist()
+        else:
             north += target.velocity_gain_1_s * (target.velocity_north_m_s - self.motion.velocity_north_m_s)
             east += target.velocity_gain_1_s * (target.velocity_east_m_s - self.motion.velocity_east_m_s)
         mask = POSITION_AXES | YAW_IGNORED | YAW_RATE_IGNORED | (0 if target.velocity_gain_1_s else VELOCITY_AXES)

@@ -10,6 +10,9 @@ from gains.sampled.prediction import predicted_growth_rate
 from gcs.control.tick import TickArray
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
+from gcs.stress.measure import fly_trial
+from gcs.stress.study import Study
+from gcs.studies.front import compared
 from scenarios.keys.link import DelayPoint, Link
 from scenarios.schema import Control, FixedGains, Scenario
 from tests.support.fleets.flown_copters import TRUTH, Flight, fly, three
@@ -19,8 +22,8 @@ ASSUMED_S = 1.2
 GAINS = FixedGains(K1=-1.898, K2=0.0, K3=1.642)
 
 
-def scenario(prediction: float | str, link_s: float) -> Scenario:
-    control = Control.model_validate({"gains": GAINS, "prediction": prediction})
+def scenario(prediction: float | str, link_s: float, gains: FixedGains = GAINS) -> Scenario:
+    control = Control.model_validate({"gains": gains, "prediction": prediction})
     flown = three(duration_s=16.0, up_down=Link(delay_s=link_s))
     return flown.model_copy(update={"control": control, "response": TRUTH}).with_calm_monitor()
 
@@ -28,6 +31,14 @@ def scenario(prediction: float | str, link_s: float) -> Scenario:
 @cache
 def planned(prediction: float | str, link_s: float) -> FlightPlan:
     return flight_plan(scenario(prediction, link_s))[1]
+
+
+def small_decay_1_s(plan: FlightPlan, link_s: float) -> tuple[float, float]:
+    """Decay rate (1/s) of an error of 3 cm of vehicle 2 at this link delay, up + down, and the loop delay (s)."""
+    found = fly_trial(Study(plan).trial("probe", {"delay": link_s}, seed=plan.scenario.seed, probe=2))
+    assert found.growth_1_s is not None
+    assert found.loop_delay_s is not None
+    return -found.growth_1_s, found.loop_delay_s
 
 
 def decay_1_s(ticks: TickArray, *, from_s: float, to_s: float) -> float:
@@ -54,6 +65,22 @@ def test_copters_settle_at_three_times_their_margin(prediction: float | str) -> 
     assert max(flight.error_m(system_id)[-1] for system_id in (2, 3)) < 0.01 * 17.0
     # the decay without delay, within what one period of the oscillation leaves
     assert decay_1_s(flight.flown, from_s=3.0, to_s=9.0) == pytest.approx(decay_at_once_1_s(), rel=0.1)
+
+
+def test_copters_decay_alike_at_three_times_the_uncompensated_delay() -> None:
+    """The uncompensated delay is the longest at which any static gains decay as fast as these do when predicted."""
+    ways = compared(flight_plan(scenario("off", 0.0))[0], "copters5").ways
+    static_s, wanted_1_s = ways[0].loop_delay_s, ways[1].decay_rate_1_s
+    static = flight_plan(scenario("off", 0.1, FixedGains(K1=ways[0].K1, K2=ways[0].K2, K3=ways[0].K3)))[1]
+    plain_1_s, plain_s = small_decay_1_s(static, static_s - 0.0112)  # the wait for the tick
+    predicted_1_s, predicted_s = small_decay_1_s(planned("measured", 0.59), 1.18)
+    assert plain_s == pytest.approx(static_s, abs=0.0005)
+    assert predicted_s > 3.0 * static_s
+    assert predicted_1_s == pytest.approx(wanted_1_s, rel=0.01)
+    # two roots nearly meet: 1 ms more delay takes 2 % of the decay
+    assert plain_1_s == pytest.approx(wanted_1_s, rel=0.02)
+    assert ways[0].string_peak > 1.3
+    assert {way.string_peak for way in ways[1:]} == {1.0}
 
 
 def test_without_prediction_the_same_copters_drift_apart() -> None:

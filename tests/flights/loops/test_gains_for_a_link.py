@@ -172,4 +172,6 @@ def test_prediction_takes_longer_delays_at_equal_decay() -> None:
     assert all(way.noise_gain > plain.noise_gain for way in predicted)
     with pytest.raises(InputError, match=r"wanted one by inclusion"):
         compared(Design(delay_margin_s=1.0), "other")
+    with pytest.raises(InputError, match=r"and \[response\] if vehicles have an autopilot"):
+        compared(flight_plan(load(SCENARIOS / "copters5.toml"))[0], "copters5")
     assert np.isfinite([way.alpha for way in predicted]).all()

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from gains.core._semidefinite import Unknown, positive_definite_solution
 from gains.core.arrays import FloatArray
@@ -15,14 +16,16 @@ from gains.core.requirement import Criteria, Requirement
 from gains.criteria.figures import LoopFigures
 from gains.criteria.poles import pole_region, roots_of
 from gains.design.design import design
-from gains.design.for_delay import criteria_gains
+from gains.design.for_delay import criteria_gains, longest_static_delay
 from gains.formation.model import FormationModel
 from gains.formation.pattern import bidirectional
 from gains.performance.flown import FlownTiming
+from gains.performance.response import Response
+from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.constant import growth_rate, period_map
 from gains.varying.jitter import Jitter, bound_covering
 
-PERIOD_S = 0.02
+PERIOD_S, LAG = 0.02, Response(lag_s=0.15, velocity_gain_1_s=2.0)
 CHAIN, PAIR, SINGLE = FormationModel((-1, 0, 1)), FormationModel((-1, 0), axes=1), FormationModel((-1, 0, 1), axes=1)
 MOST = "natural_frequency_max_rad_s", "spacing_gain_max_s2", "noise_gain_max", "string_peak_max"
 
@@ -123,6 +126,34 @@ def test_best_decay_at_a_delay_is_the_triple_root() -> None:
     assert decay == pytest.approx((2 - 2**0.5) / 0.31, rel=1e-4)
     # the spectrum of the loop as sampled and held, which differs in the square of the period
     assert -growth_rate(PAIR.A, PAIR.B, K, period_s=PERIOD_S, delay_s=0.3) == pytest.approx(decay, rel=0.1)
+
+
+@pytest.mark.parametrize("decay_1_s", [0.6, 0.96, 1.2])
+def test_no_static_gains_of_lagging_vehicles_decay_faster(decay_1_s: float) -> None:
+    """Second way: the simplex method, over the roots of the continuous loop, finds none at a delay 5 % longer."""
+    delay_s, found = longest_static_delay(decay_1_s, PERIOD_S, LAG)
+
+    def decay(gains: ScalarGains, at_s: float) -> float:
+        timing = FlownTiming(np.inf, PERIOD_S)
+        return LoopFigures(PAIR, gains.K, timing, at_s, responses=(LAG, LAG)).decay_rate_at_delay_1_s
+
+    def slowness(logarithms: FloatArray) -> float:
+        k1, k3 = np.exp(logarithms).tolist()
+        return -decay(ScalarGains(k1, 0.0, k3, 0.0), 1.05 * delay_s)
+
+    # the continuous loop differs from that of one period by 0.5 %, as two roots nearly meet
+    assert decay(found, delay_s) == pytest.approx(decay_1_s, rel=0.01)
+    ends = [
+        minimize(slowness, np.log([share * found.k1, share**2 * found.k3]), method="Nelder-Mead", tol=1e-4)
+        for share in (0.7, 1.0)
+    ]
+    assert 0.9 * decay_1_s < -min(end.fun for end in ends) < decay_1_s
+
+
+def test_vehicles_without_lag_take_the_closed_form() -> None:
+    at_once, nearly = (longest_static_delay(1.2, PERIOD_S, own)[0] for own in (None, Response(1e-3, 0.0)))
+    assert nearly == pytest.approx(at_once - 1e-3, abs=1e-3)  # a lag is as much delay, to its second order
+    assert longest_static_delay(2.0 / PERIOD_S, PERIOD_S)[0] < 0.0
 
 
 def test_gains_for_a_slow_rate_are_best_when_designed_in_discrete_time() -> None:

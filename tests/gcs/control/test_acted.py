@@ -1,6 +1,7 @@
 """Reports of the active target correct the history of set-points to what the vehicle did."""
 
 from collections import Counter
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -115,14 +116,16 @@ def test_a_delivery_longer_than_assumed_is_not_loss() -> None:
 
 
 def test_autopilots_are_recognised_by_what_they_leave_as_it_was() -> None:
-    """ArduPilot's velocity has grown since, PX4's acceleration is that of its velocity loop."""
+    """ArduPilot's velocity has grown since, and a float32 in cm rounds its acceleration; PX4's is of its own loop."""
     ardupilot, px4 = Link(), Link()
-    for tick, held in ((3, 3), (4, 4), (5, 4)):
+    for tick, held in ((3, 3), (4, 4), (5, 4), (6, 4), (7, 7), (8, 7)):
         acceleration, velocity = ardupilot.of(held)
-        ardupilot.report(tick, active(acceleration, (velocity[0] + 0.1, velocity[1] - 0.2)))
+        in_cm = np.array(acceleration, np.float32) * np.float32(100.0)
+        north, east = (in_cm * np.float32(0.01)).tolist()
+        ardupilot.report(tick, active((north, east), (velocity[0] + 0.1, velocity[1] - 0.2)))
         px4.report(tick, active((acceleration[0] + 0.7, acceleration[1]), velocity))
-    for link in (ardupilot, px4):
-        assert link.gained_m_s(5) == pytest.approx(link.wanted_m_s2(4), abs=1e-6)
+    for link, (tick, held) in product((ardupilot, px4), ((5, 4), (6, 4), (8, 7))):
+        assert link.gained_m_s(tick) == pytest.approx(link.wanted_m_s2(held), abs=1e-6)
 
 
 def test_what_an_autopilot_reports_of_its_own_changes_nothing() -> None:
