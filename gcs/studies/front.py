@@ -2,8 +2,8 @@
 
 `--compare-prediction`: the loop delay that gains take with prediction, against any without it. Slow gains take a long
 delay, so delays are compared at equal decay and string peak: the longest at which any static gains decay as fast as
-those of the scenario do with prediction, and the longest over which a station can predict with these, stable at every
-constant delay within a share of it.
+those of the scenario do with prediction, and the longest over which a station can predict with any gains that decay as
+fast, stable at every constant delay within a share of it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gains.core.requirement import plain
+from gains.criteria.predicted import PredictedFigures
 from gains.design.for_delay import fastest_at_delay
 from gains.design.front import AIMS, Aim, FrontPoint, FrontSearch, Method, Refusal, Route, efficient
+from gains.design.predicted import least_gains, longest_assumed_s
 from gains.performance.scalar_gains import PAIR, ScalarGains
-from gains.sampled.multirate import Timing
-from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 from gcs.errors import InputError
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import loop_timing
@@ -38,8 +38,9 @@ MOST_VEHICLES = 12
 Prediction = Literal["on", "off"]
 TOLERATED = 0.2, 0.1, 0.05, 0.03
 """Shares of the delay by which a comparison asks the true delay to differ from the assumed one."""
-_STEPS = 12
-# k2 as a share of k1, in gains without prediction
+# that by which the scenario's own gains are asked, too
+_OWN_TOLERATED = 0.05
+# k2 as a share of k1 of all other gains; neither decay nor stability depends on it
 _FRONT_SHARE = 0.2
 _COLOURS = {"inclusion": "#1f4e79", "graph-lqr": "#c1440e"}
 _FIGURES = {
@@ -176,14 +177,21 @@ def fields_of(found: FrontPoint | Refusal) -> PointFields:
 
 
 class Compared(Published):
-    """One way to take a loop delay, with its figures there; both ways decay alike."""
+    """One way to take a loop delay, with its figures there; all ways decay alike where the assumed delay is right."""
 
     prediction: bool
+    gains: Literal["fastest", "least", "own"]
+    """`fastest` at the delay, `least` that decay as fast with prediction, or the scenario's `own`."""
+    K1: float
+    K2: float
+    K3: float
     tolerated: float | None = None
     loop_delay_s: float
     ratio: float
     stable_s: tuple[float, float]
     decay_rate_1_s: float
+    decay_rate_half_way_1_s: float | None = None
+    """At the worse of the delays half-way to the ends of what is tolerated."""
     string_peak: float
     alpha: float
     spacing_gain_s2: float
@@ -191,46 +199,48 @@ class Compared(Published):
 
 
 class Comparison(Published):
-    """What the prediction of a scenario's gains is worth, and what it costs."""
+    """What prediction is worth at the decay of a scenario's gains, and what it costs."""
 
     scenario: str
     ways: tuple[Compared, ...]
 
 
 def compared(design: Design, name: str) -> Comparison:
-    """The comparison for the gains of a design. Raises InputError if it is not one by inclusion of stable gains."""
+    """The comparison at the decay of a design. Raises InputError if it is not one by inclusion of stable gains."""
     if design.inclusion_gains is None or design.loop != "ground" or design.response is not None:
         raise InputError(
             f"{name}: read another design, wanted one by inclusion, loop ground, of vehicles without a lag"
         )
-    own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
-    period_s, gains = design.period_s, ScalarGains(-own, front, spacing, 0.0)
-    loop = PAIR.A, PAIR.B, gains.K, Timing(period_s, period_s)
-    wanted_1_s = -predicted_growth_rate(*loop, assumed_s=period_s, delay_s=period_s)
+    K1, K2, K3 = (gain[0][0] for gain in design.inclusion_gains)
+    period_s, own = design.period_s, ScalarGains(-K1, K2, K3, 0.0)
+    wanted_1_s = PredictedFigures(PAIR, own.K, period_s, period_s, (period_s,)).decay_rate_at_delay_1_s
     late_s = (2.0 - sqrt(2.0)) / wanted_1_s - period_s / 2.0
     if not (wanted_1_s > 0.0 and late_s > 0.0):
         raise InputError(f"{name}: read gains that decay at {wanted_1_s:.3g} 1/s, wanted slower ones that are stable")
 
-    def takes(assumed_s: float, share: float) -> bool:
-        least_s, most_s = mismatch_window(*loop, assumed_s=assumed_s)
-        return (least_s <= (1.0 - share) * assumed_s or least_s == 0.0) and most_s >= (1.0 + share) * assumed_s
-
-    def way(own: ScalarGains, delay_s: float, share: float | None = None) -> Compared:
-        assumed_s = None if share is None else delay_s
-        figures = evaluated(own, period_s, assumed_s, (delay_s, delay_s)).model_dump()
-        shown = {name: figures[name] for name in Compared.model_fields if name in figures}
-        return Compared(**shown, tolerated=share, loop_delay_s=delay_s, ratio=delay_s / late_s)
-
     k1, k3 = fastest_at_delay(late_s + period_s / 2.0)  # no static gains decay faster
-    ways = [way(ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0), late_s)]
-    for share in TOLERATED:
-        longest_s, beyond_s = 0.0, PREDICTION_MAX_S
-        for _ in range(_STEPS):
-            middle_s = (longest_s + beyond_s) / 2.0
-            longest_s, beyond_s = (middle_s, beyond_s) if takes(middle_s, share) else (longest_s, middle_s)
-        if longest_s > 0.0:
-            ways.append(way(gains, longest_s, share))
-    return Comparison(scenario=name, ways=tuple(ways))
+    fastest = ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0)
+    k1, k3 = least_gains(wanted_1_s, period_s)  # with prediction none that decay as fast tolerate more
+    least = ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0)
+
+    def way(chosen: Literal["fastest", "least", "own"], gains: ScalarGains, share: float | None) -> Compared:
+        delay_s = late_s if share is None else longest_assumed_s(gains, period_s, share, PREDICTION_MAX_S)
+        assumed_s, half_way_1_s = None, None
+        if share is not None:
+            assumed_s, half_s = delay_s, ((1.0 - share / 2.0) * delay_s, (1.0 + share / 2.0) * delay_s)
+            half_way_1_s = PredictedFigures(PAIR, gains.K, period_s, delay_s, half_s).decay_rate_at_delay_1_s
+        figures = evaluated(gains, period_s, assumed_s, (delay_s, delay_s)).model_dump()
+        return Compared(
+            **{name: figures[name] for name in Compared.model_fields if name in figures},
+            gains=chosen,
+            tolerated=share,
+            loop_delay_s=delay_s,
+            ratio=delay_s / late_s,
+            decay_rate_half_way_1_s=half_way_1_s,
+        )
+
+    predicted = (*(way("least", least, share) for share in TOLERATED), way("own", own, _OWN_TOLERATED))
+    return Comparison(scenario=name, ways=(way("fastest", fastest, None), *predicted))
 
 
 def plot_front(found: FrontFields, figure: str, axes: Any) -> Any:
