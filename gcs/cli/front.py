@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from gains.design.front import Method
     from gcs.drive.takeover import Presence
     from gcs.drive.udp import StationSocket
-    from gcs.plan.design import Design, LinkPart
-    from gcs.studies.front import Compared, Comparison, FrontFields, PointFields
+    from gcs.plan.design import Design, GainsAtDelay, LinkPart
+    from gcs.studies.front import Comparison, FrontFields
     from scenarios.schema import Scenario
 
 LinksOf = Annotated[
@@ -133,7 +133,7 @@ def _print_front(found: "FrontFields") -> None:
         "noise from measurements to commands; whether on the front",
     ):
         console.print(f"         {line}")
-    columns: dict[str, Callable[[PointFields], str]] = {
+    columns: dict[str, Callable[[GainsAtDelay], str]] = {
         "ms": lambda p: f"{1e3 * p.loop_delay_s:.0f}",
         "best": lambda p: p.maximised,
         "method": lambda p: p.method,
@@ -164,17 +164,17 @@ def show_comparison(design: "Design", name: str, *, as_json: bool) -> None:
 def _print_comparison(found: "Comparison") -> None:
     from gcs.views.console import ms_text, number_text, plain_console, table_of
 
-    columns: dict[str, Callable[[Compared], str]] = {
+    columns: dict[str, Callable[[GainsAtDelay], str]] = {
         "pred": lambda w: "off" if w.tolerated is None else f"±{w.tolerated:.0%}",
         "gains": lambda w: w.gains,
         "delay": lambda w: ms_text(w.loop_delay_s, unit=""),
-        "ratio": lambda w: f"{w.ratio:.2f}",
-        "stable, ms": lambda w: " to ".join(ms_text(end_s, ".0f", unit="") for end_s in w.stable_s),
+        "ratio": lambda w: number_text(w.ratio, ".2f"),
+        "stable, ms": lambda w: " to ".join(ms_text(end_s, ".0f", unit="") for end_s in w.stable_s or ()),
         "half": lambda w: number_text(w.decay_rate_half_way_1_s, ".2f"),
-        "peak": lambda w: f"{w.string_peak:.2f}",
-        "alpha": lambda w: f"{w.alpha:.3f}",
-        "gain": lambda w: f"{w.spacing_gain_s2:.2f}",
-        "noise": lambda w: f"{w.noise_gain:.1f}",
+        "peak": lambda w: number_text(w.string_peak, ".2f"),
+        "alpha": lambda w: number_text(w.alpha, ".3f"),
+        "gain": lambda w: number_text(w.spacing_gain_s2, ".2f"),
+        "noise": lambda w: number_text(w.noise_gain, ".1f"),
     }
     console = plain_console()
     for line in (

@@ -19,7 +19,7 @@ from gains.design.front import AIMS, Aim, FrontPoint, FrontSearch, Method, Refus
 from gains.design.predicted import least_gains, longest_assumed_s
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gcs.errors import InputError
-from gcs.plan.design import Design
+from gcs.plan.design import Design, GainsAtDelay
 from gcs.plan.flight_plan import loop_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.given import with_gain, with_given
@@ -53,35 +53,13 @@ _FIGURES = {
 _AIM_NAMES: dict[Aim, str] = {"alpha_at_delay": "alpha", "decay_rate_at_delay_1_s": "decay"}
 
 
-class PointFields(Published):
-    """A point of the front, as it is printed; a route that has none says why."""
-
-    method: Method
-    prediction: bool
-    maximised: str
-    loop_delay_s: float
-    alpha: float | None = None
-    alpha_design: float | None = None
-    decay_rate_1_s: float | None = None
-    string_peak: float | None = None
-    spacing_gain_s2: float | None = None
-    noise_gain: float | None = None
-    stable_s: tuple[float, float | None] | None = None
-    is_efficient: bool = False
-    refused: str = ""
-    K: tuple[tuple[float, ...], ...] = ()
-
-
-_OF_POINT = set(PointFields.model_fields)
-
-
 class FrontFields(Published):
     """A front, as --json prints it."""
 
     scenario: str
     tolerated: float
     string_peak_max: float
-    points: tuple[PointFields, ...]
+    points: tuple[GainsAtDelay, ...]
 
 
 def front(
@@ -141,7 +119,7 @@ def searched_in(scenario: Scenario) -> FrontSearch:
 
 def point_at(
     scenario: Scenario, delay_s: float, method: Method, aim: Aim, prediction: Prediction | None
-) -> tuple[Scenario, PointFields]:
+) -> tuple[Scenario, GainsAtDelay]:
     """The scenario with the gains of a point of the front; with or without prediction, or else the better of both.
 
     Raises InputError if no gains take the delay.
@@ -167,42 +145,21 @@ def _inclusion(point: FrontPoint) -> tuple[float, float, float]:
     return (float(K[0, 0]), 0.0, 1.0) if len(K) == 1 else (float(K[1, 2]), float(K[1, 0]), float(K[1, 1]))
 
 
-def fields_of(found: FrontPoint | Refusal) -> PointFields:
+def fields_of(found: FrontPoint | Refusal) -> GainsAtDelay:
     """A point as it is printed, or why there is none."""
     method, prediction, aim = found.route
     named = {"method": method, "prediction": prediction, "maximised": _AIM_NAMES[aim], "loop_delay_s": found.delay_s}
     if isinstance(found, Refusal):
-        return PointFields.model_validate(named | {"refused": found.reason})
-    return PointFields.model_validate(named | plain({k: v for k, v in vars(found).items() if k in _OF_POINT}))
-
-
-class Compared(Published):
-    """One way to take a loop delay, with its figures there; all ways decay alike where the assumed delay is right."""
-
-    prediction: bool
-    gains: Literal["fastest", "least", "own"]
-    """`fastest` at the delay, `least` that decay as fast with prediction, or the scenario's `own`."""
-    K1: float
-    K2: float
-    K3: float
-    tolerated: float | None = None
-    loop_delay_s: float
-    ratio: float
-    stable_s: tuple[float, float]
-    decay_rate_1_s: float
-    decay_rate_half_way_1_s: float | None = None
-    """At the worse of the delays half-way to the ends of what is tolerated."""
-    string_peak: float
-    alpha: float
-    spacing_gain_s2: float
-    noise_gain: float
+        return GainsAtDelay.model_validate(named | {"refused": found.reason})
+    figures = {name: value for name, value in vars(found).items() if name in GainsAtDelay.model_fields}
+    return GainsAtDelay.model_validate(named | plain(figures))
 
 
 class Comparison(Published):
     """What prediction is worth at the decay of a scenario's gains, and what it costs."""
 
     scenario: str
-    ways: tuple[Compared, ...]
+    ways: tuple[GainsAtDelay, ...]
 
 
 def compared(design: Design, name: str) -> Comparison:
@@ -223,21 +180,15 @@ def compared(design: Design, name: str) -> Comparison:
     k1, k3 = least_gains(wanted_1_s, period_s)  # with prediction none that decay as fast tolerate more
     least = ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0)
 
-    def way(chosen: Literal["fastest", "least", "own"], gains: ScalarGains, share: float | None) -> Compared:
+    def way(chosen: str, gains: ScalarGains, share: float | None) -> GainsAtDelay:
         delay_s = late_s if share is None else longest_assumed_s(gains, period_s, share, PREDICTION_MAX_S)
         assumed_s, half_way_1_s = None, None
         if share is not None:
             assumed_s, half_s = delay_s, ((1.0 - share / 2.0) * delay_s, (1.0 + share / 2.0) * delay_s)
             half_way_1_s = PredictedFigures(PAIR, gains.K, period_s, delay_s, half_s).decay_rate_at_delay_1_s
-        figures = evaluated(gains, period_s, assumed_s, (delay_s, delay_s)).model_dump()
-        return Compared(
-            **{name: figures[name] for name in Compared.model_fields if name in figures},
-            gains=chosen,
-            tolerated=share,
-            loop_delay_s=delay_s,
-            ratio=delay_s / late_s,
-            decay_rate_half_way_1_s=half_way_1_s,
-        )
+        whose = {"gains": chosen, "tolerated": share, "loop_delay_s": delay_s, "ratio": delay_s / late_s}
+        found = evaluated(gains, period_s, assumed_s, (delay_s, delay_s))
+        return found.model_copy(update=whose | {"decay_rate_half_way_1_s": half_way_1_s})
 
     predicted = (*(way("least", least, share) for share in TOLERATED), way("own", own, _OWN_TOLERATED))
     return Comparison(scenario=name, ways=(way("fastest", fastest, None), *predicted))

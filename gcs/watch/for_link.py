@@ -18,11 +18,10 @@ from gains.criteria.predicted import PredictedFigures
 from gains.design.for_delay import criteria_gains
 from gains.design.front import Aim
 from gains.design.predicted import predicted_gains
-from gains.formation.model import FormationModel
 from gains.performance.flown import FlownLoop, FlownTiming
-from gains.performance.scalar_gains import ScalarGains
+from gains.performance.scalar_gains import PAIR, ScalarGains
 from gcs.errors import InputError
-from gcs.plan.design import LinkGains, LinkPart
+from gcs.plan.design import GainsAtDelay, LinkPart
 from gcs.plan.expected_delay import drawn_loop_delays_s
 from gcs.plan.flight_plan import loop_timing
 from gcs.plan.given import with_given
@@ -130,11 +129,11 @@ def _aim(control: Control) -> Aim:
     return "decay_rate_at_delay_1_s" if decay else "alpha_at_delay"
 
 
-def _name(own: LinkGains) -> str:
+def _name(own: GainsAtDelay) -> str:
     return "with prediction" if own.prediction else "without prediction"
 
 
-def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicted: bool) -> LinkGains:
+def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicted: bool) -> GainsAtDelay:
     """The best gains with or without prediction, and their figures."""
     control, period_s = scenario.control, loop_timing(scenario).held_s
     criteria = Criteria(**control.criteria.model_dump()) if control.criteria is not None else Criteria()
@@ -148,31 +147,31 @@ def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicte
         criteria = replace(criteria, at_delay_s=worst_s, maximise=aim)
     ends_s = delays.least_s, worst_s
     if predicted and middle_s > PREDICTION_MAX_S:
-        return LinkGains(prediction=True, refused=f"the station predicts over at most {PREDICTION_MAX_S:g} s")
+        return GainsAtDelay(prediction=True, refused=f"the station predicts over at most {PREDICTION_MAX_S:g} s")
     try:
         margin_s = None if predicted else worst_s / spare
         wanted = Requirement(margin_s, string_peak_max=control.string_peak_max, criteria=criteria)
         gains = predicted_gains(wanted, period_s, ends_s) if predicted else criteria_gains(wanted, period_s)
     except GainsError as error:
-        return LinkGains(prediction=predicted, refused=str(error))
+        return GainsAtDelay(prediction=predicted, refused=str(error))
     return evaluated(gains, period_s, middle_s if predicted else None, ends_s)
 
 
-def evaluated(gains: ScalarGains, period_s: float, assumed_s: float | None, ends_s: tuple[float, float]) -> LinkGains:
+def evaluated(
+    gains: ScalarGains, period_s: float, assumed_s: float | None, ends_s: tuple[float, float]
+) -> GainsAtDelay:
     """Gains with their exact figures: at the worse end of the delays with prediction, else at the longer delay."""
-    model = FormationModel((-1, 0), axes=1)
-    K = model.overlapping_gain([[-gains.k1]], [[gains.k2]], [[gains.k3]])
     if assumed_s is not None:
-        figures = PredictedFigures(model, K, period_s, assumed_s, ends_s, chain=gains)
+        figures = PredictedFigures(PAIR, gains.K, period_s, assumed_s, ends_s, chain=gains)
         least_s, most_s = figures.window_s
         shorter = (assumed_s - ends_s[0]) / (assumed_s - least_s) if least_s > 0.0 else 0.0
         headroom = 1.0 - max(shorter, (ends_s[1] - assumed_s) / (most_s - assumed_s))
     else:
         timing = FlownTiming(inf, period_s)
-        figures = LoopFigures(model, K, timing, ends_s[1], chain=FlownLoop(gains, timing))
+        figures = LoopFigures(PAIR, gains.K, timing, ends_s[1], chain=FlownLoop(gains, timing))
         least_s, most_s = 0.0, figures.delay_margin_s
         headroom = 1.0 - ends_s[1] / most_s
-    return LinkGains(
+    return GainsAtDelay(
         prediction=assumed_s is not None,
         K1=-gains.k1,
         K2=gains.k2,
