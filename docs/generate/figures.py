@@ -129,21 +129,25 @@ def prediction_price(runner: Runner) -> str:
     rows: list[tuple[str, ...]] = []
     for way in runner.json("gcs design scenarios/triangle5.toml --compare-prediction")["ways"]:
         shorter_s, longer_s = (way["stable_s"][0] - way["loop_delay_s"], way["stable_s"][1] - way["loop_delay_s"])
+        half_way_1_s = way["decay_rate_half_way_1_s"]
         rows.append(
             (
                 "off" if not way["prediction"] else f"on, ±{way['tolerated']:.0%} wanted",
+                way["gains"],
+                f"{-way['K1']:.2f}, {way['K2']:.2f}, {way['K3']:.2f}",
                 _ms(way["loop_delay_s"]),
                 f"{way['ratio']:.2f}",
                 f"{1e3 * shorter_s:+.0f} / {1e3 * longer_s:+.0f} ms",
                 f"{way['decay_rate_1_s']:.3f} 1/s",
+                "–" if half_way_1_s is None else f"{half_way_1_s:.2f} 1/s",
                 f"{way['string_peak']:.2f}",
                 f"{way['alpha']:.3f}",
                 f"{way['spacing_gain_s2']:.2f} s²",
                 f"{way['noise_gain']:.2f}",
             )
         )
-    head = ("prediction", "largest loop delay", "ratio", "mismatch tolerated", "decay", "string peak", "alpha")
-    return table((*head, "disturbance gain", "noise gain"), rows)
+    head = ("prediction", "gains", "k1, k2, k3", "largest loop delay", "ratio", "mismatch tolerated", "decay")
+    return table((*head, "decay half-way", "string peak", "alpha", "disturbance gain", "noise gain"), rows)
 
 
 def prediction_flights(runner: Runner) -> str:

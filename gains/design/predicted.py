@@ -7,16 +7,18 @@ one, `Criteria.at_delay_s`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, log, sqrt
+from math import exp, inf, log, sqrt
 
 import numpy as np
 
+from gains.core._bracketing import met_end
 from gains.core.arrays import FloatArray
 from gains.core.requirement import Requirement
 from gains.criteria.predicted import PredictedFigures
 from gains.design.for_delay import PatternGains, TreeGains, searched
 from gains.design.time_scale import time_scaled
 from gains.performance.flown import FlownTiming
+from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains
 
 _THINNED, _THINNED_PATTERN = 4, 10
@@ -26,6 +28,47 @@ _EVALUATIONS = 160
 _TOLERATED = 0.2
 # time scales from which gains on a pattern are started, as multiples of the assumed delay
 _SCALES = 0.2, 0.4, 0.8
+# how much more than is asked for the longest delay tolerates, as a share of it; and the least that is told from none
+_CLOSE, _NOTHING_S = 1e-6, 1e-9
+
+
+def least_gains(decay_rate_1_s: float, period_s: float) -> tuple[float, float]:
+    """Return the least (k1, k3) that decay at a rate if sampled and held without delay: a double root z = e^{-sigma T}.
+
+    z^2 - (2 - k1 T - k3 T^2 / 2) z + 1 - k1 T + k3 T^2 / 2 has both roots within |z| <= p exactly if
+
+        k1 T >= 1 - p^2 + k3 T^2 / 2   and   k3 T^2 / 2 >= (1 - p) (k1 T - 1 + p) / (1 + p),
+
+    and the double root meets both with the least k1 and the least k3. With prediction a loop decays like this at every
+    delay and the window is about 1 / (k1 + k3 tau^) to either side, so that no gains that decay as fast tolerate more.
+
+    >>> [round(gain, 3) for gain in least_gains(1.735, 0.02)]
+    [3.381, 2.908]
+    """
+    p = exp(-decay_rate_1_s * period_s)
+    return (1.0 - p) * (3.0 + p) / (2.0 * period_s), ((1.0 - p) / period_s) ** 2
+
+
+def longest_assumed_s(
+    gains: ScalarGains, period_s: float, share: float, most_s: float, responses: tuple[Response, ...] | None = None
+) -> float:
+    """Return the longest loop delay (s), up to `most_s`, of which prediction with these gains tolerates a share.
+
+    The loop is stable at every constant delay within this share of the assumed one. 0 if no delay is that long.
+
+    >>> round(longest_assumed_s(ScalarGains(3.408, 0.631, 5.608, 0.0), 0.02, 0.05, 10.0), 2)
+    1.6
+    """
+
+    def spare(log_s: float) -> float:
+        assumed_s = exp(log_s)
+        figures = PredictedFigures(PAIR, gains.K, period_s, assumed_s, (assumed_s,), responses=responses)
+        return log(max(_NOTHING_S, figures.proved_spread_s(assumed_s, 0.0)) / (share * assumed_s))
+
+    ends = [(at, spare(at)) for at in (log(period_s), log(most_s))]
+    if ends[0][1] < 0.0:
+        return 0.0
+    return most_s if ends[1][1] >= 0.0 else exp(met_end(spare, *ends, resolution=_CLOSE))
 
 
 def predicted_gains(wanted: Requirement, period_s: float, at_s: Sequence[float] | None = None) -> ScalarGains:

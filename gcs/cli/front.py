@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from gains.design.front import Method
     from gcs.drive.takeover import Presence
     from gcs.drive.udp import StationSocket
-    from gcs.plan.design import Design, LinkPart
-    from gcs.studies.front import Compared, Comparison, FrontFields, PointFields
+    from gcs.plan.design import Design, GainsAtDelay, LinkPart
+    from gcs.studies.front import Comparison, FrontFields
     from scenarios.schema import Scenario
 
 LinksOf = Annotated[
@@ -44,6 +44,13 @@ Save = Annotated[
     Path | None,
     typer.Option(metavar="FILE.toml", help="with --at or --links-of: write the scenario with these gains"),
 ]
+
+# whose gains a comparison uses
+_GAINS = {
+    "fastest": "decay fastest at the delay",
+    "least": "tolerate most of those that decay as fast",
+    "own": "of the scenario",
+}
 
 
 def chosen_for(scenario: "Scenario", links_of: Path | None) -> "tuple[Scenario, LinkPart | None]":
@@ -126,7 +133,7 @@ def _print_front(found: "FrontFields") -> None:
         "noise from measurements to commands; whether on the front",
     ):
         console.print(f"         {line}")
-    columns: dict[str, Callable[[PointFields], str]] = {
+    columns: dict[str, Callable[[GainsAtDelay], str]] = {
         "ms": lambda p: f"{1e3 * p.loop_delay_s:.0f}",
         "best": lambda p: p.maximised,
         "method": lambda p: p.method,
@@ -155,25 +162,30 @@ def show_comparison(design: "Design", name: str, *, as_json: bool) -> None:
 
 
 def _print_comparison(found: "Comparison") -> None:
-    from gcs.views.console import ms_text, plain_console, table_of
+    from gcs.views.console import ms_text, number_text, plain_console, table_of
 
-    columns: dict[str, Callable[[Compared], str]] = {
+    columns: dict[str, Callable[[GainsAtDelay], str]] = {
         "pred": lambda w: "off" if w.tolerated is None else f"±{w.tolerated:.0%}",
+        "gains": lambda w: w.gains,
         "delay": lambda w: ms_text(w.loop_delay_s, unit=""),
-        "ratio": lambda w: f"{w.ratio:.2f}",
-        "stable, ms": lambda w: " to ".join(ms_text(end_s, unit="") for end_s in w.stable_s),
-        "decay": lambda w: f"{w.decay_rate_1_s:.3f}",
-        "peak": lambda w: f"{w.string_peak:.2f}",
-        "alpha": lambda w: f"{w.alpha:.3f}",
-        "gain": lambda w: f"{w.spacing_gain_s2:.3f}",
-        "noise": lambda w: f"{w.noise_gain:.2f}",
+        "ratio": lambda w: number_text(w.ratio, ".2f"),
+        "stable, ms": lambda w: " to ".join(ms_text(end_s, ".0f", unit="") for end_s in w.stable_s or ()),
+        "half": lambda w: number_text(w.decay_rate_half_way_1_s, ".2f"),
+        "peak": lambda w: number_text(w.string_peak, ".2f"),
+        "alpha": lambda w: number_text(w.alpha, ".3f"),
+        "gain": lambda w: number_text(w.spacing_gain_s2, ".2f"),
+        "noise": lambda w: number_text(w.noise_gain, ".1f"),
     }
     console = plain_console()
     for line in (
-        "delay    the longest in ms at equal decay: that of any static gains, and",
-        "         predicted with these gains, which are stable at every constant delay",
-        "         within the share under pred",
-        "decay    in 1/s; gain from disturbance to spacing error in s²; noise to commands",
+        f"decay    {found.ways[0].decay_rate_1_s:.3f} 1/s without mismatch; half: half-way to the ends of the share",
+        "delay    the longest in ms at this decay: that of any static gains, and predicted,",
+        "         stable at every constant delay within the share under pred",
+        *(
+            f"{name:8} {_GAINS[name]}: K1 {way.K1:.3f}, K2 {way.K2:.3f}, K3 {way.K3:.3f}"
+            for name, way in {way.gains: way for way in found.ways}.items()
+        ),
+        "gain     disturbance to spacing error in s²; noise to commands; peak: string peak",
     ):
         console.print(line)
     console.print(table_of(found.ways, columns, dense=True))

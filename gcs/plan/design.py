@@ -210,22 +210,38 @@ class CodeRecord(Published):
     sha256: str
 
 
-class LinkGains(Published):
-    """Gains for a measured link, with prediction or without, and their figures at its worst delays."""
+class GainsAtDelay(Published):
+    """Gains at loop delays, with prediction or without, and their figures there; only what is known is set.
 
+    A candidate for a measured link, a point of a front, or a way of a comparison with and without prediction.
+    """
+
+    method: Literal["inclusion", "graph-lqr"] = "inclusion"
     prediction: bool
+    maximised: str = ""
+    gains: Literal["fastest", "least", "own"] = "own"
+    """`fastest` at the delay, `least` that decay as fast with prediction, or the scenario's `own`."""
     refused: str = ""
     """Why there are none; then the figures are unknown."""
     K1: float | None = None
     K2: float | None = None
     K3: float | None = None
+    tolerated: float | None = None
+    loop_delay_s: float = nan
+    ratio: float | None = None
+    """Of the delay to the longest without prediction."""
     alpha: float | None = None
+    alpha_design: float | None = None
     decay_rate_1_s: float | None = None
+    decay_rate_half_way_1_s: float | None = None
+    """At the worse of the delays half-way to the ends of what is tolerated."""
     string_peak: float | None = None
     spacing_gain_s2: float | None = None
     noise_gain: float | None = None
     stable_s: tuple[float, Margin] | None = None
     headroom: float | None = None
+    is_efficient: bool = False
+    K: tuple[tuple[float, ...], ...] = ()
 
 
 class LinkPart(Published):
@@ -239,7 +255,7 @@ class LinkPart(Published):
     headroom: float
     maximised: str
     chosen: str
-    candidates: tuple[LinkGains, ...] = ()
+    candidates: tuple[GainsAtDelay, ...] = ()
 
 
 class Design(Published):

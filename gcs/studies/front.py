@@ -2,8 +2,9 @@
 
 `--compare-prediction`: the loop delay that gains take with prediction, against any without it. Slow gains take a long
 delay, so delays are compared at equal decay: the longest at which any static gains decay as fast as those of the
-scenario do with prediction, and the longest over which a station can predict with these, stable at every constant delay
-within a share of it. The string peak of the static gains is no smaller; with a response it is larger.
+scenario do with prediction, and the longest over which a station can predict with any gains that decay as fast, or with
+the scenario's where vehicles respond with a lag, stable at every constant delay within a share of it. The string peak
+of the static gains is no smaller; with a response it is larger.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -13,17 +14,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gains.core.requirement import plain
+from gains.criteria.predicted import PredictedFigures
 from gains.design.for_delay import longest_static_delay
 from gains.design.front import AIMS, Aim, FrontPoint, FrontSearch, Method, Refusal, Route, efficient
+from gains.design.predicted import least_gains, longest_assumed_s
 from gains.performance.scalar_gains import PAIR, ScalarGains
-from gains.sampled.multirate import Timing
-from gains.sampled.prediction import predicted_growth_rate
 from gcs.errors import InputError
-from gcs.plan.design import Design
+from gcs.plan.design import Design, GainsAtDelay
 from gcs.plan.flight_plan import loop_timing
 from gcs.plan.formation import plan_formation
 from gcs.plan.given import with_gain, with_given
-from gcs.plan.mismatch import Predicted, window
 from gcs.plan.planner import pattern_of
 from gcs.published import Published
 from gcs.stress.campaign import local_workers
@@ -39,8 +39,9 @@ MOST_VEHICLES = 12
 Prediction = Literal["on", "off"]
 TOLERATED = 0.2, 0.1, 0.05, 0.03
 """Shares of the delay by which a comparison asks the true delay to differ from the assumed one."""
-_STEPS = 12
-# k2 as a share of k1, in gains without prediction
+# that by which the scenario's own gains are asked, too
+_OWN_TOLERATED = 0.05
+# k2 as a share of k1 of all other gains; neither decay nor stability depends on it
 _FRONT_SHARE = 0.2
 _COLOURS = {"inclusion": "#1f4e79", "graph-lqr": "#c1440e"}
 _FIGURES = {
@@ -53,35 +54,13 @@ _FIGURES = {
 _AIM_NAMES: dict[Aim, str] = {"alpha_at_delay": "alpha", "decay_rate_at_delay_1_s": "decay"}
 
 
-class PointFields(Published):
-    """A point of the front, as it is printed; a route that has none says why."""
-
-    method: Method
-    prediction: bool
-    maximised: str
-    loop_delay_s: float
-    alpha: float | None = None
-    alpha_design: float | None = None
-    decay_rate_1_s: float | None = None
-    string_peak: float | None = None
-    spacing_gain_s2: float | None = None
-    noise_gain: float | None = None
-    stable_s: tuple[float, float | None] | None = None
-    is_efficient: bool = False
-    refused: str = ""
-    K: tuple[tuple[float, ...], ...] = ()
-
-
-_OF_POINT = set(PointFields.model_fields)
-
-
 class FrontFields(Published):
     """A front, as --json prints it."""
 
     scenario: str
     tolerated: float
     string_peak_max: float
-    points: tuple[PointFields, ...]
+    points: tuple[GainsAtDelay, ...]
 
 
 def front(
@@ -141,7 +120,7 @@ def searched_in(scenario: Scenario) -> FrontSearch:
 
 def point_at(
     scenario: Scenario, delay_s: float, method: Method, aim: Aim, prediction: Prediction | None
-) -> tuple[Scenario, PointFields]:
+) -> tuple[Scenario, GainsAtDelay]:
     """The scenario with the gains of a point of the front; with or without prediction, or else the better of both.
 
     Raises InputError if no gains take the delay.
@@ -167,75 +146,58 @@ def _inclusion(point: FrontPoint) -> tuple[float, float, float]:
     return (float(K[0, 0]), 0.0, 1.0) if len(K) == 1 else (float(K[1, 2]), float(K[1, 0]), float(K[1, 1]))
 
 
-def fields_of(found: FrontPoint | Refusal) -> PointFields:
+def fields_of(found: FrontPoint | Refusal) -> GainsAtDelay:
     """A point as it is printed, or why there is none."""
     method, prediction, aim = found.route
     named = {"method": method, "prediction": prediction, "maximised": _AIM_NAMES[aim], "loop_delay_s": found.delay_s}
     if isinstance(found, Refusal):
-        return PointFields.model_validate(named | {"refused": found.reason})
-    return PointFields.model_validate(named | plain({k: v for k, v in vars(found).items() if k in _OF_POINT}))
-
-
-class Compared(Published):
-    """One way to take a loop delay, with its figures there; both ways decay alike."""
-
-    prediction: bool
-    tolerated: float | None = None
-    loop_delay_s: float
-    ratio: float
-    K1: float
-    K2: float
-    K3: float
-    stable_s: tuple[float, float]
-    decay_rate_1_s: float
-    string_peak: float
-    alpha: float
-    spacing_gain_s2: float
-    noise_gain: float
+        return GainsAtDelay.model_validate(named | {"refused": found.reason})
+    figures = {name: value for name, value in vars(found).items() if name in GainsAtDelay.model_fields}
+    return GainsAtDelay.model_validate(named | plain(figures))
 
 
 class Comparison(Published):
-    """What the prediction of a scenario's gains is worth, and what it costs."""
+    """What prediction is worth at the decay of a scenario's gains, and what it costs."""
 
     scenario: str
-    ways: tuple[Compared, ...]
+    ways: tuple[GainsAtDelay, ...]
 
 
 def compared(design: Design, name: str) -> Comparison:
-    """The comparison for the gains of a design. Raises InputError if it is not one by inclusion of stable gains."""
+    """The comparison at the decay of a design. Raises InputError if it is not one by inclusion of stable gains."""
     answers = set(design.responses.values())
     if design.inclusion_gains is None or design.loop != "ground" or len(answers) != (design.response is not None):
         wanted = "one by inclusion, loop ground, and [response] if vehicles have an autopilot"
         raise InputError(f"{name}: read another design, wanted {wanted}")
-    own, front, spacing = (gain[0][0] for gain in design.inclusion_gains)
-    period_s, gains, response = design.period_s, ScalarGains(-own, front, spacing, 0.0), next(iter(answers), None)
-    timing = Timing(period_s, period_s)
-    flown = Predicted(PAIR, gains.K.tobytes(), timing, None if response is None else (response, response))
-    loop, measured = flown.loop()
-    wanted_1_s = -predicted_growth_rate(*loop, timing, assumed_s=period_s, delay_s=period_s, measured=measured)
-    late_s, fastest = longest_static_delay(wanted_1_s, period_s, response) if wanted_1_s > 0.0 else (0.0, gains)
+    K1, K2, K3 = (gain[0][0] for gain in design.inclusion_gains)
+    period_s, own, response = design.period_s, ScalarGains(-K1, K2, K3, 0.0), next(iter(answers), None)
+    responses = None if response is None else (response, response)
+
+    def decay_1_s(gains: ScalarGains, assumed_s: float, *delays_s: float) -> float:
+        figures = PredictedFigures(PAIR, gains.K, period_s, assumed_s, delays_s, responses=responses)
+        return figures.decay_rate_at_delay_1_s
+
+    wanted_1_s = decay_1_s(own, period_s, period_s)
+    late_s, fastest = longest_static_delay(wanted_1_s, period_s, response) if wanted_1_s > 0.0 else (0.0, own)
     if late_s <= 0.0:
         raise InputError(f"{name}: read gains that decay at {wanted_1_s:.3g} 1/s, wanted slower ones that are stable")
 
-    def takes(assumed_s: float, share: float) -> bool:
-        least_s, most_s = window(flown, assumed_s)
-        return (least_s <= (1.0 - share) * assumed_s or least_s == 0.0) and most_s >= (1.0 + share) * assumed_s
+    def way(chosen: str, gains: ScalarGains, share: float | None) -> GainsAtDelay:
+        delay_s, assumed_s, half_way_1_s = late_s, None, None
+        if share is not None:
+            delay_s = assumed_s = longest_assumed_s(gains, period_s, share, PREDICTION_MAX_S, responses)
+            half_way_1_s = decay_1_s(gains, delay_s, (1.0 - share / 2.0) * delay_s, (1.0 + share / 2.0) * delay_s)
+        whose = {"gains": chosen, "tolerated": share, "loop_delay_s": delay_s, "ratio": delay_s / late_s}
+        found = evaluated(gains, period_s, assumed_s, (delay_s, delay_s), response)
+        return found.model_copy(update=whose | {"decay_rate_half_way_1_s": half_way_1_s})
 
-    def way(own: ScalarGains, delay_s: float, share: float | None = None) -> Compared:
-        assumed_s = None if share is None else delay_s
-        figures = evaluated(own, period_s, assumed_s, (delay_s, delay_s), response).model_dump()
-        shown = {name: figures[name] for name in Compared.model_fields if name in figures}
-        return Compared(**shown, tolerated=share, loop_delay_s=delay_s, ratio=delay_s / late_s)
-
-    ways = [way(replace(fastest, k2=_FRONT_SHARE * fastest.k1), late_s)]
-    for share in TOLERATED:
-        longest_s, beyond_s = 0.0, PREDICTION_MAX_S
-        for _ in range(_STEPS):
-            middle_s = (longest_s + beyond_s) / 2.0
-            longest_s, beyond_s = (middle_s, beyond_s) if takes(middle_s, share) else (longest_s, middle_s)
-        if longest_s > 0.0:
-            ways.append(way(gains, longest_s, share))
-    return Comparison(scenario=name, ways=tuple(ways))
+    predicted = [("own", own, share) for share in (TOLERATED if responses else (_OWN_TOLERATED,))]
+    if responses is None:  # none that decay as fast tolerate more than these
+        k1, k3 = least_gains(wanted_1_s, period_s)
+        least = ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0)
+        predicted = [*(("least", least, share) for share in TOLERATED), *predicted]
+    ways = way("fastest", replace(fastest, k2=_FRONT_SHARE * fastest.k1), None), *(way(*each) for each in predicted)
+    return Comparison(scenario=name, ways=tuple(own for own in ways if own.loop_delay_s))
 
 
 def plot_front(found: FrontFields, figure: str, axes: Any) -> Any:

@@ -22,7 +22,7 @@ from gains.performance.flown import FlownLoop, FlownTiming
 from gains.performance.response import Response
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gcs.errors import InputError
-from gcs.plan.design import LinkGains, LinkPart
+from gcs.plan.design import GainsAtDelay, LinkPart
 from gcs.plan.expected_delay import drawn_loop_delays_s
 from gcs.plan.flight_plan import loop_timing
 from gcs.plan.given import with_given
@@ -130,11 +130,11 @@ def _aim(control: Control) -> Aim:
     return "decay_rate_at_delay_1_s" if decay else "alpha_at_delay"
 
 
-def _name(own: LinkGains) -> str:
+def _name(own: GainsAtDelay) -> str:
     return "with prediction" if own.prediction else "without prediction"
 
 
-def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicted: bool) -> LinkGains:
+def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicted: bool) -> GainsAtDelay:
     """The best gains with or without prediction, and their figures."""
     control, period_s = scenario.control, loop_timing(scenario).held_s
     criteria = Criteria(**control.criteria.model_dump()) if control.criteria is not None else Criteria()
@@ -148,13 +148,13 @@ def _candidate(scenario: Scenario, delays: MeasuredDelays, aim: Aim, *, predicte
         criteria = replace(criteria, at_delay_s=worst_s, maximise=aim)
     ends_s = delays.least_s, worst_s
     if predicted and middle_s > PREDICTION_MAX_S:
-        return LinkGains(prediction=True, refused=f"the station predicts over at most {PREDICTION_MAX_S:g} s")
+        return GainsAtDelay(prediction=True, refused=f"the station predicts over at most {PREDICTION_MAX_S:g} s")
     try:
         margin_s = None if predicted else worst_s / spare
         wanted = Requirement(margin_s, string_peak_max=control.string_peak_max, criteria=criteria)
         gains = predicted_gains(wanted, period_s, ends_s) if predicted else criteria_gains(wanted, period_s)
     except GainsError as error:
-        return LinkGains(prediction=predicted, refused=str(error))
+        return GainsAtDelay(prediction=predicted, refused=str(error))
     return evaluated(gains, period_s, middle_s if predicted else None, ends_s)
 
 
@@ -164,7 +164,7 @@ def evaluated(
     assumed_s: float | None,
     ends_s: tuple[float, float],
     response: Response | None = None,
-) -> LinkGains:
+) -> GainsAtDelay:
     """Gains with their exact figures: at the worse end of the delays with prediction, else at the longer delay."""
     K, responses = gains.K, None if response is None else (response, response)
     if assumed_s is not None:
@@ -178,7 +178,7 @@ def evaluated(
         figures = LoopFigures(PAIR, K, timing, ends_s[1], responses=responses, chain=chain)
         least_s, most_s = 0.0, figures.delay_margin_s
         headroom = 1.0 - ends_s[1] / most_s
-    return LinkGains(
+    return GainsAtDelay(
         prediction=assumed_s is not None,
         K1=-gains.k1,
         K2=gains.k2,

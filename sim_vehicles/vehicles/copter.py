@@ -294,7 +294,7 @@ class Copter:
     def _active_target(self, boot_ms: int) -> messages.Message:
         """What it steers to now: the velocity of the set-point, and its acceleration.
 
-        With ArduCopter the velocity has grown since, and float32 has rounded the acceleration on its way to cm and back.
+        With ArduCopter the velocity has grown since, and float32 has rounded the acceleration to cm and back.
         PX4 reports the acceleration that its velocity loop wants.
         """
         target, (north, east) = self._target, self._target[0:2]

@@ -1,21 +1,27 @@
 """Flights of a station that predicts: they decay or grow as the certificate says, and settle where others break."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
+from gains.design.predicted import least_gains, longest_assumed_s
 from gains.performance.predicted import PredictedLoop
-from gains.performance.scalar_gains import ScalarGains
+from gains.performance.scalar_gains import PAIR, ScalarGains
+from gains.sampled.multirate import Timing
+from gains.sampled.prediction import predicted_growth_rate
 from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_virtual
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.stress.axes import at_coordinates
+from gcs.stress.free_response import probe_scenario
 from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from scenarios.files import load
 from scenarios.keys.link import DelayPoint, Jitter, Link, Links
+from scenarios.left_out import without
 from scenarios.schema import Control, FixedGains, Limits, NominalVelocity, Scenario
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
@@ -73,6 +79,51 @@ def test_without_mismatch_errors_decay_as_without_delay() -> None:
     outcome = fly_trial(Study(planned(1.5)).trial("probe", {"delay": link_s}, seed=1, probe=2))
     assert outcome.loop_delay_s == pytest.approx(1.5, abs=1e-4)
     assert known(outcome.growth_1_s) == pytest.approx(-DECAY_1_S, rel=0.02)
+
+
+@cache
+def least_assumed() -> tuple[ScalarGains, float]:
+    """The least gains that decay as fast, and the longest delay of which their prediction tolerates 5 %."""
+    k1, k3 = least_gains(DECAY_1_S, 0.02)
+    gains = ScalarGains(k1, 0.2 * k1, k3, 0.0)
+    return gains, longest_assumed_s(gains, 0.02, 0.05, 10.0)
+
+
+def least_planned(*left_out: int) -> FlightPlan:
+    gains, assumed_s = least_assumed()
+    given = FixedGains(K1=-gains.k1, K2=gains.k2, K3=gains.k3)
+    control = Control.model_validate({"gains": given, "prediction": assumed_s})
+    flown = TRIANGLE.model_copy(update={"control": control}).with_calm_monitor()
+    return flight_plan(without(flown, left_out, SCENARIOS / "triangle5.toml"))[1]
+
+
+def test_least_gains_decay_as_fast_at_their_longest_delay() -> None:
+    """2.16 s, 6.6 times what any static gains take at this decay. A mismatch of 0.1 ms would part the double root."""
+    study, assumed_s = Study(least_planned()), least_assumed()[1]
+    beside = fly_trial(study.trial("probe", {"delay": assumed_s - 0.01}, seed=1, probe=2))
+    link_s = 2.0 * assumed_s - 0.01 - known(beside.loop_delay_s)
+    outcome = fly_trial(study.trial("probe", {"delay": link_s}, seed=1, probe=2))
+    assert outcome.loop_delay_s == pytest.approx(assumed_s, abs=1e-6)
+    assert known(outcome.growth_1_s) == pytest.approx(-DECAY_1_S, rel=0.02)
+
+
+@pytest.mark.parametrize("mismatch", [-0.0475, 0.0475, 0.06])
+def test_least_gains_take_a_delay_that_is_5_percent_wrong(mismatch: float) -> None:
+    """A leader and its follower for 40 s: near the limit many modes are slow, and only time tells the slowest."""
+    gains, assumed_s = least_assumed()
+    plan, loop_s, waiting_s = least_planned(3, 4, 5), (1.0 + mismatch) * assumed_s, 0.01
+    link = Link(delay_s=(loop_s - waiting_s) / 2.0)
+    probe = probe_scenario(plan, (2,), amplitude=1.0, links=(link, link), waiting_s=waiting_s)
+    ticks = fly_virtual(replace(plan, scenario=probe.model_copy(update={"duration_s": 40.0}))).ticks
+    own = ticks[(ticks["system_id"] == 2) & (ticks["time_s"] >= 0.0)]
+    assert float(np.median(own["loop_delay_s"])) == pytest.approx(loop_s, abs=1e-4)
+    squared = own["velocity_error_north_m_s"] ** 2 + own["velocity_error_east_m_s"] ** 2
+    before, after = (float(squared[own["time_s"] // 10.0 == part].mean()) for part in (2, 3))
+    growth_1_s = np.log(after / before) / 20.0
+    timing = Timing(0.02, 0.02)
+    computed = predicted_growth_rate(PAIR.A, PAIR.B, gains.K, timing, assumed_s=assumed_s, delay_s=loop_s)
+    assert (growth_1_s < 0.0) == (computed < 0.0) == (abs(mismatch) < 0.05)
+    assert growth_1_s == pytest.approx(computed, abs=0.03)  # other modes still are as large
 
 
 def test_a_predicted_formation_settles_at_five_times_the_margin() -> None:

@@ -8,7 +8,7 @@ import pytest
 from gains.core.requirement import Criteria, Requirement
 from gains.criteria.figures import LoopFigures
 from gains.criteria.predicted import PredictedFigures
-from gains.design.predicted import predicted_gains
+from gains.design.predicted import least_gains, longest_assumed_s, predicted_gains
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
 from gains.performance.predicted import PredictedLoop
@@ -80,6 +80,73 @@ def test_the_search_comes_near_the_most_robust_gains() -> None:
     criteria = Criteria(1.0, "alpha_at_delay", delays_s=(0.8, 1.2), delay_rate=0.0)
     found = predicted_gains(Requirement(criteria=criteria, string_peak_max=1.0), PERIOD_S)
     assert found.alpha > 0.98 * 0.2843
+
+
+DECAY_1_S = 1.735
+
+
+def test_least_gains_have_the_least_k1_and_k3() -> None:
+    """Of all on a grid whose sampled matrix without delay has its eigenvalues within e^{-sigma T}."""
+    least = np.array(least_gains(DECAY_1_S, PERIOD_S))
+    first, last = (axis.ravel() for axis in np.meshgrid(*np.outer(least, np.linspace(0.5, 2.0, 61)), indexing="ij"))
+    step = np.array([[1.0, PERIOD_S], [0.0, 1.0]])  # e' = v, v' = u = -k1 v - k3 e
+    entry = np.array([PERIOD_S**2 / 2.0, PERIOD_S])
+    closed = step - entry[:, np.newaxis] * np.stack([last, first], axis=1)[:, np.newaxis, :]
+    fast = np.abs(np.linalg.eigvals(closed)).max(axis=1) <= np.exp(-DECAY_1_S * PERIOD_S)
+    assert fast.sum() > 300
+    assert first[fast].min() >= least[0] * (1.0 - 1e-9)  # rounding
+    assert last[fast].min() >= least[1] * (1.0 - 1e-9)
+
+
+def tolerates(k1: float, k3: float, late_s: float, share: float) -> bool:
+    """Whether the continuous loop is stable within a share, by crossings of the limit: roots of
+
+    s^2 + k1 s + k3 + ((k1 + k3 tau^) s + k3) (e^{-s tau} - e^{-s tau^}).
+    """
+    onto = k1 + k3 * late_s
+    omega = np.linspace(1e-3, 2.5 * onto + 3.0 * k1, 6000)  # 2 (k1 + k3 tau^) is beyond the last crossing
+    s = 1j * omega
+    turn = np.exp(-s * late_s) - (s * s + k1 * s + k3) / (onto * s + k3)  # e^{-s tau} at the limit
+    beyond = np.abs(turn) - 1.0
+    at = np.flatnonzero(beyond[:-1] * beyond[1:] < 0.0)
+    longer_s = np.mod(-np.angle(turn[at]) / omega[at] - late_s, 2.0 * np.pi / omega[at])
+    nearest_s = min(longer_s.min(), (2.0 * np.pi / omega[at] - longer_s).min())
+    return bool(nearest_s >= share * late_s)
+
+
+@pytest.mark.parametrize(("share", "reached_s"), [(0.2, 0.910), (0.05, 2.159)])
+def test_no_gains_that_decay_as_fast_tolerate_longer(share: float, reached_s: float) -> None:
+    """By crossings of the continuous loop with half a hold, on a grid; and by the search over k1, k2 and k3."""
+    k1, k3 = least_gains(DECAY_1_S, PERIOD_S)
+    gains = ScalarGains(k1, 0.2 * k1, k3, 0.0)
+    longest_s = longest_assumed_s(gains, PERIOD_S, share, 10.0)
+    assert longest_s == pytest.approx(reached_s, rel=1e-3)
+    least, late_s = DECAY_1_S, longest_s + PERIOD_S / 2.0
+    assert tolerates(2.0 * least, least**2, 0.99 * late_s, share)  # half a hold is 0.9 % off at 0.9 s
+    for own in 2.0 * least * np.geomspace(1.0, 1.5, 12):
+        for spacing in least * (own - least) * np.geomspace(1.0, 1.8, 12):  # roots left of -sigma
+            assert not tolerates(own, spacing, 1.01 * late_s, share)
+    around_s = (1.0 - share) * longest_s, (1.0 + share) * longest_s
+    criteria = Criteria(longest_s, "decay_rate_at_delay_1_s", delays_s=around_s, delay_rate=0.0)
+    found = predicted_gains(Requirement(criteria=criteria, string_peak_max=1.0), PERIOD_S)
+    figures = PredictedFigures(PAIR, found.K, PERIOD_S, longest_s, (longest_s,))
+    assert 0.975 * DECAY_1_S < figures.decay_rate_at_delay_1_s < 1.001 * DECAY_1_S  # it stops 0.3 to 1.7 % short
+
+
+@pytest.mark.parametrize(("mismatch_s", "decay_1_s"), [(1e-4, 1.515), (1e-3, 1.285), (0.054, 0.296)])
+def test_a_mismatch_parts_the_double_root(mismatch_s: float, decay_1_s: float) -> None:
+    """Of the least gains at 2.159 s, sampled, and as the continuous loop whose root is double in continuous time."""
+    k1, k3 = least_gains(DECAY_1_S, PERIOD_S)
+    for own, spacing, thinned in ((k1, k3, 1), (2.0 * DECAY_1_S, DECAY_1_S**2, 2)):
+        gain = ScalarGains(own, 0.2 * own, spacing, 0.0).K
+        found = PredictedFigures(PAIR, gain, PERIOD_S, 2.159, (2.159 + mismatch_s,), thinned=thinned)
+        assert found.decay_rate_at_delay_1_s == pytest.approx(decay_1_s, abs=2e-3)  # the second has half a hold
+
+
+def test_the_longest_assumed_delay_has_two_limits() -> None:
+    """Unstable gains take none; slow gains tolerate 5 % of the longest that is asked for."""
+    assert longest_assumed_s(ScalarGains(1.0, 0.0, -1.0, 0.0), PERIOD_S, 0.05, 10.0) == 0.0
+    assert longest_assumed_s(ScalarGains(0.2, 0.0, 0.01, 0.0), PERIOD_S, 0.05, 10.0) == 10.0
 
 
 @pytest.mark.parametrize("predecessors", [(-1, 0), (-1, 0, 1, 0, 3)])

@@ -10,7 +10,8 @@ import pytest
 from gains import analyse_delay
 from gcs import plot_front, plot_growth, plot_root_locus
 from gcs.errors import InputError
-from gcs.studies.front import FrontFields, PointFields, picture
+from gcs.plan.design import GainsAtDelay
+from gcs.studies.front import FrontFields, picture
 from gcs.views.page import figure_of
 
 # stable for delays between 0.1002 and 1.7179 s only
@@ -52,7 +53,7 @@ def test_plots_without_axes_go_into_the_current_ones() -> None:
 
 def test_front_has_a_line_for_each_route(tmp_path: Path) -> None:
     points = [
-        PointFields(method="inclusion", prediction=on, maximised="alpha", loop_delay_s=at_s, alpha=1.0 / (1.0 + at_s))
+        GainsAtDelay(method="inclusion", prediction=on, maximised="alpha", loop_delay_s=at_s, alpha=1.0 / (1.0 + at_s))
         for on in (False, True)
         for at_s in (0.1, 0.3)
     ]
