@@ -126,9 +126,8 @@ class PredictedTree:
 
     def figures(self, point: FloatArray) -> PredictedFigures:
         """The figures of the gains of a point."""
-        chain = self.tree.gains(point)
-        at_s = (self.assumed_s,) if self.at_s is None else tuple(self.at_s)
-        return PredictedFigures(PAIR, chain.K, self.period_s, self.assumed_s, at_s, self.weight, chain, _THINNED)
+        K, at_s = self.tree.gains(point).K, (self.assumed_s,) if self.at_s is None else tuple(self.at_s)
+        return PredictedFigures(PAIR, K, self.period_s, self.assumed_s, at_s, self.weight, True, _THINNED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,4 +152,6 @@ class PredictedPattern:
         own = self.pattern
         assert own.delay_s is not None
         K, period_s = own.gain(point), own.timing.period_s
-        return PredictedFigures(own.model, K, period_s, own.delay_s, (own.delay_s,), own.weight, None, _THINNED_PATTERN)
+        return PredictedFigures(
+            own.model, K, period_s, own.delay_s, (own.delay_s,), own.weight, False, _THINNED_PATTERN
+        )

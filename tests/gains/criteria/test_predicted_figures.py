@@ -11,7 +11,6 @@ from gains.criteria.predicted import PredictedFigures
 from gains.design.predicted import least_gains, longest_assumed_s, predicted_gains
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
-from gains.performance.predicted import PredictedLoop
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window_continuous, predicted_growth_rate
@@ -22,16 +21,8 @@ GAINS = ScalarGains(3.408, 0.631, 5.608, 0.0)
 K = PAIR.overlapping_gain([[-3.408]], [[0.631]], [[5.608]])
 
 
-@pytest.mark.parametrize(("assumed_s", "delay_s"), [(0.6, 0.6), (0.3, 0.2)])
-def test_robustness_and_growth_are_those_of_a_follower(assumed_s: float, delay_s: float) -> None:
-    figures = PredictedFigures(PAIR, K, PERIOD_S, assumed_s, (delay_s,), chain=GAINS)
-    loop = PredictedLoop(GAINS, PERIOD_S, assumed_s)
-    assert figures.alpha_at_delay == pytest.approx(loop.alpha(delay_s), rel=1e-5)  # on other frequencies
-    assert figures.string_peak == pytest.approx(loop.string_peak(delay_s), rel=1e-5)
-
-
 def test_predicting_over_nothing_is_no_prediction() -> None:
-    predicted = PredictedFigures(PAIR, K, PERIOD_S, 0.0, (0.15,), chain=GAINS)
+    predicted = PredictedFigures(PAIR, K, PERIOD_S, 0.0, (0.15,))
     plain = LoopFigures(PAIR, K, FlownTiming(inf, PERIOD_S), 0.15)
     for name in ("noise_gain_max", "spacing_gain_max_s2", "alpha_at_delay"):
         assert getattr(predicted, name) == pytest.approx(getattr(plain, name), rel=1e-5), name
