@@ -1,10 +1,30 @@
-"""The same figures as `LoopFigures` of a loop whose station predicts over an assumed loop delay.
+"""Figures of a loop whose station predicts over an assumed delay: those of `LoopFigures`; feed-forward of commands.
 
-With S as in `gains.performance.predicted`, noise n in the measurements and disturbances w of the errors lead to
+The station predicts every vehicle over tau^ where the loop delay is tau (`gains.sampled.prediction`). It may also feed
+a share k_ff of the command of the vehicle in front forward, which it has computed in the same tick::
 
-    u = (I - K S)^{-1} K L (n + R w),   x = R w + R B g_tau u,   R = (s I - A)^{-1},   L = e^{A tau^},
+    u_i = k_ff u_j + K1 e_i^v + K2 e_j^v + K3 e_i^p     for a follower i behind j
 
-of the whole formation. For disturbances a hold counts as half a period; noise is that of the sampled loop.
+All commands together are u = (I - k_ff N)^{-1} K x^, N being one where i follows j: lower triangular, with the diagonal
+blocks of K. Feed-forward therefore changes neither the roots nor the margin, but who acts on whom. With K2 = -K1 and
+k_ff = 1 the vehicle in front and its follower do the same, and no spacing error arises from it at any delay.
+
+A motion that its own command explains is known to the station before it happens. Between two samples it propagates as
+
+    U_i / U_j = (k_ff + K_i S_j) / (1 - K_i S_i),
+
+    S(z) = R(z) G + L R(z) (g_tau(z) - g_tau^(z)),   R(z) = (z I - Phi)^{-1},
+
+in which g_tau = (G0 z + G1) z^{-q-1} is the entry of a held command that acts tau late, and L = e^{A tau^} of the
+measured states (`HeldPlant.carry`): exact, and without mismatch free of the delay. Only a motion that no command
+explains is seen late, by the first vehicle behind it.
+
+Noise n in the measurements and disturbances w of the errors lead to
+
+    u = (I - K S)^{-1} K L (n + R w),   x = R w + R B g_tau u,
+
+of the whole formation. For disturbances the loop is continuous, R = (s I - A)^{-1}, and a hold counts as half a period;
+noise is that of the sampled loop.
 """
 
 from collections.abc import Callable
@@ -23,10 +43,8 @@ from gains.criteria.figures import LoopFigures
 from gains.delay.rightmost import rightmost_root
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
-from gains.performance.predicted import PredictedLoop
 from gains.performance.response import Response, formation_loop
-from gains.performance.scalar_gains import ScalarGains
-from gains.sampled._loop import HeldPlant, carry, radius_of, rate_of, split_delay
+from gains.sampled._loop import HeldPlant, carry, held_entry, radius_of, rate_of
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import mismatch_window, predicted_growth_rate
 
@@ -39,13 +57,29 @@ _ANGLES = 4096
 Complex = NDArray[np.complex128]
 
 
+def fed_forward(model: FormationModel, K: FloatArray, share: float) -> FloatArray:
+    """The gain (inputs, states) of u = K e with `share` of the command of the vehicle in front added to each command.
+
+    A follower gets half the leader's command beside its own gains:
+
+    >>> pair = FormationModel((-1, 0), axes=1)
+    >>> fed_forward(pair, np.array([[-3.0, 0.0, 0.0], [1.0, 2.0, -3.0]]), 0.5).tolist()
+    [[-3.0, 0.0, 0.0], [-0.5, 2.0, -3.0]]
+    """
+    whole = K.copy()
+    for i in model.followers:  # those in front come first
+        whole[model.input_slice(i)] += share * whole[model.input_slice(model.predecessors[i])]
+    return whole
+
+
 @dataclass(frozen=True, eq=False)
 class PredictedFigures:
-    """What a formation of one axis is good for with a gain K, predicted over `assumed_s`.
+    """What a formation of one axis is good for with a gain K, predicted over `assumed_s`; without prediction it is 0.
 
-    Figures at a delay are the worst at the true loop delays `delays_s`. `chain` has k1, k2 and k3 where errors run down
-    a chain of equal followers. `thinned` is as of `LoopFigures`, and the window of a search that of the continuous
-    loop, unless the delay is short. Figures without delay do not include the `responses`, for which nothing is thinned.
+    Figures at a delay are the worst at the true loop delays `delays_s`. Vehicles answer at once if they have no
+    `response`. `chain` says that the model is a vehicle and its follower of a chain of equal ones. `feed_forward` is
+    k_ff, which is not part of K. `thinned` is as of `LoopFigures`, and the window of a search that of the continuous
+    loop, unless the delay is short; a search is of vehicles without a response.
 
     The gains of `triangle5`, assumed and true delay 0.6 s:
 
@@ -62,9 +96,10 @@ class PredictedFigures:
     assumed_s: float
     delays_s: tuple[float, ...]
     weight: tuple[float, float] | None = None
-    chain: ScalarGains | None = None
+    chain: bool = False
     thinned: int = 1
-    responses: tuple[Response, ...] | None = None
+    response: Response | None = None
+    feed_forward: float = 0.0
 
     @property
     def exact(self) -> Self:
@@ -101,25 +136,13 @@ class PredictedFigures:
         return self.window_s[1] if self.window_s[1] > self.assumed_s else 0.0
 
     @cached_property
-    def _loop(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A, B and K with the responses."""
-        return formation_loop(self.model, self.K, self.responses)
-
-    @property
-    def _measured(self) -> list[bool]:
-        """Errors; a response is computed from the commands."""
-        return [k < self.model.states for k in range(len(self._loop[0]))]
-
-    @cached_property
     def window_s(self) -> tuple[float, float]:
         """The least and the largest true loop delay (s), see `gains.sampled.prediction.mismatch_window`."""
-        A, B, K = self._loop
         if self.thinned == 1 or self.assumed_s < _SHORT * self.period_s:
-            return mismatch_window(
-                A, B, K, Timing(self.period_s, self.period_s), assumed_s=self.assumed_s, measured=self._measured
-            )
+            timing = Timing(self.period_s, self.period_s)
+            return mismatch_window(*self._loop, timing, assumed_s=self.assumed_s, measured=self._measured)
         half_s = self.period_s / 2.0
-        least_s, most_s = _rough_window((A, B, K), self.assumed_s + half_s, _FREQUENCIES // self.thinned)
+        least_s, most_s = _rough_window(self._loop, self.assumed_s + half_s, _FREQUENCIES // self.thinned)
         return max(0.0, least_s - half_s), most_s - half_s
 
     def proved_spread_s(self, mean_s: float, rate: float) -> float:
@@ -140,13 +163,12 @@ class PredictedFigures:
         def decay(delay_s: float) -> float:
             if self.decay_rate_1_s <= 0.0:
                 return self.decay_rate_1_s
-            if delay_s == self.assumed_s and self.responses is None:  # the loop behind the delay is that without
+            if delay_s == self.assumed_s and self.response is None:  # the loop behind the delay is that without
                 Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
                 return -rate_of(radius_of(Phi + G @ K), self.period_s)
             if self.thinned == 1:
-                delays = {"assumed_s": self.assumed_s, "delay_s": delay_s}
-                timing = Timing(self.period_s, self.period_s)
-                return -predicted_growth_rate(A, B, K, timing, measured=self._measured, **delays)
+                loop, assumed_s = (A, B, K, Timing(self.period_s, self.period_s)), self.assumed_s
+                return -predicted_growth_rate(*loop, assumed_s=assumed_s, delay_s=delay_s, measured=self._measured)
             late = B @ K @ self._ahead
             terms = [(A + B @ K, 0.0), (late, delay_s + half_s), (-late, self.assumed_s + half_s)]
             return -rightmost_root(terms).real
@@ -155,7 +177,7 @@ class PredictedFigures:
 
     @cached_property
     def alpha_at_delay(self) -> float:
-        """The complex stability radius, as of `PredictedLoop.alpha`; 0 if the loop is unstable."""
+        """The complex stability radius, as of `gains.performance.flown`; 0 if the loop is unstable."""
         heavy, states = self.at_once.W, np.eye(self.model.states)
         return 1.0 / gain if (gain := self._peak(heavy, states)) < inf else 0.0
 
@@ -176,14 +198,25 @@ class PredictedFigures:
     @cached_property
     def string_peak(self) -> float:
         """Largest growth of a commanded motion from vehicle to vehicle; 1 where errors run down no chain."""
-        if self.chain is None:
+        if not self.chain:
             return 1.0
         if self.decay_rate_at_delay_1_s <= 0.0:
             return inf
-        response = self.responses[0] if self.responses else None
-        loop = PredictedLoop(self.chain, self.period_s, self.assumed_s, response)
         omega = np.geomspace(_LOWEST * self._slowest, pi / self.period_s, _FREQUENCIES)[:: self.thinned]
-        return max(1.0, *(self._largest(lambda at, s=s: loop.growth(at, s), omega) for s in self.delays_s))
+        return max(1.0, *(self._largest(lambda at, s=s: self.growth(at, s), omega) for s in self.delays_s))
+
+    def growth(self, omega: FloatArray, delay_s: float) -> FloatArray:
+        """|U_i / U_j| (k,) of the follower at frequencies omega (k,) in rad/s up to pi / `period_s`, if stable."""
+        z = np.exp(1j * omega * self.period_s)[:, np.newaxis, np.newaxis]
+        front, own = (self._loop[2][1] @ self._seen(z, delay_s)).T
+        return np.abs((self.feed_forward + front) / (1.0 - own))
+
+    def _seen(self, z: Complex, delay_s: float) -> Complex:
+        """S."""
+        Phi, G = (maps[0] for maps in self._plant.transition(np.array([self.period_s])))
+        R = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
+        mismatch = held_entry(self._plant, z, delay_s) - held_entry(self._plant, z, self.assumed_s)
+        return R @ G + self._ahead @ R @ mismatch
 
     def _largest(self, function: Callable[[FloatArray], FloatArray], omega: FloatArray) -> float:
         return highest(function, omega)[1] if self.thinned == 1 else float(function(omega).max())
@@ -192,8 +225,8 @@ class PredictedFigures:
         """Largest gain from disturbances that act by `entry` to what `out` reads of the errors."""
         if self.decay_rate_at_delay_1_s <= 0.0:
             return inf
-        (A, B, K), L, half_s, more = self._loop, self._ahead, self.period_s / 2.0, len(self._measured) - out.shape[1]
-        out, entry = np.pad(out, ((0, 0), (0, more))), np.pad(entry, ((0, more), (0, 0)))
+        (A, B, alone), L, half_s, n = self._loop, self._ahead, self.period_s / 2.0, self.model.states
+        K = self._fed_forward
 
         def gain_at(delay_s: float) -> Callable[[FloatArray], FloatArray]:
             def gain(omega: FloatArray) -> FloatArray:
@@ -201,28 +234,21 @@ class PredictedFigures:
                 R = np.linalg.inv(s * np.eye(len(A)) - A)
                 late = np.exp(-s * (delay_s + half_s))
                 seen = R @ B * np.exp(-s * half_s) + L @ R @ B * (late - np.exp(-s * (self.assumed_s + half_s)))
-                commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R @ entry)
-                return np.linalg.norm(out @ (R @ entry + R @ B @ commands * late), ord=2, axis=(1, 2))
+                commands = np.linalg.solve(np.eye(len(K)) - K @ seen, K @ L @ R[:, :, :n] @ entry)
+                moved = R[:, :n, :n] @ entry + (R @ B @ commands * late)[:, :n]
+                return np.linalg.norm(out @ moved, ord=2, axis=(1, 2))
 
             return gain
 
-        highest = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ K, 2) + np.linalg.norm(B @ K @ L, 2))
-        omega = np.geomspace(_LOWEST * self._slowest, highest, _FREQUENCIES)[:: self.thinned]
+        most = 4.0 * float(np.linalg.norm(A, 2) + np.linalg.norm(B @ alone, 2) + np.linalg.norm(B @ alone @ L, 2))
+        omega = np.geomspace(_LOWEST * self._slowest, most, _FREQUENCIES)[:: self.thinned]
         return max(self._largest(gain_at(delay_s), omega) for delay_s in self.delays_s)
 
     def _noise(self, angles: FloatArray, delay_s: float) -> float:
         z = np.exp(1j * angles)[:, np.newaxis, np.newaxis]
-        plant, K = self._plant, self._loop[2]
-        Phi, G = (maps[0] for maps in plant.transition(np.array([self.period_s])))
-
-        def entry(late_s: float) -> Complex:
-            whole, rest_s = split_delay(late_s, self.period_s)
-            newer = plant.transition(np.array([self.period_s - rest_s]))[1][0]
-            return (newer * (z - 1.0) + G) * z ** (-whole - 1)
-
-        R = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
-        seen = R @ G + self._ahead @ R @ (entry(delay_s) - entry(self.assumed_s))
-        commands = np.linalg.solve(np.eye(len(K)) - K @ seen, np.broadcast_to(K @ self._ahead, (len(z), *K.shape)))
+        K, measured = self._fed_forward, self._ahead[:, : self.model.states]
+        known = np.broadcast_to(K @ measured, (len(z), len(K), self.model.states))
+        commands = np.linalg.solve(np.eye(len(K)) - K @ self._seen(z, delay_s), known)
         return float((np.abs(commands) ** 2).sum(axis=2).mean(axis=0).max() ** 0.5)
 
     @cached_property
@@ -235,8 +261,24 @@ class PredictedFigures:
         return HeldPlant(*self._loop, self.period_s, np.array(self._measured))
 
     @cached_property
+    def _loop(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A, B and K with the response; K without feed-forward."""
+        answers = None if self.response is None else (self.response,) * self.model.vehicles
+        return formation_loop(self.model, self.K, answers)
+
+    @property
+    def _fed_forward(self) -> FloatArray:
+        return fed_forward(self.model, self._loop[2], self.feed_forward)
+
+    @property
+    def _measured(self) -> list[bool]:
+        """Positions and velocities; a response is computed from the commands."""
+        return [state < self.model.states for state in range(len(self._loop[0]))]
+
+    @cached_property
     def _slowest(self) -> float:
-        return float(np.abs(np.linalg.eigvals(self.at_once.closed_loop)).min())
+        A, B, K = self._loop
+        return float(np.abs(np.linalg.eigvals(A + B @ K)).min())
 
 
 def _rough_window(

@@ -18,6 +18,7 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import DisagreementError, InfeasibleError
 from gains.core.requirement import ALPHA_MIN, Requirement, plain
 from gains.core.structure import positive_seconds
+from gains.criteria.predicted import fed_forward
 from gains.delay.constant import delay_margin
 from gains.design.for_delay import criteria_gains
 from gains.design.graph import GraphDesign, GraphMethod, assess, graph_design
@@ -26,7 +27,6 @@ from gains.design.search import largest_alpha
 from gains.formation.model import FormationModel, checked_gain
 from gains.formation.pattern import Pattern, checked_pattern_gain, leader_follower
 from gains.performance.behaviour import Behaviour, BlockMargin, behaviour, block_margin, diagonal_blocks
-from gains.performance.predicted import fed_forward
 from gains.performance.robust import Certificate, certify, robustness
 from gains.performance.string_stability import Gains
 from gains.sampled.constant import sampled_delay_margin

@@ -50,7 +50,7 @@ def least_gains(decay_rate_1_s: float, period_s: float) -> tuple[float, float]:
 
 
 def longest_assumed_s(
-    gains: ScalarGains, period_s: float, share: float, most_s: float, responses: tuple[Response, ...] | None = None
+    gains: ScalarGains, period_s: float, share: float, most_s: float, response: Response | None = None
 ) -> float:
     """Return the longest loop delay (s), up to `most_s`, of which prediction with these gains tolerates a share.
 
@@ -62,7 +62,7 @@ def longest_assumed_s(
 
     def spare(log_s: float) -> float:
         assumed_s = exp(log_s)
-        figures = PredictedFigures(PAIR, gains.K, period_s, assumed_s, (assumed_s,), responses=responses)
+        figures = PredictedFigures(PAIR, gains.K, period_s, assumed_s, (assumed_s,), response=response)
         return log(max(_NOTHING_S, figures.proved_spread_s(assumed_s, 0.0)) / (share * assumed_s))
 
     ends = [(at, spare(at)) for at in (log(period_s), log(most_s))]
@@ -129,9 +129,8 @@ class PredictedTree:
 
     def figures(self, point: FloatArray) -> PredictedFigures:
         """The figures of the gains of a point."""
-        chain = self.tree.gains(point)
-        at_s = (self.assumed_s,) if self.at_s is None else tuple(self.at_s)
-        return PredictedFigures(PAIR, chain.K, self.period_s, self.assumed_s, at_s, self.weight, chain, _THINNED)
+        K, at_s = self.tree.gains(point).K, (self.assumed_s,) if self.at_s is None else tuple(self.at_s)
+        return PredictedFigures(PAIR, K, self.period_s, self.assumed_s, at_s, self.weight, True, _THINNED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,4 +155,6 @@ class PredictedPattern:
         own = self.pattern
         assert own.delay_s is not None
         K, period_s = own.gain(point), own.timing.period_s
-        return PredictedFigures(own.model, K, period_s, own.delay_s, (own.delay_s,), own.weight, None, _THINNED_PATTERN)
+        return PredictedFigures(
+            own.model, K, period_s, own.delay_s, (own.delay_s,), own.weight, False, _THINNED_PATTERN
+        )

@@ -17,7 +17,7 @@ the roots of
 
 a loop with two delays, one of them known. An acceleration is not in a vehicle's telemetry: the station computes it from
 its commands alone, and e^{A tau^} then carries on only what is `measured`, see `HeldPlant.carry`. Robustness and string
-stability are in `gains.performance.predicted`. Source:
+stability are in `gains.criteria.predicted`. Source:
 Z. Artstein, "Linear systems with delayed controls: a reduction", IEEE Trans. AC 27 (1982).
 """
 

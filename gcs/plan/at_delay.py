@@ -10,10 +10,10 @@ from math import inf
 import numpy as np
 
 from gains.core.requirement import plain
+from gains.criteria.predicted import PredictedFigures
 from gains.design.time_scale import time_scaled
 from gains.performance.flown import ALPHA_KEPT, FlownFormation, FlownLoop, FlownTiming
-from gains.performance.predicted import PredictedLoop
-from gains.performance.scalar_gains import ScalarGains
+from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled.onboard import own_part
 from gcs.plan.design import Design, FiguresAtDelay, FiguresAtExpectedDelay, GainSet
 from gcs.plan.expected_delay import expected_loop_delay_s
@@ -60,7 +60,7 @@ def figures_at(design: Design, scenario: Scenario, delay_s: float | None, gain_s
 
 
 def _is_predicted(design: Design) -> bool:
-    """Whether more than the newest states is fed back: a loop of `gains.performance.predicted`."""
+    """Whether more than the newest states is fed back: a loop of `gains.criteria.predicted`."""
     return design.prediction is not None or design.feed_forward > 0.0
 
 
@@ -72,16 +72,25 @@ def _predicted_at(design: Design, delay_s: float, gain_set: int) -> FiguresAtDel
         assumed_s = delay_s if fixed_s is None else fixed_s
     entry = _gain_set(design, gain_set)
     has_chain = design.inclusion_gains is not None and design.loop == "ground"
-    loops = [
-        PredictedLoop(chain.gains, design.period_s, assumed_s, chain.response, design.feed_forward)
+    followers = [
+        PredictedFigures(
+            PAIR,
+            chain.gains.K,
+            design.period_s,
+            assumed_s,
+            (delay_s,),
+            chain=True,
+            response=chain.response,
+            feed_forward=design.feed_forward,
+        )
         for chain in (_follower_loops(design, entry) if has_chain else [])
     ]
-    if not loops:
+    if not followers:
         return FiguresAtDelay(loop_delay_s=delay_s, has_string_verdict=False)
     return FiguresAtDelay(
         loop_delay_s=delay_s,
-        alpha=min(loop.alpha(delay_s) for loop in loops),
-        string_peak=plain(max(loop.string_peak(delay_s) for loop in loops)),
+        alpha=min(each.alpha_at_delay for each in followers),
+        string_peak=plain(max(each.string_peak for each in followers)),
     )
 
 

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from gains.core.arrays import FloatArray
+from gains.criteria.predicted import fed_forward
 from gains.formation.model import FormationModel
 from gains.performance.disturbed import DisturbedFormation, Gusts, Sensing
-from gains.performance.predicted import fed_forward
 from gains.performance.radii import SectorLoop
 from gains.performance.response import formation_loop, pushed_states
 from gains.performance.robust import disturbance_bound

@@ -7,6 +7,7 @@ import numpy as np
 
 from gains.core.arrays import FloatArray
 from gains.core.requirement import Criteria, Requirement, plain
+from gains.criteria.predicted import fed_forward
 from gains.design.design import Design as InclusionDesign
 from gains.design.design import design, evaluate_gains, trade_off
 from gains.design.graph import GraphDesign
@@ -14,7 +15,6 @@ from gains.design.required import requirement_with
 from gains.design.time_scale import time_scaled
 from gains.formation.model import FormationModel
 from gains.formation.pattern import Pattern, leader_follower, overlapping, with_links, without_links
-from gains.performance.predicted import fed_forward
 from gains.performance.response import Response, continuous_margin, sampled_margin
 from gains.performance.string_stability import string_peak
 from gcs.errors import InputError

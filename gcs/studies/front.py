@@ -171,10 +171,9 @@ def compared(design: Design, name: str) -> Comparison:
         raise InputError(f"{name}: read another design, wanted {wanted}")
     K1, K2, K3 = (gain[0][0] for gain in design.inclusion_gains)
     period_s, own, response = design.period_s, ScalarGains(-K1, K2, K3, 0.0), next(iter(answers), None)
-    responses = None if response is None else (response, response)
 
     def decay_1_s(gains: ScalarGains, assumed_s: float, *delays_s: float) -> float:
-        figures = PredictedFigures(PAIR, gains.K, period_s, assumed_s, delays_s, responses=responses)
+        figures = PredictedFigures(PAIR, gains.K, period_s, assumed_s, delays_s, response=response)
         return figures.decay_rate_at_delay_1_s
 
     wanted_1_s = decay_1_s(own, period_s, period_s)
@@ -185,14 +184,14 @@ def compared(design: Design, name: str) -> Comparison:
     def way(chosen: str, gains: ScalarGains, share: float | None) -> GainsAtDelay:
         delay_s, assumed_s, half_way_1_s = late_s, None, None
         if share is not None:
-            delay_s = assumed_s = longest_assumed_s(gains, period_s, share, PREDICTION_MAX_S, responses)
+            delay_s = assumed_s = longest_assumed_s(gains, period_s, share, PREDICTION_MAX_S, response)
             half_way_1_s = decay_1_s(gains, delay_s, (1.0 - share / 2.0) * delay_s, (1.0 + share / 2.0) * delay_s)
         whose = {"gains": chosen, "tolerated": share, "loop_delay_s": delay_s, "ratio": delay_s / late_s}
         found = evaluated(gains, period_s, assumed_s, (delay_s, delay_s), response)
         return found.model_copy(update=whose | {"decay_rate_half_way_1_s": half_way_1_s})
 
-    predicted = [("own", own, share) for share in (TOLERATED if responses else (_OWN_TOLERATED,))]
-    if responses is None:  # none that decay as fast tolerate more than these
+    predicted = [("own", own, share) for share in (TOLERATED if response else (_OWN_TOLERATED,))]
+    if response is None:  # none that decay as fast tolerate more than these
         k1, k3 = least_gains(wanted_1_s, period_s)
         least = ScalarGains(k1, _FRONT_SHARE * k1, k3, 0.0)
         predicted = [*(("least", least, share) for share in TOLERATED), *predicted]

@@ -168,7 +168,7 @@ def evaluated(
     """Gains with their exact figures: at the worse end of the delays with prediction, else at the longer delay."""
     K, responses = gains.K, None if response is None else (response, response)
     if assumed_s is not None:
-        figures = PredictedFigures(PAIR, K, period_s, assumed_s, ends_s, chain=gains, responses=responses)
+        figures = PredictedFigures(PAIR, K, period_s, assumed_s, ends_s, chain=True, response=response)
         least_s, most_s = figures.window_s
         shorter = (assumed_s - ends_s[0]) / (assumed_s - least_s) if least_s > 0.0 else 0.0
         headroom = 1.0 - max(shorter, (ends_s[1] - assumed_s) / (most_s - assumed_s))

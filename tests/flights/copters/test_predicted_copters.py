@@ -71,7 +71,9 @@ def test_copters_decay_alike_at_three_times_the_uncompensated_delay() -> None:
     """The uncompensated delay is the longest at which any static gains decay as fast as these do when predicted."""
     ways = compared(flight_plan(scenario("off", 0.0))[0], "copters5").ways
     static_s, wanted_1_s = ways[0].loop_delay_s, ways[1].decay_rate_1_s
-    static = flight_plan(scenario("off", 0.1, FixedGains(K1=ways[0].K1, K2=ways[0].K2, K3=ways[0].K3)))[1]
+    static = flight_plan(
+        scenario("off", 0.1, FixedGains(K1=known(ways[0].K1), K2=known(ways[0].K2), K3=known(ways[0].K3)))
+    )[1]
     plain_1_s, plain_s = small_decay_1_s(static, static_s - 0.0112)  # the wait for the tick
     predicted_1_s, predicted_s = small_decay_1_s(planned("measured", 0.59), 1.18)
     assert plain_s == pytest.approx(static_s, abs=0.0005)
@@ -79,7 +81,7 @@ def test_copters_decay_alike_at_three_times_the_uncompensated_delay() -> None:
     assert predicted_1_s == pytest.approx(wanted_1_s, rel=0.01)
     # two roots nearly meet: 1 ms more delay takes 2 % of the decay
     assert plain_1_s == pytest.approx(wanted_1_s, rel=0.02)
-    assert ways[0].string_peak > 1.3
+    assert known(ways[0].string_peak) > 1.3
     assert {way.string_peak for way in ways[1:]} == {1.0}
 
 

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from gains.performance.predicted import PredictedLoop
-from gains.performance.scalar_gains import ScalarGains
+from gains.criteria.predicted import PredictedFigures
+from gains.performance.scalar_gains import PAIR, ScalarGains
 from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_virtual
 from gcs.plan.at_delay import figures_at
@@ -105,8 +105,9 @@ def test_designed_gains_keep_errors_from_growing_at_long_delay() -> None:
 def test_figures_at_a_delay_are_the_fed_forward_loops() -> None:
     flown = scenario(0.9, 3.13)
     found = figures_at(flight_plan(flown)[0], flown, 0.25)
-    loop = PredictedLoop(ScalarGains(K1, 3.13, K3, 0.0), 1.0 / flown.rates.control_hz, 0.0, feed_forward=0.9)
-    assert found.string_peak == pytest.approx(loop.string_peak(0.25))
-    assert found.alpha == pytest.approx(loop.alpha(0.25))
+    K, period_s = ScalarGains(K1, 3.13, K3, 0.0).K, 1.0 / flown.rates.control_hz
+    loop = PredictedFigures(PAIR, K, period_s, 0.0, (0.25,), chain=True, feed_forward=0.9)
+    assert found.string_peak == pytest.approx(loop.string_peak)
+    assert found.alpha == pytest.approx(loop.alpha_at_delay)
     bare = scenario(0.0, 0.631)
     assert known(figures_at(flight_plan(bare)[0], bare, 0.25).string_peak) > 2.0

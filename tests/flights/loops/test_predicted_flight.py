@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from gains.criteria.predicted import PredictedFigures
 from gains.design.predicted import least_gains, longest_assumed_s
-from gains.performance.predicted import PredictedLoop
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import predicted_growth_rate
@@ -194,14 +194,15 @@ def test_commands_grow_down_the_chain_as_computed(loop_s: float, peak: float) ->
     for vehicle in base.leader_first()[1:]:
         rows = ticks[ticks["system_id"] == vehicle.system_id]
         spectra.append(np.exp(-1j * np.outer(omega, rows["due_ns"] * 1e-9)) @ rows["command_north_m_s2"])
-    loop = PredictedLoop(ScalarGains(-GAINS.K1, GAINS.K2, GAINS.K3, 0.0), 0.02, 0.3)
     delay_s = float(np.median(ticks["loop_delay_s"][ticks["system_id"] == base.leader_first()[2].system_id]))
+    K = ScalarGains(-GAINS.K1, GAINS.K2, GAINS.K3, 0.0).K
+    loop = PredictedFigures(PAIR, K, 0.02, 0.3, (delay_s,), chain=True)
     strong = np.abs(spectra[0]) > 0.5 * np.abs(spectra[0]).max()
     flown, computed = np.abs(spectra[1] / spectra[0])[strong], loop.growth(omega[strong], delay_s)
     # the two vehicles' delays differ by milliseconds, and elsewhere rounding of telemetry is no longer small
     assert flown == pytest.approx(computed, abs=0.04)
     assert flown.max() == pytest.approx(peak, abs=0.05)
-    assert flown.max() == pytest.approx(min(loop.string_peak(delay_s), computed.max()), abs=0.03)
+    assert flown.max() == pytest.approx(min(loop.string_peak, computed.max()), abs=0.03)
 
 
 def chain3(prediction: float | str) -> Scenario:

@@ -11,7 +11,6 @@ from gains.criteria.predicted import PredictedFigures
 from gains.design.predicted import least_gains, longest_assumed_s, predicted_gains
 from gains.formation.model import FormationModel
 from gains.performance.flown import FlownTiming
-from gains.performance.predicted import PredictedLoop
 from gains.performance.response import Response
 from gains.performance.scalar_gains import ScalarGains
 from gains.sampled.multirate import Timing
@@ -25,21 +24,9 @@ RESPONSES = None, Response(lag_s=0.05, velocity_gain_1_s=2.0)
 
 
 @pytest.mark.parametrize("response", RESPONSES)
-@pytest.mark.parametrize(("assumed_s", "delay_s"), [(0.6, 0.6), (0.3, 0.2)])
-def test_robustness_and_growth_are_those_of_a_follower(
-    assumed_s: float, delay_s: float, response: Response | None
-) -> None:
-    responses = None if response is None else (response, response)
-    figures = PredictedFigures(PAIR, K, PERIOD_S, assumed_s, (delay_s,), chain=GAINS, responses=responses)
-    loop = PredictedLoop(GAINS, PERIOD_S, assumed_s, response)
-    assert figures.alpha_at_delay == pytest.approx(loop.alpha(delay_s), rel=1e-5)  # on other frequencies
-    assert figures.string_peak == pytest.approx(loop.string_peak(delay_s), rel=1e-5)
-
-
-@pytest.mark.parametrize("response", RESPONSES)
 def test_predicting_over_nothing_is_no_prediction(response: Response | None) -> None:
     responses = None if response is None else (response, response)
-    predicted = PredictedFigures(PAIR, K, PERIOD_S, 0.0, (0.15,), chain=GAINS, responses=responses)
+    predicted = PredictedFigures(PAIR, K, PERIOD_S, 0.0, (0.15,), response=response)
     plain = LoopFigures(PAIR, K, FlownTiming(inf, PERIOD_S), 0.15, responses=responses)
     assert predicted.window_s[1] == pytest.approx(plain.delay_margin_s, abs=1e-6)
     for name in ("noise_gain_max", "spacing_gain_max_s2", "alpha_at_delay"):

@@ -4,18 +4,19 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from gains.core.errors import BadModelError, InfeasibleError
+from gains.criteria.predicted import PredictedFigures, fed_forward
 from gains.delay.constant import delay_margin
 from gains.design.design import Design, Requirement, design, evaluate_gains, trade_off
 from gains.formation.model import FormationModel
-from gains.performance.predicted import PredictedLoop, fed_forward
 from gains.performance.robust import robustness
-from gains.performance.scalar_gains import ScalarGains
+from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.performance.string_stability import string_peak
 from gains.sampled.constant import sampled_delay_margin, spectral_radius
 
@@ -180,6 +181,11 @@ def test_string_stability_costs_little_alpha_and_holds_down_a_chain(default_desi
     assert (spacing[1:] <= spacing[:-1] * (1 + 1e-6)).all()
 
 
+def follower(gains: ScalarGains, share: float) -> Callable[[float], PredictedFigures]:
+    """The figures at a loop delay of the sampled loop of a vehicle and its follower, without prediction."""
+    return lambda delay_s: PredictedFigures(PAIR, gains.K, 0.02, 0.0, (delay_s,), chain=True, feed_forward=share)
+
+
 @pytest.mark.parametrize("share", [0.5, 0.9])
 def test_gains_are_designed_for_the_command_fed_forward(share: float) -> None:
     """α, proof, margin and growth of the loop that flies, each against another computation of it."""
@@ -193,9 +199,9 @@ def test_gains_are_designed_for_the_command_fed_forward(share: float) -> None:
     assert found.certificate is not None
     assert 0.999 * found.alpha < found.certificate.alpha < found.alpha
     assert 0.3 <= sampled_delay_margin(TRIANGLE.A, TRIANGLE.B, flown, period_s=0.02) <= 0.3 + 1e-9
-    loop = PredictedLoop(ScalarGains(k1, k2, k3, 0.0), 0.02, 0.0, feed_forward=share)
+    loop = follower(ScalarGains(k1, k2, k3, 0.0), share)
     # 2e-3: the design takes the hold as half a period of delay
-    assert max(loop.string_peak(delay_s) for delay_s in (0.0, 0.15)) <= 1.0 + 2e-3
+    assert max(loop(delay_s).string_peak for delay_s in (0.0, 0.15)) <= 1.0 + 2e-3
     # no gain on the velocity in front is better within what may grow, tried one by one
     tried = [
         robustness(-k1, other - share * k1, k3)
@@ -205,8 +211,8 @@ def test_gains_are_designed_for_the_command_fed_forward(share: float) -> None:
     ]
     assert max(tried) <= found.alpha + 1e-9
     bare = design(TRIANGLE, Requirement(delay_margin_s=0.3, string_peak_max=1.0), period_s=0.02)
-    late = PredictedLoop(ScalarGains(-bare.K1[0, 0], bare.K2[0, 0], bare.K3[0, 0], 0.0), 0.02, 0.0)
-    assert loop.string_peak(0.25) < 0.6 * late.string_peak(0.25)
+    late = follower(ScalarGains(-bare.K1[0, 0], bare.K2[0, 0], bare.K3[0, 0], 0.0), 0.0)
+    assert loop(0.25).string_peak < 0.6 * late(0.25).string_peak
 
 
 def test_trade_off_falls_and_passes_through_the_design(default_design: Design) -> None:
