@@ -16,6 +16,7 @@ from gcs.studies.front import compared
 from scenarios.keys.link import DelayPoint, Link
 from scenarios.schema import Control, FixedGains, Scenario
 from tests.support.fleets.flown_copters import TRUTH, Flight, fly, three
+from tests.support.known import known
 
 ASSUMED_S = 1.2
 # what copters5 is designed to for a margin of 0.4 s with this response
