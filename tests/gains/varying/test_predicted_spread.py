@@ -20,6 +20,7 @@ PERIOD_S, K1, K3 = 0.02, 3.408, 5.608
 TIMING = Timing(PERIOD_S, PERIOD_S)
 FOLLOWER = np.array([[0.0, -1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[K3, -K1]])
 TICKS = 700
+DUE_S = (np.arange(TICKS) * PERIOD_S).astype(np.float64)
 UP_S = 0.2
 """Delay of telemetry; only what is between it and the assumed delay matters."""
 
@@ -35,7 +36,7 @@ def flown(assumed_s: float, mean_age_s: float, late_s: FloatArray, age_s: FloatA
     Set-point j acts at t_j + D + late_j, the state used at tick k was sampled at t_k - age_k. Velocity and spacing
     error are sums of ramps and parabolas of the steps of the set-points: no map, no transfer function.
     """
-    due_s, delivery_s = np.arange(TICKS) * PERIOD_S, assumed_s - mean_age_s
+    due_s, delivery_s = DUE_S, assumed_s - mean_age_s
     acts_s, sampled_s = due_s + delivery_s + late_s, due_s - age_s
     assert (np.diff(acts_s) > -1e-12).all()
     assert (np.diff(sampled_s) > -1e-12).all()
@@ -72,13 +73,12 @@ def deviations(rng: np.random.Generator, most_s: float) -> FloatArray:
 
 def in_order(late_s: FloatArray) -> FloatArray:
     """The same where none overtakes another: a link that keeps the order delays the later ones more."""
-    due_s = np.arange(TICKS) * PERIOD_S
-    return np.maximum.accumulate(due_s + late_s) - due_s
+    return np.maximum.accumulate(DUE_S + late_s) - DUE_S
 
 
 def jittery_ages(rng: np.random.Generator, most_s: float) -> FloatArray:
     """Ages of the newest states where the delay of telemetry jumps by so much to both sides."""
-    due_s, wait_s = np.arange(TICKS) * PERIOD_S, rng.uniform(0.0, PERIOD_S)
+    due_s, wait_s = DUE_S, rng.uniform(0.0, PERIOD_S)
     arrival_s = due_s + in_order(deviations(rng, most_s)) + wait_s
     newest = np.maximum(np.searchsorted(arrival_s, due_s, side="right") - 1, 0)
     ages_s = UP_S + due_s - due_s[newest] - wait_s
@@ -108,6 +108,14 @@ def test_ages_and_deliveries_may_jump_together(telemetry_s: float) -> None:
     for _ in range(12):
         late_s = in_order(deviations(rng, bound_s))
         assert flown(0.6, UP_S + PERIOD_S / 2.0, late_s, jittery_ages(rng, telemetry_s)) < 0.7
+
+
+def test_with_jittery_ages_the_bound_is_cautious() -> None:
+    """Deliveries twice as far off, with telemetry of +-30 ms, let errors decay in all that is tried."""
+    rng, bound_s = np.random.default_rng(3), spread(0.6).bound_s(mean_s=0.6, telemetry_s=0.03)
+    for _ in range(25):
+        late_s = in_order(deviations(rng, 2.0 * bound_s))
+        assert flown(0.6, UP_S + PERIOD_S / 2.0, late_s, jittery_ages(rng, 0.03)) < 0.9
 
 
 @pytest.mark.parametrize("seed", range(5))
