@@ -119,8 +119,8 @@ def prediction_windows(runner: Runner) -> str:
         name = _predicting(runner, f"assumed{1e3 * assumed_s:.0f}", f"{assumed_s}")
         found = runner.json(f"gcs design {name}")["prediction"]
         windows = found["mismatch_window_s"], found["mismatch_window_continuous_s"]
-        rows.append((_ms(assumed_s, 0), *map(span, windows)))
-    head = ("assumed loop delay", "stable between", "continuous model")
+        rows.append((_ms(assumed_s, 0), *map(span, windows), f"±{_ms(found['jump_s'], 0)}"))
+    head = ("assumed loop delay", "stable between", "continuous model", "set-points that jump")
     return f"Each file is `triangle5.toml` with `prediction` in s:\n\n{table(head, rows)}"
 
 

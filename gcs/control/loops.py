@@ -138,7 +138,7 @@ class PredictingGroundLoop:
         period_ns = round(NS_PER_S / plan.scenario.rates.control_hz)
         self._targets = [ActiveTargets(own, period_ns=period_ns, held_ns=held_ns) for own in self._sent]
         self._deliveries = _deliveries(plan)
-        self._states = PredictedStates(self._sent, self._deliveries, plan.timing.commands)
+        self._states = PredictedStates(self._sent, self._deliveries, plan.timing)
 
     def control(self, history: Reports, law: FeedbackLaw, blends: Sequence[Blend], now: Moment) -> list[VehicleControl]:
         nominal_m_s, opening = now.nominal_velocity_m_s, now.opening

@@ -25,7 +25,7 @@ from gains.sampled._loop import matrix_exponentials
 from gains.sampled.onboard import own_part, streamed_loop
 from gcs.control.history import Reports, State
 from gcs.control.law import FeedbackLaw, VehicleLaw
-from gcs.control.prediction import KEPT_S, Delivery, FirstUses
+from gcs.control.prediction import KEPT_S, Delivery, FirstUses, FixedDelivery
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from scenarios.schema import NS_PER_S
 
@@ -57,7 +57,7 @@ class StreamPrediction:
         self._origin_m_s = np.array(plan.scenario.nominal_velocity_at(0.0))
         self._held_ns = round(plan.scenario.safety.setpoint_timeout_s * NS_PER_S)
         self._flow = _Flow(A, B)
-        self._uses = [FirstUses(plan.timing.commands) for _ in deliveries]
+        self._uses = [FirstUses(plan.timing, given=isinstance(own, FixedDelivery)) for own in deliveries]
         self._due_ns: list[int] = []
         self._responses: list[FloatArray] = []
         """X_i at each tick as the columns of a matrix (states, vehicles)."""

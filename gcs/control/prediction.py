@@ -11,15 +11,16 @@ acceleration that follows u (`gcs.control.responding`). This is x^ = Phi(h) x + 
 `gains.sampled.prediction`, with fractions of a period where s lies between ticks. V and P are kept as running sums, so
 the cost does not grow with the delay.
 
-The assumed loop delay is the age of a state when it is first used, plus D.
+The assumed loop delay is the mean age of the states when they are first used, plus D.
 """
 
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
-from math import exp
+from math import ceil, exp
 from typing import NamedTuple, Protocol
 
+from gains.sampled.multirate import Timing
 from gcs.control.history import Reports, State, StateHistory
 from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import NS_PER_S
@@ -29,7 +30,7 @@ KEPT_S = 3.0 * PREDICTION_MAX_S
 FASTEST = 0.1
 """Fastest change of an assumed delay, in s per s."""
 _SMOOTHED_S = 2.0
-"""Time constant of the filter for measured delivery delays."""
+"""Time constant of the filter for measured delivery delays, and over how long ages are averaged that decide about D."""
 _AHEAD_S = 5.0
 """How long the trend of the measured delivery delays is extrapolated without a new measurement."""
 
@@ -217,10 +218,15 @@ class MeasuredDelivery:
 
 
 class FirstUses:
-    """The mean age of one vehicle's states at the ticks that first use them, over the last `commands` of them."""
+    """The mean age of one vehicle's states at the ticks that first use them, over the last of them.
 
-    def __init__(self, commands: int) -> None:
-        self._ages_ns = deque[int](maxlen=commands)
+    These are the commands in a common period of both rates. If D is a given loop delay minus this age, they are those
+    of about `_SMOOTHED_S`: the age of each state is known, so its jitter must not change D (`gains.varying.predicted`).
+    """
+
+    def __init__(self, timing: Timing, *, given: bool) -> None:
+        periods = ceil(_SMOOTHED_S / timing.common_s) if given else 1
+        self._ages_ns = deque[int](maxlen=periods * timing.commands)
         self._sample_ns = 0
 
     def age_ns(self, sample_ns: int, due_ns: int) -> int:
@@ -234,9 +240,9 @@ class FirstUses:
 class PredictedStates:
     """States predicted beyond the newest reports: `gcs.control.history.States` as of the last `look`."""
 
-    def __init__(self, sent: Sequence[CommandHistory], deliveries: Sequence[Delivery], commands: int) -> None:
+    def __init__(self, sent: Sequence[CommandHistory], deliveries: Sequence[Delivery], timing: Timing) -> None:
         self.deliveries, self._sent = deliveries, sent
-        self._first_uses = [FirstUses(commands) for _ in sent]
+        self._first_uses = [FirstUses(timing, given=isinstance(own, FixedDelivery)) for own in deliveries]
         self._delivery_ns: list[int | None] = [None] * len(sent)
         self._history: Reports = StateHistory(len(sent))
 

@@ -124,6 +124,8 @@ class WindowAt(Published):
     assumed_delay_s: float
     mismatch_window_s: tuple[float, Margin]
     mismatch_window_continuous_s: tuple[float, Margin]
+    jump_s: float | None = None
+    """How early or late set-points may act, jumping, if the age of telemetry does not vary; None where not proved."""
 
 
 class PredictionPart(Published):
@@ -133,6 +135,7 @@ class PredictionPart(Published):
     """None where the measured delay is assumed; then there is no one window."""
     mismatch_window_s: tuple[float, Margin] | None = None
     mismatch_window_continuous_s: tuple[float, Margin] | None = None
+    jump_s: float | None = None
     windows: tuple[WindowAt, ...] = ()
     assumes: str = ""
     """What is assumed of the set-points sent."""

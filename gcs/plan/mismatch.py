@@ -17,6 +17,7 @@ from gains.performance.response import Response, formation_loop
 from gains.sampled.multirate import Timing
 from gains.sampled.onboard import OnboardTiming, streamed_loop
 from gains.sampled.prediction import mismatch_window, mismatch_window_continuous
+from gains.varying.predicted import PredictedSpread
 from scenarios.keys.part import PREDICTION_MAX_S
 from scenarios.schema import Scenario
 
@@ -101,9 +102,13 @@ class Predicted(NamedTuple):
     onboard: OnboardTiming | None = None
     """The timing of the vehicles' own loops, if they have one."""
 
+    @property
+    def K(self) -> FloatArray:  # noqa: N802 - the letter of `gains`
+        return np.frombuffer(self.gain).reshape(self.model.inputs, self.model.states)
+
     def loop(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], list[bool] | None]:
         """A, B and K, and which states are measured: the errors, not what is computed of the responses."""
-        model, K = self.model, np.frombuffer(self.gain).reshape(self.model.inputs, self.model.states)
+        model, K = self.model, self.K
         if self.onboard is not None:
             return streamed_loop(model, K, self.onboard), None
         if self.responses is None:
@@ -131,6 +136,17 @@ def continuous_window(flown: Predicted, assumed_s: float) -> Window:
     """The mismatch window of the continuous model, without any hold, as the continuous delay margin is."""
     loop, measured = flown.loop()
     return mismatch_window_continuous(*loop, assumed_s=assumed_s, measured=measured)
+
+
+def proved_jump_s(flown: Predicted, assumed_s: float) -> float | None:
+    """How early or late (s) each set-point may act with the formation proved stable, at a constant age of telemetry.
+
+    None for loops on board and for vehicles in a loop with others, to which `PredictedSpread` does not apply.
+    """
+    loop, measured = flown.loop()
+    if flown.onboard is not None or any(len(each) > 1 for each in flown.model.coupled_vehicles(flown.K)):
+        return None
+    return PredictedSpread(*loop, flown.timing, assumed_s, measured).bound_s(mean_s=assumed_s)
 
 
 def assumption(scenario: Scenario) -> str:

@@ -40,7 +40,7 @@ from gcs.plan.flight_plan import (
 )
 from gcs.plan.formation import Formation, plan_formation
 from gcs.plan.given import gain_blocks
-from gcs.plan.mismatch import assumption, continuous_window, window
+from gcs.plan.mismatch import assumption, continuous_window, proved_jump_s, window
 from gcs.plan.onboard import onboard_plan
 from gcs.plan.own_law import OWN_DYNAMICS, code_records, own_plan, with_unknown_margin
 from scenarios.keys.own import BUILT_IN
@@ -165,6 +165,7 @@ def _window_at(plan: FlightPlan, assumed_s: float) -> WindowAt:
         assumed_delay_s=assumed_s,
         mismatch_window_s=window(flown, assumed_s),
         mismatch_window_continuous_s=continuous_window(flown, assumed_s),
+        jump_s=proved_jump_s(flown, assumed_s),
     )
 
 

@@ -14,9 +14,10 @@ from gains.core.arrays import FloatArray
 from gains.core.errors import BadModelError
 from gains.delay.several import boundary_of_two_delays, late_by_vehicle
 from gains.performance.response import formation_loop
-from gains.sampled.coupled_block import unlike_blocks
+from gains.sampled.coupled_block import CoupledBlock, PredictedLoop, unlike_blocks
 from gains.varying.bounds import varying_delay_bound
 from gains.varying.jitter import spread_bound
+from gains.varying.predicted import PredictedSpread
 from gcs.stress.axes import PREDICTION, Axis, at_coordinates, every_link
 from gcs.stress.figures import MEASURED
 from gcs.stress.study import Study
@@ -25,6 +26,7 @@ from gcs.views.page import figure_of, saved
 
 _PREDICTED, _GUARANTEED, _SEVERAL, _BLANK = "black", "#1b7837", "#7b3294", "#c8c8c8"
 _POINTS = 60
+_HALVINGS = 16
 _MOST_TICKS = 12
 
 
@@ -101,7 +103,7 @@ def _draw_map(
         plot.plot(*line.T, color=_SEVERAL, linestyle="dotted", linewidth=3.0, label="predicted: two delays, continuous")
     line = guaranteed_line(study, axes)
     if line is not None:
-        label = "guaranteed to the left, however the delay varies"
+        label = "guaranteed below, however the delay varies"
         plot.plot(*line.T, color=_GUARANTEED, linestyle="dashdot", linewidth=2.0, label=label)
     if np.isnan(measured).any():
         plot.plot([], [], "s", color=_BLANK, markersize=9, label="no growth rate could be measured")
@@ -115,29 +117,68 @@ def _draw_map(
 def guaranteed_line(study: Study, axes: Sequence[Axis]) -> FloatArray | None:
     """(k, 2) link delays and the jitter below which the formation is proved stable however the delay varies.
 
-    With jitter of at most j each way and periods T of telemetry and control, the state behind the command in action is
-    between d - 2 j and d + 2 j + 2 T old. Two bounds cover that: one for deviations from the middle
-    (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies), one for any variation between 0 and a
-    maximum (`gains.varying.bounds.varying_delay_bound`). None for other axes, for unbounded jitter, and for loops
-    in which not all feedback is late: the onboard loop, and that of a station that predicts.
+    None for other axes, for links with unbounded jitter or on which datagrams overtake each other, and for loops to
+    which no proof applies: those on board, and those of a station that predicts over the measured delay.
     """
     scenario, names = study.plan.scenario, [axis.name for axis in axes]
-    if names != ["delay", "jitter"] or len(axes[0].values) < 2 or not _all_late(study):
+    if names != ["delay", "jitter"] or len(axes[0].values) < 2 or scenario.control.loop != "ground":
         return None
     jittery = every_link(at_coordinates(scenario, {"jitter": 1.0}))
     if any(link.jitter is None or link.jitter.distribution != "uniform" for link in jittery):
         return None
-    period_s = study.plan.timing.held_s
-    loops = [(loop.A, loop.B @ loop.K) for loop in unlike_blocks(plan_loops(study.plan))]
+    delays_s = np.linspace(axes[0].values[0], axes[0].values[-1], _POINTS)
+    blocks = unlike_blocks(plan_loops(study.plan))
+    if scenario.control.prediction == "off":
+        jitter_s = _proved_s(blocks, study.plan.timing.held_s, delays_s)
+    else:
+        loops = [each.loop for each in blocks if isinstance(each.loop, PredictedLoop) and len(each.system_ids) == 1]
+        if len(loops) < len(blocks) or any(link.reordering for link in jittery):
+            return None
+        jitter_s = np.min([_proved_predicted_s(loop, delays_s) for loop in loops], axis=0)
+    jitter_s = np.minimum(jitter_s, delays_s / 2.0)  # delays cannot be negative
+    return np.stack([delays_s, jitter_s], axis=1)[jitter_s >= 0.0]
+
+
+def _proved_s(blocks: Sequence[CoupledBlock], period_s: float, delays_s: FloatArray) -> FloatArray:
+    """The jitter proved at each link delay without prediction; below 0 where nothing is.
+
+    With jitter of at most j each way and periods T of telemetry and control, the state behind the command in action is
+    between d - 2 j and d + 2 j + 2 T old. Two bounds cover that: one for deviations from the middle
+    (`gains.varying.jitter.spread_bound`, a search on a grid of frequencies), one for any variation between 0 and a
+    maximum (`gains.varying.bounds.varying_delay_bound`).
+    """
+    loops = [(block.A, block.B @ block.K) for block in blocks]
     try:
         any_s = min(varying_delay_bound(A0, A1, rate=inf) for A0, A1 in loops)
     except BadModelError:  # the loop is too large for a proof
         any_s = 0.0
-    delays_s = np.linspace(axes[0].values[0], axes[0].values[-1], _POINTS)
     around_s = [min(spread_bound(A0, A1, mean_s=delay + period_s) for A0, A1 in loops) for delay in delays_s.tolist()]
-    jitter_s = np.maximum((np.array(around_s) - period_s) / 2.0, (any_s - 2.0 * period_s - delays_s) / 2.0)
-    jitter_s = np.minimum(jitter_s, delays_s / 2.0)  # delays cannot be negative
-    return np.stack([delays_s, jitter_s], axis=1)[jitter_s >= 0.0]
+    return np.maximum((np.array(around_s) - period_s) / 2.0, (any_s - 2.0 * period_s - delays_s) / 2.0)
+
+
+def _proved_predicted_s(loop: PredictedLoop, delays_s: FloatArray) -> FloatArray:
+    """The jitter proved at each link delay for one vehicle, predicted; below 0 where nothing is.
+
+    With jitter of at most j each way, a state is between up - j and up + j + T old when it is first used. The assumed
+    delivery delay is the assumed loop delay less the mean of these ages, which may be any of them. A set-point then
+    acts d - 2 j to d + 2 j + T, less the assumed loop delay, after it is assumed to; d is the delay of both links. See
+    `gains.varying.predicted.PredictedSpread`.
+    """
+    wait_s = loop.timing.control_s
+    spread = PredictedSpread(loop.A, loop.B, loop.K, loop.timing, loop.assumed_s, loop.measured)
+
+    def proved(delay_s: float, jitter_s: float) -> bool:
+        bound_s = spread.bound_s(mean_s=delay_s + wait_s / 2.0, telemetry_s=jitter_s)
+        return bound_s >= 2.0 * jitter_s + wait_s / 2.0
+
+    found = list[float]()
+    for delay_s in delays_s.tolist():
+        low_s, high_s = -1.0, delay_s / 2.0
+        for _ in range(_HALVINGS):
+            middle_s = (max(low_s, 0.0) + high_s) / 2.0
+            low_s, high_s = (middle_s, high_s) if proved(delay_s, middle_s) else (low_s, middle_s)
+        found.append(low_s)
+    return np.array(found)
 
 
 def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outcome]) -> list[FloatArray]:
@@ -146,8 +187,9 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     Empty for other axes, for loops in which not all feedback is late, and for vehicles in a loop with others, whose
     delays matter too.
     """
-    plan = study.plan
-    if not all(axis.name.startswith("delay_") for axis in axes) or not _all_late(study):
+    plan, control = study.plan, study.plan.scenario.control
+    all_late = control.loop == "ground" and control.prediction == "off"  # x' = A x + B K x(t - tau)
+    if not all(axis.name.startswith("delay_") for axis in axes) or not all_late:
         return []
     ids = [int(axis.name.removeprefix("delay_")) for axis in axes]
     if any(system_id in loop.system_ids and len(loop.system_ids) > 1 for loop in plan_loops(plan) for system_id in ids):
@@ -161,12 +203,6 @@ def two_delays_lines(study: Study, axes: Sequence[Axis], outcomes: Sequence[Outc
     longest_s = (axes[0].values[-1] + float(less_s[0]), axes[1].values[-1] + float(less_s[1]))
     lines = boundary_of_two_delays(others, late[places[0]], late[places[1]], longest_s=longest_s)
     return [line.delays_s - less_s for line in lines]
-
-
-def _all_late(study: Study) -> bool:
-    """Whether the loop flown is x' = A x + B K x(t - tau), with all feedback as late as the links make it."""
-    control = study.plan.scenario.control
-    return control.loop == "ground" and control.prediction == "off"
 
 
 def _waiting_s(outcomes: Sequence[Outcome], system_id: int) -> float:

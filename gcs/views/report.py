@@ -140,11 +140,12 @@ def _end(end_s: float | None) -> str:
 
 
 _WINDOW_COLUMNS: dict[str, Callable[[WindowAt], str]] = {
-    "assumed delay, ms": lambda at: ms_text(at.assumed_delay_s, ".0f", unit=""),
+    "assumed, ms": lambda at: ms_text(at.assumed_delay_s, ".0f", unit=""),
     "from, ms": lambda at: _end(at.mismatch_window_s[0]),
     "to, ms": lambda at: _end(at.mismatch_window_s[1]),
     "continuous, from": lambda at: _end(at.mismatch_window_continuous_s[0]),
     "to": lambda at: _end(at.mismatch_window_continuous_s[1]),
+    "jump, ±ms": lambda at: ms_text(at.jump_s, ".0f", unit=""),
 }
 
 

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from gains.core.arrays import FloatArray
 from gains.formation.model import FormationModel
 from gains.performance.response import Response, formation_loop
+from gains.sampled.multirate import Timing
 from gcs.control.history import StateHistory
 from gcs.control.prediction import (
     FASTEST,
@@ -87,7 +88,7 @@ def test_forgetting_set_points_older_than_any_prediction_changes_nothing() -> No
 
 
 def states(sent: list[CommandHistory], assumed_s: float) -> PredictedStates:
-    return PredictedStates(sent, [FixedDelivery(assumed_s) for _ in sent], 1)
+    return PredictedStates(sent, [FixedDelivery(assumed_s) for _ in sent], Timing(0.02, 0.02))
 
 
 def test_the_newest_set_point_acts_an_assumed_delay_after_sampling() -> None:
@@ -178,3 +179,17 @@ def test_a_response_moves_as_its_differential_equation_says(response: Response) 
         # coinciding modes are parted by a thousandth of the lag; positions are summed by trapezoids
         assert [velocity.real, velocity.imag] == pytest.approx(state[0].tolist(), abs=1e-3)
         assert [moved.real, moved.imag] == pytest.approx(position.tolist(), abs=1e-3)
+
+
+def test_jitter_of_the_age_does_not_move_when_set_points_act() -> None:
+    """The age of a state is known: only its mean over two seconds counts against the assumed loop delay."""
+    history, predicted, rng = StateHistory(1), states([CommandHistory(LONG)], 0.5), np.random.default_rng(5)
+    assumed_ms = list[float]()
+    for tick in range(300):
+        due_ns = START + 20 * MS * tick
+        history.add(0, due_ns - round(MS * (200.0 + rng.uniform(-9.0, 9.0))), STATE)
+        [(acts_ns, assumed_s)] = predicted.look(history, due_ns)
+        assert assumed_s == pytest.approx(0.5)
+        assumed_ms.append((acts_ns - due_ns) / MS)
+    # a mean of 100 ages, each uniform within 9 ms: a standard deviation of 0.52 ms
+    assert np.array(assumed_ms[100:]) == pytest.approx(300.0, abs=3.0 * 0.52)

@@ -13,6 +13,7 @@ from gcs.stress.measure import fly_trial
 from gcs.stress.study import Study
 from gcs.stress.trial import Outcome, plan_loops, plan_of
 from scenarios.keys.link import Jitter, Link
+from scenarios.schema import FixedGains
 from tests.support.fleets.stress_pair import SCENARIO, pair_plan
 
 DELAY_JITTER = (Axis("delay", (0.02, 0.25)), Axis("jitter", (0.0, 0.05)))
@@ -41,10 +42,52 @@ def test_nothing_is_guaranteed_where_no_delay_is_the_longest(axes: tuple[Axis, A
     assert guaranteed_line(Study(plan), axes) is None
 
 
-def test_a_predicting_station_guarantees_nothing_by_the_unpredicted_loop() -> None:
-    control = SCENARIO.control.model_copy(update={"prediction": 0.6})
-    study = Study(replace(pair_plan(), scenario=SCENARIO.model_copy(update={"control": control})))
-    assert guaranteed_line(study, DELAY_JITTER) is None
+def predicting(prediction: float | str, *, gains: FixedGains | None = None, **changes: object) -> Study:
+    control = SCENARIO.control.model_copy(update={"prediction": prediction})
+    plan = replace(pair_plan(), scenario=SCENARIO.model_copy(update={"control": control, **changes}))
+    if gains is not None:
+        one = np.eye(2)
+        plan = replace(plan, gain=plan.model.overlapping_gain(gains.K1 * one, gains.K2 * one, gains.K3 * one))
+    return Study(plan)
+
+
+def test_predicted_flights_on_the_guaranteed_line_are_stable() -> None:
+    line = guaranteed_line(predicting(0.3), (Axis("delay", (0.1, 0.5)), Axis("jitter", (0.0, 0.05))))
+    assert line is not None
+    top = int(line[:, 1].argmax())
+    assert line[top, 1] > 0.015
+    # it falls to either side of the delay at which nothing is off: the assumed one less half a period of waiting
+    assert line[top, 0] == pytest.approx(0.29, abs=0.01)
+    halving_s = 1e-5  # what is left of the interval that is halved
+    assert (np.diff(line[: top + 1, 1]) >= -halving_s).all()
+    assert (np.diff(line[top:, 1]) <= halving_s).all()
+    for delay_s, jitter_s in (line[0], line[top], line[-1]):
+        coordinates = {"delay": float(delay_s), "jitter": float(jitter_s)}
+        outcome = fly_trial(predicting(0.3).trial("probe", coordinates, seed=7))
+        assert (outcome.growth_1_s or 0.0) < 0.0
+
+
+@pytest.mark.parametrize(("assumed_s", "jitter_s"), [(0.3, 0.030), (0.6, 0.027), (1.5, 0.017)])
+def test_jitter_proved_each_way_is_that_of_the_documentation(assumed_s: float, jitter_s: float) -> None:
+    """docs/explanation/prediction.md, at the link delay that suits the assumed one."""
+    gains = FixedGains(K1=-3.408, K2=0.631, K3=5.608)
+    line = guaranteed_line(
+        predicting(assumed_s, gains=gains), (Axis("delay", (assumed_s - 0.02, assumed_s)), DELAY_JITTER[1])
+    )
+    assert line is not None
+    assert line[:, 1].max() == pytest.approx(jitter_s, abs=0.0005)  # rounded to a millisecond
+
+
+def test_nothing_is_proved_of_measured_or_overtaking_deliveries() -> None:
+    assert guaranteed_line(predicting("measured"), DELAY_JITTER) is None
+    overtaking = Link(reordering=True)
+    links = SCENARIO.links.model_copy(update={"up": overtaking, "down": overtaking})
+    assert guaranteed_line(predicting(0.1, links=links), DELAY_JITTER) is None
+    assert guaranteed_line(predicting(0.1), DELAY_JITTER) is not None
+
+
+def test_lines_of_two_delays_are_those_without_prediction() -> None:
+    study = predicting(0.6)
     assert two_delays_lines(study, (Axis("delay_1", (0.1, 0.5)), Axis("delay_2", (0.1, 0.5))), []) == []
 
 

@@ -1,0 +1,198 @@
+"""Set-points that do not act when the station assumes: how far off is a predicted loop proved to be stable?
+
+The station predicts as in `gains.sampled.prediction`. A set-point u_j, computed at the tick t_j = j T, is assumed to
+act at t_j + D, and the *delivery delay* D does not change. In truth it acts somewhere between t_j + D - e and
+t_j + D + l, anywhere from set-point to set-point, but none overtakes another. The newest state known at tick k was
+sampled at s_k, which the station knows; s_k never falls. Let U hold the set-points from when they are due, u_act as
+they act, and w(r) = u_act(r) - U(r - D). What is predicted at tick k, for the instant t_k + D, is
+
+    x^_k = Y(t_k) + Phi(t_k + D - s_k) (x(s_k) - Y(s_k - D))    for any solution of Y' = A Y + B U,
+
+and x(r) - Y(r - D) changes by w only. So, exactly,
+
+    x^_{k+1} = (Phi(T) + G K) x^_k + w_k,   w_k = int Phi(t_{k+1} + D - r) B w(r) dr over W_k = (s_k, s_{k+1}]:
+
+the loop without delay, and each instant of w disturbs it once, when the first state sampled after it is used. Now w is
+a sum of pulses: set-point j adds (u_j - u_{j-1}) or its negative between t_j + D and when it acts, over P_j. With
+c_kj = |P_j and W_k|, Schur's test bounds the gain from u_j - u_{j-1} to the sums c_kj (u_j - u_{j-1}) by
+
+    g^2 <= max over j of |P_j|  times  max over k of the sum over j of |P_j and W_k|.
+
+The first is max(e, l). At one instant either late pulses overlap or early ones, so the second is at most the number of
+control periods in W_k times the integral over one of them of the larger number. The loop is stable if
+
+    g  sum over i of  b^i / i!  max over omega of || (1 - 1/z) K (z I - Phi(T) - G K)^{-1} A^i Phi(h) B ||  < 1,
+
+by small gain, where h is the middle of the intervals t_{k+1} + D - r, and b how far they may be from it. In a
+leader-follower tree errors pass down only, so the blocks decide one by one. The maxima are searched on a fine grid and
+refined, as that of `gains.varying.jitter`.
+
+If every state has the same age, W_k lies at the same place in every period, and a constant mismatch leaves the loop
+time-invariant. Then e and l count from the true mean instead, and the loop in the norm is that with the mismatch.
+
+States that are not measured are computed from the commands: w reaches those measured by way of them, which multiplies
+g by the integral of the modulus of that impulse response.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil, floor, inf, pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gains.core._bracketing import highest
+from gains.core.arrays import BoolArray, ComplexArray, FloatArray
+from gains.core.errors import BadModelError
+from gains.sampled._loop import HeldPlant, block_radius, held_blocks, held_entry, matrix_exponentials
+from gains.sampled.constant import checked_loop
+from gains.sampled.multirate import Predictor, Timing, lifted_radius
+from gains.sampled.prediction import checked_assumption, checked_mask
+
+# angles of the grid, and the lowest; how far halvings search; terms of the series in b that are smaller are left out
+_ANGLES, _LOWEST, _HALVINGS, _SMALL = 2000, 1e-4, 50, 1e-9
+# instants of an impulse response, and time constants over which it is integrated
+_INSTANTS, _SETTLED = 4000, 40.0
+# sums of periods and spreads are known to rounding
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedSpread:
+    """How far set-points may act from when they are assumed to, in a loop that is predicted over `assumed_s`.
+
+    A, B, K, `timing`, `assumed_s` and `measured`, and the exceptions, are those of
+    `gains.sampled.prediction.mismatch_window`; the delays of all inputs of a block vary alike.
+
+    A follower with the gains of `triangle5`, predicted over 0.6 s. If its telemetry is always equally old, its
+    set-points may act 0.14 s early or late; if that also varies by 50 ms, half as much:
+
+    >>> A, B, K = [[0, -1], [0, 0]], [[0], [1]], [[5.608, -3.408]]
+    >>> spread = PredictedSpread(A, B, K, Timing(0.02, 0.02), assumed_s=0.6)
+    >>> round(spread.bound_s(mean_s=0.6), 3), round(spread.bound_s(mean_s=0.6, telemetry_s=0.05), 3)
+    (0.14, 0.053)
+    """
+
+    A: ArrayLike
+    B: ArrayLike
+    K: ArrayLike
+    timing: Timing
+    assumed_s: float
+    measured: Sequence[bool] | None = None
+
+    def bound_s(self, *, mean_s: float, telemetry_s: float = 0.0) -> float:
+        """How far (s) each set-point may act from its mean, early or late, with the loop proved stable.
+
+        `mean_s` is the mean loop delay, at most which is returned. `telemetry_s` is how far the delay of telemetry may
+        be from its mean, to both sides. 0 if nothing is proved.
+        """
+        if not (0.0 <= mean_s < inf and 0.0 <= telemetry_s < inf):
+            raise BadModelError(f"mean_s is {mean_s}, telemetry_s {telemetry_s}; numbers of seconds >= 0 are wanted")
+        off_s = mean_s - checked_assumption(self.assumed_s)
+        period_s, regular = self.timing.control_s, telemetry_s == 0.0 and self.timing.ticks == 1
+        # the age of the newest state, held until the next, and how long none newer is known
+        varies_s = 0.0 if regular else 2.0 * telemetry_s + self.timing.telemetry_s
+        gap_s = self.timing.telemetry_s * (ceil((period_s + varies_s) / self.timing.telemetry_s - _ROUNDING) - 1)
+        windows = 1 if regular else ceil(gap_s / period_s - _ROUNDING)
+        apart_s = period_s / 2.0 + (0.0 if regular else varies_s + period_s)
+        bounds_s: list[float] = []
+        for plant, at_once in self._blocks:
+            most = at_once.most_s(apart_s)
+            aside_s = _bisected(lambda s, most=most: _gain(s - off_s, s + off_s, period_s, windows) < most, mean_s)
+            if regular and off_s != 0.0:
+                around = _Response.of(plant, self.timing, self.assumed_s, mean_s).most_s(apart_s)
+                aside_s = max(aside_s, _bisected(lambda s, most=around: _gain(s, s, period_s, 1) < most, mean_s))
+            bounds_s.append(aside_s)
+        return min(bounds_s)
+
+    @cached_property
+    def _blocks(self) -> list[tuple[HeldPlant, "_Response"]]:
+        """Each block, and how it answers without mismatch."""
+        loop = checked_loop(self.A, self.B, self.K)
+        mask = checked_mask(loop, self.measured)
+        plants = held_blocks(*loop, period_s=self.timing.control_s, measured=mask)
+        return [(own, _Response.of(own, self.timing, self.assumed_s, self.assumed_s)) for own in plants]
+
+
+@dataclass(frozen=True)
+class _Response:
+    """Largest gains from sums of pulses to u_j - u_{j-1} in one block, for each power of b; () if it is unstable."""
+
+    peaks: tuple[float, ...]
+
+    def most_s(self, apart_s: float) -> float:
+        """The least g (s) at which the sum over the powers of b is one; 0 if the loop is unstable."""
+        if not self.peaks:
+            return 0.0
+        factors = np.cumprod([1.0, *(apart_s / power for power in range(1, len(self.peaks)))])
+        total = float(factors @ np.array(self.peaks))
+        return 1.0 / total if total > 0.0 else inf
+
+    @staticmethod
+    def of(plant: HeldPlant, timing: Timing, assumed_s: float, mean_s: float) -> "_Response":
+        if mean_s == assumed_s:
+            radius = block_radius(plant, 0.0)  # the loop behind the delay is that without
+        else:
+            radius = lifted_radius(plant, timing, delay_s=mean_s, predictor=Predictor(plant, assumed_s))
+        if radius >= 1.0:
+            return _Response(())
+        A, seen = plant.A, np.ones(len(plant.A), dtype=np.bool_) if plant.measured is None else plant.measured
+        A_seen = np.where(np.outer(seen, seen), A, 0.0)
+        ahead = plant.carry(np.array([assumed_s + plant.period_s / 2.0]))[0]
+        onto = np.hstack([ahead @ plant.B, ahead @ A[:, ~seen] * _integral(A, plant.B, ~seen)])
+        grid = np.union1d(np.geomspace(_LOWEST, pi, _ANGLES), np.linspace(0.0, pi, _ANGLES)[1:])
+        found = list[float]()
+        while not found or onto.any():
+
+            def gain(angle: FloatArray, onto: FloatArray = onto) -> FloatArray:
+                return np.linalg.norm(_rows(plant, angle, assumed_s, mean_s) @ onto, ord=2, axis=(1, 2))
+
+            found.append(highest(gain, grid)[1])
+            onto = A_seen @ onto
+            if found[-1] <= _SMALL * found[0] or len(found) > 30:
+                break
+        return _Response(tuple(found))
+
+
+def _rows(plant: HeldPlant, angle: FloatArray, assumed_s: float, mean_s: float) -> ComplexArray:
+    """What a disturbance of the predicted state (n,) does to u_j - u_{j-1}, shape (k, r, n), at z = e^{j angle}."""
+    z = np.exp(1j * angle)[:, np.newaxis, np.newaxis]
+    Phi, G = (maps[0] for maps in plant.transition(np.array([plant.period_s])))
+    resolvent = np.linalg.inv(z * np.eye(len(Phi)) - Phi)
+    answers = resolvent @ G
+    if mean_s != assumed_s:
+        ahead = plant.carry(np.array([assumed_s]))[0]
+        answers = answers + ahead @ resolvent @ (held_entry(plant, z, mean_s) - held_entry(plant, z, assumed_s))
+    return (1.0 - 1.0 / z) * np.linalg.solve(np.eye(len(plant.K)) - plant.K @ answers, plant.K @ resolvent)
+
+
+def _integral(A: FloatArray, B: FloatArray, computed: BoolArray) -> float:
+    """int ||e^{A t} B|| dt of the states that are computed from the commands; 0 if there are none."""
+    own, entry = A[np.ix_(computed, computed)], B[computed]
+    if not computed.any():
+        return 0.0
+    settled_s = _SETTLED / float(-np.linalg.eigvals(own).real.max())
+    at_s = np.linspace(0.0, settled_s, _INSTANTS)
+    sizes = np.linalg.norm(matrix_exponentials(at_s[:, np.newaxis, np.newaxis] * own) @ entry, ord=2, axis=(1, 2))
+    return float(np.trapezoid(sizes, at_s))
+
+
+def _gain(early_s: float, late_s: float, period_s: float, windows: int) -> float:
+    """g (s): what set-points that act so much early or late at most do to the loop, over so many control periods."""
+    early, late = (max(0.0, each_s) / period_s for each_s in (early_s, late_s))
+    most, whole = max(early, late), floor(early)
+    # the numbers of early and of late pulses over an instant are these, or one more for a part of each period
+    larger = whole + min(1.0, early + late - 2 * whole) if whole == floor(late) else most
+    return period_s * (most * larger * windows) ** 0.5
+
+
+def _bisected(proved: Callable[[float], bool], most_s: float) -> float:
+    """The largest number up to `most_s` at which `proved` holds, if it holds below; 0 if nowhere."""
+    if proved(most_s):
+        return most_s
+    low_s, high_s = 0.0, most_s
+    for _ in range(_HALVINGS):
+        middle_s = (low_s + high_s) / 2.0
+        low_s, high_s = (middle_s, high_s) if proved(middle_s) else (low_s, middle_s)
+    return low_s
