@@ -66,12 +66,12 @@ class PredictedSpread:
     `gains.sampled.prediction.mismatch_window`; the delays of all inputs of a block vary alike.
 
     A follower with the gains of `triangle5`, predicted over 0.6 s. If its telemetry is always equally old, its
-    set-points may act 0.14 s early or late; if that also varies by 50 ms, half as much:
+    set-points may act 0.14 s early or late; if that also varies by 50 ms, a third as much:
 
     >>> A, B, K = [[0, -1], [0, 0]], [[0], [1]], [[5.608, -3.408]]
     >>> spread = PredictedSpread(A, B, K, Timing(0.02, 0.02), assumed_s=0.6)
     >>> round(spread.bound_s(mean_s=0.6), 3), round(spread.bound_s(mean_s=0.6, telemetry_s=0.05), 3)
-    (0.14, 0.053)
+    (0.141, 0.048)
     """
 
     A: ArrayLike

@@ -67,7 +67,7 @@ def test_predicted_flights_on_the_guaranteed_line_are_stable() -> None:
         assert (outcome.growth_1_s or 0.0) < 0.0
 
 
-@pytest.mark.parametrize(("assumed_s", "jitter_s"), [(0.3, 0.030), (0.6, 0.027), (1.5, 0.017)])
+@pytest.mark.parametrize(("assumed_s", "jitter_s"), [(0.3, 0.0305), (0.6, 0.027), (1.5, 0.017)])
 def test_jitter_proved_each_way_is_that_of_the_documentation(assumed_s: float, jitter_s: float) -> None:
     """docs/explanation/prediction.md, at the link delay that suits the assumed one."""
     gains = FixedGains(K1=-3.408, K2=0.631, K3=5.608)
