@@ -2,15 +2,14 @@
 
 One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The error of this offset
 is half the difference between the delays down and up, at most RTT / 2. The estimate is a straight line. Its slope is
-fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. It is used only if jitter cannot have
-tilted it much; otherwise the former slope is kept.
+fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. If jitter may have tilted it by more
+than the slope is known already, the former one is kept.
 
 The line lies midway between two limits: the lower by the quickest way up, the upper by the quickest way down. With
 jitter these are rarely ways of one exchange. While exchanges are few, the first states count as ways up, too:
 `time_boot_ms` is rounded down, so no state is sampled before its stamp or after its reception. If the quickest ways of
 the window are slower than those behind the previous line, by more than its drift explains, that line is extrapolated.
-Where stamps err, the weighted mean of the offsets is used as far as it is within that error of the midpoint: the limits
-take the worst stamp.
+Limits take the worst stamp: where stamps err, the weighted mean of the offsets counts if it is near the midpoint.
 
 The bound of the error does not depend on that line. The vehicle read its clock after the request left and before the
 reply arrived, so t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits move apart by
@@ -409,26 +408,27 @@ class VehicleClock:
         weighted = weight * (t - t_mean)
         spread = _sum(weighted * (t - t_mean))
         # The slope of a short stretch would be noise: below 0.3 s (rms) of history the former rate is kept, at first 0.
-        # So would that of exchanges which tilt the line by more than _TILT if they all queued on the same way.
-        skew, tilt, low_ns, high_ns = known.skew, _TILT, 0.0, 0.0
+        # So would that of exchanges which tilt the line by more than is known if they all queued on the same way.
+        skew, tilt, low_ns, high_ns = known.skew, ageing, 0.0, 0.0
         if spread > 0.09e18:
             skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, float(_sum(weighted * y) / spread)))
             low_ns, high_ns = _quickest(t, y, rtt, skew, ageing)
             tilt = float(_sum(np.abs(weighted) * (rtt - (high_ns - low_ns))) / (2.0 * spread))
-        if tilt >= _TILT:
+        if tilt >= ageing:
             skew = known.skew
             low_ns, high_ns = _quickest(t, y, rtt, skew, ageing)
-        age_ns = now_ns - self._state_at_ns
-        state_ns = self._state_low_ns - base + skew * age_ns
-        low_ns = state_ns if state_ns - ageing * age_ns > low_ns else low_ns
-        ways_ns, offset_ns, off_ns = high_ns - low_ns, (low_ns + high_ns) / 2.0, self._explained_ns
+        state_t = self._state_at_ns - now_ns
+        state_ns = self._state_low_ns - base - skew * state_t
+        low_ns = state_ns if state_ns + ageing * state_t > low_ns else low_ns
+        ways_ns, offset_ns = high_ns - low_ns, (low_ns + high_ns) / 2.0
+        off_ns = max(0.0, self._explained_ns - (least - ways_ns) / 2.0)  # the mean errs by what its exchanges queued
         offset_ns = min(max(float(y_mean - skew * t_mean), offset_ns - off_ns), offset_ns + off_ns)
         # The offset is off by up to half of what the quickest ways queued; one extrapolated is off by its drift, too.
         if ways_ns > self._ways_ns + 2.0 * ageing * (now_ns - self._fitted_ns) + _FLOOR_NS:
             skew, offset_ns = known.skew, float(known.offset_at_ns(now_ns) - base)
         else:
             self._ways_ns, self._fitted_ns = ways_ns, now_ns
-            self._tilt = tilt + _WANDER if tilt < _TILT else ageing
+            self._tilt = min(ageing, tilt + _WANDER)
         self._unusual_ns = round(float(np.abs(y - skew * t - offset_ns).max()))
         return ClockEstimate(samples=n, offset_ns=base + round(offset_ns), skew=skew, bound_ns=0, reference_ns=now_ns)
 
