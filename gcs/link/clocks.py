@@ -1,10 +1,15 @@
 """Round trip and clock offset of one vehicle, from its TIMESYNC exchanges.
 
 One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The error of this offset
-is half the difference between the delays down and up, at most RTT / 2. Short round trips say most, so the estimate is a
-straight line fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. It works at any RTT and
-follows the drift of the vehicle's clock. If all exchanges of the window queued for far longer than those behind the
-previous line, that line is extrapolated instead.
+is half the difference between the delays down and up, at most RTT / 2. The estimate is a straight line. Its slope is
+fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. If jitter may have tilted it by more
+than the slope is known already, the former one is kept.
+
+The line lies midway between two limits: the lower by the quickest way up, the upper by the quickest way down. With
+jitter these are rarely ways of one exchange. While exchanges are few, the first states count as ways up, too:
+`time_boot_ms` is rounded down, so no state is sampled before its stamp or after its reception. If the quickest ways of
+the window are slower than those behind the previous line, by more than its drift explains, that line is extrapolated.
+Limits take the worst stamp: where stamps err, the weighted mean of the offsets counts if it is near the midpoint.
 
 The bound of the error does not depend on that line. The vehicle read its clock after the request left and before the
 reply arrived, so t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits move apart by
@@ -67,16 +72,16 @@ _WRAP_NS = _BOOT_MS_NS << 32
 """time_boot_ms wraps after this, 49.7 days; a clock set back to before its boot wraps too."""
 _DOUBTFUL_NS = 10_000
 """An exchange this close to the line is never doubtful."""
-_WEIGHT_FLOOR_NS = 200_000.0
+_FLOOR_NS = 200_000.0
+"""Queueing that is too short to tell good exchanges from bad ones."""
 _TILT = 100e-6
 """An upper bound of how much the rates of two crystals differ."""
 _WANDER = 10e-6
 """How far the rate of a crystal changes with its temperature."""
-_QUEUED_NS = 5_000_000.0
-"""Queueing for up to this never keeps a new line from replacing the previous one."""
 _EVERY_SAMPLE = 32
 _ESTIMATE_EVERY = 4
 """After the first samples the line is fitted at every fourth only, to save time, and extrapolated in between."""
+_Floats = NDArray[np.float64]
 _sum = np.add.reduce
 """np.sum, at half its cost for so few samples."""
 
@@ -128,18 +133,15 @@ class _Limits(NamedTuple):
         """The tighter or the wider of both, compared at the newer time."""
         pick_low, pick_high = (max, min) if tighter else (min, max)
         low_at_ns, high_at_ns = max(self.low_at_ns, other.low_at_ns), max(self.high_at_ns, other.high_at_ns)
-        return _Limits(
-            pick_low(self.low_at(low_at_ns), other.low_at(low_at_ns)),
-            low_at_ns,
-            pick_high(self.high_at(high_at_ns), other.high_at(high_at_ns)),
-            high_at_ns,
-        )
+        low_ns = pick_low(self.low_at(low_at_ns), other.low_at(low_at_ns))
+        high_ns = pick_high(self.high_at(high_at_ns), other.high_at(high_at_ns))
+        return _Limits(low_ns, low_at_ns, high_ns, high_at_ns)
 
     def low_at(self, time_ns: int) -> int:
-        return self.low_ns - _drift(abs(time_ns - self.low_at_ns))
+        return self.low_ns - round(DRIFT_BOUND * abs(time_ns - self.low_at_ns))
 
     def high_at(self, time_ns: int) -> int:
-        return self.high_ns + _drift(abs(time_ns - self.high_at_ns))
+        return self.high_ns + round(DRIFT_BOUND * abs(time_ns - self.high_at_ns))
 
 
 class VehicleClock:
@@ -170,13 +172,13 @@ class VehicleClock:
         """Boot time of the newest accepted state since the last jump."""
         self._pending: dict[int, None] = {}
         self._count = 0
-        self._sent_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
-        self._rtt_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
-        self._offset_ns: NDArray[np.int64] = np.zeros(WINDOW, dtype=np.int64)
+        self._sent_ns, self._rtt_ns, self._offset_ns = (np.zeros(WINDOW, dtype=np.int64) for _ in range(3))
+        self._state_low_ns, self._state_at_ns = _LONG_AGO_NS, 0
+        """Lower limit of the offset by the quickest of the first states, and when that was received."""
         self._least_ns = self._unusual_ns = 0
         """Least round trip and largest residual of the window at the last fit."""
-        self._fastest_ns, self._queued_ns, self._fitted_ns = LATEST_NS, 0.0, _LONG_AGO_NS
-        """Least round trip since the last jump; the time that the exchanges of the line queued; when it was fitted."""
+        self._ways_ns, self._fitted_ns = float(LATEST_NS), _LONG_AGO_NS
+        """Quickest way up plus quickest way down behind the line; when it was fitted."""
         self._tilt = _TILT
         """The largest error of the line's rate."""
         self._known = _Limits(0, 0, 0, 0)
@@ -191,9 +193,8 @@ class VehicleClock:
         """The same within the bound: such a state is taken to have been sampled when it was received."""
         self._since_ns = -1
         """When the first exchange since the last jump was requested."""
-        self._doubts = self._doubts_in_a_row = 0
-        self._doubted_ns = 0
-        """Residual of the first doubtful exchange."""
+        self._doubts = self._doubts_in_a_row = self._doubted_ns = 0
+        """How many exchanges were doubtful, how many of these in a row, and the residual of the first."""
 
     def request(self, now_ns: int) -> int:
         """Note a request sent now; returns its ts1, unique among the pending requests."""
@@ -249,6 +250,8 @@ class VehicleClock:
         if not newest and sample_ns < self._since_ns:
             return None  # of the clock before a jump that an exchange has shown: its instant is unknown
         self._newest_boot_ns = max(boot_ns, self._newest_boot_ns)
+        if newest and self._count < _EVERY_SAMPLE and boot_ns - received_ns > self._state_low_ns:
+            self._state_low_ns, self._state_at_ns = boot_ns - received_ns, received_ns
         return sample_ns
 
     def _is_ahead(self, beyond_ns: float, received_ns: int, *, newest: bool) -> None:
@@ -355,13 +358,8 @@ class VehicleClock:
             return False
         known = self.estimate
         off_ns = abs(offset_ns - known.offset_at_ns(at_ns))
-        explained_ns = (
-            abs(rtt_ns - self._least_ns) / 2
-            + _UNUSUAL * self._unusual_ns
-            + DRIFT_BOUND * abs(at_ns - known.reference_ns)
-            + _DOUBTFUL_NS
-            + self._explained_ns
-        )
+        explained_ns = abs(rtt_ns - self._least_ns) / 2 + _UNUSUAL * self._unusual_ns + self._explained_ns
+        explained_ns += DRIFT_BOUND * abs(at_ns - known.reference_ns) + _DOUBTFUL_NS
         if contradicts or off_ns > explained_ns:
             self._doubts += 1
             self._doubted_ns = off_ns if self._doubts == 1 else self._doubted_ns
@@ -386,53 +384,57 @@ class VehicleClock:
         self.lost, self._newest_boot_ns = False, _LONG_AGO_NS
         self._doubtful, self._doubtful_gap_ns, self._ahead_ns = None, 0.0, 0.0
         self._count, self._since_ns = keep, ts1_ns
-        self._fastest_ns, self._fitted_ns, self._tilt = LATEST_NS, _LONG_AGO_NS, _TILT
+        self._ways_ns, self._tilt, self._state_low_ns = float(LATEST_NS), _TILT, _LONG_AGO_NS
         self._doubts = self._doubts_in_a_row = self._doubted_ns = 0
 
     def _within_limits(self, at_ns: int) -> ClockEstimate:
         """The estimate at a time: the line, moved between the limits."""
-        known, limits = self.estimate, self._known
-        if self._doubtful is not None:
-            limits = limits.joined(self._doubtful, tighter=False)
-        low_ns, high_ns = limits.low_at(at_ns), limits.high_at(at_ns)
-        if low_ns > high_ns:  # by errors of stamps
-            low_ns, high_ns = high_ns, low_ns
+        known, since = self.estimate, self._doubtful
+        limits = self._known if since is None else self._known.joined(since, tighter=False)
+        low_ns, high_ns = sorted((limits.low_at(at_ns), limits.high_at(at_ns)))  # crossed by errors of stamps
         offset_ns = min(max(known.offset_at_ns(at_ns), low_ns), high_ns)
         bound_ns = max(high_ns - offset_ns, offset_ns - low_ns) + round(self._stamps_off_ns())
         return ClockEstimate(min(self._count, WINDOW), offset_ns, known.skew, bound_ns, at_ns)
 
     def _estimated(self, now_ns: int) -> ClockEstimate:
-        n = min(self._count, WINDOW)
-        rtt = self._rtt_ns[:n]
-        least = int(rtt.min())
-        weight = 1.0 / (rtt - least + _WEIGHT_FLOOR_NS) ** 2
+        n, known, ageing = min(self._count, WINDOW), self.estimate, self._tilt
+        rtt, base = self._rtt_ns[:n], int(self._offset_ns[(self._count - 1) % WINDOW])
+        self._least_ns = least = int(rtt.min())
+        t, y = (self._sent_ns[:n] - now_ns).astype(float), (self._offset_ns[:n] - base).astype(float)
+        weight = 1.0 / (rtt - least + _FLOOR_NS) ** 2
         weight /= _sum(weight)
-        t = (self._sent_ns[:n] - now_ns).astype(float)
-        base = int(self._offset_ns[(self._count - 1) % WINDOW])
-        y = (self._offset_ns[:n] - base).astype(float)
         # Sums of products, not `@`: BLAS adds in an order that depends on the processor, and flights must not.
         t_mean, y_mean = _sum(weight * t), _sum(weight * y)
-        t -= t_mean
-        y -= y_mean
-        weighted = weight * t
-        spread = _sum(weighted * t)
+        weighted = weight * (t - t_mean)
+        spread = _sum(weighted * (t - t_mean))
         # The slope of a short stretch would be noise: below 0.3 s (rms) of history the former rate is kept, at first 0.
-        # So would that of exchanges which tilt the line by more than _TILT if they all queued on the same way.
-        tilt = float(_sum(np.abs(weighted) * (rtt - least)) / (2.0 * spread)) if spread > 0.09e18 else _TILT
-        skew = float(_sum(weighted * y) / spread) if tilt < _TILT else self.estimate.skew
-        skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, skew))
-        self._least_ns, self._unusual_ns = least, round(float(np.abs(y - skew * t).max()))
-        self._fastest_ns = min(self._fastest_ns, least)
-        queued_ns = float(_sum(weight * rtt)) - self._fastest_ns
-        # An offset is off by up to half the time that its exchange queued, and drifts; twice that is clearly worse.
-        if queued_ns > 2.0 * (self._queued_ns + 2.0 * self._tilt * (now_ns - self._fitted_ns)) + _QUEUED_NS:
-            return self.estimate
-        self._queued_ns, self._fitted_ns = queued_ns, now_ns
-        self._tilt = tilt + _WANDER if tilt < _TILT else self._tilt
-        offset = base + round(y_mean - skew * t_mean)
-        return ClockEstimate(samples=n, offset_ns=offset, skew=skew, bound_ns=0, reference_ns=now_ns)
+        # So would that of exchanges which tilt the line by more than is known if they all queued on the same way.
+        skew, tilt, low_ns, high_ns = known.skew, ageing, 0.0, 0.0
+        if spread > 0.09e18:
+            skew = min(DRIFT_BOUND, max(-DRIFT_BOUND, float(_sum(weighted * y) / spread)))
+            low_ns, high_ns = _quickest(t, y, rtt, skew, ageing)
+            tilt = float(_sum(np.abs(weighted) * (rtt - (high_ns - low_ns))) / (2.0 * spread))
+        if tilt >= ageing:
+            skew = known.skew
+            low_ns, high_ns = _quickest(t, y, rtt, skew, ageing)
+        state_t = self._state_at_ns - now_ns
+        state_ns = self._state_low_ns - base - skew * state_t
+        low_ns = state_ns if state_ns + ageing * state_t > low_ns else low_ns
+        ways_ns, offset_ns = high_ns - low_ns, (low_ns + high_ns) / 2.0
+        off_ns = max(0.0, self._explained_ns - (least - ways_ns) / 2.0)  # the mean errs by what its exchanges queued
+        offset_ns = min(max(float(y_mean - skew * t_mean), offset_ns - off_ns), offset_ns + off_ns)
+        # The offset is off by up to half of what the quickest ways queued; one extrapolated is off by its drift, too.
+        if ways_ns > self._ways_ns + 2.0 * ageing * (now_ns - self._fitted_ns) + _FLOOR_NS:
+            skew, offset_ns = known.skew, float(known.offset_at_ns(now_ns) - base)
+        else:
+            self._ways_ns, self._fitted_ns = ways_ns, now_ns
+            self._tilt = min(ageing, tilt + _WANDER)
+        self._unusual_ns = round(float(np.abs(y - skew * t - offset_ns).max()))
+        return ClockEstimate(samples=n, offset_ns=base + round(offset_ns), skew=skew, bound_ns=0, reference_ns=now_ns)
 
 
-def _drift(time_ns: int) -> int:
-    """The most that a clock drifts in a time."""
-    return round(DRIFT_BOUND * time_ns)
+def _quickest(t: _Floats, y: _Floats, rtt: NDArray[np.int64], skew: float, ageing: float) -> tuple[float, float]:
+    """Limits of the offset at t = 0 by the quickest way up and the quickest down; they worsen with age."""
+    offset, way, aged = y - skew * t, (0.5 + 0.5 * skew) * rtt, ageing * t
+    low, high = offset - way, offset + way
+    return float(low[(low + aged).argmax()]), float(high[(high - aged).argmin()])

@@ -13,8 +13,10 @@ from gains.sampled.multirate import Timing
 from gains.sampled.prediction import predicted_growth_rate
 from gcs.control.tick import TickArray
 from gcs.drive.flown import fly_virtual
+from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
+from gcs.station.station import Station
 from gcs.stress.axes import at_coordinates
 from gcs.stress.free_response import probe_scenario
 from gcs.stress.measure import fly_trial
@@ -22,7 +24,9 @@ from gcs.stress.study import Study
 from scenarios.files import load
 from scenarios.keys.link import DelayPoint, Jitter, Link, Links
 from scenarios.left_out import without
-from scenarios.schema import Control, FixedGains, Limits, NominalVelocity, Scenario
+from scenarios.schema import Control, FixedGains, Limits, NominalVelocity, Scenario, Vehicle
+from sim_vehicles.drive.fleet import Fleet
+from sim_vehicles.motion.double_integrator import State
 from tests.support.known import known
 from tests.support.paths import SCENARIOS
 
@@ -146,21 +150,42 @@ def test_the_measured_delay_is_followed() -> None:
     assert errors_m(ticks, from_s=10.0) < 1e-3 * 172.4
 
 
-def test_drift_to_ten_margins_is_followed_through_jitter_and_losses() -> None:
+@pytest.mark.parametrize("seed", [1, 5, 13])
+def test_drift_to_ten_margins_leaves_true_errors_below_1_percent(seed: int) -> None:
     """20 ms to 1.5 s each way within a minute, +-30 ms of jitter, 5 % of all datagrams lost, at 91 m/s.
 
     The assumed delay does not count: a vehicle and the one in front are predicted to the same instant, and v times its
-    error cancels. Errors of the clocks are errors of position in proportion to the speed, and here the clocks are those
-    of the short round trips at the start.
+    error cancels. Errors of the clocks are errors of position in proportion to the speed, which the station cannot see.
+    Here the clocks are those of the first seconds. Each seed is one in which a line through the quickest single
+    exchanges gave errors of 0.85 % to 1.36 %.
     """
     drift = (DelayPoint(at_s=0.0, delay_s=0.02), DelayPoint(at_s=60.0, delay_s=1.5))
     jitter = Jitter(distribution="uniform", scale_s=0.03)
     link = Link(delay_points=drift, jitter=jitter, loss_probability=0.05)
-    flown = scenario("measured", link_s=0.0, duration_s=70.0)
-    plan = flight_plan(flown.model_copy(update={"links": Links(up=link, down=link)}))[1]
-    ticks = fly_virtual(plan).ticks
-    assert ticks["loop_delay_s"][-5:].min() > 2.9
-    assert errors_m(ticks, from_s=12.0) < 0.01 * 172.4
+    flown = scenario("measured", link_s=0.0, duration_s=70.0, seed=seed)
+    flown = flown.model_copy(update={"links": Links(up=link, down=link)})
+    plan = flight_plan(flown)[1]
+    station, fleet = Station(plan, start_ns=START_NS), Fleet(flown, START_NS)
+    ticks: list[TickArray] = []
+    largest_m = 0.0
+    for tick in fly_lockstep(plan, station=station, vehicles=fleet):
+        ticks.append(tick)
+        if tick["time_s"][0] >= 12.0:
+            now_ns = int(tick["sent_ns"][0])
+            states = {own.system_id: fleet.state(own.system_id, now_ns) for own in flown.vehicles}
+            largest_m = max(largest_m, *(_spacing_error_m(vehicle, states) for vehicle in flown.leader_first()[1:]))
+    assert ticks[-1]["loop_delay_s"].min() > 2.9
+    assert errors_m(np.concatenate(ticks), from_s=12.0) < 0.01 * 172.4
+    assert largest_m < 0.01 * 172.4
+
+
+def _spacing_error_m(vehicle: Vehicle, states: dict[int, State]) -> float:
+    """How far a follower truly is from its place."""
+    assert vehicle.follows is not None
+    assert vehicle.offset_ne_m is not None
+    own, front = states[vehicle.system_id], states[vehicle.follows]
+    north_m, east_m = vehicle.offset_ne_m
+    return float(np.hypot(own.north_m - front.north_m - north_m, own.east_m - front.east_m - east_m))
 
 
 @pytest.mark.parametrize(("loop_s", "peak"), [(0.3, 1.0), (0.42, 1.25)])
