@@ -85,7 +85,6 @@ def longest_static_delay(
 
     A lag of 0.15 s costs nearly half of the delay:
 
-    >>> from gains.performance.response import Response
     >>> from gains import Response
     >>> lag = Response(lag_s=0.15, velocity_gain_1_s=2.0)
     >>> [round(longest_static_delay(1.0, 0.02, response)[0], 3) for response in (None, lag)]
