@@ -103,8 +103,10 @@ def unit_gain_roots(A: FloatArray, B: FloatArray, C: FloatArray, D: float = 0.0)
     return np.linalg.eigvals(np.block([[corner, B @ B.T / rest], [-C.T @ C / rest, -corner.T]])).astype(np.complex128)
 
 
-def solved_beside_poles(matrices: NDArray[Any], right: FloatArray) -> NDArray[Any]:
-    """X with M X = `right` (n, r) for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
+def solved_beside_poles(matrices: NDArray[Any], right: NDArray[Any]) -> NDArray[Any]:
+    """X with M X = `right` for a stack of matrices M (k, n, n), huge where a matrix is singular to rounding.
+
+    `right` is (n, r), or of each matrix (k, n, r).
 
     A resolvent is singular to rounding on a pole and near a multiple one (for a double integrator, at frequencies below
     1e-8 of its norm). Loci are infinite or large there; eps in place of a zero singular value makes them large.

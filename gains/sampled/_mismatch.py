@@ -1,152 +1,382 @@
-"""Where one block of a predicted loop loses stability as the true delay leaves the assumed one: both crossings.
+"""The mismatch window of one block of a predicted loop, at one rate or with telemetry at another rate than control.
 
-One command in every period T, sampled and held as in `gains.sampled.constant`, true delay tau, assumed delay tau^. With
-P_tau(z) = (z I - Phi)^{-1} (G0 z + G1) z^{-q-1}, the response of the sampled state to a command that acts tau late, the
-sum of the commands in the predictor telescopes, and the loop has the eigenvalue z exactly if
+Let X_i be the computed state at the instant at which, by the assumption, command i acts: X_{i+1} = Phi X_i + G u_i. The
+measured state misses the computed one by w_j at the sample j, and a command k computed from it is
 
-    det(I - K (z I - Phi)^{-1} G - K e^{A tau^} (P_tau(z) - P_tau^(z))) = 0,   G = int_0^T e^{A s} ds B,
+    u_k = K X_k + K L_k w_j,   L_k = `HeldPlant.carry` from that sample to the instant at which the command acts.
 
-with `HeldPlant.carry` in place of e^{A tau^} if some states are not measured.
+Both states answer to the same commands, one after the true delay and one after the assumed delay, so each is that of X
+an instant earlier: w_j = Phi(r) X_i + Gamma(r) u_i, with i and r by the true delay, minus the same by the assumed one.
+Of w_j only v_j counts: w_j itself, or the K L_k w_j if these are fewer numbers. Over a common period of both rates u is
+a transfer function of v, stable if the loop without delay is stable, and v is one of u: v = N(z) v, with N = 0 where
+there is no mismatch. So an end of the window has det(I - N) = 0 on the unit circle, and the loop is stable exactly
+where det(I - N) does not go around 0 as z goes around the unit circle (Nyquist).
 
-Without mismatch this is det(z I - Phi - G K) = 0: the loop without delay. As in `_crossings`, at a given fraction m of
-a period the moduli of the loci do not depend on the whole periods of tau. That gives the angle of each crossing, and
-Newton's method its delay. The crossings nearest to tau^ on either side end the window.
+Newton's method finds the ends. Its starting points are the crossings of the continuous loop (`continuous_crossings`).
+At one rate they are those of loci: with a delay of q + m periods N = z^{-q} S_m - S^, so z^q is an eigenvalue of
+(I + S^)^{-1} S_m, whose modulus does not depend on q, and hardly on m. Each end is confirmed on either side by the
+spectrum of the lifted map, or by Nyquist's criterion if that map is large. If it is not the first end, bisection leads
+to starting points nearer by.
 """
 
-from math import inf, pi
+from math import inf, log, pi
+from typing import NamedTuple
 
 import numpy as np
 
-from gains.core._bracketing import bracketed_roots, may_reach_zero
-from gains.core.arrays import ComplexArray, FloatArray
-from gains.delay._loci import log_moduli
-from gains.sampled._loop import HeldPlant, held_entry, split_delay
+from gains.core._bracketing import local_maxima, may_reach_zero
+from gains.core.arrays import ComplexArray, FloatArray, IntArray
+from gains.core.errors import DisagreementError
+from gains.delay._loci import (
+    delay_loci,
+    log_moduli,
+    solved_beside_poles,
+    sweep_frequencies,
+    swept_crossings,
+    unit_gain_roots,
+)
+from gains.sampled._loop import HeldPlant, radius_of
+from gains.sampled.multirate import Predictor, Timing, multirate_map
 
-# fractions of a period at which the angles are computed: they hardly depend on them
-_FRACTIONS = 4
-# rad by which e^{-j phi tau^ / T} turns between neighbouring angles; angles a decade; and decades below pi
-_TURN, _POINTS_PER_DECADE, _DECADES = 0.2, 40, 6
-# delays in a period at which the determinant is computed at z = -1, and starting points to either side elsewhere
-_AT_MINUS_ONE, _NEAREST = 16, 60
-# steps of Newton's method, the shortest one, in periods, and the determinant of a solution
-_STEPS, _STILL, _SOLVED = 12, 1e-12, 1e-9
-# shares of the angle and of the period by which derivatives are taken
-_DIFFERENCE = 1e-6
-# the assumed delay itself, in periods
-_AT_ASSUMED = 1e-9
+# rad by which a delayed term turns between neighbouring angles, longest true delay, in assumed ones, for which it does;
+# least number of angles, those a decade, and decades below pi; and the same turn of the continuous loop
+_TURN, _LONGEST, _ANGLES, _POINTS_PER_DECADE, _DECADES, _TURN_CONTINUOUS = 0.25, 1.5, 200, 20, 5, 0.1
+# N is bounded below by this where no angle is needed
+_SMALL = 0.95
+# fractions of a period at which loci are computed, one of them enough up to this angle; delays in a period at which
+# det(I - N) is computed at z = -1
+_FRACTIONS, _SLOW, _AT_MINUS_ONE = 4, 1.0, 16
+# starting points to either side at most, and how much farther than the nearest (periods)
+_TRIED, _FARTHER_S, _AT_ASSUMED = 12, 2.0, 1e-9
+# Newton's method: steps, the shortest one in control periods, the residual of a solution, and the shares of angle and
+# period by which derivatives are taken
+_STEPS, _STILL, _SOLVED, _DIFFERENCE = 12, 1e-11, 1e-9, 1e-7
+# states of the largest lifted map that is computed
+_LARGEST_CHECK = 60
+# shares of the mismatch at which the loop must be stable, how far (s per s) beside its end it is looked at, how much
+# farther each look beyond is than the one before, up to so many mismatches and common periods
+_WITHIN, _BESIDE, _FARTHER = (0.3, 0.6, 0.9), 1e-6, 1.15
+_SEARCHED, _SEARCHED_PERIODS = 3.0, 10.0
+# halvings between two looks, angles at which a solution is tried there, and what counts as the same mismatch
+_HALVINGS, _SEARCH_EVERY, _BESIDE_IT, _SAME = 40, 3, 4, 1e-9
+# largest turn (rad) and change of modulus (log) of det(I - N) between neighbouring angles, into how many parts they are
+# divided for that, how often, and the modulus of a zero
+_MOST_TURN, _PARTS, _REFINEMENTS, _LEAST = 1.0, 8, 14, 1e-300
 
 
-def block_window(plant: HeldPlant, assumed_s: float, refinement: int = 1) -> tuple[float, float]:
-    """The nearest true delays (s) below and above the assumed one with an eigenvalue on the unit circle; 0 and inf."""
-    loop = _PredictedBlock(plant, assumed_s)
-    found_s = np.concatenate([loop.refined(*loop.starts(refinement)), loop.at_minus_one()]) - assumed_s
-    found_s = found_s[np.abs(found_s) > _AT_ASSUMED * plant.period_s]
-    shorter_s, longer_s = found_s[found_s < 0.0], found_s[found_s > 0.0]
-    return assumed_s + float(shorter_s.max(initial=-assumed_s)), assumed_s + float(longer_s.min(initial=inf))
+def block_window(plant: HeldPlant, timing: Timing, assumed_s: float) -> tuple[float, float]:
+    """The nearest true (mean) loop delays (s) below and above the assumed one with an eigenvalue on the unit circle.
+
+    0 and `inf` if there is none, and `assumed_s` twice if the loop is unstable without mismatch. `plant` is held over
+    the common period.
+    """
+    tick = plant.transition(np.array([timing.common_s / timing.ticks]))
+    if radius_of((tick[0] + tick[1] @ plant.K)[0]) >= 1.0:
+        return assumed_s, assumed_s
+    if not plant.K.any():
+        return 0.0, inf
+    loop = _PredictedBlock(plant, timing, assumed_s)
+    shorter_s, longer_s = (loop.end_s(way) for way in (-1.0, 1.0))
+    return max(0.0, assumed_s - shorter_s), assumed_s + longer_s
+
+
+def continuous_crossings(plant: HeldPlant, assumed_s: float) -> tuple[FloatArray, FloatArray]:
+    """Frequencies (rad/s) and mismatches (s) of the roots of the continuous loop that are on the imaginary axis.
+
+    With M(s) = K e^{A tau^} (s I - A - B K)^{-1} B and an eigenvalue lambda of it, e^{s tau} is
+    lambda / (1 + lambda e^{-s tau^}). Of each crossing there are the nearest mismatches on either side. Where no
+    singular value of M exceeds a half, there is none.
+    """
+    loop = plant.A + plant.B @ plant.K
+    carried = plant.K @ plant.carry(np.array([assumed_s]))[0]
+    gain, scale = unit_gain_roots(loop, plant.B, 2.0 * carried), float(np.linalg.norm(loop))
+    highest = 1.05 * float(gain.imag[np.abs(gain.real) <= 1e-6 * scale].max(initial=0.0))
+    if highest <= 0.0:
+        return np.zeros(0), np.zeros(0)
+    own = delay_loci(loop, plant.B, carried)
+
+    def loci(omega: FloatArray) -> ComplexArray:
+        late = own(omega)
+        with np.errstate(divide="ignore", invalid="ignore"):  # infinite where a root needs no delay
+            return late / (1.0 + late * np.exp(-1j * omega * assumed_s)[:, np.newaxis])
+
+    dense = np.linspace(0.0, highest, int(highest * assumed_s / _TURN_CONTINUOUS) + _ANGLES)
+    omega = np.union1d(dense[1:], sweep_frequencies(plant.A, plant.B @ plant.K))
+    found = swept_crossings(loci, omega[omega <= highest])
+    frequency = np.array([crossing.omega for crossing in found])
+    turn_s = 2.0 * pi / frequency
+    longer_s = (np.array([crossing.delay_s for crossing in found]) - assumed_s) % turn_s
+    return np.tile(frequency, 2), np.concatenate([longer_s, longer_s - turn_s])
+
+
+class _Grid(NamedTuple):
+    """Angles (k,) of z, X_0 (k, n, m) as a function of v, and what the samples see of it by the assumed delay."""
+
+    angle: FloatArray
+    first: ComplexArray
+    assumed: ComplexArray
+
+
+class _Answers(NamedTuple):
+    """What the samples see of X_0 and v: exponents of z (k, m), maps (k, m, n) and (k, m, m)."""
+
+    exponents: FloatArray
+    of_first: FloatArray
+    of_v: FloatArray
 
 
 class _PredictedBlock:
-    """The characteristic matrix of one block at any z on the unit circle and any true delay."""
+    """I - N of one block at any z on the unit circle and any true delay."""
 
-    def __init__(self, plant: HeldPlant, assumed_s: float) -> None:
-        self.plant, self.assumed_s = plant, assumed_s
-        self.Phi, self.G = (maps[0] for maps in plant.transition(np.array([plant.period_s])))
-        self.ahead = plant.carry(np.array([assumed_s]))[0]
+    def __init__(self, plant: HeldPlant, timing: Timing, assumed_s: float) -> None:
+        self.plant, self.timing, self.assumed_s = plant, timing, assumed_s
+        self.ticks, self.common_s, self.spread_s = timing.ticks, timing.common_s, timing.spread_s
+        self.tick_s = self.common_s / self.ticks
+        K, n = plant.K, len(plant.A)
+        Phi, G = (maps[0] for maps in plant.transition(np.array([self.tick_s])))
+        self.closed = Phi + G @ K
+        commands = timing.commands_from(0, self.ticks - 1, every_tick=True)
+        taken_s = np.array([sampled_s for sampled_s, _ in commands])
+        self.samples_s, of_sample = np.unique(taken_s, return_inverse=True)
+        late_s = np.array([computed_s for _, computed_s in commands]) + max(0.0, assumed_s - self.spread_s) - taken_s
+        seen = np.eye(n) if plant.measured is None else np.diag(plant.measured.astype(np.float64))[plant.measured]
+        carried = K @ plant.carry(late_s) @ seen.T
+        # rows of v: what they see of w, and of which sample; and what v adds to each command
+        counted, onto = list[FloatArray](), list[FloatArray]()
+        for sample in range(self.samples_s.size):
+            every = np.vstack(list(carried[of_sample == sample]))
+            few = len(every) < len(seen)
+            counted.append(every @ seen if few else seen)
+            onto += np.split(np.eye(len(every)) if few else every, np.count_nonzero(of_sample == sample))
+        self.counted = np.vstack(counted)
+        self.sample = np.repeat(np.arange(self.samples_s.size), [len(rows) for rows in counted])
+        self.on_v = np.zeros((self.ticks, len(K), len(self.sample)))
+        for k, own in enumerate(onto):
+            self.on_v[k][:, self.sample == of_sample[k]] = own
+        # X_k = closed^k X_0 + added_k
+        powers, added = [np.eye(n)], [np.zeros((n, len(self.sample)))]
+        for on_v in self.on_v:
+            powers.append(self.closed @ powers[-1])
+            added.append(self.closed @ added[-1] + G @ on_v)
+        self.powers, self.added = np.array(powers), np.array(added)
+        self.by_assumed = self._answers(np.array([assumed_s]))
+        self.grid = self._grid(self._angles())
+        self.aside_s = self._refined(*self._starts())
 
-    def starts(self, refinement: int) -> tuple[FloatArray, FloatArray]:
-        """Angles and delays near the crossings next to the assumed delay."""
-        period_s, grid = self.plant.period_s, self._angles(refinement)
-        terms, found = self._terms(grid), list[FloatArray]()
-        for m in (np.arange(_FRACTIONS * refinement) / (_FRACTIONS * refinement)).tolist():
-            logs = log_moduli(self._loci(grid, m, *terms))
-            begin, rank = np.nonzero((logs[1:] > 0.0) != (logs[:-1] > 0.0))
-            share = logs[begin, rank] / (logs[begin, rank] - logs[begin + 1, rank])
-            beside, nth = np.nonzero(may_reach_zero(grid, logs) | may_reach_zero(grid, -logs))
-            angle = np.concatenate([grid[begin] + share * np.diff(grid)[begin], grid[beside], grid[beside + 2]])
-            rank = np.concatenate([rank, nth, nth])[:, np.newaxis]
-            loci = self._loci(angle, m, *self._terms(angle))
-            locus = np.take_along_axis(loci, np.take_along_axis(np.argsort(-np.abs(loci)), rank, 1), 1)[:, 0]
-            # the locus is z^{q+1}: delays with a q that need not be whole
-            turn_s = 2.0 * pi / angle * period_s
-            any_s = (np.angle(locus) / angle - 1.0 + m) * period_s
-            below_s = self.assumed_s - (self.assumed_s - any_s) % turn_s
-            found += [np.stack([angle, below_s + turns * turn_s]) for turns in (-1, 0, 1, 2)]
-        starts = np.hstack(found)
-        starts = starts[:, np.argsort(np.abs(starts[1] - self.assumed_s))]
-        longer = starts[1] > self.assumed_s
-        angles, delays_s = np.hstack(
-            [starts[:, longer][:, : _NEAREST * refinement], starts[:, ~longer][:, : _NEAREST * refinement]]
+    def end_s(self, way: float) -> float:
+        """How far (s) from the assumed delay the window ends in one direction."""
+        ends_s, longest_s = way * self.aside_s, self.assumed_s if way < 0.0 else inf
+        end_s = float(ends_s[ends_s > _AT_ASSUMED * self.tick_s].min(initial=inf))
+        known_s = end_s if end_s < inf else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
+        # at one rate no crossing in between is missed
+        looks = [*(_WITHIN if self.ticks > 1 else ()), 1.0 - _BESIDE]
+        if end_s < inf or (self.ticks > 1 and way > 0.0):
+            last_s = min(longest_s, _SEARCHED * known_s + _SEARCHED_PERIODS * self.common_s)
+            looks += [1.0 + _BESIDE, *_FARTHER ** np.arange(1.0, log(last_s / known_s) / log(_FARTHER))]
+        stable_s = 0.0
+        for aside_s in [min(longest_s, share * known_s) for share in looks]:
+            if not self._is_stable(self.assumed_s + way * aside_s):
+                return self._between(way, stable_s, aside_s, ends_s)
+            stable_s = aside_s
+        return inf
+
+    def _between(self, way: float, stable_s: float, unstable_s: float, ends_s: FloatArray) -> float:
+        """The same, between two mismatches (s), with solutions of which some may be there."""
+        for halving in range(_HALVINGS):
+            ends_s = ends_s[(ends_s >= stable_s) & (ends_s <= unstable_s)]
+            if ends_s.size:
+                end_s = float(ends_s.min())
+                inside_s = (1.0 - _BESIDE) * end_s
+                if inside_s <= stable_s * (1.0 + _SAME) or self._is_stable(self.assumed_s + way * inside_s):
+                    return end_s
+                unstable_s = inside_s
+            middle_s = (stable_s + unstable_s) / 2.0
+            if self._is_stable(self.assumed_s + way * middle_s):
+                stable_s = middle_s
+            else:
+                unstable_s = middle_s
+            if halving % _SEARCH_EVERY == 0:
+                ends_s = way * self._beside(self.assumed_s + way * middle_s)
+        raise DisagreementError(
+            f"the loop that is predicted over {self.assumed_s} s loses stability at "
+            f"{self.assumed_s + way * stable_s} s, but no eigenvalue is found on the unit circle there"
         )
-        return angles[delays_s >= 0.0], delays_s[delays_s >= 0.0]
 
-    def at_minus_one(self) -> FloatArray:
-        """The delays of eigenvalues z = -1, where the determinant repeats itself after two periods of delay."""
-        # whole periods, at which it has kinks, are among them
-        periods = split_delay(self.assumed_s, self.plant.period_s)[0] + np.arange(-2.0, 3.0, 1.0 / _AT_MINUS_ONE)
-        delays_s = np.maximum(periods * self.plant.period_s, 0.0)
+    def _beside(self, delay_s: float) -> FloatArray:
+        """Mismatches (s) of the solutions next to a true delay, from the angles at which eigenvalues are near there."""
+        if self._states(delay_s) <= _LARGEST_CHECK:
+            values = np.linalg.eigvals(self._lifted(delay_s)).astype(np.complex128)
+            angle = np.angle(values).astype(np.float64)
+            nearest = np.argsort(np.abs(np.abs(values) - 1.0))
+            angle = angle[nearest[angle[nearest] > 0.0]][:_BESIDE_IT]
+        else:
+            angle, values = self._resolved(self._answers(np.array([delay_s])))
+            sizes = np.abs(values)
+            least = np.append(local_maxima(-sizes), sizes.size - 1)
+            angle = angle[least[np.argsort(sizes[least])][:_BESIDE_IT]]
+        return self._refined(angle, np.full(angle.size, delay_s - self.assumed_s))
 
-        def determinant(delay_s: FloatArray) -> FloatArray:
-            return np.linalg.det(self._characteristic(np.full(delay_s.size, pi), delay_s)).real
+    def _lifted(self, delay_s: float) -> FloatArray:
+        predictor = Predictor(self.plant, self.assumed_s)
+        return multirate_map(self.plant, self.timing, delay_s=delay_s, predictor=predictor)
 
-        values = determinant(delays_s)
-        at = np.flatnonzero(np.sign(values[1:]) != np.sign(values[:-1]))
-        return bracketed_roots(determinant, delays_s[at], delays_s[at + 1], values[at], values[at + 1])
+    def _angles(self) -> FloatArray:
+        """Angles from 0 to pi, or to where the norm of N stays below one at every true delay."""
+        low = np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE) * pi
+        coarse = np.union1d(np.linspace(0.0, pi, _ANGLES), low)
+        delays_s = self.spread_s + np.linspace(0.0, self.common_s, max(self.ticks, 8) + 1)
+        _, onto_first, onto_v = self._answers(delays_s)
+        of_first, of_v = (np.linalg.norm(onto, axis=(1, 2)).max() for onto in (onto_first, onto_v))
+        bound = 2.0 * (of_first * np.linalg.norm(self._first(coarse), axis=(1, 2)) + of_v)
+        last = coarse[min(np.flatnonzero(bound > _SMALL).max(initial=0) + 1, coarse.size - 1)]
+        turns = last * (_LONGEST * self.assumed_s / self.common_s + 1.0) / _TURN
+        return np.union1d(np.linspace(0.0, last, int(turns) + _ANGLES), low[low < last])
 
-    def refined(self, angles: FloatArray, delays_s: FloatArray) -> FloatArray:
-        """The delays of the solutions next to these starting points, of those that lead to one."""
-        period_s = self.plant.period_s
-        beside_s = _DIFFERENCE * period_s
-        for _ in range(_STEPS):
-            value = self._nearest(angles, delays_s, np.zeros(1))
-            by_angle = (self._nearest(angles * (1.0 + _DIFFERENCE), delays_s, value) - value) / (_DIFFERENCE * angles)
-            by_delay = (self._nearest(angles, delays_s + beside_s, value) - value) / beside_s
-            area = (by_angle * by_delay.conj()).imag
-            with np.errstate(divide="ignore", invalid="ignore"):
-                angle_step = -(value * by_delay.conj()).imag / area
-                delay_step = np.clip((value * by_angle.conj()).imag / area, -period_s, period_s)
-            # the loci at -phi are the conjugates of those at phi
-            angles, delays_s = pi - np.abs(pi - np.abs(angles + angle_step)), delays_s + delay_step
-            kept = (angles > 0.0) & (delays_s >= 0.0)
-            angles, delays_s = angles[kept], delays_s[kept]
-            if not np.any(np.abs(delay_step[kept]) > _STILL * period_s):
+    def _first(self, angle: FloatArray) -> ComplexArray:
+        free = np.exp(1j * angle)[:, np.newaxis, np.newaxis] * np.eye(len(self.closed)) - self.powers[-1]
+        return np.linalg.solve(free, self.added[-1]).astype(np.complex128)
+
+    def _grid(self, angle: FloatArray) -> _Grid:
+        grid = _Grid(angle, self._first(angle), np.zeros(1, np.complex128))
+        return grid._replace(assumed=self._seen(grid, self.by_assumed))
+
+    def _answers(self, delays_s: FloatArray) -> _Answers:
+        """What the samples see with k true delays."""
+        until_s = self.samples_s - np.maximum(0.0, delays_s - self.spread_s)[:, np.newaxis]
+        behind = np.floor(until_s / self.tick_s + 1e-11)
+        rest_s = np.maximum(0.0, until_s - behind * self.tick_s)
+        flow, hold = (maps.reshape(*rest_s.shape, *maps.shape[1:]) for maps in self.plant.transition(rest_s.ravel()))
+        periods, k = np.divmod(behind.astype(np.int64), self.ticks)
+        flow = flow + hold @ self.plant.K
+        seen = self.counted[:, np.newaxis]
+        of_first = seen @ (flow @ self.powers[k])[:, self.sample]
+        of_v = seen @ (flow @ self.added[k] + hold @ self.on_v[k])[:, self.sample]
+        return _Answers(periods[:, self.sample].astype(np.float64), of_first[:, :, 0], of_v[:, :, 0])
+
+    def _seen(self, grid: _Grid, answers: _Answers) -> ComplexArray:
+        """What the samples see of v through the commands, (k, m, m), with one true delay or k of them."""
+        turned = np.exp(1j * grid.angle[:, np.newaxis] * answers.exponents)[:, :, np.newaxis]
+        return turned * (answers.of_first.astype(np.complex128) @ grid.first + answers.of_v)
+
+    def _differences(self, grid: _Grid, answers: _Answers) -> ComplexArray:
+        """I - N (k, m, m), with one true delay or k of them."""
+        return np.eye(len(self.sample)) + grid.assumed - self._seen(grid, answers)
+
+    def _determinants(self, grid: _Grid, answers: _Answers) -> ComplexArray:
+        """det(I - N) (k,), none of them zero."""
+        values = np.linalg.det(self._differences(grid, answers)).astype(np.complex128)
+        return np.where(values == 0.0, _LEAST, values)
+
+    def _is_stable(self, delay_s: float) -> bool:
+        """Whether the loop is stable at a true delay."""
+        small = self._states(delay_s) <= _LARGEST_CHECK
+        return radius_of(self._lifted(delay_s)) < 1.0 if small else self._turns(delay_s) == 0
+
+    def _turns(self, delay_s: float) -> int:
+        """How often det(I - N) goes around 0 as z goes around the unit circle, backwards."""
+        answers = self._answers(np.array([delay_s]))
+        angle, values = self._resolved(answers)
+        # from the last angle to pi the eigenvalues of I - N stay in the right half plane
+        last = self._differences(self._grid(angle[-1:]), answers)[0]
+        rest = np.angle(np.linalg.eigvals(last)).sum() if angle[-1] < pi else 0.0
+        return -round(float(np.angle(values[1:] / values[:-1]).sum() - rest) / pi)
+
+    def _resolved(self, answers: _Answers) -> tuple[FloatArray, ComplexArray]:
+        """Angles and det(I - N) at one true delay, which changes little from each angle to the next."""
+        angle, values = self.grid.angle, self._determinants(self.grid, answers)
+        for _ in range(_REFINEMENTS):
+            # beside a dip too: two zeros at one place turn the phase by a whole turn, which looks like none
+            coarse = np.abs(np.log(values[1:] / values[:-1])) > _MOST_TURN
+            coarse = np.flatnonzero(np.convolve(coarse, np.ones(3), "same") > 0.0)
+            if coarse.size == 0:
                 break
-        return delays_s[np.abs(self._nearest(angles, delays_s, np.zeros(1))) < _SOLVED]
+            shares = np.arange(1.0, _PARTS) / _PARTS
+            between = (angle[coarse, np.newaxis] + np.diff(angle)[coarse, np.newaxis] * shares).ravel()
+            order = np.argsort(np.concatenate([angle, between]))
+            added = self._determinants(self._grid(between), answers)
+            angle, values = np.concatenate([angle, between])[order], np.concatenate([values, added])[order]
+        return angle, values
 
-    def _angles(self, refinement: int) -> FloatArray:
-        turns = pi * (self.assumed_s / self.plant.period_s + 1.0) / _TURN
-        turning = np.linspace(0.0, pi, refinement * (int(turns) + 200))
-        return np.union1d(turning[1:-1], np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE) * (pi * 0.999))
+    def _states(self, delay_s: float) -> float:
+        """Of the lifted map."""
+        return len(self.closed) + len(self.plant.K) * (max(delay_s, self.assumed_s) / self.tick_s + 2.0)
 
-    def _terms(self, angle: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """K e^{A tau^} (z I - Phi)^{-1}, shape (k, r, n), and the part (k, r, r) that does not depend on tau."""
-        plant, z = self.plant, np.exp(1j * angle)[:, np.newaxis, np.newaxis]
-        resolvent = (z * np.eye(len(self.Phi)) - self.Phi).swapaxes(1, 2)
-        both = np.hstack([plant.K.T, (plant.K @ self.ahead).T]).astype(np.complex128)
-        rows, ahead = np.split(np.linalg.solve(resolvent, both).swapaxes(1, 2).astype(np.complex128), 2, axis=1)
-        assumed = ahead @ held_entry(plant, z, self.assumed_s)
-        return ahead, np.eye(plant.K.shape[0]) - rows @ self.G + assumed
+    def _starts(self) -> tuple[FloatArray, FloatArray]:
+        """Angles and mismatches (s) near the ends, the nearest to either side."""
+        if self.ticks > 1:
+            frequency, aside_s = continuous_crossings(self.plant, self.assumed_s + self.tick_s / 2.0)
+            angle = np.abs((frequency * self.common_s + pi) % (2.0 * pi) - pi)
+        else:
+            angle, aside_s = self._by_loci()
+        # z = -1, where det(I - N) is real
+        beside_s = np.arange(-2.0, 2.0, 1.0 / _AT_MINUS_ONE) * self.common_s
+        half_turn = self._grid(np.full(beside_s.size, pi))
+        answers = self._answers(np.maximum(0.0, self.assumed_s + beside_s))
+        signs = np.sign(self._determinants(half_turn, answers).real)
+        at = np.flatnonzero(signs[1:] != signs[:-1])
+        angle, aside_s = np.concatenate([angle, np.full(at.size, pi)]), np.concatenate([aside_s, beside_s[at]])
+        angle, aside_s = (each[aside_s > -self.assumed_s] for each in (angle, aside_s))
+        near: list[IntArray] = []
+        for side in (np.flatnonzero(aside_s < 0.0), np.flatnonzero(aside_s > 0.0)):
+            nearest = side[np.argsort(np.abs(aside_s[side]))][:_TRIED]
+            far_s = np.abs(aside_s[nearest])
+            near.append(nearest[far_s <= far_s.min(initial=inf) + _FARTHER_S * self.timing.held_s])
+        chosen = np.concatenate(near)
+        return angle[chosen], aside_s[chosen]
 
-    def _entered(self, z: ComplexArray, rest_s: FloatArray) -> ComplexArray:
-        """G0 z + G1 (k, n, r) with a part of a period in the delay."""
-        newer = self.plant.transition(self.plant.period_s - rest_s)[1]
-        return newer * (z - 1.0) + self.G
+    def _by_loci(self) -> tuple[FloatArray, FloatArray]:
+        """Of crossings at one rate."""
+        grid = self.grid._replace(angle=self.grid.angle[1:], first=self.grid.first[1:], assumed=self.grid.assumed[1:])
+        fractions = _FRACTIONS if grid.angle[-1] > _SLOW else 1
+        angles, asides_s = list[FloatArray](), list[FloatArray]()
+        for m in (np.arange(fractions) / fractions).tolist():
+            answers = self._answers(np.array([m * self.common_s]))
+            logs = log_moduli(self._ranked_loci(grid, answers))
+            at, rank = np.nonzero((logs[1:] > 0.0) != (logs[:-1] > 0.0))
+            share = logs[at, rank] / (logs[at, rank] - logs[at + 1, rank])
+            beside, nth = np.nonzero(may_reach_zero(grid.angle, logs) | may_reach_zero(grid.angle, -logs))
+            angle = np.concatenate([grid.angle[at] + share * np.diff(grid.angle)[at], grid.angle[beside + 1]])
+            rank = np.concatenate([rank, nth])
+            locus = self._ranked_loci(self._grid(angle), answers)[np.arange(angle.size), rank]
+            turn_s = 2.0 * pi / angle * self.common_s
+            longer_s = (np.angle(locus) / angle + m) * self.common_s - self.assumed_s
+            angles += [angle, angle]
+            asides_s += [longer_s % turn_s, longer_s % turn_s - turn_s]
+        return np.concatenate(angles), np.concatenate(asides_s)
 
-    def _loci(self, angle: FloatArray, m: float, ahead: ComplexArray, rest: ComplexArray) -> ComplexArray:
-        """The values (k, r) that z^{q+1} takes at a crossing whose delay is m beyond a whole number of periods."""
-        z = np.exp(1j * angle)[:, np.newaxis, np.newaxis]
-        entered = self._entered(z, np.array([m * self.plant.period_s]))
-        return np.linalg.eigvals(np.linalg.solve(rest, ahead @ entered)).astype(np.complex128)
+    def _ranked_loci(self, grid: _Grid, answers: _Answers) -> ComplexArray:
+        """Eigenvalues (k, m) of (I + S^)^{-1} S_m, the largest first."""
+        seen = self._seen(grid, answers)
+        loci = np.linalg.eigvals(np.linalg.solve(np.eye(len(self.sample)) + grid.assumed, seen)).astype(np.complex128)
+        return np.take_along_axis(loci, np.argsort(-np.abs(loci), axis=1), 1)
 
-    def _characteristic(self, angle: FloatArray, delay_s: FloatArray) -> ComplexArray:
-        """The matrix (k, r, r) that is singular where e^{j phi} is an eigenvalue, at each of k angles and delays."""
-        whole = np.floor(delay_s / self.plant.period_s)
-        z = np.exp(1j * angle)[:, np.newaxis, np.newaxis]
-        ahead, rest = self._terms(angle)
-        turned = z ** (-whole - 1.0)[:, np.newaxis, np.newaxis]
-        return rest - ahead @ self._entered(z, delay_s - whole * self.plant.period_s) * turned
-
-    def _nearest(self, angle: FloatArray, delay_s: FloatArray, to: ComplexArray | FloatArray) -> ComplexArray:
-        """The eigenvalue (k,) of this matrix that is nearest `to` a value."""
-        values = np.linalg.eigvals(self._characteristic(angle, delay_s))
-        nearest = np.argmin(np.abs(values - to[:, np.newaxis]), axis=1)
-        return values[np.arange(angle.size), nearest].astype(np.complex128)
+    def _refined(self, angle: FloatArray, aside_s: FloatArray) -> FloatArray:
+        """Mismatches (s) of the solutions next to these starting points, of those that lead to one."""
+        if angle.size == 0:
+            return aside_s
+        delay_s, beside_s = self.assumed_s + aside_s, _DIFFERENCE * self.tick_s
+        # u'(I - N)^{-1} v is large with the inverse of the eigenvalue that is to be zero, and so with no other
+        values, vectors = np.linalg.eig(self._differences(self._grid(angle), self._answers(delay_s)))
+        own = np.arange(angle.size), np.argmin(np.abs(values), axis=1)
+        left, right = np.linalg.pinv(vectors)[own], vectors.swapaxes(1, 2)[own][:, :, np.newaxis]
+        step_s = np.full(angle.size, inf)
+        for _ in range(_STEPS):
+            answers = self._answers(np.concatenate([delay_s, delay_s + beside_s]))
+            # at the place itself, at an angle beside it, and at a delay beside it
+            here, every = np.arange(angle.size), np.concatenate([angle, angle * (1.0 + _DIFFERENCE), angle])
+            answers = _Answers(*(part[np.concatenate([here, here, here + angle.size])] for part in answers))
+            solved = solved_beside_poles(self._differences(self._grid(every), answers), np.tile(right, (3, 1, 1)))
+            value, turned, later = 1.0 / (np.tile(left, (3, 1)) * solved[:, :, 0]).sum(axis=1).reshape(3, -1)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                by_angle, by_delay = (turned - value) / (_DIFFERENCE * angle), (later - value) / beside_s
+                area = (by_angle * by_delay.conj()).imag
+                angle_step = -(value * by_delay.conj()).imag / area
+                delay_step = np.clip((value * by_angle.conj()).imag / area, -self.tick_s, self.tick_s)
+            # N at -phi is the conjugate of that at phi
+            angle, delay_s = pi - np.abs(pi - np.abs(angle + angle_step) % (2.0 * pi)), delay_s + delay_step
+            kept = (angle > 0.0) & (delay_s >= 0.0)
+            angle, delay_s, left, right = angle[kept], delay_s[kept], left[kept], right[kept]
+            step_s = np.abs(delay_step[kept])
+            if not np.any(step_s > _STILL * self.tick_s):
+                break
+        return delay_s[step_s < _SOLVED * self.tick_s] - self.assumed_s

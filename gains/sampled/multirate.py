@@ -14,9 +14,10 @@ n is the number of slower periods in T:
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from math import ceil, floor, inf, isfinite
 
 import numpy as np
@@ -97,7 +98,7 @@ class Timing:
         """How much longer the mean loop delay of a common period is than the least one."""
         return (self.faster_s - self.step_s) / 2.0
 
-    @property
+    @cached_property
     def _ratio(self) -> Fraction:
         """Slower over faster period."""
         return Fraction(self.held_s / min(self.control_s, self.telemetry_s)).limit_denominator(_MOST_COMMANDS)
@@ -168,27 +169,6 @@ class Predictor:
         measured = self.believed.measured
         return [] if measured is None else np.flatnonzero(~measured).tolist()
 
-    def carried(
-        self,
-        x: FloatArray,
-        given: Mapping[int, FloatArray],
-        acting_s: Sequence[float],
-        *,
-        from_s: float,
-        to_s: float,
-        first: int,
-    ) -> FloatArray:
-        """The state at `to_s`, from its value x at `from_s`.
-
-        Commands act at the instants `acting_s`, ascending. They are `given`, numbered from `first` on.
-        """
-        held = bisect_right(acting_s, from_s) - 1
-        instants = [from_s, *(acts_s for acts_s in acting_s[held + 1 :] if acts_s < to_s), to_s]
-        if to_s > from_s:
-            for number, (Phi, hold) in enumerate(zip(*self.believed.between(instants), strict=True), first + held):
-                x = Phi @ x + hold @ given[number]
-        return x
-
 
 def multirate_map(
     plant: SampledPlant, timing: Timing, *, delay_s: float, predictor: Predictor | None = None
@@ -205,41 +185,45 @@ def multirate_map(
     )
     earlier = count * (ceil(max(least_s, least_assumed_s) / common_s) + 2)
     schedule = timing.commands_from(-earlier, count - 1, every_tick=predictor is not None)
-    known = list(enumerate(schedule, start=-earlier))
-    close_s = _SAME_INSTANT * common_s
-    acting = [(computed_s + least_s, i) for i, (_, computed_s) in known]
-    assumed_s = [computed_s + least_assumed_s - close_s for _, computed_s in schedule]
-    oldest = max(i for acts_s, i in acting if acts_s <= close_s)
-    kept = max(0, -oldest, earlier + 1 - bisect_right(assumed_s, 0.0) if predictor else 0)
-    computed = predictor.computed if predictor else []
-    sampled = [(taken_s, i) for i, (taken_s, _) in known if i >= 0]
-    inside = [acts_s for acts_s, i in acting if i > oldest and acts_s < common_s - close_s]
-    instants = _merged([0.0, *inside, *(taken_s for taken_s, _ in sampled), common_s], close_s)
+    close_s, taken_s = _SAME_INSTANT * common_s, [sampled_s for sampled_s, _ in schedule[earlier:]]
+    acts_s, assumed_s = ([computed_s + late_s for _, computed_s in schedule] for late_s in (least_s, least_assumed_s))
+    # commands before the period that still act in it, truly or by the assumption
+    kept = max(0, *(earlier + 1 - bisect_right(s, close_s) for s in (acts_s, *([assumed_s] if predictor else []))))
+    inside = [at_s for at_s in acts_s if close_s < at_s < common_s - close_s]
+    instants = _merged([0.0, *inside, *taken_s, common_s], close_s)
     flows, holds = plant.between(instants)
-    n = flows.shape[1]
+    n, computed = flows.shape[1], predictor.computed if predictor else []
     start = np.eye(n + kept * inputs + len(computed))
-    x, believed = start[:n], np.zeros((n, len(start)))
+    x, believed = start[:n], np.zeros((on, len(start)))
     believed[computed] = start[len(start) - len(computed) :]
-    samples = {-age: start[n + (age - 1) * inputs : n + age * inputs] for age in range(1, kept + 1)}
+    commands = {-age: start[n + (age - 1) * inputs : n + age * inputs] for age in range(1, kept + 1)}
+    times = _merged([0.0, *(at_s for at_s in assumed_s if at_s > 0.0), *taken_s, common_s], close_s)
+    maps = list(zip(*predictor.believed.between(times), strict=True)) if predictor else []
+
+    def carried(state: FloatArray, from_s: float, to_s: float) -> FloatArray:
+        """What the station believes of the state at one instant of `times`, from that at another."""
+        for k in range(*(bisect_right(times, at_s + close_s) - 1 for at_s in (from_s, to_s))):
+            Phi, hold = maps[k]
+            state = Phi @ state + hold @ commands[bisect_right(assumed_s, times[k] + close_s) - 1 - earlier]
+        return state
+
+    number, known_s, reached_s, state = 0, 0.0, 0.0, x[:on]
     for instant, Phi, hold in zip(instants, flows, holds, strict=False):
-        for taken_s, i in sampled:
-            if abs(taken_s - instant) <= close_s:
-                state, acting_s = x, assumed_s[: i + earlier + 1]
-                if predictor and computed:
-                    state = x.copy()
-                    by_now = predictor.carried(believed, samples, acting_s, from_s=0.0, to_s=taken_s, first=-earlier)
-                    state[computed] = by_now[computed]
-                if predictor:
-                    acts_s = max(taken_s, acting_s[-1])
-                    state = predictor.carried(
-                        state[:on], samples, acting_s, from_s=taken_s, to_s=acts_s, first=-earlier
-                    )
-                samples[i] = plant.K @ state[:on]
-        command = max(i for acts_s, i in acting if acts_s <= instant + close_s)
-        x = Phi @ x + hold @ samples[command]
-    if predictor and computed:
-        believed = predictor.carried(believed, samples, assumed_s, from_s=0.0, to_s=common_s, first=-earlier)
-    return np.vstack([x, *(samples[count - age] for age in range(1, kept + 1)), believed[computed]])
+        while number < count and taken_s[number] <= instant + close_s:
+            if number == 0 or taken_s[number] > taken_s[number - 1]:  # a new sample
+                state, reached_s = x[:on], taken_s[number]
+                if computed:
+                    believed, known_s = carried(believed, known_s, reached_s), reached_s
+                    state = state.copy()
+                    state[computed] = believed[computed]
+            if predictor:
+                acts_next_s = max(reached_s, assumed_s[number + earlier])
+                state, reached_s = carried(state, reached_s, acts_next_s), acts_next_s
+            commands[number] = plant.K @ state
+            number += 1
+        x = Phi @ x + hold @ commands[bisect_right(acts_s, instant + close_s) - 1 - earlier]
+    believed = carried(believed, known_s, common_s) if computed else believed
+    return np.vstack([x, *(commands[count - age] for age in range(1, kept + 1)), believed[computed]])
 
 
 def lifted_radius(plant: SampledPlant, timing: Timing, *, delay_s: float, predictor: Predictor | None = None) -> float:

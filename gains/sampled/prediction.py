@@ -22,29 +22,17 @@ Z. Artstein, "Linear systems with delayed controls: a reduction", IEEE Trans. AC
 """
 
 from collections.abc import Sequence
-from functools import partial
 from math import inf, isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from gains.core.arrays import BoolArray, FloatArray
-from gains.core.errors import BadModelError, DisagreementError
-from gains.delay._crossings import DelayedTerm
-from gains.delay._mixed import analyse_mixed
-from gains.sampled._loop import HeldPlant, block_radius, carry, held_blocks, rate_of
-from gains.sampled._mismatch import block_window
-from gains.sampled._nyquist import rates_window
+from gains.core.errors import BadModelError
+from gains.sampled._loop import HeldPlant, held_blocks, rate_of
+from gains.sampled._mismatch import block_window, continuous_crossings
 from gains.sampled.constant import checked_loop
-from gains.sampled.multirate import Predictor, Timing, first_unstable, lifted_radius
-
-# states of the largest lifted map that confirms an end, and how far from the end (s per s of mismatch) it is taken
-_LARGEST_CHECK, _BESIDE = 60, 1e-5
-# how much finer the search becomes when that contradicts it: near the limit of a loop its angles change in a period
-_REFINEMENTS = (1, 4, 16)
-# delays looked at in a continuous window, and in a control period; and how far the march goes: so many windows, and
-# control periods more
-_LOOKS_WINDOW, _LOOKS_PERIOD, _SEARCHED, _SEARCHED_PERIODS = 20, 3, 3.0, 10.0
+from gains.sampled.multirate import Predictor, Timing, lifted_radius
 
 
 def mismatch_window(
@@ -77,26 +65,8 @@ def mismatch_window(
     """
     loop, late_s = checked_loop(A, B, K), checked_assumption(assumed_s)
     plants = held_blocks(*loop, period_s=timing.common_s, measured=checked_mask(loop, measured))
-    if timing.ticks > 1:
-        ends_s = [rates_window(plant, timing, late_s) for plant in plants]
-        window_s = max(least for least, _ in ends_s), min(most for _, most in ends_s)
-        contradiction = "".join(_contradiction(plants, timing, late_s, end_s) for end_s in window_s)
-        if window_s[0] < window_s[1] and contradiction:  # near the limit of the rates
-            return _marched(
-                plants, timing, late_s, mismatch_window_continuous(*loop, assumed_s=late_s, measured=measured)
-            )
-        return window_s
-    # without mismatch the loop has the eigenvalues of that without delay
-    if max(block_radius(plant, 0.0) for plant in plants) >= 1.0:
-        return late_s, late_s
-    window_s, contradiction = (0.0, inf), ""
-    for refinement in _REFINEMENTS:
-        ends_s = [block_window(plant, late_s, refinement) for plant in plants if plant.B.shape[1] > 0]
-        window_s = max((least for least, _ in ends_s), default=0.0), min((most for _, most in ends_s), default=inf)
-        contradiction = "".join(_contradiction(plants, timing, late_s, end_s) for end_s in window_s)
-        if not contradiction:
-            return window_s
-    raise DisagreementError(contradiction)
+    ends_s = [block_window(plant, timing, late_s) for plant in plants]
+    return max(least for least, _ in ends_s), min(most for _, most in ends_s)
 
 
 def mismatch_window_continuous(
@@ -111,12 +81,13 @@ def mismatch_window_continuous(
     >>> [round(end_s, 3) for end_s in mismatch_window_continuous([[0]], [[1]], [[-1]], assumed_s=3.0)]
     [1.386, 4.873]
     """
-    (plant, entry, feedback), late_s = checked_loop(A, B, K), checked_assumption(assumed_s)
-    mask = checked_mask((plant, entry, feedback), measured)
-    late = entry @ feedback @ carry(plant, mask, np.array([late_s]))[0]
-    terms = [(plant + entry @ feedback, 0.0, 0), (late, 0.0, 1), (-late, late_s, 0)]
-    windows = analyse_mixed([DelayedTerm(*term) for term in terms], horizon_s=late_s or None).stable_intervals_s
-    return next((window for window in windows if window[0] <= late_s < window[1]), (late_s, late_s))
+    loop, late_s = checked_loop(A, B, K), checked_assumption(assumed_s)
+    plants = held_blocks(*loop, period_s=1.0, measured=checked_mask(loop, measured))
+    if max(float(np.linalg.eigvals(plant.A + plant.B @ plant.K).real.max()) for plant in plants) >= 0.0:
+        return late_s, late_s
+    aside_s = np.concatenate([continuous_crossings(plant, late_s)[1] for plant in plants])
+    shorter_s, longer_s = aside_s[aside_s < 0.0], aside_s[aside_s > 0.0]
+    return max(0.0, late_s + float(shorter_s.max(initial=-late_s))), late_s + float(longer_s.min(initial=inf))
 
 
 def predicted_growth_rate(
@@ -165,41 +136,3 @@ def checked_mask(loop: tuple[FloatArray, FloatArray, FloatArray], measured: Sequ
 
 def _radius(plant: HeldPlant, timing: Timing, assumed_s: float, delay_s: float) -> float:
     return lifted_radius(plant, timing, delay_s=delay_s, predictor=Predictor(plant, assumed_s))
-
-
-def _contradiction(plants: Sequence[HeldPlant], timing: Timing, assumed_s: float, end_s: float) -> str:
-    """What the lifted map just within the end of a window, and just beyond it, says against it; nothing if empty."""
-    known_s = end_s if end_s < inf else 2.0 * assumed_s + 5.0 * timing.held_s
-    periods = timing.ticks * (max(known_s, assumed_s) / timing.common_s + 2.0)
-    if max(len(plant.A) + plant.B.shape[1] * periods for plant in plants) > _LARGEST_CHECK:
-        return ""
-    for share in (1.0 - _BESIDE, 1.0 + _BESIDE):
-        at_s, within = assumed_s + share * (known_s - assumed_s), share < 1.0
-        if at_s >= 0.0 and (within or 0.0 < end_s < inf):
-            radius = max(_radius(plant, timing, assumed_s, at_s) for plant in plants)
-            if (radius < 1.0) != within:
-                return (
-                    f"the mismatch window around {assumed_s} s ends at {end_s} s at a period of {timing.held_s} s, but "
-                    f"the spectral radius of the lifted map at {at_s} s is {radius}"
-                )
-    return ""
-
-
-def _marched(
-    plants: Sequence[HeldPlant], timing: Timing, assumed_s: float, near_s: tuple[float, float]
-) -> tuple[float, float]:
-    """The window by a march of the lifted map's radius; `near_s` is that of the continuous loop."""
-
-    def radius_aside(plant: HeldPlant, way: float, aside_s: float) -> float:
-        return _radius(plant, timing, assumed_s, max(0.0, assumed_s + way * aside_s))
-
-    period_s, ends_s = timing.common_s / timing.ticks, [0.0, inf]
-    for plant in plants:
-        for side, way in enumerate((-1.0, 1.0)):
-            wide_s = abs(near_s[side] - assumed_s) if isfinite(near_s[side]) else 0.0
-            step_s = max(period_s / _LOOKS_PERIOD, wide_s / _LOOKS_WINDOW)
-            last_s = assumed_s if side == 0 else _SEARCHED * wide_s + _SEARCHED_PERIODS * period_s
-            looks = [*np.arange(0.0, last_s, step_s).tolist(), last_s] if plant.K.any() else [0.0]
-            found_s = first_unstable(partial(radius_aside, plant, way), looks)
-            ends_s[side] = max(ends_s[0], assumed_s - found_s) if side == 0 else min(ends_s[1], assumed_s + found_s)
-    return ends_s[0], ends_s[1]

@@ -8,10 +8,10 @@ from scipy.linalg import expm
 
 from gains import BadModelError, FormationModel, Response, Timing, mismatch_window, rightmost_root
 from gains.core.arrays import FloatArray
+from gains.delay._crossings import DelayedTerm
+from gains.delay._mixed import analyse_mixed
 from gains.performance.response import formation_loop
-from gains.sampled._loop import HeldPlant
-from gains.sampled._mismatch import block_window
-from gains.sampled._nyquist import rates_window
+from gains.sampled._loop import HeldPlant, held_blocks
 from gains.sampled.multirate import Predictor, lifted_radius
 from gains.sampled.prediction import mismatch_window_continuous, predicted_growth_rate
 
@@ -177,12 +177,66 @@ def test_a_computed_lag_has_the_window_of_its_lifted_map(rates: Timing) -> None:
     assert window_s[1] > mismatch_window(*loop, rates, assumed_s=0.613)[1]
 
 
-def test_crossings_and_nyquist_agree_at_one_rate() -> None:
-    for loop, measured in ((follower(), None), (follower(lag_s=0.15), None), (follower(lag_s=0.15), [1, 1, 0])):
-        for assumed_s in (0.3, 1.507):
-            mask = None if measured is None else np.array(measured, dtype=np.bool_)
-            plant = HeldPlant(*loop, PERIOD_S, mask)
-            assert rates_window(plant, RATES, assumed_s) == pytest.approx(block_window(plant, assumed_s), abs=1e-9)
+SLOW = FormationModel((-1, 0), axes=1).overlapping_gain([[-1.704]], [[0.3]], [[1.402]])
+FAST = FormationModel((-1, 0), axes=1).overlapping_gain([[-K1]], [[0.631]], [[K3]])
+
+
+@pytest.mark.parametrize(
+    ("gain", "rates", "assumed_s"),
+    [
+        # eigenvalues leave the unit circle in pairs, or at z = -1, and others soon after
+        (SLOW, Timing(1.0 / 5.0, 1.0 / 1.289), 0.6),
+        (SLOW, Timing(1.0 / 5.0, 1.0 / 1.289), 1.0),
+        (FAST, Timing(0.02, 0.1), 1.5),
+        (FAST, Timing(0.05, 0.02), 3.0),
+        (FAST, Timing(1.0 / 200.0, 1.0 / 30.0), 1.5),
+        (FAST, RATES, 3.0),
+    ],
+)
+def test_the_lifted_map_is_stable_just_within_a_window(gain: FloatArray, rates: Timing, assumed_s: float) -> None:
+    """The spectrum of a map in time, at every delay looked at, against zeros of a determinant on the unit circle."""
+    model = FormationModel((-1, 0), axes=1)
+    plants = held_blocks(model.A, model.B, gain, period_s=rates.common_s)
+
+    def radius_at(delay_s: float) -> float:
+        return max(
+            lifted_radius(plant, rates, delay_s=delay_s, predictor=Predictor(plant, assumed_s)) for plant in plants
+        )
+
+    window_s = mismatch_window(model.A, model.B, gain, rates, assumed_s=assumed_s)
+    for end_s in window_s:
+        if end_s > 0.0:
+            # 1e-6 of the mismatch changes the radius by 1e-8 and more; its rounding is 1e-12
+            within, beyond = (radius_at(assumed_s + share * (end_s - assumed_s)) for share in (1.0 - 1e-6, 1.0 + 1e-6))
+            assert within < 1.0 < beyond
+        assert all(radius_at(at_s) < 1.0 for at_s in np.linspace(assumed_s, end_s, 6)[:-1].tolist())
+
+
+def test_the_nearer_of_two_ends_close_together_is_found() -> None:
+    """Two equal axes, coupled by a thousandth, cross within 0.3 ms of each other: the map tells which is first."""
+    A, B, K = follower(lag_s=0.15)
+    axes = np.array([[1.0, 1e-3], [1e-3, 1.001]])
+    coupled = np.kron(np.eye(2), A), np.kron(np.eye(2), B), np.kron(axes, K)
+    window_s = mismatch_window(*coupled, RATES, assumed_s=1.0)
+    for end_s, way in zip(window_s, (-1.0, 1.0), strict=True):
+        for aside_s, is_stable in ((-1e-7, True), (1e-7, False)):
+            growth_1_s = predicted_growth_rate(*coupled, RATES, assumed_s=1.0, delay_s=end_s + way * aside_s)
+            assert (growth_1_s < 0.0) == is_stable
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_both_analyses_of_two_delays_give_one_continuous_window(seed: int) -> None:
+    """Loci of the predicted loop, against crossings of every delay counted from those unstable without any."""
+    rng = np.random.default_rng(seed)
+    k1 = float(np.exp(rng.uniform(-1.0, 1.5)))
+    k3, lag_s = k1**2 * float(np.exp(rng.uniform(-3.0, 0.0))), float(rng.choice([0.0, 0.2])) / k1
+    A, B, K = follower(k1, k3, lag_s=lag_s)
+    assumed_s = float(rng.uniform(0.1, 4.0)) / k1
+    late = B @ K @ expm(A * assumed_s)
+    terms = [(A + B @ K, 0.0, 0), (late, 0.0, 1), (-late, assumed_s, 0)]
+    windows = analyse_mixed([DelayedTerm(*term) for term in terms], horizon_s=assumed_s).stable_intervals_s
+    wanted = [window for window in windows if window[0] <= assumed_s < window[1]]
+    assert wanted == [pytest.approx(mismatch_window_continuous(A, B, K, assumed_s=assumed_s), rel=1e-9)]
 
 
 def test_a_computed_response_ends_its_continuous_window_on_the_axis() -> None:
