@@ -7,6 +7,7 @@ from typing import Literal
 
 from docs.generate import figures
 from docs.generate.blocks import differing, fill, pages_with
+from docs.generate.certificates import certificates
 from docs.generate.runner import CommandError, Runner, measured_on, runner
 from docs.generate.side_by_side import cluster, peers, tick_ratio
 from docs.generate.stages import stages
@@ -41,7 +42,7 @@ _MAKERS: dict[Kind, tuple[Callable[[Runner], str], ...]] = {
     "timed": (
         *(figures.readme_fly, figures.flights, figures.too_late, figures.punctuality, figures.copters),
         *(figures.signing, figures.design_time, figures.speed, figures.onset_real_time, tick_ratio, peers, cluster),
-        stages,
+        *(stages, certificates),
     ),
     "compiled": (figures.speed_compiled,),
 }

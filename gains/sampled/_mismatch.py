@@ -12,55 +12,59 @@ a transfer function of v, stable if the loop without delay is stable, and v is o
 there is no mismatch. So an end of the window has det(I - N) = 0 on the unit circle, and the loop is stable exactly
 where det(I - N) does not go around 0 as z goes around the unit circle (Nyquist).
 
-Newton's method finds the ends. Its starting points are the crossings of the continuous loop (`continuous_crossings`).
-At one rate they are those of loci: with a delay of q + m periods N = z^{-q} S_m - S^, so z^q is an eigenvalue of
-(I + S^)^{-1} S_m, whose modulus does not depend on q, and hardly on m. Each end is confirmed on either side by the
-spectrum of the lifted map, or by Nyquist's criterion if that map is large. If it is not the first end, bisection leads
-to starting points nearer by.
+Newton's method finds the ends. Its starting points come from loci: with a delay of q + m common periods
+N = z^{-q} S_m - S^, so z^q is an eigenvalue of (I + S^)^{-1} S_m, whose modulus does not depend on q, and hardly on m.
+Where N is large, they are the crossings of the continuous loop, and delays within the window are looked at too.
+Loci can miss a short stretch of instability around a kink, a delay at which a command starts to act as a state is
+sampled: kinks are looked at where there are few. Each end is confirmed on either side by the spectrum of the lifted
+map, or by Nyquist's criterion if that map is large. If it is not the first end, bisection leads to starting points
+nearer by.
 """
 
 from math import inf, log, pi
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from gains.core._bracketing import local_maxima, may_reach_zero
-from gains.core.arrays import ComplexArray, FloatArray, IntArray
+from gains.core.arrays import ComplexArray, FloatArray
 from gains.core.errors import DisagreementError
 from gains.delay._loci import (
     delay_loci,
     log_moduli,
     solved_beside_poles,
-    sweep_frequencies,
     swept_crossings,
     unit_gain_roots,
 )
 from gains.sampled._loop import HeldPlant, radius_of
 from gains.sampled.multirate import Predictor, Timing, multirate_map
 
-# rad by which a delayed term turns between neighbouring angles, longest true delay, in assumed ones, for which it does;
-# least number of angles, those a decade, and decades below pi; and the same turn of the continuous loop
-_TURN, _LONGEST, _ANGLES, _POINTS_PER_DECADE, _DECADES, _TURN_CONTINUOUS = 0.25, 1.5, 200, 20, 5, 0.1
-# N is bounded below by this where no angle is needed
+# rad by which a delayed term turns between neighbouring angles, the longest true delay (in assumed ones) for which it
+# does, and the least number of angles; the same turn in the continuous loop
+_TURN, _LONGEST, _ANGLES, _TURN_CONTINUOUS = 0.25, 1.5, 200, 0.1
+# angles added to even ones: shares of the highest; and beside a pole, in half-widths of its resonance
+_LOW, _BESIDE_POLE = np.logspace(-5.0, 0.0, 80), np.sinh(np.linspace(-4.0, 4.0, 17))
+# no angle is needed where the norm of N stays below this
 _SMALL = 0.95
-# fractions of a period at which loci are computed, one of them enough up to this angle; delays in a period at which
-# det(I - N) is computed at z = -1
-_FRACTIONS, _SLOW, _AT_MINUS_ONE = 4, 1.0, 16
-# starting points to either side at most, and how much farther than the nearest (periods)
-_TRIED, _FARTHER_S, _AT_ASSUMED = 12, 2.0, 1e-9
-# Newton's method: steps, the shortest one in control periods, the residual of a solution, and the shares of angle and
-# period by which derivatives are taken
+# fractions of a period at which loci are computed (one is enough below the angle `_SLOW`; twice as many at two rates),
+# and the largest N of which they are, at two rates; delays in a period at which det(I - N) is computed at z = -1 and 1
+_FRACTIONS, _SLOW, _FEW, _AT_ONE = 4, 1.0, 4, 16
+# starting points to either side at most, and the assumed delay itself (control periods)
+_TRIED, _AT_ASSUMED = 16, 1e-9
+# Newton's method: steps, the last one (control periods) and that of a solution, and shares of angle and period for
+# derivatives
 _STEPS, _STILL, _SOLVED, _DIFFERENCE = 12, 1e-11, 1e-9, 1e-7
-# states of the largest lifted map that is computed
+# states of the largest lifted map whose spectrum is computed
 _LARGEST_CHECK = 60
-# shares of the mismatch at which the loop must be stable, how far (s per s) beside its end it is looked at, how much
-# farther each look beyond is than the one before, up to so many mismatches and common periods
-_WITHIN, _BESIDE, _FARTHER = (0.3, 0.6, 0.9), 1e-6, 1.15
+# shares of the mismatch at which the loop must be stable, how far beside its end it is looked at, how much farther each
+# look beyond is than the one before, and up to how many mismatches and common periods
+_WITHIN, _BESIDE, _FARTHER = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 1e-6, 1.15
 _SEARCHED, _SEARCHED_PERIODS = 3.0, 10.0
-# halvings between two looks, angles at which a solution is tried there, and what counts as the same mismatch
-_HALVINGS, _SEARCH_EVERY, _BESIDE_IT, _SAME = 40, 3, 4, 1e-9
-# largest turn (rad) and change of modulus (log) of det(I - N) between neighbouring angles, into how many parts they are
-# divided for that, how often, and the modulus of a zero
+# halvings between two looks, after how many a solution is searched, from how many angles; and equal mismatches
+_HALVINGS, _SEARCH_EVERY, _BESIDE_IT, _SAME = 40, 3, 3, 1e-9
+# largest change of log det(I - N) between neighbouring angles, into how many parts they are divided for that and how
+# often, and the modulus of a zero
 _MOST_TURN, _PARTS, _REFINEMENTS, _LEAST = 1.0, 8, 14, 1e-300
 
 
@@ -100,9 +104,11 @@ def continuous_crossings(plant: HeldPlant, assumed_s: float) -> tuple[FloatArray
         with np.errstate(divide="ignore", invalid="ignore"):  # infinite where a root needs no delay
             return late / (1.0 + late * np.exp(-1j * omega * assumed_s)[:, np.newaxis])
 
+    poles = np.linalg.eigvals(loop).astype(np.complex128)
+    resonant = poles.imag[:, np.newaxis] + np.outer(poles.real, _BESIDE_POLE)
     dense = np.linspace(0.0, highest, int(highest * assumed_s / _TURN_CONTINUOUS) + _ANGLES)
-    omega = np.union1d(dense[1:], sweep_frequencies(plant.A, plant.B @ plant.K))
-    found = swept_crossings(loci, omega[omega <= highest])
+    omega = np.unique(np.concatenate([dense, highest * _LOW, resonant.ravel()]))
+    found = swept_crossings(loci, omega[(omega > 0.0) & (omega <= highest)])
     frequency = np.array([crossing.omega for crossing in found])
     turn_s = 2.0 * pi / frequency
     longer_s = (np.array([crossing.delay_s for crossing in found]) - assumed_s) % turn_s
@@ -159,6 +165,8 @@ class _PredictedBlock:
             powers.append(self.closed @ powers[-1])
             added.append(self.closed @ added[-1] + G @ on_v)
         self.powers, self.added = np.array(powers), np.array(added)
+        # at many angles, eigenvalues of larger matrices would take most of the time
+        self.by_loci = self.ticks == 1 or len(self.sample) <= _FEW
         self.by_assumed = self._answers(np.array([assumed_s]))
         self.grid = self._grid(self._angles())
         self.aside_s = self._refined(*self._starts())
@@ -168,9 +176,9 @@ class _PredictedBlock:
         ends_s, longest_s = way * self.aside_s, self.assumed_s if way < 0.0 else inf
         end_s = float(ends_s[ends_s > _AT_ASSUMED * self.tick_s].min(initial=inf))
         known_s = end_s if end_s < inf else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
-        # at one rate no crossing in between is missed
-        looks = [*(_WITHIN if self.ticks > 1 else ()), 1.0 - _BESIDE]
-        if end_s < inf or (self.ticks > 1 and way > 0.0):
+        looks = [*(() if self.by_loci else _WITHIN), *self._kinks(way, known_s) / known_s, 1.0 - _BESIDE]
+        looks.sort()
+        if end_s < inf or (not self.by_loci and way > 0.0):
             last_s = min(longest_s, _SEARCHED * known_s + _SEARCHED_PERIODS * self.common_s)
             looks += [1.0 + _BESIDE, *_FARTHER ** np.arange(1.0, log(last_s / known_s) / log(_FARTHER))]
         stable_s = 0.0
@@ -179,6 +187,14 @@ class _PredictedBlock:
                 return self._between(way, stable_s, aside_s, ends_s)
             stable_s = aside_s
         return inf
+
+    def _kinks(self, way: float, most_s: float) -> FloatArray:
+        """Mismatches (s) below this one at which a command starts to act as a state is sampled; none of large maps."""
+        if self._states(self.assumed_s + max(0.0, way * most_s)) > _LARGEST_CHECK:
+            return np.zeros(0)
+        first_s = np.unique((way * (self.samples_s + self.spread_s - self.assumed_s)) % self.tick_s)
+        aside_s = (first_s + np.arange(most_s / self.tick_s)[:, np.newaxis] * self.tick_s).ravel()
+        return aside_s[(aside_s < most_s) & (self.assumed_s + way * aside_s >= 0.0)]
 
     def _between(self, way: float, stable_s: float, unstable_s: float, ends_s: FloatArray) -> float:
         """The same, between two mismatches (s), with solutions of which some may be there."""
@@ -208,11 +224,11 @@ class _PredictedBlock:
             values = np.linalg.eigvals(self._lifted(delay_s)).astype(np.complex128)
             angle = np.angle(values).astype(np.float64)
             nearest = np.argsort(np.abs(np.abs(values) - 1.0))
-            angle = angle[nearest[angle[nearest] > 0.0]][:_BESIDE_IT]
+            angle = angle[nearest[angle[nearest] >= 0.0]][:_BESIDE_IT]
         else:
             angle, values = self._resolved(self._answers(np.array([delay_s])))
             sizes = np.abs(values)
-            least = np.append(local_maxima(-sizes), sizes.size - 1)
+            least = np.concatenate([[0], local_maxima(-sizes), [sizes.size - 1]])
             angle = angle[least[np.argsort(sizes[least])][:_BESIDE_IT]]
         return self._refined(angle, np.full(angle.size, delay_s - self.assumed_s))
 
@@ -222,15 +238,14 @@ class _PredictedBlock:
 
     def _angles(self) -> FloatArray:
         """Angles from 0 to pi, or to where the norm of N stays below one at every true delay."""
-        low = np.logspace(-_DECADES, 0.0, _DECADES * _POINTS_PER_DECADE) * pi
-        coarse = np.union1d(np.linspace(0.0, pi, _ANGLES), low)
+        coarse = np.union1d(np.linspace(0.0, pi, _ANGLES), pi * _LOW)
         delays_s = self.spread_s + np.linspace(0.0, self.common_s, max(self.ticks, 8) + 1)
         _, onto_first, onto_v = self._answers(delays_s)
         of_first, of_v = (np.linalg.norm(onto, axis=(1, 2)).max() for onto in (onto_first, onto_v))
         bound = 2.0 * (of_first * np.linalg.norm(self._first(coarse), axis=(1, 2)) + of_v)
         last = coarse[min(np.flatnonzero(bound > _SMALL).max(initial=0) + 1, coarse.size - 1)]
         turns = last * (_LONGEST * self.assumed_s / self.common_s + 1.0) / _TURN
-        return np.union1d(np.linspace(0.0, last, int(turns) + _ANGLES), low[low < last])
+        return np.union1d(np.linspace(0.0, last, max(int(turns), _ANGLES)), last * _LOW)
 
     def _first(self, angle: FloatArray) -> ComplexArray:
         free = np.exp(1j * angle)[:, np.newaxis, np.newaxis] * np.eye(len(self.closed)) - self.powers[-1]
@@ -285,13 +300,14 @@ class _PredictedBlock:
         """Angles and det(I - N) at one true delay, which changes little from each angle to the next."""
         angle, values = self.grid.angle, self._determinants(self.grid, answers)
         for _ in range(_REFINEMENTS):
-            # beside a dip too: two zeros at one place turn the phase by a whole turn, which looks like none
-            coarse = np.abs(np.log(values[1:] / values[:-1])) > _MOST_TURN
-            coarse = np.flatnonzero(np.convolve(coarse, np.ones(3), "same") > 0.0)
+            # slopes beside it count too: two zeros at one place turn the phase by a whole turn, which looks like none
+            width = np.diff(angle)
+            slope = np.pad(np.abs(np.log(values[1:] / values[:-1])) / width, 1)
+            coarse = np.flatnonzero(width * sliding_window_view(slope, 3).max(axis=1) > _MOST_TURN)
             if coarse.size == 0:
                 break
             shares = np.arange(1.0, _PARTS) / _PARTS
-            between = (angle[coarse, np.newaxis] + np.diff(angle)[coarse, np.newaxis] * shares).ravel()
+            between = (angle[coarse, np.newaxis] + width[coarse, np.newaxis] * shares).ravel()
             order = np.argsort(np.concatenate([angle, between]))
             added = self._determinants(self._grid(between), answers)
             angle, values = np.concatenate([angle, between])[order], np.concatenate([values, added])[order]
@@ -303,31 +319,28 @@ class _PredictedBlock:
 
     def _starts(self) -> tuple[FloatArray, FloatArray]:
         """Angles and mismatches (s) near the ends, the nearest to either side."""
-        if self.ticks > 1:
+        if self.by_loci:
+            angle, aside_s = self._by_loci()
+        else:
             frequency, aside_s = continuous_crossings(self.plant, self.assumed_s + self.tick_s / 2.0)
             angle = np.abs((frequency * self.common_s + pi) % (2.0 * pi) - pi)
-        else:
-            angle, aside_s = self._by_loci()
-        # z = -1, where det(I - N) is real
-        beside_s = np.arange(-2.0, 2.0, 1.0 / _AT_MINUS_ONE) * self.common_s
-        half_turn = self._grid(np.full(beside_s.size, pi))
+        # z = -1, and at two rates z = 1 too, where det(I - N) is real
+        spans_s = (self.common_s, self.common_s), (self.timing.held_s, self.tick_s)
+        beside_s = np.unique(np.concatenate([np.arange(-2.0 * a, 2.0 * a, b / _AT_ONE) for a, b in spans_s]))
         answers = self._answers(np.maximum(0.0, self.assumed_s + beside_s))
-        signs = np.sign(self._determinants(half_turn, answers).real)
-        at = np.flatnonzero(signs[1:] != signs[:-1])
-        angle, aside_s = np.concatenate([angle, np.full(at.size, pi)]), np.concatenate([aside_s, beside_s[at]])
+        for real in (pi, 0.0):
+            signs = np.sign(self._determinants(self._grid(np.full(beside_s.size, real)), answers).real)
+            at = np.flatnonzero(signs[1:] != signs[:-1])
+            angle, aside_s = np.append(angle, np.full(at.size, real)), np.append(aside_s, beside_s[at])
         angle, aside_s = (each[aside_s > -self.assumed_s] for each in (angle, aside_s))
-        near: list[IntArray] = []
-        for side in (np.flatnonzero(aside_s < 0.0), np.flatnonzero(aside_s > 0.0)):
-            nearest = side[np.argsort(np.abs(aside_s[side]))][:_TRIED]
-            far_s = np.abs(aside_s[nearest])
-            near.append(nearest[far_s <= far_s.min(initial=inf) + _FARTHER_S * self.timing.held_s])
-        chosen = np.concatenate(near)
+        tried, nearest = _TRIED if self.by_loci else _TRIED // _FRACTIONS, np.argsort(np.abs(aside_s))
+        chosen = np.concatenate([nearest[aside_s[nearest] * way > 0.0][:tried] for way in (-1.0, 1.0)])
         return angle[chosen], aside_s[chosen]
 
     def _by_loci(self) -> tuple[FloatArray, FloatArray]:
-        """Of crossings at one rate."""
+        """The same of all crossings, from loci."""
         grid = self.grid._replace(angle=self.grid.angle[1:], first=self.grid.first[1:], assumed=self.grid.assumed[1:])
-        fractions = _FRACTIONS if grid.angle[-1] > _SLOW else 1
+        fractions = min(self.ticks, 2) * (_FRACTIONS if grid.angle[-1] > _SLOW else 1)
         angles, asides_s = list[FloatArray](), list[FloatArray]()
         for m in (np.arange(fractions) / fractions).tolist():
             answers = self._answers(np.array([m * self.common_s]))
@@ -363,18 +376,21 @@ class _PredictedBlock:
         for _ in range(_STEPS):
             answers = self._answers(np.concatenate([delay_s, delay_s + beside_s]))
             # at the place itself, at an angle beside it, and at a delay beside it
-            here, every = np.arange(angle.size), np.concatenate([angle, angle * (1.0 + _DIFFERENCE), angle])
+            here, turn = np.arange(angle.size), _DIFFERENCE * np.where(angle > 0.0, angle, 1.0)
             answers = _Answers(*(part[np.concatenate([here, here, here + angle.size])] for part in answers))
-            solved = solved_beside_poles(self._differences(self._grid(every), answers), np.tile(right, (3, 1, 1)))
-            value, turned, later = 1.0 / (np.tile(left, (3, 1)) * solved[:, :, 0]).sum(axis=1).reshape(3, -1)
+            solved = solved_beside_poles(
+                self._differences(self._grid(np.concatenate([angle, angle + turn, angle])), answers),
+                np.tile(right, (3, 1, 1)),
+            )
             with np.errstate(divide="ignore", invalid="ignore"):
-                by_angle, by_delay = (turned - value) / (_DIFFERENCE * angle), (later - value) / beside_s
+                value, turned, later = 1.0 / (np.tile(left, (3, 1)) * solved[:, :, 0]).sum(axis=1).reshape(3, -1)
+                by_angle, by_delay = (turned - value) / turn, (later - value) / beside_s
                 area = (by_angle * by_delay.conj()).imag
                 angle_step = -(value * by_delay.conj()).imag / area
                 delay_step = np.clip((value * by_angle.conj()).imag / area, -self.tick_s, self.tick_s)
-            # N at -phi is the conjugate of that at phi
-            angle, delay_s = pi - np.abs(pi - np.abs(angle + angle_step) % (2.0 * pi)), delay_s + delay_step
-            kept = (angle > 0.0) & (delay_s >= 0.0)
+                # N at -phi is the conjugate of that at phi
+                angle, delay_s = pi - np.abs(pi - np.abs(angle + angle_step) % (2.0 * pi)), delay_s + delay_step
+            kept = delay_s >= 0.0
             angle, delay_s, left, right = angle[kept], delay_s[kept], left[kept], right[kept]
             step_s = np.abs(delay_step[kept])
             if not np.any(step_s > _STILL * self.tick_s):

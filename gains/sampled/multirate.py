@@ -199,12 +199,13 @@ def multirate_map(
     commands = {-age: start[n + (age - 1) * inputs : n + age * inputs] for age in range(1, kept + 1)}
     times = _merged([0.0, *(at_s for at_s in assumed_s if at_s > 0.0), *taken_s, common_s], close_s)
     maps = list(zip(*predictor.believed.between(times), strict=True)) if predictor else []
+    acting = [bisect_right(assumed_s, at_s + close_s) - 1 - earlier for at_s in times]
 
     def carried(state: FloatArray, from_s: float, to_s: float) -> FloatArray:
         """What the station believes of the state at one instant of `times`, from that at another."""
         for k in range(*(bisect_right(times, at_s + close_s) - 1 for at_s in (from_s, to_s))):
             Phi, hold = maps[k]
-            state = Phi @ state + hold @ commands[bisect_right(assumed_s, times[k] + close_s) - 1 - earlier]
+            state = Phi @ state + hold @ commands[acting[k]]
         return state
 
     number, known_s, reached_s, state = 0, 0.0, 0.0, x[:on]

@@ -47,16 +47,16 @@ def mismatch_window(
     """The least and the largest true loop delay (s) between which the predicted loop is stable.
 
     0 if it is stable down to no delay, `inf` if no longer delay is found to be too long, and `assumed_s` twice if it is
-    unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s, confirmed by the spectrum of
-    the lifted map on either side if that is small. With a sample for every command no crossing in between is missed;
-    otherwise delays in between are looked at, see `gains.sampled._nyquist`.
+    unstable without mismatch. The ends are crossings of the unit circle to about 1e-9 s, confirmed on either side by
+    the spectrum of the lifted map, or by Nyquist's criterion if that is large. Between them the window is a search, not
+    a proof: see `gains.sampled._mismatch`.
 
     A (n, n), B (n, p) and K (p, n) are real, with the feedback u = +K x; a response of the vehicles is part of A and B,
     see `gains.performance.response.formation_loop`. `assumed_s` is tau^, the (mean) loop delay over which is predicted.
     `measured` says which states are sampled, all if None; the station computes the others from its commands alone, K
     must not use them, and they must not depend on those that are sampled.
-    BadModelError names an argument that does not fit; DisagreementError is raised if the eigenvalues of the lifted map
-    contradict the crossings found.
+    BadModelError names an argument that does not fit; DisagreementError is raised if a window ends where no
+    eigenvalue is found on the unit circle.
 
     x' = u, u = -x takes 1.56 s at 50 Hz. A station that assumes 3 s takes 1.45 to 4.77 s:
 
@@ -72,9 +72,9 @@ def mismatch_window(
 def mismatch_window_continuous(
     A: ArrayLike, B: ArrayLike, K: ArrayLike, *, assumed_s: float, measured: Sequence[bool] | None = None
 ) -> tuple[float, float]:
-    """The same of the continuous loop, from the analysis of its two delays. A hold counts as half a period of both.
+    """The same of the continuous loop. A hold counts as half a period of both delays.
 
-    Exceptions as of `gains.delay._mixed.analyse_mixed`.
+    The frequencies come from a sweep of loci: a search, not a proof. Exceptions as of `mismatch_window`.
 
     x' = u, u = -x: s + 1 + e^{-s tau} - e^{-3 s} = 0.
 

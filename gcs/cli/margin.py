@@ -10,7 +10,7 @@ from fractions import Fraction
 from functools import partial
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic_core import to_jsonable_python
@@ -18,7 +18,9 @@ from pydantic_core import to_jsonable_python
 from gains.core.errors import BadModelError
 from gains.margin.loop_margin import LoopAtGivenDelays, LoopMargin, MarginCrossing, as_known, loop_margin
 from gains.margin.model_file import DelayModel, Term, parse_model, with_short_zeros
-from gcs.plan.design import PredictionPart
+
+if TYPE_CHECKING:  # the schema of scenarios takes as long as the rest of the answer
+    from gcs.plan.design import PredictionPart
 
 _ROWS = 20
 """Most rows of a table."""
@@ -37,7 +39,7 @@ class ScenarioMargin:
     margin: LoopMargin
     loop: str
     delay_margin_sampled_s: float | None
-    prediction: PredictionPart | None
+    prediction: "PredictionPart | None"
     """The mismatch windows of a station that predicts; the margins are those without prediction."""
 
 

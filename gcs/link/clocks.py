@@ -72,15 +72,14 @@ _WRAP_NS = _BOOT_MS_NS << 32
 """time_boot_ms wraps after this, 49.7 days; a clock set back to before its boot wraps too."""
 _DOUBTFUL_NS = 10_000
 """An exchange this close to the line is never doubtful."""
-_FLOOR_NS = 200_000.0
-"""Queueing that is too short to tell good exchanges from bad ones."""
+_FLOOR_NS = 200_000.0  # queueing too short to tell good exchanges from bad ones
 _TILT = 100e-6
 """An upper bound of how much the rates of two crystals differ."""
 _WANDER = 10e-6
 """How far the rate of a crystal changes with its temperature."""
 _EVERY_SAMPLE = 32
-_ESTIMATE_EVERY = 4
-"""After the first samples the line is fitted at every fourth only, to save time, and extrapolated in between."""
+_ESTIMATE_EVERY = 5
+"""After the first samples the line is fitted at every fifth only, to save time, and extrapolated in between."""
 _Floats = NDArray[np.float64]
 _sum = np.add.reduce
 """np.sum, at half its cost for so few samples."""
@@ -404,9 +403,9 @@ class VehicleClock:
         weight = 1.0 / (rtt - least + _FLOOR_NS) ** 2
         weight /= _sum(weight)
         # Sums of products, not `@`: BLAS adds in an order that depends on the processor, and flights must not.
-        t_mean, y_mean = _sum(weight * t), _sum(weight * y)
+        t_mean = _sum(weight * t)
         weighted = weight * (t - t_mean)
-        spread = _sum(weighted * (t - t_mean))
+        spread = _sum(weighted * t)
         # The slope of a short stretch would be noise: below 0.3 s (rms) of history the former rate is kept, at first 0.
         # So would that of exchanges which tilt the line by more than is known if they all queued on the same way.
         skew, tilt, low_ns, high_ns = known.skew, ageing, 0.0, 0.0
@@ -422,7 +421,8 @@ class VehicleClock:
         low_ns = state_ns if state_ns + ageing * state_t > low_ns else low_ns
         ways_ns, offset_ns = high_ns - low_ns, (low_ns + high_ns) / 2.0
         off_ns = max(0.0, self._explained_ns - (least - ways_ns) / 2.0)  # the mean errs by what its exchanges queued
-        offset_ns = min(max(float(y_mean - skew * t_mean), offset_ns - off_ns), offset_ns + off_ns)
+        if off_ns > 0.0:
+            offset_ns = min(max(float(_sum(weight * y) - skew * t_mean), offset_ns - off_ns), offset_ns + off_ns)
         # The offset is off by up to half of what the quickest ways queued; one extrapolated is off by its drift, too.
         if ways_ns > self._ways_ns + 2.0 * ageing * (now_ns - self._fitted_ns) + _FLOOR_NS:
             skew, offset_ns = known.skew, float(known.offset_at_ns(now_ns) - base)

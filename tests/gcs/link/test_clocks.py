@@ -94,8 +94,8 @@ def test_limits_of_different_exchanges_outdo_the_best_one(seed: int) -> None:
         down_ns, up_ns = (round(rng.uniform(70.0, 130.0) * MS) for _ in range(2))
         truth.at(k * S // 10, down_ns=down_ns, up_ns=up_ns)
         offs_ns.append(truth.error_ns(k * S // 10 + down_ns + up_ns))
-    # The least of 128 is 60 / 129 ms on average above the fastest; four times that is passed once in e^4 = 55 windows,
-    # and the errors of both ways rarely add up. The quickest exchange of the window is off by 3 ms rms, 10 ms at most.
+    # The least of 128 is 60 / 129 ms on average above the fastest; four times that is passed once in e^4 = 55 windows;
+    # the error is half the difference of two such.
     assert np.abs(offs_ns[128:]).max() < 4 * 60 / 129 * MS
 
 
