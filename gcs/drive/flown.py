@@ -44,18 +44,16 @@ class Flight:
     busy_share: float | None = None
 
 
-def fly_plan(plan: FlightPlan, *, real_time: bool, folder: Path | None = None, with_truth: bool = False) -> Flight:
-    """Fly a plan. With a folder, which is created, the run's files except the summary are left there.
+def fly_plan(
+    plan: FlightPlan, folder: Path | None = None, *, real_time: bool = False, with_truth: bool = False
+) -> Flight:
+    """Fly a plan, in virtual time or in real time.
 
-    In real time the vehicles' truth is always recorded.
+    With a folder, which is created, the run's files except the summary are left there. In real time the vehicles' truth
+    is always recorded.
     """
-    if not real_time:
-        return fly_virtual(plan, folder, with_truth=with_truth)
-    return fly_real_time(plan, margins_of(plan), folder)
-
-
-def fly_virtual(plan: FlightPlan, folder: Path | None = None, *, with_truth: bool = False) -> Flight:
-    """Fly a plan in virtual time; `folder` and `with_truth` as for `fly_plan`."""
+    if real_time:
+        return fly_real_time(plan, margins_of(plan), folder)
     station, records = Station(plan, start_ns=START_NS), list[tuple[int, ...]]()
     writer = None
     if folder is not None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from gains.performance.disturbed import DisturbedFormation
 from gains.performance.radii import SectorLoop, Worst
-from gcs.drive.flown import first_uses, fly_virtual, median_delays_s
+from gcs.drive.flown import first_uses, fly_plan, median_delays_s
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.formation import on_one_axis
@@ -162,13 +162,13 @@ def cases(plan: FlightPlan, delay_s: float, *, kinds: Sequence[Kind] = KINDS, co
 def _probe(plan: FlightPlan) -> tuple[Scenario, float]:
     """The flight that the disturbance is added to, and its loop delay (s)."""
     ids = plan.formation.system_ids
-    pilot = fly_virtual(replace(plan, scenario=_calm(plan.scenario, _PILOT_S)))
+    pilot = fly_plan(replace(plan, scenario=_calm(plan.scenario, _PILOT_S)))
     up, down = plan.scenario.link_of(ids[0])
     waiting_s = max(median_delays_s(first_uses(pilot.ticks), ids).values()) - up.delay_s - down.delay_s
     probe = probe_scenario(
         plan, ids, amplitude=_ERROR_M, links=(up, down), waiting_s=round(waiting_s, 6) % plan.timing.step_s
     )
-    calm = fly_virtual(replace(plan, scenario=_calm(probe, _PILOT_S)))
+    calm = fly_plan(replace(plan, scenario=_calm(probe, _PILOT_S)))
     return probe, round(max(median_delays_s(first_uses(calm.ticks), ids).values()), 6)
 
 
@@ -217,7 +217,7 @@ def _way(zero: Zero | None, points: Sequence[GrowthPoint], middle: float, width:
 
 def _flown(plan: FlightPlan, scenario: Scenario, size_1_s: float) -> list[GrowthPoint]:
     """The growth measured in one flight; `GrowthPoint.loop_delay_s` is the size here. Empty if nothing was measured."""
-    flight, ids = fly_virtual(replace(plan, scenario=scenario)), plan.formation.system_ids
+    flight, ids = fly_plan(replace(plan, scenario=scenario)), plan.formation.system_ids
     rows = flight.ticks[flight.ticks["commanded"] & (flight.ticks["time_s"] >= 0.0)]
     motion = motion_of(flight.ticks, ids, period_s=plan.timing.control_s)
     until_s = linear_until_s(rows, linear_error_m_s(scenario), LINEAR_COMMAND_M_S2)

@@ -42,7 +42,7 @@ import numpy as np
 from gains.core.arrays import FloatArray, IntArray
 from gcs.control.limits import LARGEST_COMMAND_M_S2
 from gcs.control.tick import TickArray
-from gcs.drive.flown import Flight, fly_plan, fly_virtual, median_delays_s
+from gcs.drive.flown import Flight, fly_plan, median_delays_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.runs.grade import commands_of, commands_on_board, effective_delay_s
 from gcs.stress.axes import has_constant_links
@@ -107,7 +107,7 @@ def response_alone(
 
 def fly_calm(plan: FlightPlan, folder: Path | None) -> Flight:
     """Fly the formation in place on the scenario's own links: the first flight of a pair."""
-    return fly_virtual(replace(plan, scenario=in_place(plan, (), amplitude=0.0)), folder, with_truth=True)
+    return fly_plan(replace(plan, scenario=in_place(plan, (), amplitude=0.0)), folder, with_truth=True)
 
 
 def response_paired(
@@ -118,7 +118,7 @@ def response_paired(
     `amplitude` is that of `in_place`. Rows after the two flights differ in their ticks are left out.
     """
     disturbed = replace(plan, scenario=in_place(plan, system_ids, amplitude=amplitude))
-    flight = fly_virtual(disturbed, folder, with_truth=True)
+    flight = fly_plan(disturbed, folder, with_truth=True)
     rows, calm_rows = _rows_of(flight.ticks, system_ids), _rows_of(calm.ticks, system_ids)
     count = _alike(rows, calm_rows)
     rows, calm_rows = rows[:count], calm_rows[:count]

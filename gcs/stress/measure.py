@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gains.sampled.coupled_block import CoupledBlock, critical_block
-from gcs.drive.flown import first_uses, fly_plan, fly_virtual, median_delays_s
+from gcs.drive.flown import first_uses, fly_plan, median_delays_s
 from gcs.output import DISK_FULL
 from gcs.plan.flight_plan import FlightPlan
 from gcs.stress import free_response
@@ -103,7 +103,7 @@ def _probe(trial: Trial, outcome: Outcome, folder: Path | None) -> Outcome:
     """
     base = plan_of(trial)
     pilot_s = max(_PILOT_S, _PILOT_PERIODS * base.timing.held_s)
-    pilot = fly_virtual(replace(base, scenario=base.scenario.model_copy(update={"duration_s": pilot_s})))
+    pilot = fly_plan(replace(base, scenario=base.scenario.model_copy(update={"duration_s": pilot_s})))
     fresh = first_uses(pilot.ticks)
     delays_s, loops = median_delays_s(fresh, base.formation.system_ids), plan_loops(base)
     critical = _loop_of(loops, delays_s, trial.probe)

@@ -20,7 +20,7 @@ from gains.formation.model import FormationModel
 from gains.performance.robust import disturbance_bound
 from gains.performance.string_stability import largest_magnitude
 from gcs.control.tick import TickArray
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
 from gcs.published import json_text
@@ -99,7 +99,7 @@ def _route(method: Method, scenario: Scenario) -> tuple[Route, TickArray]:
     begun_s = time.perf_counter()
     designed, plan = flight_plan(scenario.with_calm_monitor())
     design_s = time.perf_counter() - begun_s
-    flight = fly_virtual(plan)
+    flight = fly_plan(plan)
     summary = summarise(plan.scenario, designed, flight.ticks, flight.events)
     flown = flight.ticks[(flight.ticks["time_s"] >= 0.0) & flight.ticks["commanded"]]
     model, K = plan.model, plan.gain

@@ -11,7 +11,7 @@ import numpy as np
 
 from gcs.autopilot.identify import MISFIT_MAX, Flown, Identified, identify
 from gcs.autopilot.manoeuvre import in_words
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.errors import InputError
 from gcs.plan.flight_plan import at_once
 from gcs.plan.planner import flight_plan
@@ -64,7 +64,7 @@ def _identified(scenario: Scenario, axis: str) -> Identified:
         "navigation": None,
     }
     alone = scenario.in_steady_flight().with_calm_monitor().model_copy(update=changes)
-    flight = fly_virtual(flight_plan(alone)[1], with_truth=True)
+    flight = fly_plan(flight_plan(alone)[1], with_truth=True)
     assert flight.truth is not None
     rows = flight.ticks[flight.ticks["commanded"]]
     instants_s = commands_of(rows, flight.truth, leader.system_id) / 1e9

@@ -13,7 +13,7 @@ from gains.design.design import design
 from gains.formation.model import FormationModel
 from gains.sampled.onboard import own_part
 from gcs.control.tick import TickArray
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.plan.design import Design
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
@@ -72,7 +72,7 @@ def nonlinear_response(delay_s: float) -> tuple[float, float]:
 def flown(name: str, method: str) -> tuple[TickArray, float | None]:
     """Fly one of the triangle scenarios without link delay; returns its ticks and settling time."""
     designed, plan = _planned(name, method)
-    flight = fly_virtual(plan)
+    flight = fly_plan(plan)
     return flight.ticks, summarise(plan.scenario, designed, flight.ticks, flight.events).settling_time_s
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.plan.design import Design
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
@@ -26,7 +26,7 @@ def flown(scenario: Scenario) -> tuple[Design, Summary]:
     """Design and summary."""
     calm = scenario.model_copy(update={"monitor": scenario.monitor.model_copy(update={"act": False})})
     design, plan = flight_plan(calm)
-    flight = fly_virtual(plan)
+    flight = fly_plan(plan)
     return design, summarise(calm, design, flight.ticks, flight.events)
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from gcs.control.tick import TickArray
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.plan.planner import flight_plan
 from gcs.stress.axes import at_coordinates
 from scenarios.files import load
@@ -122,7 +122,7 @@ def scenario(name: str) -> Scenario:
 
 def flown(name: str) -> TickArray:
     _, plan = flight_plan(scenario(name))
-    return fly_virtual(plan).ticks
+    return fly_plan(plan).ticks
 
 
 def reference_of(ticks: TickArray) -> Reference:
@@ -145,12 +145,12 @@ def test_flight_is_the_reference_flight(name: str) -> None:
 @pytest.mark.parametrize("changes", [{"seed": 2}, {"duration_s": DURATION_S + 0.02}])
 def test_reference_sees_another_seed_and_another_tick(changes: dict[str, Any]) -> None:
     _, plan = flight_plan(scenario("triangle5, jitter and loss").model_copy(update=changes))
-    assert reference_of(fly_virtual(plan).ticks).sha256 != REFERENCES["triangle5, jitter and loss"].sha256
+    assert reference_of(fly_plan(plan).ticks).sha256 != REFERENCES["triangle5, jitter and loss"].sha256
 
 
 def test_the_reference_sees_gains_that_differ_by_a_thousandth() -> None:
     _, plan = flight_plan(scenario("chain3, above the margin"))
-    end = reference_of(fly_virtual(replace(plan, gain=1.001 * plan.gain)).ticks).end
+    end = reference_of(fly_plan(replace(plan, gain=1.001 * plan.gain)).ticks).end
     known = REFERENCES["chain3, above the margin"].end
     assert float(np.abs(np.array(end) - np.array(known)).max()) > 2.0 * END_TOLERANCE
 

@@ -8,7 +8,7 @@ import pytest
 from gains.sampled.multirate import lifted_radius
 from gains.sampled.onboard import onboard_loop
 from gcs.control.tick import Mode
-from gcs.drive.flown import fly_virtual, margins_of
+from gcs.drive.flown import fly_plan, margins_of
 from gcs.plan.flight_plan import onboard_timing
 from gcs.plan.planner import flight_plan
 from gcs.runs.summary import summarise
@@ -105,7 +105,7 @@ def test_missing_states_delay_the_loop_and_reused_ones_do_not() -> None:
     gone = Link(delay_s=0.02, outages=(Outage(from_s=2.02, until_s=2.52),))
     links = scenario_at(10.0).links.model_copy(update={"up": gone})
     _, plan = flight_plan(scenario_at(10.0, control=GAINS, links=links, duration_s=4.0))
-    flight = fly_virtual(plan)
+    flight = fly_plan(plan)
     own = flight.ticks[(flight.ticks["system_id"] == 2) & flight.ticks["commanded"] & (flight.ticks["time_s"] > 0.5)]
     calm = own[(own["time_s"] < 2.0)]
     assert np.ptp(calm["loop_delay_s"]) < 1e-4
@@ -122,6 +122,6 @@ def test_slow_telemetry_far_below_the_margin_is_flown_in_peace() -> None:
     """100 ms of links at 5 Hz against 214 ms: were every age of a state a loop delay, it would be past the margin."""
     scenario = scenario_at(5.0, control=GAINS, duration_s=30.0).with_link_delay(up_s=0.05, down_s=0.05)
     _, plan = flight_plan(scenario)
-    flight = fly_virtual(plan)
+    flight = fly_plan(plan)
     flown = flight.ticks[flight.ticks["commanded"] & (flight.ticks["time_s"] > 0.1)]
     assert (flown["mode"] == Mode.NOMINAL).all()

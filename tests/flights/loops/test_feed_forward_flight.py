@@ -8,7 +8,7 @@ import pytest
 from gains.criteria.predicted import PredictedFigures
 from gains.performance.scalar_gains import PAIR, ScalarGains
 from gcs.control.tick import TickArray
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.plan.at_delay import figures_at
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
@@ -53,7 +53,7 @@ def stepped(share: float, K2: float | None, *, link_s: float, leader_m_s: float 
     vehicles = tuple(placed(vehicle) for vehicle in CHAIN.vehicles)
     update = {"nominal_velocity": steps, "vehicles": vehicles, "duration_s": 12.0}
     changed = plan.scenario.model_copy(update=update)
-    return fly_virtual(flight_plan(changed)[1]).ticks
+    return fly_plan(flight_plan(changed)[1]).ticks
 
 
 def peaks_m(ticks: TickArray) -> list[float]:

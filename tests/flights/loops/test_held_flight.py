@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gains.core.arrays import FloatArray
-from gcs.drive.flown import Flight, fly_virtual
+from gcs.drive.flown import Flight, fly_plan
 from gcs.plan.expected_delay import expected_loop_delay_s
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
@@ -32,7 +32,7 @@ def planned(*, held: bool, prediction: str = "off") -> FlightPlan:
 
 @cache
 def flown(*, held: bool) -> Flight:
-    return fly_virtual(planned(held=held), with_truth=True)
+    return fly_plan(planned(held=held), with_truth=True)
 
 
 def errors_of_delays_s(flight: Flight) -> FloatArray:
@@ -71,7 +71,7 @@ def test_the_loop_delay_is_the_expected_one(held: bool) -> None:
 
 def test_a_prediction_assumes_the_hold() -> None:
     """The assumed delay counts the age of states at their first use only; the hold adds 25 ms."""
-    ticks = fly_virtual(planned(held=True, prediction="measured")).ticks
+    ticks = fly_plan(planned(held=True, prediction="measured")).ticks
     late = ticks[ticks["time_s"] > SETTLED_S]
     assert abs(np.nanmean(late["loop_delay_s"] - late["assumed_delay_s"])) < 0.012
 
@@ -97,7 +97,7 @@ def test_holding_does_not_reduce_errors() -> None:
         plan = flight_plan(base.model_copy(update=changes | {"links": links, "control": control}).with_calm_monitor())[
             1
         ]
-        ticks = fly_virtual(plan).ticks
+        ticks = fly_plan(plan).ticks
         late = ticks[(ticks["time_s"] > 2.0) & (ticks["time_s"] < 13.0)]
         return np.stack([late[f"spacing_error_{to}_m"] for to in ("north", "east")])
 

@@ -7,7 +7,7 @@ import pytest
 
 from gains.core.arrays import FloatArray
 from gcs.control.tick import TickArray
-from gcs.drive.flown import Flight, fly_virtual
+from gcs.drive.flown import Flight, fly_plan
 from gcs.drive.lockstep import START_NS, Sent, fly_lockstep, vehicles_of
 from gcs.link import mavlink
 from gcs.plan.flight_plan import FlightPlan
@@ -58,7 +58,7 @@ def pair(**update: object) -> Scenario:
 
 
 def test_the_patrol_keeps_its_shape_and_crosses_at_its_altitudes() -> None:
-    flight = fly_virtual(plan_of(PATROL.model_copy(update={"duration_s": 40.0})))
+    flight = fly_plan(plan_of(PATROL.model_copy(update={"duration_s": 40.0})))
     time_s = columns(flight.ticks, "time_s", 5)[:, 0]
     settled = time_s > 18.0
     error_m = sizes(flight.ticks, "spacing_error_{}_m", 5)[settled, 1:]
@@ -82,7 +82,7 @@ def test_the_patrol_keeps_its_shape_and_crosses_at_its_altitudes() -> None:
     "control", [GAINS, GAINS.model_copy(update={"prediction": 0.1})], ids=["fed back", "predicted"]
 )
 def test_a_follower_in_its_place_stays_there_in_a_turn(control: Control) -> None:
-    flight = fly_virtual(plan_of(pair(control=control)))
+    flight = fly_plan(plan_of(pair(control=control)))
     error_m = sizes(flight.ticks, "spacing_error_{}_m", 2)[:, 1]
     # The plan is held over a control period of 20 ms and timed to a millisecond of the measured delay: with 3 m/s³
     # that misses 0.06 m/s² at most, and at these gains 0.06 / 0.5 = 0.12 m if it lasted.
@@ -99,7 +99,7 @@ def test_a_formation_change_leads_vehicles_to_their_new_places() -> None:
         )
     )  # fmt: skip
     assert len(scenario.formation_changes) == 1
-    flight = fly_virtual(plan_of(scenario))
+    flight = fly_plan(plan_of(scenario))
     assert sizes(flight.ticks, "spacing_error_{}_m", 2)[:, 1].max() < 0.1
     north, east = (columns(flight.ticks, f"{axis}_m", 2)[-1] for axis in ("north", "east"))
     # 20 m behind and 10 m to the left, at a heading of 60 degrees; both states are newest ones, of the same instant
@@ -127,7 +127,7 @@ def predicted_error_m(scenario: Scenario, delay_s: float) -> float:
 
 
 def test_the_error_behind_an_external_leader_is_predicted() -> None:
-    flight = fly_virtual(plan_of(led()))
+    flight = fly_plan(plan_of(led()))
     flown_m = sizes(flight.ticks, "spacing_error_{}_m", 2)[:, 1].max()
     delay_s = float(np.nanmedian(columns(flight.ticks, "loop_delay_s", 2)[:, 1])) + 0.5 / 50.0  # and half a hold
     # The simulated pilot corrects every 20 ms and begins one delivery after the flight: a few hundredths of the error.
@@ -189,7 +189,7 @@ def copters(*, external: bool) -> Scenario:
 
 
 def test_multicopters_fly_at_their_own_altitudes() -> None:
-    flight: Flight = fly_virtual(plan_of(copters(external=False)))
+    flight: Flight = fly_plan(plan_of(copters(external=False)))
     down_m = columns(flight.ticks, "down_m", 2)[-1]
     # Take-off ends at 95 % of the altitude, and set-points close the rest at 0.5 1/s: within 0.5 m * exp(-2)
     assert down_m[0] - down_m[1] == pytest.approx(4.0, abs=0.3)

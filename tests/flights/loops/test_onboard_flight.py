@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gcs.control.tick import Mode, TickArray
-from gcs.drive.flown import fly_virtual, median_delays_s
+from gcs.drive.flown import fly_plan, median_delays_s
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.link.upload import float32
 from gcs.plan.design import Design
@@ -70,7 +70,7 @@ def vehicle(fleet: Fleet, system_id: int) -> DoubleIntegrator:
 @pytest.mark.parametrize(("link_delay_s", "verdict"), [(0.17, "stable"), (0.9, "stable"), (1.1, "unstable")])
 def test_the_source_breaks_beyond_the_computed_margin_not_its_own(link_delay_s: float, verdict: str) -> None:
     scenario = delayed(link_delay_s)
-    flight = fly_virtual(flown(scenario))
+    flight = fly_plan(flown(scenario))
     summary = summarise(scenario, thesis()[0], flight.ticks, flight.events)
     assert summary.verdict == verdict
     assert summary.loop == "onboard"
@@ -86,7 +86,7 @@ def test_the_acting_monitor_streams_less_and_holds_beyond_the_margin() -> None:
     plan = flown(scenario.model_copy(update={"monitor": acting}))
     assert [entry.streamed_share for entry in thesis()[0].schedule] == [1.0, 0.5, 0.25]
     assert list(plan.margins_s) == sorted(plan.margins_s)
-    ticks = fly_virtual(plan).ticks
+    ticks = fly_plan(plan).ticks
     assert set(ticks["gain_set"][(ticks["time_s"] > 5.0) & (ticks["time_s"] < 100.0)]) == {1}
     late = ticks[(ticks["time_s"] > 60.0) & (ticks["time_s"] < 100.0)]
     assert np.nanmax(np.hypot(late["spacing_error_north_m"], late["spacing_error_east_m"])) < 0.1
@@ -123,7 +123,7 @@ def test_flights_repeat_to_the_last_bit_and_seeds_move_sensors() -> None:
     def ticks(seed: int) -> bytes:
         calm = {"seed": seed, "duration_s": 2.0, "clocks": {"offset_max_s": 0.0, "drift_max_ppm": 0.0}}
         data = delayed(0.1).model_dump() | calm
-        return fly_virtual(flown(Scenario.model_validate(data))).ticks.tobytes()
+        return fly_plan(flown(Scenario.model_validate(data))).ticks.tobytes()
 
     assert ticks(1) == ticks(1) != ticks(2)
 
@@ -155,7 +155,7 @@ def test_when_one_is_lost_all_keep_place_by_own_loops(act: bool) -> None:
     scenario = delayed(0.17, duration_s=25.0)
     links = scenario.links.model_copy(update={"vehicles": (VehicleLinks(system_id=2, up=gone, down=gone),)})
     monitor = scenario.monitor.model_copy(update={"act": act})
-    flight = fly_virtual(flown(scenario.model_copy(update={"links": links, "monitor": monitor})))
+    flight = fly_plan(flown(scenario.model_copy(update={"links": links, "monitor": monitor})))
     told = [event.text for event in flight.events if event.kind == "vehicle"]
     assert told[3:] == ["is lost", "is heard again", "is in failsafe"]
     later = flight.ticks[(flight.ticks["time_s"] > 7.0) & (flight.ticks["time_s"] < 25.0)]

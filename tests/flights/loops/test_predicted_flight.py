@@ -12,7 +12,7 @@ from gains.performance.scalar_gains import PAIR, ScalarGains
 from gains.sampled.multirate import Timing
 from gains.sampled.prediction import predicted_growth_rate
 from gcs.control.tick import TickArray
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.drive.lockstep import START_NS, fly_lockstep
 from gcs.plan.flight_plan import FlightPlan
 from gcs.plan.planner import flight_plan
@@ -118,7 +118,7 @@ def test_least_gains_take_a_delay_that_is_5_percent_wrong(mismatch: float) -> No
     plan, loop_s, waiting_s = least_planned(3, 4, 5), (1.0 + mismatch) * assumed_s, 0.01
     link = Link(delay_s=(loop_s - waiting_s) / 2.0)
     probe = probe_scenario(plan, (2,), amplitude=1.0, links=(link, link), waiting_s=waiting_s)
-    ticks = fly_virtual(replace(plan, scenario=probe.model_copy(update={"duration_s": 40.0}))).ticks
+    ticks = fly_plan(replace(plan, scenario=probe.model_copy(update={"duration_s": 40.0}))).ticks
     own = ticks[(ticks["system_id"] == 2) & (ticks["time_s"] >= 0.0)]
     assert float(np.median(own["loop_delay_s"])) == pytest.approx(loop_s, abs=1e-4)
     squared = own["velocity_error_north_m_s"] ** 2 + own["velocity_error_east_m_s"] ** 2
@@ -131,20 +131,20 @@ def test_least_gains_take_a_delay_that_is_5_percent_wrong(mismatch: float) -> No
 
 
 def test_a_predicted_formation_settles_at_five_times_the_margin() -> None:
-    ticks = fly_virtual(flight_plan(scenario(1.5, link_s=1.49, duration_s=16.0))[1]).ticks
+    ticks = fly_plan(flight_plan(scenario(1.5, link_s=1.49, duration_s=16.0))[1]).ticks
     assert errors_m(ticks, from_s=12.0) < 1e-3 * 172.4
     assert ticks["headroom"][ticks["time_s"] > 2.0].min() > 0.8
     assert set(ticks["assumed_delay_s"][ticks["time_s"] > 0.0]) == {1.5}
 
 
 def test_without_prediction_the_same_formation_breaks() -> None:
-    flight = fly_virtual(flight_plan(scenario("off", link_s=1.49, duration_s=16.0))[1])
+    flight = fly_plan(flight_plan(scenario("off", link_s=1.49, duration_s=16.0))[1])
     assert "broken" in flight.events[-1].text
 
 
 def test_the_measured_delay_is_followed() -> None:
     """Links that differ from vehicle to vehicle need no configuration."""
-    ticks = fly_virtual(flight_plan(scenario("measured", link_s=0.9, duration_s=12.0))[1]).ticks
+    ticks = fly_plan(flight_plan(scenario("measured", link_s=0.9, duration_s=12.0))[1]).ticks
     flown = ticks[ticks["time_s"] > 3.0]
     assert np.abs(flown["loop_delay_s"] - flown["assumed_delay_s"]).max() < 0.002  # the rounding of time_boot_ms
     assert errors_m(ticks, from_s=10.0) < 1e-3 * 172.4
@@ -211,7 +211,7 @@ def test_commands_grow_down_the_chain_as_computed(loop_s: float, peak: float) ->
         "duration_s": 25.0,
     }
     plan = flight_plan(at_coordinates(base.model_copy(update=changes), {"delay": loop_s - 0.01}).with_calm_monitor())[1]
-    ticks = fly_virtual(plan).ticks
+    ticks = fly_plan(plan).ticks
     ticks = ticks[ticks["commanded"]]
     assert np.median(ticks["loop_delay_s"]) == pytest.approx(loop_s, abs=0.004)
     omega = np.linspace(0.3, 8.0, 78)

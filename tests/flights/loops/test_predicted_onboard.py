@@ -8,7 +8,7 @@ import pytest
 from gains.sampled._loop import HeldPlant
 from gains.sampled.multirate import Predictor, lifted_radius
 from gains.sampled.onboard import local_plant, onboard_loop, streamed_loop
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.errors import InputError
 from gcs.plan.flight_plan import FlightPlan, onboard_timing
 from gcs.plan.planner import flight_plan
@@ -76,7 +76,7 @@ def test_errors_change_at_the_rate_of_the_certificate(loop_s: float) -> None:
 def test_a_predicted_triangle_settles_at_five_times_its_margin(prediction: float | str) -> None:
     _, plan = flight_plan(triangle(prediction, link_s=0.99))
     assert plan.delay_margin_s == pytest.approx(0.206, abs=1e-3)
-    ticks = fly_virtual(plan).ticks
+    ticks = fly_plan(plan).ticks
     settled = ticks[ticks["time_s"] > 20.0]
     # the sensor's noise is 0.05 m
     assert np.nanmax(np.hypot(settled["spacing_error_north_m"], settled["spacing_error_east_m"])) < 0.5
@@ -84,7 +84,7 @@ def test_a_predicted_triangle_settles_at_five_times_its_margin(prediction: float
 
 
 def test_without_prediction_the_same_triangle_breaks() -> None:
-    flight = fly_virtual(flight_plan(triangle("off", link_s=0.99))[1])
+    flight = fly_plan(flight_plan(triangle("off", link_s=0.99))[1])
     late = flight.ticks[flight.ticks["time_s"] > 10.0]
     assert "broken" in flight.events[-1].text or np.nanmax(np.abs(late["spacing_error_north_m"])) > 5.0
 

@@ -95,10 +95,10 @@ def test_a_stable_loop_beyond_its_margin_is_flown() -> None:
 
 
 def test_an_unstable_loop_flown_all_the_same_shows_no_headroom(tmp_path: Path) -> None:
-    from gcs.drive.flown import fly_virtual
+    from gcs.drive.flown import fly_plan
 
     designed, plan = flight_plan(load(with_gains(tmp_path, 3.0, 0.6, 5.6)))
-    flight = fly_virtual(without_actions(plan))
+    flight = fly_plan(without_actions(plan))
     summary = summarise(plan.scenario, designed, flight.ticks, flight.events)
     assert summary.verdict == "unstable"
     assert summary.headroom_min is None

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from gains.performance.flown import FlownFormation, FlownTiming
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.plan.at_delay import figures_at
 from gcs.plan.design import Design, FiguresAtDelay
 from gcs.plan.expected_delay import expected_loop_delay_s
@@ -71,7 +71,7 @@ def test_table_and_summary_tell_both_at_the_measured_loop_delay() -> None:
     late = TRIANGLE.with_link_delay(up_s=0.09, down_s=0.09).model_copy(update={"duration_s": 6.0})
     calm = late.model_copy(update={"monitor": late.monitor.model_copy(update={"act": False})})
     design, plan = flight_plan(calm)
-    flight = fly_virtual(plan)
+    flight = fly_plan(plan)
     told = summarise(calm, design, flight.ticks, flight.events).at_loop_delay
     own = flight.ticks["loop_delay_s"][flight.ticks["commanded"]].reshape(-1, 5)
     assert told.loop_delay_s == pytest.approx(np.nanmedian(own, axis=0).max(), abs=1e-9)
@@ -123,7 +123,7 @@ def test_general_pattern_gain_sets_have_the_alpha_of_flown_gains(
 def test_general_pattern_flights_tell_alpha_at_the_measured_delay() -> None:
     short = TWO_WAY.model_copy(update={"duration_s": 4.0})
     design, plan = flight_plan(short)
-    flight = fly_virtual(plan)
+    flight = fly_plan(plan)
     told = summarise(short, design, flight.ticks, flight.events).at_loop_delay
     assert told == figures_at(design, short, told.loop_delay_s)
     assert 0.6 < known(told.alpha) < (design.alpha or 0.0)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.plan.planner import flight_plan
 from gcs.runs.record import DESIGN_FILE, SCENARIO_FILE, TICKS_FILE
 from gcs.stress.axes import at_coordinates
@@ -92,7 +92,7 @@ def test_a_probe_has_the_critical_vehicles_loop_delay() -> None:
     trial = study_of("triangle5").trial("probe", {"delay": 0.2}, seed=1)
     outcome = fly_trial(trial)
     scenario = trial.scenario.model_copy(update={"duration_s": 1.0, "clocks": Clocks(drift_max_ppm=0.0)})
-    ticks = fly_virtual(replace(plan_of(trial), scenario=scenario)).ticks
+    ticks = fly_plan(replace(plan_of(trial), scenario=scenario)).ticks
     own = ticks[(ticks["system_id"] == outcome.critical) & ticks["commanded"]]
     assert outcome.loop_delay_s == pytest.approx(float(np.median(own["loop_delay_s"])), abs=1e-5)
     assert outcome.waiting_s == pytest.approx((outcome.loop_delay_s or 0.0) - 0.2, abs=1e-6)
@@ -103,7 +103,7 @@ def test_vehicles_ahead_of_the_probed_one_do_not_move() -> None:
     plan = plan_of(study.trial("probe", {"delay": 0.25}, seed=4))
     links = plan.scenario.link_of(3)
     scenario = probe_scenario(plan, (3,), amplitude=1.0, links=links, waiting_s=0.013)
-    ticks = fly_virtual(replace(plan, scenario=scenario.model_copy(update={"duration_s": 5.0}))).ticks
+    ticks = fly_plan(replace(plan, scenario=scenario.model_copy(update={"duration_s": 5.0}))).ticks
     flown = ticks[ticks["time_s"] > 0.0]
     for system_id, moves in ((1, False), (2, False), (3, True)):
         own = flown[flown["system_id"] == system_id]

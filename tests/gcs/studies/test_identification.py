@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.errors import InputError
 from gcs.plan.planner import flight_plan
 from gcs.studies.identification import as_toml, responses_of
@@ -61,7 +61,7 @@ def test_an_aircraft_flies_to_the_margin_computed_with_its_identified_response()
     # the onset is within 3 % of the margin; a tenth away from it errors change several times over in 40 s
     for share in (0.9, 1.1):
         late = scenario.with_link_delay(up_s=0.5 * share * margin_s, down_s=0.5 * share * margin_s)
-        ticks = fly_virtual(flight_plan(late.with_calm_monitor())[1]).ticks
+        ticks = fly_plan(flight_plan(late.with_calm_monitor())[1]).ticks
         own = ticks[(ticks["system_id"] == 2) & ticks["commanded"]]
         error_m = np.hypot(own["spacing_error_north_m"], own["spacing_error_east_m"])
         at_s = own["time_s"]

@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 
 from gcs.cli.main import main
-from gcs.drive.flown import fly_virtual
+from gcs.drive.flown import fly_plan
 from gcs.plan.planner import flight_plan
 from gcs.runs.files import RunTail, read_ticks
 from gcs.runs.record import TLOG_FILE
@@ -22,7 +22,7 @@ from tests.support.paths import SCENARIOS
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("export") / "run"
     scenario = load(SCENARIOS / "chain3.toml").model_copy(update={"duration_s": 3.0})
-    fly_virtual(flight_plan(scenario)[1], folder)
+    fly_plan(flight_plan(scenario)[1], folder)
     return folder
 
 
