@@ -47,16 +47,18 @@ _TURN, _LONGEST, _ANGLES, _TURN_CONTINUOUS = 0.25, 1.5, 200, 0.1
 _LOW, _BESIDE_POLE = np.logspace(-5.0, 0.0, 80), np.sinh(np.linspace(-4.0, 4.0, 17))
 # no angle is needed where the norm of N stays below this
 _SMALL = 0.95
-# fractions of a period at which loci are computed (one is enough below the angle `_SLOW`; twice as many at two rates),
-# and the largest N of which they are, at two rates; delays in a period at which det(I - N) is computed at z = -1 and 1
+# fractions of a period at which loci are computed, twice as many at two rates; the angle (rad) in a period below which
+# one is enough, and kinks do not matter; the largest N of which they are computed at two rates; and the delays in a
+# period at which det(I - N) is computed at z = -1 and 1
 _FRACTIONS, _SLOW, _FEW, _AT_ONE = 4, 1.0, 4, 16
 # starting points to either side at most, and the assumed delay itself (control periods)
 _TRIED, _AT_ASSUMED = 16, 1e-9
 # Newton's method: steps, the last one (control periods) and that of a solution, and shares of angle and period for
 # derivatives
 _STEPS, _STILL, _SOLVED, _DIFFERENCE = 12, 1e-11, 1e-9, 1e-7
-# states of the largest lifted map whose spectrum is computed
-_LARGEST_CHECK = 60
+# states of the largest lifted map whose spectrum is computed, and how many kinks are looked at, times the control
+# periods in a common one
+_LARGEST_CHECK, _KINKS = 100, 600
 # shares of the mismatch at which the loop must be stable, how far beside its end it is looked at, how much farther each
 # look beyond is than the one before, and up to how many mismatches and common periods
 _WITHIN, _BESIDE, _FARTHER = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9), 1e-6, 1.15
@@ -84,6 +86,13 @@ def block_window(plant: HeldPlant, timing: Timing, assumed_s: float) -> tuple[fl
     return max(0.0, assumed_s - shorter_s), assumed_s + longer_s
 
 
+def highest_crossing(plant: HeldPlant, assumed_s: float) -> float:
+    """A frequency (rad/s) above which `continuous_crossings` has none, 0 if there is none at all."""
+    loop, carried = plant.A + plant.B @ plant.K, plant.K @ plant.carry(np.array([assumed_s]))[0]
+    gain, scale = unit_gain_roots(loop, plant.B, 2.0 * carried), float(np.linalg.norm(loop))
+    return 1.05 * float(gain.imag[np.abs(gain.real) <= 1e-6 * scale].max(initial=0.0))
+
+
 def continuous_crossings(plant: HeldPlant, assumed_s: float) -> tuple[FloatArray, FloatArray]:
     """Frequencies (rad/s) and mismatches (s) of the roots of the continuous loop that are on the imaginary axis.
 
@@ -91,13 +100,11 @@ def continuous_crossings(plant: HeldPlant, assumed_s: float) -> tuple[FloatArray
     lambda / (1 + lambda e^{-s tau^}). Of each crossing there are the nearest mismatches on either side. Where no
     singular value of M exceeds a half, there is none.
     """
-    loop = plant.A + plant.B @ plant.K
-    carried = plant.K @ plant.carry(np.array([assumed_s]))[0]
-    gain, scale = unit_gain_roots(loop, plant.B, 2.0 * carried), float(np.linalg.norm(loop))
-    highest = 1.05 * float(gain.imag[np.abs(gain.real) <= 1e-6 * scale].max(initial=0.0))
+    highest = highest_crossing(plant, assumed_s)
     if highest <= 0.0:
         return np.zeros(0), np.zeros(0)
-    own = delay_loci(loop, plant.B, carried)
+    loop = plant.A + plant.B @ plant.K
+    own = delay_loci(loop, plant.B, plant.K @ plant.carry(np.array([assumed_s]))[0])
 
     def loci(omega: FloatArray) -> ComplexArray:
         late = own(omega)
@@ -174,27 +181,31 @@ class _PredictedBlock:
     def end_s(self, way: float) -> float:
         """How far (s) from the assumed delay the window ends in one direction."""
         ends_s, longest_s = way * self.aside_s, self.assumed_s if way < 0.0 else inf
-        end_s = float(ends_s[ends_s > _AT_ASSUMED * self.tick_s].min(initial=inf))
-        known_s = end_s if end_s < inf else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
-        looks = [*(() if self.by_loci else _WITHIN), *self._kinks(way, known_s) / known_s, 1.0 - _BESIDE]
-        looks.sort()
-        if end_s < inf or (not self.by_loci and way > 0.0):
+        ends_s = np.sort(ends_s[ends_s > _AT_ASSUMED * self.tick_s])
+        known_s = float(ends_s[0]) if ends_s.size else min(longest_s, self.assumed_s + 5.0 * self.timing.held_s)
+        looks = [*self._kinks(way, max(known_s, float(ends_s.max(initial=0.0)))), (1.0 - _BESIDE) * known_s]
+        if not self.by_loci:  # these miss no crossing in between but those of a short stretch around a kink
+            looks += [share * known_s for share in _WITHIN]
+        if ends_s.size or (not self.by_loci and way > 0.0):
             last_s = min(longest_s, _SEARCHED * known_s + _SEARCHED_PERIODS * self.common_s)
-            looks += [1.0 + _BESIDE, *_FARTHER ** np.arange(1.0, log(last_s / known_s) / log(_FARTHER))]
+            farther = _FARTHER ** np.arange(1.0, log(last_s / known_s) / log(_FARTHER))
+            looks += [*((1.0 + _BESIDE) * ends_s), (1.0 + _BESIDE) * known_s, *(farther * known_s)]
         stable_s = 0.0
-        for aside_s in [min(longest_s, share * known_s) for share in looks]:
+        for aside_s in sorted(min(longest_s, float(look)) for look in looks):
             if not self._is_stable(self.assumed_s + way * aside_s):
                 return self._between(way, stable_s, aside_s, ends_s)
             stable_s = aside_s
         return inf
 
-    def _kinks(self, way: float, most_s: float) -> FloatArray:
-        """Mismatches (s) below this one at which a command starts to act as a state is sampled; none of large maps."""
-        if self._states(self.assumed_s + max(0.0, way * most_s)) > _LARGEST_CHECK:
-            return np.zeros(0)
+    def _kinks(self, way: float, most_s: float) -> list[float]:
+        """Mismatches (s) up to this one at which a command starts to act as a state is sampled, the nearest of them."""
+        if highest_crossing(self.plant, self.assumed_s) * self.timing.held_s <= _SLOW:
+            return []
         first_s = np.unique((way * (self.samples_s + self.spread_s - self.assumed_s)) % self.tick_s)
         aside_s = (first_s + np.arange(most_s / self.tick_s)[:, np.newaxis] * self.tick_s).ravel()
-        return aside_s[(aside_s < most_s) & (self.assumed_s + way * aside_s >= 0.0)]
+        # the map takes as long as there are periods in it
+        near_s = aside_s[aside_s < most_s][: _KINKS // self.ticks].tolist()
+        return [own_s for own_s in near_s if self._states(self.assumed_s + way * own_s) <= _LARGEST_CHECK]
 
     def _between(self, way: float, stable_s: float, unstable_s: float, ends_s: FloatArray) -> float:
         """The same, between two mismatches (s), with solutions of which some may be there."""
