@@ -1,24 +1,24 @@
 """The mismatch window of one block of a predicted loop, at one rate or with telemetry at another rate than control.
 
-Let X_i be the computed state at the instant at which, by the assumption, command i acts: X_{i+1} = Phi X_i + G u_i. The
-measured state misses the computed one by w_j at the sample j, and a command k computed from it is
+Let X_i be the predicted state at the instant at which command i is assumed to act: X_{i+1} = Phi X_i + G u_i. At the
+sample j the measured state differs from the predicted one by w_j, and a command k computed from it is
 
     u_k = K X_k + K L_k w_j,   L_k = `HeldPlant.carry` from that sample to the instant at which the command acts.
 
 Both states answer to the same commands, one after the true delay and one after the assumed delay, so each is that of X
 an instant earlier: w_j = Phi(r) X_i + Gamma(r) u_i, with i and r by the true delay, minus the same by the assumed one.
-Of w_j only v_j counts: w_j itself, or the K L_k w_j if these are fewer numbers. Over a common period of both rates u is
-a transfer function of v, stable if the loop without delay is stable, and v is one of u: v = N(z) v, with N = 0 where
-there is no mismatch. So an end of the window has det(I - N) = 0 on the unit circle, and the loop is stable exactly
-where det(I - N) does not go around 0 as z goes around the unit circle (Nyquist).
+Of w_j only v_j matters: w_j itself, or the K L_k w_j if these are fewer numbers. Over a common period of both rates u
+depends on v by a transfer function that is stable if the loop without delay is stable, and v depends on u. Together
+v = N(z) v, with N = 0 where there is no mismatch. So an end of the window has det(I - N) = 0 on the unit circle, and the
+loop is stable exactly where det(I - N) does not encircle 0 as z goes around the unit circle (Nyquist).
 
-Newton's method finds the ends. Its starting points come from loci: with a delay of q + m common periods
-N = z^{-q} S_m - S^, so z^q is an eigenvalue of (I + S^)^{-1} S_m, whose modulus does not depend on q, and hardly on m.
-Where N is large, they are the crossings of the continuous loop, and delays within the window are looked at too.
-Loci can miss a short stretch of instability around a kink, a delay at which a command starts to act as a state is
+Newton's method finds the ends. Its starting points come from loci: with a delay of q + m common periods, q whole and m
+below 1, N = z^{-q} S_m - S^. So z^q is an eigenvalue of (I + S^)^{-1} S_m, whose modulus does not depend on q and only
+little on m. Where N is large, they are the crossings of the continuous loop, and delays within the window are looked at
+too. Loci can miss a short stretch of instability around a kink, a delay at which a command starts to act as a state is
 sampled: kinks are looked at where there are few. Each end is confirmed on either side by the spectrum of the lifted
-map, or by Nyquist's criterion if that map is large. If it is not the first end, bisection leads to starting points
-nearer by.
+map, or by Nyquist's criterion if that map is large. If another end lies nearer, bisection finds starting points closer
+to the assumed delay.
 """
 
 from math import inf, log, pi

@@ -1,14 +1,14 @@
-"""Set-points that do not act when the station assumes: how far off is a predicted loop proved to be stable?
+"""How far from the assumed instant set-points may act, with the predicted loop proved to be stable.
 
 The station predicts as in `gains.sampled.prediction`. A set-point u_j, computed at the tick t_j = j T, is assumed to
 act at t_j + D, and the *delivery delay* D does not change. In truth it acts somewhere between t_j + D - e and
-t_j + D + l, anywhere from set-point to set-point, but none overtakes another. The newest state known at tick k was
-sampled at s_k, which the station knows; s_k never falls. Let U hold the set-points from when they are due, u_act as
-they act, and w(r) = u_act(r) - U(r - D). What is predicted at tick k, for the instant t_k + D, is
+t_j + D + l, independently of the others, but none overtakes another. The newest state known at tick k was sampled at
+s_k, which the station knows; s_k never falls. Let U(t) be the set-point computed at the latest tick at time t, u_act(t)
+the one that acts, and w(r) = u_act(r) - U(r - D). What is predicted at tick k, for the instant t_k + D, is
 
     x^_k = Y(t_k) + Phi(t_k + D - s_k) (x(s_k) - Y(s_k - D))    for any solution of Y' = A Y + B U,
 
-and x(r) - Y(r - D) changes by w only. So, exactly,
+and x(r) - Y(r - D) obeys z' = A z + B w: only w drives it. So, exactly,
 
     x^_{k+1} = (Phi(T) + G K) x^_k + w_k,   w_k = int Phi(t_{k+1} + D - r) B w(r) dr over W_k = (s_k, s_{k+1}]:
 
@@ -24,14 +24,14 @@ control periods in W_k times the integral over one of them of the larger number.
     g  sum over i of  b^i / i!  max over omega of || (1 - 1/z) K (z I - Phi(T) - G K)^{-1} A^i Phi(h) B ||  < 1,
 
 by small gain, where h is the middle of the intervals t_{k+1} + D - r, and b how far they may be from it. In a
-leader-follower tree errors pass down only, so the blocks decide one by one. The maxima are searched on a fine grid and
+leader-follower tree errors pass down only, so each block is tested alone. The maxima are searched on a fine grid and
 refined, as that of `gains.varying.jitter`.
 
 If every state has the same age, W_k lies at the same place in every period, and a constant mismatch leaves the loop
 time-invariant. Then e and l count from the true mean instead, and the loop in the norm is that with the mismatch.
 
-States that are not measured are computed from the commands: w reaches those measured by way of them, which multiplies
-g by the integral of the modulus of that impulse response.
+States that are not measured are computed from the commands. w reaches the measured states through them, which
+multiplies g by the integral of the modulus of the impulse response on that way.
 """
 
 from collections.abc import Callable, Sequence
@@ -60,7 +60,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class PredictedSpread:
-    """How far set-points may act from when they are assumed to, in a loop that is predicted over `assumed_s`.
+    """How far set-points may act from their mean delay, in a loop that is predicted over `assumed_s`.
 
     A, B, K, `timing`, `assumed_s` and `measured`, and the exceptions, are those of
     `gains.sampled.prediction.mismatch_window`; the delays of all inputs of a block vary alike.

@@ -3,9 +3,9 @@
 The prediction assumes that every set-point acts, one delivery delay after it was due. A lost one never acts: the
 vehicle holds the one before. A report says which set-point the vehicle holds at an instant. It carries the vehicle's
 own time and no key of a set-point, so the set-point is recognised by its values, float32 in both directions. From
-ArduPilot it is the acceleration, because the reported velocity grows with it. ArduPilot keeps it in cm/s², which rounds
-every fourth value to its neighbour. From PX4 it is the velocity, because the reported acceleration is that of its
-velocity loop; from our own vehicles the acceleration, which is all they report.
+ArduPilot it is the acceleration, because the reported velocity grows with it. ArduPilot keeps it in cm/s², which moves
+about a quarter of all values to the neighbouring float32. From PX4 it is the velocity, because the reported
+acceleration is that of its velocity loop; from our own vehicles the acceleration, which is all they report.
 
 The *age* of a report is its instant minus the time at which the recognised set-point was due. If none is lost, it lies
 between the delivery delay and one control period more. So a set-point that is newer than the recognised one, but older

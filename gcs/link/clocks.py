@@ -2,14 +2,15 @@
 
 One exchange gives RTT = t_receive - t_send and offset = t_remote - (t_send + t_receive) / 2. The error of this offset
 is half the difference between the delays down and up, at most RTT / 2. The estimate is a straight line. Its slope is
-fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. If jitter may have tilted it by more
-than the slope is known already, the former one is kept.
+fitted to the offsets of the window, weighted by 1 / (RTT - least RTT + 0.2 ms)^2. The previous slope is kept if jitter
+may have tilted the new one by more than the uncertainty of the previous one.
 
 The line lies midway between two limits: the lower by the quickest way up, the upper by the quickest way down. With
 jitter these are rarely ways of one exchange. While exchanges are few, the first states count as ways up, too:
 `time_boot_ms` is rounded down, so no state is sampled before its stamp or after its reception. If the quickest ways of
 the window are slower than those behind the previous line, by more than its drift explains, that line is extrapolated.
-Limits take the worst stamp: where stamps err, the weighted mean of the offsets counts if it is near the midpoint.
+One wrong stamp can set a limit. Where stamps err, the estimate is the weighted mean of the offsets instead, kept within
+the known error of the stamps from the midpoint.
 
 The bound of the error does not depend on that line. The vehicle read its clock after the request left and before the
 reply arrived, so t_remote - t_receive <= offset <= t_remote - t_send. Between exchanges these limits move apart by
@@ -28,15 +29,15 @@ round trips, the earlier residuals and the known error of the stamps explain. Su
 third in a row that is off by more than STAMPS_OFF_NS is a jump.
 
 An error that is the same in all stamps cannot be seen: it looks like an asymmetric link. `expected_error_ns` holds what
-is known beforehand of the errors of a kind of vehicle. To an error that exchanges have shown, the bound adds the least
-round trip: the exchange that showed it may itself have been off by that much.
+is known beforehand of the errors of a kind of vehicle. The bound includes the largest error that exchanges have shown
+and the least round trip: the exchange that showed it may itself have been off by that much.
 
 Telemetry shows a jump sooner: a state cannot have been sampled after it was received, nor before one that was sent
 earlier. Such a state is refused, and an exchange is due at once to decide. A state ahead of its reception by no more
 than the bound is taken to have been sampled when it was received. An overtaken state may predate a jump: it proves
 nothing, and after a jump it is refused.
 
-The loop delay of a loop closed over the ground is free of the offset's error, see `gcs.control.loop_delay`.
+In a loop closed on the ground, the error of the offset cancels from the loop delay, see `gcs.control.loop_delay`.
 """
 
 from typing import NamedTuple
