@@ -9,7 +9,7 @@ Both states answer to the same commands, one after the true delay and one after 
 an instant earlier: w_j = Phi(r) X_i + Gamma(r) u_i, with i and r by the true delay, minus the same by the assumed one.
 Of w_j only v_j matters: w_j itself, or the K L_k w_j if these are fewer numbers. Over a common period of both rates u
 depends on v by a transfer function that is stable if the loop without delay is stable, and v depends on u. Together
-v = N(z) v, with N = 0 where there is no mismatch. So an end of the window has det(I - N) = 0 on the unit circle, and the
+v = N(z) v, with N = 0 where there is no mismatch. So ends of the window have det(I - N) = 0 on the unit circle, and the
 loop is stable exactly where det(I - N) does not encircle 0 as z goes around the unit circle (Nyquist).
 
 Newton's method finds the ends. Its starting points come from loci: with a delay of q + m common periods, q whole and m
