@@ -111,11 +111,13 @@ BOTH = WEIGHTED | {"alpha_at_delay": 0.8, "decay_rate_at_delay_1_s": 2.5}
             {"spacing_gain_max_s2": 0.4, "noise_gain_max": 3.0},
             {"spacing_gain_max_s2", "noise_gain_max"},
         ),
-        ("inclusion", {"spacing_gain_max_s2": 0.7} | VARYING, {"spacing_gain_max_s2", "delays_s"}),
         # neither is reached however far the other one is relaxed
         ("inclusion", BOTH, {"alpha_at_delay and decay_rate_at_delay_1_s"}),
         ("graph-lqr", REGION | {"natural_frequency_max_rad_s": 0.8}, {"natural_frequency_max_rad_s"}),
         pytest.param("inclusion", {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6)}, {"delays_s"}, marks=LONG),
+        pytest.param(
+            "inclusion", {"spacing_gain_max_s2": 0.7} | VARYING, {"spacing_gain_max_s2", "delays_s"}, marks=LONG
+        ),
         pytest.param(
             "inclusion",
             {"spacing_gain_max_s2": 0.7, "delays_s": (0.0, 0.6), "delay_rate": 0.0},
